@@ -89,7 +89,7 @@ def main():
     options = parser.parse_args()
     random = np.random.default_rng(0)
     draws = 10.0 ** np.stack([random.uniform(0, 8, options.weights), random.uniform(0, 4, options.weights)], 1)
-    specs = [Spec(Q=q, R=1.0).checked(2, 1) for q in draws]
+    specs = [Spec(Q=q, R=1.0).check(2, 1) for q in draws]
     solve, costs = timed(solved, specs)
     designing, designs = timed(lambda spec: design(RIG, spec), specs)
     gains = [found.gain for found in designs] + [found.gain * [[1.0, 0.3]] for found in designs]

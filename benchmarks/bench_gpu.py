@@ -59,7 +59,7 @@ extern "C" __global__ void run_all(const Arrays arrays, const void* shared, long
 
 def rate(on: Any, rounds: int) -> float:
     """Return the card's single-precision operations per second, an addition and a multiplication each one."""
-    code = on.compiled(RATE)
+    code = on.compile(RATE)
     blocks = -(-THREADS // cuda.THREADS_PER_BLOCK) * cuda.THREADS_PER_BLOCK
 
     def start(context, outs, ins):

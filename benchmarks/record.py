@@ -50,7 +50,7 @@ def written(
     path = out or OUT / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     machine = {"processor": processor(), "system": platform.system(), "cores": os.cpu_count(), "load": load()}
-    versions = {**provenance.describe_platform(*packages), **provenance.commit()}
+    versions = {**provenance.describe_platform(*packages), **provenance.source_commit()}
     text = json.dumps({**record, "machine": machine, "versions": versions}, indent=2) + "\n"
     path.write_text(text, encoding="utf-8")
     return path

@@ -146,7 +146,7 @@ def tuned(config: Config, machine: Machine, shape: str) -> Machine:
         name: np.clip(float(getattr(machine, name)), 1.01 * low, 0.99 * high) for name, (low, high) in ranges.items()
     }
     best, most = replace(machine, inside), float(jnp.max(bounds(config, machine)))
-    worst = worst_of(counted(config, best.closed(), config.riders, most))
+    worst = worst_of(counted(config, best.closed_loop(), config.riders, most))
     machine = best
     for _ in range(config.stages):
         top = config.beyond * max(worst, 0.05 * most)
@@ -164,7 +164,7 @@ def tuned(config: Config, machine: Machine, shape: str) -> Machine:
             },
             method=Method(stopping=Stopping(iterations=config.iterations)),
         ).part
-        now = worst_of(counted(config, machine.closed(), config.riders, most))
+        now = worst_of(counted(config, machine.closed_loop(), config.riders, most))
         if now > worst:
             best, worst = machine, now
     return best
@@ -174,9 +174,9 @@ def for_one(config: Config, machine: Machine, shape: str, rider: float = 50.0) -
     """The machine and weights that recover the most with one rider, of designs drawn around this one."""
     ranges = limits(config, shape) | {"rider": config.designed_for, **WEIGHTS}
     most = float(jnp.max(bounds(config, machine)))
-    least = worst_of(counted(config, machine.closed(), [rider], most))
+    least = worst_of(counted(config, machine.closed_loop(), [rider], most))
     solver = FixedStep(step=config.judged_step, duration=config.judged_duration)
-    judge = arm_draws.runs(lambda z: replace(machine, z).closed(), rider, START, solver)
+    judge = arm_draws.runs(lambda z: replace(machine, z).closed_loop(), rider, START, solver)
     centre = {name: np.asarray(getattr(machine, name)) for name in ranges}
     return replace(machine, arm_draws.improved(config.draws, centre, ranges, judge, least)[0])
 
@@ -213,7 +213,7 @@ def described(config: Config, machine: Machine) -> dict[str, Any]:
 
 def judged(config: Config, machine: Machine) -> dict[str, Any]:
     """What a tuned machine does in nonlinear runs, and what is proved of its gain."""
-    loop = machine.closed()
+    loop = machine.closed_loop()
     riders = np.array([*config.riders, 50.0])
     reaches = counted(config, loop, riders, float(jnp.max(bounds(config, machine))))
     found = np.array([reach.multiple for reach in reaches])

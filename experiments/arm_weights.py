@@ -133,7 +133,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
     found = tuned(config)
-    unit = [lq_weights(found.part.loop, np.ones(6), r, found.part.design).closed() for r in (1.0, config.effort)]
+    unit = [lq_weights(found.part.loop, np.ones(6), r, found.part.design).closed_loop() for r in (1.0, config.effort)]
     known = load("arm-hanging").loop.controller.gain
     gains = {
         "Q = I, R = 1": unit[0].controller.gain,

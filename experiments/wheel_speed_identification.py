@@ -128,7 +128,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
     table = coverage(config, found)
     record.print_rows("Known parameters from a noisy wheel speed", table)
     spread = [
-        {"relative spread": one.spread, "direction": one.shown()} for one in found[0].uncertainty.directions[::-1]
+        {"relative spread": one.spread, "direction": one.describe()} for one in found[0].uncertainty.directions[::-1]
     ]
     record.print_rows("What the trace says least about", spread)
     noise = float(np.mean([np.sqrt(one.chi2 / one.uncertainty.degrees) for one in found]) * config.noise)

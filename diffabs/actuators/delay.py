@@ -111,7 +111,9 @@ class Delay:
         window = jnp.broadcast_to(row, (WINDOW_PIECES, *row.shape))
         rows = jnp.zeros((self.capacity + self.capacity // CUTS + SPARE, *row.shape), row.dtype)
         ring = Log(rows, zero, row).put(zero, row)
-        return Memory((), self._aimed(DelayMemory(ring, window, zero + 1, zero, zero, zero, zero, zero + 1, row)))
+        return Memory(
+            (), self._aim_at_break(DelayMemory(ring, window, zero + 1, zero, zero, zero, zero, zero + 1, row))
+        )
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Any:
         """Return the delayed command; beyond the next break, its linear extrapolation."""
@@ -132,7 +134,7 @@ class Delay:
         del t, signal
         m: DelayMemory = memory.held
         out = fired[0] & (m.last + 1 < m.known)
-        return memory._replace(held=self._aimed(m._replace(place=jnp.where(out, m.last + 1, m.place))))
+        return memory._replace(held=self._aim_at_break(m._replace(place=jnp.where(out, m.last + 1, m.place))))
 
     def record(self, memory: Memory, passage: Passage) -> Memory:
         """Return the memory with the finished step stored; a step of zero length is not stored."""
@@ -143,7 +145,7 @@ class Delay:
         after = passage.values[0], self.time * passage.rates[0]
         breaks = jnp.where(_differ((before.command.end, before.rate * self.time), after), 1.0, 0.0).astype(h.dtype)
         row = _row(Piece(passage.start, passage.end, cubic, breaks))
-        some = h > _rounding(passage.end)
+        some = h > _time_tolerance(passage.end)
         count = m.count + jnp.where(some, 1.0, 0.0)
         newest = jnp.where(some, row, m.newest)
         return memory._replace(held=m._replace(ring=m.ring.put(free, row), newest=newest, count=count))
@@ -159,15 +161,15 @@ class Delay:
         rows = m.ring.read(_ring_place(first.astype(int) + jnp.arange(WINDOW_PIECES), size))
         window = jnp.where(count < size, rows, jnp.nan)  # else the ring has overwritten a piece that has not left yet
         known, none = jnp.minimum(count, WINDOW_PIECES), jnp.zeros_like(count)
-        new = self._aimed(DelayMemory(m.ring, window, known, none, none, none, first, count, m.newest))
+        new = self._aim_at_break(DelayMemory(m.ring, window, known, none, none, none, first, count, m.newest))
         return memory._replace(held=self._at_once(new, clock.t))
 
     def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
         """Return the memory after the breaks that leave the delay at time t or earlier."""
         out = (m.last + 1 < m.known) & (m.until + self.time <= t)
-        return self._aimed(m._replace(place=jnp.where(out, m.last + 1, m.place)))
+        return self._aim_at_break(m._replace(place=jnp.where(out, m.last + 1, m.place)))
 
-    def differentiated(self, names: set[str]) -> "Delay":
+    def enable_derivatives(self, names: set[str]) -> "Delay":
         """Return the delay to use for derivatives with respect to the parameters in `names`."""
         return _InEvents(time=self.time, capacity=self.capacity) if "time" in names else self
 
@@ -175,7 +177,7 @@ class Delay:
         """Return the window index of the piece that leaves at time t, limited to the pieces before the next break."""
         return _count([m.window[i, 1] for i in range(WINDOW_PIECES)], t - self.time, m.place, m.last)
 
-    def _aimed(self, m: DelayMemory) -> DelayMemory:
+    def _aim_at_break(self, m: DelayMemory) -> DelayMemory:
         """Return the memory with `last` and `until` set for the present `place`."""
         last = m.known - 1
         for i in reversed(range(1, WINDOW_PIECES)):
@@ -185,7 +187,7 @@ class Delay:
         # The event comes a rounding before the grid instant: on the grid its time would lose its derivatives. If the
         # newest piece limits the step, the event comes a rounding after its end, so that it does not cut the next step.
         newest = ~breaks & (m.known == m.count)
-        return m._replace(last=last, until=until + jnp.where(newest, 1.0, -1.0) * _rounding(until + self.time))
+        return m._replace(last=last, until=until + jnp.where(newest, 1.0, -1.0) * _time_tolerance(until + self.time))
 
     def refined(self, times: int) -> "Delay":
         """Return the delay with capacity for a step that is `times` times shorter."""
@@ -212,8 +214,8 @@ class _InEvents(Delay):
     def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
         # Breaks more than a few roundings in the past have left already: when the solver repeats a step, rounding may
         # reveal a break that the first try did not see.
-        m = Delay._at_once(self, m, t - 4 * _rounding(t))
-        late = jnp.where(m.last + 1 < m.known, t + _rounding(t) - (m.until + self.time), 0.0)
+        m = Delay._at_once(self, m, t - 4 * _time_tolerance(t))
+        late = jnp.where(m.last + 1 < m.known, t + _time_tolerance(t) - (m.until + self.time), 0.0)
         return m._replace(until=m.until + jnp.maximum(jax.lax.stop_gradient(late), 0.0))
 
 
@@ -248,7 +250,7 @@ def _differ(before: tuple[Any, Any], after: tuple[Any, Any]) -> Any:
     return jnp.any(jnp.stack(jumps))
 
 
-def _rounding(t: Any) -> Any:
+def _time_tolerance(t: Any) -> Any:
     """Return the bound on the difference of two computations of the time t [s]."""
     return TIME_EPS * jnp.finfo(jnp.result_type(t)).eps * jax.lax.stop_gradient(t)
 

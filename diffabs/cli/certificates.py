@@ -71,7 +71,7 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
     values = reduced.gain if gain is None else _read_gain(gain, states)
     spec = Spec(Q=wanted.Q, R=wanted.R, decay=wanted.decay, damping=wanted.damping)
     try:
-        spec = spec.checked(len(states), 1)
+        spec = spec.check(len(states), 1)
     except ValueError as error:
         raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
     solver.solvers()  # says what is missing before anything is computed
@@ -216,7 +216,7 @@ def slowest_vertex(proof: "Certificate") -> dict[str, Any]:
 
 def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings | None = None) -> str:
     """What was asked for and is not proved, in words, and what is known besides; empty if all is proved."""
-    stable, refuted = proof.quadratically_stable, any(proof.proved("infeasible"))
+    stable, refuted = proof.quadratically_stable, any(proof.proved_data("infeasible"))
     asked = {
         "decay": (spec.decay > 0, f"decay = {spec.decay:g} 1/s", not refuted),
         "cost": (spec.Q is not None, "a guaranteed cost", True),
@@ -228,7 +228,7 @@ def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings
         found[0] += ", so no design by one over these ranges, whatever Q and R, gives this gain"
     else:
         for kind, (wanted, words, still_open) in asked.items():
-            if wanted and not any(proof.proved(kind)):
+            if wanted and not any(proof.proved_data(kind)):
                 found.append(f"{words} is {VERDICT_WORDS[None if still_open else False]}")
     if not found:
         return ""

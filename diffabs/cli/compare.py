@@ -33,7 +33,7 @@ def compare(
         a, b = Results(first), Results(second)
         _check_same(a, b)
         result = {"first": str(first), "second": str(second), **_compare_metrics(a, b, _common_metrics(a, b, metric))}
-        show.as_json(result) if as_json else show_samples.compared(result)
+        show.as_json(result) if as_json else show_samples.show_comparison(result)
 
 
 def _check_same(a: "Results", b: "Results") -> None:

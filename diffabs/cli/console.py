@@ -27,7 +27,7 @@ from diffabs.scenario.scenario import Scenario, dump, load, names
 T = TypeVar("T")
 
 FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, interrupt.INTERRUPTED, interrupt.TERMINATED
-PATIENCE, SECOND_INTERRUPT_S = progress.PATIENCE, progress.REPEAT_S
+SILENCE_S, SECOND_INTERRUPT_S = progress.SILENCE_S, progress.REPEAT_S
 AWAKE = 0.1  # s between looks for Ctrl-C
 LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
 CONTINUED = " \\"  # a line of a shell that goes on in the next
@@ -98,7 +98,7 @@ def note_command(words: Sequence[str]) -> None:
     stopwatch.count_compilations()
 
 
-def describe_making() -> dict[str, str | float]:
+def describe_run() -> dict[str, str | float]:
     """Return when, where and by which command a document is made, and how long that took so far [s]."""
     seconds, compiling = time.monotonic() - _begun, stopwatch.compile_time_since(_begun)
     return {**provenance.describe_making(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
@@ -106,7 +106,7 @@ def describe_making() -> dict[str, str | float]:
 
 def describe_source(chosen: Scenario) -> dict[str, Any]:
     """Return how every document on a scenario begins: what was asked about, and how the document is made."""
-    return {"scenario": chosen.name, "model": describe_model(chosen), "made": describe_making()}
+    return {"scenario": chosen.name, "model": describe_model(chosen), "made": describe_run()}
 
 
 def say(line: str) -> None:
@@ -184,7 +184,7 @@ def end_on_errors() -> Iterator[None]:
         fail(line)
 
 
-class EarlyEnd:
+class InterruptibleEnd:
     """What Ctrl-C asks of work that can end early and has then something to show: to finish `what` it has in hand. The
     work asks this object whether it shall. The second time Ctrl-C interrupts, and the first, too, while `nothing()` is
     reached yet."""
@@ -206,7 +206,7 @@ class EarlyEnd:
 
 
 def run_with_progress(
-    work: Callable[[], T], message: str, detail: progress.Detail | None = None, ending: EarlyEnd | None = None
+    work: Callable[[], T], message: str, detail: progress.Detail | None = None, ending: InterruptibleEnd | None = None
 ) -> T:
     """The result of `work`, with a spinner on a terminal, or a line if it takes long elsewhere. `detail` says how far
     the work is: beside the spinner, or in a line every few seconds.
@@ -229,14 +229,14 @@ def run_with_progress(
     told = (
         contextlib.nullcontext(lambda: None)
         if _quiet
-        else progress.show_progress(message, detail, say, (PATIENCE, SECOND_INTERRUPT_S))
+        else progress.show_progress(message, detail, say, (SILENCE_S, SECOND_INTERRUPT_S))
     )
     with told as tell:
         thread.start()
         ended = False
         while not ended:
             if _wait_for_interrupt(thread):
-                (ending or EarlyEnd("", nothing=lambda: True)).ask()
+                (ending or InterruptibleEnd("", nothing=lambda: True)).ask()
             ended = not thread.is_alive()
             tell()
     if errors:

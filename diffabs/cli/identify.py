@@ -142,12 +142,12 @@ def _fit_with_progress(
     """The fit, the standard deviations it was made with, and whether Ctrl-C ended it."""
     far: list[str] = []
 
-    def told(evaluations: int, cost: float) -> None:
+    def report_progress(evaluations: int, cost: float) -> None:
         far.append(f"{evaluations} evaluation{'s' if evaluations != 1 else ''}, cost {cost:.6g}")
 
-    ending = console.EarlyEnd("the evaluation in hand", nothing=lambda: not far)
+    ending = console.InterruptibleEnd("the evaluation in hand", nothing=lambda: not far)
     found, noise = console.run_with_progress(
-        lambda: _fit(chosen, readings, ranges, given, told, ending),
+        lambda: _fit(chosen, readings, ranges, given, report_progress, ending),
         f"identifying {chosen.name}",
         lambda: far[-1] if far else progress.COMPILING,
         ending,
@@ -170,7 +170,9 @@ def _fit(
 
     solver, columns = _solver(chosen.solver, readings), readings.columns
 
-    def fitted(noise: Mapping[str, float], starts: Sequence[Any] = ()) -> tuple["Identified", dict[str, np.ndarray]]:
+    def fit_traces(
+        noise: Mapping[str, float], starts: Sequence[Any] = ()
+    ) -> tuple["Identified", dict[str, np.ndarray]]:
         traces = Traces(t=readings.t, columns=columns, sigma=noise)
         options = {"solver": solver, "absolute": bool(given), "starts": starts}
         found = identify(chosen.loop, traces, dict(ranges), **options, progress=told, stopping=stopping)
@@ -178,7 +180,7 @@ def _fit(
 
     spread = {name: float(np.std(values)) or 1.0 for name, values in columns.items()}
     noise = {**spread, **given}
-    found, residuals = fitted(noise)
+    found, residuals = fit_traces(noise)
     evaluations = found.evaluations
     for _ in range(0 if len(given) == len(columns) else ROUNDS - 1):
         if stopping():
@@ -187,7 +189,7 @@ def _fit(
             name: given.get(name) or max(_root_mean_square(residuals[name]), MIN_RELATIVE_NOISE * spread[name])
             for name in columns
         }
-        found, residuals = fitted(noise, [found.values])
+        found, residuals = fit_traces(noise, [found.values])
         evaluations += found.evaluations
     return dataclasses.replace(found, evaluations=evaluations), noise
 
@@ -224,8 +226,8 @@ def _result(
             if abs(known.correlation[i, j]) > HIGH_CORRELATION
         ],
         "undetermined": [
-            {"direction": one.shown(), "spread": one.spread, "components": one.components}
-            for one in known.undetermined()
+            {"direction": one.describe(), "spread": one.spread, "components": one.components}
+            for one in known.undetermined_directions()
         ],
         "residuals": _residuals(readings, found, noise, chosen.loop.plant.shows.units),
         "chi2": found.chi2,

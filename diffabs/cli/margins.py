@@ -11,7 +11,7 @@ from rich.table import Table
 
 from diffabs.cli import console, show, targets
 from diffabs.core import provenance
-from diffabs.core.pytree import Spec, replace
+from diffabs.core.pytree import ParameterSpec, replace
 from diffabs.core.values import ScenarioError, format_given, read_number_in_range
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.registry import KMH
@@ -82,7 +82,7 @@ def _read_places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, floa
         if path in table:
             raise ScenarioError(f"--at {path} is given twice")
         table[path] = value
-    there = {**parameters_of(chosen.loop), "target": (Spec("1"), ())}
+    there = {**parameters_of(chosen.loop), "target": (ParameterSpec("1"), ())}
     found = [one.single("have a place") for one in read_entries(table, "--at", there, "no parameter of this loop")]
     values = {one.path: read_number_in_range(one.given, one.spec, one.where) / one.scale for one in found}
     return values, values.pop("target", None)

@@ -17,11 +17,11 @@ from rich.spinner import Spinner
 
 from diffabs.core import stopwatch
 
-PATIENCE = 2.0  # s without a sign of life
+SILENCE_S = 2.0  # s without a sign of life
 REPEAT_S = 5.0  # s between lines about how far work is
 FRAMES = 12.5  # per second
-QUIET = 1.0  # s in which nothing is said of time
-NOTED = 0.5  # s of compiling, from which it is
+MIN_SHOWN_S = 1.0  # s in which nothing is said of time
+MIN_COMPILING_S = 0.5  # s of compiling, from which it is
 SPINNER = 2  # columns, with the blank behind it
 COMPILING = "compiling"  # while nothing is reached
 
@@ -53,20 +53,20 @@ class WorkTiming:
         self.begun = time.monotonic()
         self.first: tuple[float, float] | None = None  # when anything was known, and how much was done then
 
-    def said(self, far: WorkProgress) -> str:
+    def describe(self, far: WorkProgress) -> str:
         """In words, to be put behind those of `far`; nothing at first."""
         now = time.monotonic()
-        rest = self.left(far, now)
-        if now - self.begun < QUIET:
+        rest = self.remaining_time(far, now)
+        if now - self.begun < MIN_SHOWN_S:
             return ""
         parts = [format_duration(now - self.begun)]
-        if (compiling := stopwatch.compile_time_since(self.begun)) >= NOTED:
+        if (compiling := stopwatch.compile_time_since(self.begun)) >= MIN_COMPILING_S:
             parts[0] += f", {format_duration(compiling)} of it compiling"
         if rest is not None:
             parts.append(f"{'at most ' if far.at_most else ''}{format_duration(rest)} left")
         return f"{'; ' if far.words else ' '}{', '.join(parts)}"
 
-    def left(self, far: WorkProgress, now: float) -> float | None:
+    def remaining_time(self, far: WorkProgress, now: float) -> float | None:
         """How long [s] the rest takes at the pace so far, compiling left out; None where that is not known yet."""
         if far.total is None:
             return None
@@ -96,7 +96,7 @@ class _Picture:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The spinner must be one object, or it would not turn."""
         far, words = self.far()
-        self.spinner.update(text=fit_line(words, far.words, self.pace.said(far), options.max_width - SPINNER))
+        self.spinner.update(text=fit_line(words, far.words, self.pace.describe(far), options.max_width - SPINNER))
         yield self.spinner
         if far.total and not far.at_most:
             yield ProgressBar(total=far.total, completed=far.done, width=min(60, options.max_width))
@@ -130,7 +130,7 @@ def show_progress(
         if time.monotonic() > due:
             far, words = picture.far()
             if told != (told := words):
-                tell(told + picture.pace.said(far))
+                tell(told + picture.pace.describe(far))
             due = time.monotonic() + timing[1] if detail else math.inf
 
     yield line

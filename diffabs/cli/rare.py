@@ -11,7 +11,7 @@ import typer
 from diffabs.cli import console, progress, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core import provenance
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.values import ScenarioError, read_number, unknown_name_error
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
@@ -49,7 +49,7 @@ def rare(
         study = _build_runner(section_sweep.build_study(chosen), metric, engine)
         found = _estimate(study, metric, bound, samples, gradients)
         result = _document(found, study, chosen, metric, bound)
-        show.as_json(result) if as_json else show_samples.rare(result, chosen)
+        show.as_json(result) if as_json else show_samples.show_rare_event(result, chosen)
 
 
 def _build_runner(study: "Study", metric: str, engine: str) -> "Study":
@@ -71,7 +71,7 @@ def _read_failure(text: str, chosen: Scenario) -> tuple[str, float]:
         raise unknown_name_error(f"{metric} is not measured", metric, chosen.objectives)
     if equals:
         return metric, read_number(
-            parse_value(bound.strip()), Spec(unit_of(chosen.objectives[metric], chosen.loop.plant)), metric
+            parse_value(bound.strip()), ParameterSpec(unit_of(chosen.objectives[metric], chosen.loop.plant)), metric
         )
     if metric not in chosen.sweep.failures:
         raise ScenarioError(f"{metric} has no bound in [sweep.failures]: say {metric}=BOUND")

@@ -10,7 +10,7 @@ from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 
 
-def swept(result: dict[str, Any], chosen: Scenario) -> None:
+def show_sweep(result: dict[str, Any], chosen: Scenario) -> None:
     """Failures, statistics with intervals, what moves what, the worst samples."""
     percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
     show_titled_table(
@@ -85,7 +85,7 @@ def _statistics(metrics: dict[str, Any], chosen: Scenario) -> Table:
     return table
 
 
-def rare(result: dict[str, Any], chosen: Scenario) -> None:
+def show_rare_event(result: dict[str, Any], chosen: Scenario) -> None:
     """A small probability, the levels that led to it, and the likeliest failures."""
     levels = Table("level", "at least", "share", "coefficient of variation", "accepted", "diverged")
     for i, row in enumerate(result["levels"], 1):
@@ -110,7 +110,7 @@ def rare(result: dict[str, Any], chosen: Scenario) -> None:
     say(f"{result['runs']} runs and {result['gradients']} gradients; {result['diverged']} diverged")
 
 
-def compared(result: dict[str, Any]) -> None:
+def show_comparison(result: dict[str, Any]) -> None:
     """Means of two sweeps, and their difference sample by sample."""
     table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")
     for name, row in result["metrics"].items():

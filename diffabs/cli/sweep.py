@@ -73,7 +73,7 @@ def sweep(
         kept = _numbers(keep, study.samples)
         for number in kept:
             _check_runnable(study, number)
-        with _continued(out, resume):
+        with _explain_resume(out, resume):
             found = _run(study, chosen, out, resume, lambda: _computer(on, scheduler, workers))
             warn_of_strays(found)
             if not found.complete:
@@ -82,7 +82,7 @@ def sweep(
             result = console.run_with_progress(
                 lambda: _result(found, study, out, kept, figures, check), "computing statistics"
             )
-        show.as_json(result) if as_json else show_samples.swept(result, chosen)
+        show.as_json(result) if as_json else show_samples.show_sweep(result, chosen)
         _warn(result["accuracy"])
         _check_any(result, chosen)
 
@@ -132,7 +132,7 @@ def warn_of_strays(found: "Results") -> None:
 
 
 @contextlib.contextmanager
-def _continued(out: pathlib.Path, resume: bool) -> Iterator[None]:
+def _explain_resume(out: pathlib.Path, resume: bool) -> Iterator[None]:
     """A full disk, a kernel that cannot be compiled any more, and Ctrl-C say how to go on."""
     try:
         yield
@@ -220,18 +220,20 @@ def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:
 def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], Any]) -> "Results":
     """Raises KeyboardInterrupt, after the chunks in hand or at once."""
     far = [progress.WorkProgress(progress.COMPILING)]
-    ending = console.EarlyEnd("the chunks in hand")
+    ending = console.InterruptibleEnd("the chunks in hand")
 
-    def told(at: "Told") -> None:
+    def report_progress(at: "Told") -> None:
         if at.damaged and not at.here:
-            console.say(f"damaged, computed again: chunk{'s' if len(at.damaged) > 1 else ''} {_listed(at.damaged)}")
+            console.say(
+                f"damaged, computed again: chunk{'s' if len(at.damaged) > 1 else ''} {_list_numbers(at.damaged)}"
+            )
         far[0] = _far(at)
 
     def run() -> "Results":
         from diffabs.sweep import sweep as run
 
         source = {"scenario": dump(chosen), "name": chosen.name}
-        return run(study, out, resume=resume, on=on(), progress=told, stopping=ending, source=source)
+        return run(study, out, resume=resume, on=on(), progress=report_progress, stopping=ending, source=source)
 
     return console.run_with_progress(run, f"sweeping {chosen.name}", lambda: far[0], ending)
 
@@ -245,7 +247,7 @@ def _far(at: "Told") -> progress.WorkProgress:
     return progress.WorkProgress(words, at.samples, at.total)
 
 
-def _listed(numbers: tuple[int, ...]) -> str:
+def _list_numbers(numbers: tuple[int, ...]) -> str:
     return ", ".join(map(str, numbers[:8])) + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")
 
 
@@ -268,7 +270,7 @@ def _result(
         halved = beside.submit(check_accuracy, study, found, check) if check else None
         said = summarise_sweep(found)
     accuracy = halved.result() if halved else None
-    result = {"out": str(out), **said, "accuracy": accuracy, "made": console.describe_making(), "files": {}}
+    result = {"out": str(out), **said, "accuracy": accuracy, "made": console.describe_run(), "files": {}}
     if kept:
         result["files"]["trajectories"] = str(write_trajectories(study, out, kept))
     if figures:

@@ -153,7 +153,7 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     from diffabs.tune import Method, StartError, Stopping
 
     goal, told = work.chosen.tune, list["TuningProgress"]()
-    ending = console.EarlyEnd("the evaluation in hand", nothing=lambda: not told)
+    ending = console.InterruptibleEnd("the evaluation in hand", nothing=lambda: not told)
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
     posed: dict[str, Any] = {
         "free": goal.free,
@@ -161,20 +161,20 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
         "over": work.batch,
         "solver": work.chosen.solver,
         "measured": work.chosen.objectives,
-        "aggregate": goal.aggregated(),
+        "aggregate": goal.read_aggregate(),
         "constraints": list(work.constraints.values()),
     }
     loop = work.chosen.loop
     most = None if work.constraints else goal.iterations  # constraints take rounds of as many, nobody knows how many
     engine = engines.choose_engine(engine, lambda: tune.build_problem(loop, **posed, engine="kernel").objection())
 
-    def tuned() -> "Tuned":
+    def run_tuning() -> "Tuned":
         told_to = {"method": method, "progress": told.append, "stopping": ending}
         return tune.tune(loop, **posed, **told_to, engine=engine)
 
     try:
         return console.run_with_progress(
-            tuned, f"tuning {work.chosen.name}", lambda: _format_progress(told, most), ending
+            run_tuning, f"tuning {work.chosen.name}", lambda: _format_progress(told, most), ending
         ), ending.asked
     except StartError as error:
         console.fail(f"{work.chosen.name}: no start can be used: {error}", console.FAILED)
@@ -231,12 +231,12 @@ def _draw(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in chosen.tune.objective.items())))
     solver = dataclasses.replace(chosen.solver, every=min(chosen.solver.every, chosen.solver.steps))
 
-    def seen(loop: Any) -> Trajectory:
+    def roll_out(loop: Any) -> Trajectory:
         run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=chosen.key()))
         assert run.trajectory is not None
         return run.trajectory
 
-    runs = {"before": seen(chosen.loop), "after": seen(found.loop)}
+    runs = {"before": roll_out(chosen.loop), "after": roll_out(found.loop)}
     where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
     title = chosen.title or chosen.name
     figure = draw_tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit)

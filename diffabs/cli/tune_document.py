@@ -88,8 +88,8 @@ def _constraints(work: Work, found: "Tuned", proved: Proved) -> list[dict[str, A
         before, after = certificates.certify_gain(work.task).decay_rate, proved.document["decay_rate"]
         rows.append(_constraint_row("certified decay", goal.decay, before, after, at_most=False))
     if work.task and goal.damping:
-        before = _damping(work.task, work.chosen.loop)
-        after = _damping(proved.task or work.task, found.loop)
+        before = _least_damping(work.task, work.chosen.loop)
+        after = _least_damping(proved.task or work.task, found.loop)
         rows.append(_constraint_row("damping", goal.damping, before, after, at_most=False))
     return rows
 
@@ -106,7 +106,7 @@ def _constraint_row(
     return {**row, "met": beyond <= 0, "missed": missed}
 
 
-def _damping(task: certificates.ProofTask, loop: Any) -> float:
+def _least_damping(task: certificates.ProofTask, loop: Any) -> float:
     """The least of the poles at the vertices."""
     from diffabs.tune import Poles
 

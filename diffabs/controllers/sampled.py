@@ -78,13 +78,13 @@ class Sampled:
         """Return the memory after a sampling instant: compute a new output, and apply an output that still waits."""
         m: SampledMemory = memory.held
         now, number = clock.ticks(self.period)
-        inner, output, _ = self.guarded(clock._replace(h=self.period, k=number), m.inner, m.next, signal)
+        inner, output, _ = self.compute_guarded(clock._replace(h=self.period, k=number), m.inner, m.next, signal)
         waits = self._waits()
         applied = jnp.where(waits, jnp.where(m.waits > 0.5, m.next, m.applied), output)
         new = SampledMemory(inner, applied, output, self._until(clock.t), jnp.where(waits, 1.0, 0.0))
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m))
 
-    def computed(self, clock: Clock, memory: Memory, signal: Tracking) -> tuple[Memory, Scalar]:
+    def compute_sample(self, clock: Clock, memory: Memory, signal: Tracking) -> tuple[Memory, Scalar]:
         """Return the inner controller's memory after one sample, and its output.
 
         Args:
@@ -92,12 +92,12 @@ class Sampled:
             memory: Inner controller's memory before the sample.
             signal: The sample.
         """
-        inner = self._sampled(clock, memory, signal)
+        inner = self._update_memory(clock, memory, signal)
         output = self.controller.output(clock.t, inner, signal)
         flow = axpy(clock.h, self.controller.flow(clock.t, inner, signal), inner.flow)
         return Memory(flow, inner.held), output
 
-    def guarded(
+    def compute_guarded(
         self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking, lost: Any = False
     ) -> tuple[Memory, Scalar, Any]:
         """Return the result of `computed` for a usable sample, else the old memory and output; and whether the sample
@@ -113,8 +113,8 @@ class Sampled:
         # Compute with finite inputs even for a skipped sample. Otherwise NaN would reach the derivatives through the
         # branch of `jnp.where` that is not taken.
         before = None if clock.before is None else replace_nan(clock.before)
-        new = self.computed(clock._replace(before=before), memory, replace_nan(signal))
-        read = leaf_dependence(lambda signal: self.computed(clock, memory, signal), signal)
+        new = self.compute_sample(clock._replace(before=before), memory, replace_nan(signal))
+        read = leaf_dependence(lambda signal: self.compute_sample(clock, memory, signal), signal)
         # A NaN counts only in a number that the controller reads: an unused channel may be NaN.
         numbers = [x for x, on in zip(jax.tree.leaves(signal), read, strict=True) if on]
         results = [x for x in jax.tree.leaves(new) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
@@ -128,7 +128,7 @@ class Sampled:
         """Return whether an output waits for the end of a delay, so that an event applies it."""
         return jnp.greater(self.delay, 0)
 
-    def differentiated(self, names: set[str]) -> "Sampled":
+    def enable_derivatives(self, names: set[str]) -> "Sampled":
         """Return the controller to use for derivatives with respect to the parameters in `names`."""
         if "delay" not in names:
             return self
@@ -156,7 +156,7 @@ class Sampled:
         applied, waits = jnp.where(fired[0], m.next, m.applied), jnp.where(fired[0], 0.0, m.waits)
         return Memory(held=m._replace(applied=applied, waits=waits))
 
-    def _sampled(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
+    def _update_memory(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
         """Return the inner controller's memory after its tick and after the events that it can only detect at a
         sampling instant.
         """

@@ -54,7 +54,9 @@ class SampledOnGrid:
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
     flow = no_flow
-    computed, guarded, _sampled = Sampled.computed, Sampled.guarded, Sampled._sampled
+    compute_sample = Sampled.compute_sample
+    compute_guarded = Sampled.compute_guarded
+    _update_memory = Sampled._update_memory
 
     def start(self, signal: Tracking) -> Memory:
         """Return the memory with output zero until the first sample has been computed."""
@@ -73,7 +75,9 @@ class SampledOnGrid:
         """
         m: GridMemory = memory.held
         now, number = clock.ticks(self.sampling_period)
-        inner, output, _ = self.guarded(clock._replace(h=self.sampling_period, k=number), m.inner, m.next, signal)
+        inner, output, _ = self.compute_guarded(
+            clock._replace(h=self.sampling_period, k=number), m.inner, m.next, signal
+        )
         close = PERIOD_EPS * jnp.finfo(jnp.result_type(clock.t, clock.h)).eps * (clock.t + self.sampling_period)
         over = jax.lax.stop_gradient(jnp.maximum(self.delay - (self.sampling_period - 2 * close), 0.0))
         new = GridMemory(inner, output, m.next, clock.t + self.delay - over, m.applied)

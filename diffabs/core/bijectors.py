@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.pytree import Spec, parameters, replace
+from diffabs.core.pytree import ParameterSpec, parameters, replace
 
 LOGARITHMIC_RATIO = 10.0  # ratio of the ends from which a range is mapped in the logarithm
 END_SHARE = 1e-9  # relative; the map is flat near an end, so a closer start could not leave it
@@ -172,7 +172,7 @@ class FreeSpace:
         Raises:
             ValueError: A value is not inside its range.
         """
-        return np.concatenate([self._placed(entry, value) for entry, value in self._of(part)])
+        return np.concatenate([self._place_values(entry, value) for entry, value in self._of(part)])
 
     def spread(self, key: jax.Array, count: int) -> np.ndarray:
         """Return `count` random starts (count, size) from the random `key`.
@@ -190,7 +190,7 @@ class FreeSpace:
         return [(entry, np.asarray(there[entry.path], float)) for entry in self.entries]
 
     @staticmethod
-    def _placed(entry: FreeParameter, value: np.ndarray) -> np.ndarray:
+    def _place_values(entry: FreeParameter, value: np.ndarray) -> np.ndarray:
         for x, (low, high) in zip(value.ravel(), entry.ranges, strict=True):
             _check_inside(entry.path, float(x), low, high)
         return np.array([m.place(float(x)) for m, x in zip(entry.maps, value.ravel(), strict=True)])
@@ -220,7 +220,7 @@ def parameter_space(part: Any, free: Sequence[str] | Mapping[str, Range | None])
     return FreeSpace(tuple(_entry(path, *there[path], ends) for path, ends in given.items()))
 
 
-def _entry(path: str, spec: Spec, value: np.ndarray, ends: Range | None) -> FreeParameter:
+def _entry(path: str, spec: ParameterSpec, value: np.ndarray, ends: Range | None) -> FreeParameter:
     low, high = (np.broadcast_to(np.asarray(x, float), value.shape) for x in ends or (spec.low, spec.high))
     maps = []
     for a, b, x in zip(low.ravel(), high.ravel(), value.ravel(), strict=True):

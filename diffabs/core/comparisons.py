@@ -57,7 +57,7 @@ class SwitchedProgram:
         self._zero = self._value("zero", False)
         moves = [True] * len(jax.tree.leaves(moving)) + [False] * len(jax.tree.leaves(fixed))
         self._inputs = [self._value(("in", i), on) for i, on in enumerate(moves)]
-        flat = self._add_jaxpr(closed.jaxpr, self._kept(closed.consts), self._inputs)
+        flat = self._add_jaxpr(closed.jaxpr, self._add_constants(closed.consts), self._inputs)
         self.outputs = jax.tree.unflatten(jax.tree.structure(shape), flat)
         self._number_comparisons(set(jax.tree.leaves(counts(self.outputs))))
         self._orders: dict[tuple[int, ...], list[_Op]] = {}
@@ -113,7 +113,7 @@ class SwitchedProgram:
         self._moves.append(moves)
         return len(self._names) - 1
 
-    def _kept(self, constants: Sequence[Any]) -> list[int]:
+    def _add_constants(self, constants: Sequence[Any]) -> list[int]:
         """Return the numbers of new constants."""
         found = [self._value(("constant", len(self._names) + i), False) for i in range(len(constants))]
         self._constants.update(zip(found, constants, strict=True))
@@ -139,7 +139,7 @@ class SwitchedProgram:
                 outs = self._operation(eqn, ins)
             else:
                 body, kept = (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, [])
-                outs = self._add_jaxpr(body, self._kept(kept), list(ins))
+                outs = self._add_jaxpr(body, self._add_constants(kept), list(ins))
             at.update(zip(eqn.outvars, outs, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 

@@ -89,7 +89,7 @@ class Loop:
         sensor = self.sensor.start(y)
         measured = self.sensor.output(0.0, sensor, y)
         reference = self.reference.start(measured)
-        tracking = self._tracking(0.0, reference, measured)
+        tracking = self._track(0.0, reference, measured)
         controller = self.controller.start(tracking)
         actuator = self.actuator.start(self.controller.output(0.0, controller, tracking))
         return LoopState(x, sensor, reference, controller, actuator)
@@ -98,7 +98,7 @@ class Loop:
         """Return the signals at time `t` [s] in `state`, computed once around the loop."""
         y = self.plant.output(state.plant)
         measured = self.sensor.output(t, state.sensor, y)
-        tracking = self._tracking(t, state.reference, measured)
+        tracking = self._track(t, state.reference, measured)
         command = self.controller.output(t, state.controller, tracking)
         control = self.actuator.output(t, state.actuator, command)
         setpoint = self.reference.setpoint(state.reference)
@@ -191,7 +191,7 @@ class Loop:
         """
         was, moved = _block_inputs(before), False
 
-        def changed(name: str, signal: Any) -> Memory:
+        def change_block(name: str, signal: Any) -> Memory:
             nonlocal state, moved
             block, memory = getattr(self, name), getattr(state, name)
             if name in fired:
@@ -212,10 +212,10 @@ class Loop:
             return memory
 
         t, y = clock.t, before.sample.output
-        measured = self.sensor.output(t, changed("sensor", y), y)
-        tracking = self._tracking(t, changed("reference", measured), measured)
-        command = self.controller.output(t, changed("controller", tracking), tracking)
-        changed("actuator", command)
+        measured = self.sensor.output(t, change_block("sensor", y), y)
+        tracking = self._track(t, change_block("reference", measured), measured)
+        command = self.controller.output(t, change_block("controller", tracking), tracking)
+        change_block("actuator", command)
         return state
 
     def signal_rates(self, t: Scalar, state: LoopState, flow: Any) -> Signals:
@@ -223,7 +223,7 @@ class Loop:
         moves = (jnp.ones_like(jnp.asarray(t)), flow)
         return jax.jvp(lambda t, z: self.signals(t, state.with_flow(z)), (jnp.asarray(t), state.flow()), moves)[1]
 
-    def _tracking(self, t: Scalar, reference: Memory, measured: Any) -> Tracking:
+    def _track(self, t: Scalar, reference: Memory, measured: Any) -> Tracking:
         target = self.reference.output(t, reference, measured)
         setpoint = self.reference.setpoint(reference)
         return Tracking(target, measured, self.feedforward.input(self.plant, measured, setpoint))

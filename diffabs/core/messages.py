@@ -173,9 +173,9 @@ class Segment(NamedTuple):
 
     def error(self) -> Cubic:
         """Return the cubic of the first plant output minus its setpoint, which a reference may move within a step."""
-        return self.shown(lambda shown: shown.output[0] - shown.setpoint)
+        return self.shown_cubic(lambda shown: shown.output[0] - shown.setpoint)
 
-    def shown(self, read: Callable[[Shown], Scalar]) -> Cubic:
+    def shown_cubic(self, read: Callable[[Shown], Scalar]) -> Cubic:
         """Return the cubic of `read`(shown), a function of the plant outputs and the setpoint."""
         return self._cubic(read, (Shown.of(self.start), Shown.of(self.end)), self.shown_rates())
 

@@ -118,7 +118,7 @@ class ComparisonTrace:
         if not self.look:
             return taken if self.mode.free is None else jnp.where(self.mode.free, says(), taken)
         margin = jnp.where(taken, x - y, y - x)
-        against = margin < -_rounding(x)
+        against = margin < -_rounding_error(x)
         if self.mode.released is not None:
             # A margin of exactly 0 (a product that has become 0) is no contradiction; without this line a released
             # answer would stay frozen for ever.
@@ -148,7 +148,7 @@ class ComparisonTrace:
             return below if self.mode.free is None else jnp.where(self.mode.free, says(), below)
         low, high = self._between(first, below, knots, x)
         # The neighbouring interval if x has left the frozen one by more than rounding.
-        next = below + jnp.where(high < -_rounding(x), 1, 0) - jnp.where(low < -_rounding(x), 1, 0)
+        next = below + jnp.where(high < -_rounding_error(x), 1, 0) - jnp.where(low < -_rounding_error(x), 1, 0)
         if self.mode.free is not None:
             next = jnp.where(self.mode.free, says(), next)
         against = _ones(next) ^ field
@@ -193,7 +193,7 @@ def _ones(count: Any) -> Any:
     return (jnp.uint32(1) << count.astype(jnp.uint32)) - 1
 
 
-def _rounding(x: Any) -> Any:
+def _rounding_error(x: Any) -> Any:
     """Return the difference from x below which a comparison is undecided by rounding."""
     most = jnp.finfo(jnp.result_type(x))
     return most.eps**ROUNDING_POWER * jnp.minimum(jnp.abs(x), most.max)

@@ -58,10 +58,10 @@ def describe_making(words: Sequence[str]) -> dict[str, str | int]:
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     machine = {"machine": platform.machine(), "system": platform.system(), "processors": os.cpu_count() or 1}
     command = shlex.join(["diffabs", *map(str, words)])
-    return {"command": command, "date": now.isoformat(), **machine, "backend": jax.default_backend(), **commit()}
+    return {"command": command, "date": now.isoformat(), **machine, "backend": jax.default_backend(), **source_commit()}
 
 
-def commit() -> dict[str, str]:
+def source_commit() -> dict[str, str]:
     """Return the commit of a working copy, marked if files differ from it; empty for an installed package."""
     root = pathlib.Path(__file__).parents[2]
     if not (root / ".git").exists():

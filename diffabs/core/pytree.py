@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
-class Spec:
+class ParameterSpec:
     """The declaration of a parameter: its unit and its range.
 
     Attributes:
@@ -66,7 +66,7 @@ class Spec:
         unit = "" if self.unit == "1" else f" {self.unit}"
         return f"{left}{self.low:g}, {self.high:g}{right}{unit}"
 
-    def around(self, units: Units | None) -> "Spec":
+    def around(self, units: Units | None) -> "ParameterSpec":
         """Return the declaration with a relative unit resolved in the `units` of a loop."""
         unit = resolve_unit(self.unit, units)
         return self if unit == self.unit else dataclasses.replace(self, unit=unit)
@@ -109,7 +109,7 @@ def param(
         tunable: False if a run does not depend smoothly on the value.
         free: Whether the value may have any shape.
     """
-    spec = Spec(
+    spec = ParameterSpec(
         unit,
         low if above is None else above,
         high if below is None else below,
@@ -193,7 +193,7 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
 
-def parameters(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[tuple[str, Spec, Any]]:
+def parameters(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[tuple[str, ParameterSpec, Any]]:
     """Yield every parameter below a part as (dotted path, spec, value), in the order of declaration.
 
     Relative units are resolved below a part with a plant, or in the given `units`.
@@ -240,14 +240,14 @@ def parts(part: Any) -> Iterator[Any]:
             yield from value if isinstance(value, tuple) else (value,)
 
 
-def elements(part: Any) -> dict[str, Spec]:
+def elements(part: Any) -> dict[str, ParameterSpec]:
     """Return the declaration of each single number below a part by path; elements of a list have their index at the
     end.
 
     Args:
         part: Part.
     """
-    found: dict[str, Spec] = {}
+    found: dict[str, ParameterSpec] = {}
     for path, spec, value in parameters(part):
         shape = np.shape(value)
         found |= {".".join([path, *map(str, at)]): spec for at in np.ndindex(shape)} if shape else {path: spec}
@@ -392,7 +392,7 @@ def prepare_derivatives(part: Any, paths: Iterable[str], prefix: str = "") -> An
     inner = {name: prepare_derivatives(getattr(part, name), paths, f"{prefix}{name}.") for name in fields}
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
     own = {path.removeprefix(prefix) for path in paths if path.startswith(prefix)}
-    return part.differentiated(own) if hasattr(part, "differentiated") else part
+    return part.enable_derivatives(own) if hasattr(part, "differentiated") else part
 
 
 def _rebuild_parts(part: Any, method: str, *args: Any) -> Any:

@@ -69,14 +69,14 @@ def split_batched(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable
     moves = [not hasattr(v, "val") and v in depends for v in program.jaxpr.outvars]
     fixed, tree = jax.tree.leaves(make(one)), jax.tree.structure(shape)
 
-    def moving(member: Any) -> list[Any]:
+    def moving_outputs(member: Any) -> list[Any]:
         return [x for x, on in zip(jax.tree.leaves(make(member)), moves, strict=True) if on]
 
     def whole(leaves: list[Any]) -> Any:
         rest = iter(leaves)
         return tree.unflatten([next(rest) if on else x for x, on in zip(fixed, moves, strict=True)])
 
-    return jax.vmap(moving)(batch) if any(moves) else [], whole
+    return jax.vmap(moving_outputs)(batch) if any(moves) else [], whole
 
 
 def depends_on_signal(function: Callable[[Any], Any], signal: Any) -> bool:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from diffabs.core import kinds
-from diffabs.core.pytree import Spec, children, parameters
+from diffabs.core.pytree import ParameterSpec, children, parameters
 from diffabs.core.rules import Rule
 from diffabs.core.units import Units, insert_unit, units_of
 
@@ -33,7 +33,7 @@ def find_problems(part: Any, prefix: str = "", units: Units | None = None) -> It
     units = units or units_of(getattr(part, "plant", None))
     for name, field, value in children(part, prefix):
         if field is not None and "spec" in field.metadata:
-            spec: Spec = field.metadata["spec"].around(units)
+            spec: ParameterSpec = field.metadata["spec"].around(units)
             if line := _find_unfit(name, spec, value):
                 found = True
                 yield line
@@ -117,7 +117,7 @@ def find_misshapen(part: Any, prefix: str = "") -> Iterator[str]:
             yield f"{name} = {kinds.format_value(value)} has shape {kinds.value_shape(value)}; it needs {spec.shape}"
 
 
-def _find_unfit(name: str, spec: Spec, value: Any) -> str:
+def _find_unfit(name: str, spec: ParameterSpec, value: Any) -> str:
     """Return a line for a value that is not a number of a run, or an empty text."""
     line = kinds.find_value_objection(value)
     return line and f"{name} = {kinds.format_value(value)} {line}; a number in {spec.interval()} is needed"

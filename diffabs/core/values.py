@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import ParameterSpec
 
-FINITE_SPEC = Spec("1")
-POSITIVE_SPEC = Spec("1", low=0.0, open_low=True)
+FINITE_SPEC = ParameterSpec("1")
+POSITIVE_SPEC = ParameterSpec("1", low=0.0, open_low=True)
 PLAIN_TYPES = (str, bool, int, float, type(None))
 
 Reader = Callable[[Any, str], Any]
@@ -99,7 +99,7 @@ def wrong_kind_error(path: str, value: Any, needed: str) -> ScenarioError:
     return ScenarioError(f"{path} = {format_given(value)} is {kind}; {needed} is needed")
 
 
-def read_number(value: Any, spec: Spec, path: str) -> float:
+def read_number(value: Any, spec: ParameterSpec, path: str) -> float:
     """Return a number as a float, without a check of its range.
 
     Args:
@@ -119,7 +119,7 @@ def read_number(value: Any, spec: Spec, path: str) -> float:
         raise ScenarioError(f"{path} = {format_given(value)} is too large for a number in {spec.interval()}") from None
 
 
-def read_number_in_range(value: Any, spec: Spec, path: str) -> float:
+def read_number_in_range(value: Any, spec: ParameterSpec, path: str) -> float:
     """Return a number as a float.
 
     Args:
@@ -165,7 +165,7 @@ def whole_reader(low: int, high: int) -> Reader:
     return lambda given, path: read_whole(given, low, high, path)
 
 
-def range_reader(spec: Spec) -> Reader:
+def range_reader(spec: ParameterSpec) -> Reader:
     """Return the reader of numbers in a range.
 
     Args:

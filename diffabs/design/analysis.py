@@ -59,7 +59,7 @@ def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *,
         from diffabs.design.scheduled import certify_schedule
 
         return certify_schedule(gain, system, spec, fastest=fastest)
-    spec = spec.checked(system.order, system.inputs)
+    spec = spec.check(system.order, system.inputs)
     k = as_gain_matrix(gain, (system.inputs, system.order))
     return Certificate(system, k, tuple(_Analysis(system, k, spec).claims(fastest)))
 
@@ -69,7 +69,7 @@ class _Analysis:
 
     def __init__(self, system: Polytope, k: np.ndarray, spec: Spec):
         self.system, self.k, self.spec = system, k, spec
-        self.closed = system.closed(k)
+        self.closed = system.closed_loop(k)
         self.discrete = system.period is not None
         self.frame = analysis_frame(self.closed, discrete=self.discrete)
 
@@ -103,7 +103,7 @@ class _Analysis:
             # For any sign of the margin: without a common P the optimum is P = 0, with a margin of 0 up to
             # rounding.
             claim = Claim("infeasible", {"W": w, **self._rate_data(asked)})
-            if np.isfinite(w).all() and self._proved(claim):
+            if np.isfinite(w).all() and self._verify_claim(claim):
                 return claim
             try:
                 # In the frame of the last P the unknown is near the unit matrix: the solver is more accurate at the
@@ -120,7 +120,7 @@ class _Analysis:
         for w in pairs.witnesses(scaled + rate.get("rate", 0.0) * np.eye(self.system.order), factor):
             w = he(t @ w @ t.T)
             claim = Claim("infeasible", {"W": w / np.abs(w).max(), **rate})
-            if self._proved(claim):
+            if self._verify_claim(claim):
                 return claim
         return None
 
@@ -175,7 +175,7 @@ class _Analysis:
             # it.
             rate = best - loosening * (abs(best) + asked)
             claim = Claim("decay", {"P": p, **self._rate_data(max(rate, asked))})
-            if self._proved(claim):
+            if self._verify_claim(claim):
                 return claim
             if rate <= asked:
                 return None
@@ -235,5 +235,5 @@ class _Analysis:
             return {"factor": min(1.0, math.exp(-rate * (self.system.period or 1.0)) * (1 + 1e-15))}
         return {"rate": rate}
 
-    def _proved(self, claim: Claim) -> bool:
+    def _verify_claim(self, claim: Claim) -> bool:
         return exact.is_proved(claim.kind, self.system, self.k, claim.data)

@@ -102,7 +102,7 @@ class _Ellipsoids(NamedTuple):
         mine = self.system[jnp.minimum(number, len(self.system) - 1)]
         return self.roots[mine], self.hopeless[mine]
 
-    def reached(self, own: Any, output: Any) -> Any:
+    def has_reached(self, own: Any, output: Any) -> Any:
         """Return whether a run is inside its ellipsoid, with a margin, or unstable."""
         root, hopeless = own
         return (jnp.sum((root @ state_of(output)) ** 2) <= CAPTURE_LEVEL) | hopeless

@@ -43,7 +43,7 @@ class Bounds:
         `spec` is a checked specification and `frame` a frame for quadratic stability.
         """
         self.system, self.k, self.spec, self.frame = system, k, spec, frame
-        self.closed, self.discrete = system.closed(k), system.period is not None
+        self.closed, self.discrete = system.closed_loop(k), system.period is not None
 
     def cost(self) -> Claim | None:
         """Return the claim with the smallest trace P."""
@@ -55,7 +55,7 @@ class Bounds:
         even = whitening_matrix(scaled)
         # trace P in the original coordinates, as a linear form of the scaled P.
         trace = at.trace_weight() / np.trace(at.trace_weight())
-        return self._found(
+        return self._solve_in_frame(
             at,
             {"P": self.system.order},
             lambda v: np.einsum("ij,dji->d", trace, v["P"]),
@@ -74,7 +74,7 @@ class Bounds:
             skew = cot * (flow - np.swapaxes(flow, -1, -2))
             return [-symmetric_from_blocks([[he(flow)], [-skew, he(flow)]]) - v["t"] * np.eye(2 * len(c))]
 
-        return self._found(
+        return self._solve_in_frame(
             self.frame,
             {"P": self.system.order, "t": (1, 1)},
             lambda v: -v["t"],
@@ -95,7 +95,7 @@ class Bounds:
         at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
         given = None if l2.disturbance is None else at.inverse @ l2.disturbance / math.sqrt(at.tau)
 
-        def bounded(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+        def gain_inequalities(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
             e = at.inverse @ b / math.sqrt(at.tau) if given is None else given
             limit = v["g"] * np.eye(e.shape[1])
             # 1e-10 keeps the answer strictly inside the inequality that the exact proof requires.
@@ -105,11 +105,11 @@ class Bounds:
             return [symmetric_from_blocks([[top], [-e.T @ v["P"], limit]])]
 
         disturbance = self.system.B if l2.disturbance is None else l2.disturbance
-        return self._found(
+        return self._solve_in_frame(
             at,
             {"P": self.system.order, "g": (1, 1)},
             lambda v: v["g"],
-            bounded,
+            gain_inequalities,
             lambda p, v, more: {
                 "kind": "l2",
                 "P": more * p,
@@ -132,12 +132,12 @@ class Bounds:
         # P scales as 1/size^2: the unknown is P size^2, near the unit matrix for starts in any unit.
         starts_size = float(np.linalg.norm(starts, axis=0).max())
 
-        def held(v: Any) -> list[np.ndarray]:
+        def input_inequalities(v: Any) -> list[np.ndarray]:
             p = v["P"]
             inside = [1 - starts_size**-2 * (x @ p @ x)[..., None, None] for x in starts.T]
             return inside + [symmetric_from_blocks([[p], [row[None] * starts_size, v["g"]]]) for row in rows]
 
-        return self._found(
+        return self._solve_in_frame(
             at,
             {"P": self.system.order, "g": (1, 1)},
             lambda v: v["g"],
@@ -149,10 +149,10 @@ class Bounds:
                 "limit": limit.limit * math.sqrt(float(v["g"][0, 0])) * more,
                 "points": limit.points,
             },
-            held,
+            input_inequalities,
         )
 
-    def _found(
+    def _solve_in_frame(
         self,
         at: Frame,
         shapes: dict[str, Any],

@@ -22,7 +22,7 @@ from diffabs.core.validity import check_part
 from diffabs.design.polytopes import MAX_VERTICES, Coverage, Polytope, Schedule
 
 CHUNK = 1024  # systems of one batch
-ENTRY_TOLERANCE = 1e-10  # relative variation below which an entry counts as constant
+MIN_ENTRY_EXTENT = 1e-10  # relative variation below which an entry counts as constant
 MIN_RELATIVE_EXTENT = 1e-9  # relative extent of the data below which a direction is ignored
 GAUGE_TOLERANCE = 1e-9  # accuracy of a gauge
 RANDOM_POINTS = 2000  # random points of each check, between the points of the grid
@@ -238,7 +238,7 @@ class _PlaneCoordinates(NamedTuple):
     def of(cls, rows: np.ndarray) -> "_PlaneCoordinates":
         size, extent = np.abs(rows).max(axis=0), np.ptp(rows, axis=0)
         # A constant entry varies only by rounding. It must not become a direction of the plane.
-        varies = extent > ENTRY_TOLERANCE * size
+        varies = extent > MIN_ENTRY_EXTENT * size
         scale = np.where(varies, extent, np.where(size > 0, size, 1.0))
         z = (rows - rows[0]) / scale
         # `* varies` removes the constant entries from the basis.

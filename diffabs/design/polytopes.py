@@ -81,7 +81,7 @@ class Polytope:
         """Number of inputs m."""
         return self.B.shape[2]
 
-    def closed(self, gain: Any) -> np.ndarray:
+    def closed_loop(self, gain: Any) -> np.ndarray:
         """Return A + B K at each vertex for K = `gain`, shape (V, n, n).
 
         Raises:

@@ -43,7 +43,7 @@ def certify_schedule(gain: Any, system: Schedule, spec: Spec, *, fastest: bool =
         ValueError: Shapes that do not fit, missing rates, discrete time, or a specification other than decay and cost.
     """
     first = system.cells[0]
-    spec = spec.checked(first.order, first.inputs)
+    spec = spec.check(first.order, first.inputs)
     if spec.rates is None or first.period is not None:
         raise ValueError("a schedule needs rates, the bounds of its parameter's derivative, and continuous time")
     if spec.damping or spec.l2 or spec.input:
@@ -59,7 +59,7 @@ def _fastest_decay_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Cla
     """Return the claim with the fastest decay, by bisection up to the slowest mode of any vertex."""
     pairs = [(cell, k) for i, cell in enumerate(system.cells) for k in gains[i : i + 2]]
     # No P(p) proves a decay faster than the slowest mode of a frozen loop.
-    low, high = spec.decay, min(-np.real(np.linalg.eigvals(cell.closed(k))).max() for cell, k in pairs)
+    low, high = spec.decay, min(-np.real(np.linalg.eigvals(cell.closed_loop(k))).max() for cell, k in pairs)
     best = None
     while high - low > SCHEDULE_DECAY_TOLERANCE * high:
         rate = (low + high) / 2

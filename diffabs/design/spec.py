@@ -58,7 +58,7 @@ class Spec:
     l2: L2Gain | None = None
     rates: tuple[float, float] | None = None
 
-    def checked(self, order: int, inputs: int) -> "Spec":
+    def check(self, order: int, inputs: int) -> "Spec":
         """Return the specification with full matrices, for a system of `order` states and `inputs` inputs.
 
         Raises:

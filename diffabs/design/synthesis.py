@@ -118,7 +118,7 @@ def pool_vertices(system: Polytope | Schedule) -> Polytope:
 
 
 def _check_specification(system: Polytope | Schedule, whole: Polytope, spec: Spec) -> Spec:
-    spec = spec.checked(whole.order, whole.inputs)
+    spec = spec.check(whole.order, whole.inputs)
     if spec.Q is None and (spec.l2 is None or spec.l2.bound is not None):
         raise ValueError("nothing to minimise: give the weights Q and R, or an L2 gain without a bound")
     if spec.Q is not None and spec.l2 is not None and spec.l2.bound is None:
@@ -177,7 +177,7 @@ def _attempt(
 
 def _residual(system: Polytope, k: np.ndarray, p: np.ndarray, spec: Spec) -> float:
     """Return the largest eigenvalue of the Riccati inequality (29) over the vertices, relative to Q + K'RK."""
-    closed, weight = system.closed(k), spec.Q + k.T @ spec.R @ k
+    closed, weight = system.closed_loop(k), spec.Q + k.T @ spec.R @ k
     discrete = system.period is not None
     left = weight + (np.swapaxes(closed, 1, 2) @ p @ closed - p if discrete else he(p @ closed))
     # Evaluated in the coordinates of P = I, where the solver worked.

@@ -28,7 +28,7 @@ class Controls:
 
     def __init__(self, session: Session, turned: Turned, replaced: Replaced):
         """Prepare the controls of a `session` with the callbacks `turned` and `replaced`; the page stays unchanged."""
-        self.session, self._turned, self._replaced = session, turned, replaced
+        self.session, self._change, self._replaced = session, turned, replaced
         self.fields: dict[str, Any] = {}
         self.sliders: dict[str, Any] = {}
         self.sources = list(dict.fromkeys([session.source, *names()]))
@@ -59,7 +59,7 @@ class Controls:
         for key in self.fields:
             self.show(key)
 
-    def refused(self, line: str) -> None:
+    def show_refusal(self, line: str) -> None:
         """Show why an input was refused; an empty `line` hides the message."""
         self.message.set_text(line)
         self.message.set_visibility(bool(line))
@@ -142,7 +142,7 @@ class Controls:
             ui.label(knob.label).classes("name").tooltip(f"{knob.name} in {knob.spec.interval()}")
             field = ui.input(value=knob.text(value)).props("dense outlined hide-bottom-space")
             field.props(f'data-field="{html.escape(key)}" aria-label="{html.escape(knob.name)}"')
-            field.on("change", lambda _: self._typed(key, field.value))
+            field.on("change", lambda _: self._take_text(key, field.value))
             self.fields[key] = field
             ui.label(unit_words(knob.spec.unit)).classes("unit")
             if knob.low is not None:
@@ -150,18 +150,18 @@ class Controls:
                 slider.props(f'data-slider="{html.escape(key)}" aria-label="{html.escape(knob.name)}"')
                 slider.on(
                     "update:model-value",
-                    lambda event: self._dragged(key, *event.args),
+                    lambda event: self._take_slider(key, *event.args),
                     throttle=CHANGE_INTERVAL_S,
                     js_handler="(place) => emit(place, explorer.edited())",
                 )
                 self.sliders[key] = slider
 
-    def _typed(self, key: str, text: Any) -> None:
-        self._turned(key, str(text), 0)
+    def _take_text(self, key: str, text: Any) -> None:
+        self._change(key, str(text), 0)
 
     # The arguments come from the browser, so their types are checked.
-    def _dragged(self, key: str, place: Any, edit: Any) -> None:
+    def _take_slider(self, key: str, place: Any, edit: Any) -> None:
         knob = self.session.knobs.get(key)
         if knob is None or knob.low is None or not isinstance(place, int | float) or not 0 <= place <= SLIDER_STEPS:
             return
-        self._turned(key, knob.text(knob.value_at(place)), edit if isinstance(edit, int) else 0)
+        self._change(key, knob.text(knob.value_at(place)), edit if isinstance(edit, int) else 0)

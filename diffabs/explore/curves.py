@@ -20,7 +20,7 @@ from diffabs.simulate.solution import Adaptive, FixedStep, Run, Solver
 
 INSTANTS = 400  # number of instants of a curve
 DRAFT_INSTANTS = 200  # number of instants of a fan, few because the browser lays all of them out with every redraw
-MAX_INSTANTS = 4 * INSTANTS  # number of steps above which a draft is quicker
+MIN_DRAFT_STEPS = 4 * INSTANTS  # number of steps above which a draft is quicker
 DRAFT_RTOL = 1e-3  # relative error of a draft's step
 MEMBERS = 200  # number of runs of a fan
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -111,7 +111,7 @@ def draft_solver(chosen: Scenario) -> Solver | None:
         chosen: Scenario.
     """
     own = chosen.solver
-    if chosen.loop.ticks or not isinstance(own, FixedStep) or own.steps <= MAX_INSTANTS:
+    if chosen.loop.ticks or not isinstance(own, FixedStep) or own.steps <= MIN_DRAFT_STEPS:
         return None
     return Adaptive(rtol=DRAFT_RTOL, duration=own.duration, step=own.duration / INSTANTS)
 

@@ -42,13 +42,13 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward a request, exchange its token for the cookie, or refuse it."""
-        if scope["type"] == "lifespan" or (self.allowed(scope) and self.known(scope)):
+        if scope["type"] == "lifespan" or (self.is_allowed(scope) and self.is_known(scope)):
             await self.app(scope, receive, _with_policy(send) if scope["type"] == "http" else send)
         elif scope["type"] == "websocket":
             # A close before the accept refuses the handshake with 403.
             await receive()
             await send({"type": "websocket.close", "code": 1008})
-        elif not self.allowed(scope):
+        elif not self.is_allowed(scope):
             await _answer(send, 403, FOREIGN)
         elif self._same(urllib.parse.parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [])):
             cookie = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
@@ -57,7 +57,7 @@ class Guard:
         else:
             await _answer(send, 403, STRANGER)
 
-    def allowed(self, scope: Mapping[str, Any]) -> bool:
+    def is_allowed(self, scope: Mapping[str, Any]) -> bool:
         """Return whether the request with this `scope` comes from this machine and from a page of the explorer."""
         given = _headers(scope)
         host, origin = given.get(b"host", []), given.get(b"origin", [])
@@ -66,7 +66,7 @@ class Guard:
         own = origin in ([], [f"http://{host[0]}"]) if here else False
         return here and own and _loopback(scope.get("client"))
 
-    def known(self, scope: Mapping[str, Any]) -> bool:
+    def is_known(self, scope: Mapping[str, Any]) -> bool:
         """Return whether the request with this `scope` has the cookie that replaces the token."""
         given = []
         for line in _headers(scope).get(b"cookie", []):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core.pytree import Spec, parameters
+from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.units import unit_at
 from diffabs.core.values import read_number_in_range, wrong_kind_error
 from diffabs.explore.friction import FACTOR_PATH
@@ -46,7 +46,7 @@ class Knob:
     name: str
     group: str
     label: str
-    spec: Spec
+    spec: ParameterSpec
     scale: float
     low: float | None
     high: float | None
@@ -176,7 +176,7 @@ def mass_path(chosen: Scenario) -> str | None:
     return None
 
 
-def _knob(chosen: Scenario, path: str, spec: Spec, value: Any) -> Iterator[Knob]:
+def _knob(chosen: Scenario, path: str, spec: ParameterSpec, value: Any) -> Iterator[Knob]:
     """Yield the numbers of one parameter; a matrix has none."""
     tail = path.rpartition(".")[2]
     scale = KMH if spec.unit == "m/s" and tail in SPEED_FIELDS and is_vehicle(chosen.loop.plant) else 1.0
@@ -209,7 +209,9 @@ def _range_in_scenario(chosen: Scenario, path: str, place: int | None, scale: fl
     return low * scale, high * scale
 
 
-def _slider_ends(spec: Spec, value: float, given: tuple[float, float] | None) -> tuple[float | None, float | None]:
+def _slider_ends(
+    spec: ParameterSpec, value: float, given: tuple[float, float] | None
+) -> tuple[float | None, float | None]:
     """Return the ends of a slider that contains the value and stays in the range, or (None, None)."""
     if not math.isfinite(value):
         return None, None

@@ -49,8 +49,8 @@ class Page:
         self.drawn = 0  # newest version with a curve or a refusal
         self.around: stability.CornerLoops | None = None  # corners computed last
         self.surrounded = False  # whether they belong to the current loop
-        self.drawer, self.thinker = (NewestJobThread(thread, self._failed) for _ in range(2))
-        self.controls = Controls(session, self._turned, self._replaced)
+        self.drawer, self.thinker = (NewestJobThread(thread, self._report_failure) for _ in range(2))
+        self.controls = Controls(session, self._change, self._replaced)
         self.results = ResultsPanel()
         self.saver = Saver(session, folder)
         self.tuner = Tuner(self, thread)
@@ -119,14 +119,14 @@ class Page:
         if self.chart is not None and self.shown is not None:
             self.chart.change(charts.change_time_axis(None if whole else curves.transient_end(self.shown)))
 
-    def refused(self, error: Exception | None) -> None:
+    def show_refusal(self, error: Exception | None) -> None:
         """Show the message of an `error`; None hides it."""
-        self.controls.refused("" if error is None else _sentence(error))
+        self.controls.show_refusal("" if error is None else _sentence(error))
 
     def reset(self) -> None:
         """Set all numbers back to the scenario's values."""
         self.session.reset()
-        self.refused(None)
+        self.show_refusal(None)
         self.controls.show_all()
         self.redraw()
 
@@ -138,25 +138,25 @@ class Page:
         self.tuner.end()
 
     # Methods that run in the server's thread.
-    def _turned(self, key: str, given: Any, edit: int) -> None:
+    def _change(self, key: str, given: Any, edit: int) -> None:
         """Apply a dragged or typed number."""
         try:
             self.session.put(key, given)
         except ScenarioError as error:
-            self.refused(error)
+            self.show_refusal(error)
             self.controls.wrong(key)
             return
         self.controls.show(key)
         self.redraw(edit, key)
 
-    def _objected(self, key: str, error: ScenarioError, version: int) -> None:
+    def _withdraw_edit(self, key: str, error: ScenarioError, version: int) -> None:
         """Refuse a number whose loop must not be run, and return to the last accepted numbers.
 
         Edits after the last accepted numbers were not checked on their own; they are withdrawn, too.
         """
         if version != self.version:
             return
-        self.refused(error)
+        self.show_refusal(error)
         self.controls.wrong(key)
         for other in self.session.withdraw():
             if other != key:
@@ -173,11 +173,11 @@ class Page:
         try:
             await asyncio.to_thread(change)
         except ScenarioError as error:
-            self.refused(error)
+            self.show_refusal(error)
             self.controls.rebuild()
             return
         with self.client:
-            self.refused(None)
+            self.show_refusal(None)
             self.controls.rebuild()
             self.begin()
 
@@ -192,13 +192,13 @@ class Page:
             self.chart.send(change, edit)
         self.shown = found
         if version == self.version != self.objected:
-            self.refused(None)
+            self.show_refusal(None)
         self.end_line.set_text(f"{self.session.given.name} {found.end}")
         if not found.draft:
             self.results.metrics(found.metrics, fresh=version == self.version)
 
     def _gave_up(self, error: Exception) -> None:
-        self.refused(error)
+        self.show_refusal(error)
         self.results.stop_waiting()
         if self.shown is None:
             self.end_line.set_text("no run")
@@ -216,7 +216,7 @@ class Page:
             self.results.verdict(found)
 
     # Methods that run in worker threads. They reach the page through `later` only.
-    def _failed(self, error: Exception) -> None:
+    def _report_failure(self, error: Exception) -> None:
         """Show an unexpected error once; its job ends."""
         self.later(self._gave_up, error)
 
@@ -227,7 +227,7 @@ class Page:
                 self.session.judge(key, now)
             self._send(curves.run_curves(now, curves.draft_solver(now)), now, version, edit)
         except ScenarioError as error:
-            self.later(self._objected, key, error, version)
+            self.later(self._withdraw_edit, key, error, version)
         finally:
             # Also after an error: `_think` waits for this version.
             self.drawn = version
@@ -245,21 +245,21 @@ class Page:
         steps = {"poles": self._poles, "fan": self._fan}
         done = [name for name in steps if self.costs.get(name, math.inf) < QUICK_JOB_S]
         for name in done:
-            self._timed(name, steps[name], now, version)
-        if not self._rested(REST, version):
+            self._time_step(name, steps[name], now, version)
+        if not self._wait_for_rest(REST, version):
             return
         if curves.draft_solver(now):
             self._send(curves.run_curves(now), now, version)
         for name in steps:
             if name not in done and version == self.version:
-                self._timed(name, steps[name], now, version)
+                self._time_step(name, steps[name], now, version)
         if version == self.version and not self.surrounded:
             self._poles(now, version, corners=True)
-        if self._rested(PROVING, version):
-            self.later(self._show_verdict, self._proved(now), version)
+        if self._wait_for_rest(PROVING, version):
+            self.later(self._show_verdict, self._prove(now), version)
         objections(now)  # compiles the check now, before the next edit needs it
 
-    def _timed(self, name: str, step: Callable[[Scenario, int], bool], now: Scenario, version: int) -> None:
+    def _time_step(self, name: str, step: Callable[[Scenario, int], bool], now: Scenario, version: int) -> None:
         begun = time.monotonic()
         useful = step(now, version)
         # Without a result the step counts as slow, so that a drag does not repeat it.
@@ -271,7 +271,7 @@ class Page:
             time.sleep(TICK)
         return version == self.version
 
-    def _rested(self, seconds: float, version: int) -> bool:
+    def _wait_for_rest(self, seconds: float, version: int) -> bool:
         """Wait until nothing has changed for some seconds, and return whether this version is still the newest."""
         while version == self.version and (left := self.turned_at + seconds - time.monotonic()) > 0:
             time.sleep(min(left, 0.02))
@@ -298,7 +298,7 @@ class Page:
         self.later(self._show_fan, found, encode_change(charts.change_fan(found)))
         return True
 
-    def _proved(self, now: Scenario) -> ProofVerdict:
+    def _prove(self, now: Scenario) -> ProofVerdict:
         try:
             return self.tools.prove(now)
         except Exception as error:  # the card shows every error, and the thread goes on

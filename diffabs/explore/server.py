@@ -88,7 +88,7 @@ def serve(
     logging.getLogger("nicegui").setLevel(logging.ERROR)  # hides messages about missing pages
     sys.setswitchinterval(THREAD_SWITCH_S)
 
-    def announced() -> None:
+    def announce() -> None:
         while not server.started and not server.should_exit:
             threading.Event().wait(0.02)
         if server.started:
@@ -97,7 +97,7 @@ def serve(
                 webbrowser.open(write_redirect_file(url, pathlib.Path(private)).as_uri())
 
     with tempfile.TemporaryDirectory(prefix="diffabs-explore-") as private:
-        threading.Thread(target=announced, daemon=True).start()
+        threading.Thread(target=announce, daemon=True).start()
         server.run(sockets=[there])
     if not server.started:
         raise OSError(f"no page can be served at http://{LOOPBACK_ADDRESS}:{port}/")

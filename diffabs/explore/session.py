@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import Spec, get, replace
+from diffabs.core.pytree import ParameterSpec, get, replace
 from diffabs.core.validity import find_problems
 from diffabs.core.values import ScenarioError, read_number_in_range, unknown_name_error, wrong_kind_error
 from diffabs.explore import friction, knobs, tuning
@@ -24,7 +24,7 @@ from diffabs.simulate.admissible import find_mismatches, find_unstable_step
 CERTIFIED, REFUTED, UNDECIDED, NOT_PROVED = "certified", "refuted", "undecided", "unknown"
 AS_GIVEN = "as in the scenario"
 EXCHANGEABLE_FAMILIES = ("road", "controller")
-PERCENT = Spec("%", low=0.0, high=90.0)
+PERCENT = ParameterSpec("%", low=0.0, high=90.0)
 
 
 class ProofVerdict(NamedTuple):
@@ -77,7 +77,7 @@ class Session:
         """
         chosen = {**self.parts, family: part}
         overrides = [f"{name}={kind}" for name, kind in chosen.items() if kind != AS_GIVEN]
-        turned = self._turned()
+        turned = self._changed_values()
         self._begin(self.source, chosen, load(self.source, overrides))
         for key, value in turned.items():
             if key in self.knobs and not key.startswith((f"{family}.", f"plant.{family}.")):
@@ -182,7 +182,7 @@ class Session:
         now = self.scenario()
         if lines := objections(now):
             raise ScenarioError(lines[0])
-        changed = bool(self._turned()) or any(part != AS_GIVEN for part in self.parts.values())
+        changed = bool(self._changed_values()) or any(part != AS_GIVEN for part in self.parts.values())
         return friction.without_factor(now.with_loop(now.loop, "explored") if changed else now, self.given)
 
     def value(self, key: str) -> float:
@@ -208,7 +208,7 @@ class Session:
         # A new dict and a new array: threads may still use the old ones.
         self._values = {**self._values, knob.path: new}
 
-    def _turned(self) -> dict[str, float]:
+    def _changed_values(self) -> dict[str, float]:
         """Return the values [SI] that differ from the scenario's, by key."""
         loop = self._base.loop
         changed = {path for path, value in self._values.items() if not np.array_equal(value, get(loop, path))}

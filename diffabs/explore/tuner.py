@@ -33,7 +33,7 @@ class Tuner:
     def __init__(self, page: "Page", thread: str):
         """Prepare the tuner of a `page`; `thread` is the name of its thread. The page stays unchanged."""
         self.page = page
-        self.worker = NewestJobThread(thread, self._failed)
+        self.worker = NewestJobThread(thread, self._report_failure)
         self.stopping, self.running = False, False
         self.origin: Scenario | None = None
 
@@ -125,9 +125,9 @@ class Tuner:
         try:
             chosen = tuning.scenario_with_goal(session.scenario(), paths, metric, session.knobs, bounded)
         except ScenarioError as error:
-            self.page.refused(error)
+            self.page.show_refusal(error)
             return
-        self.page.refused(None)
+        self.page.show_refusal(None)
         self.stopping, self.running, self.origin = False, True, session.scenario()
         self.points: list[tuple[int, float]] = []
         self.card.clear()
@@ -149,16 +149,16 @@ class Tuner:
         posed = self.page.tools.pose(chosen)
         before = curves.run_curves(chosen)
         found = tuning.tune_scenario(
-            chosen, posed, lambda i, loss: self.page.later(self._told, i, loss), lambda: self.stopping
+            chosen, posed, lambda i, loss: self.page.later(self._show_progress, i, loss), lambda: self.stopping
         )
         after = curves.run_curves(found.after)
-        self.page.later(self._found, chosen, found, before, after)
+        self.page.later(self._show_result, chosen, found, before, after)
 
-    def _failed(self, error: Exception) -> None:
+    def _report_failure(self, error: Exception) -> None:
         self.page.later(self._gave_up, error)
 
     # Methods that run in the server's thread.
-    def _told(self, iteration: int, loss: float) -> None:
+    def _show_progress(self, iteration: int, loss: float) -> None:
         if self.origin is None:
             return
         self.points.append((iteration, float(f"{loss:.6g}")))
@@ -174,9 +174,11 @@ class Tuner:
     def _gave_up(self, error: Exception) -> None:
         self.running = False
         self.card.set_visibility(False)
-        self.page.refused(error)
+        self.page.show_refusal(error)
 
-    def _found(self, chosen: Scenario, found: tuning.TuningFound, before: curves.Curves, after: curves.Curves) -> None:
+    def _show_result(
+        self, chosen: Scenario, found: tuning.TuningFound, before: curves.Curves, after: curves.Curves
+    ) -> None:
         self.running = False
         if self.origin is None:
             return

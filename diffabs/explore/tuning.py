@@ -145,7 +145,7 @@ def tune_scenario(
         over=posed.batch,
         solver=chosen.solver,
         measured=chosen.objectives,
-        aggregate=task.aggregated(),
+        aggregate=task.read_aggregate(),
         constraints=posed.constraints,
         method=Method(starts=1, seed=task.seed, stopping=Stopping(iterations=task.iterations)),
         progress=lambda progress: told(progress.point.iteration, progress.point.loss),

@@ -26,7 +26,7 @@ class NewestJobThread:
             self._job = job
             self._there.notify()
 
-    def waiting(self) -> bool:
+    def has_waiting_job(self) -> bool:
         """Return whether a job waits, so that the current job can end early."""
         return self._job is not None
 

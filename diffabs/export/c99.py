@@ -93,7 +93,7 @@ class _Text:
     def _structs(self) -> Iterator[str]:
         """Yield the structs of inputs, parameters and memory."""
         program, real = self.program, self.real
-        specs = {name: spec for number in self.device.numbers for name, spec in number.named()}
+        specs = {name: spec for number in self.device.numbers for name, spec in number.name_entries()}
         inputs, numbers, memory = (self.fields[where] for where in (INPUTS, NUMBERS, MEMORY))
         read = [f"{real} {inputs[x]}; /* [{comment_text(self.device.units.get(x, '1'))}] */" for x in program.read]
         yield from self._struct("What is measured at a sample.", "input", read)

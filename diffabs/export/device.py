@@ -23,7 +23,7 @@ from diffabs.controllers.sampled import replace_nan
 from diffabs.core.blocks import offers
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
-from diffabs.core.pytree import Spec, as_arrays, canonical_dtypes, parameters, prepare_parts
+from diffabs.core.pytree import ParameterSpec, as_arrays, canonical_dtypes, parameters, prepare_parts
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
 from diffabs.simulate.rk4 import rk4_step
 
@@ -81,7 +81,7 @@ class DeviceParameter(NamedTuple):
 
     path: str
     value: np.ndarray
-    spec: Spec
+    spec: ParameterSpec
 
     def __str__(self) -> str:
         """Return one line for the head of a file: path, value and unit."""
@@ -89,7 +89,7 @@ class DeviceParameter(NamedTuple):
         values = " ".join(f"{x:.17g}" if float(f"{x:.9g}") != x else f"{x:.9g}" for x in self.value.flat)
         return f"{self.path} = {values}{'' if self.spec.unit in ('', '1') else f' {self.spec.unit}'}"
 
-    def named(self) -> Iterator[tuple[str, str]]:
+    def name_entries(self) -> Iterator[tuple[str, str]]:
         """Yield name and description (unit and range) of each number, as in the exported code."""
         # Twice: the controller stands within `Sampled`, which itself is the loop's controller.
         path = self.path.removeprefix("controller.").removeprefix("controller.")
@@ -252,16 +252,16 @@ class _Work:
         """Return the memory at the first sample."""
         loop, given = self._with(parts), replace_nan(given)
         reference = Memory() if self.given_target else loop.reference.start(given.measured)
-        tracking, _ = self._tracking(loop, reference, given, 0.0)
+        tracking, _ = self._track(loop, reference, given, 0.0)
         zero = jnp.zeros_like(tracking.target)
         return State(loop.controller.controller.start(tracking), jnp.zeros((), jnp.int64), zero, reference)
 
     def step(self, parts: Parts, state: State, given: Input) -> tuple[Memory, Any, Any, Any]:
         """Return the controller's memory after a sample, the number of samples, the command, and the truth `held`."""
         loop, t = self._with(parts), self._time(state)
-        tracking, lost = self._tracking(loop, state.reference, given, t)
+        tracking, lost = self._track(loop, state.reference, given, t)
         clock = Clock(t, loop.controller.period, state.samples, None, before=tracking)
-        inner, command, held = loop.controller.guarded(clock, state.controller, state.command, tracking, lost)
+        inner, command, held = loop.controller.compute_guarded(clock, state.controller, state.command, tracking, lost)
         return inner, state.samples + 1, command, held
 
     def move(self, parts: Parts, state: State, i: Any) -> Memory:
@@ -287,7 +287,7 @@ class _Work:
         period = self.sampled.period
         return state.samples.astype(jnp.result_type(period)) * period
 
-    def _tracking(self, loop: Loop, reference: Memory, given: Input, t: Any) -> tuple[Tracking, Any]:
+    def _track(self, loop: Loop, reference: Memory, given: Input, t: Any) -> tuple[Tracking, Any]:
         """Return the controller's input, and whether a NaN enters the feed-forward."""
         measured = replace_nan(given.measured)
         if self.given_target:

@@ -67,7 +67,7 @@ class Lowered:
         moving = dict(zip([*self.state][len(after) :], moved, strict=bool(moved)))
         self.after = dict(zip(self.state, after, strict=False)) | moving
         self.command = self.after["command"]
-        self.kept = self._kept()
+        self.kept = self._kept_memory()
         self.moving = {name: node for name, node in moving.items() if name in self.kept}
         self.begun = {name: node for name, node in zip(self.state, started, strict=True) if name in self.kept}
         self.stored = {name: self.after[name] for name in self.kept if name in self.after and name not in moving}
@@ -76,7 +76,7 @@ class Lowered:
         self.read = [name for name, node in self.inputs.items() if node.id in seen]
         self.used = [name for name, node in self.numbers.items() if node.id in seen]
 
-    def _kept(self) -> list[str]:
+    def _kept_memory(self) -> list[str]:
         """Return the names of the memory that the command depends on, from one sample to the next."""
         kept = {"command"}
         roots = [self.command, self.held]

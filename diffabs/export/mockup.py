@@ -26,7 +26,7 @@ from diffabs.export.plant_c import FmuVariable, PlantSource, plant_source
 from diffabs.kernel.compilers import NoCompiler, find_compiler
 
 FMU_COMPILER_FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC")
-COMPILE_TIMEOUT_S = 600
+MOCKUP_COMPILE_TIMEOUT_S = 600
 LONG_AGO = (1980, 1, 1, 0, 0, 0)  # date of every file in the archive, so that equal plants give equal bytes
 SYSTEMS = {"linux": ("linux", "so"), "darwin": ("darwin", "dylib"), "win32": ("win", "dll")}
 CAUSES = {
@@ -103,7 +103,7 @@ def _compile_library(source: str) -> bytes:
         text.write_text(source, encoding="utf-8")
         try:
             command = [*find_compiler().command, *FMU_COMPILER_FLAGS, str(text), "-o", str(result), "-lm"]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=COMPILE_TIMEOUT_S)
+            done = subprocess.run(command, capture_output=True, text=True, timeout=MOCKUP_COMPILE_TIMEOUT_S)
         except (NoCompiler, OSError, subprocess.TimeoutExpired) as error:
             raise NotExported(f"an FMU needs a C compiler: {' '.join(str(error).split())}") from None
         if done.returncode or not result.is_file():

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import Spec, canonical_dtypes, parameters, prepare_parts
+from diffabs.core.pytree import ParameterSpec, canonical_dtypes, parameters, prepare_parts
 from diffabs.export.c_words import Words
 from diffabs.export.device import NotExported
 from diffabs.export.labels import Labelled
@@ -96,7 +96,7 @@ def _variables(loop: Loop) -> tuple[FmuVariable, ...]:
     return tuple(found)
 
 
-def _limits(spec: Spec) -> tuple[float, float]:
+def _limits(spec: ParameterSpec) -> tuple[float, float]:
     """Return the least and greatest double of a range.
 
     An open end gives the next double inside; next to 0 that is the least normal number, not a subnormal one.
@@ -140,7 +140,9 @@ class _Written:
         )
         self.begun = trace_outputs(graph, lambda both: prepare_parts(both[0]).start(both[1]), typed, given)
         moving, shown = (plant, state, one, one, one), (plant, state)
-        self.moved = trace_outputs(graph, lambda all: _moved(*all), moving, [*own, *held, control, time, length])
+        self.moved = trace_outputs(
+            graph, lambda all: _advance_state(*all), moving, [*own, *held, control, time, length]
+        )
         self.shown = trace_outputs(graph, lambda both: prepare_parts(both[0]).output(both[1]), shown, [*own, *held])
 
     def _place(self, where: str, path: str) -> str:
@@ -165,7 +167,7 @@ class _Written:
         yield "}\n"
 
 
-def _moved(plant: Any, state: Any, control: Any, t: Any, h: Any) -> Any:
+def _advance_state(plant: Any, state: Any, control: Any, t: Any, h: Any) -> Any:
     """Return the state after a step with constant control, as `FixedStep` computes it."""
     plant = prepare_parts(plant)
     return plant.project(rk4_step(lambda t, x: plant.derivative(t, x, control), t, state, h))

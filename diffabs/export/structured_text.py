@@ -106,13 +106,13 @@ class _Block:
                 yield f"  {self.names[MEMORY, path]} : {self._type(program.state[path])};"
         yield "  started : BOOL := FALSE;\nEND_VAR"
         if self.temporary:
-            yield from ["VAR_TEMP", *self._declared(), "END_VAR"]
+            yield from ["VAR_TEMP", *self._declare(), "END_VAR"]
         yield ""
         yield from body
         yield "END_FUNCTION_BLOCK"
 
     def _parameters(self) -> Iterator[str]:
-        specs = {name: spec for number in self.device.numbers for name, spec in number.named()}
+        specs = {name: spec for number in self.device.numbers for name, spec in number.name_entries()}
         for path in self.program.used:
             value = self._real(self.program.values[path]).strip("()")
             yield f"  {self.names[NUMBERS, path]} : {self.real} := {value}; (* {comment_text(specs[path])} *)"
@@ -129,7 +129,7 @@ class _Block:
         text = "\n   ".join(map(comment_text, lines))
         yield f"(* {text} *)"
 
-    def _declared(self) -> Iterator[str]:
+    def _declare(self) -> Iterator[str]:
         """Yield declarations of the temporaries, several of a type in a line."""
         for kind in dict.fromkeys(self.temporary.values()):
             line = ""
@@ -143,11 +143,11 @@ class _Block:
     def _body(self) -> Iterator[str]:
         program = self.program
         yield "IF reset OR NOT started THEN"
-        yield from self._assigned(program.begun, (), "  ")
+        yield from self._assign(program.begun, (), "  ")
         yield "  started := TRUE;\nEND_IF;"
-        yield from self._assigned(program.stored, [program.held], "")
+        yield from self._assign(program.stored, [program.held], "")
 
-    def _assigned(self, stored: dict[str, Node], more: Sequence[Node], indent: str) -> Iterator[str]:
+    def _assign(self, stored: dict[str, Node], more: Sequence[Node], indent: str) -> Iterator[str]:
         """Yield the operations that these nodes need, then assignments to the command and the memory."""
         yield from self._operations(live_nodes([*stored.values(), *more]), indent)
         for node in more:
@@ -252,7 +252,7 @@ class _Block:
         if op == "is_finite":
             return f"ABS({args[0]}) <= {_scientific(np.finfo(self.device.dtype).max)}"
         if op == "convert":
-            return self._converted(node, args[0])
+            return self._convert(node, args[0])
         return self._function(node, args)
 
     def _function(self, node: Node, args: list[str]) -> str:
@@ -271,7 +271,7 @@ class _Block:
             return f"SEL({whole} {beyond} {args[0]}, {whole}, {whole} {sign} 1.0)"
         raise Unsupported(op, "there is none")
 
-    def _converted(self, node: Node, arg: str) -> str:
+    def _convert(self, node: Node, arg: str) -> str:
         """Return a number converted to another type; to an integer by truncation, as in C."""
         before, after = self._type(node.args[0]), self._type(node)
         if before == after:

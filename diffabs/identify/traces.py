@@ -63,7 +63,7 @@ class Traces:
             ValueError: A column is not an output, or a shape, a value or sigma is wrong.
         """
         self._check(loop, free, solver)
-        kept = np.flatnonzero(self._kept())
+        kept = np.flatnonzero(self._kept_rows())
         over = {path: np.asarray(rows, float) for path, rows in self.over.items()}
         target = np.concatenate([self._broadcast_column(column) for column in self.columns.values()])[kept]
         weights = self.sigma
@@ -86,13 +86,13 @@ class Traces:
         Instants after `until` are NaN.
         """
         whole = np.full(len(self.columns) * math.prod(self.shape), np.nan)
-        whole[np.flatnonzero(self._kept())] = found.residuals
+        whole[np.flatnonzero(self._kept_rows())] = found.residuals
         return dict(zip(self.columns, whole.reshape(len(self.columns), *self.shape), strict=True))
 
     def _broadcast_column(self, column: Any) -> np.ndarray:
         return np.broadcast_to(np.asarray(column, float), self.shape).ravel()
 
-    def _kept(self) -> np.ndarray:
+    def _kept_rows(self) -> np.ndarray:
         until = np.inf if self.until is None else np.asarray(self.until, float)
         kept = np.asarray(self.t, float) <= np.broadcast_to(until, self.shape[:1])[:, None]
         return np.tile(kept.ravel(), len(self.columns))

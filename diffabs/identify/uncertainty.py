@@ -36,7 +36,7 @@ class Direction(NamedTuple):
     singular: float
     components: dict[str, float]
 
-    def shown(self, least: float = 0.1) -> str:
+    def describe(self, least: float = 0.1) -> str:
         """Return the components of magnitude `least` or more as text.
 
         Example: `0.83 plant.mass + 0.55 plant.inertia`.
@@ -69,7 +69,7 @@ class Uncertainty:
     degrees: int
     directions: list[Direction]
 
-    def undetermined(self, beyond: float = MAX_RELATIVE_SPREAD) -> list[Direction]:
+    def undetermined_directions(self, beyond: float = MAX_RELATIVE_SPREAD) -> list[Direction]:
         """Return the directions that the data leave open: their relative spread is larger than `beyond`."""
         return [one for one in self.directions if not one.spread <= beyond]
 

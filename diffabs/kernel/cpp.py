@@ -97,7 +97,7 @@ class Text:
         sizes = self.program.sizes
         counts = zip(("UNIFORM", "OF_LANES", "CARRIED"), (len(sizes[level]) for level in sizes), strict=True)
         yield "enum { " + ", ".join(f"{name} = {count}" for name, count in counts) + " };"
-        kinds = {place.array: scalar_type(node.dtype) for place, node in self._given(UpdateLevel.STEP)}
+        kinds = {place.array: scalar_type(node.dtype) for place, node in self._given_inputs(UpdateLevel.STEP)}
         widths = [f"{size}*sizeof({kinds.get(i, 'u8')})" for i, size in enumerate(sizes[UpdateLevel.STEP])]
         # An array without entries has no node to take the type from. Its width is 0 in any type.
         yield f"static const i64 WIDTHS[] = {{{', '.join(map(str, widths))}}};"
@@ -106,12 +106,12 @@ class Text:
         yield from self._begin()
         for name in ("renew", "step"):
             yield from self._function(name)
-        yield from self._running()
+        yield from self._running_function()
         yield from self._moves()
         yield f"enum {{ STEPS = {self.shape.steps}, ROUNDS = {self.shape.rounds} }};"
         yield self.DRIVER
 
-    def _given(self, level: UpdateLevel) -> list[tuple[InputPlace, Node]]:
+    def _given_inputs(self, level: UpdateLevel) -> list[tuple[InputPlace, Node]]:
         return [
             (p, n)
             for p, n in self.program.inputs.items()
@@ -125,15 +125,15 @@ class Text:
         shared = [f"{scalar_type(node.dtype)} v{node.id};" for node in self.shared]
         tables = [f"{scalar_type(n.args[1].dtype)} {name}[{len(n.args) - 1}];" for name, n in self.columns.values()]
         yield "struct Shared { " + " ".join([*shared, *tables]) + " int none; };"
-        carried = [f"{vector_type(n.dtype)} c{n.id}[VECTORS];" for _, n in self._given(UpdateLevel.STEP)]
-        lanes = {n.id: n for n in [*(n for _, n in self._given(UpdateLevel.LANE)), *self.lanes]}
+        carried = [f"{vector_type(n.dtype)} c{n.id}[VECTORS];" for _, n in self._given_inputs(UpdateLevel.STEP)]
+        lanes = {n.id: n for n in [*(n for _, n in self._given_inputs(UpdateLevel.LANE)), *self.lanes]}
         own = [f"{vector_type(n.dtype)} l{n.id}[VECTORS];" for n in lanes.values() if n.op != "const"]
         yield "struct Block { " + " ".join([*carried, *own]) + " int none; };"
 
     def _prepare(self) -> Iterator[str]:
         """Yield static void prepare(Shared&, arrays), which computes the values that all lanes share."""
         yield "PART void prepare(Shared& s, const Array* uniform) { (void)s; (void)uniform;"
-        for place, node in self._given(UpdateLevel.UNIFORM):
+        for place, node in self._given_inputs(UpdateLevel.UNIFORM):
             value = f"((const {scalar_type(node.dtype)}*)uniform[{place.array}].data)[{place.entry}]"
             yield "  " + _declare_uniform(node, value)
         columns = [x for _, node in self.columns.values() for x in node.args[1:]]
@@ -152,7 +152,7 @@ class Text:
         """
         yield "PART void begin(Block& b, const Shared& s, int q) { (void)b; (void)s; (void)q;"
         yield from self._uniform([node for node in live_nodes(self.lanes) if node.level == UpdateLevel.LANE])
-        for _, node in self._given(UpdateLevel.LANE):
+        for _, node in self._given_inputs(UpdateLevel.LANE):
             yield f"  const {vector_type(node.dtype)} v{node.id}_0 = b.l{node.id}[q];"
         yield from self._lines(schedule_nodes(self.lanes, UpdateLevel.LANE), ONE_VECTOR, "  ")
         for node in self.lanes:
@@ -162,7 +162,7 @@ class Text:
 
     def _function(self, name: str) -> Iterator[str]:
         """Yield static void NAME(Block&, const Shared&), which updates the carry of all vectors."""
-        carried, results = self.program.carried(), self.program.results[name]
+        carried, results = self.program.carry_inputs(), self.program.results[name]
         # Compute all results of all vectors before the first store: each may read the old carry.
         changed = [(c, r) for c, r in zip(carried, results, strict=True) if c is not r]
         yield f"BODY void {name}(Block& b, const Shared& s) {{ (void)b; (void)s;"
@@ -172,7 +172,7 @@ class Text:
                 yield f"  b.c{c.id}[{q}] = {self._name(r, q)};"
         yield "}"
 
-    def _running(self) -> Iterator[str]:
+    def _running_function(self) -> Iterator[str]:
         """Yield static void running(const Block&, const Shared&, mask*), which tells for each lane if it continues."""
         (root,) = self.program.results["running"]
         yield "PART void running(const Block& b, const Shared& s, mask* on) { (void)b; (void)s;"
@@ -189,7 +189,7 @@ class Text:
         read = [*roots, *(x for node in steps for x in operands_by_name(node))]
         lanes = {x.id: x for x in read if x.level == UpdateLevel.LANE}
         for q in range(self.shape.vectors):
-            for node in self.program.carried():
+            for node in self.program.carry_inputs():
                 if node.id in own:
                     yield f"  const {vector_type(node.dtype)} v{node.id}_{q} = b.c{node.id}[{q}];"
             for node in lanes.values():
@@ -208,14 +208,14 @@ class Text:
         yield "PART void put(Block& b, int p, i64 j, const Array* lanes, const Array* carry) {"
         yield "  const int i = p/LANES, q = p%LANES; (void)lanes;"
         for places, name, array in ((UpdateLevel.LANE, "l", "lanes"), (UpdateLevel.STEP, "c", "carry")):
-            for place, node in self._given(places):
+            for place, node in self._given_inputs(places):
                 size = self.program.sizes[places][place.array]
                 value = f"((const {scalar_type(node.dtype)}*){array}[{place.array}].data)[j*{size} + {place.entry}]"
                 target = f"b.{name}{node.id}[i]"
                 yield f"  set({target}, q, {value});" if is_boolean(node.dtype) else f"  place({target}, q, {value});"
         yield "}\nPART void take(const Block& b, int p, i64 j, const Array* carry) {"
         yield "  const int i = p/LANES, q = p%LANES;"
-        for place, node in self._given(UpdateLevel.STEP):
+        for place, node in self._given_inputs(UpdateLevel.STEP):
             size, value = self.program.sizes[UpdateLevel.STEP][place.array], f"b.c{node.id}[i]"
             value = f"get({value}, q)" if is_boolean(node.dtype) else f"at({value}, q)"
             yield f"  (({scalar_type(node.dtype)}*)carry[{place.array}].data)[j*{size} + {place.entry}] = {value};"

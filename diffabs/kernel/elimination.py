@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from diffabs.kernel.graph import Graph, Node, UpdateLevel
-from diffabs.kernel.linear import UNIT_FACTOR, Algebra, Factor, Sum, Vertex, changes_in_step, count_terms
+from diffabs.kernel.linear import FACTOR_ONE, Algebra, Factor, Sum, Vertex, changes_in_step, count_terms
 
 
 class Elimination:
@@ -159,7 +159,7 @@ class Elimination:
         if vertex.which is not None:
             if not self._can_choose_factors(vertex):
                 return
-            decided = self.algebra.decided(vertex)
+            decided = self.algebra.decide(vertex)
         spared = before - (self._factor_choice_cost(vertex) if vertex.which is not None else before)
         if key not in self.kept and spared + self._saving_without(key, decided) >= 0:
             self._replace_by_sum(key, decided)
@@ -173,7 +173,7 @@ class Elimination:
         one = vertex.sum or vertex.others
         if vertex.which is None or len(one) != 1 or (vertex.sum and vertex.others):
             return False
-        whole = {key: UNIT_FACTOR}
+        whole = {key: FACTOR_ONE}
         readers = [self.vertices[reader] for reader in self.readers[key]]
         if any(r.which is None or any(side and side not in (one, whole) for side in r.sums()) for r in readers):
             return False

@@ -27,7 +27,7 @@ _lock = threading.Lock()
 class GpuDevice(Protocol):
     """A GPU that compiles and starts kernels."""
 
-    def compiled(self, text: str) -> pathlib.Path:
+    def compile(self, text: str) -> pathlib.Path:
         """Return the file with the machine code of a CUDA C++ `text`.
 
         Raises:
@@ -78,7 +78,7 @@ def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[Any], re
     on = find_gpu()
     assert on is not None
     source = cuda.emit_cuda(program, shape)
-    code = on.compiled(source.text)
+    code = on.compile(source.text)
     sizes = [len(program.sizes[level]) for level in (UpdateLevel.UNIFORM, UpdateLevel.LANE, UpdateLevel.STEP)]
     count = given[-1].shape[0]
 
@@ -149,7 +149,7 @@ class CudaDevice:
         self.architecture = architecture
         self._loaded: dict[tuple[pathlib.Path, int], _LoadedCode] = {}
 
-    def compiled(self, text: str) -> pathlib.Path:
+    def compile(self, text: str) -> pathlib.Path:
         """Return the file with the machine code of a CUDA C++ `text`; see `GpuDevice.compiled`."""
         return nvrtc.build_cubin(text, self.architecture)
 

@@ -150,9 +150,9 @@ class Graph:
         if asked.op == "const":
             return [b if asked.attr else a for a, b in pairs]
         gate, self._gates = Gate(self._gates, which.op == "any"), self._gates + 1
-        return [b if a is b else self._gated(gate, asked, a, b) for a, b in pairs]
+        return [b if a is b else self._gate(gate, asked, a, b) for a, b in pairs]
 
-    def _gated(self, gate: Gate, which: Node, no: Node, yes: Node) -> Node:
+    def _gate(self, gate: Gate, which: Node, no: Node, yes: Node) -> Node:
         # A constant in the other branch is a placeholder: only lanes with a true `which` use the result.
         if gate.any and no.op == "const":
             return yes
@@ -196,7 +196,7 @@ class Graph:
             case "select" | "any":
                 return self.select(*args) if node.op == "select" else self.any(args[0])
             case "gate":
-                return self._gated(node.attr, *args) if args[0].op != "const" and args[1] is not args[2] else args[2]
+                return self._gate(node.attr, *args) if args[0].op != "const" and args[1] is not args[2] else args[2]
         return self.op(node.op, *args)
 
 

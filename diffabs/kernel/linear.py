@@ -25,7 +25,7 @@ class Factor(NamedTuple):
     number: Node | None
 
 
-UNIT_FACTOR = Factor(False, None)
+FACTOR_ONE = Factor(False, None)
 Sum = dict[int, Factor]  # factors by the id of their tangents
 
 
@@ -140,7 +140,7 @@ class Algebra:
         more = {x: self._times(factor, one) for x, one in inner.items()}
         return self._plus({x: one for x, one in sum.items() if x != key}, more)
 
-    def decided(self, vertex: Vertex) -> Sum:
+    def decide(self, vertex: Vertex) -> Sum:
         """Return the selection of `vertex` as one sum whose factors are selections."""
         assert vertex.which is not None
         found = {}
@@ -188,5 +188,5 @@ def count_terms(sum: Sum) -> int:
     Args:
         sum: Sum of tangents.
     """
-    alone = len(sum) == 1 and next(iter(sum.values())) == UNIT_FACTOR
-    return 0 if alone or not sum else max(1, len(sum) - any(one == UNIT_FACTOR for one in sum.values()))
+    alone = len(sum) == 1 and next(iter(sum.values())) == FACTOR_ONE
+    return 0 if alone or not sum else max(1, len(sum) - any(one == FACTOR_ONE for one in sum.values()))

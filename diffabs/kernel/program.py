@@ -52,7 +52,7 @@ class ScalarProgram:
     dtype: np.dtype
     tangents: int = 0
 
-    def carried(self) -> list[Node]:
+    def carry_inputs(self) -> list[Node]:
         """Return the nodes of the carry in their order."""
         return [node for place, node in self.inputs.items() if place.level == UpdateLevel.STEP]
 
@@ -138,7 +138,7 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
     graph, inputs = Graph(), {}
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in functions.types}
 
-    def taken(aval: Any, level: UpdateLevel) -> Array:
+    def take_inputs(aval: Any, level: UpdateLevel) -> Array:
         shape, dtype = draws.key_shape(aval)
         array, out = len(sizes[level]), np.empty(shape, object)
         for entry, at in enumerate(np.ndindex(shape)):
@@ -147,7 +147,7 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
         sizes[level].append(out.size)
         return out
 
-    given = {level: [taken(aval, level) for aval in avals] for level, avals in functions.types.items()}
+    given = {level: [take_inputs(aval, level) for aval in avals] for level, avals in functions.types.items()}
     results: dict[str, list[Node]] = {}
     for name, (jaxpr, closed, constants) in functions.each.items():
         shared = [given[UpdateLevel.UNIFORM][i] for i in closed] + [constant_array(graph, x) for x in constants]

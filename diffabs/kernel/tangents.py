@@ -258,7 +258,7 @@ def _jvp_function(
 ) -> Any:
     """Return a function of values and tangents that computes values and tangents; without `moves`, values alone."""
 
-    def called(arrays: dict[UpdateLevel, list[Any]]) -> list[Any]:
+    def call(arrays: dict[UpdateLevel, list[Any]]) -> list[Any]:
         shared = [*(arrays[UpdateLevel.UNIFORM][i] for i in function.closed), *function.constants]
         closed = jex.ClosedJaxpr(function.jaxpr, shared)
         return jex.jaxpr_as_fun(closed)(*arrays[UpdateLevel.LANE], *arrays[UpdateLevel.STEP])
@@ -269,17 +269,17 @@ def _jvp_function(
             arrays[level] = [next(rest) for _ in functions.types[level]]
             slopes[level] = [next(rest) for _ in differentiable[level]]
         if not moves:
-            return called(arrays)
+            return call(arrays)
 
-        def moved(moving: dict[UpdateLevel, list[Any]]) -> list[Any]:
+        def call_at(moving: dict[UpdateLevel, list[Any]]) -> list[Any]:
             now = {level: list(xs) for level, xs in arrays.items()}
             for level in INPUT_LEVELS:
                 for i, x in zip(differentiable[level], moving[level], strict=True):
                     now[level][i] = x
-            return called(now)
+            return call(now)
 
         moving = {level: [arrays[level][i] for i in differentiable[level]] for level in INPUT_LEVELS}
-        values, tangents = jax.jvp(moved, (moving,), (slopes,))
+        values, tangents = jax.jvp(call_at, (moving,), (slopes,))
         return [*values, *(tangents[i] for i in differentiable[UpdateLevel.STEP])]
 
     return push

@@ -1,7 +1,8 @@
-"""Linear systems in pure JAX: linearisation, sampling, Riccati and Lyapunov equations, LQR, LQG; margins of loops.
+"""Linear systems in pure JAX: linearisation, sampling, Riccati and Lyapunov equations, LQR, LQG, and stability margins.
 
-Everything but the margins is jit-able and differentiable, and `vmap` solves many systems at once. Margins, frequency
-responses and what goes to python-control are NumPy."""
+Everything except the margins works under `jit` and automatic differentiation, and `vmap` solves many systems at once.
+Margins, frequency responses and conversions to python-control are NumPy.
+"""
 
 from diffabs.linear.balance_model import BalanceModel as BalanceModel
 from diffabs.linear.gaussian import Filter as Filter

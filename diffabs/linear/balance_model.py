@@ -1,6 +1,10 @@
-"""The linear model of a balance about upright, for which its feedback u = K x is designed.
+"""The linear model of a balancing plant about upright, used to design its feedback u = K x.
 
-x' = A x + B u,   x = (theta, psi, phi, theta', psi', phi')      or, sampled,   x+ = e^(A T) x + G(T) B u
+The first line is the model in continuous time; the second is the model sampled with period T.
+
+    x' = A x + B u
+    x+ = e^(A T) x + G(T) B u
+    x = (theta, psi, phi, theta', psi', phi')
 """
 
 from collections.abc import Iterator
@@ -19,7 +23,13 @@ from diffabs.plants.arm_balance import ArmState
 
 @pytree
 class BalanceModel:
-    """A plant at rest, upright. Sampled, its control is held over the period, and there is no delay."""
+    """A balancing plant, linearised at rest and upright. With `Sampling` the control is held over the period, without
+    delay.
+
+    Attributes:
+        plant: Plant to linearise.
+        sampling: `Continuous`, or `Sampling` with delay 0.
+    """
 
     plant: Plant = part(default=ArmBalance)
     sampling: Continuous | Sampling = part(default=Continuous)
@@ -28,15 +38,15 @@ class BalanceModel:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """What the states are."""
+        """Names of the six states."""
         return ArmState._fields
 
     def matrices(self) -> StateSpace:
-        """A (6, 6) and B (6, 1), differentiable in every parameter; compiled once for each kind of model."""
+        """Return A (6, 6) and B (6, 1), differentiable in every parameter; they compile once for each kind of model."""
         return _matrices(self)
 
     def problems(self) -> Iterator[str]:
-        """A delay, which needs another state."""
+        """Yield an error for a sampling delay, because this model has no state for the previous input."""
         if isinstance(self.sampling, Sampling) and self.sampling.delay != 0:
             yield f"sampling.delay = {self.sampling.delay:g} s is outside [0, 0] s: this model has none"
 
@@ -50,5 +60,6 @@ def _matrices(model: BalanceModel) -> StateSpace:
     if not isinstance(model.sampling, Sampling):
         return system
     n = len(a)
+    # A delay of 0 in the period's own type. The previous input then has no effect, and its state is cut off.
     whole = discretise_held_input(system, model.sampling.period, 0.0 * model.sampling.period)
     return StateSpace(whole.A[:n, :n], whole.B[:n])

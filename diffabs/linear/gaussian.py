@@ -1,10 +1,10 @@
-"""Output feedback in discrete time: a steady Kalman filter, and with a regulator the LQG controller of a balance.
+"""Output feedback in discrete time: a steady-state Kalman filter, and the LQG controller of a balancing plant.
 
     x+ = A x + B u + w,  y = C x + v,  cov w = W,  cov v = V
     P = A P A' - A P C' (C P C' + V)^-1 C P A' + W,   L = P C' (C P C' + V)^-1      x^ = x^- + L (y - C x^-)
 
-The regulator's equation with A', C' in place of A, B: `dare` solves both. Separation: the poles of the closed loop are
-those of A + B K and of A - A L C, whatever the noise.
+This is the regulator's equation with A', C' in place of A, B, so `dare` solves both. Separation principle: for any
+noise covariance, the closed-loop poles are the eigenvalues of A + B K and of A - A L C.
 """
 
 from typing import Any, NamedTuple
@@ -25,7 +25,13 @@ SELECTION = np.eye(len(STATE_NAMES))[[STATE_NAMES.index(name) for name in MEASUR
 
 
 class Filter(NamedTuple):
-    """Gain L (n, p) of the correction, covariance P (n, n) of the prediction, whether P is proven (`Riccati`)."""
+    """A steady-state Kalman filter.
+
+    Attributes:
+        gain: Gain L of the correction, shape (n, p).
+        P: Covariance of the prediction error, shape (n, n).
+        stabilising: Whether P is proven to be the stabilising solution, as in `Riccati`.
+    """
 
     gain: Any
     P: Any
@@ -33,8 +39,19 @@ class Filter(NamedTuple):
 
 
 def kalman(A: Any, C: Any, W: Any, V: Any) -> Filter:
-    """The steady filter; A (n, n), C (p, n), W (n, n), V (p, p) > 0. Differentiable; NaN where there is none. Raises
-    ValueError as `dare`."""
+    """Return the steady-state Kalman filter of x+ = A x + w, y = C x + v; NaN where no such filter exists.
+
+    The result is differentiable in every argument.
+
+    Args:
+        A: State matrix, shape (n, n).
+        C: Output matrix, shape (p, n).
+        W: Covariance of w, shape (n, n).
+        V: Covariance of v, shape (p, p), positive definite.
+
+    Raises:
+        ValueError: The same cases as in `dare`.
+    """
     A, C, W, V = as_float_arrays(A, C, W, V)
     found = dare(A.T, C.T, W, V)
     spread = C @ found.P @ C.T + V
@@ -51,21 +68,27 @@ def lqg(
     noise: Any = (1e-3, 1e-3),
     voltage_max: float = np.inf,
 ) -> Sampled:
-    """Return the computer's controller of a balance that measures theta and psi only: LQR on a Kalman filter, sampled.
+    """Return a sampled controller for a balancing plant that measures only theta and psi: LQR on a Kalman filter's
+    estimate.
 
-    plant: the two-wheeler, linearised upright
-    Q (6, 6), R a number: weights of the integral of x'Q x + R u^2, by its sum over the samples
-    period: of the computer [s]
-    disturbance: standard deviations of unknown accelerations of theta, psi, phi [rad/s^2], constant over a period; an
-        estimate that the filter shall trust less wants more
-    noise: of the angles theta and psi [rad]
-    voltage_max: limit of the command [V]
+    Args:
+        plant: Two-wheeler; it is linearised upright.
+        Q: Weight of the states in the integral of x'Q x + R u^2, shape (6, 6). A sum over the samples stands for the
+            integral.
+        R: Weight of the control in the same integral, a number.
+        period: Sampling period of the controller [s].
+        disturbance: Standard deviations of unknown accelerations of theta, psi, phi [rad/s^2], constant over a period.
+            With larger values the filter trusts its prediction less.
+        noise: Standard deviations of the measured angles theta and psi [rad].
+        voltage_max: Limit of the command [V].
 
-    Raises ValueError as `dlqr`.
+    Raises:
+        ValueError: The same cases as in `dlqr`.
     """
     model = BalanceModel(plant=plant, sampling=Sampling(period=period))
     a, b = model.matrices()
     regulator = dlqr(a, b, period * jnp.asarray(Q), period * jnp.asarray(R).reshape(1, 1))
+    # An acceleration d, constant over the period T, moves an angle by d T^2/2 and its rate by d T.
     spread = jnp.concatenate([0.5 * period**2 * jnp.asarray(disturbance), period * jnp.asarray(disturbance)])
     kicks = jnp.concatenate([jnp.eye(3), jnp.eye(3)]) * spread[:, None]
     filtered = kalman(a, SELECTION, kicks @ kicks.T, jnp.diag(jnp.asarray(noise) ** 2))

@@ -1,10 +1,10 @@
-"""Lyapunov equations, and the linear algebra of many small matrices that the Riccati equations are solved with.
+"""Lyapunov equations, and the linear algebra of many small matrices on which the Riccati solvers rest.
 
     lyapunov            A' P + P A + Q = 0
     discrete_lyapunov   A' P A - P + Q = 0
 
-Functions below "Many small matrices" take stacks of shape (rows, columns, lanes). With the lanes last every operation
-is one vectorised loop; on a CPU a call of LAPACK per matrix costs more than the whole elimination of a small one.
+The functions below "Many small matrices" take stacks of shape (rows, columns, batch). With the batch as last axis each
+operation is one vectorised loop. On a CPU, a LAPACK call per small matrix takes longer than its whole elimination here.
 """
 
 from functools import reduce
@@ -15,21 +15,30 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-MAX_SMITH_STEPS = 50  # C^(2^50): a radius of 1 - 1e-13 has contracted, one of 1 has not
+MAX_SMITH_STEPS = 50  # C^(2^50) is 0 for a spectral radius of 1 - 1e-13, and not for a radius of 1
 
 
 class Lyapunov(NamedTuple):
-    """P (n, n) and its relative residual: the norm of the left side over the sum of the norms of its terms."""
+    """A solution of a Lyapunov equation.
+
+    Attributes:
+        P: Solution, shape (n, n).
+        residual: Relative residual: the norm of the left side over the sum of the norms of its terms.
+    """
 
     P: Any
     residual: Any
 
 
 def lyapunov(A: Any, Q: Any) -> Lyapunov:
-    """P of A' P + P A + Q = 0, for any A (n, n) with no two eigenvalues of sum zero; else P is not finite.
+    """Return P of A' P + P A + Q = 0 and its relative residual.
 
-    P = integral of exp(A't) Q exp(At) where A is stable. Q (n, n) need not be symmetric. Differentiable in both modes,
-    as often as wanted, but not the residual.
+    For a stable A, P is the integral of exp(A't) Q exp(At). P is differentiable to any order in both modes; the
+    residual counts as constant. P is not finite if two eigenvalues of A have the sum zero.
+
+    Args:
+        A: State matrix, shape (n, n).
+        Q: Right side, shape (n, n); it need not be symmetric.
     """
     A, Q = as_float_arrays(A, Q)
     I = jnp.eye(len(A), dtype=A.dtype)
@@ -38,9 +47,14 @@ def lyapunov(A: Any, Q: Any) -> Lyapunov:
 
 
 def discrete_lyapunov(A: Any, Q: Any) -> Lyapunov:
-    """P of A' P A - P + Q = 0, for any A (n, n) with no two eigenvalues of product one; else P is not finite.
+    """Return P of A' P A - P + Q = 0 and its relative residual.
 
-    P = sum of (A')^k Q A^k where A is stable. The rest as for `lyapunov`.
+    For a stable A, P is the sum of (A')^k Q A^k. P is differentiable to any order in both modes; the residual counts as
+    constant. P is not finite if two eigenvalues of A have the product one.
+
+    Args:
+        A: State matrix, shape (n, n).
+        Q: Right side, shape (n, n); it need not be symmetric.
     """
     A, Q = as_float_arrays(A, Q)
     P = _solve_vectorised(jnp.kron(A.T, A.T) - jnp.eye(A.size, dtype=A.dtype), Q)
@@ -48,59 +62,82 @@ def discrete_lyapunov(A: Any, Q: Any) -> Lyapunov:
 
 
 def _solve_vectorised(operator: jax.Array, Q: jax.Array) -> jax.Array:
-    """P of operator vec(P) = -vec(Q), vec by rows."""
+    """Return P of operator vec(P) = -vec(Q), where vec stacks rows."""
     return jnp.linalg.solve(operator, -Q.ravel()).reshape(Q.shape)
 
 
 def as_float_arrays(*given: Any) -> tuple[Any, ...]:
-    """As arrays of one floating type."""
+    """Return the arguments as arrays of one common floating-point type."""
     given = tuple(jnp.asarray(x) if isinstance(x, list | tuple) else x for x in given)
     kind = jnp.result_type(float, *given)
     return tuple(jnp.asarray(x, kind) for x in given)
 
 
 def relative_residual(left: jax.Array, *terms: jax.Array) -> jax.Array:
-    """Norm of a sum over the sum of the norms of its terms; 0 where these are 0. Its derivative is zero."""
+    """Return the norm of a sum over the sum of the norms of its terms; 0 where all terms are 0. Its derivative is zero.
+
+    Args:
+        left: Sum of the terms.
+        terms: Terms of the sum.
+    """
     left, terms = lax.stop_gradient((left, terms))
     axes = (0, 1)
+    # `where` computes both branches, so the divisor is replaced too: no 0/0.
     total = reduce(add, (frobenius_norm(term, axes) for term in terms))
     return jnp.where(total == 0, 0.0, frobenius_norm(left, axes) / jnp.where(total == 0, 1.0, total))
 
 
-# Many small matrices: (rows, columns, lanes)
+# Many small matrices: (rows, columns, batch)
 
 
 def frobenius_norm(X: jax.Array, axes: Any = (0, 1)) -> jax.Array:
-    """Frobenius norm, per lane."""
+    """Return the Frobenius norm of each matrix.
+
+    Args:
+        X: Matrices, shape (rows, columns, batch).
+        axes: Axes of rows and columns.
+    """
     return jnp.sqrt(jnp.sum(X * X, axes))
 
 
 def transpose(X: jax.Array) -> jax.Array:
-    """X', per lane."""
+    """Return the transpose of each matrix.
+
+    Args:
+        X: Matrices, shape (rows, columns, batch).
+    """
     return jnp.swapaxes(X, 0, 1)
 
 
 def times(*factors: jax.Array) -> jax.Array:
-    """Product of matrices, from the left, per lane. Written as a sum of outer products, which is one fused loop."""
+    """Return the product of matrices, in their order. It is a sum of outer products, which XLA fuses into one loop."""
     return reduce(lambda X, Y: reduce(add, (X[:, k, None] * Y[None, k] for k in range(len(Y)))), factors)
 
 
 def eye(n: int, like: jax.Array) -> jax.Array:
-    """Identity, per lane."""
+    """Return an identity matrix for each matrix of `like`.
+
+    Args:
+        n: Number of rows.
+        like: Array whose last axis is the batch; it also sets the data type.
+    """
     return jnp.broadcast_to(jnp.eye(n, dtype=like.dtype)[..., None], (n, n, like.shape[-1]))
 
 
 def gauss_jordan_solve(M: jax.Array, W: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(M^-1 W, log abs det M), per lane, by Gauss-Jordan elimination with partial pivoting.
+    """Return M^-1 W and log abs det M of each matrix, by Gauss-Jordan elimination with partial pivoting.
 
-    The pivot's row is gathered: XLA would fuse a masked sum over the rows into its consumer and work it out once per
-    element.
+    Args:
+        M: Matrices, shape (n, n, batch).
+        W: Right sides, shape (n, columns, batch).
     """
     rows = jnp.arange(len(M))[:, None]
 
     def step(k: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         T, log = carry
         column = T[:, k]
+        # Gather the pivot's row. XLA would fuse a masked sum over the rows into its consumer, and compute the sum once
+        # per element.
         place = jnp.argmax(jnp.where(rows >= k, jnp.abs(column), -1.0), 0)[None]
         value = jnp.take_along_axis(column, place, 0)[0]
         row = jnp.take_along_axis(T, place[None], 0)[0] / value
@@ -113,7 +150,11 @@ def gauss_jordan_solve(M: jax.Array, W: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 def cholesky(R: jax.Array) -> jax.Array:
-    """Lower triangular L with L L' = R, per lane; not finite where R is not positive definite."""
+    """Return the lower triangular L with L L' = R of each matrix; not finite where R is not positive definite.
+
+    Args:
+        R: Symmetric matrices, shape (n, n, batch).
+    """
     L = jnp.zeros_like(R)
     for k in range(len(R)):
         column = R[:, k] - jnp.sum(L * L[k], 1)
@@ -123,12 +164,16 @@ def cholesky(R: jax.Array) -> jax.Array:
 
 
 def solve_stein(C: jax.Array, *right: jax.Array) -> tuple[jax.Array, ...]:
-    """X of C' X C - X + W = 0 for each W of `right`, per lane; not finite where C is not stable.
+    """Return X of C' X C - X + W = 0 for each W of `right`; NaN where C is not stable.
 
-    Smith's squared method: X <- X + C' X C, C <- C^2. Where the powers of C do not vanish, C is not stable.
+    Smith's squared method: X <- X + C' X C, C <- C^2. C is not stable where its powers do not vanish.
+
+    Args:
+        C: Matrices, shape (n, n, batch).
+        right: One or more W, each of shape (n, n, batch).
     """
 
-    def going(carry: tuple[Any, ...]) -> jax.Array:
+    def goes_on(carry: tuple[Any, ...]) -> jax.Array:
         k, C, _ = carry
         return (k < MAX_SMITH_STEPS) & jnp.any(frobenius_norm(C) > 1e-9)
 
@@ -136,5 +181,6 @@ def solve_stein(C: jax.Array, *right: jax.Array) -> tuple[jax.Array, ...]:
         k, C, X = carry
         return k + 1, times(C, C), tuple(x + times(transpose(C), x, C) for x in X)
 
-    _, C, X = lax.while_loop(going, double, (0, C, right))
+    # The loop runs until all matrices have converged; the test below then decides for each matrix.
+    _, C, X = lax.while_loop(goes_on, double, (0, C, right))
     return tuple(jnp.where(frobenius_norm(C) <= 1e-9, x, jnp.nan) for x in X)

@@ -1,13 +1,15 @@
-"""Any loop, opened at its controller's command and linearised: what margins and Bode plots are about.
+"""The open loop of any control loop, cut at the controller's command and linearised, for margins and Bode plots.
 
     command v --> [delay] --> actuator --> plant --> sensor --> controller --> command u,     L = -du/dv
 
-The loop is taken at rest on its setpoint: everything stands still, and the first signal that the plant shows is the
-setpoint. A plant with `frozen` outputs (the speed of a brake) holds them, as in `linearization.tracking`. Blocks are
-differentiated as they are, so whatever is smooth there needs no rule of its own: lags, filters of a sensor, a gain
-schedule, an observer. A `Sampled` controller makes the loop discrete: everything before it is sampled exactly under a
-held input, also behind a delay that is no whole number of periods. Limits do not act at rest, noise and the motion of
-the target are disturbances."""
+The loop is at rest on its setpoint: everything stands still, and the plant's first signal is the setpoint. A plant with
+`frozen` outputs (the speed of a brake) holds them, as in `linearization.tracking_dynamics`. Blocks are differentiated
+directly, so a smooth block needs no rule of its own: lags, sensor filters, a gain schedule, an observer.
+
+A `Sampled` controller makes the loop discrete. The other parts are then sampled exactly under a held input, also with a
+delay that is not a whole number of periods. Limits do not act at rest; noise and the motion of the target are
+disturbances.
+"""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -29,12 +31,18 @@ from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer
 from diffabs.linear.zero_order_hold import discretise_held_input
 
-TARGET_OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)  # of the target, relative, in which directions a limit is left
+# Relative offsets of the target for the first Newton step of a controller, in the directions that leave a limit.
+TARGET_OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)
 
 
 class OpenLoop(NamedTuple):
-    """The two halves of an open loop: `plant`, in continuous time, from the command to all that the controller is
-    given, and `controller`, from that to the command; the pure delay between them [s]."""
+    """The two halves of an open loop, and the pure delay between them.
+
+    Attributes:
+        plant: System in continuous time from the command to all inputs of the controller.
+        controller: System from these inputs to the command.
+        delay: Pure delay [s].
+    """
 
     plant: Transfer
     controller: Transfer
@@ -42,14 +50,15 @@ class OpenLoop(NamedTuple):
 
     @property
     def period(self) -> float | None:
-        """Of the controller [s]; None in continuous time."""
+        """Sampling period of the controller [s]; None in continuous time."""
         return self.controller.period
 
     def transfer(self, more: float = 0.0) -> Transfer:
-        """The open loop L, from the command to its negative; `more` is added to the delay [s]."""
+        """Return the open loop L, from the command to minus the controller's command. `more` adds to the delay [s]."""
         delay = self.delay + more
         if self.period is None:
             return _drop_unobserved_states(_series(self.plant, self.controller)._replace(delay=delay))
+        # Whole periods become shifts in `Transfer`. The rest of the delay is sampled exactly.
         whole = int(np.floor(delay / self.period + WHOLE_PERIOD_TOLERANCE))
         rest = max(delay - whole * self.period, 0.0)
         plant = _sample_plant(self.plant, self.period, rest if rest > WHOLE_PERIOD_TOLERANCE * self.period else 0.0)
@@ -59,10 +68,14 @@ class OpenLoop(NamedTuple):
 def open_loop(loop: Loop, target: Any = None) -> OpenLoop:
     """Return a loop, linearised at rest on its setpoint and opened at the controller's command.
 
-    target: another setpoint, in the unit of the first signal; of a reference that finds its target, where it will be
+    Args:
+        loop: Loop to open.
+        target: Setpoint to use instead, in the unit of the first signal. If the reference searches for its target, the
+            value that it will find.
+
     Raises:
-        ValueError: a block that acts at instants (a relay, a controller that computes in every step but is not
-            `Sampled`), a plant that does not come to rest at the setpoint, a command that nothing measured acts on.
+        ValueError: A block acts at instants (a relay, a controller that computes in every step but is not `Sampled`);
+            or the plant does not come to rest at the setpoint; or the command depends on no measured signal.
     """
     rational, delay = _split_off_delays(loop)
     _check_continuous(rational)
@@ -84,7 +97,8 @@ def open_loop(loop: Loop, target: Any = None) -> OpenLoop:
 
 
 def _split_off_delays(loop: Loop) -> tuple[Loop, float]:
-    """The loop without its actuator's pure delays, and their sum [s]: they commute with what is linear."""
+    """Return the loop without its actuator's pure delays, and the sum of these delays [s]."""
+    # A pure delay commutes with linear blocks, so its place in the series does not matter.
     blocks = loop.actuator.blocks if isinstance(loop.actuator, Series) else (loop.actuator,)
     delay = float(sum(block.time for block in blocks if isinstance(block, Delay)))
     left = tuple(block for block in blocks if not isinstance(block, Delay))
@@ -92,7 +106,7 @@ def _split_off_delays(loop: Loop) -> tuple[Loop, float]:
 
 
 def _check_continuous(loop: Loop) -> None:
-    """Raises ValueError for a block that changes at instants by what it is given."""
+    """Raise ValueError for a block whose memory jumps at instants in dependence on its signal."""
     start = loop.start()
     given = {
         "sensor": loop.plant.output(start.plant),
@@ -108,13 +122,13 @@ def _check_continuous(loop: Loop) -> None:
 
 
 def _ticks_use_signal(block: Any, signal: Any) -> bool:
-    """Whether a block's ticks look at its signal; noise does not."""
+    """Return whether a block's ticks depend on its signal. Ticks that only draw noise do not."""
     memory, clock = block.start(signal), Clock(0.0, 1e-3, 1, jax.random.key(0))
     return depends_on_signal(lambda signal: block.tick(clock, memory, signal).held, signal)
 
 
 class _SurroundingStates(NamedTuple):
-    """What is integrated around the controller."""
+    """Integrated states of the parts around the controller."""
 
     plant: Any
     sensor: Any
@@ -122,7 +136,7 @@ class _SurroundingStates(NamedTuple):
 
 
 class _LinearHalves(NamedTuple):
-    """Matrices (A, B, C, D) of both halves; how far from rest they were taken, relative to the state."""
+    """Matrices (A, B, C, D) of both halves, and their distance from rest, relative to the state."""
 
     plant: Any
     controller: Any
@@ -130,7 +144,7 @@ class _LinearHalves(NamedTuple):
 
 
 def _start_output_and_setpoint(loop: Loop) -> tuple[Any, Any]:
-    """What the plant shows at the start, and the setpoint."""
+    """Return the plant's output at the start, and the setpoint."""
     start = loop.start()
     return loop.plant.output(start.plant), loop.reference.setpoint(start.reference)
 
@@ -143,6 +157,7 @@ def _linearize_halves(loop: Loop, setpoint: Any) -> _LinearHalves:
     signal, as_signal = ravel_pytree(around.signal(z))
     by_z, b = jax.jacfwd(around.moves, (0, 1))(z, command)
     chart = jax.jacfwd(around.chart)(z)
+    # M DF^-1 are the derivatives with respect to the coordinates; the frozen outputs are the last and are cut off.
     n = len(z) - around.held
     a, c = (jnp.linalg.solve(chart.T, m.T).T[:, :n] for m in (by_z, jax.jacfwd(around.signals)(z)))
     plant = (a[:n], b[:n, None], c, jnp.zeros((len(signal), 1), a.dtype))
@@ -150,8 +165,11 @@ def _linearize_halves(loop: Loop, setpoint: Any) -> _LinearHalves:
 
 
 class _Surroundings:
-    """Plant, sensor and actuator of a loop as functions of one vector z. Coordinates: the tracked signal, the states
-    that neither it nor the frozen outputs depend on, sensor, actuator, and last the `held` frozen outputs."""
+    """Plant, sensor and actuator of a loop as functions of one vector z.
+
+    The coordinates begin with the tracked signal, and the states on which neither it nor the frozen outputs depend.
+    Then follow the states of sensor and actuator, and the `held` frozen outputs.
+    """
 
     def __init__(self, loop: Loop, setpoint: Any):
         state = loop.start()
@@ -168,20 +186,20 @@ class _Surroundings:
         self.kept, self.size, self.held = kept, size, len(self.frozen)
 
     def output(self, z: Any) -> Any:
-        """What the plant shows."""
+        """Return the plant's output."""
         return self.loop.plant.output(self.unravel(z).plant)
 
     def signal(self, z: Any) -> Tracking:
-        """What the controller is given, its target at the setpoint."""
+        """Return the controller's input signal, with the target at the setpoint."""
         measured = self.loop.sensor.output(0.0, Memory(self.unravel(z).sensor, self.memory[0]), self.output(z))
         return Tracking(self.setpoint, measured, self.loop.feedforward.input(self.loop.plant, measured, self.setpoint))
 
     def signals(self, z: Any) -> Any:
-        """The same as a vector."""
+        """Return the controller's input signal as a vector."""
         return ravel_pytree(self.signal(z))[0]
 
     def flow(self, z: Any, command: Any) -> Any:
-        """dz/dt."""
+        """Return dz/dt."""
         x = self.unravel(z)
         actuator = Memory(x.actuator, self.memory[1])
         control = self.loop.actuator.output(0.0, actuator, command)
@@ -193,7 +211,7 @@ class _Surroundings:
         return ravel_pytree(rates)[0]
 
     def chart(self, z: Any) -> Any:
-        """The coordinates."""
+        """Return the coordinates."""
         if not self.frozen:
             return z
         y = self.output(z)
@@ -201,12 +219,15 @@ class _Surroundings:
         return jnp.concatenate([y[0][None], z[self.kept], z[self.size :], last])
 
     def moves(self, z: Any, command: Any) -> Any:
-        """The rates of the coordinates."""
+        """Return the rates of the coordinates."""
         return jax.jvp(self.chart, (z,), (self.flow(z, command),))[1]
 
     def rest_residual(self, free: Any) -> Any:
-        """Zero where all but the frozen outputs stand still, those are where they began, and the first signal is the
-        setpoint."""
+        """Return a vector that is zero at rest.
+
+        It contains the rates of all coordinates except the frozen outputs, and the change of the frozen outputs since
+        the start. The last entry is the first signal minus the setpoint.
+        """
         z, command = free[:-1], free[-1]
         rates = self.moves(z, command)[: len(z) - self.held]
         where = self.chart(z)[len(z) - self.held :] - self.chart(self.start)[len(z) - self.held :]
@@ -214,54 +235,63 @@ class _Surroundings:
 
 
 def _find_rest(loop: Loop, setpoint: Any) -> tuple[_Surroundings, Any, Any]:
-    """The surroundings of the controller, (z, command) at rest, and how far from it they are."""
+    """Return the surroundings of the controller, (z, command) at rest, and the relative residual there."""
     around = _Surroundings(loop, setpoint)
     there = around.chart(around.start)
     there = there.at[0].set(around.setpoint) if around.frozen else there
-    near = find_root(lambda z: around.chart(z) - there, around.start)  # on the setpoint, the rest as it starts
+    # On the setpoint, with the other coordinates at their start.
+    near = find_root(lambda z: around.chart(z) - there, around.start)
     guess = loop.plant.holding(around.output(near), around.setpoint)
     free = find_root(around.rest_residual, jnp.append(near, guess))
     return around, free, jnp.max(jnp.abs(around.rest_residual(free))) / (1 + jnp.max(jnp.abs(free)))
 
 
 def _linearize_controller(loop: Loop, signal: Any, as_signal: Any, command: Any) -> Any:
-    """(A, B, C, D) of the controller from its signal to the command, at rest where it commands what holds the plant."""
+    """Return (A, B, C, D) of the controller from its signal to its command, at rest with the command that holds the
+    plant.
+    """
     controller, memory = loop.controller, loop.start().controller
     sampled = isinstance(controller, Sampled)
     inside, unravel = ravel_pytree(memory.held.inner if sampled else memory)
 
     def compute(c: Any, s: Any) -> tuple[Any, Any]:
-        """The memory after a sample, or its rate; the command."""
+        """Return the memory after a sample, or its rate in continuous time; and the command."""
         memory, tracking = unravel(c), as_signal(s)
         if not isinstance(controller, Sampled):
             rate = controller.flow(0.0, memory, tracking)
             return ravel_pytree(memory._replace(flow=rate))[0], controller.output(0.0, memory, tracking)
         clock = Clock(0.0, controller.period, 1, None, before=tracking)
-        after, output = controller.computed(clock, memory, tracking)
+        after, output = controller.compute_sample(clock, memory, tracking)
         return ravel_pytree(after)[0], output
 
-    def holding(c: Any, s: Any = signal) -> Any:
-        """Zero where the memory is at rest and the command holds the plant."""
+    def rest_residual(c: Any, s: Any = signal) -> Any:
+        """Return a vector that is zero where the memory is at rest and the command holds the plant."""
         after, output = compute(c, s)
         return jnp.append(after - c if sampled else after, output - command)
 
-    def found(offset: Any) -> Any:
-        """Where that is, and what is left of it. The first step has the slopes at a target that is a little off: at the
-        setpoint itself the command may begin at a limit."""
+    def find_rest(offset: Any) -> Any:
+        """Return the memory at rest, and the size of the remaining residual. `offset` moves the target for the first
+        step.
+        """
+        # At the setpoint itself the command may be at the edge of a limit, where its slope is zero. The first step
+        # therefore uses the slopes at a nearby target.
         size = jnp.where(signal[0] == 0, 1.0, jnp.abs(signal[0]))
-        slopes = jax.jacfwd(holding)(inside, signal.at[0].add(offset * size))
-        c = find_root(holding, inside - jnp.linalg.pinv(slopes) @ holding(inside))
-        return c, jnp.sum(jnp.abs(holding(c)))
+        slopes = jax.jacfwd(rest_residual)(inside, signal.at[0].add(offset * size))
+        c = find_root(rest_residual, inside - jnp.linalg.pinv(slopes) @ rest_residual(inside))
+        return c, jnp.sum(jnp.abs(rest_residual(c)))
 
     if inside.size:
-        each, left = jax.vmap(found)(jnp.asarray(TARGET_OFFSETS, inside.dtype))
+        each, left = jax.vmap(find_rest)(jnp.asarray(TARGET_OFFSETS, inside.dtype))
+        # The offset with the smallest finite residual.
         inside = each[jnp.argmin(jnp.where(jnp.isfinite(left), left, jnp.inf))]
     (f, g), (h, j) = jax.jacfwd(compute, (0, 1))(inside, signal)
     return f, g, h[None], j[None]
 
 
 def _series(first: Transfer, second: Transfer) -> Transfer:
-    """The second system behind the first, which has no direct path; negated, for a loop whose feedback is negative."""
+    """Return minus the second system behind the first; the first has no direct path. The sign is that of negative
+    feedback.
+    """
     n, m = len(first.A), len(second.A)
     a = np.block([[first.A, np.zeros((n, m))], [second.B @ first.C, second.A]])
     b = np.concatenate([first.B, np.zeros((m, np.shape(first.B)[1]))])
@@ -270,7 +300,7 @@ def _series(first: Transfer, second: Transfer) -> Transfer:
 
 
 def _sample_plant(plant: Transfer, period: float, delay: float) -> Transfer:
-    """The plant at the instants of a clock, its input held, and changed `delay` after them."""
+    """Return the plant sampled with `period`, for an input that is held and changes `delay` after each instant."""
     n, m = np.shape(plant.B)
     a, b = (np.asarray(x) for x in _discretise_compiled(StateSpace(plant.A, plant.B), period, delay))
     c = np.hstack([plant.C, np.zeros((len(plant.C), m))])
@@ -283,8 +313,9 @@ _discretise_compiled = jax.jit(discretise_held_input)
 
 
 def _drop_unobserved_states(system: Transfer) -> Transfer:
-    """The system without the states that its output does not depend on, such as an integral whose gain is zero."""
+    """Return the system without the states that do not influence its output, such as an integral with gain zero."""
     kept = (system.C != 0).any(axis=0)
+    # Each pass adds the states that influence a kept one; as many passes as states reach all of them.
     for _ in kept:
         kept = kept | (system.A[kept] != 0).any(axis=0)
     return system._replace(A=system.A[np.ix_(kept, kept)], B=system.B[kept], C=system.C[:, kept])

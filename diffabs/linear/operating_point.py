@@ -1,11 +1,13 @@
-"""The linear model of any loop at rest on its setpoint, by automatic differentiation.
+"""The linear model of a control loop at rest on its setpoint, by automatic differentiation.
 
-    x' = A x + B u,   u = K x      x: what the plant and the blocks integrate, u: the controller's command
+    x' = A x + B u,   u = K x      x: states of the plant and the blocks, u: the controller's command
 
-At rest the plant stands still and shows the setpoint: f(x, u) = 0, y1(x) = setpoint, found by Newton's method from the
-loop's start. The command is differentiated there too, so that A + B K is the loop's own linearisation, for whatever
-controller is smooth there. The target is held at the setpoint: its motion is a disturbance. What neither the plant nor
-the command depends on is left out, such as the integral of a controller without an integral gain."""
+At rest the plant stands still and its first signal is the setpoint: f(x, u) = 0, y1(x) = setpoint. Newton's method
+finds this point from the loop's start. The command is differentiated there too, so A + B K is the loop's own
+linearisation for any controller that is smooth there. The target is held at the setpoint; its motion is a disturbance.
+States on which neither the plant nor the command depends are left out. An example is the integral state of a
+controller without an integral gain.
+"""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -22,12 +24,19 @@ from diffabs.core.pytree import canonical_dtypes, part, pytree, static
 from diffabs.linear.linearization import StateSpace
 from diffabs.stops import NoStop
 
-ROOT_ITERATIONS = 10  # iterations for the rest; one is enough where the loop is linear
-MAX_REST_RESIDUE = 1e-6  # relative to the state: what is further off than this is no rest
+ROOT_ITERATIONS = 10  # Gauss-Newton iterations to the point of rest; one is enough where the loop is linear
+MAX_REST_RESIDUE = 1e-6  # largest residue of a point of rest, relative to the state
 
 
 class LinearLoop(NamedTuple):
-    """A (n, n), B (n, 1), gain K (n,) of the loop's controller; and how far from rest they were taken."""
+    """A linear model of a loop, with its controller.
+
+    Attributes:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, 1).
+        K: Gain of the loop's controller, shape (n,).
+        residue: Largest rate or error at the operating point, relative to the size of the state.
+    """
 
     A: Any
     B: Any
@@ -37,7 +46,11 @@ class LinearLoop(NamedTuple):
 
 @pytree
 class OperatingPoint:
-    """The parts of a loop, and which of its states are `kept`. Make it with `operating_point`."""
+    """A loop at rest, as a linear model in continuous time. `operating_point` makes it.
+
+    Attributes:
+        kept: Indices of the loop's states that the model contains.
+    """
 
     plant: Plant = part()
     initial: Any = part()
@@ -58,26 +71,29 @@ class OperatingPoint:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """What the states are: those of the plant by their names, those of a block with its name before."""
+        """Names of the states. The state of a block has the name of the block in front."""
         names = _names(self.loop)
         return tuple(names[i] for i in self.kept)
 
     def matrices(self) -> StateSpace:
-        """A (n, n) and B (n, 1), differentiable in every parameter; compiled once for each kind of loop."""
+        """Return A (n, n) and B (n, 1), differentiable in every parameter; they compile once for each kind of loop."""
         found, kept = _linearize_at_rest(self), np.array(self.kept, int)
         return StateSpace(found.A[kept][:, kept], found.B[kept])
 
     def gain(self) -> Any:
-        """K (n,) of the loop's own controller."""
+        """Return K (n,) of the loop's own controller."""
         return _linearize_at_rest(self).K[np.array(self.kept, int)]
 
 
 def operating_point(loop: Loop) -> OperatingPoint:
     """Return the linear model of a loop at rest on its setpoint.
 
+    Args:
+        loop: Loop to linearise.
+
     Raises:
-        ValueError: a block that acts at instants (sampled, delayed, a relay), a plant that does not come to rest at the
-            setpoint, a control that is at a limit there.
+        ValueError: A block acts at instants (sampled, delayed, a relay); or the plant does not come to rest at the
+            setpoint; or the control is at a limit there.
     """
     start = loop.start()
     for name in ("sensor", "controller", "actuator"):
@@ -90,25 +106,30 @@ def operating_point(loop: Loop) -> OperatingPoint:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
     if not np.any(found.B) or not np.any(found.K):
         raise ValueError("the control is at a limit at the setpoint, or does not act there: no linear model")
+    # The plant's states come first in the vector of states.
     plant = np.arange(len(found.A)) < len(ravel_pytree(start.plant)[0])
     return dataclasses.replace(model, kept=_needed_states(found, plant))  # pyright: ignore[reportArgumentType]
 
 
 def loop_gain(loop: Loop, states: tuple[str, ...]) -> Any:
-    """Return K (n,) of a loop's controller on the states of an `OperatingPoint`, by their names. Differentiable in the
-    loop's parameters."""
+    """Return K (n,) of a loop's controller on the named states, differentiable in the loop's parameters.
+
+    Args:
+        loop: Loop with the controller.
+        states: Names of the states, as in `OperatingPoint.states`.
+    """
     names = _names(loop)
     return _linearize_at_rest(_drop_stop(loop)).K[np.array([names.index(name) for name in states])]
 
 
 def _drop_stop(loop: Loop) -> OperatingPoint:
-    """The parts of a loop but its stop."""
+    """Return the operating point with all parts of a loop except its stop."""
     fields = {f.name: getattr(loop, f.name) for f in dataclasses.fields(loop) if f.name != "stop"}  # pyright: ignore[reportArgumentType]
     return OperatingPoint(**fields)
 
 
 def _needed_states(found: LinearLoop, plant: np.ndarray) -> tuple[int, ...]:
-    """The states of the plant, those that the command depends on, and those that any of these depends on."""
+    """Return the states of the plant, the states on which the command depends, and all states that influence these."""
     kept = plant | (found.K != 0)
     for _ in kept:
         kept = kept | (found.A[kept] != 0).any(axis=0)
@@ -116,7 +137,7 @@ def _needed_states(found: LinearLoop, plant: np.ndarray) -> tuple[int, ...]:
 
 
 class _IntegratedStates(NamedTuple):
-    """What is integrated, but for the reference."""
+    """Integrated states of a loop, without those of the reference."""
 
     plant: Any
     sensor: Any
@@ -139,27 +160,29 @@ def _names(loop: Loop) -> list[str]:
 
 
 class _VectorLoop(NamedTuple):
-    """A loop on a setpoint, whose integrated states are one vector z; the actuator is given a command v."""
+    """A loop held at its setpoint, with all integrated states in one vector z and the command v as the actuator's
+    input.
+    """
 
     loop: Loop
     setpoint: Any
     unravel: Any
 
-    def tracking(self, z: Any) -> tuple[Any, Tracking]:
-        """What the plant shows, and what the controller sees."""
+    def track(self, z: Any) -> tuple[Any, Tracking]:
+        """Return the plant's output and the controller's input signal."""
         loop, x = self.loop, self.unravel(z)
         y = loop.plant.output(x.plant)
         measured = loop.sensor.output(0.0, Memory(x.sensor), y)
         return y, Tracking(self.setpoint, measured, loop.feedforward.input(loop.plant, measured, self.setpoint))
 
     def command(self, z: Any) -> Any:
-        """The controller's."""
-        return self.loop.controller.output(0.0, Memory(self.unravel(z).controller), self.tracking(z)[1])
+        """Return the controller's command."""
+        return self.loop.controller.output(0.0, Memory(self.unravel(z).controller), self.track(z)[1])
 
     def flow(self, z: Any, v: Any) -> Any:
-        """dz/dt."""
+        """Return dz/dt."""
         loop, x = self.loop, self.unravel(z)
-        y, seen = self.tracking(z)
+        y, seen = self.track(z)
         rates = _IntegratedStates(
             loop.plant.derivative(0.0, x.plant, loop.actuator.output(0.0, Memory(x.actuator), v)),
             loop.sensor.flow(0.0, Memory(x.sensor), y),
@@ -179,32 +202,43 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     inside = np.repeat(np.arange(4) == _IntegratedStates._fields.index("controller"), at)
 
     def still(free: Any) -> Any:
-        """Zero where everything but the controller is at rest, the first signal on the setpoint."""
+        """Return the rates of everything but the controller, and the first signal minus the setpoint; zero at rest."""
         moved = z.at[~inside].set(free[:-1])
-        return jnp.append(one.flow(moved, free[-1])[~inside], one.tracking(moved)[0][0] - setpoint)
+        return jnp.append(one.flow(moved, free[-1])[~inside], one.track(moved)[0][0] - setpoint)
 
+    # First the states outside the controller, together with the command that holds the plant; then the controller.
     free = find_root(still, jnp.append(z[~inside], 0.0))
     z = z.at[~inside].set(free[:-1])
 
-    def holding(memory: Any, z: Any = z) -> Any:
-        """Zero where the controller is at rest and commands what holds the plant."""
+    def rest_residual(memory: Any, z: Any = z) -> Any:
+        """Return the rates of the controller's memory, and its command minus the command that holds the plant; zero at
+        rest.
+        """
         moved = z.at[inside].set(memory)
         return jnp.append(one.flow(moved, free[-1])[inside], one.command(moved) - free[-1])
 
-    z = z.at[inside].set(find_root(holding, z[inside]))
+    z = z.at[inside].set(find_root(rest_residual, z[inside]))
     a, b = jax.jacfwd(one.flow, (0, 1))(z, free[-1])
     residue = jnp.max(jnp.abs(still(free))) / (1 + jnp.max(jnp.abs(free)))
     return LinearLoop(a, b[:, None], jax.jacfwd(one.command)(z), residue)
 
 
 def find_root(function: Any, x: Any) -> Any:
-    """Return where a function is zero, or least in squares, by Gauss and Newton. First and second derivatives are those
-    of the last two steps: each doubles their order."""
+    """Return a root of a function, or its least-squares minimiser, by the Gauss-Newton method.
+
+    The result is differentiable twice in the parameters of the function.
+
+    Args:
+        function: Function of a vector that returns a vector.
+        x: Starting point, shape (n,).
+    """
 
     def step(x: Any, function: Any = function) -> Any:
         return x - jax.lax.stop_gradient(jnp.linalg.pinv(jax.jacfwd(function)(x))) @ function(x)
 
     if not x.size:
         return x
+    # The iteration itself is not differentiated. Two last steps with a constant Jacobian are: the first makes the first
+    # derivative exact, the second also the second derivative.
     fixed = jax.lax.fori_loop(0, ROOT_ITERATIONS, lambda _, x: jax.lax.stop_gradient(step(x)), jax.lax.stop_gradient(x))
     return step(step(jax.lax.stop_gradient(fixed)))

@@ -1,14 +1,18 @@
-"""How far from rest any control at all can bring a linear system back, |u| <= U: the bound that a design is judged by.
+"""The largest initial deviation of a linear system from which any control |u| <= U can return: a bound on every design.
 
-The control reaches the coordinate z = w'x of an unstable mode s, w'A = s w', only through z' = s z + (w'B) u. Whatever
-u does, it cannot return from |z| > |w'B| U/s, and if that is the only unstable mode, every start within is returned (T.
-Hu, Z. Lin, L. Qiu, Stabilization of exponentially unstable linear systems with saturating actuators, IEEE Trans. Autom.
-Control 46, 2001). Of the multiples c d of a start d those up to c = |w'B| U/(s |w'd|) are recoverable. With the P of
-the least energy, A'P + PA - PBB'P = 0 (an LQR without Q), P = 2 s w w'/(w'B)^2 and B'PB = 2 s, so that
+Let w be the left eigenvector of an unstable mode s, w'A = s w'. The control reaches the coordinate z = w'x only through
+z' = s z + (w'B) u. No u returns from |z| > |w'B| U/s. If this is the only unstable mode, some u returns from every
+start with a smaller |z|. The multiples c d of a start d are recoverable up to c = |w'B| U/(s |w'd|).
+
+Let P be the solution for the least control energy, A'P + PA - PBB'P = 0 (an LQR without Q). Then P = 2 s w w'/(w'B)^2
+and B'PB = 2 s, so that
 
     c = 2 U / sqrt((B'P B)(d'P d))
 
-which a Riccati equation differentiates, without eigenvectors.
+A Riccati equation gives this c with its derivatives, without eigenvectors.
+
+Source: T. Hu, Z. Lin, L. Qiu, Stabilization of exponentially unstable linear systems with saturating actuators, IEEE
+Trans. Autom. Control 46, 2001.
 """
 
 from typing import Any
@@ -20,17 +24,35 @@ from diffabs.linear.riccati import care
 
 
 def recoverable_bound(A: Any, B: Any, start: Any, limit: Any) -> Any:
-    """The greatest multiple of `start` (n,) that some |u| <= limit recovers; A (n, n) with one unstable pole, B (n, 1).
-    Differentiable; NaN if A has poles on the imaginary axis. With several unstable poles it is no bound: see
-    `mode_bounds`."""
+    """Return the largest multiple of `start` from which some |u| <= limit returns, for a system with one unstable pole.
+
+    The result is differentiable; it is NaN if A has poles on the imaginary axis. With several unstable poles it is not
+    a bound: use `mode_bounds`.
+
+    Args:
+        A: State matrix, shape (n, n), with one unstable pole.
+        B: Input matrix, shape (n, 1).
+        start: Initial deviation, shape (n,).
+        limit: Largest |u|.
+    """
     b, d = jnp.asarray(B).reshape(-1), jnp.asarray(start)
     p = care(A, b[:, None], jnp.zeros_like(jnp.asarray(A)), jnp.eye(1)).P
     return 2 * limit / jnp.sqrt((b @ p @ b) * (d @ p @ d))
 
 
 def mode_bounds(A: Any, B: Any, start: Any, limit: float) -> dict[float, float]:
-    """By unstable real pole, the greatest multiple of `start` from which that mode alone can be returned. No control
-    recovers more than the least of them; with one unstable pole some control recovers all of it."""
+    """Return for each unstable real pole the largest multiple of `start` from which some |u| <= limit returns this
+    mode.
+
+    Each mode is taken alone. No control returns from more than the smallest of these multiples. With one unstable pole,
+    some control returns from every smaller multiple.
+
+    Args:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, 1).
+        start: Initial deviation, shape (n,).
+        limit: Largest |u|.
+    """
     a, b, d = np.asarray(A, float), np.asarray(B, float).reshape(-1), np.asarray(start, float)
     poles, left = np.linalg.eig(a.T)
     found = {}
@@ -42,14 +64,25 @@ def mode_bounds(A: Any, B: Any, start: Any, limit: float) -> dict[float, float]:
 
 
 def transmission_zeros(A: Any, B: Any, output: Any) -> np.ndarray:
-    """Finite transmission zeros of x' = A x + B u, y = c'x, one input: where the Rosenbrock matrix loses rank. They are
-    the poles of the inverse, which exists on the states that keep y at 0: with relative degree r, the eigenvalues of
-    (I - B (c'A^(r-1)B)^-1 c'A^(r-1)) A other than r zeros of its own making."""
+    """Return the finite transmission zeros of x' = A x + B u, y = c'x with one input: where the Rosenbrock matrix loses
+    rank.
+
+    They are the poles of the inverse system, whose states keep y at 0. With relative degree r they are eigenvalues of
+    the matrix below; its other r eigenvalues are zero and come from the projection.
+
+        (I - B (c'A^(r-1)B)^-1 c'A^(r-1)) A
+
+    Args:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, 1).
+        output: Output row c', shape (n,).
+    """
     a, b, c = np.asarray(A, float), np.asarray(B, float).reshape(-1, 1), np.asarray(output, float).reshape(1, -1)
     degree, row = 1, c
     while abs((row @ b).item()) <= 1e-12 * np.linalg.norm(row) * np.linalg.norm(b):
         degree, row = degree + 1, row @ a
         if degree > len(a):
             return np.array([])
+    # The r eigenvalues of the projection are the ones nearest to zero.
     found = np.linalg.eigvals(a - b @ (row @ a) / (row @ b).item())
     return np.delete(found, np.argsort(np.abs(found))[:degree])

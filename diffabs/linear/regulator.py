@@ -1,10 +1,10 @@
-"""Linear quadratic regulators, u = +K x: the sign is that of the rest of the package, and of the papers.
+"""Linear quadratic regulators, u = +K x: the sign of the rest of the package, and of the papers.
 
     lqr    minimises the integral of x'Q x + 2 x'S u + u'R u,  x' = A x + B u    K = -R^-1 (B'P + S')
     dlqr   minimises the sum,                                  x+ = A x + B u    K = -(R + B'P B)^-1 (B'P A + S')
 
-Pure JAX: compiled, batched and differentiated in every matrix. What a caller can be told before the equation is solved
-is told where the matrices are numbers; inside `jit` and `vmap` the flag `stabilising` says it, and K is NaN.
+Both are pure JAX: compiled, batched and differentiable in every matrix. If the matrices are numbers, errors are raised
+before the equation is solved. Inside `jit` and `vmap` the flag `stabilising` reports a failure, and K is NaN.
 """
 
 from typing import Any, NamedTuple
@@ -17,11 +17,19 @@ from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.linear.riccati import care, dare
 from diffabs.linear.weights import as_weight_matrix
 
-PBH_TOLERANCE = 1e-10  # relative: a mode with no more input than this is not moved by it
+# The input moves a mode s if the smallest singular value of (A - s I, B), relative to the largest, exceeds this.
+PBH_TOLERANCE = 1e-10
 
 
 class Regulator(NamedTuple):
-    """Gain K (m, n), and what `Riccati` says of P (n, n)."""
+    """A regulator u = K x.
+
+    Attributes:
+        gain: Gain K, shape (m, n).
+        P: Solution of the Riccati equation, shape (n, n).
+        residual: Relative residual of P, as in `Riccati`.
+        stabilising: Whether P is proven to be the stabilising solution, as in `Riccati`.
+    """
 
     gain: Any
     P: Any
@@ -30,9 +38,7 @@ class Regulator(NamedTuple):
 
 
 def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
-    """Return the gain that minimises the integral of x'Q x + 2 x'S u + u'R u of x' = A x + B u, and what belongs to it.
-
-    A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none
+    """Return the regulator that minimises the integral of x'Q x + 2 x'S u + u'R u for x' = A x + B u.
 
     >>> import jax
     >>> from diffabs.linear import lqr
@@ -41,19 +47,24 @@ def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
     >>> print(lqr(A, B, [[1.0, 0.0], [0.0, 1.0]], [[1.0]]).gain.round(4))  # -1 and -sqrt(3)
     [[-1.     -1.7321]]
 
+    Args:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, m).
+        Q: Weight of the states, shape (n, n).
+        R: Weight of the inputs, shape (m, m), positive definite.
+        S: Cross weight, shape (n, m); None for zero.
+
     Raises:
-        ValueError: shapes that do not fit; float32, in which no P can be proven; and, for matrices that are numbers and
-            not traced, entries that are not finite, Q or R that are not symmetric, R that is not positive definite, a
-            pair that is not stabilisable.
+        ValueError: The shapes do not fit, or the arrays are float32, in which no P can be proven. For matrices that are
+            not traced also: an entry is not finite, Q or R is not symmetric, R is not positive definite, or the pair
+            (A, B) is not stabilisable.
     """
     _check_matrices(A, B, Q, R, discrete=False)
     return _solve_lqr(A, B, Q, R, S)
 
 
 def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
-    """Return the gain that minimises the sum of x'Q x + 2 x'S u + u'R u of x(k+1) = A x(k) + B u(k).
-
-    A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none; R may be singular where R + B'P B > 0
+    """Return the regulator that minimises the sum of x'Q x + 2 x'S u + u'R u for x(k+1) = A x(k) + B u(k).
 
     >>> import jax
     >>> from diffabs.linear import dlqr
@@ -61,7 +72,17 @@ def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
     >>> print(dlqr([[1.0]], [[1.0]], [[1.0]], [[1.0]]).gain.round(4))  # (1 - sqrt(5))/2
     [[-0.618]]
 
-    Raises ValueError as `lqr`."""
+    Args:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, m).
+        Q: Weight of the states, shape (n, n).
+        R: Weight of the inputs, shape (m, m). If it is traced it may be singular where R + B'P B > 0; else positive
+            definite.
+        S: Cross weight, shape (n, m); None for zero.
+
+    Raises:
+        ValueError: The same cases as in `lqr`.
+    """
     _check_matrices(A, B, Q, R, discrete=True)
     return _solve_dlqr(A, B, Q, R, S)
 
@@ -82,7 +103,7 @@ def _solve_dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
 
 
 def _check_matrices(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool) -> None:
-    """What can be said of numbers."""
+    """Raise ValueError for matrices of numbers that have no regulator; accept traced ones."""
     if any(isinstance(x, Tracer) for x in (A, B, Q, R)):
         return
     a, b = np.asarray(A, float), np.asarray(B, float)
@@ -103,8 +124,15 @@ def _check_matrices(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool) -> None:
 
 
 def unstabilisable_mode(A: Any, B: Any, *, discrete: bool = False) -> complex | None:
-    """An eigenvalue of A, not stable, that the input cannot move: (A - s I, B) has rank below n there (Popov, Belevitch
-    and Hautus). None if there is none."""
+    """Return an unstable eigenvalue of A that the input cannot move, or None.
+
+    At such an eigenvalue s, (A - s I, B) has a rank below n (test of Popov, Belevitch and Hautus).
+
+    Args:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, m).
+        discrete: Whether the system is x+ = A x + B u.
+    """
     a, b = np.asarray(A, float), np.asarray(B, float)
     for mode in np.linalg.eigvals(a):
         unstable = abs(mode) >= 1 if discrete else np.real(mode) >= 0

@@ -3,14 +3,16 @@
     care    A' P + P A - (P B + S) R^-1 (P B + S)' + Q = 0              A - B R^-1 (B' P + S') stable
     dare    A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0
 
-1. R to the identity and S to zero; the state balanced, so that rows and columns of the Hamiltonian are of one size.
-2. The sign of the Hamiltonian by Newton's iteration with determinantal scaling (Byers 1987); discrete time first by a
-   Cayley transformation. Its stable subspace is spanned by (I, P).
-3. Newton-Kleinman steps, each a Lyapunov equation, until P moves no more: step 2 is not backward stable.
-4. The proof: see `Riccati`. What is not proven is returned as NaN.
+1. Transform R to the identity and S to zero. Balance the state, so that rows and columns of the Hamiltonian have about
+   equal size.
+2. Find P by structured doubling (Chu, Fan and Lin 2005); continuous time needs a Cayley transformation first. Where
+   doubling does not converge, use the matrix sign of the Hamiltonian, by Newton's iteration with determinantal scaling
+   (Byers 1987). Here discrete time needs the Cayley transformation. The stable subspace is spanned by (I, P).
+3. Apply Newton-Kleinman steps, each a Lyapunov equation, until P is constant, because step 2 is not backward stable.
+4. Prove the result, see `Riccati`. An unproven P is returned as NaN.
 
-There is no Schur form, which cannot be batched: all lanes of a `vmap` advance together. The derivative is that of the
-implicit function theorem, one Lyapunov equation with the closed loop.
+No step needs a Schur form, so all runs of a `vmap` iterate together. The implicit function theorem gives the
+derivative: one Lyapunov equation with the closed loop.
 """
 
 from collections.abc import Callable
@@ -29,14 +31,25 @@ FLOAT64_HINT = 'a proven P needs float64, for which JAX is asked by jax.config.u
 
 
 class Riccati(NamedTuple):
-    """P (n, n), its relative residual, and whether it is proven to be the stabilising solution. If not, P is NaN.
+    """A solution of a Riccati equation. P is NaN unless it is proven to be the stabilising solution.
 
-    residual: norm of the equation's left side over the sum of the norms of its terms.
-    stabilising: P is finite and symmetric; the residual is at most 1e-9; the closed loop Ac is stable, and by enough:
-    in balanced coordinates X of Ac' X + X Ac + I = 0 exists and eps |X| (sum of the norms of the terms) <= 1e-7 |P|,
-    which bounds to first order the relative error of P. It is false for a pair that cannot be stabilised, for a
-    Hamiltonian with eigenvalues on the imaginary axis (unit circle), for R that is not positive definite (of `dare`:
-    semidefinite), for input that is not finite, and for what is too close to one of these to tell.
+    `stabilising` is true under these conditions. P is finite and symmetric. The residual is at most 1e-9. The closed
+    loop Ac is stable with a margin: in balanced coordinates X of Ac' X + X Ac + I = 0 exists, and
+
+        eps |X| (sum of the norms of the terms) <= 1e-7 |P|
+
+    This bounds the relative error of P to first order. `stabilising` is false in these cases, and for data too close to
+    them:
+
+    - (A, B) is not stabilisable.
+    - The Hamiltonian has eigenvalues on the imaginary axis (in discrete time on the unit circle).
+    - R is not positive definite (in `dare`: not semidefinite).
+    - An input is not finite.
+
+    Attributes:
+        P: Solution, shape (n, n).
+        residual: Norm of the equation's left side over the sum of the norms of its terms.
+        stabilising: Whether P is proven to be the stabilising solution.
     """
 
     P: Any
@@ -45,22 +58,42 @@ class Riccati(NamedTuple):
 
 
 def care(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
-    """Return the stabilising P of A' P + P A - (P B + S) R^-1 (P B + S)' + Q = 0.
+    """Return the stabilising solution P of the continuous Riccati equation, with its proof.
 
-    A (n, n), B (n, m), Q (n, n), R (m, m) > 0, S (n, m) or none; of Q and R the symmetric part counts. Q may be
-    indefinite: P then too, if there is a stabilising one. Works under jit, vmap, and both modes of differentiation, in
-    all arguments; the residual counts as constant. The feedback is u = -R^-1 (B' P + S') x.
+        A' P + P A - (P B + S) R^-1 (P B + S)' + Q = 0,     u = -R^-1 (B' P + S') x
 
-    Raises ValueError for shapes that do not fit, complex matrices, and float32.
+    u is the feedback that belongs to P. The function works under jit, vmap, and both modes of differentiation, in all
+    arguments. The residual counts as constant.
+
+    Args:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, m).
+        Q: Weight of the states, shape (n, n); only its symmetric part counts. It may be indefinite, and P then too.
+        R: Weight of the inputs, shape (m, m), positive definite; only its symmetric part counts.
+        S: Cross weight, shape (n, m); None for zero.
+
+    Raises:
+        ValueError: The shapes do not fit, or the matrices are complex or float32.
     """
     return _riccati(_solve_continuous, A, B, Q, R, S)
 
 
 def dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
-    """Return the stabilising P of A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0.
+    """Return the stabilising solution P of the discrete Riccati equation, with its proof.
 
-    A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none. As `care`, but R may be singular, R >= 0, where
-    R + B' P B > 0. The feedback is u = -(R + B' P B)^-1 (B' P A + S') x. Raises ValueError as `care`.
+        A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0,     u = -(R + B' P B)^-1 (B' P A + S') x
+
+    u is the feedback that belongs to P. Transformations of JAX work as in `care`.
+
+    Args:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, m).
+        Q: Weight of the states, shape (n, n); only its symmetric part counts. It may be indefinite, and P then too.
+        R: Weight of the inputs, shape (m, m), positive semidefinite; it may be singular where R + B' P B > 0.
+        S: Cross weight, shape (n, m); None for zero.
+
+    Raises:
+        ValueError: The same cases as in `care`.
     """
     return _riccati(_solve_discrete, A, B, Q, R, S)
 
@@ -92,39 +125,42 @@ def _solve_compiled(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) 
 
 @jax.custom_jvp
 def _solve_continuous(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(P, residual) of the continuous equation."""
+    """Return (P, residual) of the continuous equation."""
     return solve_one(solve_care, data)
 
 
 @jax.custom_jvp
 def _solve_discrete(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(P, residual) of the discrete equation."""
+    """Return (P, residual) of the discrete equation."""
     return solve_one(solve_dare, data)
 
 
 @_solve_continuous.defjvp
 def _solve_continuous_jvp(data: Any, tangents: Any) -> Any:
-    """Ac' dP + dP Ac + (derivative of the left side at constant P) = 0."""
+    """Solve Ac' dP + dP Ac + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_continuous(*data)
 
-    def left(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
+    def left_side(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
         PA, T = P @ A, P @ B + S
         return PA + PA.T - T @ jnp.linalg.solve(R, T.T) + Q
 
     A, B, _, R, S = data
     closed = A - B @ jnp.linalg.solve(R, B.T @ P + S.T)
-    return (P, residual), (_lyapunov(closed, jax.jvp(left, data, tangents)[1]).P, jnp.zeros_like(residual))
+    return (P, residual), (_lyapunov(closed, jax.jvp(left_side, data, tangents)[1]).P, jnp.zeros_like(residual))
 
 
 @_solve_discrete.defjvp
 def _solve_discrete_jvp(data: Any, tangents: Any) -> Any:
-    """Ac' dP Ac - dP + (derivative of the left side at constant P) = 0."""
+    """Solve Ac' dP Ac - dP + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_discrete(*data)
 
-    def left(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
+    def left_side(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
         T = A.T @ P @ B + S
         return A.T @ P @ A - T @ jnp.linalg.solve(R + B.T @ P @ B, T.T) + Q
 
     A, B, _, R, S = data
     closed = A - B @ jnp.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + S.T)
-    return (P, residual), (_discrete_lyapunov(closed, jax.jvp(left, data, tangents)[1]).P, jnp.zeros_like(residual))
+    return (P, residual), (
+        _discrete_lyapunov(closed, jax.jvp(left_side, data, tangents)[1]).P,
+        jnp.zeros_like(residual),
+    )

@@ -1,6 +1,7 @@
-"""Riccati equations of many lanes at once: stacks (rows, columns, lanes), and a batch of `vmap` joins the lanes.
+"""Solvers for many Riccati equations at once, on stacks of shape (rows, columns, batch).
 
-See `riccati` for what is solved and how; here are its steps.
+Nested `vmap` calls join their axes into one batch. `riccati` states the equations and the method; this file contains
+its steps.
 """
 
 from collections.abc import Callable
@@ -24,34 +25,36 @@ from diffabs.linear.lyapunov import (
     transpose,
 )
 
-CHUNK_MATRICES = (
-    128  # that advance together: their matrices stay in the cache, and a hard one delays no more than these
-)
-BALANCING_SWEEPS, MAX_DOUBLINGS, MAX_SIGN_ITERATIONS, MAX_KLEINMAN_STEPS = (
-    12,
-    40,
-    40,
-    16,
-)  # at most: of balancing, doubling, the sign iteration, Newton-Kleinman
+# Equations that iterate together: their matrices fit the cache, and a slow equation delays only its own chunk.
+CHUNK_MATRICES = 128
+BALANCING_SWEEPS, MAX_DOUBLINGS, MAX_SIGN_ITERATIONS, MAX_KLEINMAN_STEPS = 12, 40, 40, 16
 MAX_RELATIVE_ERROR = 1e-7  # largest admitted estimate of the relative error of P in balanced coordinates
-PIVOT_ROUNDING = 1e-12  # of R: pivots below are taken for 0
+PIVOT_ROUNDING = 1e-12  # pivots of R below this count as 0, relative to the diagonal
 MAX_RELATIVE_RESIDUAL = 1e-9  # largest admitted relative residual in the given coordinates
 
 
 @partial(jax.jit, static_argnums=0)
 def solve_one(solver: Callable, data: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-    """(P, residual) of one lane."""
+    """Return (P, residual) of one equation.
+
+    Args:
+        solver: `solve_care` or `solve_dare`.
+        data: Matrices A, B, Q, R, S of the equation.
+    """
     P, residual = solver(*(x[None] for x in data))
     return P[0], residual[0]
 
 
 def _batch_over_matrices(solver: Callable) -> Callable:
-    """`solver` on arrays (lanes, rows, columns), LANES at a time, whose vmap has more lanes."""
+    """Return `solver` for arrays (batch, rows, columns): it runs in chunks of CHUNK_MATRICES, and vmap enlarges the
+    batch.
+    """
 
     @custom_vmap
     def many(*data: jax.Array) -> Any:
         lanes = len(data[0])
         width = min(CHUNK_MATRICES, lanes)
+        # The padding repeats the last equation. Zeros have no solution, and would start the fallback for the chunk.
         padding = -lanes % width
         chunks = [jnp.pad(x, ((0, padding), (0, 0), (0, 0)), mode="edge") for x in data]
         chunks = [x.reshape(-1, width, *x.shape[1:]) for x in chunks]
@@ -70,9 +73,18 @@ def _batch_over_matrices(solver: Callable) -> Callable:
 
 @_batch_over_matrices
 def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
-    """(P, residual) in continuous time, for A, B, Q, R, S; P is NaN where it is not proven."""
+    """Return (P, residual) of continuous equations; P is NaN where it is not proven.
+
+    Args:
+        A: State matrices, shape (batch, n, n).
+        B: Input matrices, shape (batch, n, m).
+        Q: Weights of the states, shape (batch, n, n), symmetric.
+        R: Weights of the inputs, shape (batch, m, m), symmetric positive definite.
+        S: Cross weights, shape (batch, n, m).
+    """
     B, S, a, b, q, d = _reduce_and_balance(A, B, Q, R, S)
     G = times(b, transpose(b))
+    # The scale is the geometric mean of the moduli of the Hamiltonian's eigenvalues.
     hamiltonian = _blocks(a, -G, -q, -transpose(a))
     scale = jnp.exp(gauss_jordan_solve(hamiltonian, hamiltonian[:, :0])[1] / len(hamiltonian))
     P, found = _solve_by_doubling(*_cayley(a, G, q, scale))
@@ -84,16 +96,25 @@ def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
 
 @_batch_over_matrices
 def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
-    """The same in discrete time, where R may be singular."""
+    """Return (P, residual) of discrete equations; P is NaN where it is not proven.
+
+    Args:
+        A: State matrices, shape (batch, n, n).
+        B: Input matrices, shape (batch, n, m).
+        Q: Weights of the states, shape (batch, n, n), symmetric.
+        R: Weights of the inputs, shape (batch, m, m), symmetric positive semidefinite; singular where R + B' P B > 0.
+        S: Cross weights, shape (batch, n, m).
+    """
     pivots, diagonal = (jnp.sum(x * eye(len(R), R), 1) for x in (cholesky(R), R))
     definite = jnp.all(pivots**2 > PIVOT_ROUNDING * diagonal, 0)
+    # `lax.cond` skips the shift if every R in the chunk is definite, which is the usual case.
     regular, same = jnp.all(definite), (Q, R, S, jnp.zeros_like(A))
     Q, R, S, shift = lax.cond(regular, lambda: same, lambda: _shift_weights(A, B, Q, R, S, definite))
     B, S, a, b, q, d = _reduce_and_balance(A, B, Q, R, S)
     I, G = eye(len(a), a), times(b, transpose(b))
 
     def by_sign() -> jax.Array:
-        """A Cayley transformation takes the unit circle to the imaginary axis."""
+        """Return P from the matrix sign. A Cayley transformation maps the unit circle to the imaginary axis."""
         minus = _blocks(a - I, -G, -q, I - transpose(a))
         return _solution_from_sign(_sign(gauss_jordan_solve(minus, _blocks(a + I, G, -q, I + transpose(a)))[0]))
 
@@ -102,12 +123,12 @@ def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
     P = _refine_and_prove(partial(_hewer, a, b, q), P, shift * d * d[:, None])
     P, residual = _unscale_with_residual(P, d, partial(_discrete_terms, A, B, Q, S))
 
-    def curved() -> jax.Array:
-        """P where R + B' P B > 0."""
+    def keep_minimum() -> jax.Array:
+        """Return P of the unshifted equation, NaN where R is singular and R + B' P B is not positive definite."""
         minimum = jnp.isfinite(frobenius_norm(cholesky(eye(B.shape[1], B) + times(transpose(B), P, B))))
         return jnp.where(definite | minimum, P + shift, jnp.nan)
 
-    return lax.cond(regular, lambda: P, curved), residual
+    return lax.cond(regular, lambda: P, keep_minimum), residual
 
 
 def _blocks(*blocks: jax.Array) -> jax.Array:
@@ -118,7 +139,10 @@ def _blocks(*blocks: jax.Array) -> jax.Array:
 
 
 def _reduce_and_balance(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
-    """B L^-T and S L^-T, L L' = R; A - B R^-1 S', B L^-T, Q - S R^-1 S' balanced, for which R = I and S = 0; and d."""
+    """Return B L^-T and S L^-T, the balanced equation with R = I and S = 0, and scales d of the state.
+
+    L is the Cholesky factor, L L' = R. The balanced matrices are those of A - B R^-1 S', B L^-T and Q - S R^-1 S'.
+    """
     inverse = transpose(gauss_jordan_solve(cholesky(R), eye(len(R), R))[0])
     B, S = times(B, inverse), times(S, inverse)
     a, q = A - times(B, transpose(S)), Q - times(S, transpose(S))
@@ -127,11 +151,10 @@ def _reduce_and_balance(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
 
 
 def _shift_weights(A: Any, B: Any, Q: Any, R: Any, S: Any, definite: jax.Array) -> tuple[Any, ...]:
-    """Q, R, S of the discrete equation for P less a diagonal matrix, and that matrix: 0 in lanes where R is definite,
-    NaN where it is not even semidefinite.
+    """Return Q, R, S of the discrete equation for P - shift, and the diagonal matrix `shift`.
 
-    The weight of the inputs then is R + B' shift B, definite if any R + B' P B is. In balanced coordinates the shift is
-    as large as Q.
+    The shift is 0 where R is definite, and NaN where R is not semidefinite. In balanced coordinates it is as large as
+    Q. The weight of the inputs becomes R + B' shift B. This is definite if R + B' P B is definite for any P.
     """
     weight, one = frobenius_norm(R), eye(len(R), R)
     semidefinite = jnp.isfinite(frobenius_norm(cholesky(R + jnp.where(weight > 0, PIVOT_ROUNDING * weight, 1.0) * one)))
@@ -144,24 +167,31 @@ def _shift_weights(A: Any, B: Any, Q: Any, R: Any, S: Any, definite: jax.Array) 
 
 
 def _balance(A: jax.Array, G: jax.Array, Q: jax.Array) -> jax.Array:
-    """Powers of two d (n, lanes), x = d z, for which row and column i of the Hamiltonian have about equal sums, its
-    diagonal left out."""
+    """Return scales d (n, batch), powers of two, x = d z, with which row i and column i of the Hamiltonian have similar
+    sums.
+
+    The sums leave out the diagonal.
+    """
     A, G, Q = jnp.abs(A) * (1 - eye(len(A), A)), jnp.abs(G), jnp.abs(Q)
 
+    # An exponent of 1/2 would equalise one row and column. All change at once, so 1/4 damps the sweep.
     def sweep(_: Any, d: jax.Array) -> jax.Array:
         row = (jnp.sum(A * d, 1) + jnp.sum(G / d, 1)) / d
         column = (jnp.sum(A / d[:, None], 0) + jnp.sum(Q * d, 1)) * d
         fine = (row > 0) & (column > 0)
         return d * jnp.where(fine, row / jnp.where(fine, column, 1.0), 1.0) ** 0.25
 
+    # Powers of two scale without rounding.
     d = lax.fori_loop(0, BALANCING_SWEEPS, sweep, jnp.ones_like(A[0]))
     return jnp.ldexp(jnp.ones_like(d), jnp.round(jnp.log2(d)).astype(int))
 
 
 def _cayley(A: jax.Array, G: jax.Array, Q: jax.Array, scale: jax.Array) -> tuple[jax.Array, ...]:
-    """(A, G, Q) of a discrete equation with the same P:  (A, -G; Q, A') <- I + 2 g (A - g, G; -Q, A' - g)^-1.
+    """Return (A, G, Q) of a discrete equation with the same P.
 
-    Chu, Fan and Lin (2005), eqs. (2.8), in one inverse. g is not an eigenvalue of A in ordinary examples.
+        (A, -G; Q, A') <- I + 2 g (A - g, G; -Q, A' - g)^-1
+
+    These are eqs. (2.8) of Chu, Fan and Lin (2005) in one inverse. In ordinary examples g is not an eigenvalue of A.
     """
     n, g = len(A), 1.09 * scale
     shifted = A - g * eye(n, A)
@@ -171,14 +201,16 @@ def _cayley(A: jax.Array, G: jax.Array, Q: jax.Array, scale: jax.Array) -> tuple
 
 
 def _solve_by_doubling(A: jax.Array, G: jax.Array, Q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """P of a discrete equation by structured doubling, and whether it converged. It does where P is stabilising and the
-    dual equation has a solution too; an unstable mode that costs nothing is an exception.
+    """Return P of a discrete equation by structured doubling, and whether it converged.
 
         W = (I + G Q)^-1 (A, G);   A <- A W_A,   G <- G + A W_G A',   Q <- Q + A' Q W_A
+
+    It converges where P is stabilising and the dual equation has a solution too. An unstable mode without cost is an
+    exception.
     """
     n = len(A)
 
-    def going(carry: Any) -> jax.Array:
+    def goes_on(carry: Any) -> jax.Array:
         k, A, _, _ = carry
         return (k < MAX_DOUBLINGS) & jnp.any(frobenius_norm(A) > 1e-5)  # the error of Q is its square
 
@@ -189,19 +221,19 @@ def _solve_by_doubling(A: jax.Array, G: jax.Array, Q: jax.Array) -> tuple[jax.Ar
         G, Q = G + times(A, W[:, n:], T), Q + times(T, Q, W[:, :n])
         return k + 1, times(A, W[:, :n]), (G + transpose(G)) / 2, (Q + transpose(Q)) / 2
 
-    _, A, _, Q = lax.while_loop(going, double, (0, A, G, Q))
+    _, A, _, Q = lax.while_loop(goes_on, double, (0, A, G, Q))
     return Q, (frobenius_norm(A) <= 1e-5) & jnp.isfinite(frobenius_norm(Q))
 
 
 def _fill_unsolved(found: jax.Array, P: jax.Array, otherwise: Callable) -> jax.Array:
-    """P, and `otherwise()` in lanes where it was not found: worked out only if there are any."""
+    """Return P with `otherwise()` where P is not found; `otherwise` runs only if a solution is missing."""
     return lax.cond(jnp.all(found), lambda: P, lambda: jnp.where(found, P, otherwise()))
 
 
 def _sign(Z: jax.Array) -> jax.Array:
-    """Newton's iteration Z <- (c Z + (c Z)^-1)/2, c = abs(det Z)^(-1/size)."""
+    """Return the matrix sign by Newton's iteration Z <- (c Z + (c Z)^-1)/2, c = abs(det Z)^(-1/size)."""
 
-    def going(carry: Any) -> jax.Array:
+    def goes_on(carry: Any) -> jax.Array:
         k, _, moved = carry
         return (k < MAX_SIGN_ITERATIONS) & jnp.any(moved > 1e-5)  # converges quadratically
 
@@ -212,11 +244,11 @@ def _sign(Z: jax.Array) -> jax.Array:
         new = (c * Z + inverse / c) / 2
         return k + 1, new, frobenius_norm(new - Z) / frobenius_norm(new)
 
-    return lax.while_loop(going, step, (0, Z, jnp.ones_like(Z[0, 0])))[1]
+    return lax.while_loop(goes_on, step, (0, Z, jnp.ones_like(Z[0, 0])))[1]
 
 
 def _solution_from_sign(Z: jax.Array) -> jax.Array:
-    """P of (Z + I) (I, P)' = 0, 2n equations, in the sense of least squares."""
+    """Return P of (Z + I) (I, P)' = 0, which are 2n equations, in the least-squares sense."""
     n = len(Z) // 2
     N, M = jnp.split(Z + eye(2 * n, Z), [n], 1)
     P = gauss_jordan_solve(times(transpose(M), M), -times(transpose(M), N))[0]
@@ -227,18 +259,20 @@ def _solution_from_sign(Z: jax.Array) -> jax.Array:
 
 
 def _refine_and_prove(newton: Callable, P: jax.Array, shift: Any = 0.0) -> jax.Array:
-    """Newton-Kleinman until P moves by less than 1e-7, then the last step and its proof; NaN where there is none.
+    """Return P after Newton-Kleinman steps until it moves by less than 1e-7, or NaN where the last step proves no
+    solution.
 
     Errors are relative to P + shift.
     """
 
-    def going(carry: Any) -> jax.Array:
+    def goes_on(carry: Any) -> jax.Array:
         return ~carry[0]
 
     def step(carry: Any) -> Any:
         _, k, P, moved, *_ = carry
         last = (k >= MAX_KLEINMAN_STEPS) | ~jnp.any(moved > 1e-7)
-        terms, D, X = newton(P, eye(len(P), P))  # X is of use in the last step; a copy of this for it compiles as long
+        # Only the last step needs X. A second copy of the step for it would take as long to compile.
+        terms, D, X = newton(P, eye(len(P), P))
         return (
             last,
             k + 1,
@@ -250,14 +284,14 @@ def _refine_and_prove(newton: Callable, P: jax.Array, shift: Any = 0.0) -> jax.A
         )
 
     none = jnp.zeros_like(P[0, 0])
-    carry = lax.while_loop(going, step, (jnp.array(False), 0, P, none + 1, none, none, none))
+    carry = lax.while_loop(goes_on, step, (jnp.array(False), 0, P, none + 1, none, none, none))
     _, _, P, _, terms, moved, proof = carry
     error, limit = jnp.finfo(P.dtype).eps * proof * terms, MAX_RELATIVE_ERROR * frobenius_norm(P + shift)
     return jnp.where((error <= limit) & (moved <= limit), P, jnp.nan)
 
 
 def _unscale_with_residual(P: jax.Array, d: jax.Array, terms: Callable) -> tuple[jax.Array, jax.Array]:
-    """P and its residual in the given coordinates, x = d z."""
+    """Return P and its residual in the given coordinates, x = d z; P is NaN if the residual is too large."""
     P = (P + transpose(P)) / 2 / (d * d[:, None])
     parts = terms(P)
     residual = relative_residual(reduce(add, parts), *parts)
@@ -265,12 +299,13 @@ def _unscale_with_residual(P: jax.Array, d: jax.Array, terms: Callable) -> tuple
 
 
 def _terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
-    """Those of the continuous equation with R = I."""
+    """Return the terms of the continuous equation with R = I."""
     PA, T = times(P, A), times(P, B) + S
     return PA, transpose(PA), -times(T, transpose(T)), Q
 
 
 def _discrete_terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
+    """Return the terms of the discrete equation with R = I."""
     PA, PB = times(P, A), times(P, B)
     T = times(transpose(B), PA) + transpose(S)
     gain = gauss_jordan_solve(eye(B.shape[1], B) + times(transpose(B), PB), T)[0]
@@ -278,9 +313,13 @@ def _discrete_terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
 
 
 def _kleinman(A: Any, B: Any, Q: Any, scale: Any, P: Any, *extra: Any) -> tuple[Any, ...]:
-    """The size of the terms; D of Ac' D + D Ac + (left side at P) = 0; X of Ac' X + X Ac + E = 0 for E of `extra`.
+    """Return the size of the terms, the Newton step D, and one X for each E of `extra`.
 
-    The Cayley transformation C = (Ac + g)(Ac - g)^-1 makes it C' D C - D + 2 g M' (..) M = 0, M = (Ac - g)^-1.
+        Ac' D + D Ac + (left side at P) = 0,     Ac' X + X Ac + E = 0
+
+    The Cayley transformation C = (Ac + g)(Ac - g)^-1 turns each into a Stein equation:
+
+        C' D C - D + 2 g M' (left side or E) M = 0,     M = (Ac - g)^-1
     """
     I, terms = eye(len(A), A), _terms(A, B, Q, jnp.zeros_like(B), P)
     M = gauss_jordan_solve(A - times(B, transpose(B), P) - scale * I, I)[0]
@@ -289,7 +328,12 @@ def _kleinman(A: Any, B: Any, Q: Any, scale: Any, P: Any, *extra: Any) -> tuple[
 
 
 def _hewer(A: Any, B: Any, Q: Any, P: Any, *extra: Any) -> tuple[Any, ...]:
-    """The same in discrete time: Ac' D Ac - D + (left side at P) = 0."""
+    """Return the size of the terms, the Newton step D, and one X for each E of `extra`, in discrete time.
+
+        Ac' D Ac - D + (left side at P) = 0,     Ac' X Ac - X + E = 0
+
+    Ac is the closed loop at P.
+    """
     terms, PB = _discrete_terms(A, B, Q, jnp.zeros_like(B), P), times(P, B)
     gain = gauss_jordan_solve(eye(B.shape[1], B) + times(transpose(B), PB), times(transpose(PB), A))[0]
     return sum(map(frobenius_norm, terms)), *solve_stein(A - times(B, gain), reduce(add, terms), *extra)

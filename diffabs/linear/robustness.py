@@ -1,4 +1,4 @@
-"""Margins of a loop over a box of parameters: its corners, and samples inside."""
+"""Margins of a loop over a box of parameters: at its corners, and at samples inside."""
 
 import itertools
 import math
@@ -14,7 +14,7 @@ from diffabs.linear.stability_margins import Margins, margins
 
 MAX_BAND_CORNERS = 2**10
 
-# How bad a margin is: the greatest is the worst.
+# A number for each margin that is larger for a worse margin.
 BADNESS: Mapping[str, Callable[[Margins], float]] = {
     "gain_up": lambda m: -m.gain[1],
     "gain_down": lambda m: m.gain[0],
@@ -27,7 +27,13 @@ BADNESS: Mapping[str, Callable[[Margins], float]] = {
 
 
 class System(NamedTuple):
-    """A loop at some values of its parameters, by path: opened, and its margins."""
+    """A loop at one point of the box.
+
+    Attributes:
+        values: Values of the parameters, by path.
+        loop: The open loop.
+        margins: Its margins.
+    """
 
     values: dict[str, float]
     loop: OpenLoop
@@ -35,18 +41,23 @@ class System(NamedTuple):
 
 
 class Band(NamedTuple):
-    """The systems of a box: its `corners` first, then samples inside."""
+    """The systems of a box of parameters.
+
+    Attributes:
+        systems: The systems at the corners, then those at the samples inside.
+        corners: Number of corners.
+    """
 
     systems: tuple[System, ...]
     corners: int
 
     @property
     def unstable(self) -> tuple[System, ...]:
-        """Those whose closed loop is not stable."""
+        """Systems with an unstable closed loop."""
         return tuple(one for one in self.systems if not one.margins.stable)
 
     def worst(self) -> dict[str, System]:
-        """The system that each margin is worst of, by the names in `BADNESS`; empty unless all are stable."""
+        """Return for each margin in `BADNESS` the system with the worst value; empty unless all systems are stable."""
         if self.unstable:
             return {}
         return {name: max(self.systems, key=lambda one, bad=bad: bad(one.margins)) for name, bad in BADNESS.items()}
@@ -55,10 +66,15 @@ class Band(NamedTuple):
 def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, target: Any = None) -> Band:
     """Return the margins of a loop over a box {path: (low, high)}: at its corners, and at samples that fill it evenly.
 
-    target: as for `open_loop`
+    Args:
+        loop: Loop to examine.
+        over: Range (low, high) of each parameter, by path, in the parameter's unit.
+        samples: Number of samples inside the box.
+        target: Setpoint, as in `open_loop`.
+
     Raises:
-        ValueError: an inverted range, too many corners, a loop without a linear model.
-        KeyError: a path that is none.
+        ValueError: A range is inverted, the box has too many corners, or the loop has no linear model.
+        KeyError: A path does not exist.
     """
     free = {path: (float(low), float(high)) for path, (low, high) in over.items()}
     for path, (low, high) in free.items():
@@ -81,8 +97,15 @@ def _system(loop: Loop, values: dict[str, float], target: Any) -> System:
 
 
 def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:
-    """Return points (count, dimensions) that fill the unit cube evenly, always the same: multiples of powers of the
-    root of x^(d+1) = x + 1 (Roberts, 2018), the golden ratio in one dimension."""
+    """Return points (count, dimensions) that fill the unit cube evenly, the same in every call.
+
+    The points are multiples of powers of the root of x^(d+1) = x + 1 (Roberts, 2018). In one dimension the root is the
+    golden ratio.
+
+    Args:
+        count: Number of points.
+        dimensions: Number of dimensions d.
+    """
     root = 2.0
     for _ in range(64):
         root = (1 + root) ** (1 / (dimensions + 1))
@@ -91,8 +114,14 @@ def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:
 
 
 def frequencies(systems: Sequence[OpenLoop], decades: float = 1.5, count: int = 400) -> np.ndarray:
-    """Return frequencies (count,) [rad/s] for a figure of these loops: so many decades around their crossovers, not
-    beyond half the sampling rate."""
+    """Return frequencies (count,) [rad/s] for a plot of these loops, around their crossovers up to half the sampling
+    rate.
+
+    Args:
+        systems: Open loops.
+        decades: Decades below the lowest and above the highest crossover.
+        count: Number of frequencies.
+    """
     found = [m.crossover for m in map(margins, systems) if math.isfinite(m.crossover)] or [1.0]
     low, high = min(found) * 10**-decades, max(found) * 10**decades
     half = [math.pi / loop.period for loop in systems if loop.period]

@@ -1,7 +1,8 @@
 """The slip loop as a linear system: plant, sensor filter, actuator lag and sampling, at a frozen speed.
 
-The model for which a feedback u = K x is designed. Maeda and Sugiura, eqs. (15)-(21), are `SlipModel()`:
-x = (integral of (slip - target), slip - target), u = tau - tau*."""
+The feedback u = K x is designed for this model. `SlipModel()` is the model of Maeda and Sugiura, eqs. (15)-(21):
+x = (integral of (slip - target), slip - target), u = tau - tau*.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -29,25 +30,30 @@ from diffabs.plants.wheel import FROZEN_OUTPUTS
 
 @pytree
 class LowPass:
-    """x_f' = cutoff (slip error - x_f): what a PID's derivative is taken from."""
+    """A first-order low-pass filter of the slip error, as in a PID's derivative term.
+
+        x_f' = cutoff (slip error - x_f)
+
+    x_f is the filtered slip error.
+    """
 
     cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
 
 
 @pytree
 class Continuous:
-    """The controller runs in continuous time."""
+    """A controller in continuous time."""
 
 
 @pytree
 class Sampling:
-    """The controller runs every `period`; its output is held, and changes `delay` after the sample was taken."""
+    """A controller that runs every `period`. Its output is held, and changes `delay` after the sample."""
 
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
     def problems(self) -> Iterator[str]:
-        """A computation that takes longer than the period."""
+        """Yield an error if the delay exceeds the period."""
         if not self.delay <= self.period:
             yield f"delay = {self.delay:g} s exceeds the period of {self.period:g} s"
 
@@ -56,10 +62,14 @@ class Sampling:
 class SlipModel:
     """The slip error at a frozen speed, under u = control - holding control.
 
-    States in this order, those in brackets where they exist: [integral of the slip error, x1' = x2], slip error x2 =
-    slip - target, [what the plant has besides slip, speed and distance], [actuator], [previous sample's control], [slip
-    error behind `filter`]. Discrete in time if `sampling` says so: integral and filter by forward Euler from the sample
-    that the control is computed from, the rest exactly, as `Sampled` does.
+    The states have this order; states in brackets exist only in some models:
+
+        [integral of the slip error, x1' = x2], slip error x2 = slip - target,
+        [states of the plant besides slip, speed and distance], [actuator],
+        [control of the previous sample], [slip error behind `filter`]
+
+    With `Sampling` the model is discrete, as `Sampled` computes. Integral and filter use forward Euler from the sample
+    that the control uses; the other states are exact.
     """
 
     plant: Plant = part(default=MirroredRig)
@@ -72,12 +82,12 @@ class SlipModel:
 
     @property
     def period(self) -> float | None:
-        """Sampling period [s], None in continuous time."""
+        """Sampling period [s]; None in continuous time."""
         return float(self.sampling.period) if isinstance(self.sampling, Sampling) else None
 
     @property
     def states(self) -> tuple[str, ...]:
-        """What the states are."""
+        """Names of the states."""
         self._check_supported()
         start = jax.eval_shape(self.plant.start, BrakeStart(speed=self.speed, slip=self.slip))
         paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(start)]
@@ -93,16 +103,18 @@ class SlipModel:
         )
 
     def matrices(self) -> StateSpace:
-        """A (n, n) and B (n, 1), differentiable in every parameter; compiled once for each kind of model.
+        """Return A (n, n) and B (n, 1), differentiable in every parameter; they compile once for each kind of model.
 
         Raises:
-            ValueError: a part that a linear slip model does not know.
+            ValueError: The model has a part that a linear slip model does not support.
         """
         self._check_supported()
         return _matrices(self)
 
     def point(self) -> tuple[Any, Any]:
-        """State and control of the linearisation: the slip is held, what remains is at rest, the speed falls."""
+        """Return state and control of the linearisation: the slip is held, the remaining states are at rest, the speed
+        falls.
+        """
         start = self.plant.start(BrakeStart(speed=self.speed, slip=self.slip))
         control = self.plant.holding(self.plant.output(start), self.slip)
         kept = independent_components(self.plant, start, ("slip", *FROZEN_OUTPUTS))
@@ -116,11 +128,12 @@ class SlipModel:
         def newton(_: Any, z: Any) -> Any:
             return z - jnp.linalg.solve(jax.jacfwd(rate)(z), rate(z))
 
+        # A fixed number of iterations: a loop until convergence has no reverse-mode derivative.
         rest = jax.lax.fori_loop(0, REMAINING_STATE_ITERATIONS, newton, x[kept])
         return ravel_pytree(start)[1](x.at[kept].set(rest)), control
 
     def controlled_system(self) -> StateSpace:
-        """Plant and actuator, sampled if the controller is: what the control acts on, the slip error first."""
+        """Return plant and actuator, sampled if the controller is; the slip error is the first state."""
         system = tracking_dynamics(self.plant, *self.point())
         if isinstance(self.actuator, Lag):
             system = _behind_lag(system, self.actuator.time_constant)
@@ -129,12 +142,15 @@ class SlipModel:
         return system
 
     def with_memory(self, system: StateSpace) -> StateSpace:
-        """The system, whose first state is the slip error, with integral and filter of the controller."""
+        """Return `system`, whose first state is the slip error, extended by the controller's integral and filter
+        states.
+        """
         p, first = len(system.A), int(self.integral)
         n = p + first + isinstance(self.filter, LowPass)
         step, keep = (self.sampling.period, 1.0) if isinstance(self.sampling, Sampling) else (1.0, 0.0)
         a = jnp.zeros((n, n), system.A.dtype).at[first : first + p, first : first + p].set(system.A)
         if self.integral:
+            # Continuous: x1' = x2. Sampled: x1+ = x1 + T x2, from the sample at the beginning of the period.
             a = a.at[0, :2].set(jnp.stack([keep, step]))
         if isinstance(self.filter, LowPass):
             rate = step * self.filter.cutoff
@@ -157,7 +173,7 @@ def _matrices(model: SlipModel) -> StateSpace:
 
 
 def _behind_lag(system: StateSpace, time_constant: Any) -> StateSpace:
-    """The system whose input is the last state, T x' = u - x."""
+    """Return the system behind a lag T x' = u - x, whose state becomes the last one."""
     a, b = system
     n, rate = len(a), 1 / time_constant
     wider = jnp.zeros((n + 1, n + 1), a.dtype).at[:n, :n].set(a).at[:n, n:].set(b).at[n, n].set(-rate)

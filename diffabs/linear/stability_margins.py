@@ -1,11 +1,12 @@
-"""How far a loop is from instability: gain, phase and delay margins, modulus margin, peaks of the sensitivities.
+"""Gain, phase and delay margins of a loop, its modulus margin, and the peaks of its sensitivities.
 
     L  the open loop, of one input and one output, with feedback u = -L v;   S = 1/(1 + L),   T = L/(1 + L)
 
-Whether the closed loop is stable is decided by its poles; with a pure delay in continuous time by counting the poles
-that cross the imaginary axis while the delay grows from zero, which they do where |L| = 1 and nowhere else (Cooke and
-van den Driessche, On zeroes of some transcendental equations, 1986). Crossings are bracketed on a grid that is refined
-until neighbours lie close, and bisected to rounding."""
+The poles decide whether the closed loop is stable. With a pure delay in continuous time, the poles that cross the
+imaginary axis are counted while the delay grows from zero. They cross only where |L| = 1 (Cooke and van den Driessche,
+On zeroes of some transcendental equations, 1986). Crossings are bracketed on a grid, which is refined until neighbours
+are close, and bisected to rounding.
+"""
 
 import math
 from collections.abc import Callable
@@ -18,30 +19,30 @@ from diffabs.linear.transfer import Transfer
 
 GRID_DECADES, PER_DECADE = 4, 60  # beyond the slowest and the fastest pole; points of the grid before it is refined
 NEIGHBOUR_DISTANCE, MAX_GRID_REFINEMENTS = 0.05, 14  # relative distance of neighbours; how often the grid is refined
-SMALL_LOOP_GAIN, DELAY_TURN_ANGLE = (
-    1e-3,
-    0.2,
-)  # |L| from which on a delay's turns are not resolved; angle of a delay between points [rad]
+# |L| below which the turns of a delay are not resolved; angle by which a delay turns L between points [rad].
+SMALL_LOOP_GAIN, DELAY_TURN_ANGLE = 1e-3, 0.2
 MAX_GRID_FREQUENCIES = 200_000  # points of a grid
 ROOT_BISECTIONS, GOLDEN = 70, (math.sqrt(5) - 1) / 2
 REAL_TOLERANCE = 1e-9  # relative: |L(0)| and L at half the sampling rate are real but for rounding
-DELAY_SEARCH_STEPS, MAX_DELAY_MULTIPLE = (
-    40,
-    4.0,
-)  # of a search for the delay margin of a sampled loop: steps, multiples of the first guess
+# Search for the delay margin of a sampled loop: steps up to the first guess, and its largest multiple to try.
+DELAY_SEARCH_STEPS, MAX_DELAY_MULTIPLE = 40, 4.0
 
 
 class Margins(NamedTuple):
-    """Margins of a loop; numbers of an unstable one are NaN.
+    """Margins of a loop; all but `stable` and `crossover` are NaN for an unstable closed loop.
 
-    stable: whether the closed loop is
-    gain: by which factors the loop's gain can be multiplied, (low, high): 0 and infinity where nothing happens
-    gain_at: where [rad/s], NaN for those
-    phase: what phase can be lost [rad], infinity without a crossover; phase_at [rad/s]
-    delay: what delay can be added [s]
-    sensitivity, sensitivity_at: Ms, the greatest |S|, and where [rad/s]; 1/Ms is the modulus margin
-    complementary, complementary_at: Mt, the greatest |T|
-    crossover: the greatest frequency at which |L| = 1 [rad/s], NaN where there is none
+    Attributes:
+        stable: Whether the closed loop is stable.
+        gain: Factors (low, high) by which the loop's gain can fall or rise; 0 and infinity without a limit.
+        gain_at: Frequencies of both [rad/s]; NaN without a limit.
+        phase: Phase margin [rad]; infinity without a crossover.
+        phase_at: Its frequency [rad/s].
+        delay: Delay margin [s].
+        sensitivity: Ms, the largest |S|; 1/Ms is the modulus margin.
+        sensitivity_at: Its frequency [rad/s].
+        complementary: Mt, the largest |T|.
+        complementary_at: Its frequency [rad/s].
+        crossover: Highest frequency at which |L| = 1 [rad/s]; NaN if there is none.
     """
 
     stable: bool
@@ -58,13 +59,19 @@ class Margins(NamedTuple):
 
     @property
     def modulus(self) -> float:
-        """The least distance of L from -1: 1/Ms."""
+        """Modulus margin 1/Ms: the smallest distance of L from -1."""
         return 1 / self.sensitivity
 
 
 class Crossovers(NamedTuple):
-    """Where |L| = 1: frequencies [rad/s] and the phase above -pi there, in (-pi, pi]. Where L is real and negative:
-    frequencies and the factors 1/|L|."""
+    """Frequencies at which |L| = 1, and frequencies at which L is real and negative.
+
+    Attributes:
+        gain_at: Frequencies with |L| = 1 [rad/s].
+        phases: Phase above -pi at these, in (-pi, pi].
+        phase_at: Frequencies at which L is real and negative [rad/s].
+        factors: 1/|L| at these.
+    """
 
     gain_at: np.ndarray
     phases: np.ndarray
@@ -75,10 +82,14 @@ class Crossovers(NamedTuple):
 def margins(loop: OpenLoop | Transfer) -> Margins:
     """Return the margins of an open loop.
 
-    Of an `OpenLoop` whose controller is sampled, the delay margin is that of the loop with the delay in it, sampled
-    anew; of a sampled `Transfer` it is the phase margin's, at the crossover where it is least.
+    The delay margin of an `OpenLoop` with a sampled controller samples the loop again with each added delay. The delay
+    margin of a sampled `Transfer` is that of the phase margin, at the crossover where it is smallest.
+
+    Args:
+        loop: Open loop with one input and one output.
+
     Raises:
-        ValueError: several inputs or outputs.
+        ValueError: The system has several inputs or outputs.
     """
     system = loop.transfer() if isinstance(loop, OpenLoop) else loop
     if np.shape(system.D) != (1, 1):
@@ -98,7 +109,12 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
 
 
 def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers:
-    """Return where |L| = 1, and where L is real and negative; w is a grid, by default `grid(system)`."""
+    """Return the frequencies at which |L| = 1, and at which L is real and negative.
+
+    Args:
+        system: Open loop with one input and one output.
+        w: Grid of frequencies [rad/s]; by default `frequency_grid(system)`.
+    """
     w = frequency_grid(system) if w is None else w
     gain_at = _roots(lambda w: np.log(np.abs(_response(system, w))), w)
     phases = np.angle(-_response(system, gain_at))
@@ -107,14 +123,20 @@ def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers
     phase_at = np.union1d(phase_at, [end for end in ends if _is_real(system, end)])
     values = _response(system, phase_at).real
     real = (values < 0) & np.isfinite(values)
-    real &= np.abs(_response(system, phase_at).imag) <= 1e-6 * np.abs(values)  # not where a pole turns the sign
+    real &= np.abs(_response(system, phase_at).imag) <= 1e-6 * np.abs(values)  # a sign change at a pole is no crossing
     return Crossovers(gain_at, phases, phase_at[real], -1 / values[real])
 
 
 def is_stable(system: Transfer) -> bool:
-    """Return whether the closed loop is stable, all its poles inside."""
+    """Return whether the closed loop is stable: all poles in the left half-plane, or in the unit circle if sampled.
+
+    Args:
+        system: Open loop with one input and one output.
+    """
     if system.period is not None or not system.delay:
         return unstable_poles(system.without_delay()) == 0
+    # The poles of the delay-free loop, and the crossings of |L| = 1. A pair crosses to the right where |L| falls and to
+    # the left where |L| rises, again and again with each further turn of the delay, 2 pi/w.
     count = unstable_poles(system._replace(delay=0.0))
     turning = find_crossovers(system._replace(delay=0.0))
     for w, phase in zip(turning.gain_at, turning.phases, strict=True):
@@ -127,7 +149,13 @@ def is_stable(system: Transfer) -> bool:
 
 
 def unstable_poles(system: Transfer) -> int:
-    """Return how many poles of the closed loop are not inside; of a system without delay."""
+    """Return the number of unstable poles of the closed loop, for a system without delay.
+
+    A loop with 1 + D = 0 is not well-posed; it counts as one pole more than its states.
+
+    Args:
+        system: Open loop without delay.
+    """
     if not 1 + system.D[0, 0]:
         return len(system.A) + 1
     poles = closed_loop_poles(system)
@@ -135,15 +163,25 @@ def unstable_poles(system: Transfer) -> int:
 
 
 def closed_loop_poles(system: Transfer) -> np.ndarray:
-    """Return the poles (order,) of the closed loop, in z where it is sampled, else in s; a delay in continuous time,
-    which has infinitely many, is left out."""
+    """Return the poles (order,) of the closed loop: in z if it is sampled, else in s.
+
+    A delay in continuous time is left out, because it makes infinitely many poles.
+
+    Args:
+        system: Open loop with one input and one output.
+    """
     system = system._replace(delay=0.0) if system.period is None else system.without_delay()
     return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))
 
 
 def frequency_grid(system: Transfer) -> np.ndarray:
-    """Return frequencies (k,) [rad/s] between which L hardly changes, from well below its slowest pole to well above
-    its fastest, or to half the sampling rate."""
+    """Return frequencies (k,) [rad/s] between which L changes little.
+
+    They begin well below the slowest pole, and end well above the fastest or at half the sampling rate.
+
+    Args:
+        system: Open loop with one input and one output.
+    """
     poles = system.poles
     if system.period is not None:
         with np.errstate(divide="ignore"):
@@ -155,6 +193,7 @@ def frequency_grid(system: Transfer) -> np.ndarray:
     low, high = (sizes.min(), sizes.max()) if len(sizes) else (1.0, 1.0)
     low, high = min(low, half) * 10.0**-GRID_DECADES, min(high * 10.0**GRID_DECADES, half)
     w = np.geomspace(low, high, int(PER_DECADE * math.log10(high / low)) + 2)
+    # Extra points around each lightly damped pole, where L changes fast.
     around = [abs(p.imag) + abs(p.real) * np.linspace(-5, 5, 41) for p in poles if p.imag > 0]
     w = np.unique(np.concatenate([w, *around]))
     w = _resolve_delay_turns(system, w[(w >= low) & (w <= high)])
@@ -162,7 +201,7 @@ def frequency_grid(system: Transfer) -> np.ndarray:
 
 
 def _delay_free_closed_poles(system: Transfer) -> np.ndarray:
-    """Of the loop without its delay, in s."""
+    """Return the closed-loop poles without the delay, in s."""
     poles = np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0)).astype(complex)
     if system.period is None:
         return poles
@@ -170,7 +209,7 @@ def _delay_free_closed_poles(system: Transfer) -> np.ndarray:
 
 
 def _resolve_delay_turns(system: Transfer, w: np.ndarray) -> np.ndarray:
-    """The grid with points at which a delay turns L by little, up to where L has become small."""
+    """Return the grid with added points, between which a delay turns L by a small angle, up to where L is small."""
     if not system.delay:
         return w
     large = w[np.abs(_response(system, w)) > SMALL_LOOP_GAIN]
@@ -181,7 +220,7 @@ def _resolve_delay_turns(system: Transfer, w: np.ndarray) -> np.ndarray:
 
 
 def _refine_grid(system: Transfer, w: np.ndarray) -> np.ndarray:
-    """The grid with points between neighbours at which L differs, as seen from 0 and from -1."""
+    """Return the grid with points added between neighbours with different L, relative to its distance from 0 and -1."""
     values = _response(system, w)
     for _ in range(MAX_GRID_REFINEMENTS):
         change = np.abs(np.diff(values))
@@ -206,13 +245,13 @@ def _rational_response(system: Transfer, w: float) -> complex:
 
 
 def _complementary_sensitivity(values: np.ndarray) -> np.ndarray:
-    """T, 1 where L is infinite."""
+    """Return T; 1 where L is infinite."""
     with np.errstate(all="ignore"):
         return np.where(np.isfinite(values), values / (1 + values), 1.0)
 
 
 def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> np.ndarray:
-    """Where a function changes its sign between neighbours of a grid, bisected to rounding."""
+    """Return the places where a function changes its sign between neighbours of a grid, bisected to rounding."""
     with np.errstate(all="ignore"):
         sign = np.sign(function(w))
         here = np.flatnonzero((sign[1:] * sign[:-1] < 0) | (sign[1:] == 0))
@@ -225,7 +264,7 @@ def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> np.nd
 
 
 def _peak(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[float, float]:
-    """The greatest value of a function and its place, by golden sections around the greatest of a grid."""
+    """Return the maximum of a function and its place, by golden-section search around the maximum on a grid."""
     with np.errstate(all="ignore"):
         i = int(np.nanargmax(function(w)))
         low, high = w[max(i - 1, 0)], w[min(i + 1, len(w) - 1)]
@@ -240,7 +279,7 @@ def _peak(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[
 
 
 def _sensitivities(system: Transfer, w: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The peaks of |S| and |T|, and where; the ends of the axis count too."""
+    """Return the peaks of |S| and |T| with their frequencies; 0 and, in continuous time, infinity count too."""
     w = np.concatenate([[0.0], w])
     sensitivities = (
         lambda w: 1 / np.abs(1 + _response(system, w)),
@@ -254,7 +293,7 @@ def _sensitivities(system: Transfer, w: np.ndarray) -> tuple[tuple[float, float]
 
 
 def _is_real(system: Transfer, w: float) -> bool:
-    """Whether L is finite and real at an end of the axis."""
+    """Return whether L is finite and real at an end of the frequency axis."""
     value = _response(system, w)[0]
     return (
         bool(np.isfinite(value)) and abs(value.imag) <= REAL_TOLERANCE * abs(value) and abs(value) < 1 / REAL_TOLERANCE
@@ -262,7 +301,7 @@ def _is_real(system: Transfer, w: float) -> bool:
 
 
 def _gain_margins(found: Crossovers) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The factors next to 1, below and above, and where."""
+    """Return the factors nearest to 1, below and above, and their frequencies."""
     low, high, low_at, high_at = 0.0, math.inf, math.nan, math.nan
     for factor, w in zip(found.factors.tolist(), found.phase_at.tolist(), strict=True):
         if low < factor < 1:
@@ -273,7 +312,7 @@ def _gain_margins(found: Crossovers) -> tuple[tuple[float, float], tuple[float, 
 
 
 def _delay_margin(loop: OpenLoop | Transfer, found: Crossovers) -> float:
-    """The delay that a stable loop bears [s]."""
+    """Return the delay margin of a stable loop [s]."""
     delays = (found.phases % (2 * math.pi)) / found.gain_at
     guess = float(delays.min()) if len(delays) else math.inf
     if not isinstance(loop, OpenLoop) or loop.period is None or not math.isfinite(guess):

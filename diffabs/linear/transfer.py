@@ -1,9 +1,9 @@
-"""A linear system with a pure delay, its frequency response, and python-control's form of it.
+"""A linear system with a pure delay, its frequency response, and conversions from and to python-control.
 
     x' = A x + B u(t - delay),   y = C x + D u(t - delay)          period is None
     x+ = A x + B u(k - delay/T), y = C x + D u(k - delay/T)        sampled every T, the delay whole periods
 
-Matrices are NumPy arrays. The delay is kept as one, and exact: its response is e^(-j w delay), nothing is approximated.
+Matrices are NumPy arrays. The delay is exact: its response is e^(-j w delay), without an approximation.
 """
 
 from typing import Any, NamedTuple
@@ -14,7 +14,16 @@ WHOLE_PERIOD_TOLERANCE = 1e-9  # of a period: how far from whole periods the del
 
 
 class Transfer(NamedTuple):
-    """A (n, n), B (n, m), C (p, n), D (p, m); sampling period [s], None in continuous time; delay [s]."""
+    """A linear system with a pure delay.
+
+    Attributes:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, m).
+        C: Output matrix, shape (p, n).
+        D: Direct path, shape (p, m).
+        period: Sampling period [s]; None in continuous time.
+        delay: Pure delay [s].
+    """
 
     A: Any
     B: Any
@@ -25,11 +34,11 @@ class Transfer(NamedTuple):
 
     @property
     def poles(self) -> np.ndarray:
-        """Of the rational part (n,): in s, or in z."""
+        """Poles (n,) of the rational part: in s, or in z if sampled."""
         return np.linalg.eigvals(self.A) if len(self.A) else np.zeros(0)
 
     def rational_response(self, w: Any) -> np.ndarray:
-        """The response (k, p, m) at w (k,) [rad/s], without the delay. Infinite at a pole."""
+        """Return the response (k, p, m) at frequencies w (k,) [rad/s], without the delay; infinite at a pole."""
         w = np.atleast_1d(np.asarray(w, float))
         point = 1j * w if self.period is None else np.exp(1j * w * self.period)
         shifted = point[:, None, None] * np.eye(len(self.A)) - self.A
@@ -37,14 +46,14 @@ class Transfer(NamedTuple):
             return self.C @ _solve_or_infinite(shifted, np.asarray(self.B, complex)) + self.D
 
     def response(self, w: Any) -> np.ndarray:
-        """The response (k, p, m) at w (k,) [rad/s]."""
+        """Return the response (k, p, m) at frequencies w (k,) [rad/s]."""
         return self.rational_response(w) * np.exp(-1j * np.atleast_1d(np.asarray(w, float)) * self.delay)[:, None, None]
 
     def without_delay(self) -> "Transfer":
-        """The same system with its whole periods of delay among its states: each input is shifted through as many.
+        """Return the same system with its whole periods of delay as states: a chain of shifts for each input.
 
         Raises:
-            ValueError: a delay in continuous time, or one that is no whole number of periods.
+            ValueError: The system has a delay in continuous time, or one that is not a whole number of periods.
         """
         if self.period is None:
             if self.delay:
@@ -60,7 +69,7 @@ class Transfer(NamedTuple):
 
 
 def _solve_or_infinite(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """x (k, n, m) of M x = right for M (k, n, n), infinite where M is singular."""
+    """Return x (k, n, m) of M x = right for M (k, n, n); infinite where M is singular."""
     right = np.broadcast_to(right, (len(matrices), *right.shape))
     try:
         return np.linalg.solve(matrices, right)
@@ -76,7 +85,7 @@ def _solve_one_or_infinite(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _delay_one_period(system: Transfer) -> Transfer:
-    """The system behind one period of delay: its inputs become states."""
+    """Return the system behind one period of delay, whose inputs become states."""
     n, m = np.shape(system.B)
     a = np.block([[system.A, system.B], [np.zeros((m, n + m))]])
     b = np.concatenate([np.zeros((n, m)), np.eye(m)])
@@ -84,12 +93,15 @@ def _delay_one_period(system: Transfer) -> Transfer:
 
 
 def to_control(system: Transfer, *, pade: int | None = None) -> Any:
-    """Return a system as python-control's `StateSpace`, in which a delay of whole periods is states.
+    """Return a system as python-control's `StateSpace`, with whole periods of delay as states.
 
-    pade: the order of the approximation that stands for a delay in continuous time, for which python-control has none
+    Args:
+        system: System to convert.
+        pade: Order of the Pade approximation of a delay in continuous time; python-control has no such delay.
+
     Raises:
         ModuleNotFoundError: python-control is not installed.
-        ValueError: a delay in continuous time and no `pade`.
+        ValueError: The system has a delay in continuous time and `pade` is None.
     """
     control: Any = _import_control()
     if system.period is None and system.delay:
@@ -104,11 +116,14 @@ def to_control(system: Transfer, *, pade: int | None = None) -> Any:
 
 
 def from_control(system: Any) -> Transfer:
-    """Return a `Transfer` of a system of python-control: a `StateSpace`, or a `TransferFunction`.
+    """Return the `Transfer` of a python-control `StateSpace` or `TransferFunction`.
+
+    Args:
+        system: System of python-control.
 
     Raises:
         ModuleNotFoundError: python-control is not installed.
-        ValueError: a sampled system whose period is not said (dt=True).
+        ValueError: The system is sampled with an unknown period (dt=True).
     """
     control: Any = _import_control()
     found = control.ss(system)

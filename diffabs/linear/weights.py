@@ -6,8 +6,18 @@ import numpy as np
 
 
 def as_weight_matrix(name: str, value: Any, size: int, *, definite: bool) -> np.ndarray:
-    """A weight as a symmetric matrix (size, size), from a matrix, a diagonal, or a number for size 1. Raises ValueError
-    for another shape, numbers that are not finite, asymmetry, or eigenvalues below 0 (at 0 where `definite`)."""
+    """Return a weight as a symmetric matrix (size, size).
+
+    Args:
+        name: Name of the weight, for messages.
+        value: Matrix, diagonal, or a number for size 1.
+        size: Number of rows.
+        definite: Whether the matrix must be positive definite; else semidefinite.
+
+    Raises:
+        ValueError: The shape is wrong, an entry is not finite, the matrix is not symmetric, or an eigenvalue is
+            negative (zero, if `definite`).
+    """
     array = np.array(value, float)
     if array.ndim < 2:
         array = np.diag(np.atleast_1d(array))

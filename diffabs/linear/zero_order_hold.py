@@ -1,4 +1,4 @@
-"""Discretise a linear system whose input is held over a period, with a computing delay."""
+"""Discretisation of a linear system whose input is held over a period, with a computing delay."""
 
 from typing import Any
 
@@ -7,12 +7,21 @@ import jax.numpy as jnp
 
 from diffabs.linear.linearization import StateSpace
 
-TERMS, EXPONENTIAL_SQUARINGS = 14, 16  # of the matrix exponential
+TERMS, EXPONENTIAL_SQUARINGS = 14, 16  # terms of the Taylor series and largest number of squarings of e^a
 
 
 def discretise_held_input(system: StateSpace, period: Any, delay: Any) -> StateSpace:
-    """One period of the system under an input that is the last state, the previous input, until `delay`, then the new
-    one: x(T) = e^(A T) x + e^(A (T - d)) G(d) u_old + G(T - d) u,  G(s) = integral of e^(A r) B over r in [0, s]."""
+    """Return the discrete system over one period, whose last states are the previous input.
+
+    The previous input acts until `delay` d, then the new one until the period T ends.
+
+        x(T) = e^(A T) x + e^(A (T - d)) G(d) u_old + G(T - d) u,  G(s) = integral of e^(A r) B over r in [0, s]
+
+    Args:
+        system: System in continuous time.
+        period: Sampling period T [s].
+        delay: Computing delay d [s], 0 to T.
+    """
     (a, b), n, m = system, *system.B.shape
     with_input = jnp.zeros((n + m, n + m), a.dtype).at[:n, :n].set(a).at[:n, n:].set(b)
     before, after = (_exponential(with_input * s) for s in (delay, period - delay))
@@ -21,11 +30,14 @@ def discretise_held_input(system: StateSpace, period: Any, delay: Any) -> StateS
 
 
 def _exponential(a: Any) -> Any:
-    """e^a by scaling and squaring of its Taylor series, to about rounding for norms up to 2^SQUARINGS.
+    """Return e^a by scaling and squaring of its Taylor series, to about rounding for norms up to
+    2^(EXPONENTIAL_SQUARINGS - 1).
 
-    Not `jax.scipy.linalg.expm`: 20,000 of the lab rig's models at once with it waited for ever (JAX 0.10.2, two cores;
-    no issue of JAX is known to us; github.com/jax-ml/jax/issues/20428 is one of its kind).
+    `jax.scipy.linalg.expm` hangs for 20,000 models of the lab rig at once (JAX 0.10.2, two cores). JAX has no known
+    issue of exactly this; github.com/jax-ml/jax/issues/20428 is similar.
     """
+    # The number of halvings is piecewise constant, so its gradient is cut. A fixed number of squarings, masked by
+    # `where`, has a reverse-mode derivative and works under vmap.
     norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(a), axis=1)))
     halvings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(norm, 0.25))) + 1, 0, EXPONENTIAL_SQUARINGS)
     scaled, one = a * 2.0**-halvings, jnp.eye(len(a), dtype=a.dtype)

@@ -263,7 +263,9 @@ class SettlingTime:
         first, entered = memory.held
         # The band is one-sided for the error at the start of the step; the sign has no derivative.
         side = sign(jax.lax.stop_gradient(segment.error().start))
-        excess = segment.shown(lambda shown: side * (shown.output[0] - shown.setpoint) - self._width(shown, first))
+        excess = segment.shown_cubic(
+            lambda shown: side * (shown.output[0] - shown.setpoint) - self._width(shown, first)
+        )
         entry = segment.start.t + segment.h * excess.root()
         return Settling(first, jnp.where(excess.start > 0, entry, entered))
 

@@ -100,14 +100,16 @@ class Designed:
         model = SlipModel(plant=MirroredRig(), slip=0.2)
         self.system = polytope(model, DESIGN_BOX)
         self.designs = {weights: design(self.system, Spec(Q=weights, R=1.0)) for weights in REFERENCE_GAINS}
-        self.printed = {weights: design(_printed(self.system), Spec(Q=weights, R=1.0)) for weights in REFERENCE_GAINS}
+        self.printed = {
+            weights: design(_as_printed(self.system), Spec(Q=weights, R=1.0)) for weights in REFERENCE_GAINS
+        }
         gains = {k2: (-K1, k2) for k2 in (-48.0, -76.6, -76.7, SAME_INTEGRAL[1])}
         self.verdicts = {k2: certify(gain, self.system, fastest=True) for k2, gain in gains.items()}
         cells = schedule(model, DESIGN_BOX, along="speed", nodes=SPEED_CELLS)
         self.varying = certify(PUBLISHED_GAIN, cells, Spec(rates=DECELERATION_RANGE, decay=5.0))
 
 
-def _printed(system: Polytope) -> Polytope:
+def _as_printed(system: Polytope) -> Polytope:
     """Return the vertices of eq. (31) as printed: blocks 3 and 4 have B of the other speed."""
     speeds = np.array([corner["speed"] for corner in system.corners])
     heavy = np.array([corner["plant.mass"] == DESIGN_BOX["plant.mass"][1] for corner in system.corners])
@@ -198,7 +200,7 @@ def slowest_pole(system: Polytope, gain: tuple[float, float]) -> tuple[float, fl
         gain: K of u = K x.
     """
     i = int(np.argmin([corner["plant.mass"] - corner["speed"] for corner in system.corners]))
-    pole = np.linalg.eigvals(system.closed(gain)[i])
+    pole = np.linalg.eigvals(system.closed_loop(gain)[i])
     pole = pole[np.argmax(np.imag(pole))]
     return float(np.real(pole)), float(np.imag(pole)), float(-np.real(pole) / abs(pole))
 
@@ -214,14 +216,14 @@ def design_summary(found: Designed) -> dict[str, Any]:
         numbers = {name: getattr(answer, name) for name in ("trace_cost", "lower_bound", "gap", "residual")}
         return {"gain": answer.gain[0].tolist(), **numbers, "certificate": answer.certificate.summary()}
 
-    def named(answers: Mapping[tuple[float, float], Design]) -> list[dict[str, Any]]:
+    def name_answers(answers: Mapping[tuple[float, float], Design]) -> list[dict[str, Any]]:
         return [{"Q": list(weights), "R": 1.0, **one(answer)} for weights, answer in answers.items()]
 
     verdicts = [{"gain": [-K1, k2], **proof.summary()} for k2, proof in found.verdicts.items()]
     coverage = found.system.coverage
     return {
-        "designs": named(found.designs),
-        "as_printed": named(found.printed),
+        "designs": name_answers(found.designs),
+        "as_printed": name_answers(found.printed),
         "verdicts": verdicts,
         "published_gain_with_bounded_deceleration": found.varying.summary(),
         "coverage": None if coverage is None else {"checked": coverage.checked, "spread": coverage.spread},
@@ -241,10 +243,10 @@ def figures(found: Designed, braked: Mapping[str, Run]) -> dict[str, Any]:
     slower = np.stack([np.ones_like(speeds), DESIGN_BOX["speed"][1] / speeds], -1)[
         ..., None
     ]  # eqs. (16), (21): 1/omega_2
-    loci = {name: np.linalg.eigvals(slower * found.system.closed(gain)[i]) for name, gain in gains.items()}
+    loci = {name: np.linalg.eigvals(slower * found.system.closed_loop(gain)[i]) for name, gain in gains.items()}
     return {
         "gain_poles": _poles(loci, speeds),
-        "gain_damping": _damping(loci, speeds),
+        "gain_damping": _draw_damping(loci, speeds),
         "gain_trajectories": plot.draw_slips(
             {name: run.trajectory for name, run in braked.items() if run.trajectory is not None},
             title="Four ways to 0.2: 5.3 kg, torque unlimited",
@@ -268,7 +270,7 @@ def _poles(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Any:
     return figure
 
 
-def _damping(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Any:
+def _draw_damping(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Any:
     figure, (ax,) = plot.sheet(title="Damping of the frozen loop", size=(6.4, 3.8))
     for i, (name, poles) in enumerate(loci.items()):
         damping = np.min(-np.real(poles) / np.abs(poles), axis=1)

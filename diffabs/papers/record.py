@@ -84,7 +84,7 @@ def solver_settings(step: FixedStep, **more: Any) -> dict[str, Any]:
 
 def origin_of_numbers() -> dict[str, str]:
     """Return the versions of everything that can change a number, and the commit if there is one."""
-    return provenance.describe_platform("jaxlib", "numpy", "matplotlib") | provenance.commit()
+    return provenance.describe_platform("jaxlib", "numpy", "matplotlib") | provenance.source_commit()
 
 
 def write_summary(folder: pathlib.Path, summary: dict[str, Any], name: str = "summary.json") -> dict[str, Any]:

@@ -170,7 +170,7 @@ def locked_time(run: Run) -> float:
     Args:
         run: Run with a trajectory.
     """
-    sample = _seen(run).sample
+    sample = _trajectory(run).sample
     still = np.argmax(sample.output.wheel_speed <= 0)
     return float(run.metrics["stop_time"] - sample.t[still])
 
@@ -187,7 +187,7 @@ def shortest_distances(car: QuarterCar, locked: Run) -> dict[str, float]:
         slip of greatest friction, and this friction from there.
     """
     best = jax.jit(peak)(car.road)
-    y = _seen(locked).sample.output
+    y = _trajectory(locked).sample.output
     i = int(np.argmax(y.slip >= float(best.slip)))
     part = (float(best.slip) - y.slip[i - 1]) / (y.slip[i] - y.slip[i - 1])
     speed, distance = (x[i - 1] + part * (x[i] - x[i - 1]) for x in (y.speed, y.distance))
@@ -210,7 +210,7 @@ def extra_rows(results: EstimatorResults) -> list[dict[str, Any]]:
             )
         )
     for solver, literal in zip(LITERAL, results.literal, strict=True):
-        name, sample = f"estimator as printed, step {solver.step:g} s, after 10 s", _seen(literal).sample
+        name, sample = f"estimator as printed, step {solver.step:g} s, after 10 s", _trajectory(literal).sample
         for quantity, unit in (("distance", "m"), ("speed", "m/s")):
             value = np.interp(10.0, sample.t, getattr(sample.output, quantity))
             rows.append(record.computed_row(name, quantity, unit, value))
@@ -228,7 +228,7 @@ def figures(results: EstimatorResults) -> dict[str, Any]:
         results: Runs that the figures need.
     """
     runs = results.runs["spline B"]
-    seen = {name: _seen(one) for name, one in runs.items()}
+    seen = {name: _trajectory(one) for name, one in runs.items()}
     drawn = {
         "fig1_no_abs": plot.draw_speeds({"": seen["no ABS"]}, title="Fig. 1: full brake without anti-lock control")
     }
@@ -242,7 +242,7 @@ def figures(results: EstimatorResults) -> dict[str, Any]:
     drawn["fig11_positions_pi"] = plot.draw_positions(single, title="Fig. 11: position, PI control")
     title = "Fig. 12: comparison of the positions, PI control"
     drawn["fig12_comparison"] = plot.draw_positions([both], zoom=(2.0, 3.3), title=title)
-    printed = {"as printed, P": _seen(results.literal[0]), "as a latch, P": seen["proposed P"]}
+    printed = {"as printed, P": _trajectory(results.literal[0]), "as a latch, P": seen["proposed P"]}
     title = "The estimator read literally does not brake"
     drawn["literal_estimator"] = plot.draw_speeds(printed, title=title)
     roads = {f"{name} (identified)": car.road for name, car in CARS.items()}
@@ -329,5 +329,5 @@ def compact(summary: Mapping[str, Any]) -> Digest:
     return digest(summary, headings, lines, CLAIMS, ("Tables 1, 2", printed), independent)
 
 
-def _seen(run: Run) -> Any:
+def _trajectory(run: Run) -> Any:
     return run.trajectory

@@ -270,7 +270,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
     progress(f"slip-lmi: convergence over {len(HALVINGS)} step lengths")
     errors = convergence_errors(runs)
     progress("slip-lmi: robust gains and their proofs")
-    rows, pictures, more = _designed(runs, filtered)
+    rows, pictures, more = _design_section(runs, filtered)
     progress("slip-lmi: figures")
     names = record.save_figures({**figures(runs, filtered, errors), **pictures}, folder)
     summary = {
@@ -308,7 +308,9 @@ def compact(summary: Mapping[str, Any]) -> Digest:
     return digest(summary, headings, lines, lmi_design.CLAIMS, (words, []), independent)
 
 
-def _designed(runs: Mapping[str, Run], filtered: Run) -> tuple[list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
+def _design_section(
+    runs: Mapping[str, Run], filtered: Run
+) -> tuple[list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
     """Return rows, figures and summary entries of section 4; only a note if its solver is not installed."""
     try:
         found = lmi_design.Designed()

@@ -15,7 +15,7 @@ from diffabs.sweep.results import Results
 CELL_COUNTS = (4, 24)
 MIN_RUNS_PER_CELL = 10  # on average over the cells, if there are enough runs
 # In machine epsilons. Metrics are differences of numbers around 1: a smaller range of values is rounding.
-ROUNDING_EPS = 16
+LEVEL_ROUNDING_EPS = 16
 
 
 class AxisVariable(NamedTuple):
@@ -44,13 +44,13 @@ class SweepView:
         # A Saltelli design repeats blocks (A, B, AB_1, ..., AB_p). Only A is an independent sample for the statistics.
         period = len(found.study["space"]["variables"]) + 2 if self.design == "saltelli" else 1
         self.rows = self.good & (found.column("sample") % period == 0)
-        least = ROUNDING_EPS * np.finfo(found.study["dtype"]).eps
+        least = LEVEL_ROUNDING_EPS * np.finfo(found.study["dtype"]).eps
         columns = ((name, found.column(name)[self.rows]) for name in found.metrics if self.rows.any())
         finite = ((name, x[np.isfinite(x)]) for name, x in columns)
         self.varying = [name for name, x in finite if x.size and np.ptp(x) > least * max(1.0, np.abs(x).max())]
         self.leading = next((name for name in [*self.bounds, *self.varying] if name in self.varying), "")
 
-    def known(self, name: str, rows: np.ndarray) -> np.ndarray:
+    def known_rows(self, name: str, rows: np.ndarray) -> np.ndarray:
         """Return the `rows` in which the metric `name` is finite.
 
         A run that never settles has no finite settling time and is left out.
@@ -59,10 +59,10 @@ class SweepView:
 
     def never(self, name: str) -> str:
         """Return a note on the number of runs that a figure of the metric `name` leaves out, or "" for none."""
-        count = np.sum(self.rows & ~self.known(name, self.rows))
+        count = np.sum(self.rows & ~self.known_rows(name, self.rows))
         return f" ({count} never: left out)" if count else ""
 
-    def named(self, name: str) -> str:
+    def label(self, name: str) -> str:
         """Return the column's `name` with its unit."""
         unit = self.units.get(name, "")
         if ", " in unit:  # units of a list's entries: the last part of the name is the index
@@ -87,7 +87,7 @@ class SweepView:
             names, places = np.unique(values.astype(str), return_inverse=True)
             return AxisVariable(path, places, names.tolist())
         fast = self.units.get(path) == "m/s"
-        return AxisVariable(f"{path} [km/h]" if fast else self.named(path), values * (KMH if fast else 1.0), [])
+        return AxisVariable(f"{path} [km/h]" if fast else self.label(path), values * (KMH if fast else 1.0), [])
 
     def influential(self, rows: np.ndarray, result: np.ndarray, *, numbers_first: bool = False) -> list[str]:
         """Return the paths of the two most influential variables on a `result`, given in these `rows`.

@@ -54,7 +54,7 @@ def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure 
     view = SweepView(found, units)
     figure, axes = _panels(view.varying, view.title("distributions of", view.rows))
     for ax, name in zip(axes, view.varying, strict=True):
-        values = found.column(name)[view.known(name, view.rows)]
+        values = found.column(name)[view.known_rows(name, view.rows)]
         low, middle, high = np.quantile(values, (0.05, 0.5, 0.95))
         far = MAX_BOUND_DISTANCE * (high - low) or np.inf
         ends = max(values.min(), low - far), min(values.max(), high + far)
@@ -66,7 +66,7 @@ def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure 
         ax.set_xlim(_limits(ax, *ends, view.bounds.get(name)))
         beyond = len(values) - counts.sum()
         outside = f" ({beyond} more outside)" if beyond else ""
-        label_axes(ax, view.named(name), f"runs{outside}{view.never(name)}", legend=False)
+        label_axes(ax, view.label(name), f"runs{outside}{view.never(name)}", legend=False)
         ax.legend(**ABOVE)
     return figure
 
@@ -85,7 +85,7 @@ def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: f
     band = f"{100 * confidence:g} % band" + ("" if view.design == "random" else " (as if independent)")
     figure, axes = _panels(view.varying, view.title("how often a value is exceeded in", view.rows))
     for ax, name in zip(axes, view.varying, strict=True):
-        values = np.sort(found.column(name)[view.known(name, view.rows)])
+        values = np.sort(found.column(name)[view.known_rows(name, view.rows)])
         n, limits = len(values), _limits(ax, values[0], values[-1], view.bounds.get(name))
         x, counts = _exceedance_corners(values, *limits)
         ax.plot(x, counts / n, color=COLOURS[0], label=f"runs{view.never(name)}")
@@ -96,7 +96,7 @@ def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: f
         make_logarithmic(ax, "y")
         ax.set_xlim(limits)
         ax.set_ylim(0.3 / n, 1.5)
-        label_axes(ax, view.named(name), "share beyond [1]", legend=False)
+        label_axes(ax, view.label(name), "share beyond [1]", legend=False)
         ax.legend(**ABOVE)
     return figure
 
@@ -115,7 +115,7 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
     """
     view = SweepView(found, units)
     metric = view.leading
-    good = view.known(metric, view.good)
+    good = view.known_rows(metric, view.good)
     paths = view.influential(good, found.column(metric)[good], numbers_first=True) if metric else []
     if not (ones := [view.variable(path, good) for path in paths]):
         return None
@@ -128,13 +128,13 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
     x, y = ones[0].values, ones[1].values if ones[1:] else values
     figure, (ax,) = sheet(title=view.title(f"greatest {metric} of", good), size=(8.4, 4.8))
     dots = ax.scatter(x[shown], y[shown], 10, values[shown], cmap="viridis", linewidths=0)
-    bar = figure.colorbar(dots, ax=ax, label=view.named(metric))
+    bar = figure.colorbar(dots, ax=ax, label=view.label(metric))
     if bound is not None and values.min() < bound < values.max():
         bar.ax.axhline(bound, color=COLOURS[1], linewidth=2.5)
-        bar.set_label(f"{view.named(metric)}, line: bound {bound:g}")
+        bar.set_label(f"{view.label(metric)}, line: bound {bound:g}")
     ax.plot(x[ends], y[ends], "o", color=COLOURS[1], fillstyle="none", label=f"the worst {len(ends)}, sample: value")
     _callouts(ax, x[ends], y[ends], [f"{i}: {v:.4g}" for i, v in zip(tail.indices, tail.values, strict=True)])
-    _name_axes(ax, ones, view.named(metric))
+    _name_axes(ax, ones, view.label(metric))
     ax.legend(**ABOVE)
     return figure
 
@@ -184,12 +184,12 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
         units: Units by the name of a column.
     """
     view = SweepView(found, units)
-    failed = found.failed()[every := view.accepted]
+    failed = found.failed_samples()[every := view.accepted]
     if not (failed.any() or view.leading):
         return None
     rows, result = every, failed
     if view.leading and min(np.sum(failed), np.sum(~failed)) < FEW:
-        rows = view.known(view.leading, view.good)
+        rows = view.known_rows(view.leading, view.good)
         result = found.column(view.leading)[rows]
     if not (ones := [view.variable(path, every) for path in view.influential(rows, result)]):
         return None
@@ -224,7 +224,7 @@ def _greatest(cell: Any, values: np.ndarray, lanes: np.ndarray) -> np.ndarray:
 def _draw_bound(view: SweepView) -> str:
     """Return the label of the colour bar for a map without failures."""
     bound = view.bounds.get(view.leading)
-    return f"greatest {view.named(view.leading)}" + ("" if bound is None else f", fails beyond {bound:g}")
+    return f"greatest {view.label(view.leading)}" + ("" if bound is None else f", fails beyond {bound:g}")
 
 
 def _exceedance_corners(ordered: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ import numpy as np
 from diffabs.core import files
 from diffabs.core.values import ScenarioError, format_given, unknown_name_error
 
-MAX_FILE_BYTES = 100_000_000  # bytes
+MAX_MEASUREMENT_BYTES = 100_000_000  # bytes
 TIME_COLUMN = "t [s]"
 IGNORED = ("target [", "command [", "control [")  # what is simulated but not measured
 
@@ -27,11 +27,11 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
     """The readings in a file, of signals with these units by name. Raises ScenarioError, one line, with the line of the
     file, for whatever is wrong."""
     try:
-        raw = files.read_content(path, MAX_FILE_BYTES + 1)
+        raw = files.read_content(path, MAX_MEASUREMENT_BYTES + 1)
     except OSError as error:
         raise ScenarioError(f"--data {path}: cannot be read, {error.strerror}") from None
-    if len(raw) > MAX_FILE_BYTES:
-        raise ScenarioError(f"--data {path}: is larger than {MAX_FILE_BYTES} bytes")
+    if len(raw) > MAX_MEASUREMENT_BYTES:
+        raise ScenarioError(f"--data {path}: is larger than {MAX_MEASUREMENT_BYTES} bytes")
     try:
         rows = list(csv.reader(raw.decode("utf-8-sig").splitlines()))
     except (UnicodeDecodeError, csv.Error):

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core.pytree import Spec, parameters
+from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.values import (
     FORMER_FIELDS,
     ScenarioError,
@@ -39,7 +39,7 @@ class ParameterEntry:
     path: str
     where: str
     given: Any
-    spec: Spec
+    spec: ParameterSpec
     shape: tuple[int, ...]
     scale: float
 
@@ -151,7 +151,7 @@ def canonical_path(path: str) -> str:
 
 
 def read_entries(
-    table: Mapping[str, Any], section: str, there: Mapping[str, tuple[Spec, tuple[int, ...]]], otherwise: str
+    table: Mapping[str, Any], section: str, there: Mapping[str, tuple[ParameterSpec, tuple[int, ...]]], otherwise: str
 ) -> Iterator[ParameterEntry]:
     """What was given, by parameter. `there`: spec and shape of what may be, by path of the loop; `otherwise`: what to
     say of a name that is not. Raises ScenarioError."""
@@ -177,7 +177,7 @@ def _current_path(path: str) -> str | None:
     return f"{section}.{older[name]}" if section.startswith("controller") and name in older else None
 
 
-def parameters_of(loop: Any) -> dict[str, tuple[Spec, tuple[int, ...]]]:
+def parameters_of(loop: Any) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]]:
     """Return spec and shape of every parameter by path."""
     return {path: (spec, np.shape(value)) for path, spec, value in parameters(loop)}
 

@@ -18,7 +18,7 @@ import numpy as np
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors, stops
 from diffabs.core import blocks, protocols
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.units import Units, resolve_unit, units_of
 from diffabs.core.values import (
     FORMER_FIELDS,
@@ -264,7 +264,7 @@ def _value(given: Any, field: dataclasses.Field[Any], default: Any, place: tuple
         if type(given) is not type(default):
             raise wrong_kind_error(path, given, f"a value like {format_given(default)}")
         return given
-    spec: Spec = field.metadata["spec"].around(units)
+    spec: ParameterSpec = field.metadata["spec"].around(units)
     if np.ndim(default) == 0:
         return read_number(given, spec, path)
     if not isinstance(given, list):
@@ -288,7 +288,7 @@ def _parts(family: str, given: Any, default: tuple[Any, ...], path: str, units: 
     return tuple(parts)
 
 
-def in_kmh(spec: Spec) -> Spec:
+def in_kmh(spec: ParameterSpec) -> ParameterSpec:
     """Return what a speed may be, in km/h."""
     return dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
 

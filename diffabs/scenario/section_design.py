@@ -19,7 +19,7 @@ from diffabs.actuators import Lag, RateLimit
 from diffabs.controllers import Sampled
 from diffabs.core.blocks import Series
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import Spec, parameters
+from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.values import (
     ScenarioError,
     format_given,
@@ -35,7 +35,7 @@ from diffabs.core.values import read_table as read_table
 from diffabs.linear.slip_model import SlipModel
 from diffabs.scenario.parameter_paths import read_entries
 
-ENTRY = Spec("1")
+ENTRY = ParameterSpec("1")
 
 Range = tuple[float, float]
 
@@ -72,8 +72,8 @@ class DesignTask:
 
     Q: Any = table_field(_weight, None)
     R: Any = table_field(_weight, None)
-    decay: float = table_field(range_reader(Spec("1/s", low=0.0)), 0.0)
-    damping: float = table_field(range_reader(Spec("1", low=0.0, high=1.0, open_high=True)), 0.0)
+    decay: float = table_field(range_reader(ParameterSpec("1/s", low=0.0)), 0.0)
+    damping: float = table_field(range_reader(ParameterSpec("1", low=0.0, high=1.0, open_high=True)), 0.0)
     over: Mapping[str, Range] = dataclasses.field(default_factory=dict)
 
     def box(self, loop: Loop) -> dict[str, Range]:
@@ -105,7 +105,7 @@ class _Parameter:
     """What can have a range: its path in the linear model, its values, and whether it is more than one number."""
 
     model: str
-    spec: Spec
+    spec: ParameterSpec
     shape: tuple[int, ...] = ()
 
 

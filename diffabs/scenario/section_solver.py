@@ -6,13 +6,13 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.solution import SOLVER_TYPES, Adaptive, FixedStep, Solver
 
-TIME_SPEC = Spec("s", low=0.0, open_low=True)
-TOLERANCE_SPEC = Spec("1", low=1e-12, high=0.01)
+TIME_SPEC = ParameterSpec("s", low=0.0, open_low=True)
+TOLERANCE_SPEC = ParameterSpec("1", low=1e-12, high=0.01)
 
 
 @dataclasses.dataclass(frozen=True)

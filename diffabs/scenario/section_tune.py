@@ -31,7 +31,7 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import Spec, parameters
+from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.values import (
     Reader,
     ScenarioError,
@@ -79,8 +79,8 @@ class Goal:
     seed: int = table_field(whole_reader(0, 2**32 - 1), 0)
     iterations: int = table_field(whole_reader(1, 100_000), 60)
     samples: int = table_field(whole_reader(0, MOST_LANES), 0)
-    decay: float = table_field(range_reader(Spec("1/s", low=0.0)), 0.0)
-    damping: float = table_field(range_reader(Spec("1", low=0.0, high=1.0, open_high=True)), 0.0)
+    decay: float = table_field(range_reader(ParameterSpec("1/s", low=0.0)), 0.0)
+    damping: float = table_field(range_reader(ParameterSpec("1", low=0.0, high=1.0, open_high=True)), 0.0)
     free: Mapping[str, Ends | None] = dataclasses.field(default_factory=dict)
     objective: Mapping[str, float] = dataclasses.field(default_factory=dict)
     over: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
@@ -117,7 +117,7 @@ class Goal:
             lanes = grid(self.over)
         return dataclasses.replace(lanes, keys=(seed,) * max(lanes.size, 1))
 
-    def aggregated(self) -> risk.Aggregate:
+    def read_aggregate(self) -> risk.Aggregate:
         """From a number per lane to one."""
         return read_one(risk.AGGREGATE_TYPES, self.aggregate, "tune.aggregate")
 
@@ -149,7 +149,7 @@ def metric_reader(
             if name not in objectives:
                 raise unknown_name_error(f"{dotted_path(path, name)} is not measured", name, objectives)
         return {
-            name: read_number_in_range(x, Spec(unit(objectives[name])), dotted_path(path, name))
+            name: read_number_in_range(x, ParameterSpec(unit(objectives[name])), dotted_path(path, name))
             for name, x in given.items()
         }
 

@@ -9,7 +9,7 @@ from diffabs.core.protocols import BalanceOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.core.rules import Rule
 from diffabs.core.timing import whole_steps
-from diffabs.sensors.noise import drawn
+from diffabs.sensors.noise import draw_noise
 
 
 @pytree
@@ -48,7 +48,7 @@ class AngleSensor:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
         now, number = clock.ticks(self.period)
         held = tuple(
-            drawn(jnp.asarray(deviation), clock.key, 2 * number + i)
+            draw_noise(jnp.asarray(deviation), clock.key, 2 * number + i)
             for i, deviation in enumerate((self.theta, self.psi))
         )
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), held, memory.held))

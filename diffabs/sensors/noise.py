@@ -52,7 +52,7 @@ class Noise:
         now, draw = clock.ticks(self.period)
         deviations = (self.slip, self.speed, self.wheel_speed, self.deceleration)
         # Every channel has its own draw number, so channels are independent.
-        noise = [drawn(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
+        noise = [draw_noise(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
         held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), held, memory.held))
 
@@ -96,7 +96,7 @@ class WheelNoise:
         if clock.key is None:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
         now, draw = clock.ticks(self.period)
-        return Memory(held=jnp.where(now, drawn(jnp.asarray(self.slip), clock.key, draw), memory.held))
+        return Memory(held=jnp.where(now, draw_noise(jnp.asarray(self.slip), clock.key, draw), memory.held))
 
 
 @pytree
@@ -129,7 +129,7 @@ class PlayedWheelNoise:
 
 
 @jax.custom_jvp
-def drawn(deviation: Any, key: Any, number: Any) -> Any:
+def draw_noise(deviation: Any, key: Any, number: Any) -> Any:
     """Return deviation * z with a standard normal z, drawn only if the deviation is nonzero or has a tangent.
 
     The tangent is z times the deviation's tangent, also at deviation 0.
@@ -143,12 +143,12 @@ def drawn(deviation: Any, key: Any, number: Any) -> Any:
 
 
 def _rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    value, moving = drawn(*primals), type(tangents[0]) is not SymbolicZero
+    value, moving = draw_noise(*primals), type(tangents[0]) is not SymbolicZero
     return value, tangents[0] * _normal(*primals) if moving else jnp.zeros_like(value)
 
 
 # Symbolic zeros let the rule skip the draw for a deviation that is not differentiated.
-drawn.defjvp(_rule, symbolic_zeros=True)
+draw_noise.defjvp(_rule, symbolic_zeros=True)
 
 
 def _normal(like: Any, key: Any, number: Any) -> Any:
@@ -199,15 +199,15 @@ class Quantisation:
         """Return the nearest multiples of q."""
         del t, memory
         return BrakeOutput(
-            _rounded(signal.slip, self.slip),
-            _rounded(signal.speed, self.speed),
-            _rounded(signal.wheel_speed, self.wheel_speed),
-            _rounded(signal.deceleration, self.deceleration),
+            _round_to(signal.slip, self.slip),
+            _round_to(signal.speed, self.speed),
+            _round_to(signal.wheel_speed, self.wheel_speed),
+            _round_to(signal.deceleration, self.deceleration),
             signal.distance,
         )
 
 
-def _rounded(x: Scalar, q: Scalar) -> Any:
+def _round_to(x: Scalar, q: Scalar) -> Any:
     # For q = 0 the divisor is 1, so that the branch not taken holds no NaN.
     fine = jnp.greater(q, 0)
     q = jnp.where(fine, q, 1.0)

@@ -1,1 +1,3 @@
-"""Run a loop: Runge-Kutta steps, landing on the stop, one run or many, what must not be run, estimates of errors."""
+"""Simulation of a loop: Runge-Kutta steps, event location, single runs and batches, admissibility checks, error
+estimates.
+"""

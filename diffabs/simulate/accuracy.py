@@ -1,16 +1,18 @@
-"""How far a run's metrics are from those of shorter steps: an estimate of their errors that asks for no reference.
+"""Estimates of the discretisation errors of a run's metrics by Richardson extrapolation, without a reference solution.
 
     d1 = m(h/2) - m(h),  d2 = m(h/4) - m(h/2),  q = |d2/d1| = 2^-p for a method of order p
     |m(h) - m(0)|, about                    |d1| + |d2| (1 + q + q^2 + ...)
 
-L. F. Richardson, Phil. Trans. R. Soc. A 210 (1911). With p = 4 the error is 16/15 of d1, that of the half step 1/15.
-Where q stays above `MAX_DIFFERENCE_RATIO` the differences do not shrink, and no limit can be estimated: the metric has
-no order.
+With p = 4 the error of the step h is 16/15 of d1, and the error of the half step is 1/15 of d1. If q exceeds
+`MAX_DIFFERENCE_RATIO`, the differences do not shrink: the metric has no order and no limit can be estimated.
 
-A run with shorter steps is the same run only if everything with a clock of its own keeps it. Noise is drawn, and a
-sampled controller computes, by the period; a delay's ring is made longer (`refined`). Noise that comes out otherwise is
-found by drawing it at both steps; a block that works once in every step (`every_step`) is another block with another
-step. Then there is nothing to compare, and every number is NaN."""
+Runs with different steps are comparable only if everything with its own clock keeps that clock. Noise is drawn and a
+sampled controller computes once per period. The ring buffer of a delay becomes longer (`refined`). `has_same_noise`
+compares the noise drawn at both steps. A block that works once in every step (`every_step`) is a different block under
+another step. If runs are not comparable, both differences, the order and the error are NaN.
+
+Source: L. F. Richardson, Phil. Trans. R. Soc. A 210 (1911).
+"""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -25,14 +27,22 @@ from diffabs.core.pytree import refine_parts
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import Run, Solver, refine_solver
 
-MAX_DIFFERENCE_RATIO = 0.75  # q of an order of 0.4
-ROUNDING_EPS = 1e3  # times the precision of a number: differences that are none
-MAX_COMPARED_INSTANTS = 256  # instants at which noise is compared
+MAX_DIFFERENCE_RATIO = 0.75  # greatest |d2/d1| of a convergent metric: an order of 0.4
+ROUNDING_EPS = 1e3  # multiples of machine epsilon: smaller differences count as rounding errors
+MAX_COMPARED_INSTANTS = 256  # greatest number of instants at which noise is compared
 
 
 class ErrorEstimate(NamedTuple):
-    """Of a metric, in its unit: its value, what a half step changes, and what half of that changes again; the order at
-    which they shrink, NaN where there is nothing left to shrink; whether they do; the error of the value."""
+    """Error estimate of one metric, in the metric's unit.
+
+    Attributes:
+        value: Value m(h) with the step h of the solver.
+        difference: Change d1 = m(h/2) - m(h) by the half step.
+        finer: Change d2 = m(h/4) - m(h/2) by the quarter step.
+        order: Observed order p = -log2(|d2/d1|). NaN if both differences are rounding errors, or if d2 = 0.
+        converges: True if the differences shrink, or if both are rounding errors.
+        error: Estimated error of `value`.
+    """
 
     value: Any
     difference: Any
@@ -43,13 +53,18 @@ class ErrorEstimate(NamedTuple):
 
     @property
     def relative(self) -> Any:
-        """The error as a fraction of the value; 0 where there is no error, infinite where there is no value."""
+        """Error as a fraction of the value: 0 for a zero error, infinite for a zero value with an error."""
         return relative_difference(self.error, self.value)
 
 
 class Accuracy(NamedTuple):
-    """Estimates by metric; whether the runs can be compared at all (`reasons` says why not), and whether they ended
-    alike: all stopped or none, none diverged."""
+    """Error estimates of all metrics of a run.
+
+    Attributes:
+        estimates: Error estimate of each metric, by name.
+        comparable: True if the runs can be compared. `incomparability_reasons` returns the reasons otherwise.
+        alike: True if no run diverged and either all or none reached their stop.
+    """
 
     estimates: dict[str, ErrorEstimate]
     comparable: Any
@@ -57,9 +72,19 @@ class Accuracy(NamedTuple):
 
 
 def estimate_accuracy(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Any = None) -> Accuracy:
-    """Estimate the errors of what `measure` returns for the same arguments, at the price of seven such runs.
+    """Return error estimates for the metrics that `measure` returns for the same arguments.
 
-    Pure; batch it with `jax.vmap`. Every period must be on the grid of `solver.step`. Raises what `measure` raises.
+    The cost is that of seven runs of `measure` (one with the step h, one with h/2, one with h/4). The function is pure:
+    batch it with `jax.vmap`.
+
+    Args:
+        loop: Closed loop to run.
+        solver: Solver. Every period of a block must be a multiple of `solver.step`.
+        objectives: Objectives by the names of their metrics.
+        key: Random key of `jax.random`, for noisy sensors.
+
+    Raises:
+        ValueError: `measure` rejects the arguments.
     """
     runs = [measure_finer(loop, solver, objectives, times, key=key) for times in (1, 2, 4)]
     fine = is_comparable(loop, solver, key)
@@ -71,30 +96,59 @@ def estimate_accuracy(loop: Loop, solver: Solver, objectives: Mapping[str, Objec
 def measure_finer(
     loop: Loop, solver: Solver, objectives: Mapping[str, Objective], times: int, *, key: Any = None
 ) -> Run:
-    """What `measure` returns with steps that are `times` shorter, over the same whole steps."""
+    """Return the result of `measure` with steps that are `times` shorter, over the same number of original steps.
+
+    Args:
+        loop: Closed loop to run.
+        solver: Solver with the original step.
+        objectives: Objectives by the names of their metrics.
+        times: Factor by which the step shrinks, a whole number.
+        key: Random key of `jax.random`, for noisy sensors.
+    """
     return measure(refine_parts(loop, times), refine_solver(solver, times), objectives, key=key)
 
 
 def runs_end_alike(*runs: Run) -> Any:
-    """Whether all of these runs stopped, or none, and none diverged."""
+    """Return True if no run diverged and either all or none of the runs reached their stop.
+
+    Args:
+        runs: Runs to compare.
+    """
     stopped = jnp.stack([run.stopped for run in runs])
     return ~jnp.stack([run.diverged for run in runs]).any(0) & (stopped.all(0) | ~stopped.any(0))
 
 
 def relative_difference(difference: Any, value: Any) -> Any:
-    """|difference/value|; 0 where the difference is, infinite where only the value is."""
+    """Return |difference/value|: 0 for a zero difference, infinite for a nonzero difference from a zero value.
+
+    Args:
+        difference: Difference, in any unit.
+        value: Value in the same unit.
+    """
     size, of = jnp.abs(difference), jnp.abs(value)
     return jnp.where(size == 0, 0.0, size / jnp.where(of > 0, of, 1.0) + jnp.where(of > 0, 0.0, jnp.inf))
 
 
 def is_comparable(loop: Loop, solver: Solver, key: Any = None) -> Any:
-    """Whether a shorter step leaves the loop what it is: its noise, and what it computes."""
+    """Return True if a shorter step changes neither the noise of the loop nor a block's computations.
+
+    Args:
+        loop: Closed loop.
+        solver: Solver with the original step.
+        key: Random key of `jax.random`, for noisy sensors.
+    """
     steady = not any(True for _ in per_step_blocks(loop))
     return steady & (has_same_noise(loop, solver, 2, key) & has_same_noise(loop, solver, 4, key))
 
 
 def incomparability_reasons(loop: Loop, solver: Solver, key: Any = None) -> list[str]:
-    """Why runs with other steps cannot be compared, a line each; none if they can. Not for traced loops."""
+    """Return one line for each reason why runs with other steps are not comparable; an empty list if they are.
+
+    Args:
+        loop: Closed loop with concrete (not traced) parameters.
+        solver: Solver with the original step.
+        key: Random key of `jax.random`, for noisy sensors.
+    """
     lines = [
         f"{name} computes once in every step: with another step it is another {name}" for name in per_step_blocks(loop)
     ]
@@ -104,7 +158,11 @@ def incomparability_reasons(loop: Loop, solver: Solver, key: Any = None) -> list
 
 
 def per_step_blocks(loop: Loop) -> Iterator[str]:
-    """The blocks of a loop that work once in every integration step, by name."""
+    """Yield the names of the loop's blocks that work once in every integration step.
+
+    Args:
+        loop: Closed loop.
+    """
     for name in BLOCKS:
         block = getattr(loop, name)
         inner = getattr(block, "blocks", (block,))
@@ -113,8 +171,13 @@ def per_step_blocks(loop: Loop) -> Iterator[str]:
 
 
 def needs_key(loop: Loop) -> bool:
-    """Whether the loop has noise: its sensor refuses to draw without a key."""
+    """Return True if the loop has noise: its sensor raises an error without a key.
+
+    Args:
+        loop: Closed loop.
+    """
     try:
+        # Tracing for shapes alone reaches the sensor's check for a key and computes nothing.
         jax.eval_shape(lambda one: _draws(one, 1e-3, 1, 1, None), loop)
     except ValueError:
         return True
@@ -122,20 +185,31 @@ def needs_key(loop: Loop) -> bool:
 
 
 def has_same_noise(loop: Loop, solver: Solver, times: int, key: Any) -> Any:
-    """Whether the sensor shows the same at the common instants with steps that are `times` shorter, of a signal that
-    does not move. Noise is all that can differ then."""
+    """Return True if the sensor shows the same values at the common instants with steps that are `times` shorter.
+
+    The plant's signal is held constant, so only noise can differ. At most `MAX_COMPARED_INSTANTS` instants are
+    compared.
+
+    Args:
+        loop: Closed loop.
+        solver: Solver with the original step.
+        times: Factor by which the step shrinks, a whole number.
+        key: Random key. Without a key (None) the answer is True.
+    """
     if key is None:
         return jnp.asarray(True)
     count = min(solver.steps, MAX_COMPARED_INSTANTS)
     a = _draws(loop, solver.step, 1, count, key)
     b = _draws(loop, solver.step / times, times, count, key)
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    same = [jnp.all((x == y) | (jnp.abs(x - y) <= 1e-6 * jnp.abs(x))) for x, y in pairs]  # equal: infinite ones, too
+    same = [jnp.all((x == y) | (jnp.abs(x - y) <= 1e-6 * jnp.abs(x))) for x, y in pairs]  # `==` also matches infinities
     return jnp.all(jnp.stack(same))
 
 
 def _draws(loop: Loop, h: float, times: int, count: int, key: Any) -> Any:
-    """What the sensor shows after each `times` steps (count, ...) of a run that stands still at its start."""
+    """Return the sensor's output after each `times` steps, with a leading axis (count,), for a plant that rests at its
+    start.
+    """
     signal = loop.plant.output(loop.plant.start(loop.initial))
     signal = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), signal)
     sensor: Any = loop.sensor
@@ -152,11 +226,12 @@ def _draws(loop: Loop, h: float, times: int, count: int, key: Any) -> Any:
 
 def _estimate(coarse: Any, half: Any, quarter: Any, fine: Any) -> ErrorEstimate:
     d1, d2 = half - coarse, quarter - half
+    # The inner `where` replaces a zero divisor: the quotient of the branch not taken stays finite.
     q = jnp.where(d1 == 0, jnp.where(d2 == 0, 0.0, jnp.inf), jnp.abs(d2) / jnp.where(d1 == 0, 1.0, jnp.abs(d1)))
     floor = ROUNDING_EPS * jnp.finfo(jnp.result_type(coarse)).eps * jnp.abs(quarter)
     rounded = (jnp.abs(d1) <= floor) & (jnp.abs(d2) <= floor)
     order = jnp.where(rounded | (q == 0), jnp.nan, -jnp.log2(jnp.where(q > 0, q, 1.0)))
-    # Without an order: four times the last difference.
+    # The geometric series |d2| (1 + q + q^2 + ...) is capped at q = MAX_DIFFERENCE_RATIO: then its sum is 4 |d2|.
     error = jnp.abs(d1) + jnp.abs(d2) / (1 - jnp.minimum(q, MAX_DIFFERENCE_RATIO))
     known = fine & jnp.isfinite(d1) & jnp.isfinite(d2)
     d1, d2, order, error = (jnp.where(known, x, jnp.nan) for x in (d1, d2, order, error))

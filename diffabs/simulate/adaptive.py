@@ -1,14 +1,16 @@
-"""Steps as long as an error allows, of one lane each: how a run under `Adaptive` goes on.
+"""Adaptive step-size control of a single run: the attempts of a run under `Adaptive`.
 
-    length     0.85 r^(-1/4) times the last, r = |error|/rtol: the error is that of the cubic in the step's middle,
-               through which everything in a step is seen; at most 3/rho, rho the spectral radius of the loop's
-               Jacobian
-    kinks      a step ends where a comparison in the flow is predicted to change (`foresight`); one within which
-               another did is tried again, up to there
-    events     a step within which a margin falls through zero is tried again until one ends on it (`landing`)
-    clocks     a step ends where a block's clock strikes
+    length     0.85 r^(-1/4) times the last length, r = |error|/rtol. The error is that of the cubic in the middle of
+               the step, which represents every signal within a step. The length is at most 3/rho, rho the spectral
+               radius of the loop's Jacobian
+    surfaces   a step ends where a comparison of the flow is predicted to change (`foresight`). If another comparison
+               changes within the step, the step is attempted again up to that change
+    events     if a margin falls through zero within a step, the step is attempted again until it ends on the zero
+               (`landing`)
+    clocks     a step ends where the clock of a block strikes
 
-The grid of `Adaptive.step` is only where clocks strike and what a trajectory keeps: no step has to end on it."""
+Clocks strike on the grid of `Adaptive.step`, and a trajectory keeps instants of this grid. A step need not end on it.
+"""
 
 from typing import Any
 
@@ -60,23 +62,29 @@ from diffabs.simulate.stepper import cast_floats, find_crossings
 from diffabs.simulate.tries import AdaptiveAttempt, AdaptiveCarry, AdaptiveDecision, AdaptivePoint
 from diffabs.simulate.tsit5 import midpoint_error, tsit5_step_with_error
 
-MAX_ATTEMPTS, ATTEMPTS_PER_INSTANT = (
-    100_000,
-    16,
-)  # tries of a run, and for each instant of its grid: more of them lead nowhere
-RESET_STEP_FRACTION = (
-    0.1  # of the length that the error allows: a step so long that ends on no comparison is none in such a row
-)
-# For derivatives: the first step after an event or a comparison that changes, as a part of the longest stable one, and
-# how much longer each of the next may be. An event excites the fastest modes of the derivative far more than the run's.
+# A run with more attempts in all, or per instant of its grid, makes no progress and has diverged.
+MAX_ATTEMPTS, ATTEMPTS_PER_INSTANT = 100_000, 16
+# Fraction of the length that the error allows. A step longer than this one that ends on no switching surface resets the
+# count of consecutive crossings.
+RESET_STEP_FRACTION = 0.1
+# For derivatives: the first step after an event or a switching surface, as a fraction of the longest stable step, and
+# the growth of this fraction per step. An event excites the fastest modes of the derivative far more than the run's.
 INITIAL_STABILITY_FRACTION, STABILITY_FRACTION_GROWTH = 1 / 16, 1.6
-MAX_CONSECUTIVE_CROSSINGS = 16  # steps in a row that end on comparisons; then steps are blunt
-CROSSING_OVERREACH = 1.5  # times the way to where a comparison is predicted to change: a step that keeps to its regime
-FIELDS_AFTER_END = ("tries", "status")  # what is still looked at when a run is over
+MAX_CONSECUTIVE_CROSSINGS = 16  # steps in a row that end on switching surfaces; then steps are unrestricted
+# A step that keeps its mode goes 1.5 times as far as the predicted crossing, so that the crossing lies within the step.
+CROSSING_OVERREACH = 1.5
+FIELDS_AFTER_END = ("tries", "status")  # fields of the carry that must stay valid when a run is over
 
 
 def init_carry(loop: Loop, objectives: Objectives, control: StepSizeControl, key: Any) -> AdaptiveCarry:
-    """Return the carry at t = 0."""
+    """Return the carry at t = 0.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        control: Step-size control.
+        key: Random key, or None.
+    """
     zero, none = jnp.asarray(0), 0.0 * control.h
     state, accumulators = start_state(loop, objectives, Clock(none, control.h, zero, key))
     state, logs = borrow(state, None), log_rows(state)
@@ -103,8 +111,18 @@ def init_carry(loop: Loop, objectives: Objectives, control: StepSizeControl, key
 def step(
     loop: Loop, objectives: Objectives, control: StepSizeControl, key: Any, carry: AdaptiveCarry, until: Any = None
 ) -> AdaptiveCarry:
-    """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
+    """Return the carry after one attempt of a step, unchanged if the run is over or has reached the instant `until`.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        control: Step-size control.
+        key: Random key, or None.
+        carry: Carry before the attempt.
+        until: Number of the grid instant at which to pause; None to go on to the end of the run.
+    """
     active = carry.running if until is None else is_before(control, carry, until)
+    # The blocks' logs leave the carry: `select` below would otherwise copy whole tables in every step.
     logs = write_last_rows(carry.point.state)
     carry = carry._replace(point=carry.point._replace(state=borrow(carry.point.state, None)))
     system = build_dynamics(loop, objectives, carry.point.t, carry.point.state, carry.point.accumulators, kinks=True)
@@ -113,6 +131,7 @@ def step(
     refreshing = carry.status == RunStatus.REFRESHING
     count, which = (system.kinks if control.notes else 0), carry.search.which
     lands = (carry.status == RunStatus.LANDING) & (which < count)
+    # Without the barrier, XLA would compile the attempt again into each expression that uses it.
     here = jit_barrier(active, lambda: attempt_step(system, carry, end, refreshing, lands, control))
     verdict = jit_barrier(active, lambda: _decide(carry, here, count, active, strike >= control.steps, control))
     strikes = verdict.taken & carry.ends
@@ -125,7 +144,7 @@ def step(
     since = jnp.where(strikes, 0.0, jnp.where(verdict.taken, carry.since + carry.length, carry.since))
     carry = carry._replace(k=k, since=since)
     after = _next_carry(loop, control, carry, here, verdict, select(verdict.taken, point, carry.point), count)
-    if until is None:  # of a run that is over, the rest does not matter
+    if until is None:  # the other fields of a run that is over have no effect: no select for them
         kept = {name: jnp.where(active, getattr(after, name), getattr(carry, name)) for name in FIELDS_AFTER_END}
         after = after._replace(**kept)
     else:
@@ -142,7 +161,7 @@ def _next_carry(
     point: AdaptivePoint,
     count: int,
 ) -> AdaptiveCarry:
-    """The carry after a try, which has led to this point, or is to be tried again from there."""
+    """Return the carry after an attempt: at `point`, with the plan for the next attempt from there."""
     trying, new = ~verdict.taken, carry.status == RunStatus.RUNNING
     error_limited = _error_limited_length(carry, here, verdict, control)
     left = (control.next_strike(loop, carry.k) - carry.k) * control.h - carry.since
@@ -159,6 +178,7 @@ def _next_carry(
     longest = jnp.minimum(error_limited, stability_fraction * carry.limit)
     length, ends = plan_step(longest, point.ahead, left, control)
     late = trying & (here.late > 0) & verdict.fine
+    # A comparison changed `late` seconds before the end: the next attempt ends there.
     length = jnp.where(late, jnp.maximum(carry.length - here.late, control.least), length)
     status = jnp.where(verdict.taken, status_after_step(loop, carry, here.point.margins, verdict), carry.status)
     refreshes = status == RunStatus.REFRESHING
@@ -206,9 +226,18 @@ def _next_carry(
 def attempt_step(
     system: Dynamics, carry: AdaptiveCarry, end: Any, refreshing: Any, lands: Any, control: StepSizeControl
 ) -> AdaptiveAttempt:
-    """Return what a try leads to. For derivatives it keeps to its regime, unless it is blunt.
+    """Return the result of one attempt.
 
-    lands: whether it ends where the comparison changes that is looked for"""
+    For derivatives (`control.notes`) the step keeps the mode of its beginning, unless steps are unrestricted.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        carry: Carry before the attempt.
+        end: Time at the end of the step [s].
+        refreshing: True for a step of length 0 that evaluates the rates after an event.
+        lands: True if the step ends on the switching surface that the search looks for.
+        control: Step-size control.
+    """
     loop, point, h = system.loop, carry.point, carry.length
     z, held = split_flow_and_held(point.state, point.accumulators)
     within, at = UNCONSTRAINED, UNCONSTRAINED
@@ -219,9 +248,11 @@ def attempt_step(
     def flow(t: Any, z: Any) -> Any:
         return system.rates(t, z, held, within)
 
+    # The error estimate waits for the rate at the end, which `ahead` computes together with everything else there.
     z, so_far = tsit5_step_with_error(flow, point.t, z, point.rate, h)
     state = point.state.with_flow(z[0])
     rests = state._replace(plant=loop.plant.project(state.plant))
+    # A projection may move the state onto a switching surface, so the end of a frozen mode is evaluated without it.
     state = select(carry.unrestricted, rests, state) if control.notes else rests
     accumulated = {name: memory._replace(flow=z[1][name]) for name, memory in point.accumulators.items()}
     found = system.ahead(end, state, accumulated, at)
@@ -242,6 +273,7 @@ def attempt_step(
         name: Memory(z[1][name], o.update(accumulated[name], segment)) for name, o in system.objectives.items()
     }
     if loop.changes and not loop.ticks:
+        # A step of length 0 must not count twice in the objectives.
         accumulators = select(refreshing, point.accumulators, accumulators)
     ahead, late = forecast_crossings(comparisons, carry.error_limited, control.least, changed, h)
     ahead = jnp.where(carry.unrestricted, 1.0, CROSSING_OVERREACH) * ahead if control.notes else ahead
@@ -254,7 +286,7 @@ def attempt_step(
 
 
 def _surface_crossing(found: LoopEvaluationWithRates, which: Any, h: Any) -> SurfaceCrossing:
-    """The comparisons that say something else at the end of a step than in it."""
+    """Return the comparisons whose answers at the end of a step contradict the mode of the step."""
     margins = [(one.numbers, one.value) for one in found.comparisons]
     return SurfaceCrossing(*find_contradicted(ComparisonAnswers(found.words, found.contradicted, margins), which, h))
 
@@ -270,10 +302,22 @@ def commit_step(
     logs: list[Any],
     mode: Mode,
 ) -> AdaptivePoint:
-    """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
-    loop without ticks, what follows from an event is left to a step of no length: there are few of them.
+    """Return the point at which the run continues, after the triggered events and the ticks of the clock.
 
-    logs: the rows of the blocks' logs, which the state is without (`core.log`); regime: that after the ticks"""
+    In a loop without ticks a later step of length 0 evaluates the rates after an event. Events are rare, so this is
+    cheaper than an evaluation after every step.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        control: Step-size control.
+        clock: Instant at the end of the step.
+        begun: Point at the beginning of the step.
+        here: Result of the attempt.
+        fired: True for each event that happens at the end of the step.
+        error_limited: Step length that the error allows [s].
+        logs: Rows of the blocks' logs, which the state is without (`core.log`).
+        mode: Mode after the ticks and events.
+    """
     loop, point = system.loop, here.point
     if not loop.changes:
         return point
@@ -285,18 +329,29 @@ def commit_step(
 
 
 def build_passages(start: Any, end: Any) -> dict[str, Passage]:
-    """Return the step between two points for the blocks that record it."""
+    """Return the step between two points as a `Passage` for each block that records its signal, by the block's name.
+
+    Args:
+        start: Point at the beginning, with the time and the recorded signals.
+        end: Point at the end, before the changes there.
+    """
     (values, rates), (last, falls) = start.recorded, end.recorded
     return {n: Passage(start.t, end.t, (values[n], last[n]), (rates[n], falls[n])) for n in values}
 
 
 def is_before(control: StepSizeControl, carry: AdaptiveCarry, instant: Any) -> Any:
-    """Return whether a run goes on, and has not come to this instant of the grid."""
+    """Return True if the run goes on and has not reached this instant of the grid.
+
+    Args:
+        control: Step-size control.
+        carry: Carry of the run.
+        instant: Number of the instant on the grid.
+    """
     return carry.running & (carry.point.t < instant * control.h)
 
 
 def _end(point: AdaptivePoint) -> Any:
-    """Of a span, before what changes there."""
+    """Return time, flow state and rate of a point: the end of a `HermiteStep`, before the changes there."""
     return point.t, point.state.flow(), point.rate[0]
 
 
@@ -321,9 +376,10 @@ def _evaluate_point(
 def _decide(
     carry: AdaptiveCarry, here: AdaptiveAttempt, count: int, active: Any, last: Any, control: StepSizeControl
 ) -> AdaptiveDecision:
+    """Return the decision on an attempt: accept it, search within it, or end the run."""
     running, landing = carry.status == RunStatus.RUNNING, carry.status == RunStatus.LANDING
     refreshing = carry.status == RunStatus.REFRESHING
-    fine = jnp.isfinite(here.error)  # the greatest of those of all states
+    fine = jnp.isfinite(here.error)  # the maximum over all states: one NaN makes it NaN
     short = carry.length <= control.least
     exact = fine & (((here.error <= 1) & (here.late <= 0)) | short)
     crossed = falls_through(*_margins(carry, here))
@@ -337,15 +393,23 @@ def _decide(
 
 
 def pack_events(fired: Margins) -> Any:
-    """Return a bit for each event."""
+    """Return the triggered events as a bit mask, one bit for each event.
+
+    Args:
+        fired: True for each event that happens.
+    """
     return sum((jnp.where(one, 1 << i, 0) for i, one in enumerate(jax.tree.leaves(fired))), jnp.asarray(0))
 
 
 def _error_limited_length(
     carry: AdaptiveCarry, here: AdaptiveAttempt, verdict: AdaptiveDecision, control: StepSizeControl
 ) -> Any:
-    """The length that the error allows. A step that was cut short says nothing against it, nor does one with a kink."""
+    """Return the step length that the error allows [s].
+
+    A step that was cut short cannot reduce this length, nor can a step with a switching surface inside.
+    """
     longer = jnp.where(verdict.fine, propose_length(carry.length, here.error), MIN_STEP_RATIO * carry.length)
+    # A step cut short by a clock or an event has a small error, so it may raise the allowed length but not lower it.
     cut = verdict.taken & (carry.length < carry.error_limited)
     wrong = ~verdict.fine | ((here.error > 1) & (here.late <= 0))
     judged = (carry.status == RunStatus.RUNNING) & (verdict.taken | wrong)
@@ -356,12 +420,14 @@ def _error_limited_length(
 
 
 def _continue_search(carry: AdaptiveCarry, here: AdaptiveAttempt, count: int) -> tuple[EventSearch, Any, Any]:
-    """What a try that is not taken tells about an event, or a comparison: the search, the next length, and how that is
-    tried."""
+    """Return the search, the next length and the next status after an attempt with an event or a switching surface
+    inside.
+    """
     new = carry.status == RunStatus.RUNNING
     base = jnp.where(new, carry.length, carry.base)
     which, ends = carry.search.which, _margins(carry, here)
     tells = find_crossings(which, count, here.kink, *ends) if count else find_event_crossings(which, 0, *ends)
+    # A step ends sqrt(eps) steps beyond a switching surface, so that the comparison has surely changed there.
     beyond = jnp.where(which < count, base * jnp.finfo(base.dtype).eps ** OVERSHOOT_EXPONENT, 0.0)
     search, length, enough = bracket_event(carry.search, carry.length, new, tells, base)
     seeking = search, length, jnp.where(enough, RunStatus.PROBING, RunStatus.SEEKING)
@@ -373,5 +439,5 @@ def _continue_search(carry: AdaptiveCarry, here: AdaptiveAttempt, count: int) ->
 
 
 def _margins(carry: AdaptiveCarry, here: AdaptiveAttempt) -> tuple[list[Any], list[Any]]:
-    """At the beginning and at the end of the try."""
+    """Return the margins at the beginning and at the end of the attempt."""
     return jax.tree.leaves(carry.point.margins), jax.tree.leaves(here.point.margins)

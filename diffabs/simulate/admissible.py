@@ -1,10 +1,12 @@
-"""What must not be run: a loop that its parts, the integration grid or its step do not allow, alone or in a batch.
+"""Admissibility of runs: the checks of a loop, its parts, its grid and its step before one run or a batch.
 
     check(loop, solver)                         raises for one loop, with its numbers
-    batch_admissibility(loop, values, solver)   a code for every lane of a batch, 0 where it is accepted
+    batch_admissibility(loop, values, solver)   returns a code for each run of a batch, 0 for an accepted run
 
-Both ask the same things in the same order: ranges of fields and rules between them (`rules`), the start against the
-stop, the parts against the step, and last whether the step is stable, which is the dearest question."""
+Both make the same checks in the same order. First come the ranges of fields and the rules between them (`rules`), then
+the start against the stop, then the parts against the step. The stability of the step comes last, because it costs
+most.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -30,33 +32,42 @@ T = TypeVar("T")
 
 
 class Admissibility(NamedTuple):
-    """Which lanes must not run: a code for each (lanes,), and what the codes mean; code 0 is accepted."""
+    """Refused runs of a batch.
+
+    Attributes:
+        codes: Code of each run, shape (runs,). Code 0 is an accepted run.
+        reasons: Reason for each code, by index; empty for code 0.
+    """
 
     codes: np.ndarray
     reasons: tuple[str, ...]
 
     @property
     def accepted(self) -> np.ndarray:
-        """Which lanes may run (lanes,)."""
+        """True for each accepted run, shape (runs,)."""
         return self.codes == 0
 
     @property
     def texts(self) -> np.ndarray:
-        """The reason of each lane (lanes,), empty where it is accepted."""
+        """Reason for the refusal of each run, shape (runs,); empty for an accepted run."""
         return np.array(self.reasons)[self.codes]
 
     @property
     def number(self) -> int:
-        """How many lanes are refused."""
+        """Number of refused runs."""
         return int(np.count_nonzero(self.codes))
 
 
 def check(part: T, solver: Solver | None = None) -> T:
-    """The part itself if its parameters are in their ranges; with a solver, if this loop may be run with it, too.
+    """Return the part itself if its parameters are in their ranges and, with a solver, if the loop may be run.
+
+    Args:
+        part: Part or loop, with concrete parameters.
+        solver: Solver. If it is given and the part is a loop, the start, the periods and the step are checked, too.
 
     Raises:
-        ValueError: names every offending field with its value, range and unit; a start beyond the stop; a period off
-            the grid; a step that is not stable.
+        ValueError: A field is out of range, the start is beyond the stop, a period is off the grid, or the step is not
+            stable. The message names every offending field with its value, range and unit.
     """
     check_parts(part)
     if isinstance(part, Loop) and solver is not None:
@@ -67,7 +78,12 @@ def check(part: T, solver: Solver | None = None) -> T:
 
 
 def find_impossible_values(loop: Loop, step: float) -> list[str]:
-    """A line for each value of a loop that no run may have, alone or on a grid of this step [s]."""
+    """Return one line for each value of a loop that no run may have; an empty list if all are allowed.
+
+    Args:
+        loop: Closed loop with concrete parameters.
+        step: Step of the grid [s].
+    """
     begun = _start_rule(loop)
     return (
         list(find_broken(part_rules(loop)))
@@ -77,7 +93,12 @@ def find_impossible_values(loop: Loop, step: float) -> list[str]:
 
 
 def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
-    """What does not go together: start and stop, parts and step; a line each."""
+    """Yield one line for each mismatch between start and stop, or between the parts and the step.
+
+    Args:
+        loop: Closed loop with concrete parameters.
+        solver: Solver of the run.
+    """
     begun = _start_rule(loop)
     if not begun.holds:
         yield begun.says()
@@ -86,7 +107,11 @@ def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
 
 
 def find_solver_faults(solver: Solver) -> list[str]:
-    """What is wrong with the solver itself, whatever it integrates."""
+    """Return one line for the first fault of the solver that is independent of the loop; an empty list if it has none.
+
+    Args:
+        solver: Solver to check.
+    """
     step, duration = solver.step, solver.duration
     if step > duration:
         return [f"solver.step = {step:g} s is outside (0, {duration:g}] s: longer than solver.duration"]
@@ -97,14 +122,21 @@ def find_solver_faults(solver: Solver) -> list[str]:
 
 
 def find_unstable_step(loop: Loop, solver: Solver) -> Iterator[str]:
-    """A line for a step that is too long for the loop; `Adaptive` finds its steps by itself."""
+    """Yield one line if the step is too long for the loop.
+
+    An `Adaptive` solver finds its own steps, so it yields nothing.
+
+    Args:
+        loop: Closed loop with concrete parameters.
+        solver: Solver of the run.
+    """
     if isinstance(solver, Adaptive):
         return
     largest, end = stable_step(loop), getattr(loop.stop, "speed", None)
     where = "" if end is None else f", between the initial speed and {end:g} m/s,"
     if solver.step > largest:
         digit = 10.0 ** (math.floor(math.log10(largest)) - 2)
-        largest = math.floor(largest / digit) * digit  # what is printed must be stable too
+        largest = math.floor(largest / digit) * digit  # rounded down: the printed step must be stable, too
         yield (
             f"solver.step = {solver.step:g} s is not stable: RK4 follows the fastest mode of this loop"
             f"{where} only with steps in (0, {largest:.3g}] s"
@@ -112,17 +144,27 @@ def find_unstable_step(loop: Loop, solver: Solver) -> Iterator[str]:
 
 
 def batch_admissibility(loop: Loop | None, values: Any, solver: Solver) -> Admissibility:
-    """The lanes of a loop that differ in the values (lanes,) at these paths: what `check` says of each, in one compiled
-    call for all. Without a loop (None) `values` is a batch of loops, whose leaves have a leading axis.
+    """Return the result of `check` for each run of a batch, with one compiled program for all runs.
 
-    Raises ValueError for a solver that is wrong whatever it integrates."""
+    Args:
+        loop: Loop that the runs have in common. If it is None, `values` is a batch of loops whose leaves have a leading
+            axis (runs,).
+        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
+        solver: Solver of all runs.
+
+    Raises:
+        ValueError: The solver has a fault that is independent of the loop.
+    """
     if lines := find_solver_faults(solver):
         raise ValueError(lines[0])
     values = {path: np.asarray(x, float) for path, x in values.items()} if isinstance(values, Mapping) else values
     loop, values = jax.tree.map(lambda x: np.asarray(x, float), (loop, values))
     with jax.enable_x64(True):
         known = jax.tree.map(lambda x: x if np.ndim(x) else as_array(float(x), x.dtype), (loop, values))
+        # Double precision: single precision could round a value across the end of its range.
         codes = np.array(_codes(*known, step=solver.step))
+    # Only accepted runs need the costly stability check. `np.resize` repeats them up to the batch's size, so that
+    # the compiled program keeps its shapes.
     if not codes.all() and not isinstance(solver, Adaptive):
         fine = np.flatnonzero(codes == 0)
         asked = values if len(fine) == len(codes) else jax.tree.map(lambda x: x[np.resize(fine, len(codes))], values)
@@ -131,7 +173,7 @@ def batch_admissibility(loop: Loop | None, values: Any, solver: Solver) -> Admis
 
 
 def _name_reasons(loop: Loop | None, values: Any, step: float, codes: np.ndarray) -> Admissibility:
-    """Only those reasons that occur; -1 is the step's."""
+    """Return the codes renumbered to the reasons that occur; code -1 is an unstable step."""
     there = [code for code in np.unique(codes).tolist() if code] if codes.any() else []
     named = {-1: f"solver.step = {step:g} s is not stable"}
     if any(code > 0 for code in there):
@@ -143,8 +185,13 @@ def _name_reasons(loop: Loop | None, values: Any, step: float, codes: np.ndarray
 
 
 def first_refusal(loop: Loop, values: Mapping[str, Any], solver: Solver) -> str | None:
-    """The first refused lane and why, in a line with its numbers; None if all lanes are accepted. Without values the
-    loop is the lane."""
+    """Return one line about the first refused run and the reason, with its numbers; None if all runs are accepted.
+
+    Args:
+        loop: Loop that the runs have in common. Without values it is the only run.
+        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
+        solver: Solver of all runs.
+    """
     if not values:
         lines = [*find_broken(part_rules(loop)), *find_mismatches(loop, solver)] or list(
             find_unstable_step(loop, solver)
@@ -168,7 +215,7 @@ def _lane(loop: Loop | None, values: Any) -> Loop:
 
 
 def _rules(loop: Loop, step: float) -> Iterator[Rule]:
-    """Everything but the stability, in the order of `check`."""
+    """Yield every rule but the stability of the step, in the order of `check`."""
     yield from part_rules(loop)
     yield _start_rule(loop)
     yield from grid_rules(loop, step)
@@ -176,27 +223,27 @@ def _rules(loop: Loop, step: float) -> Iterator[Rule]:
 
 @partial(jax.jit, static_argnames="step")
 def _codes(loop: Loop | None, values: Any, *, step: float) -> Any:
-    """The number of the first broken rule of each lane, from 1; 0 for none (lanes,)."""
+    """Return the number of the first broken rule of each run, from 1, shape (runs,); 0 if no rule is broken."""
 
     def code(values: Any) -> Any:
         holds = jnp.stack([jnp.asarray(rule.holds) for rule in _rules(canonical_dtypes(_lane(loop, values)), step)])
-        return jnp.where(jnp.all(holds), 0, 1 + jnp.argmin(holds))
+        return jnp.where(jnp.all(holds), 0, 1 + jnp.argmin(holds))  # argmin finds the first False
 
     return jax.vmap(code)(values)
 
 
+# One compiled program: the operations one by one would each cost as much as the whole function.
 @compile_once(options=QUICK_COMPILE_OPTIONS)
 def _margin(plant: Any, initial: Any, stop: Any) -> jax.Array:
-    """The margin of the stop at the start. Compiled as one: each operation by itself costs as much as all of them."""
+    """Return the margin of the stop at the start."""
     return stop.margin(plant.output(plant.start(initial)))
 
 
 def _start_rule(loop: Loop) -> Rule:
-    """A run starts on this side of its stop."""
+    """Return the rule that a run starts before its stop."""
     after = ": the run would end before it starts"
-    margin = _margin(
-        *canonical_dtypes((loop.plant, loop.initial, loop.stop))
-    )  # a number of Python raises OverflowError
+    # Arrays instead of Python numbers: a Python number overflows with an OverflowError, an array becomes infinite.
+    margin = _margin(*canonical_dtypes((loop.plant, loop.initial, loop.stop)))
     margin = margin if is_traced(margin) else np.asarray(margin)
     start, end = (getattr(part, "speed", None) for part in (loop.initial, loop.stop))
     if start is None or end is None:

@@ -1,7 +1,9 @@
-"""What happens in one step of the grid, or in a part of one; `adaptive` says the same of steps that it chooses.
+"""One fixed step, or a part of one: integration, objectives, events and ticks. `adaptive` has the same for adaptive
+steps.
 
-integrate to t + h, within one regime;  the plant's projection;  the objectives' update over the step;  at t + h the
-blocks' events and ticks;  the rates from there, with which the next step begins"""
+A step integrates to t + h within one mode. Then the plant projects its state, and the objectives are updated over the
+step. At t + h the events and ticks of the blocks happen. The rates after these changes begin the next step.
+"""
 
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -20,9 +22,17 @@ from diffabs.simulate.rk4 import rk4_step_from
 
 
 class FixedStepPoint(NamedTuple):
-    """A run at an instant, after what changes there: the loop's state and the objectives' accumulators, what is seen,
-    the rates of both (of what is integrated), the margins of the stop and of the blocks' events, and the regime: the
-    answers to the comparisons in these rates."""
+    """A run at an instant, after the changes there.
+
+    Attributes:
+        t: Time [s].
+        state: State of the loop.
+        accumulators: Accumulators of the objectives.
+        sample: Sample of the signals.
+        rate: Rates of the loop's flow and of the objectives' integrals.
+        margins: Margins of the stop and of the blocks' events.
+        mode: Answers to the comparisons in these rates.
+    """
 
     t: Any
     state: LoopState
@@ -34,8 +44,14 @@ class FixedStepPoint(NamedTuple):
 
 
 class SurfaceCrossing(NamedTuple):
-    """Of the comparisons at the end of a step: one other than that which is looked for, and which says something else
-    than in the step, or -1; whether that which is looked for does; the one of these to look for; and its margin."""
+    """Contradicted comparisons at the end of a step: their answers differ from the mode of the step.
+
+    Attributes:
+        other: A contradicted comparison other than the sought one, or -1.
+        contradicted: True if the sought comparison is contradicted.
+        chosen: Number of the comparison to search for: the sought one if it is contradicted, else `other`.
+        margin: Margin of the chosen comparison.
+    """
 
     other: Any
     contradicted: Any
@@ -44,8 +60,19 @@ class SurfaceCrossing(NamedTuple):
 
 
 class FixedStepAttempt(NamedTuple):
-    """The end of a step, before what changes there: time, state, accumulators, signals, rates, margins, comparisons,
-    the regime from there, and the step itself for the blocks that record it."""
+    """The end of an attempted step, before the changes there.
+
+    Attributes:
+        t: Time [s].
+        state: State of the loop, projected.
+        accumulators: Accumulators of the objectives.
+        signals: Signals of the loop.
+        rate: Rates of the loop's flow and of the objectives' integrals.
+        margins: Margins of the stop and of the blocks' events.
+        kink: Contradicted comparisons.
+        mode: Mode after the step.
+        passed: The step as a `Passage` for each block that records its signal.
+    """
 
     t: Any
     state: LoopState
@@ -59,9 +86,17 @@ class FixedStepAttempt(NamedTuple):
 
 
 class StepRequest(NamedTuple):
-    """A step to be made: length [s], the time at its end, the step of the grid [s]; whether it is a blunt one, over
-    whatever lies within; whether it is none, but works out anew what an event has changed; the comparison
-    that is looked for, and whether the step ends where that changes."""
+    """A step to attempt.
+
+    Attributes:
+        h: Length [s].
+        end: Time at the end [s].
+        step: Step of the grid [s].
+        unrestricted: True for a step without a mode: each stage evaluates its comparisons, across switching surfaces.
+        refresh: True for a step of length 0 that evaluates the rates after an event.
+        which: Number of the sought comparison.
+        lands: True if the step ends on the switching surface of that comparison.
+    """
 
     h: Any
     end: Any
@@ -73,7 +108,13 @@ class StepRequest(NamedTuple):
 
 
 def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopState, Accumulators]:
-    """Return state and accumulators at t = 0, after the first ticks; a block whose margin is negative has its event."""
+    """Return state and accumulators at t = 0, after the first ticks and the events of blocks with a negative margin.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        clock: Instant t = 0.
+    """
     state = loop.start()
     signals = loop.signals(clock.t, state)
     accumulators = {name: objective.start(signals.sample) for name, objective in objectives.items()}
@@ -84,14 +125,28 @@ def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopS
 
 
 def initial_point(loop: Loop, objectives: Objectives, clock: Clock, *, kinks: bool = False) -> FixedStepPoint:
-    """Return the point at t = 0."""
+    """Return the point at t = 0.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        clock: Instant t = 0.
+        kinks: True if switching surfaces are located.
+    """
     state, accumulators = start_state(loop, objectives, clock)
     system = build_dynamics(loop, objectives, clock.t, state, accumulators, kinks=kinks)
     return _evaluate_point(system, clock.t, state, accumulators, Mode(None))
 
 
 def attempt_step(system: Dynamics, point: FixedStepPoint, one: StepRequest, active: Any) -> FixedStepAttempt:
-    """Return what this step leads to, by one Runge-Kutta step."""
+    """Return the end of one Runge-Kutta step from a point.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        point: Point at the beginning.
+        one: Step to attempt.
+        active: False for a run that is over. Its result has no meaning.
+    """
     loop, (z, held) = system.loop, split_flow_and_held(point.state, point.accumulators)
 
     def flow(t: Any, z: Any, given: tuple[Any, Mode]) -> Any:
@@ -101,6 +156,7 @@ def attempt_step(system: Dynamics, point: FixedStepPoint, one: StepRequest, acti
     state = point.state.with_flow(z[0])
     accumulated = {name: memory._replace(flow=z[1][name]) for name, memory in point.accumulators.items()}
     rests = state._replace(plant=loop.plant.project(state.plant))
+    # A projection may move the state onto a switching surface, so the end of a frozen mode is evaluated without it.
     state = jax.tree.map(partial(jnp.where, one.unrestricted), rests, state) if system.kinks else rests
 
     def look() -> Any:
@@ -112,10 +168,12 @@ def attempt_step(system: Dynamics, point: FixedStepPoint, one: StepRequest, acti
         )
         return seen, SurfaceCrossing(*find_contradicted(answers, one.which, one.h)), answers.words
 
+    # The evaluation has many consumers (objectives, margins, rates). XLA would fuse a copy of it into each of them.
     seen, kink, words = jit_barrier(active, look) if system.kinks else look()
     end = (one.end, state, accumulated, seen.rate)
     segment = _build_segment(system, point, end, seen.signals.sample, one)
     new = {name: Memory(z[1][name], o.update(accumulated[name], segment)) for name, o in system.objectives.items()}
+    # A step of length 0 must not count twice in the objectives.
     accumulated = (
         jax.tree.map(partial(jnp.where, one.refresh), point.accumulators, new)
         if loop.changes and not loop.ticks
@@ -128,10 +186,19 @@ def attempt_step(system: Dynamics, point: FixedStepPoint, one: StepRequest, acti
 def commit_step(
     system: Dynamics, clock: Clock, here: FixedStepAttempt, fired: Margins, one: StepRequest, logs: list[Any]
 ) -> FixedStepPoint:
-    """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
-    loop without ticks, what follows from an event is left to a step that does it `anew`: there are few of them.
+    """Return the point at which the run continues, after the triggered events and the ticks of the clock.
 
-    logs: the rows of the blocks' logs, which the state is without (`core.log`)"""
+    In a loop without ticks a later step of length 0 (`StepRequest.refresh`) evaluates the rates after an event. Events
+    are rare, so this is cheaper than an evaluation after every step.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        clock: Instant at the end of the step.
+        here: Result of the attempt.
+        fired: True for each event that happens at the end of the step.
+        one: Step that led there.
+        logs: Rows of the blocks' logs, which the state is without (`core.log`).
+    """
     t, state, accumulators, signals, rate, margins, _, mode, passed = here
     if system.loop.changes:
         state = borrow(system.loop.change(clock, borrow(state, logs), signals, margins, fired, passed), None)
@@ -148,18 +215,39 @@ def _evaluate_point(
 
 
 def mode_at_end(system: Dynamics, words: ModeBits, which: Any, lands: Any, free: Any) -> Mode:
-    """Return the regime for the end of a step made in the regime `words`: the same, or as the numbers say where it is
-    `free`. A step that `lands` on the comparison `which` changes its answer, and others may follow."""
+    """Return the mode for the end of a step made in the mode `words`.
+
+    It is the same mode, or the comparisons are evaluated where it is `free`. A step that lands on a switching surface
+    flips the answer of that comparison, and the other comparisons may give way.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        words: Answers to the comparisons in the step.
+        which: Number of the sought comparison.
+        lands: True if the step ends on its switching surface.
+        free: True if all comparisons are evaluated.
+    """
     one_bit = single_bit(which, system.words)
     none, all = jnp.uint32(0), ~jnp.uint32(0)
+    # `loose` are the answers that the numbers may override. The landed comparison is not among them: at its zero,
+    # rounding could turn it back.
     flipped = tuple(word ^ jnp.where(lands, bit, none) for word, bit in zip(words, one_bit, strict=True))
     loose = tuple(jnp.where(free, all, jnp.where(lands, ~bit, none)) for bit in one_bit)
     return Mode(flipped, free, loose)
 
 
 def mode_after_changes(system: Dynamics, words: ModeBits, which: Any, lands: Any) -> Mode:
-    """Return the regime after the ticks and events at the end of a step: as the numbers say, but for the comparison on
-    which the step `lands`."""
+    """Return the mode after the ticks and events at the end of a step.
+
+    All comparisons are evaluated, except for the comparison on whose switching surface the step lands: it keeps its
+    answer.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        words: Answers to the comparisons at the end of the step.
+        which: Number of the sought comparison.
+        lands: True if the step ends on its switching surface.
+    """
     kept = (jnp.where(lands, bit, jnp.uint32(0)) for bit in single_bit(which, system.words))
     return Mode(words, ~lands, tuple(~bit for bit in kept))
 
@@ -168,32 +256,35 @@ def _build_segment(system: Dynamics, point: FixedStepPoint, end: Any, sample: Sa
     within = Mode(point.mode, one.unrestricted)
     ends = ((point.t, point.state, point.accumulators, point.rate[0]), end)
 
+    # Rates are computed on demand, once for all objectives that ask for them.
     def each(of: Any) -> Any:
-        return cache(lambda: tuple(system.moving(of, end, within) for end in ends))
+        return cache(lambda: tuple(system.rate_of(of, end, within) for end in ends))
 
-    smooth = (
-        ~one.unrestricted if system.kinks else False
-    )  # a step that ends on every comparison reaches no limit within
+    # A step that ends on every switching surface reaches no limit inside.
+    smooth = ~one.unrestricted if system.kinks else False
     rates = each(Shown.of), each(lambda sample: sample)
     return Segment(point.sample, sample, one.h, one.step, *rates, smooth, (True, True))
 
 
 def _build_passages(system: Dynamics, point: FixedStepPoint, end: Any, one: StepRequest) -> dict[str, Passage]:
-    """What blocks record of a step: their signals at both ends, and the rates, within its regime."""
+    """Return the recorded signals of each block at both ends of a step, and their rates within its mode."""
     loop, within = system.loop, Mode(point.mode, one.unrestricted)
 
-    def moving(t: Any, state: LoopState, accumulators: Accumulators, rate: Any) -> Any:
+    def recorded_rates(t: Any, state: LoopState, accumulators: Accumulators, rate: Any) -> Any:
         (flow, still), held = split_flow_and_held(state, accumulators)
 
-        def seen(t: Any, flow: Any) -> Any:
+        def recorded(t: Any, flow: Any) -> Any:
             if system.program is None:
                 return loop.signals(t, state.with_flow(flow)).recorded
             fixed = (held, loop, system.objectives)
-            return system.program(lambda seen: seen.signals.recorded, (t, flow, still), fixed, within)
+            return system.program(lambda recorded: recorded.signals.recorded, (t, flow, still), fixed, within)
 
-        return jax.jvp(seen, (t, flow), (jnp.ones_like(t), rate))
+        return jax.jvp(recorded, (t, flow), (jnp.ones_like(t), rate))
 
     if not loop.recorders:
         return {}
-    (starts, rates), (ends, last) = moving(point.t, point.state, point.accumulators, point.rate[0]), moving(*end)
+    (starts, rates), (ends, last) = (
+        recorded_rates(point.t, point.state, point.accumulators, point.rate[0]),
+        recorded_rates(*end),
+    )
     return {name: Passage(point.t, one.end, (starts[name], ends[name]), (rates[name], last[name])) for name in starts}

@@ -1,4 +1,6 @@
-"""Many runs at once: masses, speeds, roads, noise, one lane each."""
+"""Batches: many runs of one loop at once, with different masses, speeds, roads or noise, one row of values for each
+run.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -19,19 +21,23 @@ from diffabs.simulate.run import refuse, run_unchecked
 from diffabs.simulate.sharding import run_on_auto_mesh
 from diffabs.simulate.solution import Run, Solver
 
+# Part of a message: why a batch cannot run in a kernel.
 TOGETHER_REASON = "lanes run together, for trajectories or for derivatives in either mode"
-MAX_LENGTH_RATIO = 2.0  # lanes that run together differ by less than this factor in length
+MAX_LENGTH_RATIO = 2.0  # runs in one group differ by less than this factor in duration
 
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """Lanes: what differs between runs of a loop, a row for each. An empty batch is the loop itself, one lane.
+    """The parameters that differ between the runs of a batch, one row for each run. An empty batch is a single run of
+    the loop.
 
-    values: parameters by dotted path, in SI, (lanes, ...)
-    keys: for noisy sensors, keys of `jax.random` or whole numbers, the seeds of keys (lanes,)
-    weights: positive (lanes,); `tune` multiplies the lane's objective by it (1/the shortest distance possible, say)
-    durations: [s] (lanes,), in which each lane is sure to end; lanes that run together are then of similar length, so
-        that the short ones do not wait for the long ones. Without them all run for `solver.duration`
+    Attributes:
+        values: Parameter values by dotted path, in SI units, shape (runs, ...).
+        keys: Random keys of `jax.random`, or whole numbers as seeds of keys, shape (runs,), for noisy sensors.
+        weights: Positive weights, shape (runs,). `tune` multiplies the objective of each run by its weight, for example
+            by 1/the shortest possible distance.
+        durations: Times [s] in which each run is sure to end, shape (runs,). Runs that step together then have similar
+            durations, so that short runs do not wait for long ones. Without them all runs have `solver.duration`.
     """
 
     values: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -41,7 +47,11 @@ class Batch:
 
     @property
     def size(self) -> int:
-        """How many lanes. Raises ValueError for columns of different lengths, or of none."""
+        """Number of runs.
+
+        Raises:
+            ValueError: The columns have different lengths, or a column has no length.
+        """
         others = {name: getattr(self, name) for name in ("keys", "weights", "durations")}
         columns = {**self.values, **{name: column for name, column in others.items() if column is not None}}
         lengths = {name: np.shape(column)[0] if np.ndim(column) else 0 for name, column in columns.items()}
@@ -51,8 +61,16 @@ class Batch:
         return next(iter(lengths.values()), 1)
 
     def check(self, loop: Any, solver: Solver | None = None) -> "Batch":
-        """Return the batch if its lanes fit the loop. Raises ValueError for a path that does not exist, columns of
-        different lengths, a value out of range, and, with a solver, a lane that `batch_admissibility` refuses."""
+        """Return the batch itself if its values fit the loop.
+
+        Args:
+            loop: Loop that the runs have in common.
+            solver: Solver of all runs. If it is given, each run must pass `batch_admissibility`.
+
+        Raises:
+            ValueError: A path does not exist, columns have different lengths, a value is out of range, a weight or a
+                duration is not positive and finite, or a run is refused.
+        """
         specs, _ = {path: spec for path, spec, _ in parameters(loop)}, self.size
         for path, column in self.values.items():
             if path not in specs:
@@ -71,19 +89,26 @@ class Batch:
         return self
 
     def groups(self, duration: float) -> list[tuple[np.ndarray, float]]:
-        """Lanes (their numbers) of similar `durations`, and for how long [s] they are run, at most `duration`."""
+        """Return groups of runs with similar `durations`: the numbers of the runs and the group's duration [s], at most
+        `duration` [s].
+        """
         wanted = np.minimum(np.asarray(self.durations, float), duration)
         classes = np.floor(np.log(wanted.max() / wanted) / np.log(MAX_LENGTH_RATIO)).astype(int)
         members = [np.flatnonzero(classes == i) for i in np.unique(classes)]
         return [(lanes, float(wanted[lanes].max())) for lanes in members]
 
     def lane(self, loop: Any, i: int) -> Any:
-        """The loop of lane i."""
+        """Return the loop of run `i`, given the common `loop`."""
         return replace(loop, {path: np.asarray(column)[i] for path, column in self.values.items()})
 
     def each(self, loop: Any, function: Callable[[Any, Any], Any], lanes: Any = None) -> Any:
-        """Return function(loop, key) of every lane (key None without keys), or of those of the numbers `lanes`, with a
-        leading axis: `jax.vmap`, differentiable."""
+        """Return function(loop, key) of every run with a leading axis (runs,), by `jax.vmap`; differentiable.
+
+        Args:
+            loop: Loop that the runs have in common.
+            function: Function of the loop and the key of one run. The key is None in a batch without keys.
+            lanes: Numbers of the runs to include; None for all runs.
+        """
         columns = {path: jnp.asarray(column, float) for path, column in self.values.items()}, self._keys()
         if not jax.tree.leaves(columns):
             return jax.tree.map(lambda x: jnp.asarray(x)[None], function(loop, None))
@@ -109,43 +134,50 @@ def run_batch(
     enough: EarlyEnd | None = None,
     engine: str = "xla",
 ) -> Run:
-    """Run every lane of a batch and return what `measure` returns of each: a `Run` with a leading axis, in their order.
+    """Simulate every run of a batch and return a `Run` with a leading axis (runs,), in the order of the batch.
 
-    loop: what the lanes have in common
-    batch: what differs between them; an empty one is one lane
-    solver: step and duration [s] of every run
-    objectives: by the names of the metrics, which are (lanes,); None is none
-    trajectories: keep them, (lanes, instants, ...), every `solver.every`-th instant
-    together: True is `jax.vmap` of `measure`: all lanes step until the last has ended, and there are derivatives in
-        both modes, in the loop and in the batch's values. False has no reverse mode, but a lane that has ended makes
-        room for the next, so that few long ones do not hold up the rest. The two agree to rounding. None is True if
-        the call is traced (inside jit, grad, vmap); trajectories and an empty batch are always run together
-    accepted: which lanes are run (lanes,), or True for all; the others have `diverged`, and their metrics are NaN.
-        None is those that `batch_admissibility` accepts, or all if the call is traced
-    enough: ends runs early, which then have neither stopped, timed out nor diverged; not together
-    engine: "kernel" makes of the loop's step a program of this machine (a C++ compiler is needed): the same numbers to
-        rounding, and derivatives, forward (`jax.jvp`, `jax.jacfwd`) and not in reverse; no trajectories. "auto" does so
-        for values where it can, and otherwise what "xla" does
+    Each element is the result of `measure` for that run. The function is compiled once for a structure and a number of
+    runs, not for new values, keys or durations. Runs whose arrays lie on several devices are computed there. The axes
+    of the mesh may have any type, but Explicit axes do not work within jit.
 
-    Compiled once for a structure and a number of lanes, not for new values, keys or durations. Lanes that lie on
-    several devices run there, whatever the type of their mesh's axes; on Explicit ones not within jit.
+    Args:
+        loop: Loop that the runs have in common.
+        batch: Parameters that differ between the runs. An empty batch is one run.
+        solver: Step and duration [s] of every run.
+        objectives: Objectives by the names of the metrics, each with shape (runs,); None for no metrics.
+        trajectories: True keeps trajectories, shape (runs, instants, ...), with every `solver.every`-th instant.
+        together: True is `jax.vmap` of `measure`: all runs step until the last has ended, and derivatives exist in both
+            modes, with respect to the loop and the batch's values. False has no reverse mode, but a run that has ended
+            makes room for the next, so that a few long runs do not delay the rest. Both agree to rounding. None is True
+            if the call is traced (inside jit, grad, vmap). Trajectories and an empty batch always use True.
+        accepted: Runs to execute, shape (runs,), or True for all. The others have `diverged`, and their metrics are
+            NaN. None means the runs that `batch_admissibility` accepts, or all if the call is traced.
+        enough: Condition that ends runs early. Such a run has neither stopped, timed out nor diverged. Not
+            for runs that step together.
+        engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine, which needs a
+            C++ compiler. It returns the same numbers to rounding and has forward derivatives (`jax.jvp`, `jax.jacfwd`),
+            but no reverse mode and no trajectories. "auto" uses the kernel for values where possible, and XLA
+            otherwise.
 
-    >>> import diffabs as d
-    >>> from diffabs.objectives import StopDistance
-    >>> masses = d.Batch({"plant.mass": [12.0, 18.0]})
-    >>> run = d.run_batch(d.braking(), masses, d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
-    >>> print(*(f"{distance:.1f}" for distance in run.metrics["distance"]))
-    43.9 43.8
+    Examples:
+        >>> import diffabs as d
+        >>> from diffabs.objectives import StopDistance
+        >>> masses = d.Batch({"plant.mass": [12.0, 18.0]})
+        >>> run = d.run_batch(d.braking(), masses, d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
+        >>> print(*(f"{distance:.1f}" for distance in run.metrics["distance"]))
+        43.9 43.8
 
     Raises:
-        ValueError: columns of different lengths; what `measure` objects to; `enough` for lanes that run together; what
-            stands against the engine "kernel" (`simulate.native.kernel_objection` says it without running anything).
-        KeyError: a path that does not exist.
-        RuntimeError: a kernel in a process that was forked after JAX had started.
+        ValueError: Columns have different lengths, `measure` rejects the arguments, or `enough` is given for runs that
+            step together. Also if engine "kernel" is impossible; `simulate.native.kernel_objection` returns the reason
+            without a run.
+        KeyError: A path does not exist.
+        RuntimeError: A kernel is requested in a process that was forked after JAX had started.
     """
     if engine != "xla":
         check_process()
 
+    # Everything that may lie on devices is an argument, so that `run_on_auto_mesh` sees it.
     def run(loop: Loop, values: Any, keys: Any, objectives: Any, accepted: Any, enough: Any) -> Run:
         lanes = dataclasses.replace(batch, values=values, keys=keys)
         return _dispatch_batch(loop, lanes, solver, objectives, trajectories, together, accepted, enough, engine)
@@ -168,6 +200,7 @@ def _dispatch_batch(
     columns = {path: jnp.asarray(x) if isinstance(x, list | tuple) else x for path, x in batch.values.items()}
     batch = dataclasses.replace(batch, values=columns)
     refuse(replace(loop, {path: column[0] for path, column in batch.values.items()}), solver, objectives)
+    # Traced values cannot be checked. A traced batch runs every member, and an impossible one diverges.
     live = is_traced(loop, dict(batch.values), dict(objectives))
     if accepted is None:
         asked = bool(batch.values) and not live
@@ -205,22 +238,25 @@ def _dispatch_batch(
 def _run_vmapped(
     loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], trajectories: bool
 ) -> Run:
-    """In groups of similar length, but trajectories have all the same instants."""
+    """Run the batch with `jax.vmap`, in groups of similar duration. With trajectories there is one group, since all
+    share their instants.
+    """
     every = solver.every if trajectories else 0
 
-    def found(lanes: Any, duration: float) -> Run:
+    def run_group(lanes: Any, duration: float) -> Run:
         like = dataclasses.replace(solver, duration=duration)
         return batch.each(loop, lambda one, key: run_unchecked(one, like, objectives, key, every), lanes)
 
     if trajectories or batch.durations is None:
-        return found(None, solver.duration)
+        return run_group(None, solver.duration)
     groups = batch.groups(solver.duration)
+    # The inverse permutation restores the order of the batch after the groups are joined.
     order = np.argsort(np.concatenate([lanes for lanes, _ in groups]))
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *(found(*group) for group in groups))
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *(run_group(*group) for group in groups))
 
 
 def _mark_refused(run: Run, accepted: Any) -> Run:
-    """With lanes that are not accepted as refilled ones are."""
+    """Return the runs with the results of refused runs replaced as in a packed batch: diverged, with NaN metrics."""
     if accepted is True:
         return run
     accepted = jnp.asarray(accepted, bool)
@@ -230,7 +266,11 @@ def _mark_refused(run: Run, accepted: Any) -> Run:
 
 
 def group_by_structure(loops: Sequence[Any]) -> list[list[int]]:
-    """Return the places of those loops that can be lanes of one batch: of equal structure and shapes."""
+    """Return the indices of the loops in groups of equal structure and shapes; each group can be one batch.
+
+    Args:
+        loops: Loops to group.
+    """
     groups: dict[Any, list[int]] = {}
     for place, loop in enumerate(map(as_arrays, loops)):
         groups.setdefault((jax.tree.structure(loop), *map(np.shape, jax.tree.leaves(loop))), []).append(place)
@@ -238,8 +278,15 @@ def group_by_structure(loops: Sequence[Any]) -> list[list[int]]:
 
 
 def stack_loops(loops: Sequence[Any]) -> tuple[Any, Batch]:
-    """Return loops of one structure as lanes, for `run_batch`: the first of them, and every parameter of each (lanes,
-    ...). Raises ValueError for loops of different structures: see `group_by_structure`."""
+    """Return loops of one structure as a batch for `run_batch`: the first loop, and every parameter of each, shape
+    (runs, ...).
+
+    Args:
+        loops: Loops of one structure (see `group_by_structure`).
+
+    Raises:
+        ValueError: The loops have different structures.
+    """
     if (kinds := len(group_by_structure(loops))) != 1:
         raise ValueError(f"loops of {kinds} structures are no lanes of one batch")
     each = [{path: value for path, _, value in parameters(loop)} for loop in loops]
@@ -247,16 +294,23 @@ def stack_loops(loops: Sequence[Any]) -> tuple[Any, Batch]:
 
 
 def grid(values: Mapping[str, Sequence[float]]) -> Batch:
-    """Return a lane for every combination of the values by path."""
+    """Return a batch with one run for every combination of the values.
+
+    Args:
+        values: Values of each parameter, by dotted path.
+    """
     axes = np.meshgrid(*(np.asarray(v, float) for v in values.values()), indexing="ij")
     return Batch({path: axis.ravel() for path, axis in zip(values, axes, strict=True)})
 
 
 def latin(ranges: Mapping[str, tuple[float, float]], count: int, seed: int = 0) -> Batch:
-    """Return `count` lanes spread over a box by a scrambled Latin hypercube (SciPy's).
+    """Return a batch of `count` runs spread over a box by SciPy's scrambled Latin hypercube.
 
-    ranges: low and high by path
-    seed: of the scrambling"""
+    Args:
+        ranges: Lowest and highest value of each parameter, by dotted path.
+        count: Number of runs.
+        seed: Seed of the scrambling.
+    """
     from scipy.stats import qmc
 
     low, high = np.array(list(ranges.values()), float).T

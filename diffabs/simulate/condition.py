@@ -1,4 +1,4 @@
-"""How a run is: on its way, or over, and why."""
+"""Status of a run: running, searching for an event, or over, and the reason."""
 
 import enum
 from typing import Any
@@ -8,24 +8,48 @@ import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, Margins
 
-MAX_MISSED_FRACTION = 0.1  # of the change of the stop's margin in the step: the most that may be left of it
+# A landing on the stop may leave at most this fraction of the margin's change in the step.
+MAX_MISSED_FRACTION = 0.1
 
 
 class RunStatus(enum.IntEnum):
-    """A run goes on; or looks for an event, for how its margin falls, or for second derivatives of its moment; or is to
-    land on it, or to look around after it; or it is over."""
+    """Status of a run; every value up to `REFRESHING` means that the run goes on.
+
+    Attributes:
+        RUNNING: The next attempt is an ordinary step.
+        SEEKING: Attempts shrink a bracket around an event.
+        PROBING: The attempt measures how the margin falls near the event.
+        REFINING: The attempt provides second derivatives of the event's time.
+        LANDING: The attempt ends on the event.
+        REFRESHING: A step of length 0 evaluates the rates after the event.
+        STOPPED: The run is over and has reached its stop.
+        TIMED_OUT: The run is over because its duration has passed.
+        DIVERGED: The run is over because its numbers are invalid.
+    """
 
     RUNNING, SEEKING, PROBING, REFINING, LANDING, REFRESHING, STOPPED, TIMED_OUT, DIVERGED = range(9)
 
 
 def is_running(carry: Any) -> Any:
-    """Return whether another step of the run that has this carry is to be made or tried."""
+    """Return True if the run needs another attempt.
+
+    Args:
+        carry: Carry of the run, with a `status`.
+    """
     return carry.status <= RunStatus.REFRESHING
 
 
 def status_after_step(loop: Loop, carry: Any, margins: Margins, verdict: Any) -> Any:
-    """Return the condition after a step that is taken, with these margins at its end; `verdict` says which events
-    happen there, and whether the run is over. A landing that does not come to rest on the stop is none."""
+    """Return the status after an accepted step.
+
+    A landing whose margin is too far from zero (`MAX_MISSED_FRACTION`) makes the run diverge.
+
+    Args:
+        loop: Closed loop.
+        carry: Carry before the step.
+        margins: Margins at the end of the step.
+        verdict: Decision on the attempt: the triggered events, and True in `over` if the run ends there.
+    """
     left, scale = jnp.abs(margins["stop"][0]), carry.point.margins["stop"][0] + jnp.abs(carry.search.at_full)
     landed = jnp.where(left <= MAX_MISSED_FRACTION * scale, RunStatus.STOPPED, RunStatus.DIVERGED)
     further = jnp.asarray(RunStatus.RUNNING)

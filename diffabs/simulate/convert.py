@@ -1,4 +1,4 @@
-"""A run for a person and for other tools: a summary, a pandas.DataFrame, an xarray.Dataset, a figure."""
+"""Conversion of a run to a summary, a pandas.DataFrame, an xarray.Dataset or a figure."""
 
 import importlib
 from collections.abc import Mapping
@@ -12,17 +12,26 @@ from jax.core import Tracer
 from diffabs.core.summary import Summary, round_for_table
 
 NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
-DEFAULT_CONTROL_UNIT = "control"  # the unit of the control where no plant says it
+DEFAULT_CONTROL_UNIT = "control"  # unit of the control if no plant is given
 
 
 def is_concrete(run: Any) -> bool:
-    """Return whether a run has numbers: not within a function that JAX traces."""
+    """Return True if a run holds numbers, False inside a function that JAX traces.
+
+    Args:
+        run: Run to inspect.
+    """
     leaves = jax.tree.leaves(run)
     return all(isinstance(x, NUMBER_TYPES) and not isinstance(x, Tracer) for x in leaves)
 
 
 def summarise_run(run: Any) -> Summary:
-    """Return what a run is: how it ended, and what was measured."""
+    """Return a summary of a run: how it ended, and its metrics. A batch gets mean, least and greatest value of each
+    metric.
+
+    Args:
+        run: One run, or the runs of a batch.
+    """
     shape, kept = np.shape(run.stopped), run.trajectory is not None
     if not is_concrete(run):
         return Summary(f"Run being traced, of {len(run.metrics)} metrics")
@@ -46,11 +55,14 @@ def _summarise_runs(run: Any, count: int) -> Summary:
 
 
 def trajectory_columns(run: Any, plant: Any = None) -> dict[str, tuple[str, np.ndarray]]:
-    """Return unit and values (instants,) of what was seen in a run up to its end, by name; the time is `t`.
+    """Return unit and values (instants,) of each signal up to the end of a run, by name; the time is `t`.
 
-    plant: whose unit the control has; without one that is said as "control"
+    Args:
+        run: One run with a trajectory.
+        plant: Plant that defines the unit of the control. Without a plant the unit is "control".
+
     Raises:
-        ValueError: a run without a trajectory, or many runs.
+        ValueError: The run has no trajectory, or it is a batch of runs.
     """
     if run.trajectory is None:
         raise ValueError("the run has no trajectory: make it with rollout")
@@ -69,7 +81,15 @@ def trajectory_columns(run: Any, plant: Any = None) -> dict[str, tuple[str, np.n
 
 
 def to_pandas(run: Any, plant: Any = None) -> Any:
-    """Return the trajectory as a frame indexed by time; or, of a run without one, its metrics, a row for each lane."""
+    """Return the trajectory as a pandas.DataFrame indexed by time; without a trajectory, a row of metrics for each run.
+
+    Args:
+        run: One run with a trajectory, or any runs without.
+        plant: Plant that defines the unit of the control.
+
+    Raises:
+        ValueError: The runs are a batch with trajectories.
+    """
     import pandas  # pyright: ignore[reportMissingImports]  # the user has it, or not
 
     if run.trajectory is None:
@@ -85,7 +105,15 @@ def to_pandas(run: Any, plant: Any = None) -> Any:
 
 
 def to_xarray(run: Any, plant: Any = None) -> Any:
-    """Return the trajectory as a data set over the time, each variable with its `units`."""
+    """Return the trajectory as an xarray.Dataset over the time, each variable with its `units`.
+
+    Args:
+        run: One run with a trajectory.
+        plant: Plant that defines the unit of the control.
+
+    Raises:
+        ValueError: The run has no trajectory, or it is a batch of runs.
+    """
     import xarray  # pyright: ignore[reportMissingImports]  # the user has it, or not
 
     found = trajectory_columns(run, plant)
@@ -94,7 +122,16 @@ def to_xarray(run: Any, plant: Any = None) -> Any:
 
 
 def to_figure(run: Any, plant: Any = None, title: str = "") -> Any:
-    """Return the run as a figure: that of its kind of plant, told by what it shows."""
+    """Return a figure of the run; the plant's output type selects the kind of figure.
+
+    Args:
+        run: One run with a trajectory.
+        plant: Plant that defines the unit of the control.
+        title: Title of the figure.
+
+    Raises:
+        ValueError: The run has no trajectory.
+    """
     plot: Any = importlib.import_module("diffabs.plot")
     shown = SimpleNamespace(shows=type(run.ending.sample.output))
     unit = plant.control_unit if plant is not None else None
@@ -102,6 +139,6 @@ def to_figure(run: Any, plant: Any = None, title: str = "") -> Any:
 
 
 def _attributes(run: Any) -> Mapping[str, Any]:
-    """Metrics and how it ended, as plain numbers."""
+    """Return metrics and end flags of a run as plain numbers."""
     flags = {name: int(getattr(run, name)) for name in ("stopped", "diverged", "timed_out")}
     return {**{name: float(value) for name, value in run.metrics.items()}, **flags}

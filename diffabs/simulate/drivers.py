@@ -1,10 +1,13 @@
-"""What repeats the step of a run: until it ends, with a look at every so many instants, or so that it can be reversed.
+"""Loops that repeat the step of a run: to its end, or with a sample at every so many instants; for values or
+derivatives.
 
-    values          a while loop: it ends when the run does, and one program serves every duration
-    derivatives     checkpointed scans, whose length is known when they are compiled: reverse mode keeps the carries
+    values          a while loop, which ends with the run: one program serves every duration
+    derivatives     checkpointed scans, whose length is fixed at compilation: reverse mode keeps the carries
 
-The second have a number of slots, few different ones (`slots`), and do nothing in what is left over of them. So a new
-duration compiles no new program for values, and for derivatives only beyond the slots that there are."""
+Scans have a capacity of attempts, rounded up to one of few values (`round_up_capacity`). Steps beyond the end of the
+run do nothing. So a new duration compiles no new program for values, and a new program for derivatives only beyond the
+capacity.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,20 +17,29 @@ import jax.numpy as jnp
 
 from diffabs.simulate.checkpoint import any_lane, rematerialise, repeat_step
 
-Carry = Any  # of whatever chooses the steps; it says whether it is `running`
-Step = Callable[..., Carry]  # of a carry, and of the instant to which it goes, `until`, where it is not the end
-STEPS_PER_BLOCK = 16  # steps between two questions whether anything still runs
+Carry = Any  # pytree of the stepping method, with an attribute `running`
+Step = Callable[..., Carry]  # function of a carry and, for trajectories, of `until`, the instant at which to pause
+STEPS_PER_BLOCK = 16  # steps between two checks of `running`, which is a reduction over the whole batch
 
 
 def round_up_capacity(count: int) -> int:
-    """Return the least number of at most four significant bits that is not less than `count`: up to an eighth more."""
+    """Return the least number of at most four significant bits that is not less than `count`: up to an eighth more.
+
+    Args:
+        count: Number of attempts or instants.
+    """
     unit = 1 << max((count - 1).bit_length() - 4, 0)
     return -(-count // unit) * unit
 
 
 def run_to_end(step: Step, renew: Step, carry: Carry) -> Carry:
-    """Return the carry (one run, or a batch under `jax.vmap`) of a run that is over; `renew` is called once for a block
-    of steps. Not for reverse mode."""
+    """Return the carry at the end of a run, or of a batch under `jax.vmap`. Not for reverse mode.
+
+    Args:
+        step: Function from carry to carry: one attempt of a step.
+        renew: Function from carry to carry, called once before each block of `STEPS_PER_BLOCK` steps.
+        carry: Carry at t = 0.
+    """
 
     def block(carry: Carry) -> Carry:
         return jax.lax.scan(lambda carry, _: (step(carry), None), renew(carry), length=STEPS_PER_BLOCK)[0]
@@ -45,9 +57,20 @@ def run_with_trajectory(
     count: Any,
     room: int,
 ) -> tuple[Carry, Any]:
-    """Return the carry after `count` times `every` steps of the grid, and what was seen after each `every`-th, with a
-    leading axis of `room`, at least `count`: what is beyond is zero. `before` says whether a run goes on, and has not
-    come to an instant. Not for reverse mode."""
+    """Return the carry after `count` times `every` steps of the grid, and a sample after each `every`-th step.
+
+    The samples have a leading axis of `room`; those beyond `count` are zero. Not for reverse mode.
+
+    Args:
+        step: Function of the carry and of `until`, the instant at which it pauses: one attempt of a step.
+        renew: Function from carry to carry, called once before each attempt.
+        before: Function of carry and instant: True if the run goes on and has not reached that instant.
+        look: Function of carry and instant that returns the sample.
+        carry: Carry at t = 0.
+        every: Number of grid steps between two samples.
+        count: Number of samples.
+        room: Capacity for samples, at least `count`.
+    """
     seen = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(look, carry, count))
 
     def segment(i: Any, at: tuple[Carry, Any]) -> tuple[Carry, Any]:
@@ -63,7 +86,13 @@ def run_with_trajectory(
 
 
 def scan_to_end(step: Step, carry: Carry, room: int) -> Carry:
-    """Return the carry of a run that is over, after at most `room` tries; for derivatives."""
+    """Return the carry at the end of a run after at most `room` attempts; for derivatives.
+
+    Args:
+        step: Function from carry to carry: one attempt of a step.
+        carry: Carry at t = 0.
+        room: Capacity for attempts.
+    """
     return repeat_step(step, carry, room, lambda carry: _any_running(carry.running))
 
 
@@ -77,7 +106,18 @@ def scan_with_trajectory(
     instants: int,
     room: int,
 ) -> tuple[Carry, Any]:
-    """Return what `watch` does, `instants` for its room; each segment has room for so many tries. For derivatives."""
+    """Return the result of `run_with_trajectory` with room for `instants` samples; for derivatives.
+
+    Args:
+        step: Function of the carry and of `until`, the instant at which it pauses: one attempt of a step.
+        before: Function of carry and instant: True if the run goes on and has not reached that instant.
+        look: Function of carry and instant that returns the sample.
+        carry: Carry at t = 0.
+        every: Number of grid steps between two samples.
+        count: Number of samples.
+        instants: Capacity for samples, at least `count`.
+        room: Capacity for attempts between two samples.
+    """
 
     def segment(carry: Carry, i: Any) -> tuple[Carry, Any]:
         until = (i + 1) * every
@@ -88,6 +128,7 @@ def scan_with_trajectory(
         def some(carry: Carry) -> Carry:
             return repeat_step(lambda carry: step(carry, until=until), carry, room, on)
 
+        # The scan has `instants` rounds, the run only `count`: the rest is skipped, not computed and discarded.
         carry = jax.lax.cond(i < count, some, lambda carry: carry, carry)
         return carry, look(carry, until)
 
@@ -95,4 +136,5 @@ def scan_with_trajectory(
 
 
 def _any_running(running: Any) -> Any:
+    """Return `any_lane(running)` without a derivative."""
     return any_lane(jax.lax.stop_gradient(running))

@@ -1,8 +1,9 @@
-"""The loop and its objectives as one function of time and state.
+"""The dynamics of the loop and its objectives, as one function of time and state.
 
-Values are computed as the parts have it. For derivatives the function is a program whose comparisons are visible
-(`core.comparisons`), so that a step has one mode. A derivative through a step with a kink inside is off by up
-to one step in the kink's moment, however exact the value is."""
+For values, the parts are evaluated directly. For derivatives, the function is a program whose comparisons are visible
+(`core.comparisons`), so that a step has one mode. Without a mode, the derivative of a step with a kink inside is wrong
+by up to one step in the kink's time. The value may still be exact.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,13 +20,20 @@ from diffabs.simulate.foresight import SwitchingFunction
 Objectives = dict[str, Objective]
 Accumulators = dict[str, Memory]
 
-UNCONSTRAINED = Mode(None)  # as the numbers say
-MAX_CACHED_PROGRAMS = 256  # that are kept
+UNCONSTRAINED = Mode(None)  # no frozen answers: every comparison is evaluated
+MAX_CACHED_PROGRAMS = 256  # greatest number of programs that are kept
 _programs: dict[Any, SwitchedProgram] = {}
 
 
 class LoopEvaluation(NamedTuple):
-    """At an instant: rate of the state, rates of the objectives' integrals, signals, margins of the events."""
+    """The dynamics at an instant.
+
+    Attributes:
+        rate: Rates of the loop's flow.
+        accumulator_rates: Rates of the objectives' integrals.
+        signals: Signals of the loop.
+        margins: Margins of the stop and of the blocks' events.
+    """
 
     rate: Any
     accumulator_rates: Any
@@ -34,8 +42,17 @@ class LoopEvaluation(NamedTuple):
 
 
 class LoopEvaluationWithRates(NamedTuple):
-    """At an instant: what is seen, the rates of the sample, of what blocks record and of the margins of the events, the
-    answers to the comparisons, those that the numbers contradict, and their margins with the rates of these."""
+    """The dynamics at an instant, with the time derivatives of the signals and margins.
+
+    Attributes:
+        seen: The dynamics.
+        moving: Rates of the sample.
+        recorded: Rates of the signals that blocks record, by block.
+        falls: Rates of the margins of events.
+        words: Answers to the comparisons.
+        contradicted: Answers of the mode that the numbers contradict.
+        comparisons: Margins of the comparisons and their rates.
+    """
 
     seen: LoopEvaluation
     moving: Sample
@@ -47,7 +64,13 @@ class LoopEvaluationWithRates(NamedTuple):
 
 
 class Dynamics(NamedTuple):
-    """The program, None for values, and the parameters with which it is run."""
+    """A loop and its objectives, with the program of their dynamics.
+
+    Attributes:
+        program: The program with visible comparisons; None if the parts are evaluated directly.
+        loop: Loop with the parameters of the run.
+        objectives: Objectives by name.
+    """
 
     program: SwitchedProgram | None
     loop: Loop
@@ -55,22 +78,24 @@ class Dynamics(NamedTuple):
 
     @property
     def words(self) -> int:
-        """How many words hold the answers to them."""
+        """Number of words that hold the answers to the comparisons."""
         return self.program.words if self.program else 0
 
     @property
     def kinks(self) -> int:
-        """How many comparisons there are to be located."""
+        """Number of comparisons whose switching surfaces are located."""
         return self.program.answers if self.program else 0
 
     def rates(self, t: Any, z: Any, held: Any, mode: Mode) -> Any:
-        """dz/dt within a regime, z and what is `held` as `parted` has them."""
+        """Return dz/dt at time `t` within a `mode`, with z and `held` as `split_flow_and_held` returns them."""
         return self._at(lambda seen: seen[:2], (t, *z), held, mode)
 
     def look(
         self, t: Any, state: LoopState, accumulators: Accumulators, mode: Mode
     ) -> tuple[LoopEvaluation, ComparisonAnswers]:
-        """Everything at an instant, and the answers to its comparisons."""
+        """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`, and the answers to the
+        comparisons.
+        """
         z, held = split_flow_and_held(state, accumulators)
         moving, fixed = (t, *z), (held, self.loop, self.objectives)
         if self.program is None:
@@ -80,7 +105,10 @@ class Dynamics(NamedTuple):
     def ahead(
         self, t: Any, state: LoopState, accumulators: Accumulators, mode: Mode = UNCONSTRAINED
     ) -> "LoopEvaluationWithRates":
-        """Everything at an instant, within a regime or as the numbers say, and how it moves from there."""
+        """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`, with the rates along the flow.
+
+        By default the comparisons are evaluated.
+        """
         assert self.program is not None
         program, (z, held) = self.program, split_flow_and_held(state, accumulators)
         fixed = (held, self.loop, self.objectives)
@@ -91,21 +119,25 @@ class Dynamics(NamedTuple):
             values = [value for _, value in answers.margins]
             return (one.signals.sample, one.signals.recorded, one.margins, values), answers
 
+        # The derivative along (1, dz/dt) is the total time derivative on the trajectory.
         moving = (jnp.ones_like(t), now[:2])
         (*_, values), (sample, recorded, falls, rates), answers = jax.jvp(moves, (t, z), moving, has_aux=True)
         numbers = [number for number, _ in answers.margins]
         comparisons = [SwitchingFunction(*one) for one in zip(numbers, values, rates, strict=True)]
         return LoopEvaluationWithRates(now, sample, recorded, falls, answers.words, answers.contradicted, comparisons)
 
-    def moving(self, of: Callable[[Sample], Any], end: tuple[Any, LoopState, Accumulators, Any], mode: Mode) -> Any:
-        """d(of(sample))/dt within a regime, at a time, state and tally where d(state.flow())/dt is the last one."""
+    def rate_of(self, of: Callable[[Sample], Any], end: tuple[Any, LoopState, Accumulators, Any], mode: Mode) -> Any:
+        """Return d(of(sample))/dt within a `mode`.
+
+        `end` holds time, state, accumulators and d(state.flow())/dt; `of` is a function of the sample.
+        """
         t, state, accumulators, rate = end
         (flow, still), held = split_flow_and_held(state, accumulators)
 
-        def seen(t: Any, flow: Any) -> Any:
-            return self._at(lambda seen: of(seen.signals.sample), (t, flow, still), held, mode)
+        def evaluate(t: Any, flow: Any) -> Any:
+            return self._at(lambda evaluate: of(evaluate.signals.sample), (t, flow, still), held, mode)
 
-        return jax.jvp(seen, (t, flow), (jnp.ones_like(t), rate))[1]
+        return jax.jvp(evaluate, (t, flow), (jnp.ones_like(t), rate))[1]
 
     def _at(self, pick: Callable[[LoopEvaluation], Any], moving: Any, held: Any, mode: Mode) -> Any:
         fixed = (held, self.loop, self.objectives)
@@ -115,33 +147,55 @@ class Dynamics(NamedTuple):
 def build_dynamics(
     loop: Loop, objectives: Objectives, t: Any, state: LoopState, accumulators: Accumulators, *, kinks: bool
 ) -> Dynamics:
-    """Return the dynamics of a loop; the program is traced once for every structure, and for arguments of these
-    shapes."""
+    """Return the dynamics of a loop. A program is traced once for each structure and for arguments of these shapes.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by name.
+        t: Time [s].
+        state: State of the loop.
+        accumulators: Accumulators of the objectives.
+        kinks: True for a program with visible comparisons; False for direct evaluation.
+    """
     if not kinks:
         return Dynamics(None, loop, objectives)
     z, held = split_flow_and_held(state, accumulators)
     args = ((t, *z), (held, loop, objectives))
     leaves, tree = jax.tree.flatten(args)
+    # `result_type(float)` is part of the key: with another precision the same shapes give another program.
     key = (tree, tuple(map(jax.typeof, leaves)), jnp.result_type(float))
     if key not in _programs:
         while len(_programs) >= MAX_CACHED_PROGRAMS:
-            _programs.pop(next(iter(_programs)))
+            _programs.pop(next(iter(_programs)))  # a dict keeps the order of insertion: the oldest program goes first
+        # `counts`: only comparisons that influence rates or recorded signals produce a kink in the run.
         _programs[key] = SwitchedProgram(_evaluate_loop, *args, counts=lambda seen: (seen[:2], seen.signals.recorded))
     return Dynamics(_programs[key], loop, objectives)
 
 
 def accumulator_rates(objectives: Objectives, accumulators: Accumulators, sample: Sample) -> dict[str, Any]:
-    """Return d/dt of the objectives' integrals."""
+    """Return the rates of the objectives' integrals, by name.
+
+    Args:
+        objectives: Objectives by name.
+        accumulators: Accumulators of the objectives.
+        sample: Sample of the signals.
+    """
     return {name: one.flow(accumulators[name], sample) for name, one in objectives.items()}
 
 
 def split_flow_and_held(state: LoopState, accumulators: Accumulators) -> tuple[Any, Any]:
-    """Return what is integrated, of the loop and of the objectives, and what does not change between two instants."""
+    """Return the integrated part of loop and objectives, and the part that is constant between two instants.
+
+    Args:
+        state: State of the loop.
+        accumulators: Accumulators of the objectives.
+    """
     flow = (state.flow(), {name: memory.flow for name, memory in accumulators.items()})
     return flow, ([memory.held for memory in state[1:]], {name: memory.held for name, memory in accumulators.items()})
 
 
 def _evaluate_loop(moving: Any, fixed: Any) -> LoopEvaluation:
+    """Return the dynamics for (time, flow, accumulator flow) and ((held, accumulator held), loop, objectives)."""
     (t, flow, tally_flow), ((held, tally_held), loop, objectives) = moving, fixed
     state = LoopState(flow[0], *(Memory(*both) for both in zip(flow[1:], held, strict=True)))
     accumulators = {name: Memory(tally_flow[name], tally_held[name]) for name in tally_flow}

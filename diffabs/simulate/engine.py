@@ -1,4 +1,4 @@
-"""Which engine makes many runs: XLA, or a program of this machine (`native`), which is loaded where it is asked for."""
+"""Selection of the engine of a batch: XLA, or a program of this machine (`native`), imported only on request."""
 
 import functools
 import logging
@@ -6,13 +6,13 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from jax._src.xla_bridge import backends_are_initialized  # no public function says so without starting them
+from jax._src.xla_bridge import backends_are_initialized  # JAX has no public function that does not start the backends
 
 from diffabs.simulate.solution import Run
 
 REQUESTABLE_ENGINES = ("auto", "xla", "kernel")
 log = logging.getLogger("diffabs")
-_forked_process = 0  # id of the first process that forked while XLA's threads ran; 0 if there is none
+_forked_process = 0  # id of the first process that forked while XLA's threads ran; 0 without one
 
 
 def _before_fork() -> None:
@@ -26,32 +26,45 @@ if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
 
 
 def check_process() -> None:
-    """Raise RuntimeError in a process that was forked after JAX had started. XLA's threads stay in the parent; a kernel
-    would wait for them for ever."""
+    """Raise an error in a process that was forked after JAX had started.
+
+    XLA's threads stay in the parent process. A kernel would wait for them forever.
+
+    Raises:
+        RuntimeError: The process was forked after JAX had started.
+    """
     if _forked_process not in (0, os.getpid()):
         raise RuntimeError("no kernel runs after os.fork: XLA's threads stay in the parent; start processes by `spawn`")
 
 
 class EngineError(ValueError):
-    """What stands against the engine that is asked for."""
+    """The requested engine is not possible."""
 
     @classmethod
     def of(cls, line: Any) -> "EngineError":
-        """Return the error that a kernel is not possible, with this reason."""
+        """Return the error for a kernel that is impossible for the reason `line`."""
         return cls(f"engine = 'kernel' is not possible: {line}")
 
 
 def run_with_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "") -> Run:
-    """Return the run of an engine: "kernel" by `native()`, "xla" by `otherwise()`. "auto" takes the kernel where one is
-    possible, and else tells the log once why not. Raises ValueError for another name, and EngineError where a kernel
-    that is asked for is not possible.
+    """Return the run of an engine; "auto" uses the kernel if possible, and otherwise XLA with one log message.
 
-    why_not: a reason against a kernel that is known already"""
+    Args:
+        engine: "kernel", "xla" or "auto".
+        native: Function that runs the kernel.
+        otherwise: Function that runs XLA.
+        why_not: Reason against a kernel that is already known, or "".
+
+    Raises:
+        ValueError: The name of the engine is unknown.
+        EngineError: Engine "kernel" is requested but not possible.
+    """
     if engine not in REQUESTABLE_ENGINES:
         raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
     if engine == "xla":
         return otherwise()
     if not why_not:
+        # A local import: `import diffabs` must not need the kernel package.
         from diffabs.kernel.compilers import NoCompiler
         from diffabs.kernel.primitives import Unsupported
 
@@ -66,7 +79,12 @@ def run_with_engine(engine: str, native: Callable[[], Run], otherwise: Callable[
 
 
 def describe_engine(engine: str) -> dict[str, str]:
-    """Return what a result says of the engine that made it: its name, and what decides the bits of a kernel."""
+    """Return the name of the engine of a result and, for a kernel, the properties that determine the bits of the
+    result.
+
+    Args:
+        engine: Name of the engine.
+    """
     if engine != "kernel":
         return {"name": engine}
     from diffabs.kernel import launch
@@ -76,5 +94,9 @@ def describe_engine(engine: str) -> dict[str, str]:
 
 @functools.cache
 def log_xla_reason(why_not: str) -> None:
-    """Log why "auto" takes XLA, once for each reason."""
+    """Log the reason for XLA under engine "auto", once for each reason.
+
+    Args:
+        why_not: Reason against a kernel.
+    """
     log.warning("runs are made by XLA, not by a kernel: %s", why_not)

@@ -1,7 +1,8 @@
-"""When comparisons will change, and when they did: from their margins and the rates of these.
+"""Predicted and past crossings of switching surfaces, from the margins of comparisons and their rates.
 
-A margin x - y of a comparison moves, near a point of the run, as a line: it is zero |x - y|/|d(x - y)/dt| later, or
-earlier. A step that ends there has its kink at its end, where it does no harm."""
+Near a point of the run the margin x - y of a comparison moves along a line. It is zero at a time |x - y|/|d(x - y)/dt|
+ahead or in the past. A step that ends there has its kink at its end, where the kink costs no accuracy.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -10,16 +11,23 @@ import jax.numpy as jnp
 
 from diffabs.core.modes import WORD_BITS, ModeBits
 
-NEVER_S = 1e9  # s, as good as never
+NEVER_S = 1e9  # s; time to the next crossing if no crossing is predicted
 
 
-# How exactly steps end on comparisons. As fractions of the length that the error allows: what changes so soon changes
-# now; the shortest step that ends there. And of a step: outside of these two a comparison changed at one end.
+# Tolerances of steps that end on switching surfaces. The first two are fractions of the length that the error allows: a
+# crossing nearer than the first has happened, and the second is the shortest step that ends on a crossing. The last two
+# are fractions of a step: a crossing outside of this range lies at one end of the step.
 IMMEDIATE_FRACTION, MIN_CROSSING_STEP_FRACTION, STEP_START_FRACTION, STEP_END_FRACTION = 2e-4, 4e-3, 0.02, 0.95
 
 
 class SwitchingFunction(NamedTuple):
-    """Of comparisons: the numbers of their bits, x - y, and its rate."""
+    """Margins of comparisons with their rates.
+
+    Attributes:
+        numbers: Numbers of the comparisons' bits.
+        value: Margins x - y.
+        rate: Rates of the margins [1/s].
+    """
 
     numbers: Any
     value: Any
@@ -27,8 +35,13 @@ class SwitchingFunction(NamedTuple):
 
 
 class CrossingForecast(NamedTuple):
-    """In how many seconds the first of the comparisons will change, a great number if none does; and how many seconds
-    before the end of a step the first of those changed whose answers have, 0 if none did but at its ends."""
+    """Times to the next crossing and since the first crossing.
+
+    Attributes:
+        ahead: Time to the first predicted crossing [s]; a large number without one.
+        late: Time [s] between the first crossing inside the step and the end of the step. 0 if all crossings lie at its
+            ends.
+    """
 
     ahead: Any
     late: Any
@@ -37,17 +50,23 @@ class CrossingForecast(NamedTuple):
 def forecast_crossings(
     margins: Sequence[SwitchingFunction], natural: Any, shortest: Any, changed: ModeBits, length: Any
 ) -> CrossingForecast:
-    """Return what the margins at the end of a step say.
+    """Return the predicted and past crossings from the margins at the end of a step.
 
-    natural: the length that the error allows [s]; shortest: that of any step [s]
-    changed: bits of the comparisons whose answers are others than at the beginning of the step
-    length: of the step [s]"""
+    Args:
+        margins: Margins of the comparisons and their rates.
+        natural: Length that the error allows [s].
+        shortest: Shortest length of any step [s].
+        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
+        length: Length of the step [s].
+    """
     least, low, high = (
         jnp.maximum(IMMEDIATE_FRACTION * natural, shortest),
         (1 - STEP_END_FRACTION) * length,
         (1 - STEP_START_FRACTION) * length,
     )
     next, first = jnp.full_like(length, -NEVER_S), low
+    # value/rate is the time since the crossing, negative for a crossing ahead. A rate of 0 gives an infinite time or
+    # NaN: neither `where` below selects it.
     for one in margins:
         was = read_bits(changed, one.numbers)
         for on, since in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, one.value / one.rate)), strict=True):
@@ -57,8 +76,14 @@ def forecast_crossings(
 
 
 def valid_end_rates(margins: Sequence[SwitchingFunction], changed: ModeBits, length: Any) -> tuple[Any, Any]:
-    """Return whether the rates at the start of a step, and those at its end, are those within it: no comparison has
-    changed there."""
+    """Return two flags: the rate at the start, and the rate at the end of a step, is the rate inside. No comparison
+    changes there.
+
+    Args:
+        margins: Margins of the comparisons at the end of the step, and their rates.
+        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
+        length: Length of the step [s].
+    """
     start = end = jnp.asarray(True)
     for one in margins:
         was = read_bits(changed, one.numbers)
@@ -69,7 +94,12 @@ def valid_end_rates(margins: Sequence[SwitchingFunction], changed: ModeBits, len
 
 
 def read_bits(words: ModeBits, numbers: Any) -> Any:
-    """Return the bits of these numbers."""
+    """Return the bits with these numbers, bool.
+
+    Args:
+        words: Packed bits.
+        numbers: Numbers of the bits.
+    """
     numbers = jnp.asarray(numbers)
     word = sum(jnp.where(numbers // WORD_BITS == i, one, jnp.uint32(0)) for i, one in enumerate(words))
     return word & (jnp.uint32(1) << (numbers % WORD_BITS).astype(jnp.uint32)) != 0

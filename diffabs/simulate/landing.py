@@ -1,14 +1,18 @@
-"""Locate the zero of a margin in a step: the lengths of the tries, and the length of the step that ends on the zero.
+"""Event location: find the zero of a margin within a step, and the length of the step that ends on it.
 
-seek    tries shrink a bracket, by secant, Newton's step on a parabola, or halving, until a try ends near the zero
-probe   a try beside it, on the same side, shows how the margin falls there
-land    the final step has the length place - margin(place)/fall. Its derivative is that of the event's moment, by the
-        implicit function theorem: the margin at the end of a try carries it
-refine  for derivatives: one more try of this length. A Newton step from it is right to the second derivative, as the
-        one before was to the first: each doubles the order (A. Griewank, A. Walther, Evaluating Derivatives, 15.3)
+    seek    attempts shrink a bracket, by secant, by Newton's step on a parabola, or by bisection, until one ends near
+            the zero
+    probe   an attempt beside it, on the same side of the zero, measures how the margin falls there
+    land    the final step has the length place - margin(place)/fall. Its derivative is that of the event's time by the
+            implicit function theorem: the margin at the end of an attempt carries the derivative
+    refine  for derivatives: one more attempt of this length. A Newton step from there is right to the second
+            derivative, as the step before is right to the first: each step doubles the order
 
-The margins of comparisons have the first numbers; those of the stop and of the blocks' events follow. A comparison's
-margin is known only at the end of a try."""
+The margins of comparisons have the first numbers; the margins of the stop and of the blocks' events follow. The margin
+of a comparison is known only at the end of an attempt.
+
+Source: A. Griewank, A. Walther, Evaluating Derivatives, section 15.3 (order of the refinement).
+"""
 
 from typing import Any, NamedTuple
 
@@ -18,39 +22,44 @@ import jax.numpy as jnp
 from diffabs.core.numerics import ratio
 
 NEWTON_RADIUS_STEPS = 1e-4  # steps: a Newton step from here misses the zero by some 1e-8 steps
-PROBE_EXPONENT = 0.2  # exponent: the probe is eps**APART steps away
-OVERSHOOT_EXPONENT = 0.5  # exponent: a step ends eps**BEYOND steps past the zero of a comparison
-MAX_LOCATION_ATTEMPTS = 24  # the most for an event, whose margin may have a corner or jump
-BISECT = 4  # every so many tries halve the bracket
-GRAZING_FRACTION = (
-    1e-2  # of the margin's mean rate in the step: a margin that falls more slowly at the beginning only touches
-)
-MAX_CUBIC_CORRECTION = (
-    1e-4  # of the slope: the greatest correction by a cubic through both ends of a step; a larger one is a kink
-)
-MAX_SLOPE_CHANGE = 0.5  # of the fall: the greatest change of it within a step in which the margin is taken to be smooth
+PROBE_EXPONENT = 0.2  # the probe is eps**PROBE_EXPONENT steps away
+OVERSHOOT_EXPONENT = 0.5  # a step ends eps**OVERSHOOT_EXPONENT steps past a switching surface
+MAX_LOCATION_ATTEMPTS = 24  # greatest number of attempts for an event, whose margin may have a corner or jump
+BISECT = 4  # every fourth attempt halves the bracket
+# Fraction of the margin's mean rate in the step. A margin with a slower fall at the beginning only touches zero there.
+GRAZING_FRACTION = 1e-2
+# Fraction of the slope: greatest correction by the cubic through both ends of a step. A larger correction is a kink.
+MAX_CUBIC_CORRECTION = 1e-4
+# Fraction of the fall: greatest change within a step in which the margin counts as smooth.
+MAX_SLOPE_CHANGE = 0.5
 
 
 class EventSearch(NamedTuple):
-    """Where an event is looked for. A margin is infinite where it is not known."""
+    """State of an event search. A margin is infinite where it is not known."""
 
-    which: Any  # the number of its margin
-    full: Any  # the length that was tried first [s]
-    at_full: Any  # the margin there
-    near: Any  # the bracket's shorter length [s]
+    which: Any  # number of the sought margin
+    full: Any  # length of the first attempt [s]
+    at_full: Any  # margin there
+    near: Any  # shorter length of the bracket [s]
     at_near: Any
-    far: Any  # the bracket's longer length [s]
+    far: Any  # longer length of the bracket [s]
     at_far: Any
-    tries: Any  # how many there were
-    place: Any  # the length of the try that ended near the zero [s]
-    margin: Any  # the margin there; 0 if no zero was found
-    found: Any  # whether there is a zero
-    at_once: Any  # whether the zero is where the step begins
-    fall: Any  # the margin's slope at the end of the final step [1/s]; 0 where the moment has no derivative
+    tries: Any  # number of attempts
+    place: Any  # length of the attempt that ended near the zero [s]
+    margin: Any  # margin there; 0 if the search found no zero
+    found: Any  # True if the search found a zero
+    at_once: Any  # True if the zero lies at the beginning of the step
+    fall: Any  # slope of the margin at the end of the final step [1/s]; 0 if the event's time has no derivative
 
 
 class EventCrossing(NamedTuple):
-    """A margin that a try is about: its number, what it is at the end of the try, and at the beginning."""
+    """A margin at both ends of an attempt.
+
+    Attributes:
+        which: Number of the margin.
+        end: Margin at the end of the attempt.
+        start: Margin at its beginning.
+    """
 
     which: Any
     end: Any
@@ -58,8 +67,14 @@ class EventCrossing(NamedTuple):
 
 
 class AttemptCrossings(NamedTuple):
-    """What a try tells: the margin that is looked for, and whether it falls through zero within; another one that does,
-    and whether there is one."""
+    """Crossings within an attempt.
+
+    Attributes:
+        sought: Margin that the search looks for.
+        falls: True if the sought margin falls through zero within the attempt.
+        other: Another margin that falls through zero.
+        another: True if such another margin exists.
+    """
 
     sought: EventCrossing
     falls: Any
@@ -68,18 +83,34 @@ class AttemptCrossings(NamedTuple):
 
 
 def init_search(h: Any) -> EventSearch:
-    """Return a search for nothing."""
+    """Return an empty search.
+
+    Args:
+        h: Length of a step [s].
+    """
     none, zero, no = 0.0 * h, jnp.asarray(0), jnp.asarray(False)
     return EventSearch(zero, h, none, none, none, h, none, zero, h, none, no, no, none)
 
 
 def falls_through(before: list[Any], after: list[Any]) -> list[Any]:
-    """Return whether each margin falls through zero, from the beginning of a step to its end."""
+    """Return True for each margin that falls through zero between the beginning and the end of a step.
+
+    Args:
+        before: Margins at the beginning.
+        after: Margins at the end.
+    """
     return [(a >= 0) & (b < 0) for a, b in zip(before, after, strict=True)]
 
 
 def find_event_crossings(which: Any, first: int, before: list[Any], after: list[Any]) -> AttemptCrossings:
-    """Return what a try tells of these margins, whose numbers begin with `first`."""
+    """Return the crossings of events within an attempt.
+
+    Args:
+        which: Number of the sought margin.
+        first: Number of the first of these margins.
+        before: Margins at the beginning.
+        after: Margins at the end.
+    """
     crossed = falls_through(before, after)
     others = [one & (which != first + i) for i, one in enumerate(crossed)]
     triples = zip(others, before, after, strict=True)
@@ -93,10 +124,18 @@ def find_event_crossings(which: Any, first: int, before: list[Any], after: list[
 def bracket_event(
     search: EventSearch, x: Any, new: Any, tells: AttemptCrossings, h: Any
 ) -> tuple[EventSearch, Any, Any]:
-    """Return the search for the earliest event after the try of length x, the length to try next, and whether that is
-    the probe. It is the probe once x is near enough to the zero.
+    """Return the search for the earliest event after an attempt, the length to try next, and True if that is the probe.
 
-    new: whether nothing was looked for until now"""
+    The next length is the probe once `x` is near enough to the zero.
+
+    Args:
+        search: Search before the attempt.
+        x: Length of the attempt [s].
+        new: True if no search was active.
+        tells: Crossings within the attempt.
+        h: Length of a regular step [s], the scale of the tolerances.
+    """
+    # The search works on values only: the derivative of the event's time comes from the final Newton step.
     x = jax.lax.stop_gradient(x)
     changes = tells.another & ~tells.falls
     fresh, sought = new | changes, select(changes, tells.other, tells.sought)
@@ -111,34 +150,40 @@ def bracket_event(
 
     width, newton = search.far - search.near, x - correction
     share = ratio(search.at_near, search.at_near - search.at_far, 0.5)
-    least = jnp.minimum(
-        NEWTON_RADIUS_STEPS * h, 0.5 * width
-    )  # the first guess is no shorter: there the margin has begun to fall
+    # The first guess is no shorter, because the margin need not fall yet at the very beginning of the step.
+    least = jnp.minimum(NEWTON_RADIUS_STEPS * h, 0.5 * width)
     first = jnp.where(jnp.isfinite(search.at_near), jnp.maximum(search.near + share * width, least), least)
     inside = falls & (newton > search.near) & (newton < search.far) & (search.tries % BISECT != 0)
     guess = jnp.where(inside, newton, jnp.where(fresh, first, search.near + 0.5 * width))
     apart = h * jnp.finfo(h.dtype).eps ** PROBE_EXPONENT
-    # Before the beginning of the step its regime does not hold, and the margin says nothing.
+    # The probe stays within the step: before its beginning the mode does not hold, and the margin has no meaning.
     probe = jnp.where(sought.end < 0, x + apart, jnp.where(x > apart, x - apart, 0.5 * x))
     found = near | at_once
     search = search._replace(place=x, margin=jnp.where(found, sought.end, 0.0), found=found, at_once=at_once)
-    # Beyond the zero another margin that falls does so before it.
+    # The attempt ends just beyond the sought zero. If another margin falls through zero in it, its zero is earlier.
     earlier = enough & ~at_once & tells.another & ~changes & tells.falls & (search.tries < MAX_LOCATION_ATTEMPTS)
     search = select(earlier, _bracket(search, x, tells.other), search)
-    before = jnp.where(
-        x > 4 * NEWTON_RADIUS_STEPS * h, x - 2 * NEWTON_RADIUS_STEPS * h, 0.5 * x
-    )  # often both fall at once
+    # The next attempt is just before this zero, because two margins often fall at the same time.
+    before = jnp.where(x > 4 * NEWTON_RADIUS_STEPS * h, x - 2 * NEWTON_RADIUS_STEPS * h, 0.5 * x)
     return search, jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier
 
 
 def locate_event(search: EventSearch, x: Any, tells: AttemptCrossings, beyond: Any) -> tuple[EventSearch, Any]:
-    """Return the search with its fall, and the length that ends on the zero, after the probe of length x. `beyond` is
-    added to the length, so that the margin has surely changed its sign. The fall is that of the parabola through the
-    place, the probe, and an end of the first try. This is the end on the same side; the other one where the first says
-    nothing and the margin is smooth up to there."""
+    """Return the search with the margin's slope, and the length of the step that ends on the zero, after the probe.
+
+    The slope is that of the parabola through the place, the probe, and one end of the first attempt. This is the end on
+    the same side. It is the other end if that one is uninformative and the margin is smooth up to there.
+
+    Args:
+        search: Search before the probe.
+        x: Length of the probe [s].
+        tells: Crossings within the probe.
+        beyond: Time [s] to add to the length, so that the margin surely changes its sign.
+    """
     x = jax.lax.stop_gradient(x)
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
-    told = jnp.isfinite(tells.sought.end)  # not if another comparison changes at the probe, and this one does not
+    # The margin is unknown if another comparison changes at the probe and the sought one does not.
+    told = jnp.isfinite(tells.sought.end)
     probe = tells.sought._replace(end=jnp.where(told, tells.sought.end, margin))
     g, start = jax.lax.stop_gradient(probe[1:])
     ends = (search.full, search.at_full), (0.0 * x, start)
@@ -148,11 +193,14 @@ def locate_event(search: EventSearch, x: Any, tells: AttemptCrossings, beyond: A
     fall = (g - margin) / (x - place)
     changes = ratio(at_end - g, end - x) - fall
     far = near | (_shows_curvature(third, place, x) & (jnp.abs(changes) <= MAX_SLOPE_CHANGE * jnp.abs(fall)))
+    # Newton's divided differences: `fall` is the first, `bend` the second.
     bend = jnp.where(far, ratio(changes, end - place), 0.0)
     at_place = jnp.where(told, fall + (place - x) * bend, 0.0)
+    # Division by -inf instead of a slope that is not negative: the length stays at the place.
     length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)
     slope = at_place + 2.0 * (length - place) * bend
     last, at_last = select(near & _shows_curvature(other, place, x), other, third)
+    # The third divided difference improves the slope unless it is large: then a kink lies between the points.
     more = ratio(ratio(ratio(at_last - g, last - x) - fall, last - place) - bend, last - end)
     more *= (length - place) * (length - x) + (length - place + length - x) * (length - end)
     slope += jnp.where(jnp.abs(more) <= MAX_CUBIC_CORRECTION * jnp.abs(slope), more, 0.0)
@@ -162,21 +210,36 @@ def locate_event(search: EventSearch, x: Any, tells: AttemptCrossings, beyond: A
     moved = length + jnp.where(far, 0.0, _length_tangent(search, x, probe.end, length, slope))
     steep = _falls_from_start(search, at_place, start)
     known &= ~search.at_once | steep
+    # For an event at the beginning of the step the length is clipped at 0 in value, but not in its derivative.
     at_once = jnp.where(steep, moved - jax.lax.stop_gradient(jnp.minimum(moved, 0.0)), 0.0)
     return search._replace(fall=jnp.where(known, slope, 0.0)), jnp.where(search.at_once, at_once, moved) + beyond
 
 
 def refine(search: EventSearch, x: Any, tells: AttemptCrossings) -> Any:
-    """Return x. Its value stays; a Newton step from the margin at the end of a try of length x makes its second
-    derivatives those of the event's moment."""
+    """Return x with the second derivatives of the event's time.
+
+    The value is unchanged. The derivatives come from a Newton step on the margin at the end of an attempt of length x.
+
+    Args:
+        search: Search with the slope of the margin.
+        x: Length of the step that ends on the event [s].
+        tells: Crossings within an attempt of this length.
+    """
     left = jnp.where((search.fall < 0) & jnp.isfinite(tells.sought.end), tells.sought.end, 0.0)
     return x - (left - jax.lax.stop_gradient(left)) / jnp.where(search.fall < 0, search.fall, -1.0)
 
 
 def accept_location(search: EventSearch, x: Any, length: Any) -> tuple[Any, Any]:
-    """Return the length to try after the probe of length x, and whether to search again, in the middle of the bracket.
-    The search goes on if the final step would end farther from `place` than the probe did, or if the margin does not
-    fall there: a margin may hardly fall, and then all at once."""
+    """Return the length to try after the probe, and True if the search continues from the middle of the bracket.
+
+    It continues if the final step would end farther from `place` than the probe, or if the margin does not fall there.
+    A margin can be almost flat and then fall suddenly.
+
+    Args:
+        search: Search after the probe.
+        x: Length of the probe [s].
+        length: Located length [s].
+    """
     probe, off = jnp.abs(x - search.place), jnp.abs(length - search.place)
     missed = ((off > probe) | ((off == 0) & (search.margin != 0))) & (search.far - search.near > probe)
     again = jax.lax.stop_gradient(missed & ~search.at_once & (search.tries < MAX_LOCATION_ATTEMPTS))
@@ -184,8 +247,11 @@ def accept_location(search: EventSearch, x: Any, length: Any) -> tuple[Any, Any]
 
 
 def _length_tangent(search: EventSearch, x: Any, g: Any, zero: Any, fall: Any) -> Any:
-    """A number with value 0 and the derivatives of the event's length. They follow from those of the margin at the
-    place and at the probe x, continued to the zero: they, too, change in the ten-thousandth of a step between."""
+    """Return a number with value 0 and the derivatives of the event's length.
+
+    They come from the derivatives of the margin at the place and at the probe x. Linear extrapolation continues them to
+    the zero, because they change over the ten-thousandth of a step between.
+    """
     known = search.found & (fall < 0)
     share = ratio(zero - search.place, x - search.place)
     ends = (jnp.where(known, end, 0.0) for end in (search.margin, g))
@@ -194,14 +260,18 @@ def _length_tangent(search: EventSearch, x: Any, g: Any, zero: Any, fall: Any) -
 
 
 def _shows_curvature(end: tuple[Any, Any], place: Any, probe: Any) -> Any:
-    """Whether the margin at an end of a try says how it bends between the place and the probe."""
+    """Return True if the margin at an end of an attempt determines the curvature between the place and the probe."""
     length, margin = end
     return (jnp.abs(length - place) > 4 * jnp.abs(place - probe)) & jnp.isfinite(margin)
 
 
 def _falls_from_start(search: EventSearch, fall: Any, start: Any) -> Any:
-    """Whether a margin falls at the beginning of a step as steeply as it does on the whole. Then the moment of an event
-    there has a derivative; not if the margin jumps, or has its maximum there."""
+    """Return True if the margin is smooth and falls at the beginning of the step at `GRAZING_FRACTION` of its mean rate
+    or faster.
+
+    Only then does the time of an event there have a derivative. It has none if the margin jumps or has its maximum
+    there.
+    """
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
     smooth = jnp.where(
         jnp.isfinite(start), jnp.abs(margin - fall * place - start) <= -MAX_SLOPE_CHANGE * fall * place, True
@@ -211,8 +281,10 @@ def _falls_from_start(search: EventSearch, fall: Any, start: Any) -> Any:
 
 
 def _narrow_bracket(old: EventSearch, x: Any, first: Any, sought: EventCrossing) -> tuple[EventSearch, Any]:
-    """The search whose bracket ends at the try x, and the margin's slope in the length there: of the parabola through
-    the bracket's ends and this point, 0 for a new bracket."""
+    """Return the search whose bracket ends at the attempt x, and the margin's slope in the length there.
+
+    The slope is that of the parabola through the ends of the bracket and this point; 0 for a new bracket.
+    """
     g = jax.lax.stop_gradient(sought.end)
     slope = jnp.where(first, 0.0, _slope(old, x, g))
     new = _bracket(old, x, sought)
@@ -221,13 +293,13 @@ def _narrow_bracket(old: EventSearch, x: Any, first: Any, sought: EventCrossing)
 
 
 def _bracket(old: EventSearch, x: Any, sought: EventCrossing) -> EventSearch:
-    """A bracket from the beginning of the step to the try of length x."""
+    """Return a search with the bracket from the beginning of the step to the attempt of length x."""
     g, start = jax.lax.stop_gradient(sought[1:])
     return old._replace(which=sought.which, full=x, at_full=g, near=0.0 * x, at_near=start, far=x, at_far=g)
 
 
 def _slope(search: EventSearch, x: Any, g: Any) -> Any:
-    """d(margin)/d(length) at x, of the parabola through the bracket's ends and (x, g)."""
+    """Return d(margin)/d(length) at x, from the parabola through the ends of the bracket and (x, g)."""
     right = jnp.where(jnp.isfinite(search.at_far), ratio(search.at_far - g, search.far - x), 0.0)
     left = ratio(g - search.at_near, x - search.near)
     bent = left + right - ratio(search.at_far - search.at_near, search.far - search.near)
@@ -242,5 +314,11 @@ def _pick(which: Any, values: list[Any]) -> Any:
 
 
 def select(which: Any, a: Any, b: Any) -> Any:
-    """Return a where `which`, else b; of pytrees."""
+    """Return a if `which`, else b.
+
+    Args:
+        which: Condition.
+        a: Pytree.
+        b: Pytree of the same structure.
+    """
     return jax.tree.map(lambda x, y: jnp.where(which, x, y), a, b)

@@ -1,4 +1,4 @@
-"""How long an adaptive step may be: by its error, by stability, by the kinks and clocks ahead."""
+"""Length of an adaptive step: limits by its error, by stability, by switching surfaces and by clocks."""
 
 import dataclasses
 from functools import partial, reduce
@@ -15,20 +15,27 @@ from diffabs.core.protocols import Sample
 from diffabs.simulate.foresight import MIN_CROSSING_STEP_FRACTION
 
 INITIAL_STEP_S = 1e-4  # s, the first step
-SAFETY, MIN_ERROR = 0.85, 1e-6  # of the length that the error asks for; an error below which none counts
-MIN_STEP_RATIO, MAX_STEP_RATIO = 0.25, 2.5  # times the last step, at least and at most
-MIN_STEP_FRACTION = 1e-9  # of the duration: the shortest step; or 4 times its rounding
-TWO_STEP_RATIO = 1.2  # times the present length: a kink so near is reached in two steps
-CLOCK_REACH_FRACTION = 0.99  # of the way to a clock's instant: a step so long goes there
-STABILITY_RADIUS = 3.0  # times the inverse of the spectral radius: the longest step
+SAFETY, MIN_ERROR = 0.85, 1e-6  # fraction of the optimal length; offset that keeps the length finite for an error of 0
+MIN_STEP_RATIO, MAX_STEP_RATIO = 0.25, 2.5  # least and greatest ratio of a step to the last one
+MIN_STEP_FRACTION = 1e-9  # fraction of the duration: the shortest step, or 4 times the rounding of the duration
+TWO_STEP_RATIO = 1.2  # ratio to the present length: a nearer switching surface is reached in two equal steps
+CLOCK_REACH_FRACTION = 0.99  # fraction of the time to a clock's instant: a longer step ends on the instant
+STABILITY_RADIUS = 3.0  # the longest step is this number divided by the spectral radius
 POWER_ITERATIONS, MIN_NORM = 12, 1e-20
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps", "notes"])
 @dataclasses.dataclass(frozen=True)
 class StepSizeControl:
-    """What `Adaptive` asks for: step of the grid [s], the number of its last instant, and the error of a step; whether
-    what is between two instants of a run is to be seen, and whether what is needed to repeat it is noted."""
+    """Numbers that control the steps of an `Adaptive` solver.
+
+    Attributes:
+        h: Step of the grid [s].
+        steps: Number of the last instant of the grid.
+        rtol: Allowed relative error of a step.
+        keeps: True if the carry keeps the last step, for samples between its ends.
+        notes: True if the run is logged for a replay with derivatives.
+    """
 
     h: Any
     steps: Any
@@ -38,23 +45,41 @@ class StepSizeControl:
 
     @property
     def least(self) -> Any:
-        """The shortest step [s]."""
+        """Shortest step [s]."""
         return self.h * self.steps * jnp.maximum(MIN_STEP_FRACTION, 4 * jnp.finfo(self.h.dtype).eps)
 
     def next_strike(self, loop: Loop, k: Any) -> Any:
-        """The number of the first instant after the k-th at which a clock strikes, or the run ends."""
+        """Return the number of the first instant after the k-th at which a clock of the `loop` strikes or the run ends.
+
+        `k` is the number of an instant on the grid.
+        """
         return jnp.minimum(loop.next_tick(k, self.h), self.steps) if loop.ticks else self.steps
 
 
 def error_scales(state: LoopState, sample: Sample) -> Any:
-    """Return how large the first signal is, or where it shall go, and every state."""
+    """Return the scales of the error: the size of the first signal or of its setpoint, and the size of every state.
+
+    Args:
+        state: State of the loop.
+        sample: Sample of the signals.
+    """
     first = jnp.maximum(jnp.abs(sample.output[0]), jnp.abs(sample.setpoint))
     return first, jax.tree.map(jnp.abs, state.flow())
 
 
 def error_norm(loop: Loop, state: LoopState, off: Any, scale: Any, sample: Sample) -> Any:
-    """Return how far states are off, as a fraction of the largest values so far: the greatest of every one, and of the
-    first signal, which they move at the end of the step as they would in its middle."""
+    """Return the greatest error of all states and of the first signal, as a fraction of their scales.
+
+    The errors of the states lie in the middle of the step. The first signal is evaluated with them at the end of the
+    step, as an approximation.
+
+    Args:
+        loop: Closed loop.
+        state: State at the end of the step.
+        off: Errors of the states in the middle of the step.
+        scale: Scales of the error: the largest values so far.
+        sample: Sample at the end of the step.
+    """
     moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), off))
     all_off = (loop.plant.output(moved.plant)[0] - sample.output[0], *jax.tree.leaves(off))
     pairs = zip(all_off, jax.tree.leaves(scale), strict=True)
@@ -62,26 +87,47 @@ def error_norm(loop: Loop, state: LoopState, off: Any, scale: Any, sample: Sampl
 
 
 def propose_length(length: Any, error: Any) -> Any:
-    """Return the length that an error allows, which is 1 in a step as long as it may be: 0.85/error^(1/4) times the
-    present one."""
+    """Return the length that an error allows [s]: 0.85/error^(1/4) times the present length, within limits.
+
+    Args:
+        length: Present length [s].
+        error: Error as a multiple of the allowed error.
+    """
     return length * clamp(SAFETY / jnp.sqrt(jnp.sqrt(error + MIN_ERROR)), MIN_STEP_RATIO, MAX_STEP_RATIO)
 
 
 def plan_step(length: Any, ahead: Any, left: Any, control: StepSizeControl) -> tuple[Any, Any]:
-    """Return the length of the next step [s], and whether it ends where a clock strikes.
+    """Return the length of the next step [s], and True if the step ends where a clock strikes.
 
-    length: that the error and stability allow; ahead, left: seconds to the next kink, and to the clock's instant"""
+    Args:
+        length: Length that the error and stability allow [s].
+        ahead: Time to the next switching surface [s].
+        left: Time to the next instant of a clock [s].
+        control: Step-size control.
+    """
+    # Two steps of 0.6 lengths instead of one full step and a very short one.
     near = jnp.where(ahead < TWO_STEP_RATIO * length, 0.5 * TWO_STEP_RATIO * length, length)
     length = jnp.where(
         ahead < length, jnp.maximum(ahead, jnp.maximum(MIN_CROSSING_STEP_FRACTION * length, control.least)), near
     )
+    # A step just short of the clock's instant would leave a remainder near rounding. Else, two halves share the rest.
     ends = length > CLOCK_REACH_FRACTION * left
     return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends
 
 
 def spectral_step_limit(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
-    """Return 3/rho [s], rho about the spectral radius of the flow's Jacobian: how much longer a vector becomes each
-    time that it is multiplied by that, measured in the largest values so far."""
+    """Return the stability limit of a step, 3/rho [s], with an estimate rho of the spectral radius of the flow's
+    Jacobian.
+
+    A power iteration estimates rho: the growth of a vector per multiplication by the Jacobian. Lengths are relative to
+    the largest values so far.
+
+    Args:
+        loop: Closed loop.
+        t: Time [s].
+        state: State of the loop.
+        scale: Largest values so far, as `error_scales` returns them.
+    """
     flow, unflatten = ravel_pytree(state.flow())
     size = ravel_pytree(scale[1])[0]
     size = jnp.where(size > 0, size, 1.0)
@@ -92,21 +138,23 @@ def spectral_step_limit(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any
 
     moves = jnp.eye(size.size, dtype=size.dtype) * size
     columns = jax.vmap(lambda one: jax.jvp(rates, (flow,), (one,))[1])(moves) / size
-    # Number by number: for sums over so few XLA on a CPU calls a library, which takes ten times as long.
+    # Scalars instead of a matrix product: for such small sums XLA on a CPU calls a library, at ten times the cost.
     rows = [[columns[j, i] for j in range(size.size)] for i in range(size.size)]
 
     def longest(vector: list[Any]) -> Any:
         return reduce(jnp.maximum, map(jnp.abs, vector)) + MIN_NORM
 
-    def multiplied(at: tuple[list[Any], Any], counts: Any) -> tuple[tuple[list[Any], Any], None]:
+    def multiply(at: tuple[list[Any], Any], counts: Any) -> tuple[tuple[list[Any], Any], None]:
         vector, log = at
         norm = longest(vector)
         vector = [x / norm for x in vector]
         vector = [sum(a * x for a, x in zip(row, vector, strict=True)) for row in rows]
         return (vector, log + counts * jnp.log(norm)), None
 
-    # A loop, and not its rounds one by one: XLA would work the matrix out anew in each of them.
+    # A scan instead of an unrolled loop: XLA would compute the matrix again in each round.
     half = POWER_ITERATIONS // 2
-    later = jnp.asarray(np.arange(POWER_ITERATIONS) > half, t.dtype)  # of the norms before, and the last one, below
-    vector, log = jax.lax.scan(multiplied, (list(jnp.ones_like(size)), 0.0 * t), later)[0]
+    # The growth is averaged over the second half of the iterations, after the first half has aligned the vector.
+    later = jnp.asarray(np.arange(POWER_ITERATIONS) > half, t.dtype)
+    # Logarithms: a product of the norms of a stiff loop would overflow single precision.
+    vector, log = jax.lax.scan(multiply, (list(jnp.ones_like(size)), 0.0 * t), later)[0]
     return STABILITY_RADIUS * jnp.exp(-(log + jnp.log(longest(vector))) / half)

@@ -1,4 +1,4 @@
-"""A run as a MAT file, which MATLAB and Octave load. SciPy writes it, and is imported where that is asked for."""
+"""Export of a run as a MAT file for MATLAB and Octave. SciPy writes it and is imported only on request."""
 
 import pathlib
 from collections.abc import Mapping
@@ -10,8 +10,16 @@ from diffabs.simulate.solution import Run
 
 
 def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
-    """Write the instants up to the end of a run that has a trajectory: a column vector for each signal, their `units`
-    and the run's `metrics` as structs, and `more`, whose mappings are structs with underscores for dots."""
+    """Write the instants up to the end of a run with a trajectory to a MAT file.
+
+    The file has a column vector for each signal, and structs for their `units` and the run's `metrics`.
+
+    Args:
+        path: File to write.
+        run: One run with a trajectory.
+        plant: Plant that defines the signals and their units.
+        more: Further variables. A mapping becomes a struct, with underscores for dots in its names.
+    """
     from scipy.io import savemat
 
     assert run.trajectory is not None

@@ -1,8 +1,9 @@
-"""Many runs at once by one program of this machine: a lane stays in the processor's registers from start to stop.
+"""Batches in a compiled program of this machine: a run stays in the processor's registers from start to stop.
 
-Starts and judgements are XLA's, as for every other run; what lies between, the step of a `FixedStep` or of `Adaptive`
-as it is, with everything in it that the parts have, is translated from its jaxpr (package `kernel`). A lane that has
-ended makes room for the next one, as in `packed`."""
+XLA computes the starts and the results, as for every other run. The package `kernel` translates the step of `FixedStep`
+or `Adaptive` from its jaxpr, with everything that the parts contribute to it. A run that has ended makes room for the
+next one, as in `packed`.
+"""
 
 import operator
 from collections.abc import Mapping
@@ -30,7 +31,7 @@ from diffabs.simulate.result import finish_run
 from diffabs.simulate.run import forbid_derivatives, prepare_arguments, refuse_derivative
 from diffabs.simulate.solution import Run, Solver
 
-MAX_LANES_PER_LAUNCH = 1 << 17  # lanes that are started together: the carries of more would fill the memory
+MAX_LANES_PER_LAUNCH = 1 << 17  # runs that are started together: the carries of more runs would fill the memory
 
 
 def run_native(
@@ -42,10 +43,22 @@ def run_native(
     accepted: Any,
     enough: EarlyEnd | None = None,
 ) -> Run:
-    """Return what `packed.run_packed` returns, to rounding; with derivatives, forward.
+    """Return the result of `packed.run_packed`, equal to rounding and with forward derivatives.
 
-    Raises Unsupported for a step that cannot be translated, NoCompiler where there is none, ValueError for what
-    `measure` objects to."""
+    Args:
+        loop: Loop that the runs have in common.
+        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
+        keys: Random keys, shape (runs,), or None.
+        solver: Solver of all runs.
+        objectives: Objectives by the names of their metrics.
+        accepted: Runs to execute, bool, shape (runs,).
+        enough: Condition that ends runs early, or None.
+
+    Raises:
+        Unsupported: The step has an operation without a translation.
+        NoCompiler: This machine has no compiler.
+        ValueError: `measure` rejects the arguments.
+    """
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
     values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     values = {**values, **forbid_derivatives(loop, values)}
@@ -54,16 +67,15 @@ def run_native(
     own = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
     lanes = values, keys, accepted, own
 
-    def made(mine: Any) -> Run:
+    def run_lanes(mine: Any) -> Run:
         given = loop, mine[0], dict(objectives), method, *mine[1:], enough
-        return (
-            _run_differentiable(given) if is_traced(given) else _run(*given)
-        )  # a rule for derivatives takes longer than a short run
+        # A call through a derivative rule costs more than a short run.
+        return _run_differentiable(given) if is_traced(given) else _run(*given)
 
     if count <= MAX_LANES_PER_LAUNCH:
-        return made(lanes)
+        return run_lanes(lanes)
     runs = [
-        made(jax.tree.map(operator.itemgetter(slice(i, i + MAX_LANES_PER_LAUNCH)), lanes))
+        run_lanes(jax.tree.map(operator.itemgetter(slice(i, i + MAX_LANES_PER_LAUNCH)), lanes))
         for i in range(0, count, MAX_LANES_PER_LAUNCH)
     ]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
@@ -71,18 +83,19 @@ def run_native(
 
 @jax.custom_jvp
 def _run_differentiable(given: Any) -> Run:
-    """The runs of (loop, values, objectives, method, keys, accepted), and what is enough of each, and when."""
+    """Return the runs of (loop, values, objectives, method, keys, accepted, data for early ends, early ends)."""
     return _run(*given)
 
 
 def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
-    """By steps that end on kinks, as derivatives have them elsewhere (`run`)."""
+    """Return the runs and their tangents, by steps that end on switching surfaces, as in `run`."""
 
     moves, (given_loop, _, measured, method, *_) = tangents[0], primals[0]
     refuse_derivative(given_loop, measured, method)
     paths = differentiated_paths(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
 
     def run(given: Any) -> Run:
+        # Only paths with a nonzero tangent are prepared for derivatives.
         loop, values, objectives, method, *rest = given
         loop = prepare_derivatives(loop, paths)
         method = (
@@ -114,31 +127,32 @@ def _run(
     def start(mine: Any, key: Any, accepted: Any) -> Any:
         return _stop_unaccepted(accepted, method.start(*built(mine), key))
 
-    def running(lane: Any, carry: Any) -> Any:
+    def is_running(lane: Any, carry: Any) -> Any:
         if enough is None:
             return carry.running
         output = built(lane[0])[0].plant.output(carry.point.state.plant)
-        return carry.running & ~enough.reached(lane[2], output)
+        return carry.running & ~enough.has_reached(lane[2], output)
 
-    def judged(mine: Any, carry: Any) -> Run:
+    def finish(mine: Any, carry: Any) -> Run:
         return finish_run(*built(mine), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)
+    # `wanted` keeps tangents only for leaves of the carry that the results depend on.
     carry = run_lanes(
         lambda lane, carry: method.renew(built(lane[0])[0], carry),
         lambda lane, carry: method.step(*built(lane[0]), lane[1], carry),
-        running,
+        is_running,
         (leaves, keys, own),
         begins,
         steps=STEPS_PER_BLOCK,
         rounds=1 if enough is None else STEPS_PER_EXCHANGE // STEPS_PER_BLOCK,
-        wanted=moving_leaves(judged, leaves, begins),
+        wanted=moving_leaves(finish, leaves, begins),
     )
-    return jax.vmap(judged)(leaves, carry)
+    return jax.vmap(finish)(leaves, carry)
 
 
 def _stop_unaccepted(accepted: Any, carry: Any) -> Any:
-    """A carry that does not run if it is not accepted."""
+    """Return the carry, over from the beginning if the run is not accepted."""
     if isinstance(carry, LaggedReplay):
         return carry._replace(ahead=_stop_unaccepted(accepted, carry.ahead))
     status = jnp.where(accepted, carry.status, RunStatus.DIVERGED)
@@ -148,12 +162,21 @@ def _stop_unaccepted(accepted: Any, carry: Any) -> Any:
 def kernel_objection(
     loop: Loop, values: Mapping[str, Any], solver: Solver, objectives: Mapping[str, Objective]
 ) -> str | None:
-    """Return why these runs cannot be made by a kernel, or None: an operation of a part that has no translation, no
-    compiler on this machine, numbers that are not known yet.
+    """Return the reason why a kernel cannot make these runs, or None.
 
-    values: by path (lanes, ...); no lane is run, but the kernel is compiled, and kept
+    Reasons are an operation of a part without a translation, no compiler on this machine, and traced numbers. No run is
+    executed, but the kernel is compiled and kept.
 
-    Raises ValueError for what `measure` objects to, RuntimeError in a process that was forked after JAX had started."""
+    Args:
+        loop: Loop that the runs have in common.
+        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
+        solver: Solver of all runs.
+        objectives: Objectives by the names of their metrics.
+
+    Raises:
+        ValueError: `measure` rejects the arguments.
+        RuntimeError: The process was forked after JAX had started.
+    """
     check_process()
     if is_traced(loop, dict(values), dict(objectives)):
         return "this is traced; ask with numbers"

@@ -1,7 +1,8 @@
-"""Many runs at once, none of which waits for another: for values, not for gradients.
+"""Batches in which no run waits for another one: for values and not for gradients.
 
-A batch under `jax.vmap` runs until its slowest lane ends. Here `width` lanes run at a time, like boxes on a belt: every
-ROUND steps what has ended is taken off and the next lanes are put in its place."""
+A batch under `jax.vmap` steps until its slowest run ends. Here only `LANES_AT_ONCE` runs step at a time. Every
+`STEPS_PER_EXCHANGE` steps the runs that have ended are removed, and the next runs take their places.
+"""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -20,19 +21,19 @@ from diffabs.simulate.result import finish_run, prepare
 from diffabs.simulate.run import forbid_derivatives, prepare_arguments
 from diffabs.simulate.solution import Run, Solver
 
-LANES_AT_ONCE = 1024  # lanes whose state stays in a processor's cache
-STEPS_PER_EXCHANGE = 64  # steps
+LANES_AT_ONCE = 1024  # runs that step at a time: their state stays in a processor's cache
+STEPS_PER_EXCHANGE = 64  # steps between two exchanges of runs
 
 
 class EarlyEnd(Protocol):
-    """When a run may end before its stop and its time, because how it goes on is known; a pytree."""
+    """A condition that ends a run before its stop and its duration, because its outcome is already known; a pytree."""
 
     def own(self, number: Any) -> Any:
-        """Return what it takes to say so of lane `number`, a pytree."""
+        """Return the data for run `number` that the condition needs, a pytree."""
         ...
 
-    def reached(self, own: Any, output: Any) -> Any:
-        """Whether a lane, of which this is its own and seen now, is taken off the belt."""
+    def has_reached(self, own: Any, output: Any) -> Any:
+        """Return True if the run ends, given its `own` data and the present `output` of its plant."""
         ...
 
 
@@ -45,10 +46,20 @@ def run_packed(
     accepted: Any,
     enough: EarlyEnd | None = None,
 ) -> Run:
-    """Return what `jax.vmap` of `measure` computes for lanes that differ in the values (lanes, ...) by path, and in
-    their keys (lanes,) or None; `batch.run_batch` says what the arguments mean. Not for reverse mode.
+    """Return the result of `jax.vmap` of `measure` for runs that differ in their values and keys. Not for reverse mode.
 
-    Raises ValueError for what `measure` objects to."""
+    Args:
+        loop: Loop that the runs have in common.
+        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
+        keys: Random keys, shape (runs,), or None.
+        solver: Solver of all runs.
+        objectives: Objectives by the names of their metrics.
+        accepted: Runs to execute, bool, shape (runs,).
+        enough: Condition that ends runs early, or None.
+
+    Raises:
+        ValueError: `measure` rejects the arguments.
+    """
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
     values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     values = {**values, **forbid_derivatives(loop, values)}
@@ -58,20 +69,36 @@ def run_packed(
 def split_by_lane(
     loop: Loop, values: dict[str, Any], objectives: dict[str, Objective]
 ) -> tuple[Any, Callable[[Any], tuple[Any, Any]]]:
-    """Return what is a lane's own of the loops with these values (lanes, ...), and a function from that of one lane to
-    its loop, prepared, and what is measured."""
+    """Return the leaves of the prepared loops that depend on the values, and a function from the leaves of one run to
+    loop and objectives.
+
+    The objectives include the audit of the plant. Leaves that do not depend on the values are computed once.
+
+    Args:
+        loop: Loop that the runs have in common.
+        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
+        objectives: Objectives by the names of their metrics.
+    """
     leaves, whole = split_batched(lambda v: prepare(replace(loop, v)), values)
 
-    def built(mine: Any) -> tuple[Loop, dict[str, Objective]]:
+    def build_lane(mine: Any) -> tuple[Loop, dict[str, Objective]]:
         one, audit = whole(mine)
         return one, objectives | audit
 
-    return leaves, built
+    return leaves, build_lane
 
 
 class _LaneSlots(NamedTuple):
-    """Lanes on their way: what is their own of their loops, key and carry of each; its number (how many lanes there are
-    if it has none), the next number; and what has ended, by number."""
+    """Runs in progress and runs that have ended.
+
+    Attributes:
+        leaves: Leaves of the prepared loops that differ between the runs.
+        keys: Random keys.
+        carry: Carries.
+        number: Number of the run in each slot; the number of runs in an empty slot.
+        next: Number of the next run to start.
+        ended: Results of the runs that have ended, by number.
+    """
 
     leaves: Any
     keys: Any
@@ -100,8 +127,8 @@ def _run(
     start = jax.vmap(lambda mine, key: method.start(*built(mine), key))
     over = jax.vmap(lambda mine, carry: finish_run(*built(mine), carry)[0])
 
-    def taken(number: Any) -> tuple[Any, Any, Carry]:
-        """Lanes at their start; beyond the last one a copy of it that does not run."""
+    def take_lanes(number: Any) -> tuple[Any, Any, Carry]:
+        """Return leaves, keys and carries of these runs at t = 0; beyond the last run a copy that does not step."""
         mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
         carry = start(mine, key)
         status = jnp.where(run & (number < count), carry.status, RunStatus.DIVERGED)
@@ -116,10 +143,10 @@ def _run(
 
         slots = slots._replace(carry=jax.lax.scan(rounds, slots.carry, length=STEPS_PER_EXCHANGE // STEPS_PER_BLOCK)[0])
         free = ~slots.carry.running | _lanes_ended_early(enough, built, slots)
-        return _exchange_lanes(slots, free, over, taken, count)
+        return _exchange_lanes(slots, free, over, take_lanes, count)
 
     number = jnp.arange(min(width, count))
-    first = taken(number)
+    first = take_lanes(number)
     shapes = jax.eval_shape(over, first[0], first[2])
     ended = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
     slots = _LaneSlots(*first, number, number[-1] + 1, ended)
@@ -127,19 +154,21 @@ def _run(
 
 
 def _lanes_ended_early(enough: EarlyEnd | None, built: Callable[[Any], Any], slots: _LaneSlots) -> Any:
-    """Lanes of which enough is seen; `built` makes the loop of one of what is its own."""
+    """Return True for each slot whose run ends early; `built` returns the loop and objectives of one run."""
     if enough is None:
         return jnp.zeros_like(slots.carry.running)
     output = jax.vmap(lambda mine, at: built(mine)[0].plant.output(at.point.state.plant))(slots.leaves, slots.carry)
-    return jax.vmap(lambda number, output: enough.reached(enough.own(number), output))(slots.number, output)
+    return jax.vmap(lambda number, output: enough.has_reached(enough.own(number), output))(slots.number, output)
 
 
 def _exchange_lanes(
     slots: _LaneSlots, free: Any, over: Callable[[Any, Carry], Run], taken: Callable[[Any], Any], count: int
 ) -> _LaneSlots:
-    """Put by the runs of lanes that are free (`over`), and take the next ones in their place (`taken`)."""
+    """Return the slots with the results (`over`) of free slots stored, and the next runs (`taken`) in their place."""
     place, runs = jnp.where(free, slots.number, count), over(slots.leaves, slots.carry)
+    # Slots that are not free write to the place `count`, beyond the end: the mode "drop" discards them.
     ended = jax.tree.map(lambda all, x: all.at[place].set(x, mode="drop"), slots.ended, runs)
+    # The cumulative sum gives free slots consecutive numbers.
     number = jnp.where(free, slots.next + jnp.cumsum(free) - 1, slots.number)
     old = (slots.leaves, slots.keys, slots.carry)
     mine, key, carry = jax.tree.map(partial(_select_lanes, free), taken(number), old)

@@ -1,12 +1,15 @@
-"""Derivatives of a run with adaptive steps: the run is made once for its values and noted, and its steps are repeated.
+"""Derivatives of a run with adaptive steps: the run is made once for its values and logged, and then its steps are
+replayed.
 
-    noted      of each step: when it ends, its regime, the comparison, the events and the instant of a clock at its end
-    repeated   the same steps within the same regimes, which are smooth; a step at whose end a comparison changes, or an
-               event happens, ends where the margin g of that is zero, by Newton's step -g/(dg/dt) from the noted end,
-               whose derivative is that of the moment by the implicit function theorem
+    log        for each step: the time at its end, its mode, and the comparison, events and clock instant at its end
+    replay     the same steps within the same modes, which are smooth. If a comparison changes or an event happens at
+    the
+               end of a step, the step ends at the zero of its margin g. Newton's step -g/(dg/dt) from the logged end
+               has the derivative of the event's time, by the implicit function theorem
 
-So the derivative is that of the run whose steps end at these times, and on its kinks and events; the lengths of the
-others do not depend on anything."""
+So the derivative is that of a run whose steps end at the logged times, or on its switching surfaces and events. The
+lengths of all other steps are constants.
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -42,20 +45,27 @@ from diffabs.simulate.stepper import cast_floats
 from diffabs.simulate.tries import AdaptiveCarry
 from diffabs.simulate.tsit5 import tsit5_step_from
 
-BASE_LOG_CAPACITY, LOG_CAPACITY_PER_TICK = (
-    4096,
-    2,
-)  # tries that can be noted at an error of 1e-5, and for each instant of a grid with clocks
-MAX_SHIFT_FRACTION = (
-    1e-3  # of the try in which it was seen: no event or comparison at the end of a step is so far from its zero
-)
+# Capacity of the log: attempts at an rtol of 1e-5, and attempts for each instant of a grid with clocks.
+BASE_LOG_CAPACITY, LOG_CAPACITY_PER_TICK = 4096, 2
+# Fraction of the attempt with the first sign of an event. No event or crossing at the end of a step is farther from its
+# zero than this: a larger Newton step would come from a margin that hardly falls.
+MAX_SHIFT_FRACTION = 1e-3
 
 
 class StepLog(NamedTuple):
-    """Of every try, in blocks (blocks, BLOCK, ...): whether it led on; the time at its end and its length; the length
-    of the first try from there; the number of the instant of the grid at which a clock has struck last; a bit for each
-    event at its end; its regime, and whether that did not count; the number of the comparison that changes at its end,
-    or -1."""
+    """Log of the attempts of a run, in blocks of shape (blocks, `STEPS_PER_BLOCK`, ...).
+
+    Attributes:
+        moved: True if the attempt was accepted.
+        t: Time at its end [s].
+        length: Length [s].
+        base: Length of the first attempt from the same point [s].
+        k: Number of the grid instant at which a clock struck last.
+        triggered: Bit mask of the events at its end.
+        words: Mode of the step.
+        unrestricted: True if the step has no mode.
+        lands: Number of the comparison that changes at its end, or -1.
+    """
 
     moved: Any
     t: Any
@@ -69,8 +79,15 @@ class StepLog(NamedTuple):
 
 
 class ReplayState(NamedTuple):
-    """A run on its way: time, how much later that is than its noted one, state, accumulators, and the number of the
-    clock's last instant."""
+    """A replay in progress.
+
+    Attributes:
+        t: Time [s].
+        late: Difference between this time and the logged time [s].
+        state: State of the loop.
+        accumulators: Accumulators of the objectives.
+        k: Number of the grid instant at which a clock struck last.
+    """
 
     t: Any
     late: Any
@@ -80,30 +97,50 @@ class ReplayState(NamedTuple):
 
 
 class RecordedSignals(NamedTuple):
-    """What blocks record at an instant, and its rates."""
+    """Signals that blocks record at an instant, and their rates.
+
+    Attributes:
+        t: Time [s].
+        recorded: Signals and their rates, each by block.
+    """
 
     t: Any
     recorded: tuple[dict[str, Any], dict[str, Any]]
 
 
 class ReplayedRun(NamedTuple):
-    """A run that is over, as a judge sees it."""
+    """A replayed run that is over, as `finish_run` expects it.
+
+    Attributes:
+        point: State at the end.
+        status: Status of the run.
+    """
 
     point: ReplayState
     status: Any
 
-    running = property(is_running)  # never
+    running = property(is_running)  # always False
 
 
 def log_capacity(loop: Loop, solver: Adaptive) -> int:
-    """Return for how many tries there is room in the notes of a run."""
+    """Return the capacity of the log of a run, in attempts.
+
+    Args:
+        loop: Closed loop.
+        solver: Solver of the run.
+    """
     return math.ceil(BASE_LOG_CAPACITY * max(1.0, 1e-5 / solver.rtol) ** (1 / ADAPTIVE_ERROR_ORDER)) + (
         LOG_CAPACITY_PER_TICK * solver.steps if loop.ticks else 0
     )
 
 
 def log_attempt(old: AdaptiveCarry, new: AdaptiveCarry) -> StepLog:
-    """Return the notes of one try, between these carries."""
+    """Return the log entry of one attempt.
+
+    Args:
+        old: Carry before the attempt.
+        new: Carry after the attempt.
+    """
     moved = (new.point.t > old.point.t) | (new.triggered != 0)
     landed = (old.status == RunStatus.LANDING) & (new.triggered == 0)
     lands = jnp.where(landed, old.search.which, -1)
@@ -115,7 +152,15 @@ def log_attempt(old: AdaptiveCarry, new: AdaptiveCarry) -> StepLog:
 def log_steps(
     loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, tries: int
 ) -> tuple[StepLog, Any]:
-    """Return the notes of a run, with room for so many tries, and how it ended: it has diverged if it took more."""
+    """Return the log of a run and its status at the end; a run with more attempts than the capacity has diverged.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        stepping: Stepping method of the logged run.
+        key: Random key, or None.
+        tries: Capacity of the log in attempts.
+    """
 
     def one(carry: AdaptiveCarry, _: Any) -> tuple[AdaptiveCarry, StepLog]:
         new = stepping.step(loop, objectives, key, carry)
@@ -132,8 +177,11 @@ def log_steps(
 
 
 def _scan_active(work: Any, on: Any, carry: Any, xs: Any, length: int | None = None, reverse: bool = False) -> Any:
-    """A scan of work(carry) or, with xs, work(carry, x), which is skipped where no lane of a batch is on(carry, x):
-    it leaves zeros there."""
+    """Return the result of a scan of work(carry) or, with xs, work(carry, x), with the steps skipped if no run is
+    on(carry, x).
+
+    A skipped step returns zeros.
+    """
 
     def body(carry: Any, x: Any) -> tuple[Any, Any]:
         def run() -> tuple[Any, Any]:
@@ -150,39 +198,60 @@ def _scan_active(work: Any, on: Any, carry: Any, xs: Any, length: int | None = N
 def replay_run(
     loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, notes: StepLog, status: Any
 ) -> ReplayedRun:
-    """Return the run of these notes once more, which can be differentiated in every leaf of loop and objectives."""
+    """Return the replayed run, differentiable with respect to every leaf of loop and objectives.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        stepping: Stepping method of the logged run.
+        key: Random key, or None.
+        notes: Log of the run.
+        status: Status of the logged run at its end.
+    """
     return ReplayedRun(_replay_steps(loop, objectives, stepping, key, notes)[0], status)
 
 
 def replay_with_trajectory(
     loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, notes: StepLog, status: Any, instants: Any
 ) -> tuple[ReplayedRun, Trajectory, Trajectory]:
-    """Return the same run, what is seen at its beginning, and what at these instants (n,) of the grid: by the cubics of
-    its steps."""
+    """Return the replayed run, the sample at its beginning, and the samples at these instants of the grid.
+
+    The cubics of the steps give the samples.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        stepping: Stepping method of the logged run.
+        key: Random key, or None.
+        notes: Log of the run.
+        status: Status of the logged run at its end.
+        instants: Numbers of the grid's instants, shape (n,).
+    """
     last, spans = _replay_steps(loop, objectives, stepping, key, notes)
-    # What was skipped is zero, and comes after the end.
+    # Skipped blocks are zero and come after the end: infinity keeps the start times sorted for the search.
     starts = jnp.where(jnp.any(notes.moved, axis=1)[:, None], jax.lax.stop_gradient(spans.t), jnp.inf)
     spans = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), spans)
 
-    def seen(instant: Any) -> Trajectory:
+    def observe_at(instant: Any) -> Trajectory:
         t = instant * stepping.h
         place = jnp.searchsorted(starts.ravel(), t, side="right") - 1
         span = jax.tree.map(lambda x: x[place], spans)
         return observe(loop, t, span.at(t), t < jax.lax.stop_gradient(last.t))
 
     first = observe(loop, 0.0 * stepping.h, jax.tree.map(lambda x: x[0], spans.state), jnp.asarray(True))
-    return ReplayedRun(last, status), first, jax.vmap(seen)(instants)
+    return ReplayedRun(last, status), first, jax.vmap(observe_at)(instants)
 
 
 def _replay_steps(
     loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, notes: StepLog
 ) -> tuple[ReplayState, Any]:
-    """The end of the run, and the `HermiteStep` of every try, where they are kept."""
+    """Return the state at the end of the run and, with a trajectory, the `HermiteStep` of each attempt."""
     begun = start_replay(loop, objectives, stepping, key)
 
     def step(place: ReplayState, one: StepLog) -> tuple[ReplayState, Any]:
         return replay_attempt(loop, objectives, stepping, key, place, one)
 
+    # Checkpoints on both levels: memory for the states of the blocks plus those of one block.
     @rematerialise
     def block(place: ReplayState, some: StepLog) -> tuple[ReplayState, Any]:
         return jax.lax.scan(rematerialise(step), place, some)
@@ -191,7 +260,14 @@ def _replay_steps(
 
 
 def start_replay(loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any) -> ReplayState:
-    """Return where a run begins."""
+    """Return the state of a replay at t = 0.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        stepping: Stepping method of the logged run.
+        key: Random key, or None.
+    """
     zero = 0.0 * stepping.h
     state, accumulators = start_state(loop, objectives, Clock(zero, stepping.h, 0, key))
     return cast_floats(
@@ -202,7 +278,17 @@ def start_replay(loop: Loop, objectives: Objectives, stepping: AdaptiveStepping,
 def replay_attempt(
     loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, place: ReplayState, one: StepLog
 ) -> tuple[ReplayState, Any]:
-    """Return where a try leads, if it led on; its `HermiteStep`, where they are kept."""
+    """Return the state after a logged attempt, unchanged if the attempt was not accepted, and with a trajectory its
+    `HermiteStep`.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        stepping: Stepping method of the logged run.
+        key: Random key, or None.
+        place: State before the attempt.
+        one: Log entry of the attempt.
+    """
     logs, place = write_last_rows(place.state), place._replace(state=borrow(place.state, None))
     new, span = _step(loop, objectives, stepping, key, place, one, logs)
     place = select(one.moved, new, place)
@@ -218,8 +304,11 @@ def _step(
     one: StepLog,
     logs: list[Any],
 ) -> tuple[ReplayState, Any]:
-    """Return where one step leads, within its mode and with what happens at its end; and its `HermiteStep`, where these
-    are kept. `logs` are the rows of the logs, which the state is without."""
+    """Return the state after one step within its mode, with the changes at its end, and with a trajectory its
+    `HermiteStep`.
+
+    The state is without the rows of the blocks' logs, `logs`.
+    """
     system = build_dynamics(loop, objectives, place.t, place.state, place.accumulators, kinks=True)
     within, h = Mode(one.words, one.unrestricted), one.length - place.late
     begin = system.ahead(place.t, place.state, place.accumulators, within)
@@ -228,6 +317,7 @@ def _step(
     def flow(t: Any, z: Any, given: tuple[Any, Mode]) -> Any:
         return system.rates(t, z, *given)
 
+    # `h` is the logged length less the shift of the step's beginning: the step still ends at the logged time.
     z = tsit5_step_from(flow, place.t, z, begin.seen[:2], h, (held, within))
     noted_end = system.ahead(one.t, *_with_flow(place, z), within)
     strikes = (one.k != place.k) & (one.k < stepping.steps)
@@ -235,7 +325,7 @@ def _step(
     t = one.t + shift
     z = axpy(shift, noted_end.seen[:2], z)
     state, accumulators = _with_flow(place, z)
-    end = system.ahead(t, state, accumulators, within)  # rates, too, are those of the shifted end
+    end = system.ahead(t, state, accumulators, within)  # second evaluation: the rates must be those of the shifted end
     state = state._replace(plant=loop.plant.project(state.plant))
     sample = end.seen.signals.sample
     segment = Segment(
@@ -262,15 +352,19 @@ def _step(
 
 
 def _with_flow(place: ReplayState, z: Any) -> tuple[LoopState, Accumulators]:
-    """State and accumulators with other continuous memories, not projected: a projection may end at a comparison."""
+    """Return state and accumulators with other integrated values, without projection: a projection may end on a
+    switching surface.
+    """
     return place.state.with_flow(z[0]), {
         name: memory._replace(flow=z[1][name]) for name, memory in place.accumulators.items()
     }
 
 
 def _shift(end: LoopEvaluationWithRates, one: StepLog, strikes: Any) -> Any:
-    """How much later [s] than its noted end a step has come to its event, or to the comparison that changes there; 0
-    where there is none, or a clock decides."""
+    """Return the time [s] from the logged end of a step to its event or to the zero of its comparison.
+
+    The time is 0 without an event or comparison, or if a clock determines the end.
+    """
     shift, most = jnp.zeros_like(one.length), MAX_SHIFT_FRACTION * one.base
     for comparison in end.comparisons:
         on = comparison.numbers == one.lands
@@ -278,6 +372,7 @@ def _shift(end: LoopEvaluationWithRates, one: StepLog, strikes: Any) -> Any:
         for which, margin, rate in zip(*each, strict=True):
             close, later = _time_to_zero(which, margin, rate, most)
             shift = jnp.where(close, later, shift)
+    # A clock fixes the time of a crossing, but events come last: an event decides even at a clock's instant.
     shift = jnp.where(strikes, 0.0, shift)
     events = zip(jax.tree.leaves(end.seen.margins), jax.tree.leaves(end.falls), strict=True)
     for i, (margin, fall) in reversed(list(enumerate(events))):
@@ -287,15 +382,16 @@ def _shift(end: LoopEvaluationWithRates, one: StepLog, strikes: Any) -> Any:
 
 
 def _time_to_zero(on: Any, margin: Any, fall: Any, most: Any) -> tuple[Any, Any]:
-    """Whether a margin is zero within so many seconds, and in how many."""
+    """Return True if a margin is zero within `most` seconds, and the time to its zero [s]."""
     close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(most) * fall))
-    return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))  # the margin is 0, but for rounding
+    # The fall may be frozen: its derivative is multiplied by the margin, which is 0 except for rounding.
+    return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))
 
 
 def _commit_changes(
     system: Dynamics, clock: Clock, state: LoopState, margins: Margins, fired: Any, step: dict[str, Passage]
 ) -> LoopState:
-    """The state after the events and the ticks at the end of a step."""
+    """Return the state after the events and ticks at the end of a step."""
     signals = system.loop.signals(clock.t, state)
     leaves, tree = jax.tree.flatten(margins)
     happens = tree.unflatten([fired & (1 << i) != 0 for i in range(len(leaves))])

@@ -1,7 +1,8 @@
-"""How a run is judged when it is over: its metrics, and whether it can have been.
+"""Results of a run that is over: its metrics, and whether the run is physically possible.
 
-An unstable step may leave every number finite. So a run has `diverged`, too, if its landing did not come to rest on the
-crossing, if a metric is outside of its physical range, or if the plant's own audit says that it cannot have been."""
+An unstable step may leave every number finite. So a run has also `diverged` in three further cases. Its landing misses
+the zero of the stop's margin, a metric is outside its physical range, or the plant's audit rejects the run.
+"""
 
 import math
 from typing import Any
@@ -14,20 +15,31 @@ from diffabs.core.pytree import prepare_parts
 from diffabs.simulate.condition import RunStatus
 from diffabs.simulate.solution import Run, Trajectory
 
-PHYSICAL_RANGE_TOLERANCE = 1e-9  # of a metric beyond its physical range
-AUDIT_METRIC = ""  # the name of a plant's audit among the objectives; no metric is called so
+PHYSICAL_RANGE_TOLERANCE = 1e-9  # a metric may exceed its physical range by this much
+AUDIT_METRIC = ""  # name of a plant's audit among the objectives; no metric has an empty name
 
 
 def prepare(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
-    """The loop with everything worked out that does not change during a run, and what its plant watches it by."""
+    """Return the loop with everything precomputed that is constant during a run, and the plant's audit as an objective.
+
+    The dictionary of the audit is empty if the plant has none.
+
+    Args:
+        loop: Closed loop.
+    """
     loop = prepare_parts(loop)
     audit = getattr(loop.plant, "audit", None)
     return loop, {AUDIT_METRIC: audit(loop.initial)} if audit else {}
 
 
 def finish_run(loop: Loop, objectives: dict[str, Objective], carry: Any) -> tuple[Run, Trajectory]:
-    """The result of a run that is over, and its last instant; of the carry of whatever chose its steps. `objectives`
-    with the plant's audit."""
+    """Return the result of a run that is over, and its last instant.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by name, including the plant's audit.
+        carry: Carry of any stepping method at the end of the run.
+    """
     last = observe(loop, carry.point.t, carry.point.state, carry.running)
     stopped = carry.status == RunStatus.STOPPED
     ending = Ending(last.sample, stopped, *loop.stop.remainder(last.sample, stopped))
@@ -40,14 +52,24 @@ def finish_run(loop: Loop, objectives: dict[str, Objective], carry: Any) -> tupl
 
 
 def observe(loop: Loop, t: Any, state: LoopState, running: Any) -> Trajectory:
-    """Return what is seen of the loop at an instant."""
+    """Return the signals of the loop at an instant.
+
+    Args:
+        loop: Closed loop.
+        t: Time [s].
+        state: State of the loop.
+        running: True if the run goes on at this instant.
+    """
     signals = loop.signals(t, state)
     return Trajectory(signals.sample, signals.measured, state.plant, running)
 
 
 def _is_impossible(name: str, objective: Objective, value: Any) -> Any:
-    """Whether no real run has this value: of an audit more than 1, of a metric one outside its range, or no number."""
+    """Return True if no real run has this value: more than 1 for an audit, outside its range or not finite for a
+    metric.
+    """
     if name == AUDIT_METRIC:
+        # The negation counts NaN as impossible, too.
         return ~(value <= 1)
     low, high = getattr(objective, "physical", (-math.inf, math.inf))
     if math.isinf(low) and math.isinf(high):
@@ -55,5 +77,6 @@ def _is_impossible(name: str, objective: Objective, value: Any) -> Any:
     inside = (
         (value >= low - PHYSICAL_RANGE_TOLERANCE) & (value <= high + PHYSICAL_RANGE_TOLERANCE) & jnp.isfinite(value)
     )
-    unreached = getattr(objective, "unreached", None)  # an infinite value is the answer of a run that never gets there
+    # `unreached` is the infinite value of a run that never reaches the measured condition: a valid answer.
+    unreached = getattr(objective, "unreached", None)
     return ~inside if unreached is None else ~(inside | (value == unreached))

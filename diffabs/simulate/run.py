@@ -1,7 +1,9 @@
-"""Run a loop, by fixed or adaptive Runge-Kutta steps, and return a trajectory, or only what is measured.
+"""Single runs of a loop by fixed or adaptive Runge-Kutta steps, with a trajectory or with metrics only.
 
-A step that crosses the stop, or an event of a block, is tried again, shorter, until it ends there (`landing`). Every
-objective is thus exact to the order of the method and differentiable, wherever the crossing falls."""
+If a step crosses the stop or the event of a block, shorter steps are attempted until one ends there (`landing`). So
+every objective is exact to the order of the method and differentiable, independent of the place of the crossing in the
+step.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -34,28 +36,34 @@ from diffabs.simulate.result import finish_run, prepare
 from diffabs.simulate.solution import Adaptive, Run, Solver, Trajectory
 
 OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
-MAX_COUNTED_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
+MAX_COUNTED_STEPS = 2**31 - 8  # greatest number of steps that a 32-bit counter holds, including the landing
 
 
 def rollout(loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | None = None, *, key: Any = None) -> Run:
-    """Run a loop and return its trajectory and what is measured.
+    """Run a loop and return a `Run` with its trajectory and metrics.
 
-    loop: every part and parameter; differentiable in each leaf, and batched by `jax.vmap` over any
-    solver: step, duration [s], and how many instants are kept
-    objectives: by the names of the metrics
-    key: of `jax.random`, for noisy sensors
+    The function is pure and compiled once per structure of the loop: new values and another duration do not compile
+    again. A trajectory or a derivative does compile again if it outgrows its capacity, which is at most an eighth more
+    than requested. The stability of the step is not checked here but in `check`. A run with impossible traced
+    parameters diverges.
 
-    >>> import diffabs as d
-    >>> run = d.rollout(d.braking(), d.FixedStep(1e-4, 3.0, every=10000))
-    >>> print(*(f"{speed:.1f}" for speed in run.trajectory.sample.output.speed))  # after 0, 1, 2, 3 s
-    27.8 19.1 10.0 1.0
+    Args:
+        loop: Closed loop with every part and parameter; differentiable in each leaf, and batched by `jax.vmap` over
+            any.
+        solver: Solver with step, duration [s], and stride `every` of the trajectory's instants.
+        objectives: Objectives by the names of their metrics; None for no metrics.
+        key: Random key of `jax.random`, for noisy sensors.
 
-    Pure and jit-compiled, once per structure of the loop: new values and another duration do not compile again. A
-    trajectory or a derivative does where it becomes longer than the room that it has, up to an eighth more than asked.
-    Raises ValueError for a step, duration or stride that is not positive, a step longer than the duration, parameters
-    that are no real numbers of 32 bits or more, or have another shape than they need, and for concrete parameters that
-    no run may have: out of range, against a rule of their part, a start beyond the stop, a clock off the grid. It does
-    not ask whether the step is stable, as `check` does. Traced parameters that are impossible make a run that diverged.
+    Examples:
+        >>> import diffabs as d
+        >>> run = d.rollout(d.braking(), d.FixedStep(1e-4, 3.0, every=10000))
+        >>> print(*(f"{speed:.1f}" for speed in run.trajectory.sample.output.speed))  # after 0, 1, 2, 3 s
+        27.8 19.1 10.0 1.0
+
+    Raises:
+        ValueError: A step, duration or stride is not positive, or the step is longer than the duration. A parameter is
+            not a real number of at least 32 bits, or has a wrong shape. A concrete parameter is out of range or breaks
+            a rule of its part. The start is beyond the stop, or a clock is off the grid.
     """
     objectives = objectives or {}
     refuse_values(loop, solver, objectives)
@@ -63,23 +71,41 @@ def rollout(loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | No
 
 
 def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Any = None) -> Run:
-    """Run a loop and return only what is measured: memory does not grow with the number of steps.
+    """Run a loop and return a `Run` with metrics only: memory does not grow with the number of steps.
 
-    loop, solver, objectives, key: as in `rollout`, whose ValueErrors it raises
+    Args:
+        loop: Closed loop with every part and parameter, as in `rollout`.
+        solver: Solver with step and duration [s].
+        objectives: Objectives by the names of their metrics.
+        key: Random key of `jax.random`, for noisy sensors.
 
-    >>> import diffabs as d
-    >>> from diffabs.objectives import StopDistance
-    >>> run = d.measure(d.braking(), d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
-    >>> print(f"{run.metrics['distance']:.2f} m")
-    43.85 m
+    Examples:
+        >>> import diffabs as d
+        >>> from diffabs.objectives import StopDistance
+        >>> run = d.measure(d.braking(), d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
+        >>> print(f"{run.metrics['distance']:.2f} m")
+        43.85 m
+
+    Raises:
+        ValueError: The arguments are invalid, as in `rollout`.
     """
     refuse_values(loop, solver, objectives)
     return run_unchecked(loop, solver, objectives, key, 0)
 
 
 def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
-    """Return a run, with a trajectory of one in `every` instants, or without for 0. The values of the parameters may be
-    impossible; then it has diverged."""
+    """Return a run without a check of the parameters' values; a run with impossible values has diverged.
+
+    Args:
+        loop: Closed loop with every part and parameter.
+        solver: Solver of the run.
+        objectives: Objectives by the names of their metrics.
+        key: Random key, or None.
+        every: Stride of the trajectory's instants; 0 for a run without a trajectory.
+
+    Raises:
+        ValueError: An argument is invalid, apart from the values of parameters.
+    """
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
@@ -87,13 +113,19 @@ def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     tries = log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.room(loop, between)
     method = method.with_trajectory() if every else method
     places = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
+    # Capacities are static and rounded up, so that similar durations share one compiled program.
     run = _run_differentiable(places, (loop, objectives, method, key))
     return run._replace(trajectory=_truncate_trajectory(run.trajectory, count + 1)) if every else run
 
 
 class RunCapacity(NamedTuple):
-    """What is known when a program is compiled: places for so many tries (between two instants of a trajectory, if
-    there is one), and for so many instants, one in every so many steps."""
+    """Capacities that are fixed at compilation.
+
+    Attributes:
+        tries: Capacity for attempts in the run, or between two instants of a trajectory.
+        instants: Capacity for instants of a trajectory; 0 without one.
+        every: Number of grid steps between two instants.
+    """
 
     tries: int
     instants: int
@@ -106,23 +138,46 @@ def _truncate_trajectory(trajectory: Any, count: int) -> Any:
 
 
 def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
-    """Loop, objectives, and what chooses the steps, of one data type. Raises ValueError."""
+    """Return loop, objectives and stepping method of one data type.
+
+    Args:
+        loop: Closed loop with every part and parameter.
+        solver: Solver of the run.
+        objectives: Objectives by the names of their metrics.
+
+    Raises:
+        ValueError: An argument is invalid, apart from the values of parameters.
+    """
     refuse(loop, solver, objectives)
     loop, objectives = canonical_dtypes((as_arrays(loop), {name: as_arrays(part) for name, part in objectives.items()}))
     if is_traced(loop):
+        # Only traced values can be differentiated.
         loop = replace(loop, forbid_derivatives(loop, {path: value for path, _, value in parameters(loop)}))
     return loop, objectives, build_stepping(solver, jax.tree.leaves(loop)[0].dtype)
 
 
 def forbid_derivatives(loop: Loop, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of the values, by path of the loop, on which a run does not depend smoothly. Whoever
-    differentiates by them gets a ValueError."""
+    """Return the values on which a run does not depend smoothly, wrapped so that a derivative raises a ValueError.
+
+    Args:
+        loop: Closed loop that specifies the parameters.
+        values: Values by dotted path.
+    """
     coarse = {path for path, spec, _ in parameters(loop) if not spec.tunable}
     return {path: without_derivative(path, value) for path, value in values.items() if path in coarse}
 
 
 def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
-    """Raise ValueError for what is no run, whatever its numbers are."""
+    """Check solver, shapes and objectives of a run, independent of the parameters' values.
+
+    Args:
+        loop: Closed loop.
+        solver: Solver of the run.
+        objectives: Objectives by the names of their metrics.
+
+    Raises:
+        ValueError: A field of the solver is invalid, a parameter has a wrong shape, or a part is not an objective.
+    """
     lines = [*_find_solver_faults(solver), *find_misshapen(loop)]
     for name, part in objectives.items():
         if all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
@@ -135,7 +190,16 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
 
 
 def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
-    """Raise ValueError for what is no run, or has concrete parameters that no run may have."""
+    """Check a run as `refuse` does and, if all parameters are concrete, their values.
+
+    Args:
+        loop: Closed loop.
+        solver: Solver of the run.
+        objectives: Objectives by the names of their metrics.
+
+    Raises:
+        ValueError: An argument is invalid, or a concrete parameter has a value that no run may have.
+    """
     refuse(loop, solver, objectives)
     if is_traced(loop, dict(objectives)):
         return
@@ -148,7 +212,7 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
 
 
 def _find_solver_faults(solver: Solver) -> Iterator[str]:
-    """One line for each field that no run can have."""
+    """Yield one line for each invalid field of the solver."""
     names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
     lines = [f"solver.{name} {line}" for name in names if (line := _find_number_fault(solver, name))]
     if lines:
@@ -172,7 +236,7 @@ def _find_number_fault(solver: Solver, name: str) -> str:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _run_differentiable(places: RunCapacity, run: Any) -> Run:
-    """The run of (loop, objectives, method, key)."""
+    """Return the run of (loop, objectives, method, key)."""
     loop, objectives, method, key = run
     return _run(loop, objectives, method, key, jax.device_put(places.every), places=places.instants)
 
@@ -189,9 +253,18 @@ def _rule(places: RunCapacity, primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: Any) -> None:
-    """Raise ValueError for a run whose derivatives would be wrong."""
+    """Check that the derivatives of a run are right.
+
+    Args:
+        loop: Closed loop.
+        objectives: Objectives by the names of their metrics.
+        method: Stepping method.
+
+    Raises:
+        ValueError: The derivatives of an objective would be wrong.
+    """
     if isinstance(method, AdaptiveStepping) and loop.recorders:
-        # A repeated run sees bends of the delayed command, to rounding, elsewhere than the run that it repeats.
+        # Rounding moves the kinks of the delayed command between the logged run and its replay.
         names = [name for name, one in objectives.items() if isinstance(one, Variation)]
         if names:
             raise ValueError(
@@ -201,7 +274,7 @@ def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: A
 
 
 def _second_derivative_objection(loop: Loop, method: Any) -> str:
-    """Why a run has no second derivatives; nothing where it has."""
+    """Return the reason why a run has no second derivatives, or an empty string."""
     if isinstance(method, AdaptiveStepping):
         return "runs with adaptive steps have no second derivatives; d.FixedStep has"
     if loop.recorders:
@@ -214,12 +287,12 @@ _run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 @compile_once(static=("places",), options=SAME_RESULT_OPTIONS)
 def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, every: Any, *, places: int) -> Run:
-    """For values: `places` for a trajectory, 0 without."""
+    """Return a run for values, with capacity for `places` instants of a trajectory, 0 without one."""
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
     carry = method.start(loop, objectives, key)
     if not places:
         return finish_run(loop, objectives, run_to_end(stepped, partial(method.renew, loop), carry))[0]
-    first, count = method.seen(loop, carry, 0), -(-method.steps // every)
+    first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     seen = partial(method.seen, loop)
     carry, seen = run_with_trajectory(
         stepped, partial(method.renew, loop), method.before, seen, carry, every, count, places
@@ -229,7 +302,7 @@ def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, ev
 
 @partial(jax.jit, static_argnames="places")
 def _run_reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, *, places: RunCapacity) -> Run:
-    """For derivatives."""
+    """Return a run for derivatives in both modes."""
     if isinstance(method, AdaptiveStepping):
         return _run_by_replay(loop, objectives, method.for_replay(), key, places)
     method = method.for_derivatives()
@@ -237,7 +310,7 @@ def _run_reversible(loop: Loop, objectives: dict[str, Objective], method: Any, k
     carry, (tries, instants, every) = method.start(loop, objectives, key), places
     if not every:
         return finish_run(loop, objectives, scan_to_end(stepped, carry, tries))[0]
-    first, count = method.seen(loop, carry, 0), -(-method.steps // every)
+    first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     carry, seen = scan_with_trajectory(
         stepped, method.before, partial(method.seen, loop), carry, every, count, instants, tries
     )
@@ -249,6 +322,7 @@ def _run_by_replay(
 ) -> Run:
     loop, audit = prepare(loop)
     objectives, (tries, instants, every) = objectives | audit, places
+    # The log holds values only: derivatives come from the replay.
     still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
     run = (loop, objectives, method, key, *log_steps(still, measures, method.without_trajectory(), key, tries))
     if not every:
@@ -264,10 +338,11 @@ def _prepare_run(loop: Loop, objectives: dict[str, Objective], method: Any, key:
 
 
 def _attach_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: Any) -> Run:
-    """The first instant, those seen, and the last one in place of everything after the end."""
+    """Return the run with its trajectory: first and later instants, and the last one repeated after the end."""
     run, last = judged
 
     def join(a: Any, b: Any, c: Any) -> Any:
+        # Rows after the end contain anything, so the last instant replaces them.
         b = jnp.where(jnp.expand_dims(seen.running, range(1, b.ndim)), b, c)
         return jnp.concatenate([jnp.asarray(a)[None], b])
 

@@ -1,5 +1,7 @@
-"""Lanes that lie on several devices. XLA divides their runs by itself where the axes of a mesh are Auto: the kind for
-which a program says nothing of where its numbers lie, as none of a part does."""
+"""Batches on several devices: XLA divides the runs by itself if the axes of the mesh are of type Auto.
+
+Auto axes suit programs that do not specify the placement of their arrays, and no part of a loop specifies it.
+"""
 
 import contextlib
 from collections.abc import Callable
@@ -16,10 +18,17 @@ TRACED_EXPLICIT_AXES = (
 
 
 def run_on_auto_mesh(run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
-    """Return run(*given); what of it lies on a mesh of Explicit axes is handed over on one of Auto axes of the same
-    devices, nothing moved, and the results come back on the first.
+    """Return run(*given), with arrays on meshes of Explicit axes moved to Auto axes of the same devices.
 
-    Raises ValueError where such arrays are traced."""
+    No data move between devices. Results return to the original mesh.
+
+    Args:
+        run: Function to call.
+        given: Positional arguments, pytrees.
+
+    Raises:
+        ValueError: An array on Explicit axes is traced.
+    """
     meshes = {_auto_mesh(x.sharding.mesh): x.sharding.mesh for x in jax.tree.leaves(given) if _has_explicit_axes(x)}
     if not meshes:
         return run(*given)
@@ -28,6 +37,7 @@ def run_on_auto_mesh(run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
         mesh = getattr(getattr(x, "sharding", None), "mesh", None)
         return _put_on_mesh(x, meshes[mesh]) if mesh in meshes else x
 
+    # A mesh set around the call must be replaced, too: it would otherwise conflict with the Auto mesh of the arrays.
     meant = jax.sharding.get_abstract_mesh().axis_names
     with jax.set_mesh(next(iter(meshes))) if meant else contextlib.nullcontext():
         found = run(
@@ -37,7 +47,7 @@ def run_on_auto_mesh(run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
 
 
 def _has_explicit_axes(x: Any) -> bool:
-    """Whether an array lies on a mesh whose axes are part of its type. Raises ValueError for one that is traced."""
+    """Return True if an array lies on a mesh whose axes are part of its type; raise a ValueError if it is traced."""
     if not isinstance(x, jax.Array):
         return False
     sharding = jax.typeof(x).sharding if isinstance(x, Tracer) else x.sharding

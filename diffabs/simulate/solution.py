@@ -1,4 +1,4 @@
-"""How a run is asked for, and what it returns."""
+"""Solvers and results of a run."""
 
 import dataclasses
 import math
@@ -13,12 +13,19 @@ from diffabs.simulate import convert
 
 @dataclasses.dataclass(frozen=True)
 class FixedStep:
-    """Steps of equal length [s], up to `duration` [s]; a trajectory keeps every `every`-th instant.
+    """Steps of equal length up to a duration.
 
-    kinks: whether a step ends where a comparison in the flow changes (a limit, the knot of a measured road, a wheel
-    that locks) as it does on events. None: where a derivative is asked for, and where the rates of a part jump there
-    (conditional integration). Without, a value is exact to h^2 in such a step, where a rate jumps only to h, and a
-    derivative to one order less; it costs up to twice as much."""
+    With `kinks` a step ends where a comparison of the flow changes, as it does on events. Examples are a limit, the
+    knot of a measured road, and a wheel that locks. Without, a step across such a kink is exact to h^2, or to h where a
+    rate jumps. A derivative is exact to one order less. `kinks` costs up to twice as much time.
+
+    Attributes:
+        step: Length of a step [s].
+        duration: Longest time of the run [s].
+        every: A trajectory keeps every `every`-th instant.
+        kinks: True if steps end on switching surfaces. None does so for derivatives, and if a rate of a part jumps
+            there (conditional integration).
+    """
 
     step: float = 1e-3
     duration: float = 10.0
@@ -27,23 +34,30 @@ class FixedStep:
 
     @property
     def steps(self) -> int:
-        """How many steps the duration takes."""
+        """Number of steps in the duration."""
+        # The factor keeps the rounding of the quotient from adding a step.
         return math.ceil(self.duration / self.step * (1 - 1e-12))
 
 
 @dataclasses.dataclass(frozen=True)
 class Adaptive:
-    """Steps as long as their error allows, up to `duration` [s]; they end where a comparison in the flow changes (a
-    limit, the knot of a measured road, a wheel that locks), on events, and where a clock strikes. The method is
-    Tsitouras' of fifth order; the reference remains `FixedStep`.
+    """Steps as long as their error allows, by Tsitouras' method of fifth order. The reference method remains
+    `FixedStep`.
 
-    A signal that depends on time alone limits no step unless states follow it: an integral over a setpoint that swings
-    faster than everything else is as wrong as a cubic over a step is. Take fixed steps for it.
+    Steps end on events, where a clock strikes, and where a comparison of the flow changes. Examples are a limit, the
+    knot of a measured road, and a wheel that locks.
 
-    rtol: the error of a step, as a fraction of the greatest value so far of each state and of the first signal that the
-        plant shows. What a run measures is off by some ten times as much (`accuracy` estimates it)
-    step: of a grid [s] on which clocks strike, delays remember, and of which a trajectory keeps every `every`-th
-        instant, by interpolation. No step of the integration has to end there"""
+    A signal that depends on time alone limits no step unless states follow it. The integral of a setpoint that swings
+    faster than everything else has the error of a cubic over a step. Use fixed steps for it.
+
+    Attributes:
+        rtol: Error of a step, as a fraction of the greatest value so far of each state and of the plant's first signal.
+            The error of a metric is some ten times as much (`accuracy` estimates it).
+        duration: Longest time of the run [s].
+        step: Step of a grid [s]. Clocks strike and delays remember on this grid. No step of the integration has to end
+            there.
+        every: A trajectory keeps every `every`-th instant of the grid, by interpolation.
+    """
 
     rtol: float = 1e-5
     duration: float = 10.0
@@ -52,18 +66,24 @@ class Adaptive:
 
     @property
     def steps(self) -> int:
-        """How many instants the grid has after the first."""
+        """Number of instants of the grid after the first."""
         return math.ceil(self.duration / self.step * (1 - 1e-12))
 
 
 Solver = FixedStep | Adaptive
 SOLVER_TYPES: dict[str, type[Any]] = {"fixed": FixedStep, "adaptive": Adaptive}  # by their names in a scenario
-ADAPTIVE_ERROR_ORDER = 4  # of the error of an adaptive step, in its length
+ADAPTIVE_ERROR_ORDER = 4  # order of the error of an adaptive step in its length
 
 
 def refine_solver(solver: Solver, times: int) -> Solver:
-    """Return the solver whose steps, and those of its grid, are so many times shorter, over the same whole ones."""
+    """Return the solver with steps and grid `times` shorter, over the same number of original steps.
+
+    Args:
+        solver: Solver to refine.
+        times: Factor by which the step shrinks, a whole number.
+    """
     step = solver.step / times
+    # The duration is a multiple of the original step, so both solvers end at the same time.
     shorter = dataclasses.replace(solver, step=step, duration=solver.steps * times * step)
     if isinstance(shorter, Adaptive):
         return dataclasses.replace(shorter, rtol=shorter.rtol / times**ADAPTIVE_ERROR_ORDER)
@@ -71,53 +91,64 @@ def refine_solver(solver: Solver, times: int) -> Solver:
 
 
 def describe_solver(solver: Solver) -> dict[str, Any]:
-    """Return what decides a run's results, for a file."""
+    """Return the numbers of a solver that determine a run's results, for a file.
+
+    Args:
+        solver: Solver of the run.
+    """
     said = {"step": solver.step, "duration": solver.duration}
     return said | ({"type": "adaptive", "rtol": solver.rtol} if isinstance(solver, Adaptive) else {})
 
 
 class Trajectory(NamedTuple):
-    """What was seen, with a leading time axis. After the end of a run its last sample is repeated."""
+    """Signals of a run with a leading time axis (instants,). After the end of a run the last sample is repeated."""
 
     sample: Sample
     measured: Any  # output of the sensor
-    state: Any  # of the plant
-    running: Any  # bool: False once the run has ended
+    state: Any  # state of the plant
+    running: Any  # bool: False after the end of the run
 
     def finite(self) -> Any:
-        """Whether every number of the run is finite."""
+        """Return True if every number of the run is finite."""
         return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self.sample)]))
 
 
 class Run(NamedTuple):
-    """The result: metrics by name (NaN for a run that diverged), how it ended, and the trajectory if asked for."""
+    """The result of a run: metrics by name (NaN for a run that diverged), end flags, and a requested trajectory."""
 
     metrics: dict[str, Any]
-    stopped: Any  # bool: the stop was reached in time
-    diverged: Any  # bool: its numbers mean nothing: one became infinite, NaN or impossible, or it began beyond its stop
-    timed_out: Any  # bool: the duration was over before the stop; a run is one of the three, or was ended from outside
+    stopped: Any  # bool: the run reached its stop in time
+    diverged: Any  # bool: invalid numbers (one is infinite, NaN or impossible), or a start beyond the stop
+    timed_out: Any  # bool: the duration ended before the stop. At most one of the three is True; none if ended early
     ending: Ending
     trajectory: Trajectory | None
 
     def __repr__(self) -> str:
-        """How it ended, and what was measured."""
+        """Return how the run ended, and its metrics."""
         return str(convert.summarise_run(self))
 
     def _repr_html_(self) -> str:
-        """The same for a notebook."""
+        """Return the summary for a notebook."""
         return convert.summarise_run(self)._repr_html_()
 
     def pandas(self, plant: Any = None) -> Any:
-        """The trajectory as a pandas.DataFrame indexed by time, with `attrs["units"]`; of a run without one its
-        metrics, a row for each lane. `plant` says the unit of the control. Raises ValueError for many trajectories."""
+        """Return the trajectory as a pandas.DataFrame indexed by time, with `attrs["units"]`; without one, a row of
+        metrics for each run.
+
+        The `plant` defines the unit of the control. Trajectories of a batch raise a ValueError.
+        """
         return convert.to_pandas(self, plant)
 
     def xarray(self, plant: Any = None) -> Any:
-        """The trajectory as an xarray.Dataset over the time, each variable with `units`. Raises ValueError for a run
-        without one, or for many."""
+        """Return the trajectory as an xarray.Dataset over the time, each variable with `units`.
+
+        The `plant` defines the unit of the control. A run without a trajectory or a batch raises a ValueError.
+        """
         return convert.to_xarray(self, plant)
 
     def plot(self, plant: Any = None, *, title: str = "") -> Any:
-        """The run as a figure of matplotlib (extra `plot`); `plant` says the unit of the control. Raises
-        ValueError for a run without a trajectory."""
+        """Return the run as a matplotlib figure (extra `plot`) with this `title`.
+
+        The `plant` defines the unit of the control. A run without a trajectory raises a ValueError.
+        """
         return convert.to_figure(self, plant, title)

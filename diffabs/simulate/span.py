@@ -1,4 +1,4 @@
-"""The run between the two ends of a step: the cubic through the states and the rates there."""
+"""The run between the ends of a step: the cubic through the states and the rates there."""
 
 from typing import Any, NamedTuple
 
@@ -11,8 +11,16 @@ from diffabs.core.numerics import clamp
 
 
 class HermiteStep(NamedTuple):
-    """A step: time [s], state and rates after what changed at its beginning; those of what is integrated before what
-    changes at its end."""
+    """A step of a run, for interpolation.
+
+    Attributes:
+        t: Time at the beginning [s].
+        state: State after the changes at the beginning.
+        rate: Rates after these changes.
+        until: Time at the end [s].
+        flow: Integrated values before the changes at the end.
+        last_rate: Rates before these changes.
+    """
 
     t: Any
     state: LoopState
@@ -22,7 +30,7 @@ class HermiteStep(NamedTuple):
     last_rate: Any
 
     def at(self, t: Any) -> LoopState:
-        """Return the state at a time within the step."""
+        """Return the state at a time `t` [s] within the step."""
         h = self.until - self.t
         x = clamp((t - self.t) / jnp.where(h > 0, h, 1.0), 0.0, 1.0)
         ends = (self.state.flow(), self.flow, self.rate, self.last_rate)

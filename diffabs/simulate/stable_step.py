@@ -1,11 +1,13 @@
-"""The largest integration step that is stable for a loop.
+"""The largest stable integration step of a loop.
 
 RK4 is stable on a mode lambda while |R(h lambda)| <= 1, R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24. A braking loop stiffens
-as it slows down, its slip rate going with 1/v, so the loop is linearised where the plant says that it may be stiffest;
-else at its start and at rest. Held memories do not move: a sampled controller is not judged here.
+as it slows down, because its slip rate is proportional to 1/v. So the loop is linearised where the plant says that it
+may be stiffest, or else at its start and at rest. Held memories are constant in the linearisation: it does not judge a
+sampled controller.
 
-Of many lanes few need the eigenvalues of their matrices: rho(A) <= |(D^-1 A D)^k|^(1/k) for every diagonal D and k, and
-with the D that balances the matrices of the first lane k = 1 is mostly enough, which costs less than the matrices.
+Few runs of a batch need the eigenvalues of their matrices, because rho(A) <= |(D^-1 A D)^k|^(1/k) for every diagonal D
+and every k. With the D that balances the matrices of the first run, k = 1 is mostly enough. This costs less than the
+matrices themselves.
 """
 
 import dataclasses
@@ -25,26 +27,35 @@ from diffabs.core.protocols import Memory, Reference
 from diffabs.core.pytree import Scalar, canonical_dtypes, part, pytree, replace
 from diffabs.core.tracing import split_batched
 
-BOUND_SQUARINGS = 4  # k = 16: within 3 % of the radius for the loops of the papers
-LANES_PER_CHUNK = 256  # lanes whose matrices stay in a processor's cache
-MIN_ENTRYWISE_MATRICES = 1 << 17  # matrices of all lanes, from which on they are worked out number by number
-BALANCING_ROUNDS = 30  # rounds
-BOUND_SAFETY_FACTOR = 1.01  # what single precision may take away from a bound
+BOUND_SQUARINGS = 4  # k = 16: within 3 % of the spectral radius for the loops of the papers
+LANES_PER_CHUNK = 256  # runs whose matrices stay in a processor's cache
+MIN_ENTRYWISE_MATRICES = 1 << 17  # number of matrices of all runs from which on they are computed entry by entry
+BALANCING_ROUNDS = 30
+BOUND_SAFETY_FACTOR = 1.01  # covers the rounding of a bound in single precision
 RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 3.5 of the origin
 
 
 def stable_step(loop: Loop) -> float:
-    """Largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its stop."""
+    """Return the largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its
+    stop.
+
+    Args:
+        loop: Closed loop with concrete parameters.
+    """
     return float(_largest_stable_steps(np.asarray(_jacobian(canonical_dtypes(loop)))[None])[0])
 
 
 def stable_steps(loops: Loop) -> np.ndarray:
-    """The same for a batch of loops, whose leaves have a leading axis (n,); returns (n,)."""
+    """Return the largest stable step [s] of each loop of a batch, shape (n,).
+
+    Args:
+        loops: Batch of loops, whose leaves have a leading axis (n,).
+    """
     return _largest_stable_steps(np.asarray(_jacobians(loops)))
 
 
 def _largest_stable_steps(matrices: np.ndarray) -> np.ndarray:
-    """The largest stable step of each lane (n,) for its matrices (n, k, d, d)."""
+    """Return the largest stable step of each run, shape (n,), for matrices of shape (n, k, d, d)."""
     known = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
     modes = np.linalg.eigvals(np.where(known[..., None, None], matrices, 0.0))
     damped = (modes.real < 0) & known[..., None]
@@ -54,9 +65,17 @@ def _largest_stable_steps(matrices: np.ndarray) -> np.ndarray:
 
 
 def is_step_stable(loop: Any, values: Any, step: float) -> np.ndarray:
-    """Whether a step [s] is stable for each lane of a loop that differ in these values (lanes,) by path; without a loop
-    (None) the values are loops, whose leaves have a leading axis. Returns bool (lanes,)."""
-    with jax.enable_x64(False), np.errstate(over="ignore"):  # what single precision cannot hold is infinite
+    """Return True for each run for which the step is stable, bool, shape (runs,).
+
+    Args:
+        loop: Loop that the runs have in common. If it is None, `values` is a batch of loops whose leaves have a leading
+            axis.
+        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
+        step: Integration step [s].
+    """
+    # Cheap bounds first, in single precision, where an overflow becomes infinite. Only runs without a proof go on to
+    # tighter bounds and at last to eigenvalues.
+    with jax.enable_x64(False), np.errstate(over="ignore"):
         fine = step * np.asarray(_bounds(*_as_single_precision(loop, values), squarings=0)) <= MIN_BOUNDARY_RADIUS
         for squarings in (BOUND_SQUARINGS, None):
             left = np.flatnonzero(~fine)
@@ -68,7 +87,8 @@ def is_step_stable(loop: Any, values: Any, step: float) -> np.ndarray:
 
 
 def _as_single_precision(*trees: Any) -> Any:
-    """In single precision already here: several threads at once do not agree on what `enable_x64` makes of an array."""
+    """Return the trees in single precision."""
+    # NumPy arrays, because `enable_x64` is not consistent for JAX arrays made by several threads at once.
     return jax.tree.map(lambda x: np.asarray(x, np.float32), trees)
 
 
@@ -77,7 +97,9 @@ def _at(values: Any, lanes: np.ndarray) -> Any:
 
 
 def _is_known_stable(loop: Any, values: Any, step: float, squarings: int | None) -> np.ndarray:
-    """Whether the step is known to be stable; by the eigenvalues themselves if not by so many squarings."""
+    """Return True for each run whose step is known to be stable: by a bound with so many squarings, or with None by the
+    eigenvalues.
+    """
     if squarings is not None:
         return (
             step * np.asarray(_bounds(*_as_single_precision(loop, values), squarings=squarings)) <= MIN_BOUNDARY_RADIUS
@@ -97,7 +119,7 @@ def _lane(loop: Any) -> Callable[[Any], Loop]:
 
 @partial(jax.jit, static_argnames="squarings")
 def _bounds(loop: Any, values: Any, *, squarings: int) -> jax.Array:
-    """What the modes of every lane are not faster than [1/s] (lanes,); infinite where that is not known."""
+    """Return an upper bound on |lambda| of all modes for each run [1/s], shape (runs,); infinite if unknown."""
     count = len(jax.tree.leaves(values)[0])
 
     def matrices(values: Any) -> jax.Array:
@@ -105,11 +127,10 @@ def _bounds(loop: Any, values: Any, *, squarings: int) -> jax.Array:
 
     one = matrices(jax.tree.map(lambda x: x[0], values))
     balance = _balance(one)
-    if not split_batched(matrices, values)[0]:  # no lane has other matrices than the first
+    if not split_batched(matrices, values)[0]:  # the matrices of all runs are equal
         return jnp.full(count, _power_norm_bound(one, balance, squarings))
-    places = jnp.minimum(
-        jnp.arange(-(-count // LANES_PER_CHUNK) * LANES_PER_CHUNK), count - 1
-    )  # whole batches: one program
+    # Whole chunks: a partial chunk would need a second program.
+    places = jnp.minimum(jnp.arange(-(-count // LANES_PER_CHUNK) * LANES_PER_CHUNK), count - 1)
     filled = jax.tree.map(lambda x: x[places], values) if count > LANES_PER_CHUNK else values
 
     def bound(values: Any) -> jax.Array:
@@ -121,11 +142,14 @@ def _bounds(loop: Any, values: Any, *, squarings: int) -> jax.Array:
 
 
 def _power_norm_bound(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Array:
-    """The greatest bound of some matrices (k, n, n) with their D (k, n); the norm is that of rows, or of columns."""
+    """Return the greatest bound for matrices (k, n, n) with their balancing D (k, n), in the row-sum or column-sum
+    norm.
+    """
     a = matrices * (balance[:, None, :] / balance[:, :, None])
-    log = jnp.zeros(len(a), a.dtype)  # of what has been divided out, to the power of one over k
+    log = jnp.zeros(len(a), a.dtype)  # logarithm of the k-th root of the scales that have been divided out
     for i in range(squarings):
-        size = jnp.maximum(jnp.max(jnp.abs(a), axis=(-2, -1)), 1e-30)  # else powers would leave single precision
+        # Powers without scaling would overflow single precision.
+        size = jnp.maximum(jnp.max(jnp.abs(a), axis=(-2, -1)), 1e-30)
         a, log = a / size[:, None, None], log + jnp.log(size) / 2**i
         a = jnp.matmul(a, a, precision="highest")
     rows, columns = (jnp.max(jnp.sum(jnp.abs(a), axis), -1) for axis in (-1, -2))
@@ -134,8 +158,8 @@ def _power_norm_bound(matrices: jax.Array, balance: jax.Array, squarings: int) -
 
 
 def _norm(entries: list[list[jax.Array]], balance: jax.Array) -> jax.Array:
-    """The same without squarings, of n rows of n numbers (k,): for sums over so few XLA on a CPU calls a library, and
-    stores all matrices for it."""
+    """Return `_power_norm_bound` without squarings, for n rows of n entries of shape (k,)."""
+    # Scalars: for such small sums XLA on a CPU calls a library, and stores all matrices for it.
     sizes = [[jnp.abs(x * (balance[:, j] / balance[:, i])) for j, x in enumerate(row)] for i, row in enumerate(entries)]
     rows, columns = (reduce(jnp.maximum, map(sum, lines)) for lines in (sizes, zip(*sizes, strict=True)))
     bound = jnp.max(jnp.minimum(rows, columns))
@@ -143,8 +167,12 @@ def _norm(entries: list[list[jax.Array]], balance: jax.Array) -> jax.Array:
 
 
 def _balance(matrices: jax.Array) -> jax.Array:
-    """D (k, n) for which rows and columns of D^-1 A D are about as large. E. E. Osborne, J. ACM 7 (1960), all at once
-    and by half."""
+    """Return D, shape (k, n), for which rows and columns of D^-1 A D are about as large.
+
+    The method updates all entries at once and by half of Osborne's step.
+
+    Source: E. E. Osborne, J. ACM 7 (1960).
+    """
     size = jnp.abs(matrices) * (1 - jnp.eye(matrices.shape[-1]))
 
     def halve(_: Any, log: jax.Array) -> jax.Array:
@@ -158,14 +186,14 @@ def _balance(matrices: jax.Array) -> jax.Array:
 
 
 def _radius(direction: np.ndarray) -> np.ndarray:
-    """How far along each direction of the complex plane RK4 stays stable."""
+    """Return the distance from the origin to which RK4 is stable, along each direction of the complex plane."""
     angles = np.abs(np.angle(direction))  # the region is symmetric
     return np.interp(angles, BOUNDARY_ANGLES, BOUNDARY_RADII)
 
 
 def _find_boundary_radii(angle: np.ndarray) -> np.ndarray:
-    """The first of RADII along each direction at which RK4 grows, or the last one: by bisection, since the region is
-    star-shaped and a table of all of them would cost every command half a second."""
+    """Return the first of `RADII` along each direction at which RK4 grows, or the last one."""
+    # Bisection, because the region is star-shaped: a table of all radii would cost every command half a second.
     low, high = np.zeros(angle.shape, int), np.full(angle.shape, len(RADII) - 1)
     for _ in range(len(RADII).bit_length()):
         middle = (low + high) // 2
@@ -177,17 +205,20 @@ def _find_boundary_radii(angle: np.ndarray) -> np.ndarray:
 
 BOUNDARY_ANGLES = np.linspace(np.pi / 2, np.pi, 2001)
 BOUNDARY_RADII = _find_boundary_radii(BOUNDARY_ANGLES)
-MIN_BOUNDARY_RADIUS = float(BOUNDARY_RADII.min())  # a damped mode of whatever direction is stable up to here
+MIN_BOUNDARY_RADIUS = float(BOUNDARY_RADII.min())  # every damped mode is stable up to this |h lambda|
 
 
 def _jacobians_of(loop: Loop) -> jax.Array:
-    """d(flow)/d(flow) (k, n, n) where `_map_over_probes` looks."""
+    """Return d(flow)/d(flow), shape (k, n, n), at the points of `_map_over_probes`."""
     return _map_over_probes(_flow_jacobian, loop)
 
 
 def _map_over_probes(function: Callable[[Loop], Any], loop: Loop) -> Any:
-    """What a function says of the loop (k, ...) where the plant says that it may be stiffest (`probes`); else at its
-    start and at a start of zero, far from the target and on it."""
+    """Return the results of a function (k, ...) for the loop at the points where the plant says that it may be stiffest
+    (`probes`).
+
+    Without `probes` the points are the start and a start of zero, each far from the target and on it.
+    """
     probes = getattr(loop.plant, "probes", None)
     if probes:
         starts = probes(loop.initial, loop.reference.setpoint(loop.start().reference), loop.stop)
@@ -211,7 +242,7 @@ def _jacobians(loops: Loop) -> jax.Array:
 
 @pytree
 class _AtTarget:
-    """A reference whose target is wherever the plant is: the controller is not at a limit there."""
+    """A reference whose target follows the plant: the controller is not at a limit there."""
 
     reference: Reference = part()
 
@@ -237,11 +268,13 @@ def _flow_jacobian(loop: Loop) -> jax.Array:
         at = state.with_flow(unravel(z))
         return jax.flatten_util.ravel_pytree(loop.flow(0.0, at, loop.signals(0.0, at)))[0]
 
-    return jax.jacfwd(jax.extend.core.jaxpr_as_fun(jax.make_jaxpr(flow)(z)))(z)[0]  # half the time of tracing `flow`
+    # Differentiation of the traced program takes half the time of a second trace of `flow`.
+    return jax.jacfwd(jax.extend.core.jaxpr_as_fun(jax.make_jaxpr(flow)(z)))(z)[0]
 
 
 def _entries(loop: Loop) -> list[list[jax.Array]]:
-    """The same number by number, n rows of n: compiles longer, and runs faster for many lanes."""
+    """Return the entries of the flow's Jacobian as n rows of n numbers, shape (k,) each in a batch."""
+    # Entry by entry compiles longer than `_flow_jacobian` and runs faster for many runs.
     state = loop.start()
     leaves, tree = jax.tree.flatten(state.flow())
 

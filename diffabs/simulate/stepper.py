@@ -1,20 +1,22 @@
-"""Which steps a run under `FixedStep` takes: those of the grid, cut where an event lies between.
+"""Fixed steps of a single run: the attempts of a run under `FixedStep`, and the search for events between grid
+instants.
 
-A step within which a margin falls through zero (the stop's, a block's, that of a comparison in the flow) is tried
-again, shorter, until one ends on the zero (`landing`). So the run is a discretisation of the exact solution on both
-sides of the event, and nothing is corrected afterwards. The next step goes on to the grid.
+A margin of the stop, of a block, or of a comparison in the flow may fall through zero within a step. Then shorter steps
+are attempted until one ends on the zero (`landing`). So the run discretises the exact solution on both sides of the
+event, without a later correction. The next step goes on to the grid.
 
     RUNNING  --a margin falls through zero-->  SEEKING  -->  PROBING  -->  LANDING  -->  RUNNING, or STOPPED
 
-For derivatives REFINING lies between PROBING and LANDING: a try of the same length, from which the length has the
-second derivatives of the event's moment.
+For derivatives REFINING lies between PROBING and LANDING: an attempt of the same length. It gives the length the second
+derivatives of the event's time.
 
-Where a block has changed in an event, and no clock is looked at after each step anyway, the rates are worked out by a
-step of no length, REFRESHING.
+REFRESHING is a step of length 0 that evaluates the rates after an event has changed a block. It is needed only if no
+clock is evaluated after each step anyway.
 
-Where a comparison does not let itself be landed on, or its regime leads out of what can be computed, the way to the
-grid is one blunt step, in which comparisons say at each stage what the numbers say: right to the order of the kink. So
-are the steps after it, until in one of them no comparison changes."""
+A search on a switching surface may fail, or its mode may lead to invalid numbers. Then one unrestricted step goes to
+the grid, in which each stage evaluates its comparisons: it is accurate to the order of the kink. Later steps are
+unrestricted, too, until no comparison changes in one of them.
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -53,38 +55,38 @@ from diffabs.simulate.landing import (
     select,
 )
 
-EVENT_ATTEMPTS_PER_STEP, SPARE_ATTEMPTS = (
-    4,
-    64,
-)  # tries beyond a step of the grid for each of them, about an event; and besides
-CROSSING_ATTEMPTS_PER_STEP = (
-    1  # tries for each step of the grid, up to now, that comparisons may take; then steps are blunt
-)
-MAX_ATTEMPTS_PER_STEP = 32  # tries within one step of the grid, likewise
-MAX_RATE_RATIO, MAX_STATE_FRACTION = (
-    4,
-    1e-3,
-)  # times the rates at both ends of a step, and part of the state: the most that it may change
+EVENT_ATTEMPTS_PER_STEP, SPARE_ATTEMPTS = 4, 64  # attempts to locate events: for each step of the grid, and in addition
+CROSSING_ATTEMPTS_PER_STEP = 1  # attempts on switching surfaces per step of the grid; beyond, steps are unrestricted
+MAX_ATTEMPTS_PER_STEP = 32  # attempts within one step of the grid; beyond, steps are unrestricted
+# Greatest change of a state in a step: a multiple of the rates at both ends, plus a fraction of the state.
+MAX_RATE_RATIO, MAX_STATE_FRACTION = 4, 1e-3
 
 
 class FixedStepCarry(NamedTuple):
-    """A run on its way."""
+    """State of a run between two attempts."""
 
     point: FixedStepPoint
     k: Any  # number of the last instant of the grid
-    length: Any  # of the step to try [s]
+    length: Any  # length of the next attempt [s]
     search: EventSearch
-    extra_attempts: Any  # tries that did not end on the grid
-    here: Any  # those since its last instant
-    unrestricted: Any  # whether steps are
+    extra_attempts: Any  # attempts that did not end on the grid
+    here: Any  # such attempts since the last instant of the grid
+    unrestricted: Any  # True if steps are unrestricted
     status: Any
 
     running = property(is_running)
 
 
 class FixedStepDecision(NamedTuple):
-    """What is made of a try: whether its numbers are finite, whether it is taken, whether it then ends on the grid;
-    which events happen at its end, and whether the run is over there."""
+    """Decision on an attempt.
+
+    Attributes:
+        fine: True if its numbers are finite and plausible.
+        taken: True if the attempt is accepted.
+        on_grid: True if an accepted attempt ends on the grid.
+        triggered: True for each event at its end.
+        over: True if the run ends there.
+    """
 
     fine: Any
     taken: Any
@@ -94,8 +96,15 @@ class FixedStepDecision(NamedTuple):
 
 
 def attempt_capacity(loop: Loop, steps: int, *, kinks: bool = False) -> int:
-    """Return how many tries a run of so many steps of the grid may take: what a scan must have room for. Of three tries
-    about an event, at least, one is made twice: REFINING."""
+    """Return the greatest number of attempts in a run: the capacity of a scan.
+
+    At least three attempts belong to an event, and REFINING repeats one of them.
+
+    Args:
+        loop: Closed loop.
+        steps: Number of steps of the grid.
+        kinks: True if switching surfaces are located.
+    """
     about = (
         (CROSSING_ATTEMPTS_PER_STEP if kinks else 0) + (EVENT_ATTEMPTS_PER_STEP if loop.eventful else 0)
     ) * steps + SPARE_ATTEMPTS
@@ -103,7 +112,15 @@ def attempt_capacity(loop: Loop, steps: int, *, kinks: bool = False) -> int:
 
 
 def init_carry(loop: Loop, objectives: Objectives, h: Any, key: Any, *, kinks: bool = False) -> FixedStepCarry:
-    """Return the carry at t = 0."""
+    """Return the carry at t = 0.
+
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        h: Step of the grid [s].
+        key: Random key, or None.
+        kinks: True if switching surfaces are located.
+    """
     zero = jnp.asarray(0)
     point = initial_point(loop, objectives, Clock(0.0 * h, h, zero, key), kinks=kinks)
     status = jnp.where(point.margins["stop"][0] > 0, zero + RunStatus.RUNNING, zero + RunStatus.DIVERGED)
@@ -122,11 +139,21 @@ def step(
     kinks: bool = False,
     refines: bool = False,
 ) -> FixedStepCarry:
-    """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`.
+    """Return the carry after one attempt of a step, unchanged if the run is over or has reached the instant `until`.
 
-    kinks: whether comparisons are located, as derivatives need it
-    refines: whether the moment of an event has second derivatives; its value is the same"""
+    Args:
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        h: Step of the grid [s].
+        key: Random key, or None.
+        steps: Number of steps of the run.
+        carry: Carry before the attempt.
+        until: Number of the grid instant at which to pause; None to go on to the end of the run.
+        kinks: True if switching surfaces are located, as derivatives need it.
+        refines: True if the time of an event has second derivatives. Its value is the same.
+    """
     active = carry.running if until is None else carry.running & (carry.k < until)
+    # The blocks' logs leave the carry: `select` below would otherwise copy whole tables in every step.
     logs = log_rows(carry.point.state)
     carry = carry._replace(point=carry.point._replace(state=borrow(carry.point.state, None)))
     to_grid, landing, refreshing = (
@@ -136,6 +163,7 @@ def step(
     count, which = system.kinks, carry.search.which
     end = jnp.where(to_grid, (carry.k + 1) * h, carry.point.t + carry.length)
     one = StepRequest(carry.length, end, h, carry.unrestricted, refreshing, which, landing & (which < count))
+    # Without the barrier, XLA would compile the attempt again into each expression that uses it.
     here = jit_barrier(active, lambda: attempt_step(system, carry.point, one, active))
     verdict = jit_barrier(active, lambda: _decide(carry, here, count, active, steps))
     k = carry.k + jnp.where(verdict.on_grid, 1, 0)
@@ -145,10 +173,11 @@ def step(
 
     trying, plan = active & ~verdict.taken, (carry.search, carry.length, carry.unrestricted, carry.status)
 
-    def looked() -> Any:
+    def look() -> Any:
         return select(trying, _continue_search(carry, here, verdict.fine, count, h, refines), plan)
 
-    search, *tried = jax.lax.cond(any_lane(trying), looked, lambda: plan)
+    # Few attempts search, so a batch skips the search unless one of its runs needs it.
+    search, *tried = jax.lax.cond(any_lane(trying), look, lambda: plan)
     length, unrestricted, status = select(
         verdict.taken, _plan_next_step(loop, carry, here, verdict, h, (k + 1) * h - end), tuple(tried)
     )
@@ -168,7 +197,9 @@ def step(
 def _plan_next_step(
     loop: Loop, carry: FixedStepCarry, here: FixedStepAttempt, verdict: FixedStepDecision, h: Any, left: Any
 ) -> tuple[Any, ...]:
-    """What a try that is taken leaves: next length, whether steps are blunt, and the condition; `left` to the grid."""
+    """Return next length, unrestricted flag and status after an accepted attempt that ended `left` seconds before the
+    grid.
+    """
     ended = status_after_step(loop, carry, here.margins, verdict)
     left = jnp.where(ended == RunStatus.REFRESHING, 0.0, jnp.where(verdict.on_grid, h, left))
     same = [a == b for a, b in zip(here.mode, carry.point.mode, strict=True)]
@@ -177,6 +208,7 @@ def _plan_next_step(
 
 
 def _decide(carry: FixedStepCarry, here: FixedStepAttempt, kinks: int, active: Any, steps: Any) -> FixedStepDecision:
+    """Return the decision on an attempt: accept it, search within it, or end the run."""
     to_grid, landing = carry.status == RunStatus.RUNNING, carry.status == RunStatus.LANDING
     fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(here.state.flow())]))
     crossed = falls_through(*_margins(carry, here))
@@ -191,10 +223,11 @@ def _decide(carry: FixedStepCarry, here: FixedStepAttempt, kinks: int, active: A
 
 
 def _is_plausible(carry: FixedStepCarry, here: FixedStepAttempt) -> Any:
-    """Whether the state has changed as the rates at both ends say, roughly. Within a regime, beyond its kinks, a flow
-    need not be bounded as that of the loop is, and where a step is too long for stability that is where it leads."""
+    """Return True if the state has changed roughly as the rates at both ends predict."""
     ends = [jax.tree.leaves(point.state.flow()) for point in (carry.point, here)]
     rates = [jax.tree.leaves(point.rate[0]) for point in (carry.point, here)]
+    # A flow within a mode need not be bounded beyond its kinks, unlike the loop's own flow. A step too long for
+    # stability goes there.
     sane = []
     for a, b, p, q in zip(*ends, *rates, strict=True):
         most = MAX_RATE_RATIO * jnp.abs(carry.length) * jnp.maximum(jnp.abs(p), jnp.abs(q))
@@ -205,13 +238,14 @@ def _is_plausible(carry: FixedStepCarry, here: FixedStepAttempt) -> Any:
 def _continue_search(
     carry: FixedStepCarry, here: FixedStepAttempt, fine: Any, kinks: int, h: Any, refines: bool
 ) -> tuple[EventSearch, Any, Any, Any]:
-    """What a try that is not taken tells: the search, the next length, and how that is tried."""
+    """Return search, next length, unrestricted flag and status after an attempt that is not accepted."""
     tells = find_crossings(carry.search.which, kinks, here.kink, *_margins(carry, here))
     new = carry.status == RunStatus.RUNNING
     search, length, enough = bracket_event(carry.search, carry.length, new, tells, h)
     seeking = search, length, jnp.where(enough, RunStatus.PROBING, RunStatus.SEEKING)
+    # A step ends sqrt(eps) steps beyond a switching surface, so that the comparison has surely changed there.
     beyond = jnp.where(carry.search.which < kinks, h * jnp.finfo(h.dtype).eps ** OVERSHOOT_EXPONENT, 0.0)
-    landing = _landing(carry, *locate_event(carry.search, carry.length, tells, beyond), refines)
+    landing = _land(carry, *locate_event(carry.search, carry.length, tells, beyond), refines)
     search, length, status = select(carry.status == RunStatus.PROBING, landing, seeking)
     if refines:
         refined = carry.search, refine(carry.search, carry.length, tells), status * 0 + RunStatus.LANDING
@@ -228,8 +262,8 @@ def _continue_search(
     return search, length, unrestricted, status.astype(carry.status.dtype)
 
 
-def _landing(carry: FixedStepCarry, search: EventSearch, length: Any, refines: bool) -> tuple[EventSearch, Any, Any]:
-    """A step of this length, or a search that goes on: the condition last."""
+def _land(carry: FixedStepCarry, search: EventSearch, length: Any, refines: bool) -> tuple[EventSearch, Any, Any]:
+    """Return the search, the next length and the status after a probe: a step that lands, or a further search."""
     length, again = accept_location(search, carry.length, length)
     return search, length, jnp.where(again, RunStatus.SEEKING, RunStatus.REFINING if refines else RunStatus.LANDING)
 
@@ -237,7 +271,15 @@ def _landing(carry: FixedStepCarry, search: EventSearch, length: Any, refines: b
 def find_crossings(
     which: Any, kinks: int, kink: SurfaceCrossing, before: list[Any], after: list[Any]
 ) -> AttemptCrossings:
-    """Return what a try tells of the comparisons, first, and of the margins of the events at its ends."""
+    """Return the crossings of switching surfaces and events within an attempt; comparisons come first.
+
+    Args:
+        which: Number of the sought margin.
+        kinks: Number of comparisons.
+        kink: Contradicted comparisons at the end of the attempt.
+        before: Margins of events at the beginning.
+        after: Margins of events at the end.
+    """
     events = find_event_crossings(which, kinks, before, after)
     unknown, bends = jnp.full_like(kink.margin, jnp.inf), kink.other >= 0
     at = [jnp.where(kink.chosen == one, kink.margin, jnp.inf) for one in (which, kink.other)]
@@ -247,20 +289,26 @@ def find_crossings(
 
 
 def _margins(carry: FixedStepCarry, here: FixedStepAttempt) -> tuple[list[Any], list[Any]]:
-    """At the beginning and at the end of the try."""
+    """Return the margins at the beginning and at the end of the attempt."""
     return jax.tree.leaves(carry.point.margins), jax.tree.leaves(here.margins)
 
 
 def _last(here: FixedStepAttempt, point: FixedStepPoint) -> FixedStepPoint:
-    """The end of a run, where nothing changes any more."""
+    """Return the point at the end of a run, where no block changes any more."""
     return point._replace(state=here.state, accumulators=here.accumulators, sample=here.signals.sample)
 
 
 def cast_floats(tree: Any, dtype: Any) -> Any:
-    """Strong types throughout: a scan refuses a carry whose type weakens or strengthens."""
+    """Return the tree with strong types throughout, and its floating-point leaves cast to one type.
 
-    def typed(x: Any) -> Any:
+    Args:
+        tree: Pytree to cast.
+        dtype: Floating-point type.
+    """
+
+    # A scan rejects a carry whose type weakens or strengthens.
+    def cast(x: Any) -> Any:
         x = jnp.asarray(x)
         return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(x.dtype)
 
-    return jax.tree.map(typed, tree)
+    return jax.tree.map(cast, tree)

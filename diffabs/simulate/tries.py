@@ -1,4 +1,4 @@
-"""What a run under `Adaptive` has in hand: where it is, where a try has led, what is made of that."""
+"""Data of a run under `Adaptive`: its present point, the end of an attempt, and the decision on it."""
 
 from typing import Any, NamedTuple
 
@@ -11,9 +11,20 @@ from diffabs.simulate.landing import EventSearch
 
 
 class AdaptivePoint(NamedTuple):
-    """A run at an instant, after what changes there: the loop's state and the objectives' accumulators; what is seen,
-    and its rates; what blocks record, and its rates; the rates of what is integrated; the margins of the stop and of
-    the blocks' events; the answers to the comparisons, and in how many seconds the first of them will change."""
+    """A run at an instant, after the changes there.
+
+    Attributes:
+        t: Time [s].
+        state: State of the loop.
+        accumulators: Accumulators of the objectives.
+        sample: Sample of the signals.
+        moving: Rates of the sample.
+        recorded: Signals that blocks record, and their rates.
+        rate: Rates of the loop's flow and of the objectives' integrals.
+        margins: Margins of the stop and of the blocks' events.
+        words: Answers to the comparisons.
+        ahead: Predicted time to the first change of an answer [s].
+    """
 
     t: Any
     state: LoopState
@@ -28,9 +39,16 @@ class AdaptivePoint(NamedTuple):
 
 
 class AdaptiveAttempt(NamedTuple):
-    """The end of a try, before what changes there: the point, its signals, the error as a multiple of what is allowed,
-    the largest values of the states so far, for how many seconds a comparison has been another one, and, where steps
-    keep to a regime, the comparisons that say something else at the end."""
+    """The end of an attempt, before the changes there.
+
+    Attributes:
+        point: Point at the end.
+        signals: Signals of the loop.
+        error: Error as a multiple of the allowed error.
+        scale: Largest values of the states so far.
+        late: Time from the first change of a comparison inside the step to its end [s], or 0.
+        kink: Contradicted comparisons, if steps keep to a mode; else ().
+    """
 
     point: AdaptivePoint
     signals: Signals
@@ -41,35 +59,40 @@ class AdaptiveAttempt(NamedTuple):
 
 
 class AdaptiveCarry(NamedTuple):
-    """A run on its way."""
+    """State of a run between two attempts."""
 
     point: AdaptivePoint
     k: Any  # number of the last instant of the grid at which a clock struck
-    since: Any  # for how long [s]: differences of times would lose digits
-    error_limited: Any  # the length that the error allows [s]
-    length: Any  # of the step to try [s]
-    ends: Any  # whether that ends where a clock strikes, or with the run
-    limit: Any  # the longest stable step [s]
-    scale: Any  # the largest values of the states so far
-    base: Any  # length of the try that an event was first seen in [s]
+    since: Any  # time since that instant [s]: a difference of times would lose digits
+    error_limited: Any  # length that the error allows [s]
+    length: Any  # length of the next attempt [s]
+    ends: Any  # True if the attempt ends where a clock strikes, or with the run
+    limit: Any  # longest stable step [s]
+    scale: Any  # largest values of the states so far
+    base: Any  # length of the attempt that first contained the sought event [s]
     search: EventSearch
-    tries: Any
-    tries_at_renewal: Any  # how many of these there were when the longest stable step was last looked at
-    last_step: Any  # the last step, as a `Span`; () where nobody asks
-    turns: Any  # steps in a row that ended where a comparison changes
-    stability_fraction: Any  # the part of the longest stable step that a step may have, after an event
-    unrestricted: (
-        Any  # whether the comparisons in a step say at each stage what the numbers say, where steps keep to a regime
-    )
-    triggered: Any  # a bit for each event at the end of the last try
+    tries: Any  # number of attempts so far
+    tries_at_renewal: Any  # number of attempts at the last update of the stability limit
+    last_step: Any  # last step, a `HermiteStep`; () without a trajectory
+    turns: Any  # number of consecutive steps that ended on switching surfaces
+    stability_fraction: Any  # fraction of the longest stable step that a step may have after an event
+    unrestricted: Any  # True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode
+    triggered: Any  # bit mask of the events at the end of the last attempt
     status: Any
 
     running = property(is_running)
 
 
 class AdaptiveDecision(NamedTuple):
-    """What is made of a try: whether its numbers are finite; whether it is taken; whether an event was seen in it, and
-    is to be looked for; which events happen at its end, and whether the run is over there."""
+    """Decision on an attempt.
+
+    Attributes:
+        fine: True if its numbers are finite.
+        taken: True if the attempt is accepted.
+        searches_event: True if an event or a switching surface lies inside and is to be located.
+        triggered: True for each event at its end.
+        over: True if the run ends there.
+    """
 
     fine: Any
     taken: Any

@@ -1,16 +1,17 @@
-"""Tsitouras' Runge-Kutta step of fifth order, and how far the cubic through its ends is off in between.
+"""Tsitouras' Runge-Kutta step of fifth order, and the error of the cubic through its ends.
 
     k1 = f(t, x) is known;  ki = f(t + ci h, x + h sum_j aij kj), i = 2 ... 6;  x(t + h) = x + h sum_i bi ki
 
-Local error O(h^6). On dx/dt = lambda x it is stable up to |h lambda| = 2.7 at any angle of lambda from 95 to 180
-degrees, on the negative axis up to 3.5.
+The local error is O(h^6). On dx/dt = lambda x the step is stable up to |h lambda| = 2.7 at any angle of lambda from 95
+to 180 degrees. On the negative axis it is stable up to 3.5.
 
-In a step everything is seen through a cubic: that of the values and rates at both ends, k7 the rate at the last.
-Between ends of fifth order it is off by h^4 x''''/384 at the most, in the middle. There the method has a solution of
-its own, of fourth order, that needs no other rate; the difference of the two is h sum_i di ki.
+A cubic represents every signal within a step: the cubic of the values and rates at both ends, with k7 the rate at the
+end. Between ends of fifth order its greatest error is h^4 x''''/384, in the middle. There the method has a solution of
+its own, of fourth order, that needs no further rate. The difference of the two is h sum_i di ki.
 
-Ch. Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption, Comput. Math.
-Appl. 62 (2011) 770-775: coefficients and the weights of the solution in between."""
+Source: Ch. Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption, Comput.
+Math. Appl. 62 (2011) 770-775 (coefficients and weights of the solution in the middle).
+"""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -42,7 +43,7 @@ STEP_WEIGHTS = (
     -3.290069515436081,
     2.324710524099774,
 )  # b
-# d, of what the paper says of the middle: b(1/2) - b/2, less the cubic's 1/8 (k1 - k7)
+# d: the paper's weights b(1/2) of the solution in the middle, minus b/2 and minus the cubic's 1/8 (k1 - k7).
 MIDPOINT_ERROR_WEIGHTS = (
     *(-0.0658180311080639, 0.00635625, 0.15566420535320324, -1.0342564305778064, 2.961220122676205),
     *(-2.1794161163435377, 0.15625),
@@ -50,9 +51,17 @@ MIDPOINT_ERROR_WEIGHTS = (
 
 
 def tsit5_step_with_error(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, rate: X, h: Scalar) -> tuple[X, X]:
-    """Return x(t + h), and what the rates so far say of how far the cubic is off: `midpoint_error` needs the next.
+    """Return x(t + h), and the contribution of the rates so far to the error of the cubic.
 
-    rate: derivative(t, x)"""
+    `midpoint_error` completes the error with the rate at the end of the step.
+
+    Args:
+        derivative: Function f(t, x), with the structure of x.
+        t: Time at the beginning [s].
+        x: State at the beginning, a pytree.
+        rate: First rate k1 = f(t, x).
+        h: Length of the step [s].
+    """
     rates = [rate]
     for place, weights in zip(STAGE_NODES, STAGE_COEFFICIENTS, strict=True):
         rates.append(derivative(t + place * h, axpy(h, _weighted_sum(weights, rates), x)))
@@ -60,14 +69,30 @@ def tsit5_step_with_error(derivative: Callable[[Scalar, X], X], t: Scalar, x: X,
 
 
 def midpoint_error(so_far: X, last: X, h: Scalar) -> X:
-    """Return the difference of the step's own solution and of the cubic, in the middle; `last` is the rate at the
-    end."""
+    """Return the difference between the step's own solution and the cubic, in the middle of the step.
+
+    Args:
+        so_far: Contribution of the rates k1 to k6.
+        last: Rate k7 at the end of the step.
+        h: Length of the step [s].
+    """
     return jax.tree.map(lambda a, b: h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b), so_far, last)
 
 
 def tsit5_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, rate: X, h: Scalar, given: Any) -> X:
-    """The same step of dx/dt = derivative(t, x, given), whose first rate is known. What is no real number must come in
-    by `given`. For the body of a scan; derivatives come from a scan over the stages, as those of `rk4_step_from`."""
+    """Return x(t + h) after one step of dx/dt = derivative(t, x, given) with a known first rate k1, for the body of a
+    scan.
+
+    Derivatives come from a scan over the stages, as in `rk4_step_from`.
+
+    Args:
+        derivative: Function f(t, x, given), with the structure of x.
+        t: Time at the beginning [s].
+        x: State at the beginning, a pytree.
+        rate: First rate k1 = f(t, x, given).
+        h: Length of the step [s].
+        given: Further arguments, a pytree. Every input of the function that is not a real number must come in by it.
+    """
     derivative, constants = jax.closure_convert(derivative, t, x, given)
     return _step(derivative, t, x, rate, h, (given, *constants))
 
@@ -86,16 +111,17 @@ def _step(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
 
 
 def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
-    """The stages as rounds of a loop, which fills a table of rates."""
+    """Return x(t + h) with a scan over the stages, which fills a table of rates."""
     count = len(STEP_WEIGHTS)
+    # Rows of equal length, padded with zeros: rates that do not exist yet are zero in the table.
     rows = [[*weights, *(count - len(weights)) * [0.0]] for weights in STAGE_COEFFICIENTS]
 
-    def weighted(weights: Any, rates: Any) -> Any:
+    def weigh(weights: Any, rates: Any) -> Any:
         return jax.tree.map(lambda k: jnp.sum(weights.reshape(-1, *(k.ndim - 1) * [1]) * k, axis=0), rates)
 
     def stage(rates: Any, at: tuple[Any, Any, Any]) -> tuple[Any, None]:
         new, place, weights = at
-        rate = f(t + place * h, axpy(h, weighted(weights, rates), x), *constants)
+        rate = f(t + place * h, axpy(h, weigh(weights, rates), x), *constants)
         return jax.tree.map(lambda k, one: k.at[new].set(jnp.asarray(one, k.dtype)), rates, rate), None
 
     def table(rate: Any) -> Any:
@@ -104,8 +130,9 @@ def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
 
     dtype = jnp.result_type(h)
     rounds = (jnp.arange(1, count), jnp.asarray(STAGE_NODES, dtype), jnp.asarray(rows, dtype))
+    # Reverse mode keeps only the table of rates, and computes the stages again.
     rates = jax.lax.scan(rematerialise(stage), jax.tree.map(table, rate), rounds)[0]
-    return axpy(h, weighted(jnp.asarray(STEP_WEIGHTS, dtype), rates), x)
+    return axpy(h, weigh(jnp.asarray(STEP_WEIGHTS, dtype), rates), x)
 
 
 def _rule(f: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:

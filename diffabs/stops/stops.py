@@ -29,7 +29,7 @@ class SpeedReached:
 
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """Return 0 and 0 after a stop, else (v - v_end)/a [s] and (v^2 - v_end^2)/(2 a) [m]."""
-        time, distance = _braked(sample, self.speed, False)
+        time, distance = _rest_of_braking(sample, self.speed, False)
         return jnp.where(stopped, 0.0, time), jnp.where(stopped, 0.0, distance)
 
 
@@ -49,7 +49,7 @@ class Standstill:
 
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """Return v/a [s] and v^2/(2 a) [m]."""
-        return _braked(sample, 0.0, stopped)
+        return _rest_of_braking(sample, 0.0, stopped)
 
 
 @pytree
@@ -83,7 +83,7 @@ class NoStop:
         return 1.0 + 0.0 * output[0]
 
 
-def _braked(sample: Sample, end: Scalar, stopped: Any) -> tuple[Any, Any]:
+def _rest_of_braking(sample: Sample, end: Scalar, stopped: Any) -> tuple[Any, Any]:
     """Return time [s] and distance [m] to the speed `end` at the last deceleration.
 
     For a run that stopped, the deceleration is at least half its mean. Slip may chatter at the very end, and the last

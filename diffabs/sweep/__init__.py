@@ -1,4 +1,4 @@
-"""Monte-Carlo sweeps: what varies, who computes it, where it is kept, and what it says. Needs the extra `sweep`."""
+"""Monte-Carlo sweeps: variables, sampling designs, engines, results and statistics. Needs the extra `sweep`."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""How accurate a sweep's metrics are: a random sample of its lanes, run again with steps of half the length."""
+"""Accuracy of a sweep's metrics: a random sample of its runs, repeated with steps of half the length."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -14,16 +14,24 @@ from diffabs.simulate.solution import Run, describe_solver
 from diffabs.sweep.results import Results
 from diffabs.sweep.study import Study, precision
 
-ACCURACY_STREAM = 0x0ACC  # of random numbers, beside those of the designs
-EXCLUDED_FLAGS = ("diverged", "refused")  # flags of lanes whose metrics are none
-NEGLIGIBLE_CHANGE = 1e-9  # in the unit of the metric: a change that is none; nor is one of less than solver.rtol
-MAX_RELATIVE_CHANGE = 0.01  # relative: a metric that a half step changes by more
+ACCURACY_STREAM = 0x0ACC  # stream of random numbers, independent of the designs
+EXCLUDED_FLAGS = ("diverged", "refused")  # flags of samples without metrics
+NEGLIGIBLE_CHANGE = 1e-9  # smaller changes, or changes below solver.rtol, give no warning; in the unit of the metric
+MAX_RELATIVE_CHANGE = 0.01  # largest relative change by a half step without a warning
 
 
 def check_accuracy(study: Study, found: Results, count: int) -> dict[str, Any]:
-    """Of at most `count` lanes that ran to their end, chosen by the seed: the median and the largest change of each
-    metric by a half step, relative to its value or, where that is less, to its median; the lane with the largest; how
-    many ended in another way, or draw other noise, and are left out."""
+    """Return the change of each metric under a half step, for at most `count` runs that did not diverge.
+
+    The seed chooses the runs. For each metric the result holds the median and the largest change, and the sample with
+    the largest. A change is relative to the metric's value, or to its median if that is larger. Runs that end
+    differently, or that draw other noise, are counted and left out.
+
+    Args:
+        study: Study of the sweep.
+        found: Results of the sweep.
+        count: Largest number of runs to repeat.
+    """
     samples = _choose_samples(study, found, count)
     half = {name: np.full(len(samples), np.nan) for name in found.metrics}
     alike, fine = np.zeros(len(samples), bool), np.zeros(len(samples), bool)
@@ -46,7 +54,11 @@ def check_accuracy(study: Study, found: Results, count: int) -> dict[str, Any]:
 
 
 def accuracy_warnings(result: dict[str, Any]) -> list[str]:
-    """What a reader of the statistics must know, a line each."""
+    """Return warnings for a reader of the statistics, one line each.
+
+    Args:
+        result: Result of `check_accuracy`.
+    """
     lines = []
     rows = result["metrics"].items()
     nothing = max(NEGLIGIBLE_CHANGE, result.get("solver", {}).get("rtol", 0.0))
@@ -63,14 +75,14 @@ def accuracy_warnings(result: dict[str, Any]) -> list[str]:
 
 
 def _choose_samples(study: Study, found: Results, count: int) -> np.ndarray:
-    """Numbers of lanes, which are also their rows."""
+    """Return numbers of samples, which are also their rows in the table."""
     good = np.flatnonzero(~np.any([_has_flag(found, flag) for flag in EXCLUDED_FLAGS], axis=0))
     random = np.random.default_rng([study.seed, ACCURACY_STREAM])
     return np.sort(random.choice(good, min(count, len(good)), replace=False))
 
 
 def _has_flag(found: Results, flag: str) -> np.ndarray:
-    """Which lanes have a flag, or a reason; none in a table without this column."""
+    """Return which runs have a flag or a reason; none if the table lacks this column."""
     try:
         column = found.column(flag)
     except KeyError:
@@ -79,7 +91,7 @@ def _has_flag(found: Results, flag: str) -> np.ndarray:
 
 
 def _rerun_halved_step(study: Study, samples: np.ndarray) -> Iterator[tuple[list[int], Run, np.ndarray]]:
-    """Lanes of one structure at a time: their places among the samples, their runs, whether they can be compared."""
+    """Yield for each structure of the loop: places among the samples, their runs, and whether these can be compared."""
     loops, keys = zip(*map(study.lane, samples.tolist()), strict=True) if len(samples) else ((), ())
     for places in group_by_structure(loops):
         loop, batch = stack_loops([loops[i] for i in places])
@@ -101,6 +113,7 @@ def _summarise_changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray
     values, half, samples = values[known], half[known], samples[known]
     if not len(values):
         return {}
+    # A value near zero would have a huge relative change, so the median bounds the reference from below.
     typical = np.maximum(np.abs(values), np.median(np.abs(values)))
     relative = np.asarray(relative_difference(half - values, typical))
     worst = int(np.argmax(relative))

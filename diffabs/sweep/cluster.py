@@ -1,10 +1,11 @@
-"""Chunks computed by the workers of a Dask cluster: one on this machine, or one that is there.
+"""Computation of chunks by the workers of a Dask cluster, started on this machine or already running.
 
-A worker compiles a study once and computes one chunk at a time on one device; start one worker for each device.
-Chunks come back as the bytes of their files, so workers need no common disk, and only this process writes. A chunk
-whose worker dies is given to another one.
+A worker compiles a study once and computes one chunk at a time on one device; start one worker for each device. Chunks
+return as the bytes of their files. So workers need no common disk, and only this process writes. If a worker dies,
+another one gets its chunk.
 
-Dask sends programs, by pickle: its scheduler and workers must be machines that trust each other."""
+Dask sends programs by pickle: scheduler and workers must be machines that trust each other.
+"""
 
 import asyncio
 import contextlib
@@ -33,28 +34,36 @@ from diffabs.sweep.runner import Runner
 from diffabs.sweep.store import SweepError, describe_differences
 from diffabs.sweep.study import Study
 
-CHUNKS_PER_THREAD = 2  # chunks in hand for each thread of the workers
-MAX_CHUNK_RETRIES = (
-    5  # times that a chunk may be given up by the scheduler, each after four workers died with it in hand
-)
-TIMEOUT_SECONDS = 10.0  # s for a scheduler to answer
+CHUNKS_PER_THREAD = 2  # chunks in progress or waiting for each thread of the workers
+MAX_CHUNK_RETRIES = 5  # retries of a chunk that the scheduler gives up; it does so after four workers died with it
+TIMEOUT_SECONDS = 10.0  # time for a scheduler to answer [s]
 LOOPBACK_ADDRESS = "127.0.0.1"
-MAX_MESSAGE_CHARACTERS = 200  # characters of what Dask says
-POLL_SECONDS = 0.05  # s between looks at what is finished; workers have their next chunk in hand meanwhile
+MAX_MESSAGE_CHARACTERS = 200  # characters of a message of Dask
+POLL_SECONDS = 0.05  # time between checks for finished chunks [s]; workers already have their next chunk
 
 
 class Dask:
-    """An engine: the cluster of a scheduler (tcp://host:port), or `workers` processes on this machine."""
+    """An engine that computes chunks on a Dask cluster: the one of `scheduler` (tcp://host:port), or processes on this
+    machine.
+
+    Attributes:
+        scheduler: Address of a scheduler; None starts workers on this machine.
+        workers: Number of worker processes on this machine.
+    """
 
     def __init__(self, scheduler: str | None = None, workers: int | None = None):
-        """As many workers as there are processors if not given."""
+        """Set the cluster: `scheduler`, or else `workers` processes here, by default one for each processor."""
         self.scheduler, self.workers = scheduler, workers or os.cpu_count() or 1
 
     def run(
         self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
     ) -> Generator[ComputedChunk, None, None]:
-        """As they are finished. Raises SweepError for a scheduler that does not answer, has no workers, or has some
-        with other versions; and for a chunk that all workers die of."""
+        """Yield the `chunks` of a `study` in the order in which they finish, until `stopping()` is true.
+
+        Raises:
+            SweepError: The scheduler does not answer, has no workers, or has workers with other versions; or the
+                workers of one chunk die again and again.
+        """
         with self._client() as client:
             _check_workers(client, study.engine)
             yield from _compute_chunks(client, _convert_to_numpy(study), chunks, stopping)
@@ -79,7 +88,7 @@ class Dask:
 
 @contextlib.contextmanager
 def _silence_dask_logs() -> Iterator[None]:
-    """Without what Dask logs on stderr, a traceback where a scheduler goes away: what concerns the caller is raised."""
+    """Hide Dask's log on stderr, including tracebacks when a scheduler disappears. Errors for the caller are raised."""
     handlers = {handler: handler.level for handler in logging.getLogger("distributed").handlers}
     try:
         for handler in handlers:
@@ -92,8 +101,11 @@ def _silence_dask_logs() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _start_workers(workers: int) -> Iterator[Any]:
-    """Workers on this machine, whom nobody else reaches: pages and ports of all of them are on the loopback interface.
-    Raises SweepError where they do not start."""
+    """Start workers on this machine, with all pages and ports on the loopback interface.
+
+    Raises:
+        SweepError: The workers do not start.
+    """
     with contextlib.ExitStack() as opened:
         scratch = pathlib.Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="diffabs-dask-")))
         opened.enter_context(files.temporary_path(scratch))
@@ -108,29 +120,39 @@ def _start_workers(workers: int) -> Iterator[Any]:
                 silence_logs=logging.CRITICAL,
                 preload=[__name__],
             )
-        except Exception as error:  # Dask says so in several ways
+        except Exception as error:  # Dask raises several types
             why = " ".join(str(error).split())[:MAX_MESSAGE_CHARACTERS] or type(error).__name__
             raise SweepError(f"the workers could not be started on this machine: {why}") from None
         yield opened.enter_context(cluster)
 
 
 def dask_setup(_: Any) -> None:
-    """What Dask runs in each worker that this process starts: Ctrl-C in a terminal is for this process alone."""
+    """Ignore Ctrl-C in a worker, so that only the process in the terminal handles it. Dask calls this in each new
+    worker.
+
+    Args:
+        _: Worker, not used.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _probe_scheduler(scheduler: str) -> None:
-    """Connect, and no more: a client that does not reach its scheduler leaves a thread behind which can block the next.
-    Raises OSError, TypeError or ValueError; a TimeoutError also where something listens that is no scheduler."""
+    """Connect to a scheduler and disconnect.
+
+    A client that does not reach its scheduler would leave a thread behind, which can block the next client.
+
+    Raises:
+        OSError, TypeError, ValueError: The scheduler cannot be reached. TimeoutError if another program listens there.
+    """
 
     async def call() -> None:
         comm = await connect(scheduler, timeout=TIMEOUT_SECONDS, **Security().get_connection_args("client"))
         comm.abort()
 
     async def patient() -> None:
-        await asyncio.wait_for(call(), TIMEOUT_SECONDS + 1)  # `connect` itself waits for ever for the first words
+        await asyncio.wait_for(call(), TIMEOUT_SECONDS + 1)  # `connect` has no timeout for the handshake
 
-    with ThreadPoolExecutor(1) as apart:  # a notebook's thread runs a loop already
+    with ThreadPoolExecutor(1) as apart:  # the thread of a notebook already runs an event loop
         apart.submit(lambda: asyncio.run(patient())).result()
 
 
@@ -142,7 +164,7 @@ def _check_workers(client: Client, engine: str) -> None:
     here = _result_versions(engine)
     try:
         answers: Any = client.run(_result_versions, engine)
-    except Exception as error:  # that is all Dask says of a worker without diffabs
+    except Exception as error:  # Dask raises any type for a worker without diffabs
         raise SweepError(f"a worker cannot say its versions: {str(error).splitlines()[0]}") from None
     for worker, there in answers.items():
         for line in describe_differences(there, here):
@@ -150,7 +172,7 @@ def _check_workers(client: Client, engine: str) -> None:
 
 
 def _result_versions(engine: str) -> dict[str, str]:
-    """What can change a bit of the results, here: versions; of a kernel, the compiler and the processor."""
+    """Return the versions here that can change a bit of the results. A kernel adds its compiler and processor."""
     return provenance.describe_platform(*DECISIVE_PACKAGES) | (
         launch.describe_kernel_build() if engine == "kernel" else {}
     )
@@ -159,14 +181,13 @@ def _result_versions(engine: str) -> dict[str, str]:
 def _compute_chunks(
     client: Client, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
 ) -> Iterator[ComputedChunk]:
-    """Never more in hand than the workers need."""
+    """Yield chunks as they finish, with at most CHUNKS_PER_THREAD chunks for each worker thread in progress."""
     rest, deaths, finished = iter(chunks), dict.fromkeys(chunks, 0), as_completed()
     inside: dict[Any, int] = {}
 
     def give(chunk: int) -> None:
-        future = client.submit(
-            compute_chunk, study, chunk, pure=False
-        )  # a key of its own, as other clients have theirs
+        # `pure=False` makes a new key, so that the result of another client is not reused.
+        future = client.submit(compute_chunk, study, chunk, pure=False)
         inside[future] = chunk
         finished.add(future)
 
@@ -192,8 +213,10 @@ def _compute_chunks(
 
 
 def _wait_for_chunk(client: Client, finished: Any, stopping: Callable[[], bool]) -> bool:
-    """Wait for the next chunk. False where none will come: Ctrl-C in a terminal ends the workers, too, and not all of
-    them come back."""
+    """Wait for the next chunk and return True, or False if none will come.
+
+    Ctrl-C in a terminal also ends workers, and some of them do not return.
+    """
     while not finished.has_ready():
         if stopping() and not client.nthreads():
             return False
@@ -202,25 +225,32 @@ def _wait_for_chunk(client: Client, finished: Any, stopping: Callable[[], bool])
 
 
 def _convert_to_numpy(study: Study) -> Study:
-    """Without arrays of JAX: a process whose default is float32 would read them with half of their digits."""
+    """Return the study with NumPy arrays. A process with float32 as default would read JAX arrays with half of their
+    digits.
+    """
 
     def plain(x: Any) -> Any:
         return np.asarray(x) if isinstance(x, jax.Array) else x
 
-    # One by one: `tree.map` would sort them, and with them the columns.
+    # One by one: `tree.map` over the dictionaries would sort their keys, and so change the order of the columns.
     objectives = {name: jax.tree.map(plain, one) for name, one in study.objectives.items()}
     parts = {path: {name: jax.tree.map(plain, one) for name, one in by.items()} for path, by in study.parts.items()}
     return dataclasses.replace(study, loop=jax.tree.map(plain, study.loop), parts=parts, objectives=objectives)
 
 
 def compute_chunk(study: Study, chunk: int) -> ComputedChunk:
-    """A chunk, on a worker."""
+    """Return one chunk, computed on a worker.
+
+    Args:
+        study: Study of the sweep.
+        chunk: Number of the chunk.
+    """
     runner, seals = _prepare_runner(_StudyKey(study))
     return encode_computed_chunk(study, seals.of(chunk), runner.run([chunk])[0])
 
 
 class _StudyKey:
-    """Studies that were sent twice are one."""
+    """A study as a key of a cache: equal for studies with equal tables, also after a second transfer."""
 
     def __init__(self, study: Study):
         self.study, self.name = study, repr(study.table())

@@ -1,4 +1,4 @@
-"""What is drawn from a list: numbers or names, the values of a sample, the rows of a table."""
+"""Discrete distributions: numbers or names, the values of a sample, and the rows of a table."""
 
 import dataclasses
 import reprlib
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.values import (
     FINITE_SPEC,
     POSITIVE_SPEC,
@@ -22,14 +22,28 @@ from diffabs.core.values import (
 
 
 def choose_indices(u: ArrayLike, count: int, weights: Sequence[float] | None = None) -> np.ndarray:
-    """Which of `count` items the uniform u picks: the smallest k with u < F(k), the probabilities proportional to the
-    weights; at u = 1 the last that has any."""
+    """Return the index of the item that each uniform u picks.
+
+    It is the smallest k with u < F(k), with probabilities in proportion to the weights. At u = 1 it is the last item
+    with a positive weight.
+
+    Args:
+        u: Uniforms in [0, 1], any shape.
+        count: Number of items.
+        weights: Weight of each item; None for equal weights.
+    """
     edges = _cumulative_probabilities(count, weights)
+    # The second term is the last item with a positive weight: u = 1 would otherwise give an index past the end.
     return np.minimum(np.searchsorted(edges, u, side="right"), np.searchsorted(edges, 1.0))
 
 
 def probability_midpoints(count: int, weights: Sequence[float] | None = None) -> np.ndarray:
-    """One u for each item that has a weight."""
+    """Return for each item with a positive weight the middle of its interval of u.
+
+    Args:
+        count: Number of items.
+        weights: Weight of each item; None for equal weights.
+    """
     edges = _cumulative_probabilities(count, weights)
     widths = np.diff(edges, prepend=0.0)
     return (edges - widths / 2)[widths > 0]
@@ -40,8 +54,8 @@ def _cumulative_probabilities(count: int, weights: Sequence[float] | None) -> np
     return edges / edges[-1]
 
 
-def _weight_problems(weights: Sequence[float] | None, count: int, name: str, each: Spec) -> Iterator[str]:
-    """Lines on weights that are not as many as what they weigh, not all in `each`, or all zero."""
+def _weight_problems(weights: Sequence[float] | None, count: int, name: str, each: ParameterSpec) -> Iterator[str]:
+    """Yield an error for weights of a wrong number, for weights outside `each`, and for weights that are all zero."""
     if weights is None:
         return
     if len(weights) != count:
@@ -53,7 +67,7 @@ def _weight_problems(weights: Sequence[float] | None, count: int, name: str, eac
 
 
 class _Discrete:
-    """What is drawn from a list has its value at Phi(z) at the u = Phi(z)."""
+    """A discrete distribution, whose value at Phi(z) is the value at u = Phi(z)."""
 
     def value(self, u: ArrayLike) -> Any:
         raise NotImplementedError
@@ -66,30 +80,35 @@ class _Discrete:
 
 @dataclasses.dataclass(frozen=True)
 class Categorical(_Discrete):
-    """One of some numbers, or of some texts. `weights`: in proportion to the probabilities; all equal if None."""
+    """One of several numbers, or one of several texts.
+
+    Attributes:
+        choices: Numbers, in the parameter's unit, or texts.
+        weights: Numbers in proportion to the probabilities; None for equal probabilities.
+    """
 
     choices: tuple[float | str, ...]
     weights: tuple[float, ...] | None = None
     scaled = ("choices",)
 
     def index(self, u: ArrayLike) -> np.ndarray:
-        """The number of the choice, from 0."""
+        """Return the index of the choice at u, from 0."""
         return choose_indices(u, len(self.choices), self.weights)
 
     def value(self, u: ArrayLike) -> np.ndarray:
-        """The choice: an array of objects for texts."""
+        """Return the choice at u; an array of objects for texts."""
         return np.array(self.choices, object if self.textual() else float)[self.index(u)]
 
     def textual(self) -> bool:
-        """Whether the choices are texts."""
+        """Return whether the choices are texts."""
         return any(isinstance(choice, str) for choice in self.choices)
 
     def middles(self) -> np.ndarray:
-        """The u that give each choice once."""
+        """Return values of u that give each choice once."""
         return probability_midpoints(len(self.choices), self.weights)
 
     def support(self) -> tuple[float, float]:
-        """Of the choices' numbers, from 0, if they are texts."""
+        """Return the smallest and the largest choice; for texts those of their indices, from 0."""
         values = range(len(self.choices)) if self.textual() else np.array(self.choices, float)
         return float(min(values)), float(max(values))
 
@@ -106,8 +125,13 @@ class Categorical(_Discrete):
 
 @dataclasses.dataclass(frozen=True)
 class Empirical(_Discrete):
-    """The values of a sample, in any order, each as likely: the smallest with F(value) >= u. `interpolated`: linearly
-    between neighbours, the k-th of n at u = (k - 1)/(n - 1), as `numpy.quantile` does."""
+    """The values of a sample, in any order, with equal probabilities: the smallest value with F(value) >= u.
+
+    Attributes:
+        values: Values, in the parameter's unit.
+        interpolated: Interpolate linearly between neighbours, the k-th of n at u = (k - 1)/(n - 1), as
+            `numpy.quantile`.
+    """
 
     values: tuple[float, ...]
     interpolated: bool = False
@@ -118,6 +142,7 @@ class Empirical(_Discrete):
         return np.quantile(np.array(self.values, float), np.asarray(u), method=method)
 
     def support(self) -> tuple[float, float]:
+        """Return the smallest and the largest value."""
         return min(self.values), max(self.values)
 
     def problems(self, name: str) -> Iterator[str]:
@@ -136,28 +161,34 @@ def _read_columns(given: Any, where: str) -> dict[str, np.ndarray]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rows(_Discrete):
-    """Whole rows of a table, each as likely or by its weight: the joint distribution of its columns, which are
-    parameters by path. One uniform picks a row."""
+    """Whole rows of a table, with equal or weighted probabilities: the joint distribution of its columns.
+
+    Each column is a parameter by path. One uniform picks a row.
+
+    Attributes:
+        columns: Values of each parameter, by path, shape (rows,).
+        weights: Numbers in proportion to the probabilities of the rows; None for equal probabilities.
+    """
 
     columns: Mapping[str, Any] = table_field(_read_columns)
     weights: Any = table_field(list_reader(read_any_number), None)
 
     @property
     def size(self) -> int:
-        """How many rows."""
+        """Number of rows."""
         return len(next(iter(self.columns.values())))
 
     def value(self, u: ArrayLike) -> dict[str, np.ndarray]:
-        """The rows at u, by column."""
+        """Return the rows at u, by column."""
         rows = choose_indices(u, self.size, self.weights)
         return {path: np.asarray(column)[rows] for path, column in self.columns.items()}
 
     def middles(self) -> np.ndarray:
-        """The u that give each row once."""
+        """Return values of u that give each row once."""
         return probability_midpoints(self.size, self.weights)
 
     def problems(self, name: str) -> Iterator[str]:
-        """One line for each field that cannot be."""
+        """Yield an error for each wrong field."""
         lengths = {path: np.shape(column) for path, column in self.columns.items()}
         shapes = set(lengths.values())
         if len(shapes) != 1 or len(next(iter(shapes))) != 1 or (0,) in shapes:
@@ -167,4 +198,4 @@ class Rows(_Discrete):
         for path, column in self.columns.items():
             if np.asarray(column).dtype.kind in "fiu" and not np.isfinite(column).all():
                 yield f"{name}: column {path} is not finite in row {int(np.argmin(np.isfinite(column)))}"
-        yield from _weight_problems(self.weights, self.size, name, Spec("1", low=0.0))
+        yield from _weight_problems(self.weights, self.size, name, ParameterSpec("1", low=0.0))

@@ -1,10 +1,11 @@
-"""What a parameter may be in a sweep: distributions, given by their quantile functions. On the host, in float64.
+"""Distributions of a parameter in a sweep, given by their quantile functions; on the host, in float64.
 
-    value(u)         the quantile at u in [0, 1], the inverse of the cumulative distribution function
-    from_normal(z)   the quantile at u = Phi(z), as exact for large z as for small ones
+    value(u)         quantile at u in [0, 1], the inverse of the cumulative distribution function
+    from_normal(z)   quantile at u = Phi(z), equally exact for large and small z
 
-Each is written for p = u and q = 1 - u, of which the smaller is known to all its digits: Phi(7) is 1 - 1.28e-12 and has
-lost twelve of them, Phi(-7) none. At u = 0 and 1 the value is the end of the support, which may be infinite."""
+Each is a formula in p = u and q = 1 - u, and uses the smaller of both, which has all its digits. Phi(7) = 1 - 1.28e-12
+has lost twelve digits, and Phi(-7) none. At u = 0 and 1 the value is the end of the support, which may be infinite.
+"""
 
 import dataclasses
 import math
@@ -14,38 +15,43 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffabs.core.pytree import Spec, param
+from diffabs.core.pytree import ParameterSpec, param
 from diffabs.core.values import check_sound, format_table, kebab_case, read_one
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
 
-MIN_TRUNCATED_PROBABILITY = 1e-290  # probability between the limits of a distribution; below, its tails have no digits
+# Smallest probability between the limits of a distribution. Below it, its tails have no correct digits.
+MIN_TRUNCATED_PROBABILITY = 1e-290
 
 
 class Distribution(Protocol):
-    """A scalar random variable. `scaled`: its fields that have the unit of the parameter."""
+    """A scalar random variable.
+
+    Attributes:
+        scaled: Names of the fields that have the unit of the parameter.
+    """
 
     scaled: ClassVar[tuple[str, ...]]
 
     def value(self, u: ArrayLike) -> np.ndarray:
-        """The quantile at u in [0, 1], of any shape."""
+        """Return the quantile at u in [0, 1], any shape."""
         ...
 
     def from_normal(self, z: ArrayLike) -> np.ndarray:
-        """The quantile at Phi(z)."""
+        """Return the quantile at Phi(z), any shape."""
         ...
 
     def support(self) -> tuple[float, float]:
-        """The least and the greatest value."""
+        """Return the smallest and the largest value."""
         ...
 
     def problems(self, name: str) -> Iterator[str]:
-        """One line for each field that cannot be."""
+        """Yield an error for each wrong field; `name` stands in the messages."""
         ...
 
 
 class _Continuous:
-    """What distributions between `low` and `high` have in common: quantiles by p and q, numbers in their ranges."""
+    """Common methods of distributions between `low` and `high`: quantiles by p and q, ranges of the fields."""
 
     low: Any
     high: Any
@@ -75,14 +81,14 @@ class _Continuous:
         yield from lines or self._consistency_problems(name)
 
     def _consistency_problems(self, name: str) -> Iterator[str]:
-        """What cannot be although each number by itself could."""
+        """Yield an error for fields that contradict each other although each is in its range."""
         del name
         yield from ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Uniform(_Continuous):
-    """q low + p high."""
+    """A uniform distribution between `low` and `high`: q low + p high."""
 
     low: float = param(unit="1")
     high: float = param(unit="1")
@@ -94,8 +100,12 @@ class Uniform(_Continuous):
 
 @dataclasses.dataclass(frozen=True)
 class Normal(_Continuous):
-    """mean + deviation Phi^-1(q Phi(a) + p Phi(b)): a normal distribution, cut off at its limits if it has any, which
-    are a and b deviations from its mean."""
+    """A normal distribution, truncated at `low` and `high` if they are finite.
+
+        mean + deviation Phi^-1(q Phi(a) + p Phi(b))
+
+    The limits are a and b standard deviations from the mean.
+    """
 
     mean: float = param(unit="1")
     deviation: float = param(unit="1", above=0.0)
@@ -104,6 +114,7 @@ class Normal(_Continuous):
     scaled = ("mean", "deviation", "low", "high")
 
     def from_normal(self, z: ArrayLike) -> np.ndarray:
+        """Return the quantile at Phi(z); linear in z without limits."""
         if self.support() == (-math.inf, math.inf):
             return self.mean + self.deviation * np.asarray(z)
         return super().from_normal(z)
@@ -113,6 +124,7 @@ class Normal(_Continuous):
 
         a, b = self._limits()
         below, above = q * ndtr(a) + p * ndtr(b), q * ndtr(-a) + p * ndtr(-b)
+        # Invert in the tail with the smaller probability: it has all digits, and the other is 1 minus it.
         z = ndtri(np.minimum(below, above))
         return np.clip(self.mean + self.deviation * np.where(below < above, z, -z), self.low, self.high)
 
@@ -120,20 +132,24 @@ class Normal(_Continuous):
         return (self.low - self.mean) / self.deviation, (self.high - self.mean) / self.deviation
 
     def _consistency_problems(self, name: str) -> Iterator[str]:
-        if self.left() < MIN_TRUNCATED_PROBABILITY:
+        if self.probability_within_limits() < MIN_TRUNCATED_PROBABILITY:
             yield f"{name}: {format_table(self)} has nothing between its limits"
 
-    def left(self) -> float:
-        """The probability, without the limits, of what lies between them."""
+    def probability_within_limits(self) -> float:
+        """Return the probability of the interval between the limits under the normal distribution without limits."""
         a, b = (end / math.sqrt(2) for end in self._limits())
+        # Both differences are equal in exact arithmetic; in a tail one of them loses its digits, and becomes 0.
         return max(math.erfc(-b) - math.erfc(-a), math.erfc(a) - math.erfc(b)) / 2
 
 
 @dataclasses.dataclass(frozen=True)
 class LogNormal(_Continuous):
-    """exp of a normal distribution with mean log(median), cut off at its limits if it has any.
+    """exp of a normal distribution with mean log(median), truncated at `low` and `high`.
 
-    deviation: of the natural logarithm; 0.1 is about a tenth of the median"""
+    Attributes:
+        median: Median of the distribution without limits.
+        deviation: Standard deviation of the natural logarithm; 0.1 is about a tenth of the median.
+    """
 
     median: float = param(unit="1", above=0.0)
     deviation: float = param(unit="1", above=0.0)
@@ -142,9 +158,11 @@ class LogNormal(_Continuous):
     scaled = ("median", "low", "high")
 
     def value(self, u: ArrayLike) -> np.ndarray:
+        """Return the quantile at u in [0, 1]."""
         return np.clip(np.exp(self._logarithm().value(u)), self.low, self.high)
 
     def from_normal(self, z: ArrayLike) -> np.ndarray:
+        """Return the quantile at Phi(z)."""
         return np.clip(np.exp(self._logarithm().from_normal(z)), self.low, self.high)
 
     def _logarithm(self) -> Normal:
@@ -152,13 +170,19 @@ class LogNormal(_Continuous):
         return Normal(math.log(self.median), self.deviation, low, high)
 
     def _consistency_problems(self, name: str) -> Iterator[str]:
-        if self._logarithm().left() < MIN_TRUNCATED_PROBABILITY:
+        if self._logarithm().probability_within_limits() < MIN_TRUNCATED_PROBABILITY:
             yield f"{name}: {format_table(self)} has nothing between its limits"
 
 
 @dataclasses.dataclass(frozen=True)
 class Triangular(_Continuous):
-    """low + sqrt(p (high - low) (mode - low)) below the mode, high - sqrt(q (high - low) (high - mode)) above it."""
+    """A triangular distribution with its peak at `mode`. The quantiles below and above the mode are:
+
+        low + sqrt(p (high - low) (mode - low))
+        high - sqrt(q (high - low) (high - mode))
+
+    p = u and q = 1 - u.
+    """
 
     low: float = param(unit="1")
     mode: float = param(unit="1")
@@ -171,7 +195,7 @@ class Triangular(_Continuous):
         return np.clip(np.where(p * width < rise, rising, falling), self.low, self.high)
 
     def _consistency_problems(self, name: str) -> Iterator[str]:
-        between = Spec("1", self.low, self.high)
+        between = ParameterSpec("1", self.low, self.high)
         if not between.holds(self.mode):
             yield f"{name}: mode = {self.mode:g} is outside {between.interval()}"
 
@@ -182,29 +206,53 @@ DISTRIBUTION_TYPES = {
 
 
 def read_distribution(given: Any, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Any:
-    """The distribution of a table. Raises ScenarioError, one line, for an unknown type, a missing or unknown field, a
-    value that is not a number, and for whatever the distribution itself objects to."""
+    """Return the distribution of a table.
+
+    Args:
+        given: Table with `type` and fields.
+        where: Path of the table, for messages.
+        kinds: Class of each type, by name.
+
+    Raises:
+        ScenarioError: The type is unknown, a field is missing or unknown, a value is not a number, or the distribution
+            refuses its fields. The message is one line.
+    """
     return check_sound(read_one(kinds, given, where), where)
 
 
 def convert_distribution_to_si(distribution: Any, scale: float) -> Any:
-    """Return the distribution of a parameter in SI, given in units of which `scale` make one."""
+    """Return the distribution of a parameter in SI units.
 
-    def divided(value: Any) -> Any:
+    Args:
+        distribution: Distribution in another unit.
+        scale: Number of these units in one SI unit.
+    """
+
+    def divide(value: Any) -> Any:
         return tuple(x / scale for x in value) if isinstance(value, tuple) else value / scale
 
-    return dataclasses.replace(distribution, **{n: divided(getattr(distribution, n)) for n in distribution.scaled})
+    return dataclasses.replace(distribution, **{n: divide(getattr(distribution, n)) for n in distribution.scaled})
 
 
-def support_interval(distribution: Distribution) -> Spec:
-    """The support as an interval: open where u = 0 or 1 alone would get there."""
+def support_interval(distribution: Distribution) -> ParameterSpec:
+    """Return the support as an interval, open at an end that only u = 0 or u = 1 reaches.
+
+    Args:
+        distribution: Distribution of a parameter.
+    """
     low, high = distribution.support()
     open_low = low == -math.inf or (isinstance(distribution, LogNormal) and low == 0)
-    return Spec("1", low, high, open_low, high == math.inf)
+    return ParameterSpec("1", low, high, open_low, high == math.inf)
 
 
-def describe_out_of_range(distribution: Distribution, spec: Spec, name: str) -> str | None:
-    """A line if a parameter that is distributed so can leave its range, else None."""
+def describe_out_of_range(distribution: Distribution, spec: ParameterSpec, name: str) -> str | None:
+    """Return a line if a parameter with this distribution can leave its range, else None.
+
+    Args:
+        distribution: Distribution of the parameter.
+        spec: Range of the parameter.
+        name: Name of the parameter.
+    """
     if isinstance(distribution, Categorical) and distribution.textual():
         return f"{name} = {format_table(distribution)} is text; a number in {spec.interval()} is needed"
     own = support_interval(distribution)

@@ -1,4 +1,4 @@
-"""Who computes the chunks: the devices of this process, or a Dask cluster (`cluster`)."""
+"""Engines that compute the chunks of a sweep: the devices of this process here, a Dask cluster in `cluster`."""
 
 import itertools
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -16,7 +16,16 @@ from diffabs.sweep.study import Study
 
 
 class ComputedChunk(NamedTuple):
-    """A chunk: the bytes of its file, how many lanes it has, and how many of them failed, diverged and were refused."""
+    """A finished chunk.
+
+    Attributes:
+        chunk: Number of the chunk.
+        data: Bytes of its file.
+        lanes: Number of runs.
+        failed: Number of failed runs.
+        diverged: Number of diverged runs.
+        refused: Number of samples that were not run.
+    """
 
     chunk: int
     data: bytes
@@ -27,28 +36,35 @@ class ComputedChunk(NamedTuple):
 
 
 class Engine(Protocol):
-    """Computes chunks in any order."""
+    """A computer of chunks, in any order."""
 
     def run(
         self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
     ) -> Generator[ComputedChunk, None, None]:
-        """Every chunk once; ends early, after what it has begun, when `stopping()`, and without giving that when it is
-        closed."""
+        """Yield each of the `chunks` of a `study` once.
+
+        After `stopping()` returns true, no new chunk begins, and the chunks in progress are still yielded. If the
+        generator is closed, they are discarded.
+        """
         ...
 
 
 class Local:
-    """All devices of this process, a chunk on each at a time. Of P processes (`jax.distributed`), each takes every P-th
-    chunk."""
+    """An engine that runs one chunk at a time on each device of this process.
+
+    With P processes (`jax.distributed`), each process takes every P-th chunk.
+    """
 
     def __init__(self, devices: Sequence[Any] | None = None):
-        """All local ones if not given."""
+        """Set the `devices`; by default all local ones."""
         self.devices = list(devices or jax.local_devices())
 
     def run(
         self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
     ) -> Generator[ComputedChunk, None, None]:
-        """In order. While chunks are counted, encoded and written, the next ones run."""
+        """Yield the `chunks` of a `study` in order, until `stopping()` is true. The next chunks run while one is
+        encoded.
+        """
         runner, seals = Runner(study, self.devices), Seals(describe_owner(study))
         rest = group_items(chunks[jax.process_index() :: jax.process_count()], len(self.devices))
         with ThreadPoolExecutor(1) as beside:
@@ -63,7 +79,13 @@ class Local:
 
 
 def encode_computed_chunk(study: Study, seal: Seal, columns: Columns) -> ComputedChunk:
-    """A chunk's columns, counted and encoded."""
+    """Return a chunk with its encoded columns and its counts.
+
+    Args:
+        study: Study of the sweep.
+        seal: Seal of the chunk.
+        columns: Columns of the chunk, each of shape (samples,).
+    """
     failed = has_failed(study, columns)
     counts = (
         len(failed),
@@ -75,12 +97,21 @@ def encode_computed_chunk(study: Study, seal: Seal, columns: Columns) -> Compute
 
 
 def is_accepted(refused: Any) -> np.ndarray:
-    """Lanes that were run, of the reasons why not (lanes,)."""
+    """Return which samples were run, shape (samples,).
+
+    Args:
+        refused: Reason why a sample was not run, or an empty text, shape (samples,).
+    """
     return np.asarray(refused).astype(str) == ""
 
 
 def has_failed(study: Study, columns: Any) -> np.ndarray:
-    """Lanes that were run and diverged, ended as they should not, or left a bound of the study (lanes,)."""
+    """Return which runs diverged, had a wrong end, or exceeded a bound of the study, shape (samples,).
+
+    Args:
+        study: Study of the sweep.
+        columns: Columns of the table, by name.
+    """
     failed = np.asarray(columns["diverged"]) | has_wrong_end(columns["stopped"], study.success)
     failed = np.any(
         [failed, *(np.asarray(columns[name]) > bound for name, bound in study.failure_bounds.items())], axis=0
@@ -89,18 +120,33 @@ def has_failed(study: Study, columns: Any) -> np.ndarray:
 
 
 def has_wrong_end(stopped: Any, success: bool) -> np.ndarray:
-    """Return which lanes (lanes,) ended as they should not: without reaching a stop that is a `success`, or at one that
-    is not."""
+    """Return which runs had a wrong end, shape (samples,).
+
+    The end is wrong if a run misses a stop that is a success, or reaches a stop that is not.
+
+    Args:
+        stopped: Whether each run reached its stop, shape (samples,).
+        success: Whether reaching the stop is a success.
+    """
     return np.asarray(stopped) != success
 
 
 def describe_wrong_end(success: bool) -> str:
-    """Return what is said of those lanes."""
+    """Return the name of a wrong end.
+
+    Args:
+        success: Whether reaching the stop is a success.
+    """
     return "not stopped" if success else "stopped"
 
 
 def group_items(items: Sequence[int], size: int) -> Iterator[list[int]]:
-    """Lists of `size`, the last one shorter."""
+    """Yield lists of `size` items; the last one may be shorter.
+
+    Args:
+        items: Items to group.
+        size: Number of items in a list.
+    """
     rest = iter(items)
     while batch := list(itertools.islice(rest, size)):
         yield batch

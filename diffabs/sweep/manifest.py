@@ -1,14 +1,15 @@
-"""The manifest of a sweep: what was swept, with which versions, from which scenario; and a digest of all of that.
+"""The manifest of a sweep: its study, versions and scenario, with a digest of all of these.
 
     format      of the folder
-    study       what decides the results (`Study.table`)
-    versions    of the packages that can change a bit of them
+    study       everything that decides the results (`Study.table`)
+    versions    of the packages that can change a bit of the results
     commit      of diffabs, where it is known
     source      name and text of the scenario
-    units       of what varies and what is measured, where they are known
-    digest      SHA-256 of the rest: a file that was changed afterwards is not read
+    units       of the parameters that vary and of the metrics, where they are known
+    digest      SHA-256 of the rest; a manifest with another digest is refused
 
-Format, study and versions own the chunks: their digest is in each (`seal`)."""
+Format, study and versions own the chunks: each chunk contains their digest (`seal`).
+"""
 
 import dataclasses
 import json
@@ -18,7 +19,7 @@ from functools import partial
 from typing import Any
 
 from diffabs.core import files, provenance
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.values import (
     FINITE_SPEC,
     ScenarioError,
@@ -44,15 +45,24 @@ from diffabs.sweep.variables import Space
 MANIFEST_FORMAT = 3
 MANIFEST_NAME = "manifest.json"
 MAX_MANIFEST_BYTES = 2**30  # bytes
-DECISIVE_PACKAGES = ("jaxlib", "numpy", "scipy", "pyarrow")  # packages beside JAX that can change a bit of the result
-POSITIVE_SECONDS = Spec("s", low=0.0, open_low=True)
+DECISIVE_PACKAGES = (
+    "jaxlib",
+    "numpy",
+    "scipy",
+    "pyarrow",
+)  # packages, in addition to JAX, that can change a bit of the results
+POSITIVE_SECONDS = ParameterSpec("s", low=0.0, open_low=True)
 OWNER_KEYS = ("format", "study", "versions")
 EARLIER_FORMATS = (1, 2)
 EARLIER_FORMAT_MESSAGE = "written by an earlier diffabs: read its chunks with pandas, or sweep again"
 
 
 def describe_owner(study: Study) -> dict[str, Any]:
-    """What owns the chunks of a study, computed here and now."""
+    """Return the owner of a study's chunks when this process computes them now: format, study and versions.
+
+    Args:
+        study: Study of the sweep.
+    """
     return {
         "format": MANIFEST_FORMAT,
         "study": study.table(),
@@ -61,10 +71,17 @@ def describe_owner(study: Study) -> dict[str, Any]:
 
 
 class Seals:
-    """What each chunk of the sweep with this manifest says of itself."""
+    """The seals of all chunks of the sweep with one manifest.
+
+    Attributes:
+        study: Table of the study.
+        owner: Digest of the owner.
+        count: Number of chunks.
+        columns: Names of the columns of a chunk.
+    """
 
     def __init__(self, manifest: Mapping[str, Any]):
-        """Works out once what is the same for all."""
+        """Compute from the `manifest` the entries that all seals share."""
         self.study = manifest["study"]
         self.owner = json_digest({name: manifest[name] for name in OWNER_KEYS})
         self.count = -(-self.study["samples"] // self.study["chunk"])
@@ -72,20 +89,31 @@ class Seals:
         self.columns = frozenset({"sample", *FLAG_COLUMNS, *self.study["objectives"], *varied})
 
     def of(self, chunk: int) -> Seal:
-        """Of this chunk."""
+        """Return the seal of this chunk."""
         start = chunk * self.study["chunk"]
         rows = start, min(start + self.study["chunk"], self.study["samples"])
         return Seal(self.owner, chunk, self.study["seed"], rows, self.columns)
 
 
 def encode_manifest(manifest: Mapping[str, Any]) -> bytes:
-    """The file."""
+    """Return the bytes of the manifest's file, with its digest.
+
+    Args:
+        manifest: Manifest without a digest.
+    """
     return json.dumps({**manifest, "digest": json_digest(manifest)}, indent=1).encode()
 
 
 def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
-    """The manifest, without its digest. Raises SweepError, one line, if there is none, or it is not as it was written,
-    or something in it cannot be."""
+    """Return the manifest of a folder, without its digest.
+
+    Args:
+        folder: Folder of the sweep.
+
+    Raises:
+        SweepError: The manifest does not exist, does not match its digest, or has an invalid entry. The message is one
+            line.
+    """
     try:
         raw = files.read_content(pathlib.Path(folder) / MANIFEST_NAME, MAX_MANIFEST_BYTES)
     except (OSError, ValueError) as error:
@@ -113,7 +141,7 @@ def _check_manifest(given: Any) -> dict[str, Any]:
 
 
 def _check_study(manifest: "_Manifest") -> None:
-    """Raises ScenarioError for what a reader could not use."""
+    """Raise ScenarioError for a study that a reader cannot use."""
     study = manifest.study
     for name in study.failures:
         if name not in study.objectives:
@@ -149,7 +177,10 @@ def _read_solver(given: Any, path: str) -> _Solver:
 
 @dataclasses.dataclass(frozen=True)
 class _Study:
-    """What must be of a study (`Study.table`) for its results to be read; the parts are for the reader of the file."""
+    """The fields of a study (`Study.table`) without which its results cannot be read.
+
+    `loop`, `parts` and `objectives` only inform a person who reads the file.
+    """
 
     samples: int = table_field(whole_reader(*RANGES["samples"]))
     seed: int = table_field(whole_reader(*RANGES["seed"]))
@@ -162,7 +193,7 @@ class _Study:
     loop: Mapping[str, Any] = table_field(table_reader(read_as_given))
     parts: Mapping[str, Any] = table_field(table_reader(table_reader(read_as_given)))
     objectives: Mapping[str, Any] = table_field(table_reader(read_as_given))
-    engine: Mapping[str, str] = table_field(table_reader(read_text), dict)  # none is XLA
+    engine: Mapping[str, str] = table_field(table_reader(read_text), dict)  # empty for XLA
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A sweep's folder, opened to be read."""
+"""Results of a sweep, read from its folder."""
 
 import contextlib
 import os
@@ -21,17 +21,23 @@ from diffabs.sweep.study import FLAG_COLUMNS
 
 
 class Results:
-    """The chunks that are there. One row for each sample: parameters, metrics, `stopped`, `diverged`, `refused`.
+    """The finished chunks of a sweep as one table, with a row for each sample.
 
-    A sample that `simulate` would refuse was not run: `refused` says why, its metrics are NaN, `diverged` is set
-    lest it enter a mean, and it is in no statistic.
+    The columns are parameters, metrics, `stopped`, `diverged` and `refused`. A sample that `simulate` would refuse does
+    not run, and `refused` gives the reason. Its metrics are NaN, and `diverged` is set so that no mean includes it. No
+    statistic counts it.
 
-    Every file is verified before the first number of it is used, and again if it was changed since. The folder `chunks`
-    is a Parquet data set, for `pandas.read_parquet`, `polars.scan_parquet` and DuckDB as it is; these verify nothing.
+    Each file is verified before its first number is used, and again after a change. The folder `chunks` is a Parquet
+    data set for `pandas.read_parquet`, `polars.scan_parquet` and DuckDB; these do not verify it.
     """
 
     def __init__(self, folder: str | pathlib.Path):
-        """Raises SweepError for a folder that is no sweep, as all that reads chunks does for one that is damaged."""
+        """Open the results in `folder`.
+
+        Raises:
+            SweepError: The folder contains no sweep, no finished chunk, or one chunk twice. Methods that read chunks
+                raise it for damaged files.
+        """
         self.folder = pathlib.Path(folder)
         self.manifest = read_manifest(self.folder)
         self._seals = Seals(self.manifest)
@@ -45,34 +51,34 @@ class Results:
 
     @property
     def study(self) -> dict[str, Any]:
-        """What was swept, as values of JSON."""
+        """Table of the study, as JSON values."""
         return self.manifest["study"]
 
     @property
     def complete(self) -> bool:
-        """Whether every chunk is there."""
+        """Whether every chunk is finished."""
         return len(self.files) == self._seals.count
 
     @property
     def metrics(self) -> list[str]:
-        """Names of what was measured."""
+        """Names of the metrics."""
         return list(self.study["objectives"])
 
     @property
     def units(self) -> dict[str, str]:
-        """Of the columns, by name, where they are known."""
+        """Units of the columns, by name, where they are known."""
         return dict(self.manifest.get("units", {}))
 
     def __repr__(self) -> str:
-        """What was swept, and how much of it is there."""
+        """Return a summary of the sweep as text."""
         return str(self._summary())
 
     def _repr_html_(self) -> str:
-        """The same for a notebook."""
+        """Return a summary of the sweep for a notebook."""
         return self._summary()._repr_html_()
 
     def _summary(self) -> Summary:
-        run, lost, failed = self.accepted, self.column("diverged"), int(self.failed().sum())
+        run, lost, failed = self.accepted, self.column("diverged"), int(self.failed_samples().sum())
         rows = []
         for name in self.metrics:
             good = self.column(name)[run & ~lost]
@@ -86,12 +92,12 @@ class Results:
 
     @property
     def variables(self) -> list[str]:
-        """Paths of what varies."""
+        """Paths of the parameters that vary."""
         known = {"sample", *FLAG_COLUMNS, *self.metrics}
         return [name for name in self._schema().names if name not in known]
 
     def is_number(self, name: str) -> bool:
-        """Whether a column holds numbers, not names."""
+        """Return whether the column `name` contains numbers, and not names."""
         kind = self._schema().field(name).type
         return pa.types.is_floating(kind) or pa.types.is_integer(kind)
 
@@ -101,7 +107,7 @@ class Results:
 
     @contextlib.contextmanager
     def _open_chunk(self, chunk: int) -> Iterator[pq.ParquetFile]:
-        """A chunk, verified unless its file is as it was then."""
+        """Open a chunk, and verify it unless its file is unchanged since the last verification."""
         path = self.files[chunk]
         state = _file_identity(path)
         if state is not None and self._seen.get(chunk) == state:
@@ -122,12 +128,14 @@ class Results:
 
     @property
     def digest(self) -> str:
-        """SHA-256 over the contents of all chunks in order: equal for equal tables in chunks of one size."""
+        """SHA-256 over the contents of all chunks in order; equal for equal tables with chunks of one size."""
         return seal.tables_digest(self._read_table(chunk, None) for chunk in sorted(self.files))
 
     def failures(self) -> dict[str, np.ndarray]:
-        """Which samples (n,) failed, by how: diverged, an end that the stop does not call a success, a metric beyond
-        its bound. One that was refused did not."""
+        """Return which samples failed, shape (samples,), for each kind of failure.
+
+        The kinds are: diverged, a wrong end, and a metric beyond its bound. A refused sample has not failed.
+        """
         study, run = self.study, self.accepted
         kinds = {
             "diverged": self.column("diverged"),
@@ -136,34 +144,38 @@ class Results:
         kinds |= {f"{name} > {bound:g}": self.column(name) > bound for name, bound in study["failures"].items()}
         return {name: failed & run for name, failed in kinds.items()}
 
-    def failed(self) -> np.ndarray:
-        """Which samples (n,) failed, in any way."""
+    def failed_samples(self) -> np.ndarray:
+        """Return which samples failed, of any kind, shape (samples,)."""
         return np.any(list(self.failures().values()), axis=0)
 
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """Rows in the order of the samples; some columns, or all."""
+        """Return the rows in the order of the samples, with some `columns` or all."""
         names = list(columns) if columns is not None else None
         return pa.concat_tables([self._read_table(chunk, names) for chunk in sorted(self.files)]).unify_dictionaries()
 
     def column(self, name: str) -> np.ndarray:
-        """A column in the order of the samples. Raises KeyError."""
+        """Return the column `name` in the order of the samples, shape (samples,).
+
+        Raises:
+            KeyError: No column has this name.
+        """
         return self.table([name]).column(name).to_numpy()
 
     def pandas(self) -> Any:
-        """A pandas.DataFrame indexed by sample, with a column `failed`, and units in `attrs["units"]`."""
-        frame = self.table().to_pandas().set_index("sample").assign(failed=self.failed())
+        """Return a pandas.DataFrame indexed by sample, with a column `failed`, and units in `attrs["units"]`."""
+        frame = self.table().to_pandas().set_index("sample").assign(failed=self.failed_samples())
         frame.attrs["units"] = self.units
         return frame
 
     def polars(self) -> Any:
-        """A polars.DataFrame, with a column `failed`."""
-        import polars  # pyright: ignore[reportMissingImports]  # the user has it, or not
+        """Return a polars.DataFrame with a column `failed`."""
+        import polars  # pyright: ignore[reportMissingImports]  # optional
 
         frame: Any = polars.from_arrow(self.table())
-        return frame.with_columns(polars.Series("failed", self.failed()))
+        return frame.with_columns(polars.Series("failed", self.failed_samples()))
 
     def xarray(self) -> Any:
-        """An xarray.Dataset over the dimension `sample`, its variables with `units`."""
+        """Return an xarray.Dataset over the dimension `sample`, with `units` at its variables."""
         data = self.pandas().to_xarray()
         for name, unit in self.units.items():
             if name in data:
@@ -172,22 +184,22 @@ class Results:
 
     @property
     def accepted(self) -> np.ndarray:
-        """Which samples were run, in their order."""
+        """Mask of the samples that were run, in their order, shape (samples,)."""
         return is_accepted(self.column("refused"))
 
-    def diverged(self) -> pa.Table:
-        """The rows of lanes that were run and diverged: they are in no statistic."""
+    def diverged_rows(self) -> pa.Table:
+        """Return the rows of the diverged runs, which no statistic includes."""
         return self.table().filter(pa.array(self.column("diverged") & self.accepted))
 
     def worst(self, metric: str, count: int = 10) -> pa.Table:
-        """The rows with the greatest values of a metric, the worst first."""
+        """Return the `count` rows with the largest values of a `metric`, the largest first."""
         values = self.column(metric)
         order = np.argsort(np.where(np.isnan(values), -np.inf, values), kind="stable")[::-1][:count]
         return self.table().take(order)
 
 
 def _file_identity(path: pathlib.Path) -> tuple[int, ...] | None:
-    """By which a file that was changed is told; None where nothing can be said of it."""
+    """Return numbers that change with the file, or None if the file cannot be examined."""
     try:
         there = os.stat(path)
     except OSError:

@@ -1,4 +1,4 @@
-"""Run a sweep into a folder, or go on with one."""
+"""Execution of a sweep in a folder, from its start or after an interruption."""
 
 import contextlib
 import pathlib
@@ -18,13 +18,22 @@ from diffabs.sweep.runner import find_study_objection
 from diffabs.sweep.store import Store, SweepError
 from diffabs.sweep.study import Study
 
-CHUNK_PRESENT, CHUNK_MISSING, CHUNK_UNKNOWN = 0, 1, 2  # a chunk
+CHUNK_PRESENT, CHUNK_MISSING, CHUNK_UNKNOWN = 0, 1, 2  # states of a chunk
 
 
 class SweepProgress(NamedTuple):
-    """How far a sweep is: samples that are done, of how many, those that this run has done in how many seconds
-    (compiling left out, where `stopwatch.listen` counts it), and how many of these failed, diverged and were refused;
-    `damaged`: chunks found damaged that are computed again."""
+    """Progress of a sweep.
+
+    Attributes:
+        samples: Number of finished samples.
+        total: Number of samples of the sweep.
+        here: Number of samples that this call has finished.
+        seconds: Time of this call [s], without compiling where `stopwatch.listen` counts it.
+        failed: Number of failed runs of this call.
+        diverged: Number of diverged runs of this call.
+        damaged: Damaged chunks, which are computed again.
+        refused: Number of samples of this call that were not run.
+    """
 
     samples: int
     total: int
@@ -51,23 +60,25 @@ def sweep(
     stopping: Callable[[], bool] = lambda: False,
     source: Mapping[str, Any] | None = None,
 ) -> Results:
-    """Compute every chunk of a study that the folder does not have yet, and return the results.
+    """Compute every chunk of a study that the folder lacks, and return the results.
 
-    Of several processes (`jax.distributed.initialize`) that all call this with the same study and a folder on a common
-    disk, the first has the lock and the manifest, each computes and writes its share, and all return the whole. One
-    that fails says so after the others have finished theirs.
+    Several processes (`jax.distributed.initialize`) may call this with the same study and a folder on a common disk.
+    The first process holds the lock and writes the manifest. Each computes and writes its share, and all return the
+    whole table. A process that fails raises its error after the others have finished their shares.
 
-    out: the folder; it is made
-    resume: go on with a folder that has chunks of this study already
-    on: who computes; None is every device of this process
-    progress: told after every chunk how many runs are done
-    stopping: asked after every chunk; True ends the run, and `resume` goes on later
-    source: put into the manifest, for whoever reads it
+    Args:
+        study: Study to run.
+        out: Folder for the results; it is created.
+        resume: Continue with a folder that already contains chunks of this study.
+        on: Engine that computes the chunks; None is every device of this process.
+        progress: Function that is called with the progress after every chunk.
+        stopping: Function that is called after every chunk; True ends the run, and `resume` continues it later.
+        source: Notes for the manifest, such as name and text of the scenario.
 
     Raises:
-        ValueError: a study that cannot be run, or not by its engine.
-        SweepError: a folder that holds something else, is in use, or cannot be written; another process died.
-        OSError: a full disk; what is there stays, and `resume` goes on.
+        ValueError: The study cannot be run, or not by its engine.
+        SweepError: The folder contains something else, is in use, or cannot be written; or another process died.
+        OSError: The disk is full. Finished chunks stay, and `resume` continues.
     """
     study.check()
     if study.engine != "xla" and (line := find_study_objection(study)):
@@ -87,32 +98,38 @@ def sweep(
 def _begin_sweep(
     store: Store, study: Study, resume: bool, source: Mapping[str, Any]
 ) -> Iterator[tuple[list[int], list[int]]]:
-    """The chunks that are missing, and those of them that were damaged. Until every process is done, the first one has
-    the folder's lock."""
+    """Yield the missing chunks, and the damaged ones among them.
+
+    The first process holds the folder's lock until every process is done.
+    """
     found, damaged = np.full(study.chunks, CHUNK_UNKNOWN, np.int8), []
     with contextlib.ExitStack() as held:
         try:
             if jax.process_index() == 0:
-                held.enter_context(store.locked())
-                notes = {**provenance.commit(), "source": dict(source), "units": study.units()}
+                held.enter_context(store.lock())
+                notes = {**provenance.source_commit(), "source": dict(source), "units": study.units()}
                 manifest = {**describe_owner(study), **notes}
                 store.begin(manifest, resume=resume)
                 whole, damaged = store.scan(Seals(manifest))
                 found[:] = np.where(np.isin(np.arange(study.chunks), list(whole)), CHUNK_PRESENT, CHUNK_MISSING)
-        finally:  # whatever happened: the others wait for this
+        finally:  # also after an error, because the other processes wait for this broadcast
             found = _synchronise(multihost_utils.broadcast_one_to_all, found)
         if CHUNK_UNKNOWN in found:
             raise SweepError(f"{store.folder}: the first process could not begin, and says why")
         try:
             yield np.flatnonzero(found == CHUNK_MISSING).tolist(), damaged
-        except Exception:  # a process that left at once would take those with it that still compute
+        except Exception:  # leaving at once would abort the processes that still compute
             _synchronise(multihost_utils.sync_global_devices, "chunks")
             raise
         _synchronise(multihost_utils.sync_global_devices, "chunks")
 
 
 def _synchronise(meet: Callable[[Any], Any], what: Any) -> Any:
-    """What all processes do at the same time; nothing where there is but one. Raises SweepError if one has died."""
+    """Meet all other processes and return the result; a single process returns `what`.
+
+    Raises:
+        SweepError: A process has died.
+    """
     if jax.process_count() == 1:
         return what
     try:
@@ -122,7 +139,7 @@ def _synchronise(meet: Callable[[Any], Any], what: Any) -> Any:
 
 
 class _ProgressCounter:
-    """Counts what is done, and tells."""
+    """A counter of finished runs that reports each change."""
 
     def __init__(self, study: Study, missing: list[int], damaged: tuple[int, ...], told: Any):
         self.total, self.told, self.damaged = study.samples, told, damaged

@@ -1,9 +1,13 @@
-"""Chunks of lanes in one compiled function. A lane that `simulate` would refuse does not run: its row says why.
+"""Execution of chunks in compiled functions. A sample that `simulate` would refuse does not run; its row gives the
+reason.
 
-A block is a number of lanes of one structure, always as many. On D devices D blocks run at once, each in a program of
-its own. A program sharded over the devices (`shard_map`) is another one for each D, and rounds otherwise; this one is
-always the same, so a lane's result does not depend on D. Without alternatives of parts a block is a whole chunk; with
-them a chunk is sorted into blocks of an eighth, the last of each structure filled up with copies."""
+A block is a fixed number of runs with one structure of the loop. On D devices, D blocks run at once, each in a program
+of its own. A program sharded over the devices (`shard_map`) would differ for each D, and round differently. This
+program is the same for all D, so the result of a run does not depend on D.
+
+Without alternative parts a block is a whole chunk. With them a chunk is sorted into blocks of an eighth; copies fill
+the last block of each structure.
+"""
 
 import contextlib
 import dataclasses
@@ -28,7 +32,14 @@ Columns = dict[str, np.ndarray]
 
 
 class _Block(NamedTuple):
-    """Lanes of a chunk (the place in a list of chunks), and their parameters."""
+    """A block of runs of one chunk, with their parameters.
+
+    Attributes:
+        chunk: Place of the chunk in a list of chunks.
+        lanes: Places of the runs in the chunk.
+        values: Values of the parameters, by path, shape (block,).
+        samples: Numbers of the samples, shape (block,).
+    """
 
     chunk: int
     lanes: np.ndarray  # places in the chunk
@@ -37,10 +48,10 @@ class _Block(NamedTuple):
 
 
 class Runner:
-    """Runs chunks of a study on some devices of this process; compiles once for each structure of the loop."""
+    """A runner of a study's chunks on devices of this process; it compiles once for each structure of the loop."""
 
     def __init__(self, study: Study, devices: Sequence[Any] | None = None):
-        """`devices`: all local ones if not given."""
+        """Set the `study` and the `devices`; by default all local ones."""
         self.study = study
         self.devices = list(devices or jax.local_devices())
         self.size = study.chunk if not study.parts else -(-study.chunk // BLOCKS_PER_CHUNK)
@@ -48,7 +59,9 @@ class Runner:
         self._pool = ThreadPoolExecutor(len(self.devices))
 
     def run(self, chunks: Sequence[int]) -> list[Columns]:
-        """The columns of each chunk: sample, one per variable, metrics, stopped, diverged, refused (why, or '')."""
+        """Return the columns of each of the `chunks`: sample, parameters, metrics, stopped, diverged, refused (reason,
+        or '').
+        """
         drawn = [self._draw_chunk(c) for c in chunks]
         for columns in drawn:
             columns |= {name: np.zeros(len(columns["sample"]), self.study.dtype) for name in self.study.objectives}
@@ -67,7 +80,7 @@ class Runner:
         return {"sample": np.arange(start, stop), **self.study.draw(start, stop)}
 
     def _sort_into_blocks(self, drawn: list[Columns]) -> dict[tuple[str, ...], list[_Block]]:
-        """Blocks by the names of their parts."""
+        """Return the blocks, grouped by the names of their parts."""
         found: dict[tuple[str, ...], list[_Block]] = {}
         for c, columns in enumerate(drawn):
             names = np.array([np.asarray(columns[path], str) for path in self.study.parts]).T
@@ -77,13 +90,14 @@ class Runner:
                 members = np.flatnonzero((names == np.array(kind, dtype=names.dtype)).all(axis=1))
                 for k in range(0, len(members), self.size):
                     lanes = members[k : k + self.size]
+                    # `resize` repeats the runs: a block of full size needs no second program.
                     filled = np.resize(lanes, self.size)
                     block = _Block(c, lanes, {p: v[filled] for p, v in values.items()}, columns["sample"][filled])
                     found.setdefault(kind, []).append(block)
         return found
 
     def _run_on_devices(self, names: tuple[str, ...], blocks: list[_Block]) -> Iterator[Columns]:
-        """One block on each device, or fewer."""
+        """Run at most one block on each device."""
         loop, program = self._variant(names), self._program(names)
         return self._pool.map(
             lambda block, device: self._run_on_device(loop, program, block, device), blocks, self.devices
@@ -102,7 +116,7 @@ class Runner:
         return values, block.samples.astype(np.uint32), accepted
 
     def _compile_program(self, names: tuple[str, ...], block: _Block) -> None:
-        """Have the program of some parts traced, and its kernel compiled."""
+        """Trace the program of some parts, and compile its kernel."""
         with precision(self.study.dtype), _convert_compiler_errors():
             self._program(names).lower(*self._arguments(block, np.ones(self.size, bool)))
 
@@ -121,7 +135,7 @@ class Runner:
 
 @contextlib.contextmanager
 def _convert_compiler_errors() -> Iterator[None]:
-    """Raises EngineError where a kernel turns out not to be possible once it is compiled: a full disk, say."""
+    """Raise EngineError if a kernel cannot be compiled, because of a full disk for example."""
     try:
         yield
     except NoCompiler as error:
@@ -130,8 +144,13 @@ def _convert_compiler_errors() -> Iterator[None]:
 
 @functools.lru_cache(maxsize=4)
 def find_study_objection(study: Study) -> str | None:
-    """Return why its engine cannot make the runs of a study, those of the first chunk, or None. Nothing is run, but
-    what makes them is compiled."""
+    """Return the reason why the study's engine cannot make the runs of the first chunk, or None.
+
+    Nothing runs, but the programs are compiled.
+
+    Args:
+        study: Study to examine.
+    """
     runner = Runner(study, jax.local_devices()[:1])
     try:
         for names, blocks in runner._sort_into_blocks([runner._draw_chunk(0)]).items():
@@ -142,7 +161,7 @@ def find_study_objection(study: Study) -> str | None:
 
 
 def _measure_block(study: Study, loop: Any, values: Mapping[str, Any], samples: Any, accepted: Any) -> dict[str, Any]:
-    """Metrics and flags of a block of lanes, of which those run that are accepted."""
+    """Return metrics and flags of a block; only the accepted samples run."""
     keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples)
     given = (loop, Batch(values, keys), study.solver, study.objectives)
     done = run_batch(*given, together=False, accepted=accepted, engine=study.engine)

@@ -1,4 +1,4 @@
-"""A column of numbers in a file: CSV with names in its first line, or Parquet."""
+"""Columns of numbers in files: CSV with names in its first line, or Parquet."""
 
 import pathlib
 
@@ -14,8 +14,16 @@ TABLE_READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
 
 
 def read_column(path: pathlib.Path, column: str) -> np.ndarray:
-    """The numbers, in float64. Raises ValueError, in one line, for a file that cannot be read, a column that is not
-    there, and whatever is no finite number."""
+    """Return a column of numbers as float64, shape (rows,).
+
+    Args:
+        path: File with the suffix .csv or .parquet.
+        column: Name of the column.
+
+    Raises:
+        ValueError: The file cannot be read, the column does not exist, or an entry is not a finite number. The message
+            is one line.
+    """
     if path.suffix.lower() not in TABLE_READERS:
         raise ValueError(f"{path} is neither {' nor '.join(TABLE_READERS)}")
     try:
@@ -41,7 +49,7 @@ def _parse_numbers(values: pa.ChunkedArray, where: str) -> np.ndarray:
 
 
 def _parse_number(value: object) -> float:
-    """NaN for what is none, and for what is missing."""
+    """Return a value as a float; NaN for a missing value, or one that is not a number."""
     try:
         return float(value) if isinstance(value, str | float | int) and not isinstance(value, bool) else np.nan
     except (OverflowError, ValueError):

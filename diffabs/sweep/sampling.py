@@ -1,8 +1,12 @@
-"""Where in the unit cube the samples of a sweep lie. Sample i is a function of (seed, i), or of (seed, i, samples) for
-a design that is a finite set; so a chunk [start, stop) can be drawn by itself.
+"""Sampling designs: points of the unit cube for the samples of a sweep.
 
-The points of a random design are odd multiples of 2^-53, those of Sobol' sequences odd multiples of 2^-33: never 0, 1,
-and 1 - u is exact. SciPy's sequences have up to 64 bits, but in SciPy 1.17 `fast_forward` raises for more than 32."""
+Sample i is a function of (seed, i), or of (seed, i, samples) for a finite design. So a chunk [start, stop) can be drawn
+alone.
+
+Points of a random design are odd multiples of 2^-53, and points of Sobol' sequences odd multiples of 2^-33. They are
+never 0 or 1, and 1 - u is exact. SciPy's sequences have up to 64 bits, but in SciPy 1.17 `fast_forward` raises for more
+than 32.
+"""
 
 import dataclasses
 import functools
@@ -28,24 +32,33 @@ from diffabs.core.values import (
 )
 from diffabs.sweep.distributions import support_interval
 
-MAX_UINT32 = 2**32 - 1  # samples, whose numbers have 32 bits in JAX's keys and in the sequences; and the greatest seed
-MAX_HYPERCUBE_SAMPLES = 1_000_000  # of a Latin hypercube, which has to be made as a whole
+# Largest number of samples, whose numbers have 32 bits in JAX's keys and in the sequences; and largest seed.
+MAX_UINT32 = 2**32 - 1
+MAX_HYPERCUBE_SAMPLES = 1_000_000  # a Latin hypercube is drawn and kept as a whole
 SOBOL_BITS = 32
 
 
 class SamplingDesign(Protocol):
-    """How samples fill the unit cube."""
+    """A rule by which samples fill the unit cube."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
-        """Samples start, ..., stop - 1: (stop - start, dimension), in (0, 1), or [0, 1] for grids and corners."""
+        """Return samples start, ..., stop - 1, shape (stop - start, dimension), in (0, 1), or in [0, 1] for grids and
+        corners.
+
+        `seed` selects the points of a random design; `samples` is the number of all samples.
+        """
         ...
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
-        """How many samples there are. Raises ValueError if there cannot be as many as wanted."""
+        """Return the number of samples for these `variables`; `samples` is the wanted number, or None.
+
+        Raises:
+            ValueError: The design cannot have the wanted number.
+        """
         ...
 
     def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
-        """One line for each field that cannot be, or cannot with these variables."""
+        """Yield an error for each field that is wrong, alone or with these variables."""
         del name, variables
         yield from ()
 
@@ -59,9 +72,11 @@ class Random(SamplingDesign):
         high, low = np.moveaxis(
             np.asarray(_random_words(_check_seed(seed), np.uint32(start), stop - start, dimension)), -1, 0
         )
+        # 32 + 20 bits and half of the last one: never 0 or 1, and exact in float64.
         return (high * 2.0**20 + (low >> 12) + 0.5) * 2.0**-52
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        """Return `samples`, for any `variables`."""
         del variables
         return _check_samples(samples)
 
@@ -75,10 +90,12 @@ def _random_words(seed: Any, start: Any, count: int, dimension: int) -> jax.Arra
 
 @dataclasses.dataclass(frozen=True)
 class Sobol(SamplingDesign):
-    """Scrambled Sobol' sequences (SciPy's: linear matrix scramble and digital shift, Matousek 1998), one after another.
+    """Scrambled Sobol' sequences, one after another (SciPy's: linear matrix scramble and digital shift, Matousek 1998).
 
-    replicates: how many, scrambled independently: the spread of their means tells the error. Each is balanced only if
-        it has a power of two of samples (Owen 2020, arXiv:2008.08051)"""
+    Attributes:
+        replicates: Number of sequences, scrambled independently; the spread of their means gives the error. Each is
+            balanced only with a power of two of samples (Owen 2020, arXiv:2008.08051).
+    """
 
     replicates: int = table_field(whole_reader(1, MAX_UINT32), 1)
 
@@ -91,6 +108,7 @@ class Sobol(SamplingDesign):
         return np.concatenate(points)
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        """Return `samples` if it is a multiple of the replicates, for any `variables`."""
         del variables
         return _check_multiple(_check_samples(samples), self.replicates, "the number of replicates")
 
@@ -100,13 +118,12 @@ class Sobol(SamplingDesign):
 
 
 def _sobol_points(seed: int, replicate: int, start: int, stop: int, dimension: int) -> np.ndarray:
-    """Points of one scrambled sequence, moved by half of their last bit. Skipping 10^7 points takes a tenth of a
-    second."""
+    """Return points of one scrambled sequence, moved by half of their last bit. Skipping 10^7 points takes 0.1 s."""
     from scipy.stats import qmc
 
     engine = qmc.Sobol(dimension, bits=SOBOL_BITS, rng=_generator(seed, replicate))
     if start == 0 < stop:
-        # The first point by itself: a first draw that is no power of two would warn, but chunks may have any length.
+        # Draw the first point alone: SciPy warns if the first draw is not a power of two, and chunks have any length.
         points = np.concatenate([engine.random(1), engine.random(stop - 1)])
     else:
         points = engine.fast_forward(start).random(stop - start)
@@ -115,12 +132,15 @@ def _sobol_points(seed: int, replicate: int, start: int, stop: int, dimension: i
 
 @dataclasses.dataclass(frozen=True)
 class LatinHypercube(SamplingDesign):
-    """SciPy's Latin hypercube: each variable has one sample in each of its N strata. All are drawn at once and kept."""
+    """SciPy's Latin hypercube: each variable has one sample in each of its N strata. All samples are drawn and kept
+    together.
+    """
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         return _hypercube_points(seed, samples, dimension)[start:stop]
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        """Return `samples` if it is at most MAX_HYPERCUBE_SAMPLES, for any `variables`."""
         del variables
         if (count := _check_samples(samples)) > MAX_HYPERCUBE_SAMPLES:
             raise ValueError(
@@ -157,15 +177,18 @@ def _read_levels(given: Any, where: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Grid(SamplingDesign):
-    """Every combination of levels, the last variable changing fastest.
+    """Every combination of levels; the last variable changes fastest.
 
-    levels: of every variable, or of each by name: how many, which are equally spaced in u from 0 to 1, or a tuple of u.
-        What is drawn from a list, `Categorical` and `Rows`, has a level for each of its items unless it is given u."""
+    Attributes:
+        levels: Number of levels of every variable, or an entry for each variable by name. A number gives levels equally
+            spaced in u from 0 to 1; a tuple gives the u. `Categorical` and `Rows` have a level for each item, unless u
+            are given.
+    """
 
     levels: int | Mapping[str, int | tuple[float, ...]] = table_field(_read_levels)
 
     def over(self, variables: Mapping[str, Any]) -> "Grid":
-        """The same with the levels u of each of these variables, in their order."""
+        """Return the grid with the levels u of each of these `variables`, in their order."""
         return Grid({name: tuple(map(float, self._axis(name, item))) for name, item in variables.items()})
 
     def _axis(self, name: str, variable: Any) -> Any:
@@ -175,7 +198,7 @@ class Grid(SamplingDesign):
         return variable.middles() if hasattr(variable, "middles") else np.linspace(0, 1, levels)
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
-        """Of a grid `over` its variables, or with one number of levels for all."""
+        """Return samples of a grid made by `over`, or of a grid with one number of levels for all variables."""
         del seed, samples
         given = [self.levels] * dimension if isinstance(self.levels, int) else list(self.levels.values())
         if len(given) != dimension:
@@ -185,6 +208,11 @@ class Grid(SamplingDesign):
         return np.stack([axis[place] for axis, place in zip(axes, places, strict=True)], 1)
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        """Return the number of points of the grid over `variables`.
+
+        Raises:
+            ValueError: `samples` is given, and is another number.
+        """
         sizes = [len(self._axis(name, item)) for name, item in variables.items()]
         return _check_exact_count(math.prod(sizes), samples, f"the grid {' x '.join(map(str, sizes))}")
 
@@ -208,12 +236,17 @@ class Grid(SamplingDesign):
 
 @dataclasses.dataclass(frozen=True)
 class Corners(SamplingDesign):
-    """The 2^d corners of the box of supports, the last variable changing fastest."""
+    """The 2^d corners of the box of supports; the last variable changes fastest."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         return Grid(2).unit(seed, start, stop, dimension, samples)
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        """Return the number of corners, 2^d for d `variables`.
+
+        Raises:
+            ValueError: `samples` is given, and is another number.
+        """
         return _check_exact_count(2 ** len(variables), samples, "the corners")
 
     def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
@@ -226,10 +259,13 @@ class Corners(SamplingDesign):
 
 @dataclasses.dataclass(frozen=True)
 class Saltelli(SamplingDesign):
-    """Rows of d + 2 samples for Sobol' sensitivity indices: A, B, and A with column j from B for j = 0, ..., d - 1.
+    """Rows of d + 2 samples for Sobol' sensitivity indices.
 
-    Row r of A and B is point r of one scrambled Sobol' sequence of dimension 2 d. Saltelli et al. 2010, Computer
-    Physics Communications 181, 259."""
+    The samples of a row are A, B, and A with column j from B for j = 0, ..., d - 1. Row r of A and B is point r of one
+    scrambled Sobol' sequence of dimension 2 d.
+
+    Source: Saltelli et al. 2010, Computer Physics Communications 181, 259.
+    """
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         del samples
@@ -240,6 +276,7 @@ class Saltelli(SamplingDesign):
         return np.where(from_b, b, a)
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        """Return `samples` if it is a multiple of the number of `variables` plus 2."""
         return _check_multiple(_check_samples(samples), len(variables) + 2, "the number of variables plus 2")
 
 
@@ -247,7 +284,15 @@ DESIGN_TYPES = {kebab_case(cls.__name__): cls for cls in (Random, Sobol, LatinHy
 
 
 def read_sampling_design(given: Any, where: str) -> SamplingDesign:
-    """The design of a table, or of the bare name of a type. Raises ScenarioError, in one line."""
+    """Return the design of a table, or of the bare name of a type.
+
+    Args:
+        given: Table with `type` and fields, or a name.
+        where: Path of the table, for messages.
+
+    Raises:
+        ScenarioError: The table is no design. The message is one line.
+    """
     return check_sound(read_one(DESIGN_TYPES, given, where), where)
 
 

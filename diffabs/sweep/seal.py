@@ -1,8 +1,10 @@
-"""How a chunk is told from a damaged, exchanged or foreign one.
+"""Detection of chunks that are damaged, exchanged, or from another sweep.
 
-The name of its file holds the first 16 digits of the SHA-256 of all its bytes, so a changed bit anywhere is seen. In
-it, as key-value metadata of Parquet (DuckDB: `parquet_kv_metadata`), are its number, the seed, and its owner: a digest
-of everything in the manifest that decides its numbers. Whoever reads a chunk compares all of them, and its samples."""
+The file name of a chunk contains the first 16 digits of the SHA-256 of its bytes, which detects any changed bit. The
+file contains, as key-value metadata of Parquet (DuckDB: `parquet_kv_metadata`), its number, the seed, and its owner.
+The owner is a digest of everything in the manifest that decides the numbers. A reader compares all of these, and the
+samples.
+"""
 
 import hashlib
 import io
@@ -23,15 +25,23 @@ DIGEST_DIGITS = 16
 
 
 class SweepError(ScenarioError):
-    """A sweep that cannot be started, continued or read; one line."""
+    """A sweep that cannot be started, continued or read; the message is one line."""
 
 
 class DamagedError(SweepError):
-    """A chunk that is not what was written, and can be computed again."""
+    """A chunk that differs from the written one, and can be computed again."""
 
 
 class Seal(NamedTuple):
-    """What a chunk says of itself, and which samples and columns it must have."""
+    """The identity of a chunk, with its samples and columns.
+
+    Attributes:
+        owner: Digest of format, study and versions.
+        chunk: Number of the chunk.
+        seed: Seed of the sweep.
+        rows: First sample of the chunk, and one past its last.
+        columns: Names of the columns that the chunk must have.
+    """
 
     owner: str
     chunk: int
@@ -40,19 +50,30 @@ class Seal(NamedTuple):
     columns: frozenset[str] = frozenset()
 
     def metadata(self) -> dict[bytes, bytes]:
-        """As kept in the file."""
+        """Return owner, number and seed as metadata of the file."""
         told = {"owner": self.owner, "chunk": str(self.chunk), "seed": str(self.seed)}
         return {f"diffabs.{name}".encode(): value.encode() for name, value in told.items()}
 
 
 def json_digest(value: Any) -> str:
-    """SHA-256 of values of JSON. The order of names counts: it is that of a design's columns."""
+    """Return the SHA-256 of JSON values.
+
+    The order of names counts, because it is the order of a design's columns.
+
+    Args:
+        value: Value of JSON types.
+    """
     return hashlib.sha256(json.dumps(value, separators=(",", ":")).encode()).hexdigest()
 
 
 def encode_chunk(columns: Mapping[str, np.ndarray], seal: Seal, units: Mapping[str, str] | None = None) -> bytes:
-    """A chunk as the bytes of its Parquet file: the same columns of the same sweep give the same bytes. A column whose
-    unit is known has it in its field's metadata, under `unit`."""
+    """Return a chunk as the bytes of its Parquet file. The same columns of the same sweep give the same bytes.
+
+    Args:
+        columns: Columns by name, each of shape (samples,).
+        seal: Seal of the chunk.
+        units: Units of columns, where they are known; a field's metadata holds its unit under `unit`.
+    """
     arrays = {name: _arrow_array(column) for name, column in columns.items()}
     told = {name: {"unit": unit} for name, unit in (units or {}).items()}
     schema = pa.schema([pa.field(n, array.type, metadata=told.get(n)) for n, array in arrays.items()], seal.metadata())
@@ -66,12 +87,27 @@ def _arrow_array(column: np.ndarray) -> pa.Array:
 
 
 def chunk_file_name(chunk: int, data: bytes) -> str:
-    """The name of a chunk's file."""
+    """Return the name of a chunk's file.
+
+    Args:
+        chunk: Number of the chunk.
+        data: Bytes of the file.
+    """
     return f"part-{chunk:08d}-{hashlib.sha256(data).hexdigest()[:DIGEST_DIGITS]}.parquet"
 
 
 def verify_chunk(data: bytes, path: pathlib.Path, seal: Seal) -> pq.ParquetFile:
-    """The chunk in these bytes of a file. Raises DamagedError, or SweepError for a chunk of another sweep."""
+    """Return the chunk in these bytes of a file.
+
+    Args:
+        data: Bytes of the file.
+        path: Path of the file.
+        seal: Seal that the chunk must have.
+
+    Raises:
+        DamagedError: The chunk is not the one that was written.
+        SweepError: The chunk belongs to another sweep.
+    """
     if chunk_file_name(seal.chunk, data) != path.name:
         raise DamagedError(f"{path} is damaged: its contents do not match its name; --resume computes it again")
     try:
@@ -98,7 +134,7 @@ def _describe_metadata(key: bytes, told: Mapping[bytes, bytes]) -> str:
 
 
 def _check_table(found: pq.ParquetFile, path: pathlib.Path, seal: Seal) -> None:
-    """Raises DamagedError for columns that are missing, or other samples."""
+    """Raise DamagedError for missing columns or other samples."""
     missing = sorted(seal.columns - set(found.schema_arrow.names))
     if missing:
         raise DamagedError(f"{path} has no column {missing[0]}; --resume computes it again")
@@ -109,7 +145,11 @@ def _check_table(found: pq.ParquetFile, path: pathlib.Path, seal: Seal) -> None:
 
 
 def tables_digest(tables: Iterable[pa.Table]) -> str:
-    """SHA-256 over names, types and values of all columns: equal for equal tables, whatever file they are in."""
+    """Return the SHA-256 over names, types and values of all columns; equal for equal tables in any files.
+
+    Args:
+        tables: Tables, in order.
+    """
     whole = hashlib.sha256()
     for table in tables:
         for column, values in zip(table.column_names, table.columns, strict=True):

@@ -1,10 +1,11 @@
 """The folder of a sweep: a manifest, and one Parquet file for each chunk.
 
-    manifest.json                             what was swept, and with which versions
+    manifest.json                             study and versions of the sweep
     chunks/part-00000012-<digest>.parquet     a chunk; its name holds the first 16 digits of its SHA-256
 
-A file is written beside its place, flushed to the disk, and renamed, so that what is there is whole, and its name says
-what must be in it: no index to keep, nothing to repair after a kill. One process at a time has the lock."""
+A file is written beside its place, flushed to the disk, and renamed. So each file is whole, and its name determines its
+contents. There is no index to keep, and nothing to repair after a kill. One process at a time has the lock.
+"""
 
 import contextlib
 import json
@@ -24,20 +25,23 @@ from diffabs.sweep.seal import SweepError as SweepError
 
 CHUNKS_FOLDER, LOCK_FILE = "chunks", ".lock"
 MAX_VALUE_CHARACTERS = 60
-IGNORED_PREFIXES = (".", "_")  # beginnings of names that no reader of data sets takes for a part of one
+IGNORED_PREFIXES = (".", "_")  # readers of Parquet data sets ignore names with these beginnings
 
 
 class Store:
     """A folder, opened for one sweep."""
 
     def __init__(self, folder: pathlib.Path):
-        """Nothing is read or written yet."""
+        """Set the `folder`, without reading or writing."""
         self.folder, self.chunks = pathlib.Path(folder), pathlib.Path(folder) / CHUNKS_FOLDER
 
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
-        """Alone in the folder, which is made if it is not there. Raises SweepError if another process has it, or if it
-        cannot be written."""
+    def lock(self) -> Iterator[None]:
+        """Hold the lock of the folder, which is created if it does not exist.
+
+        Raises:
+            SweepError: Another process has the lock, or the folder cannot be written.
+        """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             lock = filelock.FileLock(self.folder / LOCK_FILE, timeout=0)
@@ -52,9 +56,15 @@ class Store:
             lock.release()
 
     def begin(self, manifest: Mapping[str, Any], *, resume: bool) -> None:
-        """Write the manifest, or compare it with the one that is there. Raises SweepError for a folder that holds
-        another configuration (naming the first differences), finished chunks although `resume` is not set, or other
-        files. A sweep that never finished a chunk (its scheduler did not answer, say) is begun anew."""
+        """Write the `manifest`, or compare it with the existing one if `resume` is set.
+
+        A sweep without a finished chunk (because its scheduler did not answer, for example) starts again from the
+        beginning.
+
+        Raises:
+            SweepError: The folder contains another configuration (the message names the first differences), finished
+                chunks while `resume` is not set, or other files.
+        """
         for leftover in (self.folder / f"{MANIFEST_NAME}.tmp", *self.chunks.glob("part-*.parquet.tmp")):
             leftover.unlink(missing_ok=True)
         if not (self.folder / MANIFEST_NAME).exists():
@@ -85,8 +95,13 @@ class Store:
         files.write_durably(self.folder / MANIFEST_NAME, encode_manifest(manifest))
 
     def scan(self, seals: Seals) -> tuple[dict[int, pathlib.Path], list[int]]:
-        """Chunks of a sweep that are there and whole, and those that are damaged. A damaged file is removed; one of
-        another name is left alone. Raises SweepError for a chunk of another sweep, and for what is no file."""
+        """Return the whole chunks of the sweep with these `seals` by number, and the numbers of the damaged ones.
+
+        A damaged file is removed. A file with another name stays.
+
+        Raises:
+            SweepError: A chunk belongs to another sweep, or is not a file.
+        """
         whole, damaged = {}, []
         for chunk, paths in list_chunks(self.folder, seals.count)[0].items():
             for path in paths:
@@ -99,13 +114,17 @@ class Store:
         return whole, [chunk for chunk in dict.fromkeys(damaged) if chunk not in whole]
 
     def write(self, chunk: int, data: bytes) -> pathlib.Path:
-        """A chunk, whole or not at all."""
+        """Write the `data` of a `chunk`, completely or not at all, and return its path."""
         return files.write_durably(self.chunks / seal.chunk_file_name(chunk, data), data)
 
 
 def list_chunks(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathlib.Path]], list[pathlib.Path]]:
-    """Files with the name of one of `count` chunks, by number, and whatever else lies beside them that another reader
-    would take for a part of the data set."""
+    """Return the files of the chunks by number, and other files that a reader would take for parts of the data set.
+
+    Args:
+        folder: Folder of the sweep.
+        count: Number of chunks of the sweep.
+    """
     named, strays = {}, []
     for path in sorted((folder / CHUNKS_FOLDER).glob("*")):
         number = seal.CHUNK_NAME_PATTERN.fullmatch(path.name)
@@ -117,8 +136,16 @@ def list_chunks(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathli
 
 
 def check_owner(folder: pathlib.Path, manifest: Mapping[str, Any], sample: int) -> None:
-    """Whether the manifest is that of the chunks: of the one with this sample, or, while it is not there, of the first.
-    Raises SweepError."""
+    """Check that a chunk belongs to the manifest: the chunk with this sample, or the first one if that is missing.
+
+    Args:
+        folder: Folder of the sweep.
+        manifest: Manifest of the folder.
+        sample: Number of the sample.
+
+    Raises:
+        SweepError: The folder has no finished chunk, or the chunk does not belong to the manifest.
+    """
     seals = Seals(manifest)
     named = list_chunks(folder, seals.count)[0]
     if not named:
@@ -130,7 +157,14 @@ def check_owner(folder: pathlib.Path, manifest: Mapping[str, Any], sample: int) 
 
 
 def read_chunk(path: pathlib.Path) -> bytes:
-    """The bytes of a chunk's file. Raises SweepError for what is no file or cannot be read."""
+    """Return the bytes of a chunk's file.
+
+    Args:
+        path: Path of the file.
+
+    Raises:
+        SweepError: The path is not a file, or cannot be read.
+    """
     try:
         return files.read_content(path)
     except OSError as error:
@@ -138,7 +172,13 @@ def read_chunk(path: pathlib.Path) -> bytes:
 
 
 def describe_differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
-    """Where two documents differ, a line each."""
+    """Yield one line for each difference between two documents.
+
+    Args:
+        there: Document that exists.
+        wanted: Document to compare with.
+        path: Path of both documents, for messages.
+    """
     if isinstance(there, dict) and isinstance(wanted, dict):
         for key in [*there, *(key for key in wanted if key not in there)]:
             inner = f"{path}.{key}" if path else str(key)
@@ -148,7 +188,7 @@ def describe_differences(there: Any, wanted: Any, path: str = "") -> Iterator[st
 
 
 def _decisive_entries(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """What results depend on: everything but the commit, which is a note."""
+    """Return the entries that decide the results: all except the notes on commit, source and units."""
     return {key: value for key, value in manifest.items() if key not in ("commit", "source", "units")}
 
 

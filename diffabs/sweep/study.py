@@ -1,7 +1,8 @@
-"""What a sweep runs: a loop, what varies in it, how it is integrated, and what is measured.
+"""The definition of a sweep: a loop, its varying parameters, its solver, and its metrics.
 
-Lane i is a function of (seed, i) alone: its parameters come from the design, its noise from `fold_in(key, i)`. It is
-computed in chunk i // chunk, and nothing about it depends on who computes that chunk, or when."""
+Run i is a function of (seed, i) alone: the design gives its parameters, and `fold_in(key, i)` its noise. Chunk i //
+chunk contains it. The process, device and time of the computation do not change it.
+"""
 
 import contextlib
 import dataclasses
@@ -28,24 +29,29 @@ from diffabs.sweep.variables import Space
 DTYPES = ("float32", "float64")
 STUDY_ENGINES = ("xla", "kernel")
 RANGES = {"samples": (1, 2**32 - 1), "chunk": (1, 2**20), "seed": (0, 2**32 - 1)}  # keys are folded with 32 bits
-NOISE_STREAM = (
-    2**32 - 1
-)  # of the stream of keys, folded into the seed where the random design folds the number of a sample
+# Noise keys fold this into the seed, where the random design folds the number of a sample: the streams never meet.
+NOISE_STREAM = 2**32 - 1
 FLAG_COLUMNS = ("stopped", "diverged", "refused")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Study:
-    """A sweep, fully described.
+    """A complete description of a sweep.
 
-    space: distributions by dotted path, `plant.mass` or `controller.gain.0`, and the design that draws from them
-    parts: for a path drawn by a `Categorical` of names, the part that each name stands for
-    objectives: what is measured; without any, what is usual for what the plant shows
-    failures: metrics whose excess over a bound counts as a failure; so do, always, diverging, an end that the stop does
-        not call a success, and the bounds that objectives have of their own (`failure`)
-    chunk: lanes that are computed and stored together; results are the same to the bit for the same chunk
-    engine: "xla" or "kernel", what makes the runs (`simulate.batch.run_batch`); the bits differ, and for a kernel they
-        are those of a compiler and a processor, which are part of what the sweep is
+    Attributes:
+        loop: Loop with the values of all parameters that do not vary.
+        space: Distributions by dotted path, `plant.mass` or `controller.gain.0`, and the design that draws from them.
+        samples: Number of samples.
+        solver: Solver of each run.
+        objectives: Metrics by name; if empty, the usual ones for the plant's signals.
+        seed: Seed of parameters and noise.
+        chunk: Number of runs that are computed and stored together. Results are equal to the bit for equal `chunk`.
+        dtype: "float32" or "float64".
+        engine: "xla" or "kernel" (`simulate.batch.run_batch`). Their results differ in the last bits. Those of a kernel
+            also depend on the compiler and the processor, which are part of the sweep's identity.
+        parts: For a path drawn by a `Categorical` of names, the part that each name stands for.
+        failures: Bounds of metrics; a larger value is a failure. Divergence, an end that the stop does not call a
+            success, and the objectives' own bounds (`failure`) are always failures.
     """
 
     loop: Loop
@@ -61,17 +67,17 @@ class Study:
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Without objectives, those usual for what the plant shows."""
+        """Replace empty objectives by the usual ones for the plant's signals."""
         if not self.objectives:
             object.__setattr__(self, "objectives", default_objectives(self.loop.plant))
 
     @property
     def success(self) -> bool:
-        """Whether reaching the stop is what a run shall do."""
+        """Whether a run succeeds by reaching its stop."""
         return bool(self.loop.stop.success)
 
     def units(self) -> dict[str, str]:
-        """Of the parameters that vary and of the metrics, by name, where they are known."""
+        """Return the units of the varying parameters and of the metrics, by name, where they are known."""
         loop = units_of(self.loop.plant)
         declared = {path: spec.unit for path, spec, _ in parameters(self.loop, units=loop)}
         varied = {path: declared[path] for path in self.space.paths if path in declared}
@@ -80,33 +86,41 @@ class Study:
 
     @property
     def failure_bounds(self) -> dict[str, float]:
-        """Bounds of metrics beyond which a lane has failed: those of the objectives themselves, then the study's."""
+        """Bounds of the metrics beyond which a run fails: those of the objectives, replaced by those of the study."""
         said = {name: getattr(part, "failure", None) for name, part in self.objectives.items()}
         own = {name: float(bound) for name, bound in said.items() if bound is not None}
         return own | {name: float(bound) for name, bound in self.failures.items()}
 
     @property
     def chunks(self) -> int:
-        """How many chunks there are; the last may be shorter."""
+        """Number of chunks; the last may be shorter."""
         return -(-self.samples // self.chunk)
 
     def bounds(self, chunk: int) -> tuple[int, int]:
-        """First sample of a chunk and one past its last."""
+        """Return the first sample of a `chunk`, and one past its last."""
         return chunk * self.chunk, min((chunk + 1) * self.chunk, self.samples)
 
     def check(self) -> "Study":
-        """Raises ValueError, in one line, for everything that is wrong."""
+        """Return the study if it is valid.
+
+        Raises:
+            ValueError: The study has errors; one line lists all.
+        """
         lines = [*self._number_problems(), *self._variable_problems()] or list(find_problems(self.loop))
         if lines:
             raise ValueError("; ".join(dict.fromkeys(lines)))
         return self
 
     def draw(self, start: int, stop: int) -> dict[str, np.ndarray]:
-        """Values of the samples by path."""
+        """Return the values of samples start, ..., stop - 1 by path, each of shape (stop - start,)."""
         return self.space.draw(self.seed, start, stop, self.samples)
 
     def lane(self, i: int) -> tuple[Loop, jax.Array]:
-        """Loop and random key of sample i. Raises ValueError for a sample that is not in the sweep."""
+        """Return loop and random key of sample i.
+
+        Raises:
+            ValueError: The sample is not in the sweep.
+        """
         if not 0 <= i < self.samples:
             raise ValueError(f"sample {i} is outside [0, {self.samples - 1}]")
         values = {path: column[0] for path, column in self.draw(i, i + 1).items()}
@@ -114,11 +128,15 @@ class Study:
             return replace(self.variant(values), numeric_values(values)), noise_key(self.seed, i)
 
     def variant(self, values: Mapping[str, Any]) -> Loop:
-        """The loop with the parts that a sample's names stand for."""
+        """Return the loop with the parts whose names are in `values`."""
         return replace(self.loop, {path: self.parts[path][str(values[path])] for path in self.parts})
 
     def table(self) -> dict[str, Any]:
-        """Everything that decides the results, as values of JSON. Raises NoCompiler for a kernel without one."""
+        """Return everything that decides the results, as JSON values.
+
+        Raises:
+            NoCompiler: The engine is a kernel, and there is no compiler.
+        """
         own: dict[str, Any] = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
         own |= {"failures": self.failure_bounds, "success": self.success}
         if self.engine != "xla":
@@ -194,17 +212,30 @@ def _part_problems(path: str, distribution: Any, choices: Mapping[str, Any], loo
 
 
 def numeric_values(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Those values that are numbers, not names."""
+    """Return the values that are numbers, and not names.
+
+    Args:
+        values: Values by path.
+    """
     return {path: value for path, value in values.items() if np.asarray(value).dtype.kind in "fiu"}
 
 
 @contextlib.contextmanager
 def precision(dtype: str) -> Iterator[None]:
-    """JAX's default type inside, whatever it is outside."""
+    """Set JAX's default type in this context.
+
+    Args:
+        dtype: "float32" or "float64".
+    """
     with jax.enable_x64(dtype == "float64"):
         yield
 
 
 def noise_key(seed: Any, i: Any) -> jax.Array:
-    """The key of sample i's sensors."""
+    """Return the random key for the sensors of sample i.
+
+    Args:
+        seed: Seed of the sweep.
+        i: Number of the sample.
+    """
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), NOISE_STREAM), i)

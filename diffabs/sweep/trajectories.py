@@ -1,6 +1,7 @@
-"""Trajectories of chosen samples, run again and kept in a zarr group: dimensions `sample` and `instant`.
+"""Trajectories of chosen samples, run again and kept in a zarr group with dimensions `sample` and `instant`.
 
-`xarray.open_zarr(folder / "trajectories.zarr", consolidated=False)` opens it."""
+`xarray.open_zarr(folder / "trajectories.zarr", consolidated=False)` opens it.
+"""
 
 import dataclasses
 import pathlib
@@ -18,13 +19,22 @@ from diffabs.simulate.solution import Trajectory
 from diffabs.sweep.study import Study, precision
 
 TRAJECTORIES_NAME = "trajectories.zarr"
-MAX_INSTANTS = 2000  # of a trajectory
+MAX_TRAJECTORY_INSTANTS = 2000  # recorded instants of a trajectory
 
 
 def write_trajectories(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pathlib.Path:
-    """Run these samples again and write their trajectories, whole or not at all, in place of earlier ones.
+    """Run these samples again, write their trajectories, and return the path of the group.
 
-    Raises ValueError for a sample that is not in the sweep."""
+    The group replaces an earlier one. It is written completely or not at all.
+
+    Args:
+        study: Study of the sweep.
+        folder: Folder of the sweep.
+        samples: Numbers of the samples.
+
+    Raises:
+        ValueError: A sample is not in the sweep.
+    """
     path = pathlib.Path(folder) / TRAJECTORIES_NAME
     seen = [run_signals(rerun_sample(study, i).sample, study.loop.plant) for i in samples]
     with files.new_folder(path) as folder:
@@ -41,9 +51,14 @@ def write_trajectories(study: Study, folder: str | pathlib.Path, samples: Sequen
 
 
 def rerun_sample(study: Study, i: int) -> Trajectory:
-    """One sample's run, on the host. After its end the last instant is repeated."""
+    """Return the trajectory of one sample, on the host. After the end of the run the last instant repeats.
+
+    Args:
+        study: Study of the sweep.
+        i: Number of the sample.
+    """
     loop, key = study.lane(i)
-    every = max(study.solver.every, -(-study.solver.steps // MAX_INSTANTS))
+    every = max(study.solver.every, -(-study.solver.steps // MAX_TRAJECTORY_INSTANTS))
     with precision(study.dtype):
         loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
         run = jax.device_get(rollout(loop, dataclasses.replace(study.solver, every=every), key=key))

@@ -1,4 +1,4 @@
-"""What varies in a sweep, together: distributions by path, how they depend on each other, and the design of samples."""
+"""The joint distribution of a sweep's parameters: distributions by path, their correlation, and the sampling design."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.core import values
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.values import (
     as_plain,
     check_sound,
@@ -23,16 +23,22 @@ from diffabs.sweep.discrete import Rows as Rows
 from diffabs.sweep.distributions import Distribution, Normal, describe_out_of_range
 from diffabs.sweep.sampling import Grid, LatinHypercube, Random, SamplingDesign, Sobol
 
-MIN_CORRELATION_EIGENVALUE = 1e-10  # eigenvalue of a correlation matrix: below, its factor has no digits
-ENTRY_TOLERANCE = 1e-9  # relative, of entries that have to be equal
+MIN_CORRELATION_EIGENVALUE = 1e-10  # below it, the Cholesky factor of a correlation matrix loses its digits
+CORRELATION_TOLERANCE = 1e-9  # relative tolerance of entries that must be equal
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Correlation:
-    """A Gaussian copula: z = L n with L L^T = `matrix` and n independent standard normals; a variable is the quantile
-    of its distribution at Phi(z). Normal variables without limits are then jointly normal, with these correlations.
+    """A Gaussian copula: each variable is the quantile of its distribution at Phi(z), with correlated z.
 
-    paths: variables; those not named are independent"""
+        z = L n,   L L^T = matrix,   n independent standard normals
+
+    Normal variables without limits are then jointly normal, with these correlations.
+
+    Attributes:
+        paths: Correlated variables; all others are independent.
+        matrix: Correlation matrix, shape (paths, paths).
+    """
 
     paths: tuple[str, ...]
     matrix: Any = table_field(list_reader(list_reader(read_any_number)))
@@ -41,21 +47,25 @@ class Correlation:
     def from_covariance(
         paths: tuple[str, ...], covariance: Any, variables: Mapping[str, Any] | None = None
     ) -> "Correlation":
-        """The correlations of a covariance matrix. Raises ValueError where the root of a variance is not the deviation
-        of the normal variable, if variables are given."""
+        """Return the correlation of the variables `paths` with a `covariance` matrix.
+
+        Raises:
+            ValueError: A variance is not positive; or its root is not the deviation of a normal variable in
+                `variables`.
+        """
         variances = np.diag(np.asarray(covariance, float))
         for path, variance in zip(paths, variances, strict=True):
             if not variance > 0:
                 raise ValueError(f"covariance: the variance of {path} = {variance:g} is not positive")
             marginal = (variables or {}).get(path)
-            if isinstance(marginal, Normal) and abs(marginal.deviation / np.sqrt(variance) - 1) > ENTRY_TOLERANCE:
+            if isinstance(marginal, Normal) and abs(marginal.deviation / np.sqrt(variance) - 1) > CORRELATION_TOLERANCE:
                 root = f"{np.sqrt(variance):g}, the root of its variance in the covariance"
                 raise ValueError(f"{path}: deviation = {marginal.deviation:g} is not {root}")
         matrix = covariance / np.sqrt(np.outer(variances, variances))
         return Correlation(tuple(paths), tuple(map(tuple, matrix.tolist())))
 
     def correlate(self, z: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """L z: independent standard normals of these paths, correlated."""
+        """Return L z, correlated normals, for independent standard normals z by path."""
         factor = np.linalg.cholesky(np.asarray(self.matrix, float))
         # Term by term: a matrix product may round a sample differently in chunks of different lengths.
         return {
@@ -64,7 +74,7 @@ class Correlation:
         }
 
     def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
-        """One line for each thing that cannot be, or cannot with these variables."""
+        """Yield an error for each field that is wrong, alone or with these variables."""
         for path in dict.fromkeys(self.paths):
             if self.paths.count(path) > 1:
                 yield f"{name}: {path} is named {self.paths.count(path)} times"
@@ -82,9 +92,9 @@ class Correlation:
             yield f"{name}: matrix needs {n} rows of {n} numbers, as many as paths"
         elif not np.isfinite(matrix).all():
             yield f"{name}: matrix is not finite"
-        elif not np.allclose(matrix, matrix.T, rtol=0, atol=ENTRY_TOLERANCE):
+        elif not np.allclose(matrix, matrix.T, rtol=0, atol=CORRELATION_TOLERANCE):
             yield f"{name}: matrix is not symmetric"
-        elif not np.allclose(np.diag(matrix), 1, rtol=0, atol=ENTRY_TOLERANCE):
+        elif not np.allclose(np.diag(matrix), 1, rtol=0, atol=CORRELATION_TOLERANCE):
             yield f"{name}: matrix has {np.diag(matrix).tolist()} on its diagonal, not ones"
         elif (least := np.linalg.eigvalsh(matrix)[0]) < MIN_CORRELATION_EIGENVALUE:
             low = f"its least eigenvalue is {least:.3g}, below {MIN_CORRELATION_EIGENVALUE:g}"
@@ -92,7 +102,15 @@ class Correlation:
 
 
 def read_correlation(given: Any, where: str) -> Correlation:
-    """The correlation of a table. Raises ScenarioError."""
+    """Return the correlation of a table.
+
+    Args:
+        given: Table with `paths` and `matrix`.
+        where: Path of the table, for messages.
+
+    Raises:
+        ScenarioError: The table is no correlation.
+    """
     return check_sound(values.read_table(Correlation, given, where), where)
 
 
@@ -102,8 +120,13 @@ def _read_variable(given: Any, where: str) -> Any:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Space:
-    """The variables of a sweep, in the order of the columns of its design. Those whose value is a `Distribution` are
-    parameters, by path; `Rows` hold several and may have any name."""
+    """The variables of a sweep, in the order of the columns of its design.
+
+    Attributes:
+        variables: `Distribution` of a parameter by path, or `Rows` of several parameters under any name.
+        correlation: Correlation of some variables, or None.
+        design: Sampling design.
+    """
 
     variables: Mapping[str, Distribution | Rows] = table_field(table_reader(_read_variable))
     correlation: Correlation | None = table_field(read_correlation, None)
@@ -111,23 +134,32 @@ class Space:
 
     @property
     def dimension(self) -> int:
-        """How many uniforms make a sample."""
+        """Number of uniforms for one sample."""
         return len(self.variables)
 
     @property
     def paths(self) -> tuple[str, ...]:
-        """The parameters, in order."""
+        """Paths of the parameters, in order."""
         return tuple(path for name, item in self.variables.items() for path in _variable_paths(name, item))
 
     def check(self, samples: int | None = None) -> int:
-        """How many samples the design has. Raises ValueError, in one line, for everything that is wrong."""
+        """Return the number of samples of the design; `samples` is the wanted number, or None.
+
+        Raises:
+            ValueError: The space has errors; one line lists all.
+        """
         if lines := list(self.problems()):
             raise ValueError("; ".join(lines))
         return self.design.count(self.variables, samples)
 
     def draw(self, seed: int, start: int, stop: int, samples: int) -> dict[str, np.ndarray]:
-        """Samples start, ..., stop - 1 of so many: an array for each path. The space is taken to be checked. Raises
-        ValueError for samples that are not there."""
+        """Return samples start, ..., stop - 1 of `samples` by path, each of shape (stop - start,).
+
+        `seed` selects the points of the design. The space must be valid, see `check`.
+
+        Raises:
+            ValueError: The design does not have these samples.
+        """
         count = self.design.count(self.variables, samples)
         if not 0 <= start <= stop <= count:
             raise ValueError(f"samples [{start}, {stop}) are outside [0, {count})")
@@ -147,8 +179,10 @@ class Space:
         return _flatten_rows(drawn)
 
     def normal(self, z: Any) -> dict[str, np.ndarray]:
-        """The values at independent standard normal coordinates z (n, dimension), correct to their last digits in both
-        tails: an array for each path."""
+        """Return the values at independent standard normal coordinates z (n, dimension) by path, each of shape (n,).
+
+        They are correct to their last digits in both tails.
+        """
         columns = self._columns(np.asarray(z, float))
         columns |= self.correlation.correlate(columns) if self.correlation else {}
         return _flatten_rows({name: item.from_normal(columns[name]) for name, item in self.variables.items()})
@@ -157,7 +191,7 @@ class Space:
         return dict(zip(self.variables, np.ascontiguousarray(points.T), strict=True))
 
     def problems(self) -> Iterator[str]:
-        """One line for each thing that is wrong with the space."""
+        """Yield an error for each problem of the space."""
         if not self.variables:
             yield "variables are empty: nothing varies"
         lines = [line for name, item in self.variables.items() for line in item.problems(name)]
@@ -165,15 +199,15 @@ class Space:
         yield from (
             f"{path} is given {n} times" for path in dict.fromkeys(self.paths) if (n := self.paths.count(path)) > 1
         )
-        # What a design or a correlation says of a variable makes sense only if the variable does.
+        # A design or a correlation examines only valid variables.
         yield from self.design.problems("design", None if lines else self.variables)
         if self.correlation:
             yield from self.correlation.problems("correlation", self.variables)
             if not isinstance(self.design, Random | Sobol | LatinHypercube):
                 yield f"correlation: a {kebab_case(type(self.design).__name__)} design needs independent variables"
 
-    def describe_out_of_range(self, specs: Mapping[str, Spec], prefix: str = "") -> Iterator[str]:
-        """A line for each parameter with one of these specs that can leave its range."""
+    def describe_out_of_range(self, specs: Mapping[str, ParameterSpec], prefix: str = "") -> Iterator[str]:
+        """Yield a line for each parameter that can leave its range in `specs`; `prefix` stands before its name."""
         for name, item in self.variables.items():
             if isinstance(item, Rows):
                 for path, column in item.columns.items():
@@ -184,15 +218,22 @@ class Space:
                 yield line
 
     def table(self) -> dict[str, Any]:
-        """As values of TOML, which `read` reads."""
+        """Return the space as TOML values, the input of `read_space`."""
         correlation = {"correlation": plain_fields(self.correlation)} if self.correlation else {}
         variables = {name: as_plain(item, brief=True) for name, item in self.variables.items()}
         return {"variables": variables, **correlation, "design": as_plain(self.design, brief=True)}
 
 
 def read_space(given: Any, where: str) -> Space:
-    """The space of a table with `variables`, and maybe `correlation` and `design`. Raises ScenarioError, in one line,
-    for whatever is wrong with one of them; `Space.check` says what is wrong with them together."""
+    """Return the space of a table with `variables`, and optionally `correlation` and `design`.
+
+    Args:
+        given: Table.
+        where: Path of the table, for messages.
+
+    Raises:
+        ScenarioError: One of these is wrong; the message is one line. `Space.check` finds errors in their combination.
+    """
     return values.read_table(Space, given, where)
 
 
@@ -201,7 +242,7 @@ def _variable_paths(name: str, item: Any) -> tuple[str, ...]:
 
 
 def _flatten_rows(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The columns of rows in the place of their variable."""
+    """Return the values with `Rows` replaced by their columns."""
     flat = {}
     for name, drawn in values.items():
         flat |= drawn if isinstance(drawn, dict) else {name: drawn}

@@ -49,7 +49,7 @@ class AugmentedLagrangianSearch:
             StartError: The subject cannot run with its own parameters, and the method has no other start.
         """
         self.problem, self.method, self.progress, self.stopping = problem, method, progress, stopping
-        self.refused = problem.refused()
+        self.refused = problem.find_refusal()
         if self.refused and method.starts == 1:
             raise StartError(f"{Reason.START.value}: {self.refused}")
         own = problem.space.place(problem.subject)[None]
@@ -58,7 +58,7 @@ class AugmentedLagrangianSearch:
         # Copies of the own start give the same batch shape as the search, so that both share one compiled program.
         alike = np.repeat(own, len(self.starts), axis=0)
         self.before: ObjectiveEvaluation = jax.device_get(
-            slice_start(problem.evaluator(1.0)(alike, self._multipliers()).seen, 0)
+            slice_start(problem.evaluator(1.0)(alike, self._multipliers()).evaluation, 0)
         )
         if self.refused:  # the results of inadmissible runs are meaningless
             self.before = jax.tree.map(lambda x: np.full(np.shape(x), np.nan), self.before)._replace(diverged=0)
@@ -87,7 +87,7 @@ class AugmentedLagrangianSearch:
             problem.steady(),
             chosen,
             method.stopping,
-            self._told,
+            self._report,
             self.stopping,
         )
         descent_states = self._run_rounds(descent)
@@ -134,7 +134,7 @@ class AugmentedLagrangianSearch:
         met = point.violation <= 0
         return not met, point.objective if met else point.violation
 
-    def _told(self, descent_states: list[DescentState]) -> None:
+    def _report(self, descent_states: list[DescentState]) -> None:
         """Record the best feasible or least infeasible point so far and report the progress."""
         for before, descent_state in zip(self.earlier, descent_states, strict=True):
             better = self.best is None or self._rank(descent_state.history[-1]) < self._rank(self.best.history[-1])
@@ -179,13 +179,13 @@ class AugmentedLagrangianSearch:
             values=values,
             objective=(float(self.before.objective), last.objective),
             violation=(float(np.max(self.before.excess, initial=0.0)), last.violation),
-            metrics=(self.before.metrics, best.seen.metrics),
+            metrics=(self.before.metrics, best.evaluation.metrics),
             met=last.violation <= 0,
             reason=best.reason or Reason.LIMIT,
             history=best.history,
             starts=[start(descent_state) for descent_state in descent_states],
             mode=self.problem.mode,
-            diverged=(int(self.before.diverged), int(best.seen.diverged)),
+            diverged=(int(self.before.diverged), int(best.evaluation.diverged)),
             engine=describe_engine(self.problem.engine),
         )
 
@@ -199,7 +199,7 @@ def _violations(descent_states: list[DescentState]) -> np.ndarray:
 
 def _raise_multipliers(m: Multipliers, descent_states: list[DescentState]) -> Multipliers:
     """Return the updated multipliers, m <- max(0, m + c (g + d))."""
-    excess = np.stack([descent_state.seen.excess for descent_state in descent_states]) + m.margin[:, None]
+    excess = np.stack([descent_state.evaluation.excess for descent_state in descent_states]) + m.margin[:, None]
     # A NaN excess (a start rejected at its first evaluation) leaves the multiplier unchanged.
     return m._replace(values=np.maximum(0.0, m.values + m.penalty[:, None] * np.nan_to_num(excess)))
 

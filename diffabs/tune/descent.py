@@ -64,7 +64,7 @@ class FeasiblePoint(NamedTuple):
     """An accepted step that meets every constraint."""
 
     z: np.ndarray
-    seen: Any
+    evaluation: Any
     point: DescentPoint
 
 
@@ -75,7 +75,7 @@ class DescentState:
     z: np.ndarray
     loss: float
     gradient: np.ndarray
-    seen: Any
+    evaluation: Any
     update: np.ndarray
     t: float = 1.0
     low: float = 0.0  # greatest t known to be too short; `better` is the point there
@@ -92,11 +92,11 @@ class DescentState:
 
     def note(self) -> None:
         """Append the present point to the history, and keep it if it is the best feasible point so far."""
-        worst = float(np.max(self.seen.excess, initial=0.0))
+        worst = float(np.max(self.evaluation.excess, initial=0.0))
         self.history.append(
             DescentPoint(
                 self.iterations,
-                float(self.seen.objective),
+                float(self.evaluation.objective),
                 self.loss,
                 float(np.max(np.abs(self.gradient))),
                 worst,
@@ -104,7 +104,7 @@ class DescentState:
             )
         )
         if worst <= 0:
-            self.keep(FeasiblePoint(self.z, self.seen, self.history[-1]))
+            self.keep(FeasiblePoint(self.z, self.evaluation, self.history[-1]))
 
     def keep(self, other: FeasiblePoint | None) -> None:
         """Keep the feasible point `other` if its objective is less than the objective of the point kept so far."""
@@ -115,7 +115,7 @@ class DescentState:
         """Return to the feasible point that was kept, if the present point violates a constraint."""
         last = self.history[-1]
         if self.kept and not last.violation <= 0:
-            self.z, self.seen, self.reason = self.kept.z, self.kept.seen, Reason.KEPT
+            self.z, self.evaluation, self.reason = self.kept.z, self.kept.evaluation, Reason.KEPT
             point = self.kept.point._replace(iteration=last.iteration, evaluations=last.evaluations)
             self.history.append(point)
 
@@ -187,7 +187,7 @@ class Descent:
         self.multipliers = multipliers
         first, fine = self._evaluate_at(starts)
         descent_states = [
-            DescentState(z, float(first.loss[i]), first.gradient[i], slice_start(first.seen, i), np.zeros_like(z))
+            DescentState(z, float(first.loss[i]), first.gradient[i], slice_start(first.evaluation, i), np.zeros_like(z))
             for i, z in enumerate(starts)
         ]
         for descent_state, ok in zip(descent_states, fine, strict=True):
@@ -211,7 +211,7 @@ class Descent:
         moved = []
         for i, descent_state in enumerate(descent_states):
             taken = (
-                self._judged(descent_state, fine[i], trials[i], slice_start(found, i))
+                self._judge(descent_state, fine[i], trials[i], slice_start(found, i))
                 if descent_state.reason is None
                 else None
             )
@@ -223,10 +223,10 @@ class Descent:
     def _evaluate_at(self, z: np.ndarray) -> tuple[LossEvaluation, np.ndarray]:
         """Return the evaluation at z and a mask (starts,) of the finite, admissible points."""
         found = jax.device_get(self.evaluate(jnp.asarray(z), self.multipliers))
-        fine = np.isfinite(found.loss) & np.isfinite(found.gradient).all(axis=1) & (found.seen.diverged == 0)
+        fine = np.isfinite(found.loss) & np.isfinite(found.gradient).all(axis=1) & (found.evaluation.diverged == 0)
         return found, fine & self.steady(z)
 
-    def _judged(
+    def _judge(
         self, descent_state: DescentState, fine: bool, z: np.ndarray, found: LossEvaluation
     ) -> tuple[np.ndarray, LossEvaluation] | None:
         """Return the accepted point and its evaluation; otherwise None, with the next trial step set in the state."""
@@ -258,11 +258,11 @@ class Descent:
         descent_state.idle = (
             descent_state.idle + 1 if gained <= self.stopping.change * max(abs(descent_state.loss), 1e-12) else 0
         )
-        descent_state.z, descent_state.loss, descent_state.gradient, descent_state.seen = (
+        descent_state.z, descent_state.loss, descent_state.gradient, descent_state.evaluation = (
             z,
             float(found.loss),
             found.gradient,
-            found.seen,
+            found.evaluation,
         )
         descent_state.t, descent_state.low, descent_state.high, descent_state.better, descent_state.trials = (
             1.0,

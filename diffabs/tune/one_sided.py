@@ -69,7 +69,7 @@ def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, 
         where: First words of the warning.
     """
 
-    def compared(values: Mapping[str, Any]) -> Any:
+    def compare(values: Mapping[str, Any]) -> Any:
         """Return both numbers of each pair in each run, shape (2, runs, pairs)."""
         loop = as_arrays(build_subject_loop(replace(subject, values)))
         both = batch.each(loop, lambda loop, _: [jnp.stack(two) for _, *two in one_sided_candidates(loop, solver)])
@@ -79,12 +79,12 @@ def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, 
     if not names:
         return
     values = {path: jnp.asarray(value, float) for path, value in values.items()}
-    x, y = np.asarray(compared(values))
+    x, y = np.asarray(compare(values))
     small = EQUAL_ROUNDING_STEPS * np.finfo(x.dtype).eps
     equal = np.isfinite(x) & np.isclose(x, y, rtol=small, atol=0.0)
     if not equal.any():
         return
-    slopes = jax.jacfwd(lambda values: jnp.subtract(*compared(values)))(values)
+    slopes = jax.jacfwd(lambda values: jnp.subtract(*compare(values)))(values)
     moves = {path: abs(np.asarray(slope)) > small for path, slope in slopes.items()}  # above rounding
     for i, name in enumerate(names):
         moving = [path for path, ones in moves.items() if ones[:, i][equal[:, i]].any()]

@@ -58,7 +58,7 @@ class LossEvaluation(NamedTuple):
 
     loss: Any
     gradient: Any
-    seen: ObjectiveEvaluation
+    evaluation: ObjectiveEvaluation
 
 
 class Multipliers(NamedTuple):
@@ -75,7 +75,7 @@ def build_subject_loop(subject: Any) -> Loop:
     Args:
         subject: Loop, or a part with a method `closed()`.
     """
-    return subject if isinstance(subject, Loop) else subject.closed()
+    return subject if isinstance(subject, Loop) else subject.closed_loop()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class Problem:
             return str(EngineError.of(error))
         return None
 
-    def seen(self, z: Any) -> ObjectiveEvaluation:
+    def evaluate(self, z: Any) -> ObjectiveEvaluation:
         """Return objective, excesses, number of diverged runs and metrics at `z`."""
         runs = self.runs(z)
         each = sum(weight * runs.metrics[name] for name, weight in self.weights.items())
@@ -179,7 +179,7 @@ class Problem:
         """Return the function (z, multipliers) -> (L, (L, evaluation)) for an objective divided by `scale`."""
 
         def loss(z: Any, m: Multipliers) -> tuple[Any, tuple[Any, ObjectiveEvaluation]]:
-            seen = self.seen(z)
+            seen = self.evaluate(z)
             value = seen.objective / scale + _penalty(seen.excess, m)
             return value, (value, seen)
 
@@ -206,9 +206,9 @@ class Problem:
 
     def objective_evaluator(self) -> Callable[[Any], ObjectiveEvaluation]:
         """Return the compiled function z (starts, p) -> ObjectiveEvaluation, without a gradient."""
-        return jax.jit(jax.vmap(self.seen))
+        return jax.jit(jax.vmap(self.evaluate))
 
-    def refused(self) -> str | None:
+    def find_refusal(self) -> str | None:
         """Return a one-line reason why the first inadmissible run of the subject cannot start, or None."""
         return first_refusal(build_subject_loop(self.subject), self.batch.values, self.solver)
 
@@ -227,12 +227,12 @@ class Problem:
 
         compiled = jax.jit(jax.vmap(loops))
 
-        def accepted(z: np.ndarray) -> np.ndarray:
+        def accept(z: np.ndarray) -> np.ndarray:
             # Starts and runs share one axis, so that one call checks all of them.
             flat = jax.tree.map(lambda x: np.reshape(x, (-1, *x.shape[2:])), jax.device_get(compiled(jnp.asarray(z))))
             return batch_admissibility(None, flat, self.solver).accepted.reshape(len(z), -1).min(axis=1)
 
-        return accepted
+        return accept
 
 
 def choose_gradient_mode(space: FreeSpace) -> DerivativeMode:

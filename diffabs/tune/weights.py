@@ -55,7 +55,7 @@ class LQWeights:
         root = root + jnp.diag(diagonal)
         return root @ root.T, jnp.exp(jnp.asarray(self.log_effort))[None, None]
 
-    def closed(self) -> Loop:
+    def closed_loop(self) -> Loop:
         """Return the loop with the gain designed from these weights."""
         return replace(self.loop, {self.path: self.design(*self.weights())[0]})
 

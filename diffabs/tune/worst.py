@@ -222,7 +222,7 @@ def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[Desce
         [problem.space.place(replace(problem.subject, _values_by_path(problem.space, point))) for point in points]
     )
     none = Multipliers(np.zeros((len(z), 0)), np.ones(len(z)))
-    first = jax.device_get(problem.evaluator(1.0)(jnp.asarray(z), none)).seen
+    first = jax.device_get(problem.evaluator(1.0)(jnp.asarray(z), none)).evaluation
     scale = max(abs(float(first.objective[0])), 1e-12)
     loss = problem.loss(scale)
     descent = Descent(
@@ -255,9 +255,9 @@ def _build_worst_case(
         {n: x[i] for n, x in screened.metrics.items()},
     )
     for lane in lanes:
-        if lane.reason is not Reason.START and -float(lane.seen.objective) > value:
-            place, value = free.values(jnp.asarray(lane.z)), -float(lane.seen.objective)
-            metrics = {name: x[0] for name, x in lane.seen.metrics.items()}
+        if lane.reason is not Reason.START and -float(lane.evaluation.objective) > value:
+            place, value = free.values(jnp.asarray(lane.z)), -float(lane.evaluation.objective)
+            metrics = {name: x[0] for name, x in lane.evaluation.metrics.items()}
     bad = np.flatnonzero(screened.diverged | np.isnan(screened.metrics[metric]))
     place = {path: np.asarray(x) for path, x in place.items()}
     return WorstCase(

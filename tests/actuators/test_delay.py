@@ -171,8 +171,8 @@ def test_the_moment_of_a_jump_is_differentiable(first, late, derivative):
 
 @killed_by(
     "actuators/delay.py",
-    "jnp.where(newest, 1.0, -1.0) * _rounding(until + self.time)",
-    "_rounding(until + self.time)",
+    "jnp.where(newest, 1.0, -1.0) * _time_tolerance(until + self.time)",
+    "_time_tolerance(until + self.time)",
     case="0.002",
 )
 @pytest.mark.slow

@@ -61,12 +61,12 @@ def test_what_is_left_does_not_count_compiling(clock):
     """30 s, of which 20 were compiling, for a tenth of the work: the rest takes 90 s, not 270."""
     now, watch = clock
     pace = WorkTiming()
-    assert pace.said(WorkProgress("compiling", 0, 100)) == ""
+    assert pace.describe(WorkProgress("compiling", 0, 100)) == ""
     now[0] = 130.0
     watch.add(105.0, 125.0)
-    assert pace.said(WorkProgress("ten", 10, 100)) == "; 30 s, 20 s of it compiling, 1 min 30 s left"
-    assert pace.said(WorkProgress("", 10, 100, at_most=True)).endswith(", at most 1 min 30 s left")
-    assert pace.said(WorkProgress("")) == " 30 s, 20 s of it compiling"
+    assert pace.describe(WorkProgress("ten", 10, 100)) == "; 30 s, 20 s of it compiling, 1 min 30 s left"
+    assert pace.describe(WorkProgress("", 10, 100, at_most=True)).endswith(", at most 1 min 30 s left")
+    assert pace.describe(WorkProgress("")) == " 30 s, 20 s of it compiling"
 
 
 @killed_by("cli/progress.py", "self.first = self.first or (now, far.done)", "self.first = self.first or (now, 0.0)")
@@ -74,11 +74,11 @@ def test_what_was_there_before_is_no_pace(clock):
     """A sweep that goes on: 50 of 100 were there; 10 more took 10 s."""
     now, _ = clock
     pace = WorkTiming()
-    pace.said(WorkProgress("", 50, 100))
+    pace.describe(WorkProgress("", 50, 100))
     now[0] = 101.5
-    assert pace.said(WorkProgress("fifty", 50, 100)) == "; 2 s"
+    assert pace.describe(WorkProgress("fifty", 50, 100)) == "; 2 s"
     now[0] = 110.0
-    assert pace.said(WorkProgress("sixty", 60, 100)) == "; 10 s, 40 s left"
+    assert pace.describe(WorkProgress("sixty", 60, 100)) == "; 10 s, 40 s left"
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_documents_say_how_long_they_took():
     console.note_command(["list", "roads"])
     with stopwatch.count_as_compiling():
         time.sleep(0.2)
-    made = console.describe_making()
+    made = console.describe_run()
     assert made["command"] == "diffabs list roads"
     assert 0.1 <= made["of it compiling"] <= made["seconds"] <= 300.0
 

@@ -229,7 +229,7 @@ def test_a_press_interrupts_where_work_is_waited_for(signals):
 
 def test_work_that_can_end_early_is_asked_first(signals, capsys):
     interrupt.begin_hearing()
-    ending = console.EarlyEnd("this")
+    ending = console.InterruptibleEnd("this")
 
     def work():
         interrupt._press()
@@ -250,7 +250,7 @@ def test_nothing_to_show_is_not_waited_for(signals):
     interrupt._press()
     with pytest.raises(KeyboardInterrupt):
         console.run_with_progress(
-            lambda: time.sleep(5), "working", ending=console.EarlyEnd("this", nothing=lambda: True)
+            lambda: time.sleep(5), "working", ending=console.InterruptibleEnd("this", nothing=lambda: True)
         )
 
 

@@ -107,7 +107,7 @@ def test_a_regime_goes_on_beyond_its_kinks(name, at, beyond, value, slope):
     np.testing.assert_allclose([found, move], [value, slope], rtol=1e-15)
 
 
-@killed_by("core/modes.py", "against = margin < -_rounding(x)", "against = margin < -jnp.inf", case="gt")
+@killed_by("core/modes.py", "against = margin < -_rounding_error(x)", "against = margin < -jnp.inf", case="gt")
 @pytest.mark.parametrize("name", [name for name, (_, count) in KINKED.items() if count])
 def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
     f, _ = KINKED[name]
@@ -232,7 +232,7 @@ def clockwork(rate: Any, place: Any) -> Loop:
 
 @killed_by(
     "core/modes.py",
-    "next = below + jnp.where(high < -_rounding(x), 1, 0) - jnp.where(low < -_rounding(x), 1, 0)",
+    "next = below + jnp.where(high < -_rounding_error(x), 1, 0) - jnp.where(low < -_rounding_error(x), 1, 0)",
     "next = below",
     case="a table",
 )

@@ -13,7 +13,7 @@ from project import ROOT
 
 from diffabs.core import files, provenance, values
 from diffabs.core.exports import lazy_getattr
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.values import (
     ScenarioError,
     as_plain,
@@ -32,7 +32,7 @@ from diffabs.sweep.sampling import Sobol
 
 @dataclasses.dataclass(frozen=True)
 class Cup:
-    volume: float = table_field(range_reader(Spec("l", low=0.0, open_low=True)))
+    volume: float = table_field(range_reader(ParameterSpec("l", low=0.0, open_low=True)))
     handles: int = table_field(whole_reader(0, 2), 1)
     glaze: str = table_field(choice_reader("matt", "shiny"), "matt")
     marks: Any = table_field(table_reader(values.read_text, "texts"), dict)
@@ -85,7 +85,7 @@ def test_a_type_that_is_not_there():
 
 def test_nan_is_in_no_range():
     with pytest.raises(ScenarioError, match=r"x = nan is outside \[0, 1\]"):
-        read_number_in_range(float("nan"), Spec("1", 0.0, 1.0), "x")
+        read_number_in_range(float("nan"), ParameterSpec("1", 0.0, 1.0), "x")
 
 
 @killed_by(
@@ -184,4 +184,4 @@ def test_a_working_copy_knows_its_commit():
         pytest.skip("not a working copy")
     command = ["git", "-C", str(root), "rev-parse", "--short=12", "HEAD"]
     head = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    assert provenance.commit()["commit"].removesuffix("-dirty") == head
+    assert provenance.source_commit()["commit"].removesuffix("-dirty") == head

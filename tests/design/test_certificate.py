@@ -37,7 +37,7 @@ def both(system, gain, kind, **data):
     """The verdict of both verifiers, which must agree."""
     one = Certificate(system, gain, (Claim(kind, data),))
     stored = json.loads(json.dumps(plain(one)), parse_int=float)
-    verdict = checker.proved(stored["system"], stored["gain"], kind, stored["claims"][0]["data"])
+    verdict = checker.proved_data(stored["system"], stored["gain"], kind, stored["claims"][0]["data"])
     assert one.verified_exactly == verdict, (kind, data)
     return verdict
 
@@ -225,7 +225,7 @@ def test_no_common_function_is_proved_too():
     scale = np.diag([1.0, 5.0])  # x2 is larger than x1
     W = [cp.Variable((2, 2), PSD=True) for _ in range(4)]
     t = cp.Variable()
-    loops = [np.linalg.inv(scale) @ C @ scale for C in rig().closed(gain)]
+    loops = [np.linalg.inv(scale) @ C @ scale for C in rig().closed_loop(gain)]
     S = sum(C @ w + w @ C.T for C, w in zip(loops, W, strict=True))
     cp.Problem(cp.Maximize(t), [S >> t * np.eye(2), sum(cp.trace(w) for w in W) == 1]).solve(solver="CLARABEL")
     witness = [scale @ (w.value + w.value.T + 1e-7 * np.eye(2)) @ scale for w in W]
@@ -777,7 +777,7 @@ def test_what_a_certificate_says():
     assert worst is not None
     assert worst["corner"] == {"a": A_HIGH, "w": W_HIGH}
     assert worst["margin"] == certificate.margins["decay"] < 0
-    assert certificate.frozen == tuple(np.linalg.eigvals(rig().closed([-20.0, -8.0])).real.max(axis=1))
+    assert certificate.frozen == tuple(np.linalg.eigvals(rig().closed_loop([-20.0, -8.0])).real.max(axis=1))
     assert str(certificate).count("NOT PROVED") == 1
     assert Certificate(rig(), [-20.0, -8.0], (wrong,)).quadratically_stable is None
     assert not Certificate(rig(), [-20.0, -8.0], ()).verified_exactly

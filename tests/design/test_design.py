@@ -132,7 +132,7 @@ def unfailing(count, seed):
         bound = max(single(q1, q2, r, alpha, speed)[1] for alpha in ALPHAS for speed in (FAST, SLOW))
         assert bound * (1 - 1e-6) <= found.trace_cost
         assert proof.guaranteed_cost <= found.trace_cost * (1 + 1e-5)
-        assert np.linalg.eigvals(RIG.closed(found.gain)).real.max() < 0
+        assert np.linalg.eigvals(RIG.closed_loop(found.gain)).real.max() < 0
     return reported
 
 
@@ -162,9 +162,9 @@ def test_published_gain_has_no_common_lyapunov_matrix():
     assert proof.quadratically_stable is False
     assert proof.verified_exactly
     np.testing.assert_allclose(
-        sorted(np.linalg.eigvals(RIG.closed(proof.gain)[0]).imag), [-103.3147, 103.3147], rtol=1e-6
+        sorted(np.linalg.eigvals(RIG.closed_loop(proof.gain)[0]).imag), [-103.3147, 103.3147], rtol=1e-6
     )
-    assert np.linalg.eigvals(RIG.closed(proof.gain)).real.max() < 0
+    assert np.linalg.eigvals(RIG.closed_loop(proof.gain)).real.max() < 0
 
 
 @killed_by(
@@ -249,7 +249,7 @@ def test_what_two_vertices_refute_needs_no_solver(monkeypatch, lie):
 
 def test_fastest_decay_of_one_system_is_that_of_its_poles():
     gain = (-1000.0, -30.0)
-    slowest = -np.linalg.eigvals(ONE.closed(gain)).real.max()
+    slowest = -np.linalg.eigvals(ONE.closed_loop(gain)).real.max()
     proof = certify(gain, ONE, fastest=True)
     assert slowest * (1 - 2e-3) < proof.decay_rate <= slowest
     assert certify(gain, ONE, Spec(decay=0.99 * slowest)).decay_rate >= 0.99 * slowest
@@ -258,7 +258,7 @@ def test_fastest_decay_of_one_system_is_that_of_its_poles():
 
 def test_cost_of_one_system_is_that_of_its_lyapunov_equation():
     gain, q, r = np.array([[-1000.0, -30.0]]), np.diag([3.0, 2.0]), 0.5
-    closed = ONE.closed(gain)[0]
+    closed = ONE.closed_loop(gain)[0]
     exact = np.trace(solve_continuous_lyapunov(closed.T, -(q + r * gain.T @ gain)))
     found = certify(gain, ONE, Spec(Q=q, R=r)).guaranteed_cost
     assert exact < found < exact * (1 + 1e-6)
@@ -273,14 +273,14 @@ def frequency_response(closed, b, c, d, gain, count=20001):
 @killed_by("design/bounds.py", "z = l2.output + l2.feedthrough @ self.k", "z = l2.output")
 def test_l2_gain_of_one_system_is_its_frequency_peak():
     gain, c, d = np.array([[-1000.0, -30.0]]), np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [0.003]])
-    peak = frequency_response(ONE.closed(gain)[0], ONE.B[0], c, d, gain)
+    peak = frequency_response(ONE.closed_loop(gain)[0], ONE.B[0], c, d, gain)
     found = certify(gain, ONE, Spec(l2=L2Gain(output=c, feedthrough=d))).l2_gain
     assert peak * (1 - 1e-6) < found < peak * (1 + 1e-4)
 
 
 def test_damping_of_one_system_is_that_of_its_poles():
     gain = (-1000.0, -30.0)
-    pole = np.linalg.eigvals(ONE.closed(gain)[0])[0]
+    pole = np.linalg.eigvals(ONE.closed_loop(gain)[0])[0]
     zeta = -pole.real / abs(pole)
     assert 0.3 < zeta < 0.9
     assert certify(gain, ONE, Spec(damping=zeta * 0.999)).damping == zeta * 0.999
@@ -290,7 +290,7 @@ def test_damping_of_one_system_is_that_of_its_poles():
 def switched(system, gain, count=40, seed=0, steps=400, h=5e-4):
     """States (count, steps + 1, n) from START where the vertex changes at random, exact within each step."""
     random = np.random.default_rng(seed)
-    maps = np.array([expm(h * closed) for closed in system.closed(gain)])
+    maps = np.array([expm(h * closed) for closed in system.closed_loop(gain)])
     x = np.repeat(START[None], count, 0)
     states = [x]
     for _ in range(steps):
@@ -328,16 +328,16 @@ def test_guarantees_hold_while_the_system_switches():
 )
 def test_pole_regions():
     found = design(RIG, Spec(Q=(K1**2, 1.0), R=1.0, decay=90.0, damping=0.95))
-    poles = np.linalg.eigvals(RIG.closed(found.gain))
+    poles = np.linalg.eigvals(RIG.closed_loop(found.gain))
     assert poles.real.max() <= -90.0
     assert (-poles.real / np.abs(poles)).min() >= 0.95
     assert found.certificate.decay_rate >= 90.0
     assert found.certificate.damping == 0.95
     free = design(RIG, Spec(Q=(K1**2, 1.0), R=1.0))
-    poles = np.linalg.eigvals(RIG.closed(free.gain))
+    poles = np.linalg.eigvals(RIG.closed_loop(free.gain))
     assert poles.real.max() > -90.0 or (-poles.real / np.abs(poles)).min() < 0.95
     damped = design(RIG, Spec(Q=(K1**2, 1.0), R=1.0, damping=0.95))
-    poles = np.linalg.eigvals(RIG.closed(damped.gain))
+    poles = np.linalg.eigvals(RIG.closed_loop(damped.gain))
     assert (-poles.real / np.abs(poles)).min() >= 0.95
     assert found.trace_cost > free.trace_cost
 
@@ -345,7 +345,7 @@ def test_pole_regions():
 def test_l2_bound_and_smallest_l2_gain():
     bounded = design(RIG, Spec(Q=(1e6, 1e4), R=1.0, l2=L2Gain(output=[[0.0, 1.0]], bound=0.005)))
     assert bounded.certificate.l2_gain <= 0.005
-    for closed, b in zip(RIG.closed(bounded.gain), RIG.B, strict=True):
+    for closed, b in zip(RIG.closed_loop(bounded.gain), RIG.B, strict=True):
         peak = frequency_response(closed, b, np.array([[0.0, 1.0]]), np.zeros((1, 1)), bounded.gain)
         assert peak <= bounded.certificate.l2_gain
     c, d, e = [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], [[0.0], [0.0], [0.01]], [[0.0], [1.0]]
@@ -387,7 +387,7 @@ def test_discrete_design_and_proofs():
     proof = found.certificate
     assert proof.verified_exactly
     assert proof.decay_rate >= 8.0
-    assert np.abs(np.linalg.eigvals(system.closed(found.gain))).max() <= np.exp(-8.0 * PERIOD)
+    assert np.abs(np.linalg.eigvals(system.closed_loop(found.gain))).max() <= np.exp(-8.0 * PERIOD)
     too_fast = certify((-1e6, -3000.0), system)  # stable in continuous time, not at 1 kHz
     assert certify((-1e6, -3000.0), RIG).quadratically_stable
     assert too_fast.quadratically_stable is False
@@ -399,7 +399,7 @@ def test_discrete_design_and_proofs():
 )
 def test_discrete_analysis_of_one_system():
     system, gain = sampled(ONE), np.array([[-1000.0, -30.0]])
-    closed = system.closed(gain)[0]
+    closed = system.closed_loop(gain)[0]
     slowest = -np.log(np.abs(np.linalg.eigvals(closed)).max()) / PERIOD
     fastest = certify(gain, system, fastest=True).decay_rate
     assert slowest * (1 - 2e-3) < fastest <= slowest
@@ -444,7 +444,7 @@ def test_published_gain_is_proved_for_a_speed_that_cannot_jump():
     before = x @ form(proof, speed) @ x
     while speed - 7.8 * h > 5 / 3.6:
         alpha = ALPHAS[int(speed * 100) % 2]
-        closed = rig((speed / 0.099,), (alpha,)).closed((-11753.0, -48.0))[0]
+        closed = rig((speed / 0.099,), (alpha,)).closed_loop((-11753.0, -48.0))[0]
         x, speed = expm(h * closed) @ x, speed - 7.8 * h
         after = x @ form(proof, speed) @ x
         assert after <= before * np.exp(-2 * 5.0 * h) * (1 + 1e-3)

@@ -128,7 +128,7 @@ def test_cost_obeys_the_envelope_theorem():
     """d trace Z/dQ = sum over the vertices of X W X, with W the multipliers of eq. (30) where Q is, at the solver's
     optimum: the derivative needs no derivative of X or F."""
     for q1, q2, r in PUBLISHED.values():
-        spec = Spec(Q=(q1, q2), R=r).checked(2, 1)
+        spec = Spec(Q=(q1, q2), R=r).check(2, 1)
         frame = next(design_frames(RIG, spec.Q, spec.R))[0]
         program = DesignProgram(RIG, RIG, spec, frame)
         blocks = program.blocks(1.0)

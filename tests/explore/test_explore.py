@@ -485,10 +485,10 @@ def test_only_the_own_page_on_this_machine_is_answered(allowed, host, origin, cl
     given = {b"host": host, b"origin": origin}
     headers = [(name, value.encode()) for name, value in given.items() if value is not None]
     scope = {"type": "http", "headers": headers, "client": (client, 5) if client else None}
-    assert Guard(None, 8342, TOKEN).allowed(scope) == allowed
+    assert Guard(None, 8342, TOKEN).is_allowed(scope) == allowed
 
 
-@killed_by("explore/guard.py", "(self.allowed(scope) and self.known(scope))", "self.allowed(scope)")
+@killed_by("explore/guard.py", "(self.is_allowed(scope) and self.is_known(scope))", "self.allowed(scope)")
 @killed_by(
     "explore/guard.py",
     "len(given) == 1 and secrets.compare_digest(given[0].encode(), self.token.encode())",

@@ -136,7 +136,7 @@ class TestFit:
             return part.a * part.k * jnp.exp(-x) + part.c - y
 
         found = fit(Decay(a=2.0), ["a", "k", "c"], product, data=DATA, sigma=SIGMA)
-        (open_,) = found.uncertainty.undetermined()
+        (open_,) = found.uncertainty.undetermined_directions()
         assert np.isinf(open_.spread)
         a, k = abs(float(found.values["a"])), float(found.values["k"])
         expected = np.array([1.0, -1.0, 0.0]) / np.array([max(a, 2.0) / a, 1.0, 1.0])  # sizes: |a| or its scale; k
@@ -144,7 +144,7 @@ class TestFit:
         components = np.array(list(open_.components.values()))
         np.testing.assert_allclose(np.abs(components @ expected), 1.0, rtol=0, atol=1e-6)
         assert components[0] * components[1] < 0
-        assert "a" in open_.shown()
+        assert "a" in open_.describe()
         assert k > 0
         assert found.uncertainty.correlation[0, 1] == pytest.approx(-1.0, abs=1e-6)
         assert found.uncertainty.singular[-1] < 1e-9 * found.uncertainty.singular[0]
@@ -304,7 +304,7 @@ class TestTraces:
         data = noisy(LOOP, ("wheel_speed",), {"wheel_speed": 0.05}, seed=2)
         free = ["plant.road.scale", "plant.road.road.D", "plant.inertia"]
         found = identify(LOOP, data, free, solver=SOLVER, tolerances=Tolerances(cost=1e-6))
-        (open_,) = found.uncertainty.undetermined()
+        (open_,) = found.uncertainty.undetermined_directions()
         scale, peak, inertia = open_.components.values()
         assert open_.spread > 1e3
         assert scale * peak < 0

@@ -352,6 +352,6 @@ def test_without_a_solver_the_design_is_left_out(monkeypatch):
         raise ModuleNotFoundError('robust design needs cvxpy: pip install ".[design]" in a clone', name="cvxpy")
 
     replace_seam(monkeypatch, "designed", missing)
-    rows, figures, more = slip_lmi._designed({}, None)
+    rows, figures, more = slip_lmi._design_section({}, None)
     assert (rows, figures, more["design"]) == ([], {}, None)
     assert 'pip install ".[design]" in a clone' in more["notes"][0]

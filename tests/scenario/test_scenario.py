@@ -458,7 +458,7 @@ def test_lanes_are_every_combination_with_one_noise():
 
 @pytest.mark.parametrize("kind", risk.AGGREGATE_TYPES)
 def test_aggregates_are_those_of_the_library(kind):
-    part = load("slip-lmi", [f"tune.aggregate={kind}"]).tune.aggregated()
+    part = load("slip-lmi", [f"tune.aggregate={kind}"]).tune.read_aggregate()
     assert type(part) is risk.AGGREGATE_TYPES[kind]
     assert vars(part) == vars(risk.AGGREGATE_TYPES[kind]())
 

@@ -217,7 +217,7 @@ def test_what_was_missed_or_refused_is_told_apart(swept, monkeypatch):
     columns = {"stopped": stopped, "refused": refused, "diverged": refused != "", "iae": np.zeros(20)}
     monkeypatch.setattr(swept, "column", columns.__getitem__)
     monkeypatch.setitem(swept.manifest["study"], "failures", {"iae": 0.02})
-    assert np.flatnonzero(swept.failed()).tolist() == [3]
+    assert np.flatnonzero(swept.failed_samples()).tolist() == [3]
     assert np.flatnonzero(swept.failures()["not stopped"]).tolist() == [3]
 
 

@@ -325,7 +325,7 @@ class TestWhoeverRuns:
             "initial.speed is not above stop.speed: the run would end before it starts"
         }
         np.testing.assert_array_equal(swept.column("diverged"), below)  # lest somebody's mean over the table take them
-        assert swept.diverged().num_rows == 0
+        assert swept.diverged_rows().num_rows == 0
         assert not swept.column("stopped")[below].any()
         found = summarise_sweep(Results(swept.folder))
         for name in swept.metrics:

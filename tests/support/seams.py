@@ -7,7 +7,7 @@ import pytest
 SEAMS = {
     "build_proof_task": "diffabs.cli.certificates.build_proof_task",
     "compiled_room": "diffabs.cli.compiled.ROOM",
-    "patience": "diffabs.cli.console.PATIENCE",
+    "patience": "diffabs.cli.console.SILENCE_S",
     "second_interrupt_s": "diffabs.cli.console.SECOND_INTERRUPT_S",
     "terminal_width": "diffabs.cli.console._terminal_width",
     "is_animated": "diffabs.cli.console.is_animated",
@@ -15,7 +15,7 @@ SEAMS = {
     "run_with_progress": "diffabs.cli.console.run_with_progress",
     "max_csv_rows": "diffabs.cli.main.MAX_CSV_ROWS",
     "main_run": "diffabs.cli.main._run",
-    "progress_quiet": "diffabs.cli.progress.QUIET",
+    "progress_quiet": "diffabs.cli.progress.MIN_SHOWN_S",
     "write_report_file": "diffabs.cli.report.write_report_file",
     "tune_draw": "diffabs.cli.tune._draw",
     "certify_result": "diffabs.cli.tune.certify_result",

@@ -15,7 +15,7 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 from seams import replace_seam
 
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.values import as_plain
 from diffabs.scenario.toml import write_toml
 from diffabs.sweep import distributions, sampling
@@ -32,7 +32,7 @@ from diffabs.sweep.distributions import (
 from diffabs.sweep.sampling import Corners, Grid, LatinHypercube, Random, Saltelli, Sobol
 from diffabs.sweep.variables import Correlation, Rows, Space
 
-MASS = Spec("kg", 0, open_low=True)
+MASS = ParameterSpec("kg", 0, open_low=True)
 HINT = "; truncate it with low and high"
 SAMPLE = (3.0, -1.0, 2.0, 2.0, 7.5)
 CONTINUOUS = {
@@ -689,17 +689,21 @@ def test_a_covariance_unlike_the_deviations_is_refused():
     ("ours", "spec", "line"),
     [
         (Normal(5.75, 0.3), MASS, f"normal(5.75, 0.3) reaches (-inf, inf), outside (0, inf) kg{HINT}"),
-        (Normal(5.75, 0.3), Spec("kg"), None),
-        (Normal(5.75, 0.3, low=0), Spec("kg", 0), None),
+        (Normal(5.75, 0.3), ParameterSpec("kg"), None),
+        (Normal(5.75, 0.3, low=0), ParameterSpec("kg", 0), None),
         (Normal(5.75, 0.3, low=0), MASS, f"normal(5.75, 0.3, low = 0) reaches [0, inf), outside (0, inf) kg{HINT}"),
         (LogNormal(1, 0.3), MASS, None),
-        (LogNormal(1, 0.3), Spec("1", 0, 9), f"log-normal(1, 0.3) reaches (0, inf), outside [0, 9]{HINT}"),
-        (Uniform(0, 5), Spec("s", 0, 5), None),
-        (Uniform(0, 5), Spec("s", 0, 5, open_high=True), "uniform(0, 5) reaches [0, 5], outside [0, 5) s"),
-        (Uniform(0, 5), Spec("s", 1, 6), "uniform(0, 5) reaches [0, 5], outside [1, 6] s"),
-        (Categorical((1.0, 7.0)), Spec("1", 0, 6), "categorical([1.0, 7.0]) reaches [1, 7], outside [0, 6]"),
-        (Categorical(("a", "b")), Spec("1"), "categorical(['a', 'b']) is text; a number in (-inf, inf) is needed"),
-        (Empirical(SAMPLE), Spec("1", -1, 7.5), None),
+        (LogNormal(1, 0.3), ParameterSpec("1", 0, 9), f"log-normal(1, 0.3) reaches (0, inf), outside [0, 9]{HINT}"),
+        (Uniform(0, 5), ParameterSpec("s", 0, 5), None),
+        (Uniform(0, 5), ParameterSpec("s", 0, 5, open_high=True), "uniform(0, 5) reaches [0, 5], outside [0, 5) s"),
+        (Uniform(0, 5), ParameterSpec("s", 1, 6), "uniform(0, 5) reaches [0, 5], outside [1, 6] s"),
+        (Categorical((1.0, 7.0)), ParameterSpec("1", 0, 6), "categorical([1.0, 7.0]) reaches [1, 7], outside [0, 6]"),
+        (
+            Categorical(("a", "b")),
+            ParameterSpec("1"),
+            "categorical(['a', 'b']) is text; a number in (-inf, inf) is needed",
+        ),
+        (Empirical(SAMPLE), ParameterSpec("1", -1, 7.5), None),
     ],
     ids=range(12),
 )
@@ -712,5 +716,5 @@ def test_what_leaves_the_range_of_a_parameter_is_said(ours, spec, line):
 
 def test_rows_that_leave_the_range_of_a_parameter_are_said():
     ours = Space({"r": Rows({"m": [1.0, 7.0], "n": [5.0, 5.0]})})
-    found = list(ours.describe_out_of_range({"m": Spec("kg", 0, 6), "n": Spec("kg", 0, 6)}, "over."))
+    found = list(ours.describe_out_of_range({"m": ParameterSpec("kg", 0, 6), "n": ParameterSpec("kg", 0, 6)}, "over."))
     assert found == ["over.r: column m = 1 ... 7 leaves [0, 6] kg"]

@@ -144,7 +144,7 @@ def test_diverged_runs_are_counted_and_keep_their_row(study, swept):
     bad = swept.column("controller.gain.1") > 0
     assert 5 < bad.sum() < 40
     assert np.array_equal(swept.column("diverged"), bad)
-    rows = swept.diverged()
+    rows = swept.diverged_rows()
     assert rows.column("sample").to_numpy().tolist() == np.flatnonzero(bad).tolist()
     assert np.array_equal(rows.column("plant.mass").to_numpy(), study.draw(0, 150)["plant.mass"][bad])
     assert np.isnan(rows.column("iae").to_numpy()).all()

@@ -162,7 +162,7 @@ def test_killed_at_each_step_of_writing(tmp_path):
     for last in range(1, 8):
         store = Store(tmp_path / str(last))
         renamed = [k for k in (2, 5, 8) if k < last]
-        with store.locked():
+        with store.lock():
             assert (store.folder / "manifest.json").exists() == (len(renamed) > 0)
             store.begin(table, resume=True)
             there, damaged = store.scan(seals)

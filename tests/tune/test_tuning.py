@@ -67,9 +67,9 @@ def test_gradients_of_both_modes_agree_with_differences():
     forward, reverse = (value_and_gradient(build_problem(RIG, free=GAINS, mode=mode, **ask)) for mode in DerivativeMode)
     z = build_problem(RIG, free=GAINS, **ask).space.place(RIG)
     found = forward(z)
-    assert (found.seen.excess > 0).all()
+    assert (found.evaluation.excess > 0).all()
     np.testing.assert_allclose(found.gradient, reverse(z).gradient, rtol=1e-8)
-    np.testing.assert_allclose(found.seen.metrics["overshoot"] / 0.01 - 1, found.seen.excess, rtol=1e-9)
+    np.testing.assert_allclose(found.evaluation.metrics["overshoot"] / 0.01 - 1, found.evaluation.excess, rtol=1e-9)
     h = 1e-5
     for i in range(2):
         e = h * np.eye(2)[i]
@@ -145,11 +145,11 @@ def test_lanes_in_groups_are_the_lanes_together():
     values = {"initial.speed": speeds}
     ask = {"free": GAINS, "objective": {"stop_distance": 1.0}, "solver": d.FixedStep(5e-4, 0.8)}
     together, apart = (
-        jax.jit(build_problem(RIG, over=d.Batch(values, durations=t), **ask).seen)(jnp.zeros(2))
+        jax.jit(build_problem(RIG, over=d.Batch(values, durations=t), **ask).evaluate)(jnp.zeros(2))
         for t in (None, np.array([0.3, 0.8, 0.25, 0.75]))
     )
     np.testing.assert_allclose(apart.metrics["stop_distance"], together.metrics["stop_distance"], rtol=1e-12)
-    weighed = build_problem(RIG, over=d.Batch(values, weights=1 / speeds), **ask).seen(jnp.zeros(2))
+    weighed = build_problem(RIG, over=d.Batch(values, weights=1 / speeds), **ask).evaluate(jnp.zeros(2))
     np.testing.assert_allclose(weighed.objective, np.mean(together.metrics["stop_distance"] / speeds), rtol=1e-12)
 
 
@@ -246,7 +246,7 @@ class TestWeights:
         np.testing.assert_allclose(loop.weights()[0], q, rtol=1e-12)
         a, b = (np.asarray(x) for x in model.matrices())
         k = -b.T @ solve_continuous_are(a, b, q, np.array([[2.0]])) / 2.0
-        np.testing.assert_allclose(loop.closed().controller.gain, k[0], rtol=1e-8)
+        np.testing.assert_allclose(loop.closed_loop().controller.gain, k[0], rtol=1e-8)
 
     @pytest.mark.slow
     def test_its_derivative(self):
@@ -254,7 +254,7 @@ class TestWeights:
 
         def gain(x):
             values = {"log_diagonal": x[:2], "lower": x[2:3], "log_effort": x[3]}
-            return d.replace(loop, values).closed().controller.gain
+            return d.replace(loop, values).closed_loop().controller.gain
 
         x, h = jnp.concatenate([loop.log_diagonal, loop.lower + 30.0, jnp.zeros(1)]), 1e-5
         slope = jax.jacfwd(gain)(x)
@@ -371,7 +371,9 @@ class TestWorstCase:
         assert found.report().startswith("COUNTEREXAMPLE: max_slip" if not found.met else "No counterexample in")
 
     @killed_by(
-        "tune/worst.py", "if lane.reason is not Reason.START and -float(lane.seen.objective) > value:", "if False:"
+        "tune/worst.py",
+        "if lane.reason is not Reason.START and -float(lane.evaluation.objective) > value:",
+        "if False:",
     )
     @pytest.mark.slow
     def test_the_ascent_finds_what_lies_between_the_points(self):

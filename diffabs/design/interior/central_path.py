@@ -111,7 +111,7 @@ def follow_path(
     rounding = jnp.finfo(first.dtype).eps ** 0.5 * jnp.max(jnp.abs(here.c))
     path = path._replace(shift=jnp.maximum(2 * first, 0.0) + 1e-3 * jnp.abs(first) + rounding)
 
-    def going(path: CentralPathState) -> Any:
+    def goes_on(path: CentralPathState) -> Any:
         """Return whether another Newton step is necessary."""
         return (
             (path.steps < MAX_PATH_STEPS)
@@ -129,7 +129,7 @@ def follow_path(
         # Shift and mu change only near the centre, where the full Newton step converges quadratically.
         return jax.tree.map(lambda new, old: jnp.where(decrement < CENTRING_DECREMENT, new, old), after, path)
 
-    return lax.while_loop(going, step, path)
+    return lax.while_loop(goes_on, step, path)
 
 
 def localise_problem(problem: GuaranteedCostProblem, point: PathPoint) -> LocalProblem:

@@ -118,10 +118,10 @@ def _follow_path(discrete: bool, closed: Any) -> tuple[Any, Any, Any]:
     # The initial s exceeds the largest eigenvalue of all L_i(I), so that every S_i > 0.
     start = _DecayPathState(0, 0, T, jnp.max(jnp.linalg.eigvalsh(L)) + size, size / vertices / n, 0.0 * size, 0)
 
-    def going(path: _DecayPathState) -> Any:
+    def goes_on(path: _DecayPathState) -> Any:
         return (path.steps < MAX_DECAY_STEPS) & (path.settled < FINAL_CENTRE_STEPS) & jnp.isfinite(path.decrement)
 
-    path = lax.while_loop(going, lambda path: _advance_path(closed, path, inverse, discrete), start)
+    path = lax.while_loop(goes_on, lambda path: _advance_path(closed, path, inverse, discrete), start)
     slack = path.s * one - _lyapunov_operator(_transform_loops(closed, path.T), one, discrete)
     return jnp.where(jnp.isfinite(path.decrement), path.s, jnp.nan), path.T, jnp.linalg.inv(slack)
 

@@ -88,7 +88,7 @@ class Certificate:
         """Whether the certificate has a claim and all its claims are proved."""
         return bool(self.claims) and all(self.verify())
 
-    def proved(self, *kinds: str) -> Iterator[Mapping[str, Any]]:
+    def proved_data(self, *kinds: str) -> Iterator[Mapping[str, Any]]:
         """Yield the data of the proved claims of these `kinds`."""
         for claim, verdict in zip(self.claims, self.verify(), strict=True):
             if verdict and claim.kind in kinds:
@@ -108,30 +108,32 @@ class Certificate:
     def quadratically_stable(self) -> bool | None:
         """True if one P is proved to decrease at all vertices, False if a proof excludes such a P, otherwise None."""
         # A scheduled claim with equal P at all nodes is a proof for one P.
-        one = [data["P"] for data in self.proved("scheduled") if (data["P"] == data["P"][0]).all()]
-        if one or any(self.proved(*QUADRATIC_KINDS)):
+        one = [data["P"] for data in self.proved_data("scheduled") if (data["P"] == data["P"][0]).all()]
+        if one or any(self.proved_data(*QUADRATIC_KINDS)):
             return True
         # Only a witness against the rate 0 excludes stability; a witness against a faster decay leaves it open.
-        refuted = (data.get("rate", 0.0) <= 0 and data.get("factor", 1.0) >= 1 for data in self.proved("infeasible"))
+        refuted = (
+            data.get("rate", 0.0) <= 0 and data.get("factor", 1.0) >= 1 for data in self.proved_data("infeasible")
+        )
         return False if any(refuted) else None
 
     @property
     def stable(self) -> bool | None:
         """True if stability is proved, with one P or with a P that depends on a schedule's parameter; else None."""
-        return True if any(self.proved(*QUADRATIC_KINDS, "scheduled")) else None
+        return True if any(self.proved_data(*QUADRATIC_KINDS, "scheduled")) else None
 
     @property
     def decay_rate(self) -> float | None:
         """Largest proved decay rate of |x| [1/s]."""
-        rates = [data.get("rate", 0.0) for data in self.proved("decay", "scheduled")]
+        rates = [data.get("rate", 0.0) for data in self.proved_data("decay", "scheduled")]
         if self.period is not None:
-            rates = [-math.log(data.get("factor", 1.0)) / self.period for data in self.proved("decay")]
+            rates = [-math.log(data.get("factor", 1.0)) / self.period for data in self.proved_data("decay")]
         return max(rates, default=None)
 
     @property
     def guaranteed_cost(self) -> float | None:
         """Trace P of the first proved cost claim, rounded up; for a scheduled claim the largest over the nodes."""
-        return self._cost(self.proved("cost", "scheduled"))
+        return self._cost(self.proved_data("cost", "scheduled"))
 
     def _cost(self, claims: Iterator[Mapping[str, Any]]) -> float | None:
         """Return trace P of the first of these claims that has a cost."""
@@ -145,7 +147,7 @@ class Certificate:
     @property
     def cost_from_start(self) -> float | None:
         """Cost x0' P x0 of the first proved cost claim that has x0, rounded up."""
-        for data in self.proved("cost"):
+        for data in self.proved_data("cost"):
             if "x0" in data:
                 # Fractions, so that the sum is rounded once, upwards.
                 x, P = np.vectorize(Fraction, [object])(data["x0"]), np.vectorize(Fraction, [object])(data["P"])
@@ -155,17 +157,17 @@ class Certificate:
     @property
     def damping(self) -> float | None:
         """Largest damping ratio [1] proved for all fixed systems of the hull."""
-        return max((data["zeta"] for data in self.proved("damping")), default=None)
+        return max((data["zeta"] for data in self.proved_data("damping")), default=None)
 
     @property
     def l2_gain(self) -> float | None:
         """Bound of the L2 gain in the first proved l2 claim."""
-        return next((data["gamma"] for data in self.proved("l2")), None)
+        return next((data["gamma"] for data in self.proved_data("l2")), None)
 
     @property
     def input_limit(self) -> np.ndarray | None:
         """Bounds of the inputs (m,) in the first proved input claim."""
-        return next((data["limit"] for data in self.proved("input")), None)
+        return next((data["limit"] for data in self.proved_data("input")), None)
 
     @functools.cached_property
     def _margins(self) -> list[tuple[str, dict[int, float]]]:
@@ -209,7 +211,7 @@ class Certificate:
         size = np.real if self.period is None else np.abs
         found = []
         for c, cell in enumerate(self.cells):
-            pair = [size(np.linalg.eigvals(cell.closed(gain))).max(axis=-1) for gain in gains[c : c + 2]]
+            pair = [size(np.linalg.eigvals(cell.closed_loop(gain))).max(axis=-1) for gain in gains[c : c + 2]]
             found += np.max(pair, axis=0).tolist()
         return tuple(found)
 

@@ -67,17 +67,19 @@ def block_matrix(rows: list[list[Matrix]]) -> Matrix:
     flat = [each for row in rows for each in row]
     lead = np.broadcast_shapes(*(each.shape[:-2] for each in flat))
 
-    def joined(get: Callable[[Matrix], Any]) -> Any:
+    def join_blocks(get: Callable[[Matrix], Any]) -> Any:
         """Return the block matrix of one array of each block."""
         return np.block([[np.broadcast_to(get(each), (*lead, *each.shape[-2:])) for each in row] for row in rows])
 
     if not isinstance(flat[0], Dyadic):
-        return joined(np.asarray)
+        return join_blocks(np.asarray)
     rows = [[as_dyadic(each) for each in row] for row in rows]
     bits = max(each.bits for row in rows for each in row)
     rows = [[each.at(bits) for each in row] for row in rows]
     return Dyadic(
-        joined(lambda each: each.ints), bits, joined(lambda each: 0 * each.ints if each.error is None else each.error)
+        join_blocks(lambda each: each.ints),
+        bits,
+        join_blocks(lambda each: 0 * each.ints if each.error is None else each.error),
     )
 
 

@@ -15,7 +15,7 @@ CERTIFICATE_FORMAT, CERTIFICATE_VERSION = "diffabs certificate", 1
 MAX_CERTIFICATE_BYTES, MAX_STATES_PLUS_INPUTS = 2**24, 64  # bytes; states and inputs together
 
 
-def listed(value: float | np.ndarray) -> Any:
+def convert_to_list(value: float | np.ndarray) -> Any:
     """Return a number or nested lists for JSON.
 
     Args:
@@ -117,7 +117,7 @@ def format_certificate(
         "version": CERTIFICATE_VERSION,
         "system": describe_system(system),
         "gain": gain.tolist(),
-        "claims": [{"kind": kind, "data": {k: listed(v) for k, v in data.items()}} for kind, data in claims],
+        "claims": [{"kind": kind, "data": {k: convert_to_list(v) for k, v in data.items()}} for kind, data in claims],
     }
     return json.dumps(data, allow_nan=False, indent=1) + "\n"
 

@@ -128,27 +128,27 @@ class DesignProgram:
         """Yield every inequality that a vertex has to satisfy."""
         spec, frame, discrete = self.spec, self.frame, self.period is not None
 
-        def seen(v: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        def evaluate(v: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
             x, f = v[f"X{place.node}"], v[f"F{place.node}"]
             drift = sum((rate * v[f"X{i}"] for i, rate in place.drift), np.zeros_like(x))
             return x, f, place.A @ x + place.B @ f, drift
 
         def cost(v: Values) -> np.ndarray:
-            x, f, flow, drift = seen(v)
+            x, f, flow, drift = evaluate(v)
             return inequalities.cost_lmi(x, flow, drift, self.root, f, self.even, discrete=discrete)
 
         def decay(v: Values) -> np.ndarray:
-            x, _, flow, drift = seen(v)
+            x, _, flow, drift = evaluate(v)
             rate = spec.decay * (1 + SPECIFICATION_TIGHTENING) * (self.period or 1 / frame.tau)
             return inequalities.decay_lmi(x, flow, drift, rate, discrete=discrete)
 
         def damping(v: Values) -> np.ndarray:
             # Tightened in 1 - zeta, so that zeta stays below 1.
             zeta = 1 - (1 - spec.damping) * (1 - SPECIFICATION_TIGHTENING)
-            return inequalities.damping_lmi(seen(v)[2], zeta / np.sqrt(1 - zeta**2))
+            return inequalities.damping_lmi(evaluate(v)[2], zeta / np.sqrt(1 - zeta**2))
 
         def gain(v: Values) -> np.ndarray:
-            (x, f, flow, drift), l2 = seen(v), spec.l2
+            (x, f, flow, drift), l2 = evaluate(v), spec.l2
             assert l2 is not None
             z = (l2.output @ frame.T @ x + l2.feedthrough @ frame.U @ f) / np.sqrt(frame.tau)
             # g is then near 1, as are the other unknowns.

@@ -1,1 +1,1 @@
-"""What a sweep says: estimates with intervals, sensitivities, paired comparisons, the summary."""
+"""Statistics of a sweep: estimates with intervals, sensitivities, paired comparisons, and the summary."""

@@ -1,11 +1,13 @@
-"""Two variants on the same samples: what the difference is, and what it gained to share the samples.
+"""Comparison of two variants on the same samples: their difference, and the gain from common samples.
 
     mean(a - b)    t interval                median(a - b)    order statistics
     P(a < b)       Clopper-Pearson           reduction        (var a + var b)/var(a - b)
 
-Common random numbers: the reduction is the factor by which independent samples would have to be more for an equally
-sharp mean difference. P. Glasserman and D. D. Yao, Some guidelines and guarantees for common random numbers, Manage.
-Sci. 38 (1992)."""
+The reduction is the gain from common random numbers. Independent samples would need this factor more for an equally
+sharp mean difference.
+
+Source: P. Glasserman and D. D. Yao, Some guidelines and guarantees for common random numbers, Manage. Sci. 38 (1992).
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -17,8 +19,16 @@ from diffabs.sweep.statistics.sensitivity import pearson
 
 
 class PairedComparison(NamedTuple):
-    """Of a - b: mean, median; share of samples where a < b, and how many are equal; correlation of a with b;
-    (var a + var b)/var(a - b), infinite for a constant difference, NaN if both are constant."""
+    """Statistics of the difference a - b.
+
+    Attributes:
+        mean: Mean of a - b.
+        median: Median of a - b.
+        less: Share of samples with a < b.
+        ties: Number of samples with a = b.
+        correlation: Pearson correlation of a with b.
+        reduction: (var a + var b)/var(a - b); infinite for a constant difference, NaN if both are constant.
+    """
 
     mean: IntervalEstimate
     median: IntervalEstimate
@@ -29,9 +39,15 @@ class PairedComparison(NamedTuple):
 
 
 def compare_pairs(a: Any, b: Any, *, confidence: float = 0.95) -> PairedComparison:
-    """From outputs (n,) of two variants, sample by sample.
+    """Return the comparison of two variants, sample by sample.
 
-    Raises ValueError for fewer than four samples, for lengths that differ, and for values not finite.
+    Args:
+        a: Outputs of the first variant, shape (n,).
+        b: Outputs of the second variant, shape (n,).
+        confidence: Confidence of the intervals, in (0, 1).
+
+    Raises:
+        ValueError: There are fewer than four samples, the lengths differ, or a value is not finite.
     """
     one, other = as_column(a, least=4), as_column(b)
     if one.shape != other.shape:

@@ -1,25 +1,29 @@
-"""Which inputs move an output: correlations of a sweep, and Sobol' indices from two designs and their mixtures.
+"""Sensitivity of an output to the inputs: correlations of a sweep, and Sobol' indices from two designs and their
+mixtures.
 
     Pearson    tanh(atanh r -+ z/sqrt(n-3))                            Fisher (1921)
     Spearman   tanh(atanh r -+ z sqrt((1 + r^2/2)/(n-3)))              Bonett and Wright (2000)
     first      S_j = mean(f(B) (f(AB_j) - f(A)))/V                     Saltelli et al. (2010), table 2 (b)
     total      T_j = mean((f(A) - f(AB_j))^2)/(2 V)                    Jansen (1999)
 
-AB_j is the design A with the j-th column of B, V the variance of f(A) and f(B) together. S_j: the share of V that would
-go if input j were known; T_j: the share that would stay if all others were. The indices have percentile bootstrap
-intervals over rows; all that they need of a row is linear in a few features of it, so a resample is a product of counts
-with features.
+AB_j is the design A with the j-th column of B. V is the variance of f(A) and f(B) together. S_j is the share of V that
+vanishes if input j is known. T_j is the share that remains if all other inputs are known. The indices have percentile
+bootstrap intervals over rows. They are functions of sums of a few features of each row, so a resample is a product of
+counts with features.
 
-The intervals of both correlations are for binormal columns. Others they can miss by far: of y = x + x^2, x normal, they
-cover 67 and 83 % instead of 95 %. `binormal=False` takes the standard error from the influence of each sample instead,
+The intervals of both correlations hold for binormal columns. For other laws they can fail: with y = x + x^2 and normal
+x, they cover 67 and 83 % instead of 95 %. `binormal=False` takes the standard error from the influence of each sample:
 
     p_i = u_i v_i - r (u_i^2 + v_i^2)/2,   sd(p)/(1 - r^2)/sqrt(n-3)  in place of  1/sqrt(n-3)
 
-with u, v standardised; Spearman's, of ranks, has also what a sample does to the ranks of the others.
+u and v are standardised. For Spearman's correlation, of ranks, the influence includes the effect of a sample on the
+ranks of the others.
 
-D. G. Bonett and T. A. Wright, Sample size requirements for estimating Pearson, Kendall and Spearman correlations,
-Psychometrika 65 (2000). A. Saltelli et al., Variance based sensitivity analysis of model output, Comput. Phys. Commun.
-181 (2010). M. J. W. Jansen, Analysis of variance designs for model output, Comput. Phys. Commun. 117 (1999)."""
+Sources: D. G. Bonett and T. A. Wright, Sample size requirements for estimating Pearson, Kendall and Spearman
+correlations, Psychometrika 65 (2000). A. Saltelli et al., Variance based sensitivity analysis of model output, Comput.
+Phys. Commun. 181 (2010). M. J. W. Jansen, Analysis of variance designs for model output, Comput. Phys. Commun. 117
+(1999).
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -36,27 +40,45 @@ from diffabs.sweep.statistics.estimates import (
     upper_level,
 )
 
-MAX_ROW_GROUPS = 4096  # beyond that many, rows are resampled in random groups of one size: same law, bounded price
+# More rows are resampled in random groups of one size: the law is the same, and the cost is bounded.
+MAX_ROW_GROUPS = 4096
 
 
 class Correlations(NamedTuple):
-    """One estimate per input."""
+    """Correlations of an output with each input.
+
+    Attributes:
+        pearson: Pearson correlation of each input.
+        spearman: Spearman correlation of each input.
+    """
 
     pearson: list[IntervalEstimate]
     spearman: list[IntervalEstimate]
 
 
 class SobolIndices(NamedTuple):
-    """One estimate per input."""
+    """Sobol' indices of each input.
+
+    Attributes:
+        first: First-order index of each input.
+        total: Total index of each input.
+    """
 
     first: list[IntervalEstimate]
     total: list[IntervalEstimate]
 
 
 def correlations(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = True) -> Correlations:
-    """Of each column of x (n, d) with y (n,); NaN between -1 and 1 where one of the two is constant.
+    """Return the correlations of each column of x with y; NaN between -1 and 1 where one of the two is constant.
 
-    Raises ValueError for fewer than four samples, for lengths that differ, and for values not finite.
+    Args:
+        x: Inputs, shape (n, d).
+        y: Output, shape (n,).
+        confidence: Confidence of the intervals, in (0, 1).
+        binormal: Whether both columns are jointly normal; False estimates the standard error from the data.
+
+    Raises:
+        ValueError: There are fewer than four samples, the lengths differ, or a value is not finite.
     """
     outputs, inputs = as_column(y, least=4), np.asarray(x)
     if inputs.ndim != 2 or len(inputs) != len(outputs):
@@ -70,7 +92,17 @@ def correlations(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = T
 
 
 def pearson(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = True) -> IntervalEstimate:
-    """Of two columns (n,); otherwise as `correlations`."""
+    """Return the Pearson correlation of two columns; NaN between -1 and 1 where one of the two is constant.
+
+    Args:
+        x: First column, shape (n,).
+        y: Second column, shape (n,).
+        confidence: Confidence of the interval, in (0, 1).
+        binormal: Whether both columns are jointly normal; False estimates the standard error from the data.
+
+    Raises:
+        ValueError: There are fewer than four samples, the lengths differ, or a value is not finite.
+    """
     one, other = as_column(x, least=4), as_column(y)
     if one.shape != other.shape:
         raise ValueError(f"{len(one)} and {len(other)} values are not pairs: leave a lane out of both")
@@ -82,11 +114,21 @@ def pearson(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = True) 
 def sobol_indices(
     a: Any, b: Any, ab: Any, *, confidence: float = 0.95, replicates: int = BOOTSTRAP_REPLICATES, seed: int = 0
 ) -> SobolIndices:
-    """From outputs f(A), f(B) (n,) and f(AB_j) (d, n); NaN without bounds if f is constant.
+    """Return the Sobol' indices of d inputs; NaN with infinite ends if f is constant.
 
-    The same seed, the same intervals. They are those of independent rows: for rows of a low-discrepancy design they are
-    too wide. Raises ValueError for fewer than four rows, for shapes that do not fit, for values not finite, and
-    for too few replicates.
+    The intervals assume independent rows. For rows of a low-discrepancy design they are too wide.
+
+    Args:
+        a: Outputs f(A), shape (n,).
+        b: Outputs f(B), shape (n,).
+        ab: Outputs f(AB_j), shape (d, n).
+        confidence: Confidence of the intervals, in (0, 1).
+        replicates: Number of bootstrap replicates.
+        seed: Seed of the bootstrap; the same seed gives the same intervals.
+
+    Raises:
+        ValueError: There are fewer than four rows or too few replicates, the shapes do not fit, or a value is not
+            finite.
     """
     fa, fb, mixed = as_column(a, least=4), as_column(b), np.asarray(ab)
     if fa.shape != fb.shape or mixed.ndim != 2 or mixed.shape[1] != len(fa):
@@ -106,14 +148,13 @@ def sobol_indices(
 
 
 def _spearman(x: np.ndarray, y: np.ndarray, confidence: float, binormal: bool) -> IntervalEstimate:
-    """From ranks."""
+    """Return the Spearman correlation from ranks."""
     u, v = _standardise(x), _standardise(y)
     r = float(np.clip(np.mean(u * v), -1.0, 1.0))
     if binormal:
         return _fisher_interval(r, math.sqrt(1 + r * r / 2), confidence, len(u))
-    others = _sum_above(x, v - r * u) / np.std(x) + _sum_above(y, u - r * v) / np.std(
-        y
-    )  # what a sample does to others' ranks
+    # The effect of a sample on the ranks of the others.
+    others = _sum_above(x, v - r * u) / np.std(x) + _sum_above(y, u - r * v) / np.std(y)
     return _fisher_interval(r, _atanh_deviation(_influence(u, v, r) + others, r), confidence, len(u))
 
 
@@ -126,14 +167,14 @@ def _influence(u: np.ndarray, v: np.ndarray, r: float) -> np.ndarray:
 
 
 def _sum_above(x: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Sum of w over the samples of greater x, and half of it over those of equal x."""
+    """Return for each sample the sum of w over samples with larger x, plus half of it over samples with equal x."""
     _, place = np.unique(x, return_inverse=True)
     sums = np.bincount(place, weights=w)
     return (sums.sum() - np.cumsum(sums) + sums / 2)[place]
 
 
 def _atanh_deviation(influence: np.ndarray, r: float) -> float:
-    """Of sqrt(n) atanh r; zero for columns that determine each other."""
+    """Return the standard deviation of sqrt(n) atanh r; zero for columns that determine each other."""
     return float(np.std(influence)) / (1 - r * r) if r * r < 1 else 0.0
 
 
@@ -147,10 +188,10 @@ def _fisher_interval(r: float, spread: float, confidence: float, n: int) -> Inte
 
 
 def _sum_group_features(a: np.ndarray, b: np.ndarray, mixed: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Sums of the features of the rows of each group, (groups, 3 + 2 d), rows assigned to groups at random.
+    """Return sums of the features over the rows of each group, (groups, 3 + 2 d), with random groups.
 
-    Features: 1, a + b, a^2 + b^2, and for each j: b (ab_j - a), (ab_j - a)^2. The overall mean is taken out first: that
-    changes no index, and the first-order estimator is least noisy there.
+    The features are 1, a + b, a^2 + b^2, and for each j: b (ab_j - a), (ab_j - a)^2. The overall mean is subtracted
+    first. This changes no index, and the first-order estimator has the least noise there.
     """
     n = len(a)
     groups = min(n, MAX_ROW_GROUPS)
@@ -165,13 +206,15 @@ def _sum_group_features(a: np.ndarray, b: np.ndarray, mixed: np.ndarray, random:
 
 
 def _resample_groups(replicates: int, groups: int, random: np.random.Generator) -> np.ndarray:
-    """How often each group occurs among as many that are drawn, (replicates, groups)."""
+    """Return the count of each group in draws of as many groups, (replicates, groups)."""
     drawn = random.integers(groups, size=(replicates, groups)) + groups * np.arange(replicates)[:, None]
     return np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape).astype(float)
 
 
 def _indices_from_sums(sums: np.ndarray) -> np.ndarray:
-    """First-order, then total indices (replicates, 2 d) from sums of features over the rows (replicates, 3 + 2 d)."""
+    """Return first-order, then total indices (replicates, 2 d), from sums of features over the rows (replicates, 3 + 2
+    d).
+    """
     n = sums[:, :1]
     mean, square = sums[:, 1:2] / (2 * n), sums[:, 2:3] / (2 * n)
     products, squares = sums[:, 3::2] / n, sums[:, 4::2] / n

@@ -1,13 +1,14 @@
-"""What a finished sweep says, as values of JSON: counts, probabilities of failure, statistics of each metric,
-sensitivities, the worst samples. A column at a time, so that ten million rows fit into memory.
+"""The summary of a finished sweep, as JSON values.
 
-Which intervals are right depends on the design:
+It contains counts, failure probabilities, statistics of each metric, sensitivities, and the worst samples. Columns are
+read one at a time, so that ten million rows fit into memory. The design decides the intervals:
 
     random                      of independent samples
     sobol, replicates > 1       from the spread between the replicates
     sobol, latin-hypercube      of independent samples, which are too wide
     grid, corners               none: nothing is random; limits of intervals are null
-    saltelli                    of its rows A, too wide as those of Sobol' sequences; Sobol' indices from all"""
+    saltelli                    of its rows A, too wide as those of Sobol' sequences; Sobol' indices from all
+"""
 
 import math
 from collections.abc import Iterator
@@ -21,9 +22,9 @@ from diffabs.sweep.statistics.estimates import summarise_column as summarised
 from diffabs.sweep.statistics.sensitivity import correlations, sobol_indices
 
 QUANTILE_LEVELS, CVAR_LEVEL = (0.05, 0.5, 0.95), 0.95
-MAX_CORRELATED_SAMPLES = 200_000  # samples from which correlations are computed: the first ones
+MAX_CORRELATED_SAMPLES = 200_000  # correlations use at most this number of samples, the first ones
 MAX_LISTED_SAMPLES = 10
-MIN_SAMPLES = 4  # samples of which anything is said
+MIN_SAMPLES = 4  # smallest number of samples with statistics
 INTERVAL_NOTES = {
     "random": "independent samples",
     "sobol": "spread between replicates",
@@ -36,8 +37,15 @@ INTERVAL_NOTES = {
 
 
 def summarise_sweep(found: Results, confidence: float = 0.95) -> dict[str, Any]:
-    """Of the chunks that are there. Lanes that diverged are counted, and in no statistic but the failures; lanes that
-    were refused are counted, and in none."""
+    """Return the summary of the finished chunks.
+
+    Diverged runs are counted, and enter the failures but no other statistic. Refused samples are counted, and enter
+    none.
+
+    Args:
+        found: Results of the sweep.
+        confidence: Confidence of the intervals, in (0, 1).
+    """
     accepted = found.accepted
     diverged = found.column("diverged") & accepted
     view = _RowSelection(found, accepted & ~diverged, accepted)
@@ -63,7 +71,7 @@ def summarise_sweep(found: Results, confidence: float = 0.95) -> dict[str, Any]:
 
 
 def _summarise_refused(found: Results, accepted: np.ndarray) -> dict[str, Any]:
-    """How many samples were not run, the first of them, and how often for which reason."""
+    """Return the number of refused samples, the first of them, and the count of each reason."""
     reasons, counts = np.unique(found.column("refused")[~accepted].astype(str), return_counts=True)
     return {
         "count": int(np.sum(~accepted)),
@@ -73,7 +81,7 @@ def _summarise_refused(found: Results, accepted: np.ndarray) -> dict[str, Any]:
 
 
 class _RowSelection:
-    """The rows that are in the statistics, and how they are grouped."""
+    """The rows that enter the statistics, and their groups."""
 
     def __init__(self, found: Results, good: np.ndarray, accepted: np.ndarray):
         design = found.study["space"]["design"]
@@ -87,12 +95,14 @@ class _RowSelection:
         return self.found.column(name)[self.good & self.rows]
 
     def blocks(self, name: str) -> list[np.ndarray]:
-        """One column for each replicate."""
+        """Return one column for each replicate."""
         values = np.where(self.good, self.found.column(name), np.nan)
         return [block[np.isfinite(block)] for block in np.split(values, self.replicates)]
 
     def never(self, name: str) -> dict[str, Any]:
-        """How many runs have an infinite value: they never got to what is measured. They are in no other number."""
+        """Return the runs with an infinite value, which never reach the measured event. No other statistic includes
+        them.
+        """
         rows = self.good & self.rows & np.isinf(self.found.column(name))
         return {"count": int(rows.sum()), "samples": self.found.column("sample")[rows][:MAX_LISTED_SAMPLES].tolist()}
 
@@ -134,7 +144,7 @@ def _summarise_metric(view: _RowSelection, name: str, confidence: float) -> dict
 
 
 def _summarise_sensitivity(found: Results, view: _RowSelection, confidence: float) -> dict[str, Any]:
-    """By metric and variable: correlations, or for a Saltelli design Sobol' indices."""
+    """Return by metric and variable the correlations, or the Sobol' indices of a Saltelli design."""
     variables = [path for path in found.variables if found.is_number(path)]
     metrics = {name: found.column(name) for name in found.metrics}
     if view.period > 1:
@@ -159,7 +169,7 @@ def _summarise_sensitivity(found: Results, view: _RowSelection, confidence: floa
 
 
 def _summarise_indices(values: np.ndarray, view: _RowSelection, names: list[str], confidence: float) -> dict[str, Any]:
-    """Rows of which a lane diverged, or has an infinite value, are left out whole."""
+    """Return the Sobol' indices of one metric, without rows in which a run diverged or has an infinite value."""
     whole = len(values) // view.period * view.period
     table, good = values[:whole].reshape(-1, view.period), view.good[:whole] & np.isfinite(values[:whole])
     good = good.reshape(-1, view.period).all(axis=1)
@@ -181,7 +191,7 @@ def _worst_samples(found: Results, view: _RowSelection, name: str) -> list[dict[
 
 
 def _json_estimate(estimate: dict[str, Any], random: bool) -> dict[str, Any]:
-    """Ends of an interval that are not finite, or not there, are null."""
+    """Return an estimate with null for ends that are infinite or do not exist."""
     ends = {end: estimate[end] if random and math.isfinite(estimate[end]) else None for end in ("low", "high")}
     value = estimate["value"]
     return {"value": value if math.isfinite(value) else None, **ends}
