@@ -1,1 +1,1 @@
-"""The command `diffabs`: one module for each command, tables, and how a command talks to a person."""
+"""The command `diffabs`: one module for each command, the tables on stdout, and the messages on stderr."""

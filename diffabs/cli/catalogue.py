@@ -1,4 +1,4 @@
-"""The commands `list` and `show`: every part with its parameters, every packaged scenario, a scenario as TOML."""
+"""The commands `list` and `show`: all parts with their parameters, the packaged scenarios, a scenario as TOML."""
 
 import pathlib
 from typing import Annotated, Any
@@ -17,14 +17,20 @@ LISTED_FAMILIES = (*PLURALS, "scenarios")
 
 
 def families_like(incomplete: str) -> list[str]:
-    """Completions of a family's name."""
+    """Return completions of a family's name.
+
+    Args:
+        incomplete: Start of the name.
+    """
     return [name for name in LISTED_FAMILIES if name.startswith(incomplete)]
 
 
 def list_parts(
     family: Annotated[
         str | None,
-        typer.Argument(metavar="[FAMILY]", help=f"{', '.join(PLURALS)} or scenarios.", autocompletion=families_like),
+        typer.Argument(
+            metavar="[FAMILY]", help=f"Family to list: {', '.join(PLURALS)} or scenarios.", autocompletion=families_like
+        ),
     ] = None,
     as_json: console.Json = False,
 ) -> None:
@@ -48,12 +54,12 @@ def show_scenario(
     scenario: console.ScenarioName,
     changes: console.Changes = None,
     out: Annotated[
-        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write to this file; default: stdout.")
+        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="File to write; default: stdout.")
     ] = None,
 ) -> None:
     """Print a scenario as TOML with every field.
 
-    One's own can start from it."""
+    Edit the output to make a scenario of your own."""
     with console.end_on_errors():
         targets.check_scenario_file(out)
         text = dump(console.load_scenario(scenario, changes, integrated=False))
@@ -62,7 +68,7 @@ def show_scenario(
 
 
 def _describe_family(plural: str) -> dict[str, Any]:
-    """The members of a family as plain values."""
+    """Return the members of a family as plain values."""
     if plural == "scenarios":
         return {name: read_header(name) for name in names()}
     family = PLURALS[plural]

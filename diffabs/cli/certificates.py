@@ -1,6 +1,7 @@
-"""What the commands that prove something share: a scenario as linear systems, a gain on them, a certificate as JSON.
+"""Shared code of the commands that prove: a scenario as linear systems, a gain on them, a certificate as JSON.
 
-All of it needs the extra `design`, so what needs that is imported when a command runs."""
+Everything here needs the extra `design`. Modules that need the extra are imported only when a command runs.
+"""
 
 import contextlib
 import dataclasses
@@ -31,33 +32,54 @@ if TYPE_CHECKING:
     from diffabs.design.frozen import FrozenLoops
     from diffabs.design.state_feedback import ReducedLoop
 
-# Of the JSON document. Without a certificate most are null.
+# Keys of the JSON document; without a certificate most are null.
 FROM_PROOF = ("quadratically_stable", "stable", "verified_exactly", "decay_rate", "damping", "trace_cost",
               "guaranteed_cost", "worst_vertex", "margins", "claims")  # fmt: skip
 FROM_DESIGN = ("lower_bound", "gap", "residual")
-SCHEDULE_CELLS = 8  # in which a Lyapunov matrix that follows the speed is linear
-SLIPS, MARGIN = 2001, 1.01  # where friction is asked for its greatest value, and how much more is allowed for
+SCHEDULE_CELLS = 8  # cells of the speed range; the Lyapunov matrix is linear in the speed in each cell
+SLIPS, MARGIN = 2001, 1.01  # samples of the friction curve, and a factor for a maximum between two samples
 VERDICT_WORDS = {True: "proved", False: "disproved", None: "undecided"}
 
 Box = dict[str, tuple[float, float]]
 
 
 class ProofTask(NamedTuple):
-    """A scenario brought to linear systems: the gain in question, the set it is about, the specification."""
+    """A scenario reduced to linear systems, with the gain to certify.
+
+    Attributes:
+        chosen: Scenario.
+        reduced: Linear loop of the scenario, with the gain of its controller.
+        gain: Gain to certify, one number per state.
+        model: Linear model with one gain; the paths of the box are its parameters.
+        states: Names of the model's states.
+        over: Ranges (low, high) of the parameters, in SI.
+        polytope: Polytope of the systems.
+        spec: Specification of the closed loops.
+    """
 
     chosen: Scenario
     reduced: "ReducedLoop"
     gain: np.ndarray
-    model: Any  # of which the gain is one gain, and whose parameters the box is about
-    states: tuple[str, ...]  # of the model
+    model: Any
+    states: tuple[str, ...]
     over: Box
     polytope: "Polytope"
     spec: "Spec"
 
 
 def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) -> ProofTask:
-    """A scenario's systems and gain, or another gain on them. Raises ScenarioError; ValueError for a loop that has no
-    linear model; ModuleNotFoundError without the extra."""
+    """Return the linear systems of a scenario with the gain to certify.
+
+    Args:
+        chosen: Scenario.
+        gain: Text `k1,k2,...` of another gain; by default the gain of the controller.
+        weighed: True if the task needs the weights Q and R.
+
+    Raises:
+        ScenarioError: The gain is not one finite number per state, or the section [design] does not fit the model.
+        ValueError: The loop has no linear model.
+        ModuleNotFoundError: The extra `design` is not installed.
+    """
     if weighed and chosen.design.Q is None:
         raise ScenarioError("design.Q and design.R are missing: a design minimises the cost that they weigh")
     from diffabs.design import Spec
@@ -74,15 +96,17 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
         spec = spec.check(len(states), 1)
     except ValueError as error:
         raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
-    solver.solvers()  # says what is missing before anything is computed
+    solver.solvers()  # fails early if no SDP solver is installed
     reduced, model, over = _follow_speed(chosen.loop, reduced, wanted.box(chosen.loop))
     systems = grid_polytope(model, over) if isinstance(model, BalanceModel) else polytope(model, over)
     return ProofTask(chosen, reduced, values, model, tuple(model.states), over, systems, spec)
 
 
 def _follow_speed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoop", Any, Box]:
-    """The linear model and its box; where the gain follows the speed, those in which it is one gain, whose proof covers
-    every fall of the speed that friction allows."""
+    """Return the linear model and its box; for a gain that follows the speed, the model in which it is one gain.
+
+    A proof for that model covers every fall of the speed that friction allows.
+    """
     controller = inner_controller(loop.controller)
     if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):
         return reduced, reduced.model, box
@@ -92,6 +116,7 @@ def _follow_speed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["Reduce
     if model.period is None:
         raise ValueError("controller proportional-feedback: only sampled it can be brought to one gain")
     slowest = box.get("speed", (float(reduced.model.speed),))[0]
+    # Conservative: the greatest deceleration over the box at the slowest speed, where the relative fall is greatest.
     falls = (0.0, greatest_speed_fall(_greatest_deceleration(loop.plant, box, slowest), slowest, float(model.period)))
     neglected = tuple(line for line in reduced.neglected if "fall of the speed" not in line)
     over = {f"model.{path}": ends for path, ends in box.items()} | {"fall": falls}
@@ -99,7 +124,10 @@ def _follow_speed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["Reduce
 
 
 def _greatest_deceleration(plant: Plant, box: Box, speed: float) -> float:
-    """The greatest deceleration [m/s^2] that friction gives at a speed, over the corners of the box."""
+    """Return an upper bound of the deceleration [m/s^2] by friction at a speed, over the corners of the box.
+
+    The maximum over `SLIPS` slips times `MARGIN` allows for a greater value between two slips.
+    """
     inside = {path.removeprefix("plant."): ends for path, ends in box.items() if path.startswith("plant.")}
 
     def deceleration(plant: Plant, slip: Any) -> Any:
@@ -111,7 +139,11 @@ def _greatest_deceleration(plant: Plant, box: Box, speed: float) -> float:
 
 
 def certify_gain(task: ProofTask) -> "Certificate":
-    """What can be proved about the gain, with the fastest decay."""
+    """Return the certificate of the gain, with the fastest provable decay.
+
+    Args:
+        task: Linear systems, gain and specification.
+    """
     from diffabs.design import analysis
 
     return analysis.certify(task.gain, task.polytope, task.spec, fastest=True)
@@ -127,26 +159,36 @@ def _read_gain(text: str, states: Sequence[str]) -> np.ndarray:
         raise ScenarioError(f"--gain {format_given(text)} is outside (-inf, inf): a gain is finite")
     if len(values) != len(states):
         raise ScenarioError(
-            f"--gain {format_given(text)} has {len(values)} of {len(states)} numbers: {', '.join(states)}"
+            f"--gain {format_given(text)} has {len(values)} of {len(states)} numbers, one for each of"
+            f" {', '.join(states)}"
         )
     return values
 
 
 class FurtherFindings(NamedTuple):
-    """What is known of a gain that no common Lyapunov matrix proves: its loops at fixed parameters, and the fall of the
-    speed [m/s^2] up to which a Lyapunov matrix that follows the speed proves it; None if that was not asked or does not
-    succeed."""
+    """Results on a gain without a common Lyapunov matrix.
+
+    Attributes:
+        frozen: Poles of the closed loops at fixed parameters.
+        fall: Greatest fall of the speed [m/s^2] for which a Lyapunov matrix that follows the speed proves stability.
+            None if that proof fails or does not apply.
+    """
 
     frozen: "FrozenLoops"
     fall: float | None
 
     def document(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the findings as JSON values."""
         return {"frozen": self.frozen._asdict(), "proved_for_a_speed_falling_by": self.fall}
 
 
 def find_further(task: ProofTask, proof: "Certificate") -> FurtherFindings | None:
-    """What is known besides; None where a common Lyapunov matrix says more."""
+    """Return results without a common Lyapunov matrix; None if a common one exists, because it proves more.
+
+    Args:
+        task: Linear systems, gain and specification.
+        proof: Certificate of the gain.
+    """
     from diffabs.design.frozen import analyse_frozen_loops
 
     if proof.quadratically_stable:
@@ -156,8 +198,10 @@ def find_further(task: ProofTask, proof: "Certificate") -> FurtherFindings | Non
 
 
 def _permitted_fall(task: ProofTask) -> float | None:
-    """The greatest fall of the speed that friction allows, if a Lyapunov matrix piecewise linear in the speed proves
-    stability up to it."""
+    """Return the greatest fall of the speed [m/s^2] that friction allows, if stability is proved for it; else None.
+
+    The Lyapunov matrix of the proof is piecewise linear in the speed.
+    """
     from diffabs.design import Spec, analysis
     from diffabs.design.parameter_box import schedule
 
@@ -177,7 +221,16 @@ def proof_document(
     known: FurtherFindings | None = None,
     **numbers: float | None,
 ) -> dict[str, Any]:
-    """The JSON document. Parameters have the names of the linear model, in SI."""
+    """Return the JSON document of a proof. Parameters have the names of the linear model, in SI.
+
+    Args:
+        task: Linear systems, gain and specification.
+        proof: Certificate; None if there is none.
+        out: File of the certificate.
+        reason: Sentence on everything unproved; None if all is proved.
+        known: Results without a common Lyapunov matrix.
+        **numbers: Numbers of a design: lower bound, gap, residual, trace cost.
+    """
     summary: dict[str, Any] = proof.summary() if proof else {}
     if proof:
         summary["worst_vertex"] = summary["worst_vertex"] or slowest_vertex(proof)
@@ -206,7 +259,13 @@ def proof_document(
 
 
 def slowest_vertex(proof: "Certificate") -> dict[str, Any]:
-    """For a proof that is about all vertices together: the vertex with the slowest pole, as `worst_vertex`."""
+    """Return the vertex with the slowest pole, in the form of `worst_vertex`.
+
+    A proof about all vertices together has no worst vertex of its own.
+
+    Args:
+        proof: Certificate.
+    """
     index = int(np.argmax(proof.frozen))
     margin = (0.0 if proof.period is None else 1.0) - proof.frozen[index]
     corners = proof.cells[0].corners
@@ -215,7 +274,13 @@ def slowest_vertex(proof: "Certificate") -> dict[str, Any]:
 
 
 def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings | None = None) -> str:
-    """What was asked for and is not proved, in words, and what is known besides; empty if all is proved."""
+    """Return a sentence on required properties without a proof; empty if all are proved.
+
+    Args:
+        proof: Certificate.
+        spec: Required properties.
+        known: Results without a common Lyapunov matrix.
+    """
     stable, refuted = proof.quadratically_stable, any(proof.proved_data("infeasible"))
     asked = {
         "decay": (spec.decay > 0, f"decay = {spec.decay:g} 1/s", not refuted),
@@ -225,7 +290,7 @@ def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings
     found = [] if stable else [f"quadratic stability is {VERDICT_WORDS[stable]}"]
     if stable is False:
         found[0] += f": no common Lyapunov matrix exists for the {proof.cells[0].vertices} vertices"
-        found[0] += ", so no design by one over these ranges, whatever Q and R, gives this gain"
+        found[0] += ", so no Q and R give this gain by a design over these ranges"
     else:
         for kind, (wanted, words, still_open) in asked.items():
             if wanted and not any(proof.proved_data(kind)):
@@ -236,12 +301,16 @@ def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings
         return f"{', '.join(found)}; that is not instability: {describe_frozen_stability(known)}"
     worst = slowest_vertex(proof)
     where = ", ".join(f"{name} {value:.6g}" for name, value in (worst["corner"] or {}).items())
-    kind = "is unstable even if it is fixed" if worst["margin"] <= 0 else "has the slowest pole"
+    kind = "is unstable even with fixed parameters" if worst["margin"] <= 0 else "has the slowest pole"
     return f"{', '.join(found)}; vertex {worst['index']}{f' ({where})' if where else ''} {kind}"
 
 
 def describe_frozen_stability(known: FurtherFindings) -> str:
-    """In words, of a gain whose frozen loops are all stable."""
+    """Return a sentence on a gain whose frozen loops are all stable.
+
+    Args:
+        known: Results without a common Lyapunov matrix.
+    """
     loops = known.frozen
     where = ", ".join(f"{name} {value:.6g}" for name, value in loops.at.items())
     said = f"each of {loops.systems} frozen systems is stable by its poles"
@@ -249,14 +318,19 @@ def describe_frozen_stability(known: FurtherFindings) -> str:
     if known.fall is None:
         return said
     return (
-        f"{said}, and a Lyapunov matrix that follows the speed proves stability while that falls by no more than"
-        f" {known.fall:.4g} m/s^2, all that friction allows"
+        f"{said}, and a Lyapunov matrix that follows the speed proves stability while the speed falls by at most"
+        f" {known.fall:.4g} m/s^2, the most that friction allows"
     )
 
 
 @contextlib.contextmanager
 def report_design_errors() -> Iterator[None]:
-    """What `diffabs.design` raises, in one line: what is missing or does not fit is bad input."""
+    """Turn errors of `diffabs.design` into one line.
+
+    Raises:
+        ScenarioError: A value does not fit.
+        typer.Exit: The extra is missing, or the linear algebra failed.
+    """
     try:
         yield
     except ModuleNotFoundError as error:

@@ -1,5 +1,4 @@
-"""How accurate the metrics of a scenario's run are, as values of JSON: against steps of a half and a quarter, and in
-single precision."""
+"""Accuracy of a run's metrics as JSON values: against half steps, quarter steps and single precision."""
 
 import dataclasses
 import math
@@ -16,16 +15,25 @@ from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import Adaptive, Run, Solver, describe_solver, refine_solver
 
-MIN_CHANGE = 1e-6  # of a value: below, nobody asks for its order
-FINEST = 4  # the shortest step is this part of the scenario's
-CLOSER = 16  # times smaller: the error of a step with which a run with adaptive steps is compared
-LOOSE, LEAST = 100, 0.01  # times `rtol`, of a metric or of this, where that is more: a greater change is told
+MIN_CHANGE = 1e-6  # of a value; the order of a smaller error does not matter
+FINEST = 4  # the shortest step of the check is the scenario's divided by this
+CLOSER = 16  # `rtol` of the run with adaptive steps is divided by this for the comparison
+LOOSE, LEAST = 100, 0.01  # a change above LOOSE * rtol * max(|metric|, LEAST) is reported
 
 
 def check_accuracy(chosen: Scenario, key: Any) -> dict[str, Any]:
-    """The document, by metric: what a half step changes, absolutely and relative to the value, what a quarter changes
-    again, the order, the error, and what single precision changes. Raises ScenarioError for a step too short to be
-    shortened."""
+    """Return the accuracy of each metric as JSON values.
+
+    They hold the changes by a half step (absolute and relative), by a further quarter step, and by single precision.
+    They also hold the order and the error.
+
+    Args:
+        chosen: Scenario of the run.
+        key: Random key of its noise.
+
+    Raises:
+        ScenarioError: A quarter of the step takes too many steps.
+    """
     solver = chosen.solver
     if FINEST * solver.duration / solver.step > MAX_SOLVER_STEPS:
         least = FINEST * solver.duration / MAX_SOLVER_STEPS
@@ -60,8 +68,15 @@ def check_accuracy(chosen: Scenario, key: Any) -> dict[str, Any]:
 
 
 def describe_loose_metrics(metrics: Mapping[str, Any], solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
-    """Return what to tell of a run with adaptive steps: the metrics that a smaller error of a step changes by much more
-    than that error. Such a run chatters, or amplifies its errors. `again` makes it with another solver."""
+    """Return one line on metrics that a smaller `rtol` changes by much more than `rtol`; no line without any.
+
+    Such a run chatters, or amplifies its errors.
+
+    Args:
+        metrics: Metrics of the run by name.
+        solver: Solver of the run.
+        again: Function that makes the run again with another solver.
+    """
     closer = dataclasses.replace(solver, rtol=solver.rtol / CLOSER)
     others = again(closer).metrics.items()
     changed = [(name, value) for name, value in others if metrics[name] != value]  # both may be infinite
@@ -74,19 +89,23 @@ def describe_loose_metrics(metrics: Mapping[str, Any], solver: Adaptive, again: 
 
 
 def describe_check(found: dict[str, Any]) -> list[str]:
-    """What a reader of the table must know, a line each."""
+    """Return the warnings of a check, a line each.
+
+    Args:
+        found: Values of `check_accuracy`.
+    """
     lines = [f"accuracy unknown: {why}" for why in found["reasons"]]
     if found["comparable"] and not found["ended alike"]:
-        lines.append("accuracy unknown: with a shorter step the run ends in another way")
+        lines.append("accuracy unknown: with a shorter step the run ends differently")
     rows = found["metrics"].items()
     loose = [name for name, row in rows if not row["converges"] and row["error"] > MIN_CHANGE * abs(row["value"])]
     if found["comparable"] and loose:
-        lines.append(f"a shorter step does not bring {', '.join(loose)} any nearer to a value: the error is a guess")
+        lines.append(f"shorter steps do not converge for {', '.join(loose)}: the error is a guess")
     return lines
 
 
 def _run_in_single_precision(chosen: Scenario) -> dict[str, float]:
-    """The metrics in single precision. Noise is not asked for: other bits are drawn for it."""
+    """Return the metrics in single precision. The loop has no noise: single precision would draw another noise."""
     with jax.enable_x64(False):
         loop, objectives = jax.tree.map(lambda x: np.asarray(x, np.float32), (chosen.loop, dict(chosen.objectives)))
         return {name: float(x) for name, x in measure(loop, chosen.solver, objectives).metrics.items()}

@@ -13,19 +13,19 @@ from diffabs.core.values import ScenarioError, unknown_name_error
 if TYPE_CHECKING:
     from diffabs.sweep import Results
 
-FEWEST = 4  # samples of which anything is said
-SHARED_FIELDS = ("space", "seed", "samples")  # of two studies whose samples are the same
+FEWEST = 4  # common samples below which a metric is left out
+SHARED_FIELDS = ("space", "seed", "samples")  # fields that two studies of the same samples share
 
 
 def compare(
     first: Annotated[pathlib.Path, typer.Argument(help="Folder of a sweep.")],
-    second: Annotated[pathlib.Path, typer.Argument(help="Folder of another, over the same samples.")],
+    second: Annotated[pathlib.Path, typer.Argument(help="Folder of another sweep over the same samples.")],
     metric: Annotated[list[str] | None, typer.Option(help="Only this metric; may be repeated.")] = None,
     as_json: console.Json = False,
 ) -> None:
     """Compare two sweeps on common random numbers.
 
-    It says what the second does better or worse than the first."""
+    The samples are the same, so differences of the second from the first have narrow intervals."""
     with console.end_on_errors():
         console.need_extra("sweep")
         from diffabs.sweep import Results
@@ -37,13 +37,13 @@ def compare(
 
 
 def _check_same(a: "Results", b: "Results") -> None:
-    """Raises ScenarioError for sweeps over different samples, or that are not complete."""
+    """Raise ScenarioError for sweeps over different samples, and for incomplete sweeps."""
     from diffabs.sweep.store import describe_differences
 
     for found in (a, b):
         warn_of_strays(found)
         if not found.complete:
-            raise ScenarioError(f"{found.folder} is not complete; --resume goes on with it")
+            raise ScenarioError(f"{found.folder} is not complete; diffabs sweep ... --resume completes it")
     for line in describe_differences({k: a.study[k] for k in SHARED_FIELDS}, {k: b.study[k] for k in SHARED_FIELDS}):
         raise ScenarioError(
             f"the samples are not the same: {line.replace(' there, ', ' in the first, ')} in the second"
@@ -54,13 +54,16 @@ def _common_metrics(a: "Results", b: "Results", wanted: list[str] | None) -> lis
     both = [name for name in a.metrics if name in b.metrics]
     for name in wanted or ():
         if name not in both:
-            raise unknown_name_error(f"--metric {name} is not in both", name, both)
+            raise unknown_name_error(f"--metric {name} is not in both sweeps", name, both)
     return wanted or both
 
 
 def _compare_metrics(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
-    """Paired statistics of second minus first, over samples that diverged or were refused in neither. A sample that
-    never settles in one of them is left out of that metric, and counted."""
+    """Return paired statistics of second minus first.
+
+    Samples that diverged or were refused in either sweep are left out. A sample with an infinite metric in either sweep
+    is left out of that metric, and counted.
+    """
     from diffabs.sweep.statistics.estimates import Moments
     from diffabs.sweep.statistics.paired import compare_pairs
 

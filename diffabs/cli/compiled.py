@@ -1,6 +1,8 @@
-"""Compiled programs are kept between commands: in the user's cache folder, by JAX, which names them by what they are.
+"""The cache of compiled programs in the user's cache folder, which JAX keeps between commands.
 
-Compiling is most of what a command costs. Who configures JAX's own cache decides; DIFFABS_NO_CACHE=1 turns it off."""
+Compiling takes most of the time of a command. JAX names a program by a hash of its contents. A user's own settings of
+JAX's cache take precedence; DIFFABS_NO_CACHE=1 turns this cache off.
+"""
 
 import logging
 import os
@@ -12,24 +14,29 @@ import jax
 
 from diffabs.core import files, provenance
 
-OFF_VARIABLE = "DIFFABS_NO_CACHE"  # if set, nothing is kept
-WORTH = 0.05  # s of compiling, from which a program is kept
-ROOM = 256 * 2**20  # bytes on disk; beyond, the oldest half goes
-USER_VARIABLES = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # by which a user has decided
+OFF_VARIABLE = "DIFFABS_NO_CACHE"  # if set, no program is kept
+WORTH = 0.05  # s of compiling; faster programs are not kept
+ROOM = 256 * 2**20  # bytes on disk; above, the oldest half is removed
+USER_VARIABLES = (
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_ENABLE_COMPILATION_CACHE",
+)  # of JAX; they take precedence
 
 
 def use_compilation_cache() -> pathlib.Path | None:
-    """Return the folder that JAX from now on keeps compiled programs in, or None: without one everything works, and
-    compiles. Nothing is said of a folder that cannot be written or of a damaged entry."""
+    """Return the folder in which JAX keeps compiled programs from now on, or None without one.
+
+    All commands work without a folder, but compile again. An unwritable folder and a damaged entry give no message.
+    """
     chosen = jax.config.values.get("jax_compilation_cache_dir")
     if os.environ.get(OFF_VARIABLE) or any(name in os.environ for name in USER_VARIABLES) or chosen:
         return None
     try:
         folder = _user_folder() / "diffabs" / f"jax-{provenance.processor()}"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if files.others_may_write(folder):  # what is read from there is run
+        if files.others_may_write(folder):  # a program read from there is executed: another user could plant one
             logging.getLogger("diffabs").warning(
-                "%s: nothing is kept there, because other users may write to it", folder
+                "%s: compiled programs are not kept there, because other users may write to it", folder
             )
             return None
         if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
@@ -45,7 +52,7 @@ def use_compilation_cache() -> pathlib.Path | None:
 
 
 def _user_folder() -> pathlib.Path:
-    """Return where this system wants caches. Raises RuntimeError where the user has no home."""
+    """Return the system's folder for caches. Raises RuntimeError for a user without home."""
     if sys.platform == "darwin":
         return pathlib.Path.home() / "Library" / "Caches"
     given = pathlib.Path(os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", ""))

@@ -1,4 +1,4 @@
-"""What every command does: report errors in one line, wait with a sign of life, leave."""
+"""Shared code of all commands: errors in one line, progress during work, Ctrl-C, and exit statuses."""
 
 import contextlib
 import importlib.util
@@ -28,9 +28,9 @@ T = TypeVar("T")
 
 FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, interrupt.INTERRUPTED, interrupt.TERMINATED
 SILENCE_S, SECOND_INTERRUPT_S = progress.SILENCE_S, progress.REPEAT_S
-AWAKE = 0.1  # s between looks for Ctrl-C
+AWAKE = 0.1  # s between two checks for Ctrl-C
 LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
-CONTINUED = " \\"  # a line of a shell that goes on in the next
+CONTINUED = " \\"  # end of a shell's line that continues on the next
 WORKER = "diffabs worker"
 EXTRAS = {
     "sweep": ("filelock", "pyarrow", "scipy", "zarr"),
@@ -41,15 +41,24 @@ EXTRAS = {
 }
 
 
-# What commands take.
+# Arguments and options that commands share.
 def scenarios_like(incomplete: str) -> list[str]:
-    """Completions; where there is none the shell offers files."""
+    """Return completions of a scenario's name; without one the shell completes files.
+
+    Args:
+        incomplete: Start of the name.
+    """
     return [name for name in names() if name.startswith(incomplete)]
 
 
 def fields_like(context: typer.Context, incomplete: str) -> list[str]:
-    """Completions of --set: the fields of the scenario on the line, as `show` writes them."""
-    words = [context.params.get("scenario"), *context.args]  # an option without its value leaves words unread
+    """Return completions of --set: the fields of the scenario on the line, as `show` writes them.
+
+    Args:
+        context: Context with the words so far.
+        incomplete: Start of the field's path.
+    """
+    words = [context.params.get("scenario"), *context.args]  # an unfinished option leaves words unparsed here
     try:
         tables = tomllib.loads(dump(load(next(filter(None, words)))))
     except (StopIteration, OSError, ValueError):
@@ -66,7 +75,7 @@ def _field_paths(tables: dict[str, Any], above: str = "") -> Iterator[str]:
 
 
 ScenarioName = Annotated[
-    str, typer.Argument(help="A TOML file, or the name of a packaged scenario.", autocompletion=scenarios_like)
+    str, typer.Argument(help="TOML file, or name of a packaged scenario.", autocompletion=scenarios_like)
 ]
 Changes = Annotated[
     list[str] | None,
@@ -77,7 +86,7 @@ Changes = Annotated[
         autocompletion=fields_like,
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout, nothing else there.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result to stdout as one JSON document.")]
 
 
 _quiet = False
@@ -86,37 +95,58 @@ _begun = time.monotonic()
 
 
 def quieten(wanted: bool) -> None:
-    """Say no more than errors, warnings, and what was interrupted; or everything."""
+    """Set whether lines other than errors, warnings and interruptions are suppressed.
+
+    Args:
+        wanted: True to suppress them.
+    """
     global _quiet
     _quiet = wanted
 
 
 def note_command(words: Sequence[str]) -> None:
-    """Note the words of the command that begins."""
+    """Store the words of the command that begins, and start its clock.
+
+    Args:
+        words: Words after `diffabs`.
+    """
     global _given, _begun
     _given, _begun = tuple(words), time.monotonic()
     stopwatch.count_compilations()
 
 
 def describe_run() -> dict[str, str | float]:
-    """Return when, where and by which command a document is made, and how long that took so far [s]."""
+    """Return date, place and command of a document, and the time [s] it took so far."""
     seconds, compiling = time.monotonic() - _begun, stopwatch.compile_time_since(_begun)
     return {**provenance.describe_making(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
 
 
 def describe_source(chosen: Scenario) -> dict[str, Any]:
-    """Return how every document on a scenario begins: what was asked about, and how the document is made."""
+    """Return the first keys of every document on a scenario: name, model, and origin of the document.
+
+    Args:
+        chosen: Scenario.
+    """
     return {"scenario": chosen.name, "model": describe_model(chosen), "made": describe_run()}
 
 
 def say(line: str) -> None:
-    """A line for a person, on stderr; on a terminal folded between words."""
+    """Write a line for a person to stderr; on a terminal it is folded between words.
+
+    Args:
+        line: Line without a line break.
+    """
     if not _quiet or line.startswith(LOUD):
         _write("\n".join(_fold_line(line)))
 
 
 def say_command(line: str, words: Sequence[str]) -> None:
-    """A line that ends in a command; on a terminal too narrow for both the command has its own lines, to copy."""
+    """Write a line that ends in a command; a narrow terminal gets the command on lines of its own, to copy.
+
+    Args:
+        line: Text before the command.
+        words: Words of the command, which are quoted for a shell.
+    """
     width, command = _terminal_width(), [shlex.quote(word) for word in words]
     if width is None or len(" ".join([line, *command])) <= width:
         say(" ".join([line, *command]))
@@ -132,8 +162,11 @@ def say_command(line: str, words: Sequence[str]) -> None:
 
 
 def _write(text: str) -> None:
-    """Not with `typer.echo`, which writes past what has taken the place of stderr: the display of how far work is,
-    which moves out of the way."""
+    """Write to the current stderr.
+
+    While a display of progress is drawn, it replaces `sys.stderr` and moves out of the way. `typer.echo` would write
+    past it.
+    """
     print(text, file=sys.stderr, flush=True)
 
 
@@ -145,26 +178,39 @@ def _fold_line(line: str) -> list[str]:
 
 
 def _terminal_width() -> int | None:
-    """Columns of the terminal that stderr is; None where it is none."""
+    """Return the columns of the terminal behind stderr; None for a file or a pipe."""
     console = Console(stderr=True)
     return console.width if console.is_terminal else None
 
 
 def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
-    """Leave with one line. Raises typer.Exit."""
+    """End the command with one line on stderr.
+
+    Args:
+        line: Text of the error.
+        status: Exit status.
+
+    Raises:
+        typer.Exit: Always.
+    """
     say(f"error: {line}")
     raise typer.Exit(status)
 
 
 def is_animated() -> bool:
-    """Whether stderr shows a spinner."""
+    """Return True if stderr shows a spinner."""
     return progress.can_redraw(Console(stderr=True))
 
 
 @contextlib.contextmanager
 def end_on_errors() -> Iterator[None]:
-    """Bad input, a full disk, Ctrl-C, and parts from outside that raise or exit end a command with one line and their
-    exit status."""
+    """End a command with one line and an exit status for expected errors.
+
+    Expected are bad input, a full disk, Ctrl-C, and parts from outside that raise or exit.
+
+    Raises:
+        typer.Exit: One of these errors occurred.
+    """
     try:
         yield
     except ScenarioError as error:
@@ -185,20 +231,26 @@ def end_on_errors() -> Iterator[None]:
 
 
 class InterruptibleEnd:
-    """What Ctrl-C asks of work that can end early and has then something to show: to finish `what` it has in hand. The
-    work asks this object whether it shall. The second time Ctrl-C interrupts, and the first, too, while `nothing()` is
-    reached yet."""
+    """The reaction to Ctrl-C of work that can end early with a partial result.
+
+    The first Ctrl-C sets `asked`; the work reads it by calling this object, finishes `what`, and ends. The second
+    Ctrl-C interrupts at once. So does the first while `nothing()` is true: there is no partial result yet.
+    """
 
     def __init__(self, what: str, nothing: Callable[[], bool] = lambda: False):
-        """Nobody has asked yet."""
+        """Store `what`, the step to finish, for messages, and `nothing`, which is true while there is no result."""
         self.what, self.nothing, self.asked = what, nothing, False
 
     def __call__(self) -> bool:
-        """Whether Ctrl-C was pressed."""
+        """Return True after Ctrl-C."""
         return self.asked
 
     def ask(self) -> None:
-        """Ctrl-C was pressed. Raises KeyboardInterrupt if the work is not to be waited for."""
+        """Handle Ctrl-C.
+
+        Raises:
+            KeyboardInterrupt: It is the second Ctrl-C, or there is no result yet.
+        """
         if self.asked or self.nothing():
             raise KeyboardInterrupt
         self.asked = True
@@ -208,23 +260,32 @@ class InterruptibleEnd:
 def run_with_progress(
     work: Callable[[], T], message: str, detail: progress.Detail | None = None, ending: InterruptibleEnd | None = None
 ) -> T:
-    """The result of `work`, with a spinner on a terminal, or a line if it takes long elsewhere. `detail` says how far
-    the work is: beside the spinner, or in a line every few seconds.
+    """Return the result of `work`, with a spinner on a terminal, or lines on stderr elsewhere.
 
-    The work has a thread of its own, because Ctrl-C cannot interrupt compiled code in the main one. Raises what it
-    raises, and KeyboardInterrupt at once, or with an `ending` when there is nothing to wait for.
+    The work runs in its own thread, because Ctrl-C cannot interrupt compiled code in the main thread.
+
+    Args:
+        work: Function to run.
+        message: Text beside the spinner.
+        detail: Function that returns the progress, for the spinner or for a line every few seconds.
+        ending: Reaction to Ctrl-C; by default the work is interrupted at once.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C interrupted the work.
+        BaseException: The work raised it.
     """
     result: list[T] = []
     errors: list[BaseException] = []
 
     def run() -> None:
         try:
-            # a part from outside may print: stdout is for the result
+            # a part from outside may print, and stdout must hold nothing but the result
             with contextlib.redirect_stdout(sys.stderr), warnings_in_lines():
                 result.append(work())
         except BaseException as error:
             errors.append(error)
 
+    # Daemon: after an interrupt the process can exit while compiled code still runs.
     thread = threading.Thread(target=run, name=WORKER, daemon=True)
     told = (
         contextlib.nullcontext(lambda: None)
@@ -246,14 +307,17 @@ def run_with_progress(
 
 @contextlib.contextmanager
 def warnings_in_lines() -> Iterator[None]:
-    """Say what the library warns of in a line, without the file that warns."""
+    """Write each warning of Python code as one line, without file and line number."""
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: say(f"warning: {' '.join(str(message).split())}")
         yield
 
 
 def _wait_for_interrupt(thread: threading.Thread) -> bool:
-    """Wait a moment for a thread. Whether Ctrl-C was pressed; an exception where this is not the command's process."""
+    """Wait a moment for a thread; return True after Ctrl-C.
+
+    `interrupt` counts Ctrl-C in the process of the command. Elsewhere Ctrl-C raises KeyboardInterrupt.
+    """
     try:
         thread.join(AWAKE)
     except KeyboardInterrupt:
@@ -262,7 +326,16 @@ def _wait_for_interrupt(thread: threading.Thread) -> bool:
 
 
 def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: bool = True) -> Scenario:
-    """A scenario; says what is allowed in it but hardly meant. Raises ScenarioError."""
+    """Return a scenario, and warn of values that are allowed but probably a mistake.
+
+    Args:
+        scenario: Name of a packaged scenario, or path of a TOML file.
+        changes: Overrides.
+        integrated: Also check that the step is stable for the loop.
+
+    Raises:
+        ScenarioError: As in `load`.
+    """
     chosen = run_with_progress(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
     for line in chosen.cautions():
         say(f"warning: {line}")
@@ -270,8 +343,16 @@ def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: b
 
 
 def leave(status: Any) -> NoReturn:
-    """Exit at once where interrupted work still runs: the interpreter would wait for it; what that work has begun to
-    write and its processes go with it. Raises SystemExit else."""
+    """Exit, at once if interrupted work still runs.
+
+    The interpreter would wait for the work's thread. Unfinished files and processes of the work are removed.
+
+    Args:
+        status: Exit status.
+
+    Raises:
+        SystemExit: No work runs.
+    """
     status = TERMINATED if status == INTERRUPTED and interrupt.was_terminated() else status
     if any(thread.name == WORKER for thread in threading.enumerate()):
         for child in multiprocessing.active_children():
@@ -284,19 +365,36 @@ def leave(status: Any) -> NoReturn:
 
 
 def add_option_overrides(changes: Sequence[str] | None, section: str, **fields: Any) -> list[str]:
-    """Return overrides, with those that options of their own say of fields of a section."""
+    """Return overrides with those of separate options added.
+
+    Args:
+        changes: Overrides of --set.
+        section: Section of the fields.
+        **fields: Values by field; None is left out.
+    """
     return [*(changes or ()), *(f"{section}.{name}={value}" for name, value in fields.items() if value is not None)]
 
 
 def need_extra(extra: str) -> None:
-    """Raises typer.Exit if a module of an optional extra is not installed."""
+    """End the command if a module of an optional extra is not installed.
+
+    Args:
+        extra: Key of `EXTRAS`.
+
+    Raises:
+        typer.Exit: A module is missing.
+    """
     missing = [name for name in EXTRAS[extra] if importlib.util.find_spec(name) is None]
     if missing:
         fail(f'{" and ".join(missing)} needed: pip install ".[{extra}]" in a clone')
 
 
 def need_matplotlib() -> None:
-    """Raises typer.Exit where no figure can be drawn."""
+    """End the command if Matplotlib is not installed.
+
+    Raises:
+        typer.Exit: Matplotlib is missing.
+    """
     os.environ.setdefault("MPLBACKEND", "agg")
     if importlib.util.find_spec("matplotlib") is None:
         fail('figures need matplotlib: pip install ".[plot]" in a clone')

@@ -1,6 +1,7 @@
-"""The commands `design` and `certify`: a robust gain for a scenario, and what can be proved about one.
+"""The commands `design`, `certify` and `verify`: a robust gain for a scenario, and proofs about a gain.
 
-Both need the extra `design`, so what needs it is imported when a command runs."""
+`design` and `certify` need the extra `design`. Modules that need it are imported only when a command runs.
+"""
 
 import math
 import pathlib
@@ -26,7 +27,7 @@ def design(
 ) -> None:
     """Find the gain with the least guaranteed cost.
 
-    It is a state feedback for all systems within the ranges of [design], and its cost is proved."""
+    The gain is a state feedback for all systems within the ranges of [design.over]. A certificate proves its cost."""
     with console.end_on_errors(), certificates.report_design_errors():
         with targets.new_target_file(out, "--out") as file:
             task = _prepare(scenario, changes or (), weighed=True)
@@ -49,15 +50,16 @@ def design(
 def certify(
     scenario: console.ScenarioName,
     gain: Annotated[
-        str | None, typer.Option(metavar="K1,K2,...", help="The gain of u = K x; else the scenario's controller's own.")
+        str | None,
+        typer.Option(metavar="K1,K2,...", help="Gain of u = K x; default: that of the scenario's controller."),
     ] = None,
     changes: console.Changes = None,
     as_json: console.Json = False,
     out: Out = None,
 ) -> None:
-    """Prove that a gain is stable over the ranges of [design].
+    """Prove that a gain is stable over the ranges of [design.over].
 
-    The proof, or what stands against it, holds however fast the parameters vary."""
+    The result, proved or disproved, holds for parameters that vary arbitrarily fast."""
     with console.end_on_errors(), certificates.report_design_errors():
         with targets.new_target_file(out, "--out") as file:
             task = _prepare(scenario, changes or (), gain)
@@ -65,7 +67,7 @@ def certify(
             if file:
                 found.save(file)
         known = console.run_with_progress(
-            lambda: certificates.find_further(task, found), "looking at what is known besides"
+            lambda: certificates.find_further(task, found), "analysing the loops at fixed parameters"
         )
         reason = certificates.describe_unproved(found, task.spec, known)
         _show(certificates.proof_document(task, found, out, reason=reason or None, known=known), task, as_json)
@@ -74,15 +76,18 @@ def certify(
 
 
 def verify(
-    file: Annotated[pathlib.Path, typer.Argument(metavar="FILE.json", help="What design or certify wrote.")],
+    file: Annotated[
+        pathlib.Path, typer.Argument(metavar="FILE.json", help="Certificate written by design or certify.")
+    ],
     seconds: Annotated[
-        float, typer.Option(help="Refuse a file that is not decided after so many seconds of computing.")
+        float, typer.Option(help="Limit of the computing time [s]; an undecided file is refused after it.")
     ] = 6.0,
     as_json: console.Json = False,
 ) -> None:
     """Prove a saved certificate again, in exact fractions.
 
-    The code shares nothing with what made the certificate. Exit status 0 proved, 1 not proved, 2 no certificate."""
+    The code is independent of the code that made the certificate.
+    Exit status: 0 proved, 1 not proved, 2 no certificate."""
     from diffabs.design.verify import verify_file as verified
 
     with console.end_on_errors():
@@ -101,7 +106,7 @@ def verify(
         }, as_json)  # fmt: skip
         if not proved:
             why = "; ".join(f"{verdict.kind}: {verdict.reason}" for verdict in verdicts if verdict.reason)
-            console.fail(f"{file}: not proved: {why or 'the file claims nothing'}", console.FAILED)
+            console.fail(f"{file}: not proved: {why or 'the file has no claims'}", console.FAILED)
 
 
 def _prepare(
@@ -124,10 +129,12 @@ def _show(result: dict[str, Any], task: certificates.ProofTask, as_json: bool) -
     for line in task.reduced.neglected:
         console.say(f"neglected: {line}")
     if not task.reduced.exact:
-        console.say("note: the linear model is not the loop's own linearisation; a proof is about the model")
+        console.say("note: the linear model differs from the loop's linearisation; the proof is about the model")
     spread = task.polytope.coverage.spread if task.polytope.coverage else 1.0
     if not task.polytope.corners:
-        console.say("note: the corners do not cover the ranges; the vertices are those of a box around the systems")
+        console.say(
+            "note: the corners do not cover the ranges; the vertices are the corners of a box around the systems"
+        )
     elif not math.isclose(spread, 1.0):
         console.say(f"note: the corners do not cover the ranges; the vertices are spread by {spread:.4g}")
     for path in result["files"].values():

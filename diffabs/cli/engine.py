@@ -1,4 +1,4 @@
-"""What makes the runs of a command: the option, and what becomes of "auto"."""
+"""The option `--engine`, which selects the program that makes the runs of a command."""
 
 from collections.abc import Callable
 from typing import Annotated
@@ -9,17 +9,33 @@ from diffabs.cli import console
 from diffabs.core.values import unknown_name_error
 from diffabs.simulate.engine import REQUESTABLE_ENGINES
 
-Engine = Annotated[str, typer.Option(help="xla, kernel (a program of this machine, by its C++ compiler), or auto.")]
+Engine = Annotated[
+    str, typer.Option(help="Engine of the runs: xla, kernel (compiled by this machine's C++ compiler) or auto.")
+]
 
 
 def check_engine_name(engine: str) -> None:
-    """Raises ScenarioError for a name of none."""
+    """Check the name of an engine.
+
+    Args:
+        engine: Value of the option.
+
+    Raises:
+        ScenarioError: The name is unknown.
+    """
     if engine not in REQUESTABLE_ENGINES:
         raise unknown_name_error(f"--engine {engine} is unknown", engine, REQUESTABLE_ENGINES)
 
 
 def choose_engine(engine: str, objection: Callable[[], str | None]) -> str:
-    """Return "xla" or "kernel": of "auto" the second where nothing stands against it; else a line says what does."""
+    """Return "xla" or "kernel".
+
+    "auto" becomes "kernel" if nothing prevents it; otherwise a line on stderr gives the reason for XLA.
+
+    Args:
+        engine: Value of the option.
+        objection: Function that compiles a kernel and returns the reason against it, or None.
+    """
     if engine != "auto":
         return engine
     line = console.run_with_progress(objection, "compiling a kernel")

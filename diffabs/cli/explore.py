@@ -17,35 +17,40 @@ if TYPE_CHECKING:
     from diffabs.explore.tuning import TuningTask
 
 PORT = 8342
-DEFAULT_SCENARIO = "slip-cured"  # what is shown where nothing is asked for
+DEFAULT_SCENARIO = "slip-cured"  # shown without an argument
 
 
 def explore(
     scenario: console.ScenarioName = DEFAULT_SCENARIO,
     port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help=f"Of the page; 0 for any. Default: {PORT}, else any.")
+        int | None,
+        typer.Option(
+            min=0,
+            max=65535,
+            help=f"Port of the page; 0 for any free port. Default: {PORT}, or any free port if it is in use.",
+        ),
     ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
 ) -> None:
     """Drag parameters in the browser.
 
-    Curves, a fan of runs, poles and a certificate follow. The page tunes, and saves."""
+    Curves, a fan of runs, poles and a certificate follow at once. The page can also tune and save."""
     with console.end_on_errors():
         console.need_extra("explore")
-        console.load_scenario(scenario, None)  # what is wrong is said here, not in a page
+        console.load_scenario(scenario, None)  # reports a wrong scenario here, before a page opens
         from diffabs.explore import server
 
         there = _open_socket(port)
         told = {"ready": lambda url: console.say(f"{url} (on this machine only; Ctrl-C ends it)"), "browser": browser}
-        if not interrupt.take_interrupt():  # while the framework was imported
+        if not interrupt.take_interrupt():  # Ctrl-C may have come during the import of the framework
             with console.warnings_in_lines():
                 server.serve(scenario, _page_tools(), pathlib.Path.cwd(), there, thread=console.WORKER, **told)
             interrupt.take_interrupt()
-        raise KeyboardInterrupt  # nothing else ends it
+        raise KeyboardInterrupt  # only Ctrl-C ends the server
 
 
 def _open_socket(port: int | None) -> socket.socket:
-    """A socket at the port that is asked for; at the usual one or any other if none is. Raises typer.Exit."""
+    """Return a socket at the given port, else at the usual port or any free one. Raises typer.Exit."""
     from diffabs.explore.server import listen_on_loopback
 
     try:
@@ -53,19 +58,23 @@ def _open_socket(port: int | None) -> socket.socket:
     except OSError as error:
         if port is None and error.errno == errno.EADDRINUSE:
             return listen_on_loopback(0)
-        why = "another program listens there" if error.errno == errno.EADDRINUSE else error.strerror
+        why = "another program uses this port" if error.errno == errno.EADDRINUSE else error.strerror
         console.fail(f"--port {port}: {why}")
 
 
 def _page_tools() -> "Tools":
-    """What the page needs of other commands."""
+    """Return the functions of other commands that the page uses."""
     from diffabs.explore.session import Tools
 
     return Tools(prove_scenario, pose_tuning)
 
 
 def prove_scenario(chosen: Scenario) -> "ProofVerdict":
-    """Return what can be proved of a scenario over the ranges of its [design]."""
+    """Return the verdict on a scenario over the ranges of its [design].
+
+    Args:
+        chosen: Scenario.
+    """
     from diffabs.explore.session import CERTIFIED, NOT_PROVED, REFUTED, UNDECIDED, ProofVerdict
 
     found = tune.certify_result(chosen)
@@ -77,7 +86,14 @@ def prove_scenario(chosen: Scenario) -> "ProofVerdict":
 
 
 def pose_tuning(chosen: Scenario) -> "TuningTask":
-    """Return lanes and constraints of a scenario's [tune]. Raises ScenarioError."""
+    """Return runs and constraints of a scenario's [tune].
+
+    Args:
+        chosen: Scenario.
+
+    Raises:
+        ScenarioError: The section does not fit the loop, or an extra is not installed.
+    """
     from diffabs.explore.tuning import TuningTask
 
     try:

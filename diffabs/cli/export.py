@@ -1,5 +1,4 @@
-"""The command `export`: the computer's part of a scenario as C, Structured Text or difference equations; the plant as
-an FMU."""
+"""The command `export`: a scenario's controller as C, Structured Text or a table, or its plant as an FMU."""
 
 import dataclasses
 import enum
@@ -22,7 +21,7 @@ from diffabs.simulate.solution import FixedStep
 
 
 class Form(enum.StrEnum):
-    """What can be written."""
+    """A format of the output."""
 
     C = "c"
     ST = "st"
@@ -31,7 +30,7 @@ class Form(enum.StrEnum):
 
 
 class Given(enum.StrEnum):
-    """What can come from outside."""
+    """A signal that the code can receive as an input."""
 
     TARGET = "target"
 
@@ -41,22 +40,22 @@ def export(
     to: Annotated[
         Form,
         typer.Option(
-            help="C99, Structured Text (IEC 61131-3), a table of difference equations; or the plant as an FMU."
+            help="Controller as C99, Structured Text (IEC 61131-3) or difference equations; or the plant as an FMU."
         ),
     ] = Form.C,
     changes: console.Changes = None,
     out: Annotated[
-        pathlib.Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write to this file; default: stdout.")
+        pathlib.Path | None, typer.Option("--out", "-o", metavar="FILE", help="File to write; default: stdout.")
     ] = None,
-    single: Annotated[bool, typer.Option("--float32", help="Numbers in single precision.")] = False,
-    given: Annotated[
-        Given | None, typer.Option(help="What the code is given from outside, beside measurements.")
-    ] = None,
+    single: Annotated[bool, typer.Option("--float32", help="Write numbers in single precision.")] = False,
+    given: Annotated[Given | None, typer.Option(help="Signal that the code takes as a further input.")] = None,
     period: Annotated[
         float | None,
         typer.Option(metavar="SECONDS", help="Sample the scenario's continuous controller with this period."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="With --to table: one JSON document on stdout.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="With --to table: print one JSON document to stdout.")
+    ] = False,
 ) -> None:
     """Write the sampled controller as code, or the plant as FMU.
 
@@ -89,19 +88,19 @@ def export(
                 console.fail(f"{chosen.name}: {_add_hint(str(error))}")
             file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
         if out and to is Form.ST:
-            console.say(f"st: {out}; FUNCTION_BLOCK {_function_prefix(chosen, out)}, to be called once a period")
+            console.say(f"st: {out}; call FUNCTION_BLOCK {_function_prefix(chosen, out)} once a period")
         elif out:
             console.say(f"c: {out}; try it with: cc -std=c99 -D{_function_prefix(chosen, out).upper()}_MAIN {out} -lm")
 
 
 def _add_hint(line: str) -> str:
-    """With what the command line can do about it."""
+    """Return a message with Python's arguments replaced by options of the command line."""
     line = line.replace("give the target from outside", "say --given target")
     return line.replace("give the period at which", "say --period SECONDS, at which")
 
 
 def _sample_controller(chosen: Scenario, period: float) -> Scenario:
-    """The scenario with its controller as it is, sampled. Raises ScenarioError."""
+    """Return the scenario with its controller sampled. Raises ScenarioError."""
     from diffabs.controllers import Sampled, SampledOnGrid
 
     inner = chosen.loop.controller
@@ -115,7 +114,7 @@ def _sample_controller(chosen: Scenario, period: float) -> Scenario:
 
 
 def _function_prefix(chosen: Scenario, out: pathlib.Path | None) -> str:
-    """What functions begin with: the file's name, or the scenario's."""
+    """Return the prefix of the functions' names, from the name of the file or of the scenario."""
     name = re.sub(r"[\W_]+", "_", out.stem if out else chosen.name, flags=re.ASCII).strip("_")
     return name if name[:1].isalpha() else f"controller_{name}"
 
@@ -132,7 +131,7 @@ def _write_source(chosen: Scenario, out: pathlib.Path | None, to: Form, single: 
 
 
 def _write_fmu(chosen: Scenario, file: pathlib.Path, out: pathlib.Path) -> None:
-    """The plant, as the scenario integrates it. Raises ScenarioError, NotExported."""
+    """Write the plant with the scenario's fixed steps. Raises ScenarioError, NotExported."""
     from diffabs.export import build_fmu
 
     solver = chosen.solver
@@ -169,4 +168,7 @@ def _show_columns(chosen: Scenario, period: float, columns: list[str], rows: dic
     for name, row in rows.items():
         table.add_row(name, *(f"{value:.8g}" for value in row))
     show.show_titled_table(f"{chosen.title or chosen.name}: every {1e3 * period:g} ms, at k", table)
-    console.say("note: d is the difference from rest on the setpoint, x that of what is remembered; limits do not act")
+    console.say(
+        "note: d is the deviation from rest at the setpoint, x the deviation of the controller's state; limits are not"
+        " included"
+    )

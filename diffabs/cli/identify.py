@@ -1,6 +1,7 @@
 """The command `identify`: parameters of a scenario from a measured run.
 
-It needs the extra `tune`; what needs that is imported when it runs."""
+It needs the extra `tune`. Modules that need it are imported only when the command runs.
+"""
 
 import dataclasses
 import math
@@ -25,39 +26,45 @@ if TYPE_CHECKING:
     from diffabs.identify.fit import Identified
 
 HIGH_CORRELATION = 0.95
-ROUNDS = 3  # fits, where the noise is estimated from the residuals of the one before
-MIN_RELATIVE_NOISE = 1e-6  # of a column's spread: less noise than that is not believed
+ROUNDS = 3  # fits; each estimates unknown noise from the residuals of the previous fit
+MIN_RELATIVE_NOISE = 1e-6  # of a column's spread: a lower bound of estimated noise
 MAX_DATA_ROWS = 20_000  # of a simulated trajectory
 DEPENDENT = {"slip", "speed", "wheel_speed"}
 REDUNDANT = (
-    "slip, speed and wheel_speed: one follows from the others, and counted as independent they make the standard"
-    " deviations too small; choose with --column"
+    "slip, speed and wheel_speed depend on each other; together they make the standard deviations too small; choose"
+    " columns with --column"
 )
-SPARE = 2  # steps after the last instant of the data
+SPARE = 2  # extra steps, so that the run covers the last instant of the data
 
 
 def identify(
     scenario: console.ScenarioName,
-    data: Annotated[pathlib.Path, typer.Option(metavar="FILE.csv", help="A run, in the columns of simulate --csv.")],
+    data: Annotated[
+        pathlib.Path, typer.Option(metavar="FILE.csv", help="Measured run, with the columns of simulate --csv.")
+    ],
     free: Annotated[
-        list[str], typer.Option(metavar="PATH[=LOW:HIGH]", help="A parameter to find, and its range; may be repeated.")
+        list[str],
+        typer.Option(metavar="PATH[=LOW:HIGH]", help="Parameter to identify, and its range; may be repeated."),
     ],
     sigma: Annotated[
         list[str] | None,
-        typer.Option(metavar="COLUMN=NUMBER", help="Standard deviation of a column's noise; else from the residuals."),
+        typer.Option(
+            metavar="COLUMN=NUMBER",
+            help="Standard deviation of a column's noise; default: estimated from the residuals.",
+        ),
     ] = None,
     column: Annotated[
-        list[str] | None, typer.Option(metavar="COLUMN", help="Compare this column, not all; may be repeated.")
+        list[str] | None, typer.Option(metavar="COLUMN", help="Compare only this column; may be repeated.")
     ] = None,
     changes: console.Changes = None,
     as_json: console.Json = False,
     out: Annotated[
-        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write the scenario with what was found.")
+        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write the scenario with the identified values.")
     ] = None,
 ) -> None:
     """Find parameters of a scenario from a measured run.
 
-    It says how well the run determines them."""
+    Each value has a standard deviation. Parameters that the run does not determine are named."""
     with console.end_on_errors(), certificates.report_design_errors():
         console.need_extra("tune")
         targets.check_scenario_file(out)
@@ -73,7 +80,7 @@ def identify(
                 show.as_json(result) if as_json else show.show_identification(result)
                 console.say("interrupted: these are the values so far, not the best ones; no file is written")
                 raise typer.Exit(console.INTERRUPTED)
-            if result["undetermined"]:  # inside, so that no file is written
+            if result["undetermined"]:  # inside `with`: the exception discards the file
                 show.as_json(result) if as_json else show.show_identification(result)
                 missing = "; ".join(row["direction"] for row in result["undetermined"])
                 console.fail(f"{chosen.name}: not identifiable from these data: {missing}", console.FAILED)
@@ -84,7 +91,7 @@ def identify(
 
 
 def _compared_columns(data: pathlib.Path, names: Sequence[str] | None, units: Mapping[str, str]) -> Readings:
-    """Those columns of a file that are compared."""
+    """Return the columns of a file that are compared."""
     readings = read_measurements(data, units)
     for name in names or ():
         if name not in readings.columns:
@@ -96,7 +103,7 @@ def _compared_columns(data: pathlib.Path, names: Sequence[str] | None, units: Ma
 
 
 def _read_noise(given: Sequence[str], readings: Readings, units: Mapping[str, str]) -> dict[str, float]:
-    """Standard deviations by column, in SI."""
+    """Return standard deviations by column, in SI."""
     found: dict[str, float] = {}
     for text in given:
         name, equals, number = text.partition("=")
@@ -118,7 +125,7 @@ def _read_noise(given: Sequence[str], readings: Readings, units: Mapping[str, st
 
 
 def _read_ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.Ends | None]:
-    """Ranges by path; None where they are the declared ones."""
+    """Return ranges by path; None for the declared range."""
     table = {}
     for text in given:
         path, equals, ends = text.partition("=")
@@ -139,7 +146,7 @@ def _read_ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tu
 def _fit_with_progress(
     chosen: Scenario, readings: Readings, ranges: Mapping[str, section_tune.Ends | None], given: Mapping[str, float]
 ) -> tuple["Identified", dict[str, float], bool]:
-    """The fit, the standard deviations it was made with, and whether Ctrl-C ended it."""
+    """Return the fit, its standard deviations by column, and True if Ctrl-C ended it."""
     far: list[str] = []
 
     def report_progress(evaluations: int, cost: float) -> None:
@@ -163,8 +170,11 @@ def _fit(
     told: Callable[[int, float], None],
     stopping: Callable[[], bool],
 ) -> tuple["Identified", dict[str, float]]:
-    """The fit, and the standard deviations it was made with. What is not given is first the spread of a column, then
-    that of its residuals, until it hardly changes. Raises ValueError."""
+    """Return the fit, and its standard deviations by column. Raises ValueError.
+
+    An unknown deviation starts as the spread of its column. It then becomes the root mean square of the column's
+    residuals, over `ROUNDS` fits in all.
+    """
     from diffabs.identify.identification import identify
     from diffabs.identify.traces import Traces
 
@@ -182,6 +192,7 @@ def _fit(
     noise = {**spread, **given}
     found, residuals = fit_traces(noise)
     evaluations = found.evaluations
+    # Weights by residuals change the fit, and the fit its residuals: iterate a few times from the last values.
     for _ in range(0 if len(given) == len(columns) else ROUNDS - 1):
         if stopping():
             break
@@ -195,7 +206,7 @@ def _fit(
 
 
 def _solver(solver: Solver, readings: Readings) -> Solver:
-    """As long as the data, with as many instants as memory allows."""
+    """Return the solver with the duration of the data, and at most `MAX_DATA_ROWS` instants."""
     steps = math.ceil(float(readings.t[-1]) / solver.step) + SPARE
     if steps * solver.step >= solver.duration:
         steps = solver.steps
@@ -213,7 +224,7 @@ def _result(
     found: "Identified",
     noise: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The JSON document."""
+    """Return the JSON document."""
     known = found.uncertainty
     return {
         **console.describe_source(chosen),
@@ -244,7 +255,7 @@ def _result(
 def _scalar_values(
     chosen: Scenario, ranges: Mapping[str, section_tune.Ends | None], found: "Identified"
 ) -> dict[str, dict[str, Any]]:
-    """One for each number: `controller.gain.0` where a parameter is a list."""
+    """Return one row for each number: a list `controller.gain` gives `controller.gain.0` and so on."""
     specs = {path: spec for path, spec, _ in parameters(chosen.loop)}
     rows = {}
     for path, ends in ranges.items():
@@ -262,7 +273,7 @@ def _scalar_values(
 def _residuals(
     readings: Readings, found: "Identified", noise: Mapping[str, float], units: Mapping[str, str]
 ) -> dict[str, dict[str, Any]]:
-    """Simulated minus measured, by column."""
+    """Return statistics of simulated minus measured, by column."""
     each = np.split(np.asarray(found.residuals), len(readings.columns))
     return {
         name: {

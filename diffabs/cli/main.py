@@ -1,11 +1,13 @@
-"""The command `diffabs`. Exit status: 0 done, 1 not possible (diverged, no gain, not proved), 2 bad input.
+"""The command `diffabs`: the program, and its command `simulate`.
 
-Results go to stdout, as tables or with --json as one JSON document; everything else goes to stderr."""
+Exit status: 0 done; 1 not possible (diverged, no gain, not proved); 2 bad input; 130 interrupted. Results go to stdout,
+as tables or with --json as one JSON document. Everything else goes to stderr.
+"""
 
 import gc
 
 COLLECTS = gc.isenabled()
-gc.disable()  # while modules are made: a look for garbage goes through all of JAX's, a sixth of a short command
+gc.disable()  # during imports: collections would scan all of JAX's objects, a sixth of a short command's time
 
 import contextlib
 import dataclasses
@@ -56,20 +58,20 @@ app = typer.Typer(
     no_args_is_help=True,
     cls=usage.Group,
     context_settings={"help_option_names": ["-h", "--help"]},
-    rich_markup_mode=None,  # plain help, that scripts and people can read
+    rich_markup_mode=None,  # plain help, for scripts and people
     pretty_exceptions_enable=False,
     help="Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers.",
 )
 
-AT_LIMIT = "at a limit"  # among the objectives of a run; no metric of a scenario has a space in its name
-WARNED_LIMIT_SHARE = 0.5  # of the time, from which a run at a limit is worth a warning
+AT_LIMIT = "at a limit"  # key among a run's objectives; the space keeps it apart from a scenario's metrics
+WARNED_LIMIT_SHARE = 0.5  # share of time at a limit, above which a run gets a warning
 MAX_CSV_ROWS = 20_000  # of a trajectory
-YOUNG = 50_000  # objects between two looks for garbage; 700 by default, and tracing makes many that stay
+YOUNG = 50_000  # new objects between two collections (default 700): tracing makes many lasting objects
 
 
 def main() -> NoReturn:
-    """The executable: run the command line, and leave."""
-    gc.freeze()  # what was imported stays
+    """Run the command line, and exit. This is the executable `diffabs`."""
+    gc.freeze()  # imported objects stay: collections skip them
     gc.set_threshold(YOUNG)
     interrupt.begin_hearing()
     try:
@@ -104,7 +106,7 @@ def simulate(
         str | None,
         typer.Argument(
             autocompletion=console.scenarios_like,
-            help="A TOML file, or the name of a packaged scenario.",
+            help="TOML file, or name of a packaged scenario.",
             show_default=False,
         ),
     ] = None,
@@ -113,13 +115,15 @@ def simulate(
     csv: Annotated[pathlib.Path | None, typer.Option(help="Write the trajectory to this file.")] = None,
     mat: Annotated[pathlib.Path | None, typer.Option(help="Write trajectory, units and metrics for MATLAB.")] = None,
     plot: Annotated[pathlib.Path | None, typer.Option(help="Draw the run to this file (.png, .pdf, .svg).")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of noisy sensors; the same as --set solver.seed=N.")] = None,
-    from_sweep: Annotated[
-        pathlib.Path | None, typer.Option(metavar="DIR", help="Run a sample of this sweep again.")
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the noise of sensors; the same as --set solver.seed=N.")
     ] = None,
-    sample: Annotated[int | None, typer.Option(help="Which one, with --from-sweep.")] = None,
+    from_sweep: Annotated[
+        pathlib.Path | None, typer.Option(metavar="DIR", help="Folder of a sweep; run one of its samples again.")
+    ] = None,
+    sample: Annotated[int | None, typer.Option(help="Number of the sample, with --from-sweep.")] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Also run half and quarter steps, and say how accurate each metric is.")
+        bool, typer.Option("--check", help="Also run half and quarter steps, and show the accuracy of each metric.")
     ] = False,
 ) -> None:
     """Run a scenario once and show its metrics."""
@@ -158,7 +162,7 @@ def simulate(
 def _load_source(
     scenario: str | None, from_sweep: pathlib.Path | None, sample: int | None, changes: Any, seed: int | None
 ) -> tuple[Scenario, Any]:
-    """What is run, and the key of its noise."""
+    """Return the scenario to run, and the key of its noise."""
     if from_sweep and sample is not None:
         return console.run_with_progress(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
     chosen = console.load_scenario(scenario or "", console.add_option_overrides(changes, "solver", seed=seed))
@@ -166,17 +170,16 @@ def _load_source(
 
 
 def _judge(chosen: Scenario, result: dict[str, Any]) -> None:
-    """Say what must be known of the metrics. Raises typer.Exit for a run without any."""
+    """Write the warnings. Raises typer.Exit for a diverged run, which has no metrics."""
     if result["diverged"]:
-        why = "a number became infinite or impossible, or something switched in every step: there are no metrics"
+        why = "a number became infinite or invalid, or a part switched in every step; there are no metrics"
         console.fail(f"{chosen.name} diverged: {why}", 1)
     for warning in result["warnings"]:
         console.say(f"warning: {warning}")
 
 
 def _warnings(chosen: Scenario, run: Run, limited: float) -> Iterator[str]:
-    """Yield what a reader of the metrics must know: how the run ended, what it never reached, and a control that is
-    limited most of the time."""
+    """Yield warnings: an unexpected end of the run, a metric never reached, a control mostly at a limit."""
     stop, stopped = chosen.loop.stop, bool(run.stopped)
     if bool(run.diverged):
         return
@@ -186,7 +189,7 @@ def _warnings(chosen: Scenario, run: Run, limited: float) -> Iterator[str]:
         yield (otherwise or "STOPPED EARLY: the run reached its stop") if stopped else late
     for name in chosen.objectives:
         if math.isinf(run.metrics[name]):
-            yield f"{name} is infinite: the run ends before it gets there"
+            yield f"{name} is infinite: the run ends before the event that it measures"
     if limited > WARNED_LIMIT_SHARE:
         limits, unit = at_limits(chosen.loop), chosen.loop.plant.control_unit
         ends = f"{float(limits.low):g} to {float(limits.high):g} {unit}"
@@ -194,17 +197,17 @@ def _warnings(chosen: Scenario, run: Run, limited: float) -> Iterator[str]:
 
 
 def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: Any, seed: int | None) -> None:
-    """Raises typer.Exit: either a scenario, or a sweep and a sample of it as it is."""
+    """Raise typer.Exit unless there is either a scenario, or a sweep with a sample and no overrides."""
     if (scenario is None) == (from_sweep is None):
-        console.fail("what shall be run: a SCENARIO, or --from-sweep DIR --sample N")
+        console.fail("either SCENARIO or --from-sweep DIR --sample N is needed")
     if (from_sweep is None) != (sample is None):
         console.fail("--from-sweep DIR and --sample N need each other")
     if from_sweep and (changes or seed is not None):
-        console.fail("a sample of a sweep is run as it was: no --set, no --seed")
+        console.fail("--from-sweep runs a sample unchanged: --set and --seed do not apply")
 
 
 def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
-    """Raises typer.Exit for files that cannot be written, or are one and the same."""
+    """Raise typer.Exit for files that cannot be written, or that are the same file."""
     targets.check_picture(wanted["plot"])
     targets.check_mat(wanted["mat"])
     places = {name: targets.resolve_path(path, f"--{name}") for name, path in wanted.items() if path}
@@ -214,7 +217,7 @@ def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
 
 
 def _run(chosen: Scenario, key: Any, keep: bool) -> tuple[Run, float]:
-    """Return the run, on the host, and for which share of it the control was at a limit."""
+    """Return the run, on the host, and the share of its time with the control at a limit."""
     measured = {**chosen.objectives, AT_LIMIT: at_limits(chosen.loop)}
     run = jax.device_get(_describe_run(chosen, measured, key, keep=keep))
     return run._replace(metrics={name: run.metrics[name] for name in chosen.objectives}), float(run.metrics[AT_LIMIT])
@@ -224,13 +227,14 @@ def _describe_run(chosen: Scenario, measured: dict[str, Any], key: Any, *, keep:
     if not keep:
         return measure(chosen.loop, chosen.solver, measured, key=key)
     steps = chosen.solver.steps
+    # A file needs few rows: thin the trajectory on the device, before it takes memory.
     every = min(max(chosen.solver.every, math.ceil(steps / MAX_CSV_ROWS)), steps)
     solver = dataclasses.replace(chosen.solver, every=every)
     return rollout(chosen.loop, solver, measured, key=key)
 
 
 def _find_loose_metrics(chosen: Scenario, run: Run, key: Any, keep: bool) -> list[str]:
-    """What a run does not know as well as its solver suggests; `_run` makes it once more, by the same program."""
+    """Return warnings of metrics that depend on `rtol`; `_run` makes a second run with the same compiled program."""
     solver = chosen.solver
     if not isinstance(solver, Adaptive) or run.diverged:
         return []

@@ -1,4 +1,4 @@
-"""The command `margins`: how far the linearised loop is from instability."""
+"""The command `margins`: stability margins of the linearised loop."""
 
 import importlib
 import math
@@ -40,12 +40,14 @@ def margins(
     at: Annotated[
         list[str] | None,
         typer.Option(
-            "--at", metavar="PATH=VALUE", help="Only here: speed=10, plant.mass=6, target=0.15; may be repeated."
+            "--at", metavar="PATH=VALUE", help="Fix a parameter: speed=10, plant.mass=6, target=0.15; may be repeated."
         ),
     ] = None,
     samples: Annotated[
         int,
-        typer.Option(min=0, max=MOST_SAMPLES, help="Systems inside the ranges of [design.over], beside the corners."),
+        typer.Option(
+            min=0, max=MOST_SAMPLES, help="Number of systems inside the ranges of [design.over], added to the corners."
+        ),
     ] = 32,
     changes: console.Changes = None,
     plot: Annotated[
@@ -55,7 +57,7 @@ def margins(
 ) -> None:
     """Compute stability margins of the linearised loop.
 
-    Gain, phase, delay and modulus margin, here and at their worst over [design.over]."""
+    It shows gain, phase, delay and modulus margin of the scenario, and the worst over [design.over]."""
     with console.end_on_errors():
         targets.check_picture(plot)
         with targets.new_target_file(plot, "--plot") as picture:
@@ -70,7 +72,7 @@ def margins(
 
 
 def _read_places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, float], float | None]:
-    """The values by path of the loop, in SI, and the target. Raises ScenarioError."""
+    """Return values by path of the loop, in SI, and the target. Raises ScenarioError."""
     table: dict[str, Any] = {}
     for item in given:
         path, _, text = item.partition("=")
@@ -83,7 +85,7 @@ def _read_places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, floa
             raise ScenarioError(f"--at {path} is given twice")
         table[path] = value
     there = {**parameters_of(chosen.loop), "target": (ParameterSpec("1"), ())}
-    found = [one.single("have a place") for one in read_entries(table, "--at", there, "no parameter of this loop")]
+    found = [one.single("be fixed") for one in read_entries(table, "--at", there, "no parameter of this loop")]
     values = {one.path: read_number_in_range(one.given, one.spec, one.where) / one.scale for one in found}
     return values, values.pop("target", None)
 
@@ -91,7 +93,9 @@ def _read_places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, floa
 def _find_margins(
     chosen: Scenario, values: dict[str, float], target: float | None, samples: int
 ) -> tuple["System", "Band | None"]:
-    """The loop at these values, and over the ranges that are left. Raises typer.Exit where it is not linear."""
+    """Return the loop at these values, and over the remaining ranges. Raises typer.Exit for a loop without
+    linearisation.
+    """
     from diffabs.linear.robustness import band
 
     loop = replace(chosen.loop, values)
@@ -113,7 +117,11 @@ def _draw(chosen: Scenario, nominal: "System", found: "Band | None", picture: pa
 
 
 def margin_numbers(found: "Margins") -> dict[str, float]:
-    """The margins by their names in the JSON document."""
+    """Return the margins by their names in the JSON document.
+
+    Args:
+        found: Margins of one loop.
+    """
     low, high = found.gain
     return {
         **{"gain_up": high, "gain_down": low, "phase": found.phase, "delay": found.delay},
@@ -130,7 +138,7 @@ def _document(
     target: float | None,
     plot: pathlib.Path | None,
 ) -> dict[str, Any]:
-    """For JSON, in SI. Infinity (no limit) is a text, as in an override."""
+    """Return the JSON document, in SI. Infinity (no limit) is a text, as in an override."""
 
     def plain(one: "System") -> dict[str, Any]:
         rows = margin_numbers(one.margins).items()
@@ -158,7 +166,7 @@ def _document(
 
 
 def _show(result: dict[str, Any], chosen: Scenario, nominal: "System", found: "Band | None") -> None:
-    """A table of the margins, and where each is worst."""
+    """Show a table of the margins, with the worst value and its place."""
     here = margin_numbers(nominal.margins)
     worst = found.worst() if found else {}
     columns = [f"worst of {len(found.systems)}", "where"] if worst and found else []
@@ -177,7 +185,7 @@ def _show(result: dict[str, Any], chosen: Scenario, nominal: "System", found: "B
     delay = f", {1e3 * result['delay_in_the_loop']:g} ms of delay" if result["delay_in_the_loop"] else ""
     show.show_titled_table(f"{chosen.title or chosen.name}: the linearised loop, {when}{delay}", table)
     if frozen := getattr(chosen.loop.plant, "frozen", ()):
-        console.say(f"note: {' and '.join(frozen)} are held where they are; limits do not act")
+        console.say(f"note: {' and '.join(frozen)} are held constant; limits are not included")
     show.show_files(result)
 
 
@@ -197,7 +205,7 @@ def _format_place(values: dict[str, float], chosen: Scenario) -> str:
 
 
 def _judge(chosen: Scenario, nominal: "System", found: "Band | None") -> None:
-    """Raises typer.Exit for a loop that is not stable, here or within the ranges."""
+    """Raise typer.Exit for a loop that is unstable, here or within the ranges."""
     if not nominal.margins.stable:
         console.fail(f"{chosen.name}: the closed loop is not stable: no margins", console.FAILED)
     if found and found.unstable:

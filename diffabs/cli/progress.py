@@ -1,8 +1,9 @@
-"""How far a command is: drawn on a terminal, a line now and then elsewhere, the same words in both.
+"""Progress of a command: redrawn on a terminal, a line now and then elsewhere, with the same words.
 
-    MESSAGE ... WHAT IS REACHED; 1 min 34 s, 12 s of it compiling, at most 40 s left
+    MESSAGE ... PROGRESS; 1 min 34 s, 12 s of it compiling, at most 40 s left
 
-What is left is worked out without the time that went into compiling: that is not needed again."""
+The estimate of the time left excludes compiling, which does not recur.
+"""
 
 import contextlib
 import math
@@ -18,16 +19,23 @@ from rich.spinner import Spinner
 from diffabs.core import stopwatch
 
 SILENCE_S = 2.0  # s without a sign of life
-REPEAT_S = 5.0  # s between lines about how far work is
+REPEAT_S = 5.0  # s between lines of progress
 FRAMES = 12.5  # per second
-MIN_SHOWN_S = 1.0  # s in which nothing is said of time
-MIN_COMPILING_S = 0.5  # s of compiling, from which it is
-SPINNER = 2  # columns, with the blank behind it
-COMPILING = "compiling"  # while nothing is reached
+MIN_SHOWN_S = 1.0  # s at the start without times
+MIN_COMPILING_S = 0.5  # s of compiling; a shorter time is not shown
+SPINNER = 2  # columns of the spinner and the blank after it
+COMPILING = "compiling"  # words before the first progress
 
 
 class WorkProgress(NamedTuple):
-    """How far work is, in words; and where it is known, `done` of `total`, or of as much as it can be (`at_most`)."""
+    """Progress of work.
+
+    Attributes:
+        words: Progress in words.
+        done: Finished amount.
+        total: Whole amount; None if unknown.
+        at_most: True if `total` is only an upper bound.
+    """
 
     words: str
     done: float = 0.0
@@ -39,22 +47,26 @@ Detail = Callable[[], WorkProgress | str]
 
 
 def format_duration(seconds: float) -> str:
-    """A length of time, in words."""
+    """Return a length of time in words.
+
+    Args:
+        seconds: Length [s].
+    """
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 class WorkTiming:
-    """How long work has taken, and will: since when, and since when something of it was done."""
+    """The clock of some work: its start, and its start after the first reported amount."""
 
     def __init__(self) -> None:
-        """It begins now."""
+        """Start the clock."""
         self.begun = time.monotonic()
-        self.first: tuple[float, float] | None = None  # when anything was known, and how much was done then
+        self.first: tuple[float, float] | None = None  # time and amount of the first known progress
 
     def describe(self, far: WorkProgress) -> str:
-        """In words, to be put behind those of `far`; nothing at first."""
+        """Return the times in words, to follow the words of `far`; empty in the first second."""
         now = time.monotonic()
         rest = self.remaining_time(far, now)
         if now - self.begun < MIN_SHOWN_S:
@@ -67,7 +79,10 @@ class WorkTiming:
         return f"{'; ' if far.words else ' '}{', '.join(parts)}"
 
     def remaining_time(self, far: WorkProgress, now: float) -> float | None:
-        """How long [s] the rest takes at the pace so far, compiling left out; None where that is not known yet."""
+        """Return the time left [s] at `now` by the pace so far, without compiling; None if unknown.
+
+        `far` is the progress; the pace counts from the first call with a total.
+        """
         if far.total is None:
             return None
         self.first = self.first or (now, far.done)
@@ -77,24 +92,28 @@ class WorkTiming:
 
 
 def can_redraw(console: Console) -> bool:
-    """Whether lines can be drawn over: not into a file, nor on a terminal without movements (TERM=dumb)."""
+    """Return True if lines can be redrawn: on a terminal that can move its cursor (not TERM=dumb).
+
+    Args:
+        console: Console of stderr.
+    """
     return console.is_terminal and not console.is_dumb_terminal
 
 
 class _Picture:
-    """A spinner with the words, and a bar below where the total is known."""
+    """A spinner with words, and a bar below it if the total is known."""
 
     def __init__(self, message: str, detail: Detail | None):
         self.message, self.detail, self.spinner, self.pace = message, detail, Spinner("dots"), WorkTiming()
 
     def far(self) -> tuple[WorkProgress, str]:
-        """How far it is; and that with the message, without times."""
+        """Return the progress; and the message with it, without times."""
         far = self.detail() if self.detail else ""
         far = WorkProgress(far) if isinstance(far, str) else far
         return far, f"{self.message} ... {far.words}".strip()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The spinner must be one object, or it would not turn."""
+        """Yield spinner and bar. The spinner stays one object: a new one would always draw its first frame."""
         far, words = self.far()
         self.spinner.update(text=fit_line(words, far.words, self.pace.describe(far), options.max_width - SPINNER))
         yield self.spinner
@@ -103,8 +122,16 @@ class _Picture:
 
 
 def fit_line(words: str, rest: str, times: str, width: int) -> str:
-    """Return words and times in one line of a terminal: where they are too long, only the rest of the words, that is
-    without the message, and of those as much as there is room for."""
+    """Return words and times on one line of a terminal.
+
+    Words that are too long lose the message first. They are then cut at the end.
+
+    Args:
+        words: Message and progress.
+        rest: Progress alone.
+        times: Times, which are never cut.
+        width: Columns of the line.
+    """
     room = width - len(times)
     if len(words) > room:
         words = rest or words
@@ -115,11 +142,17 @@ def fit_line(words: str, rest: str, times: str, width: int) -> str:
 def show_progress(
     message: str, detail: Detail | None, tell: Callable[[str], None], timing: tuple[float, float]
 ) -> Iterator[Callable[[], None]]:
-    """How far some work is, until the end; the function that is given is to be called often. `tell` writes a line,
-    `timing` [s] is when the first one comes where nothing can be drawn, and how often others follow."""
+    """Show the progress of work until the end of the block; yields a function to call often.
+
+    Args:
+        message: Name of the work.
+        detail: Function that returns the progress.
+        tell: Function that writes a line, if stderr cannot be redrawn.
+        timing: Time [s] of the first line, and time [s] between further lines.
+    """
     console, picture = Console(stderr=True), _Picture(message, detail)
     if can_redraw(console):
-        # Only standard error: what is drawn must not get in between results that go elsewhere.
+        # stdout is not redirected: Live would print results on stderr.
         with Live(picture, console=console, transient=True, refresh_per_second=FRAMES, redirect_stdout=False):
             yield lambda: None
         return

@@ -1,6 +1,7 @@
-"""The command `rare`: the probability of a failure that a sweep would hardly meet.
+"""The command `rare`: the probability of a failure that is too rare for a sweep.
 
-It needs the extra `sweep`, which is imported when it runs."""
+It needs the extra `sweep`, which is imported only when the command runs.
+"""
 
 import dataclasses
 import math
@@ -23,29 +24,33 @@ if TYPE_CHECKING:
     from diffabs.reliability.subset_simulation import RareEvent, SubsetProgress
     from diffabs.sweep import Study
 
-MAX_SHOWN_FAILURES = 5  # failures
+MAX_SHOWN_FAILURES = 5
 
 
 def rare(
     scenario: console.ScenarioName,
-    failure: Annotated[str, typer.Argument(metavar="METRIC[=BOUND]", help="Default: the bound in [sweep.failures].")],
+    failure: Annotated[
+        str, typer.Argument(metavar="METRIC[=BOUND]", help="Metric and bound; default: the bound in [sweep.failures].")
+    ],
     changes: console.Changes = None,
-    samples: Annotated[int, typer.Option(help="Runs of each level.")] = 2800,
-    seed: Annotated[int | None, typer.Option(help="The same as --set sweep.seed=N.")] = None,
-    gradients: Annotated[bool, typer.Option("--gradients", help="Also draw around points found by gradients.")] = False,
+    samples: Annotated[int, typer.Option(help="Runs of each level, a multiple of 10.")] = 2800,
+    seed: Annotated[int | None, typer.Option(help="Seed of the samples; the same as --set sweep.seed=N.")] = None,
+    gradients: Annotated[
+        bool, typer.Option("--gradients", help="Also sample around points of failure that gradients find.")
+    ] = False,
     engine: engines.Engine = "xla",
     as_json: console.Json = False,
 ) -> None:
     """Compute the probability that a metric reaches a bound.
 
-    The scenario varies as [sweep.over] says. Probabilities of 1e-7 and less can be had."""
+    Parameters vary as [sweep.over] says. Probabilities below 1e-7 are feasible."""
     with console.end_on_errors():
         console.need_extra("sweep")
         engines.check_engine_name(engine)
         chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
         metric, bound = _read_failure(failure, chosen)
         if samples < 20 or samples % 10:
-            console.fail(f"--samples {samples} is no multiple of 10 from 20 on")
+            console.fail(f"--samples {samples} is not a multiple of 10 in [20, inf)")
         study = _build_runner(section_sweep.build_study(chosen), metric, engine)
         found = _estimate(study, metric, bound, samples, gradients)
         result = _document(found, study, chosen, metric, bound)
@@ -53,7 +58,7 @@ def rare(
 
 
 def _build_runner(study: "Study", metric: str, engine: str) -> "Study":
-    """Raises ScenarioError for a study that cannot be run."""
+    """Return the study with its engine. Raises ScenarioError for a study that cannot be run."""
     from diffabs.reliability.failure import find_metric_objection
 
     try:
@@ -65,10 +70,10 @@ def _build_runner(study: "Study", metric: str, engine: str) -> "Study":
 
 
 def _read_failure(text: str, chosen: Scenario) -> tuple[str, float]:
-    """A metric and its bound in SI. Raises ScenarioError."""
+    """Return a metric and its bound in SI. Raises ScenarioError."""
     metric, equals, bound = text.partition("=")
     if metric not in chosen.objectives:
-        raise unknown_name_error(f"{metric} is not measured", metric, chosen.objectives)
+        raise unknown_name_error(f"{metric} is not a metric of this scenario", metric, chosen.objectives)
     if equals:
         return metric, read_number(
             parse_value(bound.strip()), ParameterSpec(unit_of(chosen.objectives[metric], chosen.loop.plant)), metric
@@ -79,7 +84,7 @@ def _read_failure(text: str, chosen: Scenario) -> tuple[str, float]:
 
 
 def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients: bool) -> "RareEvent":
-    """Raises ScenarioError for what cannot be asked, typer.Exit where too many runs diverge."""
+    """Return the probability. Raises ScenarioError for a wrong task, typer.Exit if too many runs diverge."""
     from diffabs.reliability.failure import failure_probability
     from diffabs.reliability.importance_sampling import DivergenceError
 
@@ -101,7 +106,7 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
     except KeyboardInterrupt:
         if not levels:
             raise
-        console.say(f"interrupted: {_describe_levels(levels, metric)}, by {levels[-1].evaluations:,} runs; no further")
+        console.say(f"interrupted: {_describe_levels(levels, metric)}, by {levels[-1].evaluations:,} runs")
         raise typer.Exit(console.INTERRUPTED) from None
     except DivergenceError as error:
         console.fail(str(error), console.FAILED)
@@ -110,13 +115,13 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
 
 
 def _describe_levels(levels: "list[SubsetProgress]", metric: str) -> str:
-    """What the levels tell that are finished."""
+    """Return a sentence on the probability that the finished levels give."""
     probability = math.prod(level.share for level in levels)
     return f"{metric} >= {levels[-1].threshold:.4g} has a probability of about {probability:.2g}"
 
 
 def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str, bound: float) -> dict[str, Any]:
-    """As values of JSON; the failures, the most likely first, as values by path in SI."""
+    """Return the JSON document; its failures are values by path in SI, the likeliest first."""
     rows = study.space.normal(found.failing[:MAX_SHOWN_FAILURES]) if len(found.failing) else {}
     return {
         **console.describe_source(chosen),

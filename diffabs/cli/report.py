@@ -17,11 +17,13 @@ ENDINGS = (".html", ".htm")
 def report(
     source: Annotated[
         pathlib.Path,
-        typer.Argument(metavar="DIR|FILE.json", help="What reproduce, sweep, tune, identify, design or rare wrote."),
+        typer.Argument(
+            metavar="DIR|FILE.json", help="Result of reproduce, sweep, rare, tune, identify, design or certify."
+        ),
     ],
     out: Annotated[
         pathlib.Path | None,
-        typer.Option("--out", "-o", metavar="FILE.html", help="Default: report.html in the folder."),
+        typer.Option("--out", "-o", metavar="FILE.html", help="File to write; default: report.html in the folder."),
     ] = None,
 ) -> None:
     """Make one HTML file of a result.
@@ -40,8 +42,17 @@ def report(
 
 
 def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, title: str = "") -> None:
-    """Write the report of what folders or files hold, whole or not at all. Raises ScenarioError for one that holds
-    nothing of ours, OSError."""
+    """Write the report of all documents in folders or files. The file is written whole or not at all.
+
+    Args:
+        sources: Folders or files with documents.
+        target: HTML file.
+        title: Title of the report; by default the title of its only section, or the number of results.
+
+    Raises:
+        ScenarioError: A source has no document.
+        OSError: A file cannot be read or written.
+    """
     from diffabs.report import ReportError, find_documents
     from diffabs.report import build_report as made
 
@@ -53,9 +64,16 @@ def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, tit
 
 
 def check_target(target: pathlib.Path) -> None:
-    """Raises typer.Exit where a file of somebody else's has the name."""
+    """Check that a report may be written to a file.
+
+    Args:
+        target: HTML file.
+
+    Raises:
+        typer.Exit: The file exists and is not a report.
+    """
     from diffabs.report import is_report
 
     target = targets.resolve_path(target, "--out")
     if target.exists() and not (target.is_file() and is_report(target)):
-        console.fail(f"--out {target}: exists and is no earlier report; move it away")
+        console.fail(f"--out {target}: exists and is not an earlier report; move it away")

@@ -1,4 +1,4 @@
-"""The command `reproduce`: a paper's whole result. It draws, and needs the extra `plot`."""
+"""The command `reproduce`: all results of a paper. It draws figures, and needs the extras `plot` and `report`."""
 
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def reproduce(
-    name: Annotated[str, typer.Argument(help="slip-lmi, slip-estimator, arm-balance, or all.")] = "all",
+    name: Annotated[str, typer.Argument(help="Paper: slip-lmi, slip-estimator, arm-balance, or all.")] = "all",
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
         "out"
     ),
@@ -21,7 +21,7 @@ def reproduce(
 ) -> None:
     """Reproduce a paper's results.
 
-    It makes all figures and summary.json, and says in short what agrees with the paper and what is refuted."""
+    It writes all figures and summary.json. It shows which numbers agree with the paper, and the refuted claims."""
     with console.end_on_errors():
         console.need_matplotlib()
         console.need_extra("report")
@@ -41,16 +41,16 @@ def reproduce(
         except KeyboardInterrupt:
             if not results:
                 raise
-            console.say(f"interrupted: whole are {', '.join(str(out / paper) for paper in results)}")
+            console.say(f"interrupted: finished are {', '.join(str(out / paper) for paper in results)}")
             raise typer.Exit(console.INTERRUPTED) from None
         if whole:
-            console.say(f"report of all: {whole}")
+            console.say(f"report of all papers: {whole}")
         if as_json:
             show.as_json({"out": str(out), "papers": results, "versions": provenance.versions()})
 
 
 def _write_joint_report(out: pathlib.Path, results: dict[str, Any]) -> pathlib.Path:
-    """The report of several papers in one file."""
+    """Write the report of several papers in one file, and return its path."""
     path = out / report.DEFAULT_NAME
     report.check_target(path)
     report.write_report_file([out / paper for paper in results], path, f"{len(results)} papers, reproduced")
@@ -58,7 +58,7 @@ def _write_joint_report(out: pathlib.Path, results: dict[str, Any]) -> pathlib.P
 
 
 def _reproduce_with_progress(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:
-    """The summary of a paper. Its steps are told beside the spinner, or in a line each where there is none."""
+    """Return the summary of a paper; its steps are shown beside the spinner, or on a line each."""
     spins, steps = console.is_animated(), [progress.COMPILING]
 
     def step(sentence: str) -> None:

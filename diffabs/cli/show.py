@@ -1,4 +1,4 @@
-"""What the commands show: tables for a person, JSON and CSV for a script."""
+"""Output of the commands: tables for a person, JSON and CSV for a script."""
 
 import json
 import math
@@ -21,22 +21,30 @@ from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.solution import Trajectory
 
-BOUND_SHARE = 1e-3  # of its range, from a bound, on which a tuned number then stands
-PIPE_WIDTH = 140  # columns of a table that goes to a file
+BOUND_SHARE = 1e-3  # of its range: a tuned number this close to a bound counts as on it
+PIPE_WIDTH = 140  # columns of a table on a pipe or in a file
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
 COSTS = (
-    "trace cost bounds the cost x'Px summed over starts at 1 in each state; guaranteed cost is that bound, proved in"
-    " fractions. No common gain costs less than the lower bound. The gap is what another solution might save, relative."
+    "trace cost bounds the sum of the costs x'Px of runs from 1 in each single state. guaranteed cost is this bound,"
+    " proved in exact fractions. lower bound: no common gain costs less. gap: greatest relative saving of another gain."
 )
 
 
 def as_json(value: Any) -> None:
-    """One JSON document on stdout; numbers that JSON does not have are null."""
+    """Print one JSON document to stdout.
+
+    Args:
+        value: Values; a number without a form in JSON becomes null.
+    """
     typer.echo(json.dumps(replace_infinite(value), indent=2, allow_nan=False))
 
 
 def replace_infinite(value: Any) -> Any:
-    """Numbers that JSON does not have become null."""
+    """Return values with null in place of NaN and infinity, which JSON lacks.
+
+    Args:
+        value: Dictionaries, lists and plain values.
+    """
     if isinstance(value, dict):
         return {str(key): replace_infinite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -45,9 +53,15 @@ def replace_infinite(value: Any) -> Any:
 
 
 def write_csv(trajectory: Trajectory, plant: Any, path: pathlib.Path) -> None:
-    """The instants up to the end of the run, with units in the header."""
+    """Write the instants up to the end of the run to a CSV file, with units in its header.
+
+    Args:
+        trajectory: Trajectory of the run.
+        plant: Plant, for the units.
+        path: File to write.
+    """
     columns = {f"{name} [{unit}]": values for name, (unit, values) in run_signals(trajectory.sample, plant).items()}
-    rows = int(trajectory.running.sum()) + 1  # after the end the last sample is repeated
+    rows = int(trajectory.running.sum()) + 1  # after the end the trajectory repeats its last sample
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write(",".join(columns) + "\n")
         for row in zip(*(values[:rows].tolist() for values in columns.values()), strict=True):
@@ -55,7 +69,12 @@ def write_csv(trajectory: Trajectory, plant: Any, path: pathlib.Path) -> None:
 
 
 def show_run(result: dict[str, Any], chosen: Scenario) -> None:
-    """Metrics with their units, and what was written."""
+    """Show metrics with their units, and the files written.
+
+    Args:
+        result: JSON document of the run.
+        chosen: Scenario.
+    """
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
         table.add_row(
@@ -68,18 +87,27 @@ def show_run(result: dict[str, Any], chosen: Scenario) -> None:
 
 
 def show_accuracy(found: dict[str, Any]) -> None:
-    """What shorter steps, and single precision, change."""
+    """Show the changes of the metrics by shorter steps and by single precision.
+
+    Args:
+        found: Values of `check_accuracy`.
+    """
     table = Table("metric", "half step", "relative", "order", "error", "float32")
     for name, row in found["metrics"].items():
         order = "none" if not row["converges"] else "" if math.isnan(row["order"]) else f"{row['order']:.1f}"
         numbers = (row["difference"], row["relative"], row["error"], row["float32 difference"])
         half, relative, error, single = ("" if x is None or math.isnan(x) else f"{x:.1e}" for x in numbers)
         table.add_row(name, half, relative, order, error, single)
-    show_titled_table("what a half step changes, at which order, the error that is left at this step; float32", table)
+    show_titled_table("change by a half step, order, error at this step, change in float32", table)
 
 
 def show_family(name: str, members: dict[str, Any]) -> None:
-    """The members of a family, field by field; or the scenarios."""
+    """Show the members of a family, field by field; or the scenarios.
+
+    Args:
+        name: Name of the family in the plural, or `scenarios`.
+        members: Values by name of the member.
+    """
     if name == "scenarios":
         table = Table("name", "title", "description")
         for member, header in members.items():
@@ -99,13 +127,22 @@ def show_family(name: str, members: dict[str, Any]) -> None:
 
 
 def show_paper(digest: Digest, folder: pathlib.Path) -> None:
-    """The compact result of a paper, and where everything else is."""
+    """Show the compact result of a paper, and the folder of its files.
+
+    Args:
+        digest: Compact result.
+        folder: Folder of the files.
+    """
     _console().print(show_digest(digest))
     say(f"{digest.figures} figures, summary.json and report.html: {folder}\n")
 
 
 def show_digest(digest: Digest) -> Group:
-    """Title, table, how many numbers agree, what is refuted: fits 80 columns."""
+    """Return title, table, number of agreeing values and verdicts of a paper, in 80 columns.
+
+    Args:
+        digest: Compact result.
+    """
     table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     for heading, *cells in zip(digest.headings, *digest.lines, strict=True):
         words = heading == digest.headings[0] or any(cell[:1].isalpha() for cell in cells)
@@ -119,7 +156,14 @@ def show_digest(digest: Digest) -> Group:
 
 
 def show_proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict: str) -> None:
-    """A gain, what is proved about it, and the vertices for which it is."""
+    """Show a gain, the proof, and the vertices of its polytope.
+
+    Args:
+        result: JSON document of the proof.
+        title: Title of the first table.
+        units: Units of the parameters by path of the linear model.
+        verdict: Word for the stability.
+    """
     gains = Table("state", "gain")
     for state, value in zip(result["states"], result["gain"], strict=True):
         gains.add_row(state, f"{value:.8g}")
@@ -152,7 +196,12 @@ def show_proof(result: dict[str, Any], title: str, units: Mapping[str, str], ver
 
 
 def show_verification(result: dict[str, Any], json_wanted: bool) -> None:
-    """A line for each claim."""
+    """Show a line for each claim, or the JSON document.
+
+    Args:
+        result: JSON document of the verification.
+        json_wanted: True for JSON.
+    """
     if json_wanted:
         return as_json(result)
     console = _console()
@@ -163,7 +212,12 @@ def show_verification(result: dict[str, Any], json_wanted: bool) -> None:
 
 
 def show_tuning(result: dict[str, Any], chosen: Scenario) -> None:
-    """Parameters, metrics and constraints before and after, and how it went."""
+    """Show parameters, metrics and constraints before and after, and the course of the tuning.
+
+    Args:
+        result: JSON document of the tuning.
+        chosen: Scenario.
+    """
     free = Table("parameter", "before", "after", "low", "high", "unit")
     for path, row in result["free"].items():
         free.add_row(path, *(format_brief(row[key]) for key in ("before", "after", "low", "high")), row["unit"])
@@ -172,13 +226,13 @@ def show_tuning(result: dict[str, Any], chosen: Scenario) -> None:
     for name in result["metrics"]["before"]["mean"]:
         numbers = (result["metrics"][when][of][name] for of in ("mean", "worst") for when in ("before", "after"))
         metrics.add_row(name, *map(format_brief, numbers), unit_of(chosen.objectives[name], chosen.loop.plant))
-    show_titled_table(f"over {result['lanes']} lane{'s' if result['lanes'] > 1 else ''}", metrics)
+    show_titled_table(f"over {result['lanes']} run{'s' if result['lanes'] > 1 else ''}", metrics)
     if result["constraints"]:
         limits = Table("constraint", "bound", "before", "after", "met")
         for row in result["constraints"]:
             numbers = ("" if row[key] is None else format_brief(row[key]) for key in ("bound", "before", "after"))
             limits.add_row(row["name"], *numbers, "yes" if row["met"] else f"NO, {format_shortfall(row)}")
-        show_titled_table("constraints, worst lane or vertex", limits)
+        show_titled_table("constraints, worst run or vertex", limits)
     how = Table("tuning", "")
     for name in ("before", "after"):
         how.add_row(f"objective {name}", format_brief(result["objective"][name]))
@@ -187,13 +241,17 @@ def show_tuning(result: dict[str, Any], chosen: Scenario) -> None:
     how.add_row("greatest component of the last gradient", f"{result['gradient_norm']:.2g}")
     how.add_row("it ended because", result["reason"])
     if bounds := list(numbers_at_bounds(result["free"])):
-        how.add_row("it stands on bounds", ", ".join(bounds))
+        how.add_row("parameters at bounds", ", ".join(bounds))
     show_titled_table("", how)
     show_files(result)
 
 
 def format_shortfall(row: dict[str, Any]) -> str:
-    """By how much a constraint is not met."""
+    """Return the amount by which a constraint is not met, in words.
+
+    Args:
+        row: Row of the constraint.
+    """
     if row["missed"] is None:
         return "not known"
     part = f" ({100 * row['missed'] / abs(row['bound']):.2g} %)" if row["bound"] else ""
@@ -201,7 +259,11 @@ def format_shortfall(row: dict[str, Any]) -> str:
 
 
 def show_identification(result: dict[str, Any]) -> None:
-    """Values with standard deviations, what hangs together, what the data leave open, and what is left over."""
+    """Show values with standard deviations, residuals and strong correlations.
+
+    Args:
+        result: JSON document of the identification.
+    """
     values = Table("parameter", "before", "identified", "standard deviation", "unit")
     for name, row in result["values"].items():
         values.add_row(
@@ -219,35 +281,54 @@ def show_identification(result: dict[str, Any]) -> None:
 
 
 def show_files(result: dict[str, Any]) -> None:
-    """What was written, and where."""
+    """Write the names of the written files to stderr.
+
+    Args:
+        result: JSON document with the key `files`.
+    """
     for name, path in result["files"].items():
         say(f"{name}: {path}")
 
 
 def format_brief(value: Any) -> str:
-    """A number to six digits, of a list the first four."""
+    """Return a number with six digits, or the first four entries of a list.
+
+    Args:
+        value: Number, list or text.
+    """
     if isinstance(value, list):
         return f"[{', '.join(map(format_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
     return round_for_table(value) if isinstance(value, float) else str(value)
 
 
 def show_titled_table(title: str, table: Table) -> None:
-    """A table on stdout, below its title."""
+    """Print a table to stdout, below its title.
+
+    Args:
+        title: Title; empty for none.
+        table: Table, which is split into several if it is too wide.
+    """
     for column in table.columns:
-        column.overflow = "fold"  # a pipe has no width: nothing may be cut off
+        column.overflow = "fold"  # fold long cells: rich would cut them off
     console = _console()
     console.print(*([title] if title else []), *fit_table(table, console.width), sep="\n")
 
 
 def _console() -> Console:
-    console = Console(markup=False, emoji=False, highlight=False)  # `[N m]` is a unit here, not a style
+    console = Console(markup=False, emoji=False, highlight=False)  # rich would read the unit `[N m]` as a style
     if not console.is_terminal:
         console.width = PIPE_WIDTH
     return console
 
 
 def numbers_at_bounds(free: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the tuned numbers that ended within a thousandth of their range of one of its ends, with that end."""
+    """Yield each tuned number at a bound of its range, with the bound.
+
+    A number is at a bound if its distance is at most `BOUND_SHARE` of the range.
+
+    Args:
+        free: Rows of the free parameters by path.
+    """
     for path, row in free.items():
         after, low, high = np.broadcast_arrays(*(np.asarray(row[key], float) for key in ("after", "low", "high")))
         for at in np.ndindex(after.shape):

@@ -1,4 +1,4 @@
-"""What the commands about many samples show: a sweep, a small probability, two sweeps beside each other."""
+"""Tables of the commands on many samples: a sweep, a small probability, a comparison of two sweeps."""
 
 from typing import Any
 
@@ -11,7 +11,12 @@ from diffabs.scenario.scenario import Scenario
 
 
 def show_sweep(result: dict[str, Any], chosen: Scenario) -> None:
-    """Failures, statistics with intervals, what moves what, the worst samples."""
+    """Show failures, statistics with intervals, sensitivities and the worst samples of a sweep.
+
+    Args:
+        result: JSON document of the sweep.
+        chosen: Scenario.
+    """
     percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
     show_titled_table(
         f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", _failures(result["failures"])
@@ -19,14 +24,14 @@ def show_sweep(result: dict[str, Any], chosen: Scenario) -> None:
     constant = [name for name, row in result["metrics"].items() if row and row["least"] == row["greatest"]]
     moving = {name: row for name, row in result["metrics"].items() if name not in constant}
     show_titled_table(
-        "statistics of the lanes that did not diverge; summary.json has all intervals", _statistics(moving, chosen)
+        "statistics of the runs that did not diverge; summary.json has all intervals", _statistics(moving, chosen)
     )
     for name in constant:
         unit = unit_of(chosen.objectives[name], chosen.loop.plant)
-        say(f"{name} is {format_brief(result['metrics'][name]['mean']['value'])} {unit} in every lane")
+        say(f"{name} is {format_brief(result['metrics'][name]['mean']['value'])} {unit} in every run")
     for name, row in result["never"].items():
         where = f"{row['count']} runs, the first sample {row['samples'][0]}"
-        say(f"warning: {name} is infinite (never) in {where}: they are in no statistic of it")
+        say(f"warning: {name} is infinite (never) in {where}: its statistics leave them out")
     paths = list(next(iter(result["sensitivity"].values()), {}))
     if paths:
         kind = list(next(iter(result["sensitivity"].values()))[paths[0]])[-1]
@@ -41,8 +46,8 @@ def show_sweep(result: dict[str, Any], chosen: Scenario) -> None:
     if (refused := result["refused"])["count"]:
         why = "; ".join(f"{reason} ({count})" for reason, count in refused["reasons"].items())
         say(
-            f"refused: {refused['count']} of {result['samples']} samples were not run and are in no number here, the"
-            f" first sample {refused['samples'][0]}: {why}"
+            f"refused: {refused['count']} of {result['samples']} samples were not run and are left out of all numbers,"
+            f" the first sample {refused['samples'][0]}: {why}"
         )
     if result["accuracy"] and result["accuracy"]["metrics"]:
         changes = Table("metric", "median change", "largest", "in sample")
@@ -50,7 +55,7 @@ def show_sweep(result: dict[str, Any], chosen: Scenario) -> None:
             changes.add_row(name, f"{row['median']:.1e}", f"{row['largest']:.1e}", str(row["sample"]))
         count = len(result["accuracy"]["samples"])
         show_titled_table(
-            f"what a half step changes, relative, in {count} lane{'s' if count > 1 else ''} drawn from all", changes
+            f"relative change by a half step, in {count} run{'s' if count > 1 else ''} drawn from all", changes
         )
     for name, rows in result["worst"].items():
         if rows:
@@ -61,8 +66,8 @@ def show_sweep(result: dict[str, Any], chosen: Scenario) -> None:
 
 
 def _failures(found: dict[str, Any]) -> Table:
-    """A row for each failure that was seen, and one for all that were not."""
-    table = Table("failure", "lanes", "probability", "low", "high")
+    """Return a table with a row for each failure that occurred, and one row for all others."""
+    table = Table("failure", "runs", "probability", "low", "high")
     for name, row in found.items():
         if row["count"]:
             table.add_row(name, str(row["count"]), *_estimate(row))
@@ -73,7 +78,7 @@ def _failures(found: dict[str, Any]) -> Table:
 
 
 def _statistics(metrics: dict[str, Any], chosen: Scenario) -> Table:
-    """A row for each metric; of the intervals only the mean's."""
+    """Return a table with a row for each metric; only the mean has its interval."""
     kinds = [
         kind for kind in next((row for row in metrics.values() if row), {}) if kind not in ("mean", "least", "greatest")
     ]
@@ -86,7 +91,12 @@ def _statistics(metrics: dict[str, Any], chosen: Scenario) -> Table:
 
 
 def show_rare_event(result: dict[str, Any], chosen: Scenario) -> None:
-    """A small probability, the levels that led to it, and the likeliest failures."""
+    """Show a small probability, its levels, and the likeliest failures.
+
+    Args:
+        result: JSON document of the probability.
+        chosen: Scenario.
+    """
     levels = Table("level", "at least", "share", "coefficient of variation", "accepted", "diverged")
     for i, row in enumerate(result["levels"], 1):
         names = ("threshold", "share", "cov", "acceptance")
@@ -111,7 +121,11 @@ def show_rare_event(result: dict[str, Any], chosen: Scenario) -> None:
 
 
 def show_comparison(result: dict[str, Any]) -> None:
-    """Means of two sweeps, and their difference sample by sample."""
+    """Show means of two sweeps, and their difference sample by sample.
+
+    Args:
+        result: JSON document of the comparison.
+    """
     table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")
     for name, row in result["metrics"].items():
         less = f"{100 * row['share in which the second is less']['value']:.1f} %"
@@ -119,7 +133,7 @@ def show_comparison(result: dict[str, Any]) -> None:
         table.add_row(name, *means, *_estimate(row["difference"]), less, format_brief(row["variance reduction"]))
     out = f", {result['left out']} left out that diverged" if result["left out"] else ""
     show_titled_table(f"{result['second']} against {result['first']}: {result['samples']} common samples{out}", table)
-    say("variance reduction: as many times more samples would be needed if the two sweeps did not share them")
+    say("variance reduction: factor by which sweeps without common samples would need more samples")
 
 
 def _estimate(row: dict[str, Any]) -> list[str]:

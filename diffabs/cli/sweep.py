@@ -1,6 +1,8 @@
 """The command `sweep`: a Monte-Carlo study into a folder, with statistics.
 
-It needs the extra `sweep`, and for Dask `cluster`; what needs them is imported when it runs."""
+It needs the extra `sweep`, and for Dask the extra `cluster`. Modules that need them are imported only when the command
+runs.
+"""
 
 import contextlib
 import dataclasses
@@ -41,25 +43,25 @@ def sweep(
         pathlib.Path | None, typer.Option(metavar="DIR", help="Folder of the sweep; default: out/sweep-NAME.")
     ] = None,
     changes: console.Changes = None,
-    samples: Annotated[int | None, typer.Option(help="The same as --set sweep.samples=N.")] = None,
-    seed: Annotated[int | None, typer.Option(help="The same as --set sweep.seed=N.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep that is in the folder.")] = False,
+    samples: Annotated[int | None, typer.Option(help="Number of samples; the same as --set sweep.samples=N.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the samples; the same as --set sweep.seed=N.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the sweep in the folder.")] = False,
     engine: engines.Engine = "xla",
-    on: Annotated[str, typer.Option(help="local or dask.")] = "local",
+    on: Annotated[str, typer.Option(help="Place of the runs: local or dask.")] = "local",
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port.")
+        str | None, typer.Option(metavar="ADDRESS", help="Address of a Dask scheduler, tcp://host:port.")
     ] = None,
-    workers: Annotated[int | None, typer.Option(help="Dask workers on this machine.")] = None,
-    devices: Annotated[int | None, typer.Option(help="CPU devices of this process.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Number of Dask workers on this machine.")] = None,
+    devices: Annotated[int | None, typer.Option(help="Number of CPU devices of this process.")] = None,
     keep: Annotated[
         str | None, typer.Option(metavar="N,N,...", help="Samples whose trajectories are kept (zarr).")
     ] = None,
-    figures: Annotated[bool, typer.Option("--figures", help=f"Draw into DIR/{FIGURES}.")] = False,
+    figures: Annotated[bool, typer.Option("--figures", help=f"Draw figures into DIR/{FIGURES}.")] = False,
     as_json: console.Json = False,
 ) -> None:
-    """Run a scenario for many values, and show statistics.
+    """Run a scenario for many samples, and show statistics.
 
-    Values are drawn as [sweep.over] says. Statistics have confidence intervals."""
+    Parameters vary as [sweep.over] says. Statistics have confidence intervals."""
     with console.end_on_errors():
         _check_options(engine, on, scheduler, workers, devices, figures)
         _check_samples(samples)
@@ -88,14 +90,24 @@ def sweep(
 
 
 def _check_any(result: dict[str, Any], chosen: Scenario) -> None:
-    """Raises typer.Exit if no sample could be run."""
+    """Raise typer.Exit if every sample was refused."""
     if result["refused"]["count"] == result["samples"]:
         why = next(iter(result["refused"]["reasons"]))
         console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
 
 
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
-    """A sample of a sweep as a scenario, and the key of its noise. Raises SweepError or ValueError."""
+    """Return a sample of a sweep as a scenario, and the key of its noise.
+
+    Args:
+        folder: Folder of the sweep.
+        number: Number of the sample.
+
+    Raises:
+        SweepError: The folder holds no sweep of a scenario, or its scenario does not match its study.
+        ScenarioError: The sample was refused.
+        typer.Exit: The number is out of range, or the extra is not installed.
+    """
     console.need_extra("sweep")
     from diffabs.sweep.store import SweepError, check_owner, describe_differences, read_manifest
 
@@ -105,7 +117,7 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
         raise SweepError(f"{folder} was not swept from a scenario; Study.lane({number}) is this sample")
     chosen = loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
     study = section_sweep.build_study(chosen)
-    swept = {name: value for name, value in manifest["study"].items() if name != "engine"}  # a sample is run by XLA
+    swept = {name: value for name, value in manifest["study"].items() if name != "engine"}  # XLA runs single samples
     for line in describe_differences(swept, study.table(), "study"):
         raise SweepError(f"{folder}: the scenario in its manifest is not what was swept: {line}")
     if not 0 <= number < study.samples:
@@ -117,7 +129,7 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
 
 
 def _check_runnable(study: "Study", number: int) -> tuple[Any, jax.Array]:
-    """Loop and key of a sample. Raises ScenarioError for one that must not be run."""
+    """Return loop and key of a sample. Raises ScenarioError for a refused sample."""
     loop, key = study.lane(number)
     if line := first_refusal(loop, {}, study.solver):
         raise ScenarioError(f"sample {number} was refused: {line}")
@@ -125,24 +137,28 @@ def _check_runnable(study: "Study", number: int) -> tuple[Any, jax.Array]:
 
 
 def warn_of_strays(found: "Results") -> None:
-    """Files among the chunks that are not read, but would be by others."""
+    """Warn of files among the chunks that are not part of the sweep: other readers would read them too.
+
+    Args:
+        found: Results of the sweep.
+    """
     if found.strays:
         more = f" (and {len(found.strays) - 1} more)" if found.strays[1:] else ""
-        console.say(f"warning: {found.strays[0]}{more} is no chunk of this sweep; other readers would take it in")
+        console.say(f"warning: {found.strays[0]}{more} is not a chunk of this sweep; other programs would read it, too")
 
 
 @contextlib.contextmanager
 def _explain_resume(out: pathlib.Path, resume: bool) -> Iterator[None]:
-    """A full disk, a kernel that cannot be compiled any more, and Ctrl-C say how to go on."""
+    """Add the way to resume to the messages of a full disk, a failed kernel and Ctrl-C."""
     try:
         yield
     except (OSError, EngineError) as error:
         where = f"{out}: {error.strerror}" if isinstance(error, OSError) and not error.filename else str(error)
-        console.fail(f"{' '.join(where.split())}; finished chunks stay, --resume goes on", console.FAILED)
+        console.fail(f"{' '.join(where.split())}; finished chunks are kept; --resume continues", console.FAILED)
     except KeyboardInterrupt:
         if not any((out / "chunks").glob("*.parquet")):
             raise
-        line = f"interrupted: finished chunks are in {out}; go on with:"
+        line = f"interrupted: finished chunks are in {out}; continue with:"
         console.say_command(line, ["diffabs", *sys.argv[1:], *([] if resume else ["--resume"])])
         raise typer.Exit(console.INTERRUPTED) from None
 
@@ -181,7 +197,7 @@ def _check_samples(samples: int | None) -> None:
 
 
 def _numbers(keep: str | None, samples: int) -> list[int]:
-    """Sample numbers of an option. Raises typer.Exit."""
+    """Return the sample numbers of --keep. Raises typer.Exit."""
     try:
         numbers = [int(text) for text in keep.split(",")] if keep else []
     except ValueError:
@@ -193,7 +209,7 @@ def _numbers(keep: str | None, samples: int) -> list[int]:
 
 
 def _with_engine(study: "Study", engine: str) -> "Study":
-    """The study, whose engine is "kernel" if that is asked for, or possible and left to us."""
+    """Return the study with its engine: "kernel" if it is chosen, or if it is "auto" and possible."""
     if engine == "xla":
         return study
     from diffabs.sweep.runner import find_study_objection
@@ -218,7 +234,7 @@ def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:
 
 
 def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], Any]) -> "Results":
-    """Raises KeyboardInterrupt, after the chunks in hand or at once."""
+    """Return the results. Raises KeyboardInterrupt after Ctrl-C: at once, or after the current chunks."""
     far = [progress.WorkProgress(progress.COMPILING)]
     ending = console.InterruptibleEnd("the chunks in hand")
 
@@ -239,7 +255,7 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: 
 
 
 def _far(at: "Told") -> progress.WorkProgress:
-    """How far a sweep is."""
+    """Return the progress of a sweep."""
     if not at.here:
         return progress.WorkProgress(f"{at.samples:,} of {at.total:,}, {progress.COMPILING}", at.samples, at.total)
     bad = f"{at.failed:,} failed, {at.diverged:,} diverged" + (f", {at.refused:,} refused" if at.refused else "")
@@ -261,11 +277,12 @@ def _warn(accuracy: dict[str, Any] | None) -> None:
 def _result(
     found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool, check: int
 ) -> dict[str, Any]:
-    """The JSON document, which is also written into the folder."""
+    """Return the JSON document, which is also written into the folder."""
     from diffabs.sweep.checking import check_accuracy
     from diffabs.sweep.statistics.summary import summarise_sweep
     from diffabs.sweep.trajectories import write_trajectories
 
+    # Half steps run beside the statistics: compiled code and NumPy release Python's global lock.
     with ThreadPoolExecutor(1) as beside:
         halved = beside.submit(check_accuracy, study, found, check) if check else None
         said = summarise_sweep(found)

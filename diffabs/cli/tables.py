@@ -1,15 +1,21 @@
-"""Tables that fit a terminal: cells are folded between words, and a table too wide for that becomes several."""
+"""Tables that fit a terminal: cells are folded between words, and a table that is still too wide becomes several."""
 
 import copy
 
 from rich.table import Column, Table
 
-FRAME, PER_COLUMN = 1, 3  # columns of the frame, and of it and the padding for each column
+FRAME, PER_COLUMN = 1, 3  # width of the frame; further width of frame and padding for each column
 
 
 def fit_table(table: Table, width: int) -> list[Table]:
-    """The table as one or more, each no wider than `width` where its longest words allow that. The first column, which
-    says what a row is about, comes again in each."""
+    """Return a table as one or more tables, each at most `width` wide if its longest words allow it.
+
+    The first column names the row, so it is repeated in each table.
+
+    Args:
+        table: Table.
+        width: Columns of the terminal.
+    """
     groups: list[list[Column]] = []
     first, *others = table.columns
     for column in others:
@@ -21,11 +27,12 @@ def fit_table(table: Table, width: int) -> list[Table]:
 
 
 def _lay_out(table: Table, columns: list[Column], width: int) -> Table:
-    """These columns of a table: each as wide as its longest word, and what is left goes to those that need it."""
+    """Return a table of these columns, each as wide as its longest word; wider columns share the remaining width."""
     new = copy.copy(table)
     new.columns = [copy.copy(column) for column in columns]
     spare = width - _least(columns)
     needs = {i: _line(column) - _word(column) for i, column in enumerate(columns)}
+    # Smallest need first, so that the width it leaves unused goes to the wider columns.
     for place, i in enumerate(sorted(needs, key=lambda i: needs[i])):
         more = max(0, min(needs[i], spare // (len(columns) - place)))
         spare -= more
@@ -43,9 +50,10 @@ def _texts(column: Column) -> list[str]:
 
 
 def _word(column: Column) -> int:
-    """Of the longest word."""
+    """Return the length of the longest word."""
     return max((len(word) for text in _texts(column) for word in text.split()), default=1)
 
 
 def _line(column: Column) -> int:
+    """Return the length of the longest text."""
     return max(map(len, _texts(column)), default=1)

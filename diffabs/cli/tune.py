@@ -1,6 +1,8 @@
-"""The command `tune`: the free parameters of [tune] by gradients, and what can be proved of the result.
+"""The command `tune`: tuning of the free parameters of [tune] by gradients, and a proof about the result.
 
-It needs the extra `tune`, and for a proof `design`; what needs them is imported when it runs."""
+It needs the extra `tune`, and for a proof the extra `design`. Modules that need them are imported only when the command
+runs.
+"""
 
 import contextlib
 import dataclasses
@@ -25,26 +27,26 @@ from diffabs.simulate.solution import Trajectory
 if TYPE_CHECKING:
     from diffabs.tune import Tuned, TuningProgress
 
-OF_THE_COMMAND = ("scenario", "model", "made", "versions", "files")  # of a certificate: the tuning says the same
-BOUND_ROUNDING = 1e-9  # relative: of a decay rate as a factor for one period, with plenty to spare
+OF_THE_COMMAND = ("scenario", "model", "made", "versions", "files")  # keys of a certificate that the tuning has too
+BOUND_ROUNDING = 1e-9  # relative; rounding of a decay rate that is proved as a factor per period is smaller
 
 
 def tune(
     scenario: console.ScenarioName,
     changes: console.Changes = None,
-    starts: Annotated[int | None, typer.Option(help="Descents; the same as --set tune.starts=N.")] = None,
+    starts: Annotated[int | None, typer.Option(help="Number of descents; the same as --set tune.starts=N.")] = None,
     engine: engines.Engine = "xla",
     as_json: console.Json = False,
     out: Annotated[
         pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write the tuned scenario to this file.")
     ] = None,
     plot: Annotated[
-        pathlib.Path | None, typer.Option(metavar="FILE.png", help="Draw how the tuning went, and its worst lane.")
+        pathlib.Path | None, typer.Option(metavar="FILE.png", help="Draw the history of the tuning, and its worst run.")
     ] = None,
 ) -> None:
     """Tune the free parameters of [tune] by gradients.
 
-    It tunes over all runs of [tune] at once."""
+    The objective is taken over all runs of [tune] at once."""
     with console.end_on_errors(), certificates.report_design_errors():
         console.need_extra("tune")
         engines.check_engine_name(engine)
@@ -55,7 +57,7 @@ def tune(
             picture = files.enter_context(targets.new_target_file(plot, "--plot"))
             chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "tune", starts=starts))
             result, told = _tune_and_document(chosen, engine, out_file, picture)
-            if not result["met"]:  # inside, so that no file is written
+            if not result["met"]:  # inside `with`: the exception discards the files
                 _show(result, told, chosen, as_json)
                 _leave_if_interrupted(result)
                 console.fail(
@@ -68,7 +70,7 @@ def tune(
 
 
 def _leave_if_interrupted(result: dict[str, Any]) -> None:
-    """Raises typer.Exit: what was shown is the best so far."""
+    """Raise typer.Exit after Ctrl-C: the result shown is the best so far."""
     if result["interrupted"]:
         met = "" if result["met"] else f"; not met: {_unmet_constraints(result)}, so that no file is written"
         console.say(f"interrupted: this is the best so far, not a minimum{met}")
@@ -87,16 +89,16 @@ def _show(result: dict[str, Any], told: str, chosen: Scenario, as_json: bool) ->
 def _tune_and_document(
     chosen: Scenario, engine: str, out: pathlib.Path | None, picture: pathlib.Path | None
 ) -> tuple[dict[str, Any], str]:
-    """The JSON document and a sentence about the certificate. The files are written if all constraints are met. Ctrl-C
-    leaves out what is not there yet, once there is something to show."""
-    work = console.run_with_progress(lambda: build_work(chosen), "computing the lanes")
+    """Return the JSON document and a sentence on the certificate; the files are written if all constraints are met.
+
+    After Ctrl-C the document lacks the parts that are not computed yet.
+    """
+    work = console.run_with_progress(lambda: build_work(chosen), "computing the runs")
     found, interrupted = _tune_with_progress(work, engine)
     after = chosen.with_loop(found.loop, "tuned")
     try:
         proved = console.run_with_progress(lambda: certify_result(after), "certifying the result")
-        result = console.run_with_progress(
-            lambda: tuning_document(work, found, proved), "comparing with what there was before"
-        )
+        result = console.run_with_progress(lambda: tuning_document(work, found, proved), "comparing before and after")
     except KeyboardInterrupt:
         interrupted, proved = True, _without_certificate("interrupted")
         result = _without_proof(work, tuning_document(work._replace(task=None), found, proved))
@@ -108,7 +110,7 @@ def _tune_and_document(
 
 
 def _draw_until_interrupt(draw: Callable[[], None], picture: pathlib.Path) -> bool:
-    """Whether a picture could be drawn before Ctrl-C; else there is none."""
+    """Return True if the picture was drawn before Ctrl-C; otherwise its file is removed."""
     try:
         console.run_with_progress(draw, "drawing")
     except KeyboardInterrupt:
@@ -118,7 +120,7 @@ def _draw_until_interrupt(draw: Callable[[], None], picture: pathlib.Path) -> bo
 
 
 def _without_proof(work: Work, result: dict[str, Any]) -> dict[str, Any]:
-    """With the constraints that nobody has looked at, which are therefore not met."""
+    """Return the document with the unchecked constraints added, as not met."""
     seen = [row["name"] for row in result["constraints"]]
     goal = work.chosen.tune
     bounds = {"certified decay": goal.decay, "damping": goal.damping}
@@ -131,7 +133,15 @@ def _without_proof(work: Work, result: dict[str, Any]) -> dict[str, Any]:
 
 
 def build_work(chosen: Scenario) -> Work:
-    """Raises ScenarioError for what does not fit together."""
+    """Return the runs and constraints of a tuning.
+
+    Args:
+        chosen: Scenario with a section `[tune]`.
+
+    Raises:
+        ScenarioError: The section does not fit the loop.
+        ModuleNotFoundError: An extra is not installed.
+    """
     from diffabs.tune import AtMost, CertifiedDecay, Poles
 
     goal = chosen.tune.check(chosen.loop)
@@ -148,7 +158,7 @@ def build_work(chosen: Scenario) -> Work:
 
 
 def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
-    """Tune, and say how far it is; whether Ctrl-C ended it. Raises typer.Exit where no start can be used."""
+    """Return the tuning, and True if Ctrl-C ended it. Raises typer.Exit if no start can be used."""
     from diffabs import tune
     from diffabs.tune import Method, StartError, Stopping
 
@@ -165,7 +175,7 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
         "constraints": list(work.constraints.values()),
     }
     loop = work.chosen.loop
-    most = None if work.constraints else goal.iterations  # constraints take rounds of as many, nobody knows how many
+    most = None if work.constraints else goal.iterations  # with constraints the number of rounds is unknown
     engine = engines.choose_engine(engine, lambda: tune.build_problem(loop, **posed, engine="kernel").objection())
 
     def run_tuning() -> "Tuned":
@@ -183,7 +193,7 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
 
 
 def _format_progress(told: "list[TuningProgress]", most: int | None = None) -> progress.WorkProgress:
-    """How far it is, in one line; of so many iterations at most, where that is known."""
+    """Return the progress on one line; `most` is the greatest number of iterations, None if unknown."""
     if not told:
         return progress.WorkProgress(progress.COMPILING)
     last, total = told[-1], len(told)
@@ -195,13 +205,18 @@ def _format_progress(told: "list[TuningProgress]", most: int | None = None) -> p
 
 
 def certify_result(after: Scenario) -> Proved:
-    """A certificate over the ranges of [design], if there can be one, of the decay that is asked for, if that can be
-    proved."""
+    """Return a certificate over the ranges of [design], if it exists.
+
+    It has the required decay rate of [tune] if that can be proved, else the fastest provable one.
+
+    Args:
+        after: Scenario with the tuned loop.
+    """
     decay = after.tune.decay
     try:
         task = certificates.build_proof_task(after)
         found = certificates.certify_gain(task)
-        if (found.decay_rate or 0.0) < decay:  # the search for the fastest ends a little below it
+        if (found.decay_rate or 0.0) < decay:  # the search for the fastest decay ends slightly below the optimum
             asked = certificates.certify_gain(
                 task._replace(spec=dataclasses.replace(task.spec, decay=decay * (1 + BOUND_ROUNDING)))
             )
@@ -223,7 +238,7 @@ def _without_certificate(why: str) -> Proved:
 
 
 def _draw(work: Work, found: "Tuned", path: pathlib.Path) -> None:
-    """The history, and the lane that is the worst afterwards, before and after."""
+    """Draw the history, and the run that is worst after the tuning, before and after it."""
     from diffabs.plot.style import write_figure
     from diffabs.plot.tuning import draw_tuning
 

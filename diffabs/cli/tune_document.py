@@ -1,4 +1,4 @@
-"""The JSON document of a tuning: what was free, metrics and constraints before and after, the certificate."""
+"""The JSON document of a tuning: free parameters, metrics and constraints before and after, certificate."""
 
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,7 +17,14 @@ WHEN = ("before", "after")
 
 
 class Work(NamedTuple):
-    """What is tuned: the scenario, its lanes, its constraints by name, and the linear systems a decay is asked of."""
+    """The task of a tuning.
+
+    Attributes:
+        chosen: Scenario.
+        batch: Runs.
+        constraints: Constraints by name.
+        task: Linear systems for a decay rate or damping; None without these constraints.
+    """
 
     chosen: Scenario
     batch: "Batch"
@@ -26,7 +33,14 @@ class Work(NamedTuple):
 
 
 class Proved(NamedTuple):
-    """The JSON of a certificate, whose numbers are null where there is none, and why not in a sentence."""
+    """The outcome of a proof.
+
+    Attributes:
+        document: JSON values of the certificate; null without a certificate.
+        sentence: Result, or the reason for no certificate.
+        task: Linear systems of the proof; None without a certificate.
+        certified: True if there is a certificate.
+    """
 
     document: dict[str, Any]
     sentence: str
@@ -35,7 +49,13 @@ class Proved(NamedTuple):
 
 
 def tuning_document(work: Work, found: "Tuned", proved: Proved) -> dict[str, Any]:
-    """The whole document, without the files that were written."""
+    """Return the whole document, without the written files.
+
+    Args:
+        work: Task of the tuning.
+        found: Result of the tuning.
+        proved: Outcome of the proof.
+    """
     chosen, goal = work.chosen, work.chosen.tune
     return {
         **console.describe_source(chosen),
@@ -70,7 +90,7 @@ def _free(chosen: Scenario, found: "Tuned", path: str) -> dict[str, Any]:
 
 
 def _over_lanes(metrics: dict[str, Any], chosen: Scenario) -> dict[str, dict[str, float]]:
-    """NaN where a lane diverged: a mean over the others would hide it."""
+    """Return mean and worst metrics; NaN if a run diverged, because a mean of the others would hide it."""
     each = {name: np.asarray(metrics[name], float) for name in chosen.objectives}
     return {
         "mean": {name: float(values.mean()) for name, values in each.items()},
@@ -79,7 +99,7 @@ def _over_lanes(metrics: dict[str, Any], chosen: Scenario) -> dict[str, dict[str
 
 
 def _constraints(work: Work, found: "Tuned", proved: Proved) -> list[dict[str, Any]]:
-    """What was asked for, its worst value before and after, and whether it is met."""
+    """Return a row for each constraint: its worst value before and after, and whether it is met."""
     goal, rows = work.chosen.tune, []
     for name, bound in goal.limits.items():
         before, after = (float(np.max(metrics[name])) for metrics in found.metrics)
@@ -97,8 +117,10 @@ def _constraints(work: Work, found: "Tuned", proved: Proved) -> list[dict[str, A
 def _constraint_row(
     name: str, bound: float, before: float | None, after: float | None, *, at_most: bool
 ) -> dict[str, Any]:
-    """A line of the constraints. Met is met, without a tolerance; else `missed` is by how much it is not, or null where
-    no number is known."""
+    """Return a row of the constraints.
+
+    A constraint is met without tolerance. `missed` is the amount by which it is not met, null if unknown.
+    """
     reached = math.nan if after is None else after
     beyond = reached - bound if at_most else bound - reached
     missed = None if math.isnan(beyond) else max(beyond, 0.0)
@@ -107,7 +129,7 @@ def _constraint_row(
 
 
 def _least_damping(task: certificates.ProofTask, loop: Any) -> float:
-    """The least of the poles at the vertices."""
+    """Return the least damping of the poles over the vertices."""
     from diffabs.tune import Poles
 
     return float(Poles(task.polytope).least_damping(loop))

@@ -1,5 +1,6 @@
-"""How the command line is used: an example in every help, --quiet and --parts everywhere, and one line for a wrong
-usage."""
+"""Usage of the command line: an example in every help, --quiet and --parts for every command, one line for a wrong
+usage.
+"""
 
 import functools
 import inspect
@@ -14,19 +15,22 @@ import typer.core
 from diffabs.cli import console
 from diffabs.scenario.registry import register_parts
 
-# Of the click that this typer brings or needs: the ancestor of all complaints about arguments.
+# The base class of all usage errors. It is taken from the Click that this Typer uses, which may be Typer's own copy.
 UsageError: Any = typer.BadParameter.__base__
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say nothing but results, warnings and errors.")]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print only results, warnings and errors.")]
 Parts = Annotated[
-    list[str] | None, typer.Option(metavar="MODULE", help="Know the parts in this Python module; may be repeated.")
+    list[str] | None, typer.Option(metavar="MODULE", help="Also use the parts in this Python module; may be repeated.")
 ]
 
 
 class Group(typer.core.TyperGroup):
-    """The program, whose complaint about an argument is one line like any other error."""
+    """The program. It reports a wrong argument in one line, like any other error."""
 
     def main(self, *args: Any, standalone_mode: bool = True, **more: Any) -> Any:
-        """Run a command, and exit if `standalone_mode`."""
+        """Run a command; exit with its status if `standalone_mode`, else return the status.
+
+        `args` and `more` are those of Click.
+        """
         given = more.get("args", args[0] if args else None)
         console.note_command(sys.argv[1:] if given is None else given)
         try:
@@ -50,7 +54,14 @@ def _format_error(error: Any) -> int:
 
 
 def add_command(app: typer.Typer, function: Callable[..., Any], example: str, name: str | None = None) -> None:
-    """Make a function a command: with its example (what follows `diffabs`), with --quiet and --parts."""
+    """Add a function as a command, with its example, --quiet and --parts.
+
+    Args:
+        app: Program.
+        function: Function of the command.
+        example: Words after `diffabs`.
+        name: Name of the command; by default the name of the function.
+    """
 
     @functools.wraps(function)
     def command(*args: Any, quiet: bool, parts: list[str] | None, **given: Any) -> Any:

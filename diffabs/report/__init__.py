@@ -1,9 +1,9 @@
-"""A result as one HTML file that needs nothing else: for colleagues, and for paper. Needs the extra `report`.
+"""Reports: results as one self-contained HTML file, for colleagues and for printing. Needs the extra `report`.
 
-documents   what commands wrote, found in a folder or a file
-page        what a section of a report consists of
-studies, findings, proofs, experiments    a document as a section
-writing     sections as HTML, by the template beside it
+- `documents`: documents of commands, found in a folder or a file
+- `page`: contents of a section, as plain data
+- `studies`, `findings`, `proofs`, `experiments`: a document as a section
+- `writing`: sections as HTML, by the template beside it
 """
 
 from diffabs.report.documents import Document as Document

@@ -1,4 +1,4 @@
-"""A small chart as SVG, for what no command has drawn."""
+"""A small line chart as SVG, for results without a drawn figure."""
 
 import math
 from collections.abc import Sequence
@@ -11,8 +11,16 @@ TICKS = 4
 
 
 def draw_lines(points: Sequence[tuple[float, float]], across: str, up: str) -> str:
-    """Return points (x, y) joined by a line, with axes; the vertical one is logarithmic where values differ by more
-    than a factor of 20. Points that are no numbers are left out."""
+    """Return an SVG of points joined by a line, with axes; empty without a finite point.
+
+    The vertical axis is logarithmic if all values are positive and differ by more than a factor of 20. Points with a
+    missing or infinite coordinate are left out.
+
+    Args:
+        points: Points (x, y).
+        across: Label of the horizontal axis.
+        up: Label of the vertical axis.
+    """
     points = [(x, y) for x, y in points if x is not None and y is not None and math.isfinite(x) and math.isfinite(y)]
     if not points:
         return ""
@@ -53,5 +61,6 @@ def draw_lines(points: Sequence[tuple[float, float]], across: str, up: str) -> s
 
 
 def _widen_range(low: float, high: float, share: float = 0.05) -> tuple[float, float]:
+    """Return the range with a margin of `share` on each side; a range of one value gets a width."""
     room = share * (high - low)
     return (low - room, high + room) if high > low else (low - (abs(low) or 1.0) / 2, high + (abs(high) or 1.0) / 2)

@@ -1,4 +1,4 @@
-"""The documents that commands write, recognised by what is in them."""
+"""The JSON documents of the commands, recognised by their keys."""
 
 import errno
 import json
@@ -26,11 +26,17 @@ READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, design and certify
 
 
 class ReportError(ValueError):
-    """What no report can be made of, and why, in one line."""
+    """A source without a readable document; the message gives the reason in one line."""
 
 
 class Document(NamedTuple):
-    """A document: of which kind, its content, and the file that it was read from."""
+    """A JSON document of a command.
+
+    Attributes:
+        kind: Key of `KEYS_BY_KIND`.
+        content: Values of the document.
+        path: File of the document.
+    """
 
     kind: str
     content: dict[str, Any]
@@ -38,16 +44,19 @@ class Document(NamedTuple):
 
     @property
     def folder(self) -> pathlib.Path:
-        """Where its figures are."""
+        """Folder of the document's figures."""
         return self.path.parent
 
 
 def find_documents(source: pathlib.Path) -> list[Document]:
-    """Return the documents of a file, or of a folder: those in it, and the results in folders of their own below it.
+    """Return the documents in a file, or in a folder and its subfolders of results.
+
+    Args:
+        source: File, or folder with `*.json` files and `*/summary.json` below it.
 
     Raises:
-        ReportError: there is none.
-        OSError: a file cannot be read.
+        ReportError: There is no document.
+        OSError: A file cannot be read.
     """
     if not source.exists():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(source))
@@ -58,34 +67,34 @@ def find_documents(source: pathlib.Path) -> list[Document]:
     if found:
         return list(found.values())
     if (source / MANIFEST).is_file():
-        raise ReportError(f"{source}: the sweep has no {SUMMARY} yet; diffabs sweep ... --resume goes on with it")
-    raise ReportError(f"{source}: holds nothing that {READABLE_DOCUMENTS}")
+        raise ReportError(f"{source}: the sweep has no {SUMMARY} yet; diffabs sweep ... --resume completes it")
+    raise ReportError(f"{source}: has no document that {READABLE_DOCUMENTS}")
 
 
 def _sort_key(path: pathlib.Path) -> tuple[int, str]:
-    """The papers come first, in the order in which they are reproduced."""
+    """Return a key that puts papers first, in the order of their reproduction."""
     name = path.parent.name
     return [*PAPERS, name].index(name), name
 
 
 def _documents_of_file(path: pathlib.Path, named: bool = False) -> Iterator[Document]:
-    """The documents of a file; where a person has named it there must be one."""
+    """Yield the documents of a file. Raises ReportError for a `named` file without a document."""
     try:
         content = json.loads(files.read_content(path, MAX_DOCUMENT_BYTES), parse_int=_read_integer)
     except OverflowError as error:
         raise ReportError(f"{path}: {error}") from None
     except (ValueError, RecursionError):
         if named:
-            raise ReportError(f"{path}: is no JSON document that {READABLE_DOCUMENTS}") from None
+            raise ReportError(f"{path}: is not a JSON document that {READABLE_DOCUMENTS}") from None
         return
     found = list(_inside(content, path))
     if named and not found:
-        raise ReportError(f"{path}: is no document that {READABLE_DOCUMENTS}")
+        raise ReportError(f"{path}: is not a document that {READABLE_DOCUMENTS}")
     yield from found
 
 
 def _read_integer(text: str) -> int:
-    """Return a whole number of JSON. Raises OverflowError for one that no float can be."""
+    """Return a whole number of JSON. Raises OverflowError for a number beyond the range of a float."""
     value = int(text)
     if abs(value) > sys.float_info.max:
         raise OverflowError(f"a whole number of {len(text.lstrip('-'))} digits is too large")
@@ -93,7 +102,7 @@ def _read_integer(text: str) -> int:
 
 
 def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
-    """A document, or those of all papers in what `reproduce --json` prints."""
+    """Yield a document, or the documents of all papers in the output of `reproduce --json`."""
     if not isinstance(content, dict):
         return
     if isinstance(content.get("papers"), dict) and isinstance(content.get("out"), str):
@@ -107,7 +116,11 @@ def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
 
 
 def _home(kind: str, content: dict[str, Any], path: pathlib.Path) -> pathlib.Path:
-    """Where a document belongs: what `sweep --json` prints, beside the sweep's manifest."""
+    """Return the path of a document.
+
+    The output of `sweep --json` counts as the summary in the sweep's folder, because its figures and manifest are
+    there.
+    """
     if kind == "sweep" and not (path.parent / MANIFEST).exists() and isinstance(content.get("out"), str):
         return pathlib.Path(content["out"]) / SUMMARY
     return path

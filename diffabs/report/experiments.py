@@ -1,4 +1,4 @@
-"""A paper's reproduction as a section."""
+"""Reproductions of papers as sections of a report."""
 
 import pathlib
 from collections.abc import Mapping
@@ -25,7 +25,14 @@ COLUMNS = {"name": "what", "quantity": "quantity", "unit": "unit", "ours": "ours
 
 
 def paper_section(document: Document) -> Section:
-    """Return the section of a paper."""
+    """Return the section of a paper's reproduction.
+
+    Args:
+        document: Document of `reproduce`.
+
+    Raises:
+        KeyError: The paper is unknown, or the document lacks a key.
+    """
     content = document.content
     name = content["paper"]
     if name not in MODULES:
@@ -33,12 +40,12 @@ def paper_section(document: Document) -> Section:
     found = compact(content)
     return Section(
         title=content["title"],
-        question="Are the numbers, figures and claims of this paper true? Its experiments are computed anew, and"
-        " compared with what it prints and with independent solutions.",
+        question="Are the numbers, figures and claims of this paper true? Its experiments are computed again, and"
+        " compared with its printed values and with independent solutions.",
         answer=list(found.agreement),
         verdicts=[ReportVerdict(*verdict) for verdict in found.verdicts],
         model=model_tables(describe_model(load(name, integrated=False))),
-        model_note=f"The packaged scenario {name}; the first column of the tables says what a row changes.",
+        model_note=f"The packaged scenario {name}; the first column of the tables names the change of each row.",
         figures=existing_figures(content["figures"], document.folder),
         tables=[ReportTable("In short", found.headings, found.lines), *_tables(content)],
         certificate=_certificates(content.get("design")),
@@ -50,7 +57,13 @@ def paper_section(document: Document) -> Section:
 
 
 def existing_figures(names: Any, folder: pathlib.Path) -> list[Figure]:
-    """Return those pictures of a folder that are there; names that lead out of it are none."""
+    """Return the readable pictures of a folder.
+
+    Args:
+        names: Names of files. A name with a path is skipped, so that a document cannot name files outside of the
+            folder.
+        folder: Folder of the pictures.
+    """
     found = [embed_image(folder / name) for name in names if pathlib.PurePath(name).name == name]
     return [figure for figure in found if figure]
 

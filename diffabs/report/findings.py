@@ -1,4 +1,4 @@
-"""Tunings and identifications as sections."""
+"""Tunings and identifications as sections of a report."""
 
 import pathlib
 from collections.abc import Iterator, Mapping
@@ -22,11 +22,18 @@ from diffabs.report.page import (
     table_unit,
 )
 
-NORMAL = 1.959964  # standard deviations on either side of a 95 % interval
+NORMAL = 1.959964  # half-width of a 95 % interval, in standard deviations
 
 
 def tuning_section(document: Document) -> Section:
-    """Return the section of a tuning."""
+    """Return the section of a tuning.
+
+    Args:
+        document: Document of `tune`.
+
+    Raises:
+        KeyError: The document lacks a key.
+    """
     content = document.content
     before, after = (content["objective"][when] for when in ("before", "after"))
     limits = [row["name"] for row in content["constraints"]]
@@ -60,7 +67,7 @@ def _constraint_row(row: Mapping[str, Any]) -> ReportVerdict:
 
 
 def _figures(document: Document) -> Iterator[Figure]:
-    """How the objective fell, and the picture that the command has drawn, where it still is."""
+    """Yield the objective over the gradients, and the picture that the command drew, if the file still exists."""
     history = document.content["history"]
     points = [(row["evaluations"], row["objective"]) for row in history]
     if len(points) > 1:
@@ -95,7 +102,14 @@ def _tuning_tables(content: Mapping[str, Any]) -> Iterator[ReportTable]:
 
 
 def identification_section(document: Document) -> Section:
-    """Return the section of an identification."""
+    """Return the section of an identification.
+
+    Args:
+        document: Document of `identify`.
+
+    Raises:
+        KeyError: The document lacks a key.
+    """
     content = document.content
     data = content["data"]
     return Section(

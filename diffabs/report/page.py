@@ -1,4 +1,4 @@
-"""What a section of a report consists of: plain data, which a template lays out."""
+"""Contents of a report's section: plain data for the template."""
 
 import base64
 import dataclasses
@@ -13,22 +13,22 @@ from diffabs.core.summary import round_for_table
 
 IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 LARGEST_IMAGE = 2**25  # bytes
-LARGEST_AXES = 2**21  # characters of the numbers that a picture shows
-ENDS = ("box", "x", "y", "log")  # numbers of axes
-MAX_SHOWN_ENTRIES = 8  # entries of a list
+LARGEST_AXES = 2**21  # characters of JSON with the numbers of a picture
+ENDS = ("box", "x", "y", "log")  # lists of numbers of each axes
+MAX_SHOWN_ENTRIES = 8  # of a list in a cell
 UNKNOWN_ORIGIN = "not known: the document does not say"
 VERDICT_NAMES = {True: "proved", False: "disproved", None: "undecided"}
 
 
 class ShownNumber(NamedTuple):
-    """A number as a reader sees it, and all its digits."""
+    """A number as a reader sees it, and with all its digits."""
 
     shown: str
     exact: str
 
 
 class ReportTable(NamedTuple):
-    """Cells are texts, numbers, lists of numbers, truth values, or None for nothing."""
+    """A table; cells are texts, numbers, lists of numbers, truth values, or None for an empty cell."""
 
     title: str
     headings: Sequence[str]
@@ -37,8 +37,14 @@ class ReportTable(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """An image, by the address of its own bytes or as SVG that this package has drawn, and what it is of; `axes` are
-    the numbers that it shows, as JSON of `diffabs.plot.shown`, "" where it does not say."""
+    """A picture with its caption.
+
+    Attributes:
+        caption: Caption.
+        address: Image as a data URL; empty for a drawn one.
+        drawn: SVG that this package drew; empty for an embedded image.
+        axes: Numbers of the picture's axes, as JSON of `diffabs.plot.shown`; empty if the file has none.
+    """
 
     caption: str
     address: str = ""
@@ -47,7 +53,7 @@ class Figure(NamedTuple):
 
 
 class ReportVerdict(NamedTuple):
-    """A word, and the sentence it is about."""
+    """A verdict in one word, and its sentence."""
 
     word: str
     sentence: str
@@ -55,8 +61,24 @@ class ReportVerdict(NamedTuple):
 
 @dataclasses.dataclass
 class Section:
-    """A result: what was asked, what came out, the model, figures, tables, what is proved, notes, where it comes from
-    and the commands that compute it again."""
+    """A result with its question and its origin.
+
+    Attributes:
+        title: Heading.
+        question: Question that the result answers.
+        answer: Sentences of the answer.
+        verdicts: Verdicts on requirements or claims.
+        model: Tables of the parts and parameters.
+        model_note: Sentence on the model.
+        figures: Pictures.
+        figures_note: Sentence in place of missing pictures.
+        tables: Tables of the result.
+        certificate: Verdicts of a proof.
+        certificate_tables: Numbers of a proof.
+        notes: Further sentences.
+        provenance: Names and values: date, commit, machine, versions, seeds.
+        again: Commands that compute the result again.
+    """
 
     title: str
     question: str
@@ -75,7 +97,13 @@ class Section:
 
 
 def shown_numbers(value: Any) -> list[ShownNumber | str]:
-    """Return what a cell shows: a text, or numbers; of a long list, or one of lists, the first entries."""
+    """Return the texts and numbers that a cell shows.
+
+    A list shows its first `MAX_SHOWN_ENTRIES` entries and its length; nested lists are flattened.
+
+    Args:
+        value: Content of the cell.
+    """
     if value is None:
         return [""]
     if isinstance(value, bool):
@@ -91,7 +119,12 @@ def shown_numbers(value: Any) -> list[ShownNumber | str]:
 
 
 def embed_image(path: pathlib.Path, caption: str = "") -> Figure | None:
-    """Return a picture with its bytes in it; None for a file that is none, or cannot be read."""
+    """Return a picture with its bytes as a data URL; None for an unreadable file and for other types.
+
+    Args:
+        path: File with the suffix .png or .svg, at most `LARGEST_IMAGE` bytes long.
+        caption: Caption; by default the name of the file.
+    """
     kind = IMAGES.get(path.suffix.lower())
     try:
         data = files.read_content(path, LARGEST_IMAGE + 1) if kind else b""
@@ -105,7 +138,7 @@ def embed_image(path: pathlib.Path, caption: str = "") -> Figure | None:
 
 
 def _axes(text: str) -> str:
-    """What a picture says of its axes; nothing for what a page could not show."""
+    """Return the numbers of a picture's axes as JSON; empty for numbers that a page cannot show."""
     if len(text) > LARGEST_AXES:
         return ""
     try:
@@ -125,7 +158,11 @@ def _finite(values: Any) -> bool:
 
 
 def model_tables(model: Mapping[str, Any] | None) -> list[ReportTable]:
-    """Return the parts and the parameters of `scenario.model`."""
+    """Return tables of parts, parameters and solver.
+
+    Args:
+        model: Values of `describe_model`; None for no tables.
+    """
     if not model:
         return []
     more = {path: format_pairs({**about, "type": None}) for path, about in model["parts"].items()}
@@ -141,15 +178,25 @@ def model_tables(model: Mapping[str, Any] | None) -> list[ReportTable]:
 
 
 def table_unit(text: str | None) -> str:
-    """Return a unit for a table: what has none has the unit 1."""
+    """Return a unit for a table: "1" for a number without unit, empty for None.
+
+    Args:
+        text: Unit.
+    """
     return "" if text is None else "1" if text == "" else text
 
 
 def describe_origin(content: Mapping[str, Any], **more: Any) -> list[tuple[str, Any]]:
-    """Return where a document comes from: date, commit, machine, versions, and seeds or other `more`."""
+    """Return the origin of a document as rows of name and value: date, commit, machine and versions.
+
+    Args:
+        content: Values of the document.
+        **more: Further rows by name, such as seeds; None is left out.
+    """
     made = {name: value for name, value in (content.get("made") or {}).items() if name != "command"}
     versions = {f"version of {name}": value for name, value in (content.get("versions") or {}).items()}
-    for name in ("commit", "machine", "backend"):  # what older documents have among the versions
+    # Older documents keep the origin among the versions.
+    for name in ("commit", "machine", "backend"):
         if value := versions.pop(f"version of {name}", None):
             made.setdefault(name, value)
     rows = {
@@ -165,17 +212,30 @@ def describe_origin(content: Mapping[str, Any], **more: Any) -> list[tuple[str, 
 
 
 def format_pairs(values: Mapping[str, Any]) -> str:
-    """Return names with their values in a line; what is None has none."""
+    """Return names with their values on one line; values that are None are left out.
+
+    Args:
+        values: Values by name.
+    """
     return ", ".join(f"{name} {value}" for name, value in values.items() if value is not None)
 
 
 def original_command(content: Mapping[str, Any], otherwise: str = "") -> list[str]:
-    """Return the command that a document was made by, or another that does the same; none where none is known."""
+    """Return the command that made a document, as a list of one line; the list is empty if the command is unknown.
+
+    Args:
+        content: Values of the document.
+        otherwise: Equivalent command for a document without one.
+    """
     line = (content.get("made") or {}).get("command") or otherwise
     return [str(line)] if line else []
 
 
 def join_words(words: Iterable[Any]) -> str:
-    """Return words in a sentence."""
+    """Return words joined by commas and "and"; "nothing" without words.
+
+    Args:
+        words: Values to write as words.
+    """
     words = list(map(str, words))
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"

@@ -1,4 +1,4 @@
-"""Designs, certificates and what they prove, as sections."""
+"""Designs, certificates and their claims as sections of a report."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -29,7 +29,14 @@ PROOF_UNITS = {
 
 
 def design_section(document: Document) -> Section:
-    """Return the section of a design, or of a gain that was looked at."""
+    """Return the section of a design, or of the certificate of a given gain.
+
+    Args:
+        document: Document of `design` or `certify`.
+
+    Raises:
+        KeyError: The document lacks a key.
+    """
     content = document.content
     units = content.get("units") or {}
     ranges = join_words(
@@ -54,12 +61,20 @@ def design_section(document: Document) -> Section:
 
 
 def proof_verdicts(proof: Mapping[str, Any]) -> list[ReportVerdict]:
-    """Return what is proved, disproved or left open, in words; that there is no certificate, and why, else."""
+    """Return the verdicts of a certificate: proved, disproved or undecided.
+
+    Without a certificate, one verdict gives the reason.
+
+    Args:
+        proof: Values of the certificate.
+    """
     if proof.get("gain") is None:
-        return [ReportVerdict("no certificate", proof.get("reason") or "none was asked for")]
+        return [ReportVerdict("no certificate", proof.get("reason") or "none is required")]
     exactly = ", verified in exact arithmetic" if proof["verified_exactly"] else ""
     stable = proof["quadratically_stable"]
-    about = f"one Lyapunov matrix for all {proof['vertices']} vertices, however fast the parameters vary{exactly}"
+    about = (
+        f"one Lyapunov matrix for all {proof['vertices']} vertices, for parameters that vary arbitrarily fast{exactly}"
+    )
     found = [ReportVerdict(VERDICT_NAMES[stable], about)]
     found += [ReportVerdict("proved" if one["proved"] else "not proved", f"{one['kind']}{_value(one['kind'], proof)}")
               for one in proof["claims"] or []]  # fmt: skip
@@ -79,7 +94,12 @@ def _unit(text: str | None) -> str:
 
 
 def proof_tables(proof: Mapping[str, Any], content: Mapping[str, Any]) -> list[ReportTable]:
-    """Return the numbers of a certificate, and its vertices with their poles."""
+    """Return tables of the numbers of a certificate, and of its vertices with their poles.
+
+    Args:
+        proof: Values of the certificate.
+        content: Values of the document around it, for units.
+    """
     if proof.get("gain") is None:
         return []
     units = proof.get("units") or content.get("units") or {}
@@ -95,19 +115,26 @@ def proof_tables(proof: Mapping[str, Any], content: Mapping[str, Any]) -> list[R
         for i, (corner, one) in enumerate(zip(corners, poles, strict=False))
     ]
     heads = [f"{name} [{table_unit(units[name])}]" if name in units else name for name in names]
-    return [ReportTable("What is proved, in numbers", ("quantity", "value", "unit"), numbers),
+    return [ReportTable("Numbers of the certificate", ("quantity", "value", "unit"), numbers),
             ReportTable(f"{proof['vertices']} vertices", ("vertex", *heads, pole), rows)]  # fmt: skip
 
 
 def _notes(content: Mapping[str, Any]) -> list[str]:
     notes = [f"Neglected: {line}" for line in content["neglected"]]
     if not content["exact"]:
-        notes.append("The linear model is not the loop's own linearisation; a proof is about the model.")
+        notes.append("The linear model differs from the loop's linearisation; the proof is about the model.")
     return notes
 
 
 def certificate_section(document: Document) -> Section:
-    """Return the section of a saved certificate, which is proved again now."""
+    """Return the section of a saved certificate, whose claims are proved again.
+
+    Args:
+        document: Certificate in its own file.
+
+    Raises:
+        KeyError: The document lacks a key.
+    """
     content = document.content
     proved = verify_file(document.path)
     system = content["system"]
@@ -117,7 +144,7 @@ def certificate_section(document: Document) -> Section:
     return Section(
         title=f"Certificate {document.path.name}",
         question="Does the saved certificate prove what it claims? It is proved again, in fractions, by code that"
-        " shares nothing with what made it.",
+        " is independent of the code that made it.",
         answer=[f"{sum(not one.reason for one in proved)} of {len(proved)} claims are proved."],
         model=[
             ReportTable("Vertices", ("vertex", *names), [[i, *row.values()] for i, row in enumerate(corners)], "in SI")

@@ -1,4 +1,4 @@
-"""Sweeps and rare events as sections."""
+"""Sweeps and rare events as sections of a report."""
 
 import json
 import pathlib
@@ -24,20 +24,28 @@ from diffabs.report.page import (
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import ScenarioError, loads
 
-FIGURES, UNDRAWN = "figures", "None were drawn: diffabs sweep ... --figures draws them."
+FIGURES, UNDRAWN = "figures", "No figures: diffabs sweep ... --figures draws them."
 CAPTIONS = {
     "distributions": "How the metrics are distributed, with medians, quantiles and bounds",
     "exceedance": "How often a value is exceeded",
-    "failure_map": "Where it fails: what matters most, across and up",
-    "sensitivity": "What moves what, with intervals",
+    "failure_map": "Failures over the two most influential parameters",
+    "sensitivity": "Sensitivities, with intervals",
     "worst": "The worst runs among all",
 }
-MAX_WORST_RUNS = 3  # samples of a metric
+MAX_WORST_RUNS = 3  # shown for each metric
 INTERVAL = ("value", "low", "high")
 
 
 def sweep_section(document: Document) -> Section:
-    """Return the section of a sweep."""
+    """Return the section of a sweep.
+
+    Args:
+        document: Document of `sweep`; the sweep's manifest lies in its folder.
+
+    Raises:
+        KeyError: The document or the manifest lacks a key.
+        OSError: The manifest cannot be read.
+    """
     content, manifest = document.content, _manifest(document.folder)
     study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
     found, note = _scenario_model(source, document.folder)
@@ -73,9 +81,9 @@ def _commit(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _scenario_model(source: Mapping[str, Any], folder: pathlib.Path) -> tuple[dict[str, Any] | None, str]:
-    """The model in a manifest, or why there is none."""
+    """Return the model in a manifest and a note; None and the reason for a manifest without a readable scenario."""
     if "scenario" not in source:
-        return None, "Swept from Python, not from a scenario: the model is in the script that did it."
+        return None, "The sweep ran from Python, without a scenario: the model is in that script."
     try:
         return describe_model(
             loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
@@ -85,7 +93,7 @@ def _scenario_model(source: Mapping[str, Any], folder: pathlib.Path) -> tuple[di
 
 
 def _space(space: Mapping[str, Any], units: Mapping[str, str]) -> ReportTable:
-    """What varies, and how."""
+    """Return a table of the distributions."""
     variables = space["variables"]
     keys = list(dict.fromkeys(key for one in variables.values() for key in one if key != "type"))
     rows = [
@@ -93,7 +101,7 @@ def _space(space: Mapping[str, Any], units: Mapping[str, str]) -> ReportTable:
         for path, one in variables.items()
     ]
     design = ", ".join(map(str, space["design"].values()))
-    return ReportTable("What varies", ("parameter", "distribution", *keys, "unit"), rows, f"sampling: {design}")
+    return ReportTable("Varied parameters", ("parameter", "distribution", *keys, "unit"), rows, f"sampling: {design}")
 
 
 def _failure_tables(content: Mapping[str, Any], percent: str) -> str:
@@ -135,7 +143,7 @@ def _tables(content: Mapping[str, Any], units: Mapping[str, str], percent: str) 
         if estimate["value"] is not None
     ]
     if moved:
-        yield ReportTable("What moves what", ("metric", "parameter", "measure", "value", *bounds), moved)
+        yield ReportTable("Sensitivities", ("metric", "parameter", "measure", "value", *bounds), moved)
     worst = [
         [name, table_unit(units.get(name)), row["value"], row["sample"]]
         for name, rows in content["worst"].items()
@@ -144,13 +152,13 @@ def _tables(content: Mapping[str, Any], units: Mapping[str, str], percent: str) 
     yield ReportTable("The greatest values", ("metric", "unit", "value", "sample"), worst)
     if (accuracy := content.get("accuracy")) and accuracy.get("metrics"):
         rows = [[name, row["median"], row["largest"], row["sample"]] for name, row in accuracy["metrics"].items()]
-        title = f"What a half step changes, relative, in {len(accuracy['samples'])} runs drawn from all"
+        title = f"Relative change by a half step, in {len(accuracy['samples'])} runs drawn from all"
         yield ReportTable(title, ("metric", "median", "largest", "in sample"), rows)
 
 
 def _notes(content: Mapping[str, Any]) -> Iterator[str]:
     for reason, count in (content["refused"].get("reasons") or {}).items():
-        yield f"{count} samples were refused, and are in no number here: {reason}"
+        yield f"{count} samples were refused, and are left out of all numbers: {reason}"
     if content["diverged"]["count"]:
         yield f"Diverged samples: {join_words(content['diverged']['samples'][:20])}."
 
@@ -161,7 +169,14 @@ def _sample(content: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
 
 
 def rare_section(document: Document) -> Section:
-    """Return the section of a small probability."""
+    """Return the section of a small failure probability.
+
+    Args:
+        document: Document of `rare`.
+
+    Raises:
+        KeyError: The document lacks a key.
+    """
     content = document.content
     low, high = content["interval"]
     failure = f"{content['metric']} >= {content['bound']:g} {content['unit']}"

@@ -1,4 +1,7 @@
-"""Sections as one HTML file: no script but our own, which the policy names by its checksum; nothing is fetched."""
+"""Sections as one HTML file.
+
+The file fetches nothing. The only script is the package's own: the content security policy allows it by its checksum.
+"""
 
 import base64
 import hashlib
@@ -11,8 +14,8 @@ from diffabs.report import experiments, findings, proofs, studies
 from diffabs.report.documents import Document, ReportError
 from diffabs.report.page import Section, shown_numbers
 
-MARK = b'<meta name="generator" content="diffabs report'  # what a report begins with
-MARK_WITHIN_BYTES = 1024  # bytes in which it is
+MARK = b'<meta name="generator" content="diffabs report'  # near the start of every report
+MARK_WITHIN_BYTES = 1024  # length of the start of a file with the mark
 SECTION_BY_KIND: dict[str, Callable[[Document], Section]] = {
     "reproduce": experiments.paper_section,
     "sweep": studies.sweep_section,
@@ -25,11 +28,14 @@ SECTION_BY_KIND: dict[str, Callable[[Document], Section]] = {
 
 
 def build_report(found: Sequence[Document], title: str = "") -> str:
-    """Return a report of these documents as HTML, a section each.
+    """Return a report of documents as HTML, with one section each.
 
-    title: of the whole; by default that of the only section
+    Args:
+        found: Documents of the commands.
+        title: Title of the report; by default the title of the only section, or the number of results.
+
     Raises:
-        ReportError: a document lacks what its kind has.
+        ReportError: A document lacks a key of its kind.
     """
     import jinja2
 
@@ -51,7 +57,11 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
 
 
 def script_checksum(script: str) -> str:
-    """Return how a content security policy names a script."""
+    """Return the source expression of a content security policy that allows a script.
+
+    Args:
+        script: Text of the script.
+    """
     return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
 
@@ -64,10 +74,17 @@ def _section(document: Document) -> Section:
         return SECTION_BY_KIND[document.kind](document)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError) as error:
         said = " ".join(f"{type(error).__name__} {error}".split())
-        raise ReportError(f"{document.path}: is no whole document of {document.kind}: {said}") from None
+        raise ReportError(f"{document.path}: is not a complete document of {document.kind}: {said}") from None
 
 
 def is_report(path: pathlib.Path) -> bool:
-    """Return whether a file is a report of this package, which another may replace."""
+    """Return True for a file that is a report of diffabs, which another report may replace.
+
+    Args:
+        path: File to read.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
     with path.open("rb") as file:
         return MARK in file.read(MARK_WITHIN_BYTES)

@@ -1,4 +1,7 @@
-"""TOML files to loops and tasks, and back: `load`, `loads`, `dump`, `names`, `Scenario`, `ScenarioError`."""
+"""Scenarios: TOML files to loops and tasks, and back.
+
+Exports `load`, `loads`, `dump`, `names`, `Scenario` and `ScenarioError`.
+"""
 
 from typing import TYPE_CHECKING
 

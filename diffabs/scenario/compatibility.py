@@ -1,4 +1,4 @@
-"""Parts that do not fit together: one reads what another does not show."""
+"""Check of whether the parts of a loop fit together: each part finds the signals that it reads."""
 
 import dataclasses
 import traceback
@@ -16,11 +16,17 @@ from diffabs.simulate.advance import initial_point
 
 
 def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
-    """One line for the first part of a loop, and for each objective, that reads what the plant does not show. Nothing
-    is computed: the loop is only traced."""
+    """Yield one line for the loop if a part reads a missing signal, else one line for each such objective.
+
+    The loop is only traced: no number is computed.
+
+    Args:
+        loop: Loop to trace once around, and through one instant.
+        objectives: Objectives of its runs by name, traced on one sample and one segment.
+    """
     arrays, measured = canonical_dtypes((loop, dict(objectives)))
     if not isinstance(_trial("", lambda: jax.eval_shape(_trials, arrays, measured)), str):
-        return  # one trace is enough where all fit
+        return  # the usual case: one trace shows that all parts fit
     around = _trial("", lambda: jax.eval_shape(_trace_loop, arrays))
     if isinstance(around, str):
         yield around
@@ -32,12 +38,12 @@ def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[st
 
 
 def _trials(loop: Loop, objectives: Mapping[str, Objective]) -> Any:
-    sample = _sample(loop)  # once: following the signal around the loop is most of the time
+    sample = _sample(loop)  # shared: tracing the signals around the loop takes most of the time
     return _trace_loop(loop), [_read(objective, sample) for objective in objectives.values()]
 
 
 def _trace_loop(loop: Loop) -> Any:
-    """Once around the loop, and through an instant."""
+    """Trace the loop once around, and through an instant."""
     return initial_point(loop, {}, Clock(0.0, 1e-3, 0, jax.random.key(0)))
 
 
@@ -55,7 +61,7 @@ def _read(objective: Objective, sample: Sample) -> Any:
 
 
 def _trial(path: str, trace: Any) -> Any:
-    """What `trace` returns, or a line if a part read something that is not there."""
+    """Return the result of `trace`, or one line if a part reads an attribute that its input lacks."""
     try:
         return trace()
     except AttributeError as error:
@@ -63,4 +69,4 @@ def _trial(path: str, trace: Any) -> Any:
         parts = [part for part in frames if dataclasses.is_dataclass(part) and not isinstance(part, Loop)]
         there = getattr(error.obj, "_fields", None) or [f.name for f in dataclasses.fields(error.obj)]  # pyright: ignore[reportArgumentType]
         names = f"{kebab_case(type(parts[-1]).__name__)} needs {error.name}"
-        return f"{path or 'loop'}: {names}, and here is only {', '.join(there)}: these parts do not fit together"
+        return f"{path or 'loop'}: {names}; there is only {', '.join(there)}: these parts do not fit together"

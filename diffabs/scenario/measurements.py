@@ -1,4 +1,4 @@
-"""Measured runs as CSV files, in the columns that `diffabs simulate --csv` writes."""
+"""Measured runs as CSV files, with the columns that `diffabs simulate --csv` writes."""
 
 import csv
 import math
@@ -13,19 +13,32 @@ from diffabs.core.values import ScenarioError, format_given, unknown_name_error
 
 MAX_MEASUREMENT_BYTES = 100_000_000  # bytes
 TIME_COLUMN = "t [s]"
-IGNORED = ("target [", "command [", "control [")  # what is simulated but not measured
+IGNORED = ("target [", "command [", "control [")  # columns of a simulation without a measurement
 
 
 class Readings(NamedTuple):
-    """Instants [s], increasing, and what was measured at them, in SI, by the names of a plant's output."""
+    """The readings of a measured run.
+
+    Attributes:
+        t: Instants [s], increasing.
+        columns: Readings at the instants, in SI, by the names of a plant's output.
+    """
 
     t: np.ndarray
     columns: dict[str, np.ndarray]
 
 
 def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
-    """The readings in a file, of signals with these units by name. Raises ScenarioError, one line, with the line of the
-    file, for whatever is wrong."""
+    """Return the readings in a CSV file.
+
+    Args:
+        path: File of UTF-8 text, at most `MAX_FILE_BYTES` long, with the column `t [s]`.
+        units: Units of the plant's signals by name: a column's header is `name [unit]`.
+
+    Raises:
+        ScenarioError: The file cannot be read, a column is unknown, a cell is no finite number, or the instants do not
+            increase. The message names the line of the file.
+    """
     try:
         raw = files.read_content(path, MAX_MEASUREMENT_BYTES + 1)
     except OSError as error:
@@ -52,22 +65,22 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
 
 
 def _names(header: Sequence[str], path: pathlib.Path, units: Mapping[str, str]) -> dict[int, str]:
-    """The columns that are compared, by their numbers."""
+    """Return the names of the compared columns by column number."""
     headers = {f"{name} [{unit}]": name for name, unit in units.items()}
     there = ", ".join((TIME_COLUMN, *headers))
     if TIME_COLUMN not in header:
-        what = f"line 1 is no header with {TIME_COLUMN}" if header else "is empty"
+        what = f"line 1 has no column {TIME_COLUMN}" if header else "is empty"
         raise ScenarioError(f"--data {path}: {what}; there is {there}")
     for name in header:
         if header.count(name) > 1:
-            raise ScenarioError(f"--data {path}: column {format_given(name)} is there twice")
+            raise ScenarioError(f"--data {path}: column {format_given(name)} occurs twice")
         if name != TIME_COLUMN and name not in headers and not name.startswith(IGNORED):
             raise unknown_name_error(
                 f"--data {path}: column {format_given(name)} is unknown", name, (TIME_COLUMN, *headers)
             )
     names = {i: headers[name] for i, name in enumerate(header) if name in headers}
     if not names:
-        raise ScenarioError(f"--data {path}: no column was measured; there is {', '.join(headers)}")
+        raise ScenarioError(f"--data {path}: has no column of a measured signal; there is {', '.join(headers)}")
     return names
 
 

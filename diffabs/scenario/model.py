@@ -1,4 +1,4 @@
-"""What a scenario is made of, as values of JSON: for the documents that commands write, and their readers."""
+"""The contents of a scenario as JSON values, for the documents of the commands and for their readers."""
 
 import math
 from typing import Any
@@ -13,8 +13,12 @@ from diffabs.simulate.solution import describe_solver
 
 
 def describe_model(chosen: Scenario) -> dict[str, Any]:
-    """Return title and description, the parts by path, every parameter with its unit, how it is integrated, and the
-    units of the metrics by name."""
+    """Return a scenario as JSON values: title, description, parts, parameters with units, solver, and units of the
+    metrics.
+
+    Args:
+        chosen: Scenario to describe.
+    """
     return {
         "title": chosen.title,
         "description": chosen.description,
@@ -26,7 +30,11 @@ def describe_model(chosen: Scenario) -> dict[str, Any]:
 
 
 def describe_parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
-    """Return every part by its path: its type, and what it has beside parameters."""
+    """Return every part by its path: its type, and its fields that are not parameters.
+
+    Args:
+        chosen: Scenario to describe.
+    """
     found = dict(registry.part_choices(chosen.loop))
     for name, one in chosen.objectives.items():
         found |= registry.part_choices(one, f"objective.{name}")
@@ -34,8 +42,13 @@ def describe_parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
 
 
 def describe_numbers(chosen: Scenario) -> dict[str, dict[str, Any]]:
-    """Return value and unit of every number by its path, in SI; what JSON has no number for is a text that an override
-    understands."""
+    """Return value (in SI) and unit of every parameter by its path.
+
+    JSON has no infinity and no NaN: these become texts, which an override accepts.
+
+    Args:
+        chosen: Scenario to describe.
+    """
 
     def plain(value: Any) -> Any:
         return value if math.isfinite(value) else str(value)

@@ -1,5 +1,8 @@
-"""Parts from outside: the modules of installed packages, by entry points of the group `diffabs.parts`, and those that a
-person names (`--parts`). A scenario file never names one: a file that somebody sends must not import code."""
+"""Parts from outside of diffabs: modules of installed packages, and modules named with `--parts`.
+
+An installed package registers its module as an entry point of the group `diffabs.parts`. A scenario file cannot name a
+module: a file from somebody else must not import code.
+"""
 
 import contextlib
 import dataclasses
@@ -19,32 +22,51 @@ _named: dict[str, ModuleType] = {}
 
 
 def register_modules(names: Iterable[str]) -> None:
-    """Import modules whose parts are to be known from now on, from the Python path or the working directory. Raises
-    ValueError, one line, for what is no name of a module, and for one that cannot be imported."""
+    """Import modules from the Python path or the working directory, and keep them as sources of parts.
+
+    Args:
+        names: Dotted names of the modules.
+
+    Raises:
+        ValueError: A name is not that of a Python module, or the module cannot be imported.
+    """
     for name in names:
         if not all(word.isidentifier() for word in name.split(".")):
-            raise ValueError(f"--parts {name} is no name of a Python module, such as dc_servo")
+            raise ValueError(f"--parts {name} is not the name of a Python module, such as dc_servo")
         here = os.getcwd()
         if here not in sys.path:
-            sys.path.append(here)  # at the end: nothing here hides a module of Python's
+            sys.path.append(here)  # at the end, so that no file here hides a module of the standard library
         _named[name] = _import_module(name, f"--parts {name}")
 
 
 @cache
 def installed_modules() -> tuple[ModuleType, ...]:
-    """Return the modules of installed packages. Raises ValueError for one that cannot be imported."""
+    """Return the modules that installed packages register.
+
+    Raises:
+        ValueError: A module cannot be imported.
+    """
     points = sorted(importlib.metadata.entry_points(group=ENTRY_POINT_GROUP), key=lambda point: point.name)
     return tuple(_import_module(point.value, f"entry point {point.name} of {ENTRY_POINT_GROUP}") for point in points)
 
 
 def registered_modules() -> tuple[ModuleType, ...]:
-    """Return every module with parts from outside, each once."""
+    """Return every module with parts from outside, each once.
+
+    Raises:
+        ValueError: A module of an installed package cannot be imported.
+    """
     return tuple({module.__name__: module for module in (*installed_modules(), *_named.values())}.values())
 
 
 def exported_parts(module: ModuleType) -> Iterator[tuple[str, Any]]:
-    """Yield the parts of a module by name: classes made with `pytree` here, and named instances; not what is imported
-    from diffabs."""
+    """Yield name and part for each class made with `pytree` and each named instance in a module.
+
+    Classes imported from diffabs are left out.
+
+    Args:
+        module: Module whose `__all__`, or else public names, are searched.
+    """
     for name in getattr(module, "__all__", [name for name in vars(module) if not name.startswith("_")]):
         item = getattr(module, name)
         cls = item if isinstance(item, type) else type(item)
@@ -58,8 +80,14 @@ def exported_parts(module: ModuleType) -> Iterator[tuple[str, Any]]:
 
 
 def describe_outside_error(error: BaseException, names: Iterable[str] | None = None) -> str:
-    """Return one line about an error that came through code from outside: its file, line, type and message; nothing for
-    another error. That code is the packages that these modules belong to, or all modules with parts."""
+    """Return one line about an error raised through outside code: file, line, type and message.
+
+    The line is empty for any other error.
+
+    Args:
+        error: Error with its traceback.
+        names: Modules whose packages count as outside code; by default all registered modules.
+    """
     known = names or [module.__name__ for module in registered_modules()]
     outer = {name.partition(".")[0] for name in known} - {"diffabs"}
     frames = [
@@ -73,7 +101,7 @@ def describe_outside_error(error: BaseException, names: Iterable[str] | None = N
 
 def _import_module(name: str, whose: str) -> ModuleType:
     try:
-        with contextlib.redirect_stdout(sys.stderr):  # what a module prints is no part of a command's document
+        with contextlib.redirect_stdout(sys.stderr):  # a print of the module would break the JSON on stdout
             return importlib.import_module(name)
     except ModuleNotFoundError as error:
         where = "" if error.name != name.partition(".")[0] else ", on the Python path or in the working directory"

@@ -5,7 +5,8 @@
     "road.scale" = ...                   the road has a section of its own, here as elsewhere
     "initial.speed_kmh" = ...            speeds may be given in km/h
 
-What stands behind the path differs from table to table; this module knows the paths and the units."""
+This module reads paths and units. Each table gives its values another meaning, which the module of its section reads.
+"""
 
 import dataclasses
 import re
@@ -33,8 +34,16 @@ TABLES = (("design", "over"), ("tune", "free"), ("tune", "over"), ("sweep", "ove
 
 @dataclasses.dataclass(frozen=True)
 class ParameterEntry:
-    """What was given for a parameter: its path in the loop, the place for messages, and the parameter's unit and range,
-    both in the unit in which the value was given, `scale` of which make one in SI; and its shape, () for a number."""
+    """The value given for one parameter.
+
+    Attributes:
+        path: Path of the parameter in the loop.
+        where: Place of the value, for messages.
+        given: The value, in the unit of `spec`.
+        spec: Unit and range of the parameter, in the unit in which the value was given.
+        shape: Shape of the parameter, () for a number.
+        scale: Factor from SI to the given unit: 3.6 for a speed in km/h, else 1.
+    """
 
     path: str
     where: str
@@ -44,30 +53,47 @@ class ParameterEntry:
     scale: float
 
     def single(self, what: str) -> "ParameterEntry":
-        """Return this entry. Raises ScenarioError for a parameter that is a list: only single numbers can do `what`."""
+        """Return this entry if the parameter is a single number.
+
+        Args:
+            what: Verb for the message, such as "have a range".
+
+        Raises:
+            ScenarioError: The parameter is a list.
+        """
         if self.shape:
             raise ScenarioError(f"{self.where} is a list of {self.shape[0]} numbers; only single numbers can {what}")
         return self
 
     def values(self) -> tuple[float, ...]:
-        """Return the numbers that were given, or the one, in SI. Raises ScenarioError, also where there are none."""
+        """Return the given numbers in SI; a single number counts as a list of one.
+
+        Raises:
+            ScenarioError: The list is empty, or an item is no number in the range.
+        """
         given = self.given if isinstance(self.given, list) else [self.given]
         if not given:
             raise ScenarioError(f"{self.where} = [] is empty; numbers in {self.spec.interval()} are needed")
         return tuple(read_number_in_range(x, self.spec, f"{self.where}.{i}") / self.scale for i, x in enumerate(given))
 
     def range(self, or_else: str = "") -> Ends:
-        """Return low and high in SI, each a tuple where the parameter is a list and one was given.
+        """Return low and high in SI, each a tuple if a list was given for a parameter that is a list.
 
-        or_else: what might have been given instead; such a range is of coordinates, which never reach its ends: they
-            may be those of an open range, and must differ.
-        Raises ScenarioError."""
+        Args:
+            or_else: Alternative to a range, for messages. If it is not empty, the range is open: its ends may lie on
+                the ends of an open interval, and must differ. A free parameter of a tuning is such a range, because its
+                coordinate never reaches an end.
+
+        Raises:
+            ScenarioError: The value is not a pair, an end is outside the parameter's range, or the ends are in the
+                wrong order.
+        """
         needed = f"a range [low, high] in {self.spec.interval()}"
         if not isinstance(self.given, list):
             raise wrong_kind_error(self.where, self.given, needed + or_else)
         if len(self.given) != 2:
             raise ScenarioError(
-                f"{self.where} = {format_given(self.given)} is no range [low, high] in {self.spec.interval()}"
+                f"{self.where} = {format_given(self.given)} is not a range [low, high] in {self.spec.interval()}"
             )
         ends = [self._end(item, f"{self.where}.{i}") for i, item in enumerate(self.given)]
         low, high = map(np.asarray, ends)
@@ -82,7 +108,7 @@ class ParameterEntry:
         return tuple(scale_to_si(end, self.scale) for end in ends)
 
     def _end(self, given: Any, path: str) -> Any:
-        """A number, or a tuple of as many as the parameter has."""
+        """Return one end of a range: a number, or a tuple with as many numbers as the parameter."""
         if not self.shape or not isinstance(given, list):
             return read_number(given, self.spec, path)
         if len(given) != self.shape[0]:
@@ -92,13 +118,26 @@ class ParameterEntry:
 
 
 def scale_to_si(value: Any, scale: float) -> Any:
-    """Return a number, or a tuple of them, that was given in units of which `scale` make one in SI."""
+    """Return a number, or a tuple of numbers, in SI.
+
+    Args:
+        value: Number or nested tuple of numbers, in the given unit.
+        scale: Factor from SI to the given unit.
+    """
     return tuple(scale_to_si(item, scale) for item in value) if isinstance(value, tuple) else value / scale
 
 
 def to_canonical_form(table: dict[str, Any]) -> dict[str, Any]:
-    """Bring a scenario to its canonical form: the road in a section of its own, and every such table by dotted path,
-    however they were written. Returns the table. Raises ScenarioError."""
+    """Return the table of a scenario in canonical form, changed in place.
+
+    The road becomes a section of its own, and the tables with parameter keys get dotted paths.
+
+    Args:
+        table: Sections of the scenario.
+
+    Raises:
+        ScenarioError: The road or a path is given twice.
+    """
     plant = table.get("plant")
     if isinstance(plant, dict) and "road" in plant:
         if "road" in table:
@@ -112,7 +151,14 @@ def to_canonical_form(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def forget_replaced_part(table: dict[str, Any], replaced: str) -> None:
-    """Another part has other parameters: what was said about those of the one it replaces goes with it."""
+    """Remove the entries for parameters of a replaced part from the tables with parameter keys.
+
+    The new part has other parameters.
+
+    Args:
+        table: Sections of the scenario, changed in place.
+        replaced: Path of the part.
+    """
     for section, name in TABLES:
         inside = table.get(section)
         if isinstance(inside, dict) and isinstance(inside.get(name), dict):
@@ -120,14 +166,28 @@ def forget_replaced_part(table: dict[str, Any], replaced: str) -> None:
 
 
 def join_path_keys(keys: list[str]) -> list[str]:
-    """The keys of an override, with a path in one of these tables as one key."""
+    """Return the keys of an override, with a path in one of the tables joined to one key.
+
+    Args:
+        keys: Words of the override's path between its dots.
+    """
     if tuple(keys[:2]) in TABLES and len(keys) > 2:
         return [*keys[:2], canonical_path(".".join(keys[2:]))]
     return keys
 
 
 def flatten_table(table: Mapping[str, Any], section: str) -> dict[str, Any]:
-    """The values by dotted path. Raises ScenarioError for a path that comes twice."""
+    """Return the values of nested tables by dotted path.
+
+    A table with the key `type` or `choices` is a value.
+
+    Args:
+        table: Nested tables.
+        section: Name of the table, for messages.
+
+    Raises:
+        ScenarioError: A path is given twice, or nested more than `MAX_DEPTH` deep.
+    """
     found: dict[str, Any] = {}
     pending = list(table.items())
     while pending:
@@ -145,7 +205,11 @@ def flatten_table(table: Mapping[str, Any], section: str) -> dict[str, Any]:
 
 
 def canonical_path(path: str) -> str:
-    """A path as messages have it: without the quotes of a key, the road in a section of its own."""
+    """Return a path as messages show it: without quotes, and with the road in a section of its own.
+
+    Args:
+        path: Path as given.
+    """
     path = path.replace('"', "").replace("'", "")
     return path.removeprefix("plant.") if path.startswith("plant.road.") else path
 
@@ -153,8 +217,19 @@ def canonical_path(path: str) -> str:
 def read_entries(
     table: Mapping[str, Any], section: str, there: Mapping[str, tuple[ParameterSpec, tuple[int, ...]]], otherwise: str
 ) -> Iterator[ParameterEntry]:
-    """What was given, by parameter. `there`: spec and shape of what may be, by path of the loop; `otherwise`: what to
-    say of a name that is not. Raises ScenarioError."""
+    """Yield one entry for each parameter in a table.
+
+    A speed also has a key in km/h, and a controller's limit also has its older name.
+
+    Args:
+        table: Nested or dotted values by path.
+        section: Name of the table, for messages.
+        there: Spec and shape of each allowed parameter by path of the loop.
+        otherwise: Predicate for a path that is not allowed, for messages.
+
+    Raises:
+        ScenarioError: A path is not allowed, or a parameter is given twice.
+    """
     known = {canonical_path(path): (path, spec, shape, 1.0) for path, (spec, shape) in there.items()}
     known |= {f"{k}_kmh": (path, in_kmh(spec), n, KMH) for k, (path, spec, n, _) in known.items() if spec.unit == "m/s"}
     known |= {former: item for key, item in known.items() if (former := _current_path(key)) not in (None, *known)}
@@ -178,7 +253,11 @@ def _current_path(path: str) -> str | None:
 
 
 def parameters_of(loop: Any) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]]:
-    """Return spec and shape of every parameter by path."""
+    """Return spec and shape of every parameter by path.
+
+    Args:
+        loop: Loop, or another part with parameters.
+    """
     return {path: (spec, np.shape(value)) for path, spec, value in parameters(loop)}
 
 

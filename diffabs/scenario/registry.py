@@ -1,9 +1,12 @@
-"""Which parts there are, by family and name, and how the values of a scenario become one.
+"""The parts by family and name, and the construction of a part from the values of a scenario.
 
-A part is found by its shape among the names that its family's package exports: whoever has the methods of the family's
-contract is listed, under the kebab-case of its name (`QuarterCar` is `quarter-car`, `SNOW` is `snow`). Writing a part
-and exporting it is thus all that it takes to use it in a scenario. Parts from outside are in modules of their own, all
-families in one: such a part is of the family whose contract asks most of it, or of its `family`, if it says one."""
+A part belongs to a family if its class has all methods of the family's contract in `core.protocols`, and if the
+family's package exports it. Its name in scenarios is the kebab-case of its Python name: `QuarterCar` is `quarter-car`,
+`SNOW` is `snow`. To add a part, write its class and export it.
+
+A module from outside may hold parts of all families. Such a part belongs to the family whose contract has the most
+methods among the contracts that fit. The attribute `family` of its class overrides this.
+"""
 
 import dataclasses
 import inspect
@@ -37,15 +40,16 @@ from diffabs.scenario.defaults import braking
 
 KMH = 3.6  # km/h in a m/s
 MAX_DEPTH = 16  # parts inside parts; more is a mistake, and Python's stack is finite
-MAX_FILE_BYTES = 10_000_000  # of a whole number that shapes arrays
-DEFAULT_UNITS = units_of(braking().plant)  # in which parts are listed that are in no loop
+MAX_FILE_BYTES = 10_000_000  # largest static whole number: such numbers become shapes of arrays
+DEFAULT_UNITS = units_of(braking().plant)  # units in which `list` shows a part outside of a loop
 
 
 def _methods(cls: type) -> frozenset[str]:
     return frozenset(n for n in dir(cls) if not n.startswith("_") and callable(getattr(cls, n)))
 
 
-# A family: the modules that export its parts, and the methods by which they are told. An initial state has none.
+# A family: the modules that export its parts, and the methods of its contract. An initial state is a record without
+# methods, so its contract is empty and a class without public methods fits.
 FAMILIES: dict[str, tuple[tuple[ModuleType, ...], frozenset[str]]] = {
     "plant": ((plants,), _methods(protocols.Plant)),
     "road": ((roads,), _methods(protocols.Road)),
@@ -62,8 +66,16 @@ FAMILIES: dict[str, tuple[tuple[ModuleType, ...], frozenset[str]]] = {
 
 
 def family_types(family: str) -> Mapping[str, Any]:
-    """The parts of a family by name, with their defaults: one of each class, and the named constants; also those from
-    outside. Raises ScenarioError for a module of those that does not import, or that takes a name twice."""
+    """Return the parts of a family by name: an instance of each class with its defaults, and the named constants.
+
+    Parts from outside are included.
+
+    Args:
+        family: Key of `FAMILIES`.
+
+    Raises:
+        ScenarioError: A module from outside cannot be imported, or uses a name that another part already has.
+    """
     try:
         modules = outside.registered_modules()
     except ValueError as error:
@@ -72,8 +84,14 @@ def family_types(family: str) -> Mapping[str, Any]:
 
 
 def register_parts(names: Iterable[str]) -> None:
-    """Find the parts of these modules, too, from now on. Raises ScenarioError for a module that does not import, has no
-    parts, or takes a name twice."""
+    """Import modules, and add their parts to the families.
+
+    Args:
+        names: Dotted names of Python modules.
+
+    Raises:
+        ScenarioError: A module cannot be imported, has no parts, or uses a name that another part already has.
+    """
     try:
         outside.register_modules(names)
     except ValueError as error:
@@ -86,7 +104,7 @@ def register_parts(names: Iterable[str]) -> None:
 
 @cache
 def _outside_parts(family: str, modules: tuple[ModuleType, ...]) -> Mapping[str, Any]:
-    """Parts from outside by name. Raises ScenarioError."""
+    """Return the parts of outside modules by name. Raises ScenarioError for a name that is already used."""
     found: dict[str, Any] = {}
     for module in modules:
         for exported, part in _parts_of(module).items():
@@ -95,14 +113,14 @@ def _outside_parts(family: str, modules: tuple[ModuleType, ...]) -> Mapping[str,
                 continue
             if name in _packaged_parts(family) or name in found:
                 whose = "diffabs" if name in _packaged_parts(family) else "another module"
-                raise ScenarioError(f"parts of {module.__name__}: there is a {family} {name} already, of {whose}")
+                raise ScenarioError(f"parts of {module.__name__}: a {family} {name} exists already, in {whose}")
             found[name] = part
     return found
 
 
 @cache
 def _parts_of(module: ModuleType) -> Mapping[str, Any]:
-    """An instance of every part that a module exports. Raises ScenarioError for a field without default."""
+    """Return an instance of every part that a module exports. Raises ScenarioError for a field without default."""
     try:
         return {name: item() if isinstance(item, type) else item for name, item in outside.exported_parts(module)}
     except TypeError as error:
@@ -110,7 +128,11 @@ def _parts_of(module: ModuleType) -> Mapping[str, Any]:
 
 
 def _families_of(cls: type) -> set[str]:
-    """Of those whose methods it has, the family that asks for most; blocks alone are alike in three."""
+    """Return the families of a part from outside.
+
+    Among the contracts that fit, the one with the most methods decides. The contract of a block belongs to three
+    families, so a plain block is in all three.
+    """
     if said := getattr(cls, "family", None):
         return {said}
     fits = {name: len(contract) for name, (_, contract) in FAMILIES.items() if contract and contract <= _methods(cls)}
@@ -121,7 +143,7 @@ def _families_of(cls: type) -> set[str]:
 
 @cache
 def _packaged_parts(family: str) -> Mapping[str, Any]:
-    """The parts of diffabs itself."""
+    """Return the parts of diffabs itself by name."""
     modules, contract = FAMILIES[family]
     found = {}
     for exported, item in ((n, x) for module in modules for n, x in vars(module).items()):
@@ -132,44 +154,82 @@ def _packaged_parts(family: str) -> Mapping[str, Any]:
 
 
 def name_of(family: str, part: Any) -> str:
-    """The name of a named constant, else that of the part's class."""
+    """Return the name of a named constant, else the name of the part's class.
+
+    Args:
+        family: Family of the part.
+        part: Instance of the part.
+    """
     named = (name for name, item in family_types(family).items() if item is part)
     return next(named, kebab_case(type(part).__name__))
 
 
 def family_of(field: str, enclosing: str) -> str:
-    """The family of the parts in a field: `road` and `roads` hold roads, `blocks` the same as the part they are in."""
+    """Return the family of the parts in a field.
+
+    `road` and `roads` hold roads; any other field, such as `blocks`, holds parts of the enclosing family.
+
+    Args:
+        field: Name of the field.
+        enclosing: Family of the part that has the field.
+    """
     return next((name for name in (field, field.removesuffix("s")) if name in FAMILIES), enclosing)
 
 
 def type_name(given: Any) -> Any:
-    """The type that a section of a scenario names, as a bare word or in its table; None where it names none."""
+    """Return the type that a section of a scenario names, as a bare word or in its table; None without a name.
+
+    Args:
+        given: Value of the section.
+    """
     return given.get("type") if isinstance(given, dict) else given
 
 
 def inner_fields(family: str, name: str) -> list[str]:
-    """The fields of a part that hold one part of its own family: the controller that `sampled` runs."""
+    """Return the fields of a part that hold one part of the same family, such as the controller inside `sampled`.
+
+    Args:
+        family: Family of the part.
+        name: Name of the part.
+    """
     part = family_types(family)[name]
     own = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
     return [field for field in own if family_of(field, "") == family and not isinstance(getattr(part, field), tuple)]
 
 
 def part_summary(part: Any) -> str:
-    """The first paragraph of a part's docstring, on one line."""
+    """Return the first paragraph of a part's docstring, on one line.
+
+    Args:
+        part: Instance of the part.
+    """
     return " ".join((inspect.getdoc(type(part)) or "").split("\n\n")[0].split())
 
 
 def unit_of(objective: Any, plant: Any = None) -> str:
-    """The unit of what an objective measures on a plant, without one on the usual; empty where it does not say."""
+    """Return the unit of an objective's value; empty if the objective declares none.
+
+    Args:
+        objective: Objective.
+        plant: Plant whose signals the objective measures; by default the usual plant.
+    """
     return resolve_unit(getattr(objective, "unit", ""), units_of(plant) or DEFAULT_UNITS)
 
 
 def build_part(family: str, given: Any, default: Any, path: str, units: Units | None = None) -> Any:
-    """The part that a table, or the bare name of a type, describes.
+    """Return the part that a table, or the bare name of a type, describes.
 
-    A table without `type` describes `default` with some fields changed; default None means that a type is needed.
-    `units` are those of the loop, for messages.
-    Raises ScenarioError; ranges are left to `diffabs.check`.
+    A table without `type` changes fields of `default`. Ranges of numbers are checked later, by `diffabs.check`.
+
+    Args:
+        family: Family of the part.
+        given: Table or name, as read from TOML.
+        default: Part with the default fields; None if a type is required.
+        path: Place of the value, for messages.
+        units: Units of the loop's signals, for messages.
+
+    Raises:
+        ScenarioError: The type is missing or unknown, a field is unknown, or a value has the wrong type.
     """
     there = family_types(family)
     table = {"type": given} if isinstance(given, str) else given
@@ -187,10 +247,22 @@ def build_part(family: str, given: Any, default: Any, path: str, units: Units | 
 
 
 def fill_part(template: Any, table: dict[str, Any], family: str, path: str, units: Units | None = None) -> Any:
-    """A copy of a part with the fields of a table. Raises ScenarioError for an unknown field or a wrong type."""
+    """Return a copy of a part with the fields of a table.
+
+    Args:
+        template: Part with the default fields.
+        table: New values by field; a speed may have the key `<field>_kmh`.
+        family: Family of the part; empty for a whole loop.
+        path: Place of the table, for messages.
+        units: Units of the loop's signals, for messages.
+
+    Raises:
+        ScenarioError: A field is unknown or given twice, a value has the wrong type, or parts are nested too deeply.
+    """
     if path.count(".") > MAX_DEPTH:
         raise ScenarioError(f"{format_given(path)}: parts are nested more than {MAX_DEPTH} deep")
     fields = {field.name: field for field in dataclasses.fields(template)}
+    # Every field in m/s may also be given as <field>_kmh.
     edge = {f"{n}_kmh": f for n, f in fields.items() if "spec" in f.metadata and f.metadata["spec"].unit == "m/s"}
     values = {}
     for key, given in table.items():
@@ -214,7 +286,7 @@ def fill_part(template: Any, table: dict[str, Any], family: str, path: str, unit
 
 
 def _find_inner_field(part: Any, key: str) -> str:
-    """Return the path of a field of this name in a part inside this one; empty without one."""
+    """Return the path of a field of this name in a part inside this one, or an empty text."""
     pending = [("", part)]
     while pending:
         path, one = pending.pop(0)
@@ -228,8 +300,16 @@ def _find_inner_field(part: Any, key: str) -> str:
 
 
 def build_loop(sections: dict[str, Any]) -> Loop:
-    """The loop of the sections of a scenario; what is left out is as the plant says that it usually is, or is missing.
-    Raises ScenarioError."""
+    """Return the loop that the sections of a scenario describe.
+
+    A section that is left out gets the plant's usual part.
+
+    Args:
+        sections: Values of the sections by field of the loop.
+
+    Raises:
+        ScenarioError: A section is wrong, or is left out while the plant has no usual part for it.
+    """
     plant = fill_part(braking(), {"plant": sections["plant"]}, "", "").plant if "plant" in sections else braking().plant
     own, units = getattr(plant, "usual_parts", dict), units_of(plant)
     parts = {"plant": plant, **own()}
@@ -242,12 +322,17 @@ def build_loop(sections: dict[str, Any]) -> Loop:
     return fill_part(Loop(**parts), sections, "", "", units)
 
 
-# What a scenario has besides the fields of a loop.
+# Sections of a scenario that are not fields of a loop.
 OTHER_SECTIONS = ("road", "solver", "objective", "design", "tune", "sweep", "title", "description")
 
 
 def join_path(path: str, key: str) -> str:
-    """A dotted path; the road of the plant has a section of its own."""
+    """Return a dotted path; the road of the plant has the path `road`.
+
+    Args:
+        path: Path of the part.
+        key: Field in it.
+    """
     return "road" if (path, key) == ("plant", "road") else dotted_path(path, key)
 
 
@@ -273,7 +358,7 @@ def _value(given: Any, field: dataclasses.Field[Any], default: Any, place: tuple
 
 
 def _parts(family: str, given: Any, default: tuple[Any, ...], path: str, units: Units | None) -> tuple[Any, ...]:
-    """A list of parts; or a table by number, which changes some of the default ones, or adds the next."""
+    """Return a tuple of parts from a list, or from a table that changes default parts by number or adds the next."""
     if isinstance(given, list) and given:
         return tuple(build_part(family, item, None, f"{path}.{i}", units) for i, item in enumerate(given))
     if not isinstance(given, dict):
@@ -289,12 +374,23 @@ def _parts(family: str, given: Any, default: tuple[Any, ...], path: str, units: 
 
 
 def in_kmh(spec: ParameterSpec) -> ParameterSpec:
-    """Return what a speed may be, in km/h."""
+    """Return the spec of a speed in km/h.
+
+    Args:
+        spec: Spec of the speed in m/s.
+    """
     return dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
 
 
 def describe_part(family: str, part: Any) -> dict[str, dict[str, Any]]:
-    """A part's fields: default, unit and range of each, as plain values. A default that is a part is its name."""
+    """Return the fields of a part as plain values: default, unit and range of each.
+
+    A default that is a part is given by its name.
+
+    Args:
+        family: Family of the part.
+        part: Instance of the part.
+    """
     rows = {}
     for field in dataclasses.fields(part):
         value, spec = getattr(part, field.name), field.metadata.get("spec")
@@ -320,7 +416,12 @@ def describe_part(family: str, part: Any) -> dict[str, dict[str, Any]]:
 
 
 def part_choices(part: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every part below this one by its path: its type, and its fields that are no parameters."""
+    """Yield path and choices of this part and every part below it: its type, and its fields that are not parameters.
+
+    Args:
+        part: Part, or tuple of parts.
+        path: Path of the part; empty for a whole loop, which itself is not yielded.
+    """
     if isinstance(part, tuple):
         for i, item in enumerate(part):
             yield from part_choices(item, f"{path}.{i}")

@@ -1,16 +1,17 @@
-"""A scenario: a TOML file, or the name of a packaged one, that says what is run.
+"""Scenarios: a TOML file, or the name of a packaged one, describes a loop and the tasks on it.
 
     title, description    one printable line; printable lines
     [plant] [road] [initial] [sensor] [reference] [feedforward] [controller] [actuator] [stop]    a part each: `type`
     [solver]       type (fixed, adaptive), step [s], duration [s], every (trajectories keep every so many steps), rtol
                    (of adaptive steps), kinks (of fixed ones), seed (of noisy sensors)
     [objective]    name = a part; adds to, or changes, those of every report on such a plant
-    [design]       what a robust gain is asked for, and over which ranges: see `section_design`
-    [tune]         which parameters are free, what is made small, and over which runs: see `section_tune`
-    [sweep]        what varies in a Monte-Carlo sweep, and what counts as a failure: see `section_sweep`
+    [design]       requirements on a robust gain, and the ranges of parameters: see `section_design`
+    [tune]         free parameters, objective, and the runs it is taken over: see `section_tune`
+    [sweep]        distributions of a Monte-Carlo sweep, and bounds of a failure: see `section_sweep`
 
-What is left out has its default, if the plant says one; else it is asked for. Speeds may be given in km/h:
-`speed_kmh`. A value is never evaluated as code."""
+A section that is left out gets the plant's usual part; it is required if the plant has none. Speeds may be given in
+km/h: `speed_kmh`. A value is never evaluated as code.
+"""
 
 import dataclasses
 import importlib.resources
@@ -56,14 +57,26 @@ from diffabs.simulate.admissible import find_mismatches, find_unstable_step
 from diffabs.simulate.solution import Adaptive, Solver
 
 MAX_SCENARIO_BYTES = 1_000_000  # bytes
-MAX_PATH_LENGTH = 4096  # characters of it in a message
+MAX_PATH_LENGTH = 4096  # characters of a path in a message
 TEXTS = {"title": read_printable_line, "description": read_printable_lines}
 
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """What is run: a loop, how it is integrated [s], what is measured, the seed of its noise; what a design must do,
-    what is tuned, and what varies in a sweep."""
+    """A loop with its solver and objectives, and the tasks on it: a design, a tuning, a sweep.
+
+    Attributes:
+        name: Name of the packaged scenario, or of the file without its suffix.
+        title: One line for reports.
+        description: Lines for reports.
+        loop: Loop to run.
+        solver: Step [s], duration [s] and method of the integration.
+        objectives: Objectives of a run by name.
+        seed: Seed of the noise of the sensors.
+        design: Section `[design]`.
+        tune: Section `[tune]`.
+        sweep: Section `[sweep]`.
+    """
 
     name: str
     title: str = ""
@@ -77,18 +90,22 @@ class Scenario:
     sweep: section_sweep.SweepSection = dataclasses.field(default_factory=section_sweep.SweepSection)
 
     def key(self) -> jax.Array:
-        """The random key of a run, `jax.random.key(seed)`."""
+        """Return the random key of a run, `jax.random.key(seed)`."""
         if jax.config.jax_default_prng_impl == "threefry2x32" and 0 <= self.seed < 2**31:  # pyright: ignore
+            # The same key as below. `jax.random.key` would compile a program for it.
             words: Any = np.array([0, self.seed], np.uint32)
-            return jax.random.wrap_key_data(words)  # JAX would compile a program for it
+            return jax.random.wrap_key_data(words)
         return jax.random.key(self.seed)
 
     def with_loop(self, loop: Loop, how: str) -> "Scenario":
-        """The same with another loop, of which the old title may not be true: it says `how` that came about."""
+        """Return this scenario with another `loop`, and a title that says `how` the loop was found.
+
+        The description is dropped, because it may be wrong for the new loop.
+        """
         return dataclasses.replace(self, loop=loop, title=f"{self.name}, {how}", description="")
 
     def cautions(self) -> list[str]:
-        """What is allowed but hardly meant, a line each."""
+        """Return one line for each value of the loop that is allowed but probably a mistake."""
         return list(find_cautions(self.loop))
 
 
@@ -99,21 +116,30 @@ def names() -> list[str]:
 
 
 def read_header(name_or_path: str | pathlib.Path) -> dict[str, str]:
-    """Title and description of a scenario, without building it. Raises ScenarioError."""
+    """Return title and description of a scenario, without building it.
+
+    Args:
+        name_or_path: Name of a packaged scenario, or path of a TOML file.
+
+    Raises:
+        ScenarioError: The file cannot be read, or a text is not printable.
+    """
     table = _parse(_read(name_or_path)[1], str(name_or_path))
     return {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
 
 
 def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, integrated: bool = True) -> Scenario:
-    """Return the scenario in a TOML file, or a packaged one, with overrides such as `controller.kp=4000`.
+    """Return the scenario in a TOML file, or a packaged scenario, with overrides such as `controller.kp=4000`.
 
-    name_or_path: `slip-lmi`, or `mine.toml`
-    overrides: `path=value`; a value is one of TOML, a bare word is text, and `1,2` a list; `controller=relay` replaces
-        the part
-    integrated: ask, too, whether the step is stable for the loop
+    Args:
+        name_or_path: Name of a packaged scenario, such as `slip-lmi`, or path of a file, such as `mine.toml`.
+        overrides: Texts `path=value`. A value is a TOML value; a bare word is a text, and `1,2` a list.
+            `controller=relay` replaces the part.
+        integrated: Also check that the step is stable for the loop.
 
-    Raises ScenarioError, one line, for a file that cannot be read, unknown names, wrong types, values out of range, and
-    a step that is not stable.
+    Raises:
+        ScenarioError: The file cannot be read, a name is unknown, a value has the wrong type or is out of range, or the
+            step is unstable. The message is one line.
     """
     name, raw = _read(name_or_path)
     folder = pathlib.Path() if str(name_or_path) in names() else pathlib.Path(name_or_path).parent
@@ -129,14 +155,19 @@ def loads(
     folder: pathlib.Path = pathlib.Path(),
     integrated: bool = True,
 ) -> Scenario:
-    """Return the scenario in a text.
+    """Return the scenario in a TOML text.
 
-    raw: the text, in UTF-8
-    name, origin: of the scenario, and of the text in messages
-    folder: where the files lie that the text names
-    overrides, integrated: as in `load`
+    Args:
+        raw: Text in UTF-8.
+        name: Name of the scenario.
+        origin: Name of the text, for messages.
+        overrides: As in `load`.
+        folder: Folder of the files that the text names.
+        integrated: As in `load`.
 
-    Raises ScenarioError, as `load`."""
+    Raises:
+        ScenarioError: As in `load`.
+    """
     table = _parse(raw, origin)
     before = {family: type_name(table.get(family)) for family in FAMILIES}
     for override in overrides:
@@ -151,15 +182,17 @@ def loads(
 
 
 def _retitle(name: str, overrides: Sequence[str]) -> dict[str, Any]:
-    """Title and description of what is no longer what the file says, but for what the overrides say themselves."""
+    """Return title and description of an overridden scenario, without the texts that an override sets itself."""
     said = {override.partition("=")[0].strip() for override in overrides}
     new = {"title": make_printable(f"{name} with {', '.join(overrides)}"), "description": ""}
     return {key: text for key, text in new.items() if key not in said}
 
 
 def _without_inner(before: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line for each section that an override replaced by a part around others, without saying which: the
-    scenario's own part would silently become the default one."""
+    """Yield a line for each section whose new part encloses another part that the override does not name.
+
+    Without this check the default inner part would silently replace the scenario's own part.
+    """
     for family, old in before.items():
         name, given = type_name(table.get(family)), table.get(family)
         if name in (None, old) or name not in family_types(family):
@@ -167,11 +200,11 @@ def _without_inner(before: Mapping[str, Any], table: Mapping[str, Any]) -> Itera
         for field in inner_fields(family, name):
             inner = given.get(field) if isinstance(given, dict) else None
             if inner is None or (isinstance(inner, dict) and "type" not in inner):
-                yield f"{family}.{field} is missing: {name} is around another {family}; say which, with its type"
+                yield f"{family}.{field} is missing: {name} encloses another {family}; give its type"
 
 
 def _refuse(*objections: Iterable[str]) -> None:
-    """Raises ScenarioError with the lines of the first who objects; the later ones are not asked then."""
+    """Raise ScenarioError with all lines of the first check that yields any; the checks after it do not run."""
     for lines in objections:
         found = [re.sub(r"^plant\.road\b", "road", line) for line in lines]
         if found:
@@ -235,6 +268,7 @@ def _override(table: dict[str, Any], override: str) -> None:
         node = child
     place = _place(node, keys[-1], ".".join(keys[:-1]))
     if isinstance(place, str):
+        # An override in m/s replaces a value in km/h and the reverse; both together would be given twice.
         other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
         node.pop(other, None)
         if keys[0] == "controller":  # an override replaces the same limit under its other name
@@ -276,7 +310,8 @@ def _assemble(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenari
         place = join_path("objective", read_printable_line(key, "a name in objective"))
         measured[key] = build_part("objective", value, report.get(key), place, units_of(loop.plant))
     objectives = {**report, **measured}
-    _refuse(_wrong_values(loop, objectives), find_misfits(loop, objectives))  # before what is said of their parameters
+    # First: the sections below need valid parameters.
+    _refuse(_wrong_values(loop, objectives), find_misfits(loop, objectives))
     return Scenario(
         name=name,
         **texts,
@@ -291,14 +326,18 @@ def _assemble(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenari
 
 
 def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
-    """What the parts object to."""
+    """Yield the objections of the parts to their values."""
     yield from find_problems(loop)
     for name, objective in objectives.items():
         yield from find_problems(objective, f"{join_path('objective', name)}.", units_of(loop.plant))
 
 
 def dump(scenario: Scenario) -> str:
-    """Return TOML that loads back to the same scenario; every field is written, numbers at full precision."""
+    """Return TOML that loads back to the same scenario, with every field, and numbers at full precision.
+
+    Args:
+        scenario: Scenario to write.
+    """
     sections = {field.name: as_plain(getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)}
     if "road" in sections["plant"]:
         sections["road"] = sections["plant"].pop("road")

@@ -1,4 +1,4 @@
-"""The section [design] of a scenario: what a gain is asked for, and the ranges over which it is robust.
+"""The section [design] of a scenario: requirements on a gain, and the ranges over which it is robust.
 
     Q, R       weights of the integral of x'Qx + u'Ru: a diagonal or a full matrix
     decay      1/s
@@ -7,7 +7,8 @@
     "plant.mass" = [5.3, 6.2]              # a path of the loop, as elsewhere in scenarios; low and high, in SI
     "initial.speed_kmh" = [5.0, 50.0]      # or in km/h
 
-A path may be one key with dots or nested tables. Only what the linear model of a loop depends on can have a range."""
+A path may be one key with dots or nested tables. Only parameters of the loop's linear model can have a range.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -41,7 +42,10 @@ Range = tuple[float, float]
 
 
 def _weight(given: Any, path: str) -> Any:
-    """A weight as a number or nested tuples, which compare; its order is for the model to say."""
+    """Return a weight as a number or nested tuples, which can be compared.
+
+    The size is not checked here: only the linear model has the order.
+    """
     from diffabs.linear.weights import as_weight_matrix
 
     if not isinstance(given, list | int | float) or isinstance(given, bool):
@@ -67,8 +71,15 @@ def _numbers(given: Any, path: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class DesignTask:
-    """What a gain is asked for: weights (tuples of their rows, or of a diagonal) or None, decay [1/s], damping, and the
-    ranges given, in SI, by path of the loop."""
+    """The requirements on a gain.
+
+    Attributes:
+        Q: Weight of the states: a number, or tuples of a diagonal or of rows; None without a cost.
+        R: Weight of the control, in the same form.
+        decay: Required decay rate [1/s].
+        damping: Required damping of the poles, in [0, 1).
+        over: Ranges (low, high), in SI, by path of the loop.
+    """
 
     Q: Any = table_field(_weight, None)
     R: Any = table_field(_weight, None)
@@ -77,14 +88,19 @@ class DesignTask:
     over: Mapping[str, Range] = dataclasses.field(default_factory=dict)
 
     def box(self, loop: Loop) -> dict[str, Range]:
-        """The ranges by path of the loop's linear model, that of the speed between the loop's start and its stop if
-        none was given."""
+        """Return the ranges by path of the linear model of `loop`.
+
+        A speed without a range gets the range from the loop's stop to its start.
+        """
         known = _rangeable_parameters(loop)
         return {known[path].model: ends for path, ends in self._with_speed(loop).items()}
 
     def ranges(self, loop: Loop) -> dict[str, Range]:
-        """The ranges by path of the loop, without those of a single value; that of the speed between the loop's start
-        and its stop if others are given and none of it."""
+        """Return the ranges by path of `loop`, without ranges of a single value.
+
+        If other parameters have ranges and the speed has none, the speed gets the range from the loop's stop to its
+        start.
+        """
         over = self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else self.over
         return {path: ends for path, ends in over.items() if ends[0] < ends[1]}
 
@@ -96,13 +112,13 @@ class DesignTask:
         return over
 
     def table(self) -> dict[str, Any]:
-        """As values of TOML."""
+        """Return the section as TOML values."""
         return {name: value for name, value in plain_fields(self).items() if value is not None}
 
 
 @dataclasses.dataclass(frozen=True)
 class _Parameter:
-    """What can have a range: its path in the linear model, its values, and whether it is more than one number."""
+    """A parameter that can have a range: its path in the linear model, its spec, and its shape."""
 
     model: str
     spec: ParameterSpec
@@ -110,7 +126,15 @@ class _Parameter:
 
 
 def read_design_section(table: Any, loop: Loop) -> DesignTask:
-    """The task of a section. Raises ScenarioError, one line, for whatever is wrong with it."""
+    """Return the task that a section describes.
+
+    Args:
+        table: Values of the section.
+        loop: Loop whose linear model the ranges refer to.
+
+    Raises:
+        ScenarioError: A value is wrong, or only one of Q and R is given. The message is one line.
+    """
     task: DesignTask = read_table(DesignTask, table, "design", over=lambda given, path: _over(given, path, loop))
     for there, missing in (("Q", "R"), ("R", "Q")):
         if getattr(task, there) is not None and getattr(task, missing) is None:
@@ -121,12 +145,15 @@ def read_design_section(table: Any, loop: Loop) -> DesignTask:
 def _over(given: Any, path: str, loop: Loop) -> dict[str, Range]:
     table = table_reader(read_as_given, "ranges")(given, path)
     there = {name: (parameter.spec, parameter.shape) for name, parameter in _rangeable_parameters(loop).items()}
-    found = read_entries(table, path, there, "nothing that the linear model of this loop depends on")
+    found = read_entries(table, path, there, "not a parameter of this loop's linear model")
     return {item.path: item.single("have a range").range() for item in found}
 
 
 def _rangeable_parameters(loop: Loop) -> dict[str, _Parameter]:
-    """What can have a range, by path of the loop. The model's names for the rest of the loop are `reduction`'s."""
+    """Return the parameters that can have a range, by path of the loop.
+
+    A slip loop's linear model is a `SlipModel`, with its own paths. Any other plant keeps the paths of the loop.
+    """
     if not hasattr(loop.plant, "frozen"):
         return {path: _Parameter(path, spec, np.shape(x)) for path, spec, x in parameters(loop.plant, "plant.")}
     model = {field.name: field.metadata["spec"] for field in dataclasses.fields(SlipModel) if "spec" in field.metadata}

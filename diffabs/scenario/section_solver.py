@@ -1,6 +1,7 @@
-"""The section [solver]: how a run is integrated, and the seed of its noise.
+"""The section [solver] of a scenario: the integration of a run, and the seed of its noise.
 
-Where no type is given, a step or `kinks` make it fixed; otherwise, and with an rtol, steps are adaptive."""
+Without a type, `step` or `kinks` select fixed steps. Otherwise, and always with `rtol`, steps are adaptive.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -17,7 +18,7 @@ TOLERANCE_SPEC = ParameterSpec("1", low=1e-12, high=0.01)
 
 @dataclasses.dataclass(frozen=True)
 class _Any:
-    """What every solver has."""
+    """Fields of every solver."""
 
     step: float = table_field(range_reader(TIME_SPEC), FixedStep.step)
     duration: float = table_field(range_reader(TIME_SPEC), FixedStep.duration)
@@ -27,14 +28,14 @@ class _Any:
 
 @dataclasses.dataclass(frozen=True)
 class _Fixed(_Any):
-    """Fixed steps."""
+    """Fields of fixed steps."""
 
     kinks: bool | None = table_field(read_switch, FixedStep.kinks)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Adaptive(_Any):
-    """Adaptive ones."""
+    """Fields of adaptive steps."""
 
     rtol: float = table_field(range_reader(TOLERANCE_SPEC), Adaptive.rtol)
 
@@ -43,7 +44,14 @@ SECTIONS = {"fixed": _Fixed, "adaptive": _Adaptive}
 
 
 def read_solver_section(given: Any) -> tuple[Solver, int]:
-    """Return solver and seed of a section. Raises ScenarioError."""
+    """Return solver and seed of a section.
+
+    Args:
+        given: Values of the section.
+
+    Raises:
+        ScenarioError: A field is unknown, or a value has the wrong type or is out of range.
+    """
     table = {"type": _default_type(given), **given} if isinstance(given, Mapping) else given
     found = read_one(SECTIONS, table, "solver")
     said = plain_fields(found)
@@ -53,12 +61,17 @@ def read_solver_section(given: Any) -> tuple[Solver, int]:
 
 
 def _default_type(given: Mapping[str, Any]) -> str:
-    """The type that is meant where none is given."""
+    """Return the type of a section that names none."""
     return "fixed" if {"step", "kinks"} & given.keys() and "rtol" not in given else "adaptive"
 
 
 def write_solver_section(solver: Solver, seed: int) -> dict[str, Any]:
-    """Return the section that is read so."""
+    """Return the section that `read_solver_section` reads back to the same solver and seed.
+
+    Args:
+        solver: Fixed or adaptive solver.
+        seed: Seed of the noise.
+    """
     kind = next(name for name, one in SOLVER_TYPES.items() if type(solver) is one)
     said = {name: value for name, value in plain_fields(solver).items() if value is not None}
     return {"type": kind, **said, "seed": seed}

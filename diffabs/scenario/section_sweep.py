@@ -1,4 +1,4 @@
-"""The section [sweep] of a scenario: what varies, how often it is drawn, and what counts as a failure.
+"""The section [sweep] of a scenario: distributions, number of runs, and bounds of a failure.
 
     samples, seed            runs (0: as many as the design has, or 1,000)
     chunk                    runs that are computed and stored together
@@ -18,8 +18,9 @@
     [sweep.failures]
     overshoot = 0.5                                           # more is a failure; so is not to stop, or to lock
 
-The distributions are those of `diffabs.sweep.distributions`. Reading needs no extra, but for
-files; running needs the extra `sweep`."""
+The distributions are those of `diffabs.sweep.distributions`. Reading the section needs no extra, except for files.
+Running the sweep needs the extra `sweep`.
+"""
 
 import dataclasses
 import pathlib
@@ -53,13 +54,19 @@ from diffabs.sweep.variables import Correlation, Space, read_correlation
 if TYPE_CHECKING:
     from diffabs.sweep import Study
 
-DEFAULT_SAMPLES = 1000  # where the design does not say how many there are
+DEFAULT_SAMPLES = 1000  # for a sampling design without a number of points of its own
 PARTS = {field.name for field in dataclasses.fields(Loop)} | {"road"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """One of some parts: what was given, the distribution of their names, and the part of each name."""
+    """A categorical distribution over parts.
+
+    Attributes:
+        given: Values as read from TOML.
+        names: Distribution of the names of the parts.
+        parts: The part of each name.
+    """
 
     given: Any
     names: distributions.Categorical
@@ -68,7 +75,12 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True)
 class SweepSection:
-    """What varies, in SI. `over`: distributions, and choices of parts, by path of the loop."""
+    """The section as read, in SI.
+
+    Attributes:
+        over: Distributions, and choices of parts, by path of the loop.
+        failures: Bounds by metric: a run with a greater value fails.
+    """
 
     samples: int = table_field(whole_reader(0, sampling.MAX_UINT32), 0)
     seed: int = table_field(whole_reader(0, sampling.MAX_UINT32), 0)
@@ -81,7 +93,7 @@ class SweepSection:
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
-        """As values of TOML, what is usual in short."""
+        """Return the section as TOML values, with short forms for common values."""
         design = as_plain(self.design, brief=True)
         given = {"design": design["type"] if len(design) == 1 else design}
         given["over"] = {path: _format_item(item) for path, item in self.over.items()}
@@ -90,7 +102,7 @@ class SweepSection:
 
 
 def _format_item(item: Any) -> Any:
-    """A distribution, or a choice of parts, as it is given."""
+    """Return a distribution, or a choice of parts, as a TOML value."""
     if isinstance(item, distributions.Uniform):
         return [item.low, item.high]
     return item.given if isinstance(item, Choice) else as_plain(item, brief=True)
@@ -99,8 +111,19 @@ def _format_item(item: Any) -> Any:
 def read_sweep_section(
     table: Any, loop: Loop, objectives: Mapping[str, Objective], folder: pathlib.Path
 ) -> SweepSection:
-    """The section. Files are read now, and their names are relative to `folder`: what was read no longer depends on
-    them. Raises ScenarioError, one line, for whatever is wrong with it."""
+    """Return the sweep that a section describes.
+
+    Files of numbers are read at once, so the result does not depend on them.
+
+    Args:
+        table: Values of the section.
+        loop: Loop with the parameters that vary.
+        objectives: Objectives of its runs by name.
+        folder: Folder of the files that the section names.
+
+    Raises:
+        ScenarioError: A value is wrong, or a file cannot be read. The message is one line.
+    """
     plan: SweepSection = read_table(
         SweepSection,
         table,
@@ -114,7 +137,7 @@ def read_sweep_section(
 
 
 def _over(given: Mapping[str, Any], loop: Loop, folder: pathlib.Path) -> dict[str, Any]:
-    """Distributions and choices by path of the loop, in the order given."""
+    """Return distributions and choices by path of the loop, in the order given."""
     there = {path: (spec, ()) for path, spec in elements(loop).items()}
     numbers = {path: item for path, item in given.items() if path not in PARTS}
     known = read_entries(numbers, "sweep.over", there, "not a parameter of this loop")
@@ -130,12 +153,12 @@ def _over(given: Mapping[str, Any], loop: Loop, folder: pathlib.Path) -> dict[st
 
 
 def _distribution(item: ParameterEntry, folder: pathlib.Path) -> Any:
-    """In SI; a pair of numbers is uniform."""
+    """Return the distribution of one parameter, in SI; a pair of numbers is uniform."""
     given = item.given
     if isinstance(given, list):
         if len(given) != 2:
             raise ScenarioError(
-                f"{item.where} = {format_given(given)} is no pair [low, high], and no table with a type"
+                f"{item.where} = {format_given(given)} is neither a pair [low, high] nor a table with a type"
             )
         given = {"type": "uniform", "low": given[0], "high": given[1]}
     if not isinstance(given, dict):
@@ -147,13 +170,13 @@ def _distribution(item: ParameterEntry, folder: pathlib.Path) -> Any:
 
 
 def _with_numbers(given: Mapping[str, Any], where: str, folder: pathlib.Path) -> Mapping[str, Any]:
-    """The table of a distribution with the numbers of a file in the place of its name."""
+    """Return the table of a distribution, with the numbers of a file in the place of its name."""
     if given.get("type") != "empirical" or "file" not in given:
         return given
     if "values" in given:
         raise ScenarioError(f"{where} has values and a file; one of them is needed")
     if "column" not in given:
-        raise ScenarioError(f"{where}.column is missing: which one of {format_given(given['file'])}?")
+        raise ScenarioError(f"{where}.column is missing: name a column of {format_given(given['file'])}")
     file, column = (read_text(given[key], f"{where}.{key}") for key in ("file", "column"))
     try:
         from diffabs.sweep import sample_files
@@ -167,7 +190,7 @@ def _with_numbers(given: Mapping[str, Any], where: str, folder: pathlib.Path) ->
 
 
 def _choice(key: str, given: Any, default: Any) -> Choice:
-    """Names of parts as they are drawn; one that has no name has its number."""
+    """Return a choice of parts; a part given as a table has its number as its name."""
     where = f"sweep.over.{key}"
     table = {"choices": given} if isinstance(given, list) else given
     if not isinstance(table, dict) or not isinstance(table.get("choices"), list) or not table["choices"]:
@@ -180,7 +203,7 @@ def _choice(key: str, given: Any, default: Any) -> Choice:
 
 
 def _in_loop(correlation: Correlation, over: Iterable[str]) -> Correlation:
-    """The same with paths of the loop, however they were written."""
+    """Return the correlation with paths of the loop, for paths in any allowed form."""
     known = {canonical_path(path): path for path in over}
     paths = [canonical_path(path).removesuffix("_kmh") for path in correlation.paths]
     for path, given in zip(paths, correlation.paths, strict=True):
@@ -190,12 +213,19 @@ def _in_loop(correlation: Correlation, over: Iterable[str]) -> Correlation:
 
 
 def build_study(chosen: Any) -> "Study":
-    """The sweep of a scenario. Raises ScenarioError."""
+    """Return the sweep of a scenario.
+
+    Args:
+        chosen: Scenario with a section `[sweep]`.
+
+    Raises:
+        ScenarioError: Nothing varies, or the section does not fit the loop.
+    """
     from diffabs.sweep import Study
 
     plan: SweepSection = chosen.sweep
     if not plan.over:
-        raise ScenarioError('sweep.over is empty: say what varies, as in [sweep.over] "plant.mass" = [5.3, 6.2]')
+        raise ScenarioError('sweep.over is empty; for example [sweep.over] "plant.mass" = [5.3, 6.2]')
     choices = {path: item for path, item in plan.over.items() if isinstance(item, Choice)}
     variables = {path: item.names if path in choices else item for path, item in plan.over.items()}
     space = Space(variables, plan.correlation, plan.design)
@@ -217,5 +247,5 @@ def build_study(chosen: Any) -> "Study":
 
 
 def _natural_count(space: Space) -> int:
-    """As many samples as the design has by itself."""
+    """Return the number of points of a grid or of corners, else `DEFAULT_SAMPLES`."""
     return space.check() if isinstance(space.design, sampling.Corners | sampling.Grid) else DEFAULT_SAMPLES

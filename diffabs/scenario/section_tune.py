@@ -1,4 +1,4 @@
-"""The section [tune] of a scenario: which parameters are free, what is made small, and over which runs.
+"""The section [tune] of a scenario: free parameters, objective, and the runs it is taken over.
 
     starts, seed     descents: the first from the scenario's own values, the others drawn from the ranges
     iterations       of each descent
@@ -20,7 +20,8 @@
     [tune.limits]
     overshoot = 0.008                                        # at most, on every lane
 
-Paths are those of `parameter_paths`. Only reading is done without the extra `tune`."""
+Paths are those of `parameter_paths`. Reading the section needs no extra; tuning needs the extra `tune`.
+"""
 
 import dataclasses
 import math
@@ -58,7 +59,7 @@ MOST_LANES = 100_000
 
 
 def _aggregate(given: Any, path: str) -> dict[str, Any]:
-    """Type and fields."""
+    """Return type and fields of an aggregate."""
     part = read_one(risk.AGGREGATE_TYPES, given, path)
     return {
         "type": next(name for name, kind in risk.AGGREGATE_TYPES.items() if type(part) is kind),
@@ -72,8 +73,21 @@ def _mean() -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """What is tuned, in SI. `free`: ranges by path, None the declared one; `objective`: weights by metric; `over`:
-    values by path; `aggregate`: its type and fields; `limits`: greatest values by metric."""
+    """The goal of a tuning, in SI.
+
+    Attributes:
+        starts: Number of descents.
+        seed: Seed of the starts, and of the Latin hypercube.
+        iterations: Greatest number of iterations of each descent.
+        samples: Number of runs of the Latin hypercube; 0 for every combination.
+        decay: Required certified decay rate [1/s]; 0 for none.
+        damping: Required damping of the poles, in [0, 1); 0 for none.
+        free: Ranges by path; None for the declared range.
+        objective: Weights by metric.
+        over: Values by path.
+        aggregate: Type and fields of the aggregate over the runs.
+        limits: Greatest allowed values by metric.
+    """
 
     starts: int = table_field(whole_reader(1, 1000), 1)
     seed: int = table_field(whole_reader(0, 2**32 - 1), 0)
@@ -88,16 +102,20 @@ class Goal:
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
-        """As values of TOML."""
+        """Return the section as TOML values."""
         free = {path: DECLARED_RANGE if ends is None else as_plain(ends) for path, ends in self.free.items()}
         return plain_fields(self) | {"free": free}
 
     def check(self, loop: Loop) -> "Goal":
-        """What only matters once a loop is tuned. Raises ScenarioError: nothing free, no objective, a start at an end
-        of its range or outside, a lane that would end before it starts."""
+        """Return this goal if `loop` can be tuned with it.
+
+        Raises:
+            ScenarioError: No parameter is free, no metric has a weight, or a start is not inside its range. Also raised
+                if a run's initial speed is at or below the stop's.
+        """
         for name, example in (("free", '"controller.gain" = [-20000.0, -80.0]'), ("objective", "iae = 1.0")):
             if not getattr(self, name):
-                raise ScenarioError(f"tune.{name} is empty: say what, as in [tune.{name}] {example}")
+                raise ScenarioError(f"tune.{name} is empty; for example [tune.{name}] {example}")
         check_starts(loop, self.free, "tune.free")
         end, slowest = getattr(loop.stop, "speed", 0.0), min(self.over.get("initial.speed", (math.inf,)))
         if not slowest > end:
@@ -108,7 +126,7 @@ class Goal:
         return self
 
     def batch(self, seed: int) -> Batch:
-        """The lanes, each with the same noise."""
+        """Return the batch of runs; all runs have the noise of `seed`."""
         if not self.over:
             lanes = grid({})
         elif self.samples:
@@ -118,12 +136,21 @@ class Goal:
         return dataclasses.replace(lanes, keys=(seed,) * max(lanes.size, 1))
 
     def read_aggregate(self) -> risk.Aggregate:
-        """From a number per lane to one."""
+        """Return the aggregate, which maps one number per run to one number."""
         return read_one(risk.AGGREGATE_TYPES, self.aggregate, "tune.aggregate")
 
 
 def read_tune_section(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
-    """The goal of a section. Raises ScenarioError, one line, for whatever is wrong with it."""
+    """Return the goal that a section describes.
+
+    Args:
+        table: Values of the section.
+        loop: Loop with the free parameters.
+        objectives: Objectives of its runs by name.
+
+    Raises:
+        ScenarioError: A value is wrong, or there are more than `MOST_LANES` combinations. The message is one line.
+    """
     goal: Goal = read_table(
         Goal,
         table,
@@ -142,12 +169,20 @@ def read_tune_section(table: Any, loop: Loop, objectives: Mapping[str, Objective
 def metric_reader(
     objectives: Mapping[str, Objective], what: str, unit: Callable[[Objective], str] = lambda _: "1"
 ) -> Reader:
-    """Return the reader of a table of numbers by metric, in these units."""
+    """Return the reader of a table of numbers by metric.
+
+    Args:
+        objectives: Objectives by name, whose names are the allowed keys.
+        what: Contents of the table, for messages.
+        unit: Function from an objective to the unit of its number.
+    """
 
     def read(given: Any, path: str) -> dict[str, float]:
         for name in table_reader(read_as_given, what)(given, path):
             if name not in objectives:
-                raise unknown_name_error(f"{dotted_path(path, name)} is not measured", name, objectives)
+                raise unknown_name_error(
+                    f"{dotted_path(path, name)} is not a metric of this scenario", name, objectives
+                )
         return {
             name: read_number_in_range(x, ParameterSpec(unit(objectives[name])), dotted_path(path, name))
             for name, x in given.items()
@@ -161,7 +196,16 @@ def _entries(table: dict[str, Any], section: str, loop: Loop) -> Iterable[Parame
 
 
 def free_ranges(table: dict[str, Any], loop: Loop, section: str) -> dict[str, Ends | None]:
-    """Ranges by path of the loop, in SI; None for the declared one. Raises ScenarioError."""
+    """Return the ranges of the free parameters by path of the loop, in SI; None for a declared range.
+
+    Args:
+        table: Ranges as given, by path.
+        loop: Loop with the parameters.
+        section: Name of the table, for messages.
+
+    Raises:
+        ScenarioError: A path is unknown, a range is wrong, or a run does not depend smoothly on the parameter.
+    """
     found: dict[str, Ends | None] = {}
     for item in _entries(table, section, loop):
         if not item.spec.tunable:
@@ -175,7 +219,18 @@ def _over(table: dict[str, Any], loop: Loop) -> dict[str, tuple[float, ...]]:
 
 
 def check_starts(loop: Loop, free: Mapping[str, Ends | None], section: str) -> None:
-    """Raises ScenarioError for a value of the loop at an end of its range or outside: it could not be moved."""
+    """Check that each free parameter starts inside its range.
+
+    A start at an end of the range cannot move: the coordinate of the parameter is infinite there.
+
+    Args:
+        loop: Loop with the values at the start.
+        free: Ranges by path; None for the declared range.
+        section: Name of the table, for messages.
+
+    Raises:
+        ScenarioError: A start is at an end of its range or outside.
+    """
     lines = [line for path, ends in free.items() for line in _at_range_end(loop, path, ends, section)]
     if lines:
         raise ScenarioError("; ".join(lines))

@@ -1,4 +1,4 @@
-"""TOML as values and back, no more of it than a scenario needs."""
+"""Reading and writing of the subset of TOML that a scenario needs."""
 
 import json
 import re
@@ -7,13 +7,20 @@ from typing import Any
 
 from diffabs.core.values import ScenarioError, format_given
 
-MOST_LEVELS = 50  # of tables and lists; no scenario has a tenth of that
-MAX_INTEGER = 2**63  # of a whole number, as TOML has it
+MOST_LEVELS = 50  # of nested tables and lists; a scenario has fewer than 5
+MAX_INTEGER = 2**63  # bound of whole numbers: TOML has 64 bits
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The table that a text is. Raises ValueError for what is no TOML, and ScenarioError for values nested too deeply
-    and for whole numbers of more than 64 bits, which no message could show."""
+    """Return the table that a TOML text describes.
+
+    Args:
+        text: TOML text.
+
+    Raises:
+        ValueError: The text is not TOML.
+        ScenarioError: Values are nested too deeply, or a whole number has more than 64 bits.
+    """
     try:
         table = tomllib.loads(text)
     except RecursionError:
@@ -23,6 +30,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def _refuse_extremes(table: dict[str, Any]) -> None:
+    # A loop with its own stack: recursion would fail on the deep nesting that it must refuse.
     pending: list[tuple[str, int, Any]] = [(key, 1, item) for key, item in table.items()]
     while pending:
         where, level, item = pending.pop()
@@ -36,7 +44,16 @@ def _refuse_extremes(table: dict[str, Any]) -> None:
 
 
 def parse_value(text: str) -> Any:
-    """The value that a text on the command line means. Raises ScenarioError, as `parsed`."""
+    """Return the value that a text on the command line stands for.
+
+    A TOML value is read as such, `1,2` is a list of numbers, and any other text is itself.
+
+    Args:
+        text: Text after the `=` of an override.
+
+    Raises:
+        ScenarioError: Values are nested too deeply, or a whole number has more than 64 bits.
+    """
     for candidate in (f"v = {text}", f"v = [{text}]"):
         try:
             read = parse_toml(candidate)
@@ -51,7 +68,12 @@ def parse_value(text: str) -> Any:
 
 
 def write_toml(top: dict[str, Any], sections: dict[str, dict[str, Any]]) -> str:
-    """The text of a file with these values, and these sections below them."""
+    """Return the text of a TOML file.
+
+    Args:
+        top: Values at the top of the file.
+        sections: Values of each section by its name.
+    """
     lines = [f"{_write_key(key)} = {_write_value(value)}" for key, value in top.items()]
     for name, values in sections.items():
         lines += ["", f"[{name}]", *(f"{_write_key(key)} = {_write_value(value)}" for key, value in values.items())]

@@ -135,7 +135,7 @@ def _synchronise(meet: Callable[[Any], Any], what: Any) -> Any:
     try:
         return meet(what)
     except jax.errors.JaxRuntimeError as error:
-        raise SweepError("another process died; finished chunks stay, and resume goes on") from error
+        raise SweepError("another process died; finished chunks stay; --resume continues the sweep") from error
 
 
 class _ProgressCounter:

@@ -44,7 +44,7 @@ def test_the_papers_start_falls_and_that_is_said(falling):
     assert document["metrics"]["peak_torque"] <= 30 * (48 + 30 * 10) / 3
     assert [line for line in result.stderr.splitlines() if line.startswith("warning: ")] == [
         "warning: FELL: the frame reached the stop's angle",
-        "warning: settling_time is infinite: the run ends before it gets there",
+        "warning: settling_time is infinite: the run ends before the event that it measures",
     ]
 
 
@@ -89,7 +89,7 @@ BAD = [
     ("controller=proportional-feedback", "proportional-feedback needs speed"),
     ("stop=standstill", "standstill needs speed"),
     ("objective.overshoot=max-slip", "objective.overshoot: max-slip needs slip"),
-    ("initial=brake-start", "arm-balance needs theta, and here is only speed, slip"),
+    ("initial=brake-start", "arm-balance needs theta; there is only speed, slip"),
 ]
 
 

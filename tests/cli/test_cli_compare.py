@@ -61,7 +61,7 @@ def test_only_common_samples_are_compared(swept):
     result = run("compare", folder / "a", folder / "c", status=2)
     assert "the samples are not the same: seed is 0 in the first, 1" in result.stderr
     result = run("compare", folder / "a", folder / "b", "--metric", "overshot", status=2)
-    assert "--metric overshot is not in both; did you mean overshoot?" in result.stderr
+    assert "--metric overshot is not in both sweeps; did you mean overshoot?" in result.stderr
     result = run("compare", folder / "a", folder, status=2)
     assert "is no sweep" in result.stderr
 

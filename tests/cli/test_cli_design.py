@@ -215,7 +215,7 @@ def test_published_gain_has_no_common_lyapunov_matrix(tmp_path):
     assert document["worst_vertex"]["claim"] == "poles"
     assert document["worst_vertex"]["margin"] == pytest.approx(22.53, abs=0.01)
     assert "quadratic stability is disproved: no common Lyapunov matrix exists for the 4 vertices" in document["reason"]
-    assert "whatever Q and R, gives this gain" in document["reason"]
+    assert "no Q and R give this gain" in document["reason"]
     assert result.stderr.splitlines()[-1] == f"error: slip-lmi: {document['reason']}"
     assert left_in(tmp_path) == {"c.json"}
     assert checked(tmp_path / "c.json").returncode == 0
@@ -233,7 +233,7 @@ def test_what_is_known_besides_of_the_published_gain():
     friction = 2 * 0.399595428169 * 9.81  # of a locked wheel, and of a disk whose inertia is half of its mass
     assert friction < besides["proved_for_a_speed_falling_by"] < 1.011 * friction
     assert "that is not instability: each of 289 frozen systems is stable by its poles" in reason
-    assert "proves stability while that falls by no more than 7.918 m/s^2, all that friction allows" in reason
+    assert "proves stability while the speed falls by at most 7.918 m/s^2, the most that friction allows" in reason
     table = run("certify", "slip-lmi", status=1).stdout
     assert "quadratically stable" not in table
     rows = {r[0]: r[1] for line in table.splitlines() if len(r := [c.strip() for c in line.split("│")[1:-1]]) == 3}
@@ -281,7 +281,7 @@ def test_fastest_decay_and_least_cost_of_a_gain():
 
 
 def test_unstable_gain_says_so():
-    assert "vertex 2 (plant.mass 6.2, speed 1.38889) is unstable even if it is fixed" in run(
+    assert "vertex 2 (plant.mass 6.2, speed 1.38889) is unstable even with fixed parameters" in run(
         "certify", "slip-lmi", "--gain=11753,158", status=1
     ).stderr  # fmt: skip
 
@@ -325,7 +325,7 @@ def test_sampled_loop_behind_a_delay():
     result = run("certify", "slip-lmi", "--gain=-100,-20,0", *changes)
     assert "largest |pole| [1]" in result.stdout
     assert "neglected: The actuator's delay of 0.01 s, which can destabilise." in result.stderr
-    assert "note: the linear model is not the loop's own linearisation" in result.stderr
+    assert "note: the linear model differs from the loop's linearisation" in result.stderr
 
 
 @killed_by(
@@ -344,14 +344,14 @@ def test_a_gain_that_follows_the_speed_is_proved_as_one():
     assert "The fall of the speed: it is frozen." not in document["neglected"]
     fixed = ("controller.controller=state-feedback", "controller.controller.gain=-17481,-349")
     result = run("certify", "slip-cured", *(word for change in fixed for word in ("--set", change)), status=1)
-    assert "is unstable even if it is fixed" in result.stderr
+    assert "is unstable even with fixed parameters" in result.stderr
 
 
 # bad input
 
 
 BAD = [
-    (("--gain=1,2,3",), '--gain "1,2,3" has 3 of 2 numbers: integral of slip error, slip error'),
+    (("--gain=1,2,3",), '--gain "1,2,3" has 3 of 2 numbers, one for each of integral of slip error, slip error'),
     (("--gain=1;2",), '--gain "1;2": numbers are needed, as in --gain=-11753,-48'),
     (("--gain=",), '--gain "": numbers are needed'),
     (("--gain=nan,1",), '--gain "nan,1" is outside (-inf, inf)'),

@@ -88,13 +88,13 @@ def test_readings_are_what_simulate_writes(small, tmp_path):
 
 BAD_FILES = [
     ((), "is empty; there is t [s], slip [1], speed [m/s]"),
-    (("1,2,3",), "line 1 is no header with t [s]"),
-    (("slip [1]", "0"), "line 1 is no header with t [s]"),
+    (("1,2,3",), "line 1 has no column t [s]"),
+    (("slip [1]", "0"), "line 1 has no column t [s]"),
     ((HEADER,), "has a header and no numbers"),
-    (("t [s]", "0"), "no column was measured; there is slip [1]"),
+    (("t [s]", "0"), "has no column of a measured signal; there is slip [1]"),
     (("t [s],wheel_spede [m/s]", "0,1"), 'column "wheel_spede [m/s]" is unknown; did you mean wheel_speed [m/s]?'),
     (("t [s],speed [km/h]", "0,1"), 'column "speed [km/h]" is unknown; did you mean speed [m/s]?'),
-    (("t [s],slip [1],slip [1]", "0,1,1"), 'column "slip [1]" is there twice'),
+    (("t [s],slip [1],slip [1]", "0,1,1"), 'column "slip [1]" occurs twice'),
     ((HEADER, ROWS[0], "0.1,fast,0,0"), 'line 3: wheel_speed [m/s] = "fast" is text; a number is needed'),
     ((HEADER, ROWS[0], "", "0.1,,0,0"), 'line 4: wheel_speed [m/s] = "" is text; a number is needed'),
     ((HEADER, "0,nan,0,0"), "line 2: wheel_speed [m/s] = nan is outside (-inf, inf)"),

@@ -97,7 +97,7 @@ def test_reproduce_everything(papers, tmp_path):
     assert left_in(out) == {"slip-lmi", "slip-estimator", "report.html"}
     assert left_in(out / "slip-lmi") == {"figure1.png", "summary.json", "report.html"}
     assert (out / "report.html").read_text() == "report of 2"
-    assert f"report of all: {out / 'report.html'}\n" in result.stderr
+    assert f"report of all papers: {out / 'report.html'}\n" in result.stderr
     lines = [line.split() for line in result.stdout.splitlines()]
     assert lines.count(["proposed", "PI", "2.99"]) == 2
     assert lines.count(["1", "of", "1", "published", "numbers", "reproduced."]) == 2

@@ -57,12 +57,12 @@ def test_tables_for_a_person(scenario, runs, monkeypatch):
 @pytest.mark.parametrize(
     ("args", "needed"),
     [
-        (["stop_distanc=3"], "stop_distanc is not measured; did you mean stop_distance? There is "),
+        (["stop_distanc=3"], "stop_distanc is not a metric of this scenario; did you mean stop_distance? There is "),
         (["overshoot"], "overshoot has no bound in [sweep.failures]: say overshoot=BOUND"),
         (["overshoot=nan"], "threshold must be finite, not nan"),
         (["overshoot=much"], 'overshoot = "much" is text; a number in (-inf, inf) is needed'),
-        (["overshoot=1", "--samples", 7], "--samples 7 is no multiple of 10 from 20 on"),
-        (["overshoot=1", "--samples", -20], "--samples -20 is no multiple of 10 from 20 on"),
+        (["overshoot=1", "--samples", 7], "--samples 7 is not a multiple of 10 in [20, inf)"),
+        (["overshoot=1", "--samples", -20], "--samples -20 is not a multiple of 10 in [20, inf)"),
         (["overshoot=1", "--seed", -1], "sweep.seed = -1 is outside [0, "),
         (["overshoot=1", "--set", "sweep.over.plant.mas=1,2"], "sweep.over.plant.mas is not a parameter of this loop"),
         (["overshoot=1", "--set", 'sweep.over.road=["rig"]'], "plant.road: alternatives of parts have no normal coord"),

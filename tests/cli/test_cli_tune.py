@@ -235,7 +235,7 @@ def test_table_for_people(small, invented):
     assert found["iae"] == ["0.3", "0.2", "0.3", "0.2", "s"]
     assert found["overshoot"] == ["0.5", "0.3", "0.2", "yes"]
     assert found["it ended because"] == [Reason.CHANGE.value]
-    assert "over 2 lanes" in result.stdout
+    assert "over 2 runs" in result.stdout
     assert result.stderr == "no certificate: no proof was asked for\n"
 
 
@@ -502,7 +502,10 @@ BAD = [
     (("--set", "tune.free.plant.mass=5.3,6"), "plant.mass = 5.3 is outside (5.3, 6) kg, its range in tune.free"),
     (("--set", "tune.over.initial.speed_kmh=30,50"), "tune.over.initial.speed = 8.33333 m/s is not above stop.speed"),
     (("--starts", "0"), "tune.starts = 0 is outside [1, 1000]"),
-    (("--set", "tune.limits.overshot=1"), "tune.limits.overshot is not measured; did you mean overshoot?"),
+    (
+        ("--set", "tune.limits.overshot=1"),
+        "tune.limits.overshot is not a metric of this scenario; did you mean overshoot?",
+    ),
     (("--plot", "a.bmp"), "--plot a.bmp: the name must end in .png, .pdf, .svg"),
     (("--out", "tuned"), "--out tuned: the name must end in .toml"),
     (("--out", "none/c.toml"), "No such file or directory"),

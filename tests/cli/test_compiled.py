@@ -99,7 +99,7 @@ def test_a_folder_that_others_may_write_to_is_no_cache(user, caplog):
     assert compiled.use_compilation_cache() is None
     assert jax.config.jax_compilation_cache_dir is None
     assert [record.message for record in caplog.records] == [
-        f"{folder}: nothing is kept there, because other users may write to it"
+        f"{folder}: compiled programs are not kept there, because other users may write to it"
     ]
 
 

@@ -42,7 +42,7 @@ def test_a_sweep_finishes_its_chunks_and_says_how_to_go_on(file, room):
         process.send_signal(signal.SIGTERM)
         stdout, stderr = ended(process)
     assert stdout == ""
-    assert stderr.splitlines()[-1].startswith(f"interrupted: finished chunks are in {out}; go on with: ")
+    assert stderr.splitlines()[-1].startswith(f"interrupted: finished chunks are in {out}; continue with: ")
     assert left_in(out) == {".lock", "manifest.json", "chunks"}
     assert nothing_temporary(room)
 

@@ -292,8 +292,8 @@ def test_lines_fold_between_words_and_commands_stay_whole(monkeypatch, capsys):
     assert max(map(len, told.splitlines())) <= 40
     assert told.split() == line.split()
     command = ["diffabs", "sweep", "slip-lmi", "--set", "title=a b", "--samples", "100000", "--resume"]
-    console.say_command("go on with:", command)
+    console.say_command("continue with:", command)
     head, *rest = capsys.readouterr().err.splitlines()
-    assert head == "go on with:"
+    assert head == "continue with:"
     assert max(map(len, rest)) <= 40
     assert shlex.split("\n".join(rest).replace("\\\n", " ")) == command  # as a shell joins them

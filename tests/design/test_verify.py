@@ -143,7 +143,7 @@ FALSE = [
     (document("infeasible", system={**UNSTABLE, "A": [[[-1.0]]]}, W=[[[-1.0]]]), 1, "W is not positive definite"),
     (document("scheduled", P=[[[1.0]]], rates=[0.0, 1.0]), 2, "a claim of kind scheduled does not fit the system"),
     (document("damping", P=[[1.0]], system=stepping(0.5), zeta=0.1, cot=1.0), 2, "does not fit the system"),
-    ({**document(), "claims": []}, 1, "the file claims nothing"),
+    ({**document(), "claims": []}, 1, "the file has no claims"),
     ({}, 2, "the file must have the members format, version, system, gain, claims and no other"),
     ([], 2, "the file must have the members"),
     ({**document(), "version": 2}, 2, "format and version"),

@@ -252,13 +252,13 @@ def test_a_scenario_never_imports_code():
         ("broken", "1 / 0", "broken.py, line 1: ZeroDivisionError: division by zero"),
         ("lacking", "import nowhere_to_be_found", "--parts lacking: there is no module nowhere_to_be_found"),
         ("absent", None, "--parts absent: there is no module absent, on the Python path or in the working directory"),
-        ("os; import sys", None, "--parts os; import sys is no name of a Python module"),
+        ("os; import sys", None, "--parts os; import sys is not the name of a Python module"),
         ("empty", "from diffabs.controllers import PID", "--parts empty: there is no part in this module"),
         ("leaving", "import sys\nsys.exit(3)", "leaving.py, line 2: SystemExit: 3"),
         (
             "clashing",
             f"from dc_servo import DCMotor\n{OF_PARTS}@pytree\nclass QuarterCar(DCMotor): ...",
-            "parts of clashing: there is a plant quarter-car already, of diffabs",
+            "parts of clashing: a plant quarter-car exists already, in diffabs",
         ),
         (
             "needy",

@@ -379,4 +379,4 @@ def test_a_port_that_is_taken_is_said(tmp_path, explorer):
     words = [sys.executable, "-m", "diffabs", "explore", "slip-cured", "-q", "--no-browser"]
     words += ["--port", str(explorer.port)]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stderr) == (2, f"error: --port {explorer.port}: another program listens there\n")
+    assert (done.returncode, done.stderr) == (2, f"error: --port {explorer.port}: another program uses this port\n")

@@ -375,11 +375,11 @@ def test_a_sweep_with_figures_writes_its_report(results):
     ("content", "words"),
     [
         (None, "there is no such folder or file"),
-        ({}, "holds nothing that reproduce, sweep"),
-        ({"notes.txt": "hello"}, "holds nothing that reproduce, sweep"),
-        ({"manifest.json": "{}"}, "--resume goes on with it"),
-        ({"x.json": '{"free": {}, "history": [], "constraints": []}'}, "is no whole document of tune: KeyError"),
-        ({"x.json": '{"papers": 3}', "y.json": "[" * 100_000}, "holds nothing"),
+        ({}, "has no document that reproduce, sweep"),
+        ({"notes.txt": "hello"}, "has no document that reproduce, sweep"),
+        ({"manifest.json": "{}"}, "--resume completes it"),
+        ({"x.json": '{"free": {}, "history": [], "constraints": []}'}, "is not a complete document of tune: KeyError"),
+        ({"x.json": '{"papers": 3}', "y.json": "[" * 100_000}, "has no document"),
     ],
 )
 def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
@@ -409,7 +409,7 @@ def test_files_of_others_stay(results, tmp_path):
     out = tmp_path / "report.html"
     out.write_text("<html>a thesis</html>")
     result = command("report", results / "tune.json", "-o", out, status=2)
-    assert "exists and is no earlier report" in result.stderr
+    assert "exists and is not an earlier report" in result.stderr
     assert_one_error_line(command("report", results / "tune.json", "-o", tmp_path / "report.pdf", status=2))
     assert_one_error_line(command("report", results / "tune.json", "-o", tmp_path, status=2))
     assert out.read_text() == "<html>a thesis</html>"
@@ -452,7 +452,7 @@ def test_a_chart_has_its_points_where_they_are():
 
 def test_what_a_document_lacks_is_named(tmp_path):
     (tmp_path / "x.json").write_text('{"gain": [1.0], "states": ["a"], "over": {}, "poles": []}')
-    with pytest.raises(ReportError, match=r"no whole document of design: KeyError 'lower_bound'"):
+    with pytest.raises(ReportError, match=r"not a complete document of design: KeyError 'lower_bound'"):
         build_report(find_documents(tmp_path))
 
 

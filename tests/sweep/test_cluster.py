@@ -220,7 +220,7 @@ def test_a_scheduler_that_dies_ends_it_with_one_line(scenario, alone, tmp_path, 
     assert (process.returncode, stdout) == (1, "")
     lines = [line for line in stderr.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1
-    assert lines[0].endswith("; finished chunks stay, --resume goes on")
+    assert lines[0].endswith("; finished chunks are kept; --resume continues")
     assert "Traceback" not in stderr
     assert run("sweep", scenario, "--out", out, "--samples", "64000", "--resume", "--json").exit_code == 0
 

@@ -95,7 +95,7 @@ def test_what_is_wrong_with_a_file_is_said(scenario, tmp_path, change, needed):
 @pytest.mark.parametrize(
     ("given", "needed"),
     [
-        ('{type="empirical", file="day/masses.csv"}', 'column is missing: which one of "day/masses.csv"?'),
+        ('{type="empirical", file="day/masses.csv"}', 'column is missing: name a column of "day/masses.csv"'),
         ('{type="empirical", file=3, column="v"}', "plant.mass.file = 3 is a number; text is needed"),
         ('{type="empirical", file="day/masses.csv", column=["v"]}', "is a list; text is needed"),
         ('{type="empirical", file="day/masses.txt", column="v"}', "day/masses.txt is neither .csv nor .parquet"),

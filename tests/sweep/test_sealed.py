@@ -155,7 +155,7 @@ def test_a_stray_file_makes_nothing_interrupted(copy, whole, name):
     assert as_read(copy) == as_read(whole / "out")
     for command in (["compare", whole / "out", copy], ["sweep", whole / "small.toml", "--out", copy, "--resume"]):
         result = run(*command, "--json")
-        said = f"warning: {stray} is no chunk of this sweep; other readers would take it in\n"
+        said = f"warning: {stray} is not a chunk of this sweep; other programs would read it, too\n"
         assert result.stderr == said
     assert stray.exists()
 

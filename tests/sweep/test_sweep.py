@@ -369,7 +369,10 @@ BAD = [
     (("--set", "sweep.over.plant.mass=[6,5]"), "sweep.over.plant.mass"),
     (("--set", "sweep.over.controller.gain.7=1,2"), "sweep.over.controller.gain.7 is not a parameter of this loop"),
     (("--set", 'sweep.over.road=["glass"]'), "sweep.over.road.0"),
-    (("--set", "sweep.failures.overshot=1"), "sweep.failures.overshot is not measured; did you mean overshoot?"),
+    (
+        ("--set", "sweep.failures.overshot=1"),
+        "sweep.failures.overshot is not a metric of this scenario; did you mean overshoot?",
+    ),
     (("--engine", "spark"), "--engine spark is unknown"),
     (("--on", "mars"), "--on mars is unknown"),
     (("--scheduler", "tcp://127.0.0.1:1"), "--scheduler tcp://127.0.0.1:1 needs --on dask"),

@@ -201,8 +201,8 @@ def test_control_c_says_how_to_go_on(longer, tmp_path):
     assert (process.returncode, out) == (130, "")
     lines = err.splitlines()
     assert "interrupted: finishing the chunks in hand (Ctrl-C again: at once)" in lines
-    assert lines[-1].startswith(f"interrupted: finished chunks are in {folder}; go on with: diffabs sweep ")
-    again = shlex.split(lines[-1].partition("go on with: diffabs ")[2])
+    assert lines[-1].startswith(f"interrupted: finished chunks are in {folder}; continue with: diffabs sweep ")
+    again = shlex.split(lines[-1].partition("continue with: diffabs ")[2])
     assert again == [*command(longer.scenario, folder, *long)[3:], "--resume"]
     there = chunks(folder)
     assert 0 < len(there) < 1000
@@ -250,7 +250,7 @@ def test_a_full_disk(copy, whole, monkeypatch):
         patch.setattr(os, "fsync", full)
         result = run("sweep", whole.scenario, "--out", copy, "--resume", "--json", status=1)
     assert_one_error_line(result)
-    assert "No space left on device; finished chunks stay, --resume goes on" in result.stderr
+    assert "No space left on device; finished chunks are kept; --resume continues" in result.stderr
     assert chunks(copy) == chunks(whole.folder) - set(sorted(chunks(whole.folder))[4:6])
     assert left_in(copy / "chunks") == chunks(copy)
     document = json.loads(run("sweep", whole.scenario, "--out", copy, "--resume", "--json").stdout)
@@ -292,7 +292,7 @@ def test_a_disk_that_is_really_full(longer, tmp_path):
     assert (0 < int(count) < 100, status, unfinished) == (True, "1", "0")
     assert longer.digest in digest
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert lines == [f"error: {out}: No space left on device; finished chunks stay, --resume goes on"]
+    assert lines == [f"error: {out}: No space left on device; finished chunks are kept; --resume continues"]
     assert "Traceback" not in done.stderr
 
 
@@ -353,7 +353,7 @@ def test_chunks_that_are_gone_or_damaged_together(copy, whole):
     result = run("sweep", whole.scenario, "--out", copy, "--resume", "--json")
     assert json.loads(result.stdout)["digest"] == whole.digest
     assert f"damaged, computed again: chunks 2, {len(names) - 1}\n" in result.stderr
-    assert f"warning: {copy / 'chunks' / 'merged.parquet'} is no chunk of this sweep" in result.stderr
+    assert f"warning: {copy / 'chunks' / 'merged.parquet'} is not a chunk of this sweep" in result.stderr
     assert (copy / "chunks" / "merged.parquet").read_bytes() == b"mine"
 
 
