@@ -3,7 +3,7 @@
 `core.protocols`, the page of contracts, re-exports these names.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -154,7 +154,8 @@ class Segment(NamedTuple):
         smooth: True if no limit is reached inside, because the step would end there. Otherwise the cubic of a limited
             signal may exceed the limits.
         within: Whether the rates at the start and at the end are the rates inside the step, also at a limit. With only
-            one such rate, the cubic is the parabola through both ends with that rate; with none, the straight line.
+            one such rate, the cubic of a signal that is no plant output is the parabola through both ends with that
+            rate; with none, the straight line.
     """
 
     start: Sample
@@ -168,8 +169,7 @@ class Segment(NamedTuple):
 
     def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
         """Return the cubic of `read`(output), by default of the first plant output."""
-        start, end = self.shown_rates()
-        return self._cubic(read, (self.start.output, self.end.output), (start.output, end.output))
+        return self.shown_cubic(lambda shown: read(shown.output))
 
     def error(self) -> Cubic:
         """Return the cubic of the first plant output minus its setpoint, which a reference may move within a step."""
@@ -177,24 +177,36 @@ class Segment(NamedTuple):
 
     def shown_cubic(self, read: Callable[[Shown], Scalar]) -> Cubic:
         """Return the cubic of `read`(shown), a function of the plant outputs and the setpoint."""
-        return self._cubic(read, (Shown.of(self.start), Shown.of(self.end)), self.shown_rates())
+        ends = (Shown.of(self.start), Shown.of(self.end))
+        first, last = (jax.tree.map(lambda rate: self.h * rate, rates) for rates in self.shown_rates())
+        # The error of a step bounds a jump in the rates of the plant, so both of them are used. It does not see the
+        # setpoint, whose rate may jump at the end of a step.
+        setpoint = self._inside(Cubic(ends[0].setpoint, ends[1].setpoint, first.setpoint, last.setpoint))
+        slopes = (first._replace(setpoint=setpoint.start_slope), last._replace(setpoint=setpoint.end_slope))
+        return _read_cubic(read, ends, slopes)
 
     def sample(self, read: Callable[[Sample], Scalar]) -> Cubic:
         """Return the cubic of `read`(sample), a function of any signals. It costs the rates of all signals."""
-        return self._cubic(read, (self.start, self.end), self.sample_rates())
+        slopes = (jax.tree.map(lambda rate: self.h * rate, rates) for rates in self.sample_rates())
+        return self._inside(_read_cubic(read, (self.start, self.end), slopes))
 
-    def _cubic(self, read: Callable[[Any], Scalar], ends: tuple[Any, Any], rates: tuple[Any, Any]) -> Cubic:
-        (a, da), (b, db) = (jax.jvp(read, (end,), (rate,)) for end, rate in zip(ends, rates, strict=True))
-        first, last, rise, (start, end) = self.h * da, self.h * db, b - a, self.within
+    def _inside(self, cubic: Cubic) -> Cubic:
+        """Return the cubic without the slopes that are not those inside the step."""
+        rise, (start, end) = cubic.end - cubic.start, self.within
         # `within` may be traced; the comparison with True is decided at trace time and skips the selections.
         if start is True and end is True:
-            return Cubic(a, b, first, last)
-        return Cubic(
-            a,
-            b,
-            jnp.where(start, first, jnp.where(end, 2.0 * rise - last, rise)),
-            jnp.where(end, last, jnp.where(start, 2.0 * rise - first, rise)),
+            return cubic
+        first, last = cubic.start_slope, cubic.end_slope
+        return cubic._replace(
+            start_slope=jnp.where(start, first, jnp.where(end, 2.0 * rise - last, rise)),
+            end_slope=jnp.where(end, last, jnp.where(start, 2.0 * rise - first, rise)),
         )
+
+
+def _read_cubic(read: Callable[[Any], Scalar], ends: Iterable[Any], slopes: Iterable[Any]) -> Cubic:
+    """Return the cubic of `read` from its arguments at both ends, and their rates times the length of the step."""
+    (a, da), (b, db) = (jax.jvp(read, (end,), (slope,)) for end, slope in zip(ends, slopes, strict=True))
+    return Cubic(a, b, da, db)
 
 
 def resting_segment(sample: Sample, h: Scalar) -> Segment:

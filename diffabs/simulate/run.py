@@ -293,7 +293,7 @@ def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, ev
     if not places:
         return finish_run(loop, objectives, run_to_end(stepped, partial(method.renew, loop), carry))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
-    seen = partial(method.seen, loop)
+    seen = partial(method.observe_at, loop)
     carry, seen = run_with_trajectory(
         stepped, partial(method.renew, loop), method.before, seen, carry, every, count, places
     )
@@ -312,7 +312,7 @@ def _run_reversible(loop: Loop, objectives: dict[str, Objective], method: Any, k
         return finish_run(loop, objectives, scan_to_end(stepped, carry, tries))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     carry, seen = scan_with_trajectory(
-        stepped, method.before, partial(method.seen, loop), carry, every, count, instants, tries
+        stepped, method.before, partial(method.observe_at, loop), carry, every, count, instants, tries
     )
     return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
 

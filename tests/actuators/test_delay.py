@@ -1,6 +1,7 @@
 """Pure delay against closed forms: where the command is smooth, where it jumps, at steps of any length, and derivatives
 with respect to everything. Against SciPy: `test_order_of_events.py`; in random loops: `gradients_random.py`."""
 
+import dataclasses
 import functools
 from math import factorial
 from typing import Any
@@ -21,6 +22,7 @@ from diffabs.core.blocks import Passage, Series
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import canonical_dtypes, param, pytree
 from diffabs.objectives import TorqueRate
+from diffabs.references import Setpoint
 from diffabs.simulate.dynamics import build_dynamics
 from diffabs.simulate.stepper import init_carry
 
@@ -227,7 +229,7 @@ def test_a_relay_behind_a_delay_has_its_limit_cycle():
         band, late, force = at
         relay = Relay(band=band, torque_min=-force, torque_max=force)
         there = loop(relay, Delay(time=late, capacity=64), Integrator(), 0.0)
-        there = d.replace(there, {"reference.slip": 0.0})
+        there = dataclasses.replace(there, reference=Setpoint(value=0.0))
         return d.measure(there, d.FixedStep(1e-3, 0.1), {"mean": Mean()}).ending.sample.output.slip
 
     def exact(at):

@@ -221,7 +221,7 @@ def test_the_grid_agrees_with_located_events(rig):
         one, sensor=Series(blocks=(one.sensor.blocks[0], sensors.Bias(), one.sensor.blocks[2]))
     )
     at = d.FixedStep(1e-4, 0.3)
-    exact = d.rollout(rig["loops"].for_derivatives(smooth), d.FixedStep(2.5e-5, 0.3, every=4), key=jax.random.key(0))
+    exact = d.rollout(rig["loops"].located(smooth), d.FixedStep(2.5e-5, 0.3, every=4), key=jax.random.key(0))
     near = d.rollout(smooth, at, key=jax.random.key(0))
     slips = [np.asarray(run.trajectory.sample.output.slip) for run in (near, exact)]
     np.testing.assert_allclose(*slips, rtol=0, atol=2e-6)

@@ -25,6 +25,7 @@ from diffabs.simulate.run import prepare_arguments
 from diffabs.tune import worst_case
 
 LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
+SAMPLED = "controller={type='sampled',controller={type='pid',low=0.0,high=9.03},period=0.005}"
 FINE = 4  # times shorter than a scenario's are the fixed steps that are compared with
 MEASURED = {"iae": IAE(), "max_slip": MaxSlip(), "stop_distance": StopDistance()}
 
@@ -299,7 +300,7 @@ def test_a_derivative_through_relay_and_latch_is_that_of_rk4():
 )
 @pytest.mark.slow
 def test_a_trajectory_between_ticks_is_that_of_fixed_steps():
-    chosen = load("slip-lmi", ["controller={type='sampled',controller='pid',period=0.005}"])
+    chosen = load("slip-lmi", [SAMPLED])
     solvers = d.Adaptive(1e-6, 0.03), d.FixedStep(1e-4, 0.03, every=10)
     seen, reference = (d.rollout(chosen.loop, one, {}).trajectory.sample.output.slip for one in solvers)
     np.testing.assert_allclose(seen, reference, atol=1e-6)
@@ -315,14 +316,12 @@ def test_a_trajectory_between_ticks_is_that_of_fixed_steps():
 @pytest.mark.parametrize(
     "more",
     [
-        pytest.param([], id="limits"),
-        pytest.param(
-            ["controller={type='sampled',controller='pid',period=0.005}"], id="sampled", marks=pytest.mark.slow
-        ),
+        pytest.param(LIMITS, id="limits"),
+        pytest.param([SAMPLED], id="sampled", marks=pytest.mark.slow),
     ],
 )
 def test_the_derivative_of_a_trajectory_is_that_of_fixed_steps(more):
-    chosen = load("slip-lmi", ["controller.torque_min=0", "controller.torque_max=9.03", *more])
+    chosen = load("slip-lmi", more)
 
     def slip(solver):
         return lambda mass: (

@@ -83,7 +83,8 @@ def test_a_process_that_dies_ends_the_others(folder, digest, victim):
         other = processes[1 - victim]
         if victim == 1:  # JAX ends this one only when it has missed the heart beats of 100 s
             assert any(
-                "another process died; finished chunks stay; --resume continues the sweep" in line for line in other.stderr
+                "another process died; finished chunks stay; --resume continues the sweep" in line
+                for line in other.stderr
             )
             other.kill()
         assert other.wait(PATIENCE) != 0
