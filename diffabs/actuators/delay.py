@@ -26,6 +26,7 @@ from diffabs.core.log import Log
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree, static
 from diffabs.core.rules import Rule, as_rule_array
+from diffabs.core.types import Int, PyTree
 
 TIME_ROUNDING = 1e-6  # relative rounding of single precision
 WINDOW_PIECES = 6  # pieces; a step that spans more is cut
@@ -50,13 +51,13 @@ class Piece(NamedTuple):
     breaks: Scalar
 
     @classmethod
-    def of(cls, row: Any) -> "Piece":
+    def of(cls, row: PyTree) -> "Piece":
         """Return the piece stored in `row`, a row of the ring or of the window."""
         start, end, *command, breaks = row
         return cls(start, end, Cubic(*command), breaks)
 
     @property
-    def rate(self) -> Any:
+    def rate(self) -> Scalar:
         """Rate of the command at the end of the piece [control/s]."""
         return self.command.end_slope / (self.end - self.start)
 
@@ -79,12 +80,12 @@ class DelayMemory(NamedTuple):
     ring: Log
     window: Any
     known: Any
-    place: Any
-    last: Any
-    until: Any
+    place: Scalar
+    last: PyTree
+    until: Scalar
     first: Any
-    count: Any
-    newest: Any
+    count: Scalar
+    newest: Int
 
 
 @pytree
@@ -115,7 +116,7 @@ class Delay:
             (), self._aim_at_break(DelayMemory(ring, window, zero + 1, zero, zero, zero, zero, zero + 1, row))
         )
 
-    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Any:
+    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
         """Return the delayed command; beyond the next break, its linear extrapolation."""
         del signal
         m: DelayMemory = memory.held
@@ -124,12 +125,12 @@ class Delay:
         within = _at_most_one(x)
         return piece.command(within) + (x - within) * piece.command.end_slope
 
-    def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: Any) -> tuple[Any]:
+    def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: PyTree) -> tuple[PyTree]:
         """Return the time until the next break leaves the delay, or until the step needs pieces beyond the window."""
         del signal, rate
         return (memory.held.until + self.time - t,)
 
-    def event(self, t: Scalar, memory: Memory, signal: Scalar, fired: tuple[Any]) -> Memory:
+    def event(self, t: Scalar, memory: Memory, signal: Scalar, fired: tuple[PyTree]) -> Memory:
         """Return the memory after a break has left the delay: the next pieces may be read."""
         del t, signal
         m: DelayMemory = memory.held
@@ -173,7 +174,7 @@ class Delay:
         """Return the delay to use for derivatives with respect to the parameters in `names`."""
         return _InEvents(time=self.time, capacity=self.capacity) if "time" in names else self
 
-    def _place(self, t: Scalar, m: DelayMemory) -> Any:
+    def _place(self, t: Scalar, m: DelayMemory) -> PyTree:
         """Return the window index of the piece that leaves at time t, limited to the pieces before the next break."""
         return _count([m.window[i, 1] for i in range(WINDOW_PIECES)], t - self.time, m.place, m.last)
 
@@ -223,7 +224,7 @@ def _row(piece: Piece) -> Any:
     return jnp.stack([jnp.asarray(x) for x in jax.tree.leaves(piece)])
 
 
-def _piece(window: Any, place: Any) -> Piece:
+def _piece(window: Any, place: Scalar) -> Piece:
     """Return the piece at a place of the window, by selects.
 
     A gather at a computed index would prevent XLA from fusing the stages of a step.
@@ -235,12 +236,12 @@ def _piece(window: Any, place: Any) -> Piece:
     return Piece.of(row)
 
 
-def _ring_place(place: Any, size: int) -> Any:
+def _ring_place(place: Scalar, size: int) -> Scalar:
     """Return a place wrapped into a ring of `size` rows, for place < 2 size."""
     return jnp.where(place >= size, place - size, place)
 
 
-def _differ(before: tuple[Any, Any], after: tuple[Any, Any]) -> Any:
+def _differ(before: tuple[PyTree, PyTree], after: tuple[PyTree, PyTree]) -> Scalar:
     """Return whether value, or rate times delay, jumps between `before` and `after` by more than rounding."""
     size = jnp.abs(before[0]) + jnp.abs(before[1]) + jnp.abs(after[0]) + jnp.abs(after[1])
     jumps = [
@@ -250,7 +251,7 @@ def _differ(before: tuple[Any, Any], after: tuple[Any, Any]) -> Any:
     return jnp.any(jnp.stack(jumps))
 
 
-def _time_tolerance(t: Any) -> Any:
+def _time_tolerance(t: Scalar) -> Scalar:
     """Return the bound on the difference of two computations of the time t [s]."""
     return TIME_EPS * jnp.finfo(jnp.result_type(t)).eps * jax.lax.stop_gradient(t)
 
@@ -260,24 +261,24 @@ def _time_tolerance(t: Any) -> Any:
 
 
 @jax.custom_jvp
-def _count(ends: list[Any], t: Any, low: Any, high: Any) -> Any:
+def _count(ends: list[PyTree], t: Scalar, low: Scalar, high: Scalar) -> Scalar:
     """Return the number of pieces that are over at time t, clamped to [low, high]."""
     over = sum(jnp.where((i < high) & (t >= end), 1.0, 0.0) for i, end in enumerate(ends))
     return jnp.maximum(jnp.minimum(jnp.asarray(over, t.dtype), high), low)
 
 
 @_count.defjvp
-def _constant(at: Any, moves: Any) -> tuple[Any, Any]:
+def _constant(at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
     del moves
     count = _count(*at)
     return count, jnp.zeros_like(count)
 
 
 @jax.custom_jvp
-def _at_most_one(x: Any) -> Any:
+def _at_most_one(x: Scalar) -> Any:
     return jnp.minimum(x, 1.0)
 
 
 @_at_most_one.defjvp
-def _slope(at: Any, moves: Any) -> tuple[Any, Any]:
+def _slope(at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
     return _at_most_one(*at), jnp.where(at[0] <= 1.0, moves[0], 0.0)

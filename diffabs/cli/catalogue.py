@@ -1,12 +1,13 @@
 """The commands `list` and `show`: all parts with their parameters, the packaged scenarios, a scenario as TOML."""
 
 import pathlib
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from diffabs.cli import console, show, targets
 from diffabs.core import values
+from diffabs.core.types import JsonObject
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import dump, names, read_header
 
@@ -67,7 +68,7 @@ def show_scenario(
             file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
 
 
-def _describe_family(plural: str) -> dict[str, Any]:
+def _describe_family(plural: str) -> JsonObject:
     """Return the members of a family as plain values."""
     if plural == "scenarios":
         return {name: read_header(name) for name in names()}

@@ -21,6 +21,7 @@ from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import parameters, replace
+from diffabs.core.types import JsonObject, Part, PyTree, Scalar
 from diffabs.core.values import ScenarioError, format_given
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import SlipModel
@@ -60,7 +61,7 @@ class ProofTask(NamedTuple):
     chosen: Scenario
     reduced: "ReducedLoop"
     gain: np.ndarray
-    model: Any
+    model: Part
     states: tuple[str, ...]
     over: Box
     polytope: "Polytope"
@@ -102,7 +103,7 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
     return ProofTask(chosen, reduced, values, model, tuple(model.states), over, systems, spec)
 
 
-def _follow_speed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoop", Any, Box]:
+def _follow_speed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoop", PyTree, Box]:
     """Return the linear model and its box; for a gain that follows the speed, the model in which it is one gain.
 
     A proof for that model covers every fall of the speed that friction allows.
@@ -130,7 +131,7 @@ def _greatest_deceleration(plant: Plant, box: Box, speed: float) -> float:
     """
     inside = {path.removeprefix("plant."): ends for path, ends in box.items() if path.startswith("plant.")}
 
-    def deceleration(plant: Plant, slip: Any) -> Any:
+    def deceleration(plant: Plant, slip: Scalar) -> Any:
         return plant.output(plant.start(BrakeStart(speed=speed, slip=slip))).deceleration
 
     slips = np.linspace(0.0, 1.0, SLIPS)
@@ -177,7 +178,7 @@ class FurtherFindings(NamedTuple):
     frozen: "FrozenLoops"
     fall: float | None
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> JsonObject:
         """Return the findings as JSON values."""
         return {"frozen": self.frozen._asdict(), "proved_for_a_speed_falling_by": self.fall}
 
@@ -220,7 +221,7 @@ def proof_document(
     reason: str | None = None,
     known: FurtherFindings | None = None,
     **numbers: float | None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the JSON document of a proof. Parameters have the names of the linear model, in SI.
 
     Args:
@@ -231,7 +232,7 @@ def proof_document(
         known: Results without a common Lyapunov matrix.
         **numbers: Numbers of a design: lower bound, gap, residual, trace cost.
     """
-    summary: dict[str, Any] = proof.summary() if proof else {}
+    summary: JsonObject = proof.summary() if proof else {}
     if proof:
         summary["worst_vertex"] = summary["worst_vertex"] or slowest_vertex(proof)
     coverage = task.polytope.coverage
@@ -258,7 +259,7 @@ def proof_document(
     }
 
 
-def slowest_vertex(proof: "Certificate") -> dict[str, Any]:
+def slowest_vertex(proof: "Certificate") -> JsonObject:
     """Return the vertex with the slowest pole, in the form of `worst_vertex`.
 
     A proof about all vertices together has no worst vertex of its own.

@@ -2,12 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import numpy as np
 
+from diffabs.core.types import JsonObject, Key, Params
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, needs_key
@@ -21,7 +21,7 @@ CLOSER = 16  # `rtol` of the run with adaptive steps is divided by this for the 
 LOOSE, LEAST = 100, 0.01  # a change above LOOSE * rtol * max(|metric|, LEAST) is reported
 
 
-def check_accuracy(chosen: Scenario, key: Any) -> dict[str, Any]:
+def check_accuracy(chosen: Scenario, key: Key) -> JsonObject:
     """Return the accuracy of each metric as JSON values.
 
     They hold the changes by a half step (absolute and relative), by a further quarter step, and by single precision.
@@ -67,7 +67,7 @@ def check_accuracy(chosen: Scenario, key: Any) -> dict[str, Any]:
     }
 
 
-def describe_loose_metrics(metrics: Mapping[str, Any], solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
+def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
     """Return one line on metrics that a smaller `rtol` changes by much more than `rtol`; no line without any.
 
     Such a run chatters, or amplifies its errors.
@@ -88,7 +88,7 @@ def describe_loose_metrics(metrics: Mapping[str, Any], solver: Adaptive, again: 
     return [f"solver.rtol = {closer.rtol:.2g} changes {', '.join(found)}: {why}"]
 
 
-def describe_check(found: dict[str, Any]) -> list[str]:
+def describe_check(found: JsonObject) -> list[str]:
     """Return the warnings of a check, a line each.
 
     Args:

@@ -1,13 +1,14 @@
 """The command `compare`: two sweeps over the same samples, sample by sample."""
 
 import pathlib
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
 
 from diffabs.cli import console, show, show_samples
 from diffabs.cli.sweep import warn_of_strays
+from diffabs.core.types import JsonObject
 from diffabs.core.values import ScenarioError, unknown_name_error
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def _common_metrics(a: "Results", b: "Results", wanted: list[str] | None) -> lis
     return wanted or both
 
 
-def _compare_metrics(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
+def _compare_metrics(a: "Results", b: "Results", metrics: list[str]) -> JsonObject:
     """Return paired statistics of second minus first.
 
     Samples that diverged or were refused in either sweep are left out. A sample with an infinite metric in either sweep

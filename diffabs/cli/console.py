@@ -19,6 +19,7 @@ from rich.console import Console
 
 from diffabs.cli import progress
 from diffabs.core import files, interrupt, provenance, stopwatch
+from diffabs.core.types import Int, JsonObject
 from diffabs.core.values import ScenarioError
 from diffabs.scenario import outside
 from diffabs.scenario.model import describe_model
@@ -66,7 +67,7 @@ def fields_like(context: typer.Context, incomplete: str) -> list[str]:
     return [f"{path}=" for path in _field_paths(tables) if path.startswith(incomplete)]
 
 
-def _field_paths(tables: dict[str, Any], above: str = "") -> Iterator[str]:
+def _field_paths(tables: JsonObject, above: str = "") -> Iterator[str]:
     for name, value in tables.items():
         if isinstance(value, dict):
             yield from _field_paths(value, f"{above}{name}.")
@@ -121,7 +122,7 @@ def describe_run() -> dict[str, str | float]:
     return {**provenance.describe_making(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
 
 
-def describe_source(chosen: Scenario) -> dict[str, Any]:
+def describe_source(chosen: Scenario) -> JsonObject:
     """Return the first keys of every document on a scenario: name, model, and origin of the document.
 
     Args:
@@ -342,7 +343,7 @@ def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: b
     return chosen
 
 
-def leave(status: Any) -> NoReturn:
+def leave(status: Int) -> NoReturn:
     """Exit, at once if interrupted work still runs.
 
     The interpreter would wait for the work's thread. Unfinished files and processes of the work are removed.

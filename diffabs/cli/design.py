@@ -6,13 +6,14 @@
 import math
 import pathlib
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from diffabs.cli import certificates, console, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import parameters
+from diffabs.core.types import JsonObject
 
 CHECK = "check it with: diffabs verify"
 
@@ -118,7 +119,7 @@ def _prepare(
     )
 
 
-def _show(result: dict[str, Any], task: certificates.ProofTask, as_json: bool) -> None:
+def _show(result: JsonObject, task: certificates.ProofTask, as_json: bool) -> None:
     if as_json:
         show.as_json(result)
     else:

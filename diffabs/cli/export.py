@@ -4,7 +4,7 @@ import dataclasses
 import enum
 import pathlib
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -13,6 +13,7 @@ from rich.table import Table
 from diffabs import __version__
 from diffabs.cli import console, show, targets
 from diffabs.core.provenance import versions
+from diffabs.core.types import PyTree
 from diffabs.core.units import units_of
 from diffabs.core.validity import find_problems
 from diffabs.core.values import ScenarioError
@@ -119,7 +120,7 @@ def _function_prefix(chosen: Scenario, out: pathlib.Path | None) -> str:
     return name if name[:1].isalpha() else f"controller_{name}"
 
 
-def _write_source(chosen: Scenario, out: pathlib.Path | None, to: Form, single: bool, given: Any) -> str:
+def _write_source(chosen: Scenario, out: pathlib.Path | None, to: Form, single: bool, given: PyTree) -> str:
     from diffabs.export import c_source, computer_program, structured_text
 
     step = getattr(chosen.solver, "step", None)

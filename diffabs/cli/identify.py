@@ -7,7 +7,7 @@ import dataclasses
 import math
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -15,6 +15,7 @@ import typer
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
+from diffabs.core.types import JsonObject, PyTree
 from diffabs.core.values import ScenarioError, format_given, unknown_name_error
 from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read_measurements
@@ -181,7 +182,7 @@ def _fit(
     solver, columns = _solver(chosen.solver, readings), readings.columns
 
     def fit_traces(
-        noise: Mapping[str, float], starts: Sequence[Any] = ()
+        noise: Mapping[str, float], starts: Sequence[PyTree] = ()
     ) -> tuple["Identified", dict[str, np.ndarray]]:
         traces = Traces(t=readings.t, columns=columns, sigma=noise)
         options = {"solver": solver, "absolute": bool(given), "starts": starts}
@@ -223,7 +224,7 @@ def _result(
     ranges: Mapping[str, section_tune.Ends | None],
     found: "Identified",
     noise: Mapping[str, float],
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the JSON document."""
     known = found.uncertainty
     return {
@@ -254,7 +255,7 @@ def _result(
 
 def _scalar_values(
     chosen: Scenario, ranges: Mapping[str, section_tune.Ends | None], found: "Identified"
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, JsonObject]:
     """Return one row for each number: a list `controller.gain` gives `controller.gain.0` and so on."""
     specs = {path: spec for path, spec, _ in parameters(chosen.loop)}
     rows = {}
@@ -272,7 +273,7 @@ def _scalar_values(
 
 def _residuals(
     readings: Readings, found: "Identified", noise: Mapping[str, float], units: Mapping[str, str]
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, JsonObject]:
     """Return statistics of simulated minus measured, by column."""
     each = np.split(np.asarray(found.residuals), len(readings.columns))
     return {

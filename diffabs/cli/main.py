@@ -44,6 +44,7 @@ from diffabs.cli import (
 from diffabs.cli.checking import check_accuracy, describe_check, describe_loose_metrics
 from diffabs.core import interrupt, provenance
 from diffabs.core.pytree import parameters
+from diffabs.core.types import JsonObject, Key, PyTree, Scalar
 from diffabs.objectives import at_limits
 from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
@@ -76,7 +77,7 @@ def main() -> NoReturn:
     interrupt.begin_hearing()
     try:
         app()
-        status: Any = 0
+        status: Scalar = 0
     except SystemExit as left:
         status = left.code
     interrupt.stop_hearing()
@@ -161,7 +162,7 @@ def simulate(
 
 def _load_source(
     scenario: str | None, from_sweep: pathlib.Path | None, sample: int | None, changes: Any, seed: int | None
-) -> tuple[Scenario, Any]:
+) -> tuple[Scenario, PyTree]:
     """Return the scenario to run, and the key of its noise."""
     if from_sweep and sample is not None:
         return console.run_with_progress(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
@@ -169,7 +170,7 @@ def _load_source(
     return chosen, chosen.key()
 
 
-def _judge(chosen: Scenario, result: dict[str, Any]) -> None:
+def _judge(chosen: Scenario, result: JsonObject) -> None:
     """Write the warnings. Raises typer.Exit for a diverged run, which has no metrics."""
     if result["diverged"]:
         why = "a number became infinite or invalid, or a part switched in every step; there are no metrics"
@@ -216,14 +217,14 @@ def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
             console.fail(f"--{one} and --{other} are the same file, {wanted[one]}")
 
 
-def _run(chosen: Scenario, key: Any, keep: bool) -> tuple[Run, float]:
+def _run(chosen: Scenario, key: Key, keep: bool) -> tuple[Run, float]:
     """Return the run, on the host, and the share of its time with the control at a limit."""
     measured = {**chosen.objectives, AT_LIMIT: at_limits(chosen.loop)}
     run = jax.device_get(_describe_run(chosen, measured, key, keep=keep))
     return run._replace(metrics={name: run.metrics[name] for name in chosen.objectives}), float(run.metrics[AT_LIMIT])
 
 
-def _describe_run(chosen: Scenario, measured: dict[str, Any], key: Any, *, keep: bool) -> Run:
+def _describe_run(chosen: Scenario, measured: JsonObject, key: Key, *, keep: bool) -> Run:
     if not keep:
         return measure(chosen.loop, chosen.solver, measured, key=key)
     steps = chosen.solver.steps
@@ -233,7 +234,7 @@ def _describe_run(chosen: Scenario, measured: dict[str, Any], key: Any, *, keep:
     return rollout(chosen.loop, solver, measured, key=key)
 
 
-def _find_loose_metrics(chosen: Scenario, run: Run, key: Any, keep: bool) -> list[str]:
+def _find_loose_metrics(chosen: Scenario, run: Run, key: Key, keep: bool) -> list[str]:
     """Return warnings of metrics that depend on `rtol`; `_run` makes a second run with the same compiled program."""
     solver = chosen.solver
     if not isinstance(solver, Adaptive) or run.diverged:
@@ -249,7 +250,7 @@ def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
     draw(run, title=chosen.title or chosen.name, unit=plant.control_unit).savefig(picture)
 
 
-def _result(chosen: Scenario, run: Run, limited: float, files: dict[str, pathlib.Path | None]) -> dict[str, Any]:
+def _result(chosen: Scenario, run: Run, limited: float, files: dict[str, pathlib.Path | None]) -> JsonObject:
     return {
         "scenario": chosen.name,
         "metrics": {name: float(run.metrics[name]) for name in chosen.objectives},

@@ -4,7 +4,7 @@ import importlib
 import math
 import pathlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -12,6 +12,7 @@ from rich.table import Table
 from diffabs.cli import console, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import ParameterSpec, replace
+from diffabs.core.types import JsonObject, Scalar
 from diffabs.core.values import ScenarioError, format_given, read_number_in_range
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.registry import KMH
@@ -73,7 +74,7 @@ def margins(
 
 def _read_places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, float], float | None]:
     """Return values by path of the loop, in SI, and the target. Raises ScenarioError."""
-    table: dict[str, Any] = {}
+    table: JsonObject = {}
     for item in given:
         path, _, text = item.partition("=")
         try:
@@ -110,7 +111,7 @@ def _find_margins(
 
 
 def _draw(chosen: Scenario, nominal: "System", found: "Band | None", picture: pathlib.Path) -> None:
-    frequency: Any = importlib.import_module("diffabs.plot.frequency")
+    frequency: Scalar = importlib.import_module("diffabs.plot.frequency")
     others = [one.loop for one in found.systems] if found else []
     title = f"{chosen.title or chosen.name}: the open loop"
     frequency.loop_shape(nominal.loop, nominal.margins, others, title=title).savefig(picture)
@@ -137,10 +138,10 @@ def _document(
     values: dict[str, float],
     target: float | None,
     plot: pathlib.Path | None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the JSON document, in SI. Infinity (no limit) is a text, as in an override."""
 
-    def plain(one: "System") -> dict[str, Any]:
+    def plain(one: "System") -> JsonObject:
         rows = margin_numbers(one.margins).items()
         return {"stable": one.margins.stable, **{k: "inf" if v == math.inf else float(v) for k, v in rows}}
 
@@ -165,7 +166,7 @@ def _document(
     }
 
 
-def _show(result: dict[str, Any], chosen: Scenario, nominal: "System", found: "Band | None") -> None:
+def _show(result: JsonObject, chosen: Scenario, nominal: "System", found: "Band | None") -> None:
     """Show a table of the margins, with the worst value and its place."""
     here = margin_numbers(nominal.margins)
     worst = found.worst() if found else {}

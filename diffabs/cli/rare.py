@@ -5,7 +5,7 @@ It needs the extra `sweep`, which is imported only when the command runs.
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +13,7 @@ from diffabs.cli import console, progress, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core import provenance
 from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import JsonObject
 from diffabs.core.values import ScenarioError, read_number, unknown_name_error
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
@@ -120,7 +121,7 @@ def _describe_levels(levels: "list[SubsetProgress]", metric: str) -> str:
     return f"{metric} >= {levels[-1].threshold:.4g} has a probability of about {probability:.2g}"
 
 
-def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str, bound: float) -> dict[str, Any]:
+def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str, bound: float) -> JsonObject:
     """Return the JSON document; its failures are values by path in SI, the likeliest first."""
     rows = study.space.normal(found.failing[:MAX_SHOWN_FAILURES]) if len(found.failing) else {}
     return {

@@ -1,12 +1,13 @@
 """The command `reproduce`: all results of a paper. It draws figures, and needs the extras `plot` and `report`."""
 
 import pathlib
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from diffabs.cli import console, progress, report, show, targets
 from diffabs.core import provenance, values
+from diffabs.core.types import JsonObject
 
 if TYPE_CHECKING:
     from diffabs.papers import Reproduction
@@ -29,7 +30,7 @@ def reproduce(
 
         if name != "all" and name not in PAPERS:
             raise values.unknown_name_error(f"there is no paper {values.format_given(name)}", name, (*PAPERS, "all"))
-        results: dict[str, Any] = {}
+        results: JsonObject = {}
         try:
             for paper in PAPERS if name == "all" else (name,):
                 with targets.new_target_folder(out / paper) as folder:
@@ -49,7 +50,7 @@ def reproduce(
             show.as_json({"out": str(out), "papers": results, "versions": provenance.versions()})
 
 
-def _write_joint_report(out: pathlib.Path, results: dict[str, Any]) -> pathlib.Path:
+def _write_joint_report(out: pathlib.Path, results: JsonObject) -> pathlib.Path:
     """Write the report of several papers in one file, and return its path."""
     path = out / report.DEFAULT_NAME
     report.check_target(path)
@@ -57,7 +58,7 @@ def _write_joint_report(out: pathlib.Path, results: dict[str, Any]) -> pathlib.P
     return path
 
 
-def _reproduce_with_progress(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:
+def _reproduce_with_progress(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> JsonObject:
     """Return the summary of a paper; its steps are shown beside the spinner, or on a line each."""
     spins, steps = console.is_animated(), [progress.COMPILING]
 

@@ -4,7 +4,6 @@ import json
 import math
 import pathlib
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 import typer
@@ -16,6 +15,7 @@ from diffabs.cli.console import say
 from diffabs.cli.tables import fit_table
 from diffabs.core.loop import run_signals
 from diffabs.core.summary import round_for_table
+from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.papers.digest import Digest
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
@@ -30,7 +30,7 @@ COSTS = (
 )
 
 
-def as_json(value: Any) -> None:
+def as_json(value: Scalar) -> None:
     """Print one JSON document to stdout.
 
     Args:
@@ -39,7 +39,7 @@ def as_json(value: Any) -> None:
     typer.echo(json.dumps(replace_infinite(value), indent=2, allow_nan=False))
 
 
-def replace_infinite(value: Any) -> Any:
+def replace_infinite(value: Scalar) -> Scalar:
     """Return values with null in place of NaN and infinity, which JSON lacks.
 
     Args:
@@ -52,7 +52,7 @@ def replace_infinite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_csv(trajectory: Trajectory, plant: Any, path: pathlib.Path) -> None:
+def write_csv(trajectory: Trajectory, plant: Part, path: pathlib.Path) -> None:
     """Write the instants up to the end of the run to a CSV file, with units in its header.
 
     Args:
@@ -68,7 +68,7 @@ def write_csv(trajectory: Trajectory, plant: Any, path: pathlib.Path) -> None:
             file.write(",".join(f"{value:.12g}" for value in row) + "\n")
 
 
-def show_run(result: dict[str, Any], chosen: Scenario) -> None:
+def show_run(result: JsonObject, chosen: Scenario) -> None:
     """Show metrics with their units, and the files written.
 
     Args:
@@ -86,7 +86,7 @@ def show_run(result: dict[str, Any], chosen: Scenario) -> None:
     show_files(result)
 
 
-def show_accuracy(found: dict[str, Any]) -> None:
+def show_accuracy(found: JsonObject) -> None:
     """Show the changes of the metrics by shorter steps and by single precision.
 
     Args:
@@ -101,7 +101,7 @@ def show_accuracy(found: dict[str, Any]) -> None:
     show_titled_table("change by a half step, order, error at this step, change in float32", table)
 
 
-def show_family(name: str, members: dict[str, Any]) -> None:
+def show_family(name: str, members: JsonObject) -> None:
     """Show the members of a family, field by field; or the scenarios.
 
     Args:
@@ -155,7 +155,7 @@ def show_digest(digest: Digest) -> Group:
     return Group(digest.title, table, *digest.agreement, verdicts)
 
 
-def show_proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict: str) -> None:
+def show_proof(result: JsonObject, title: str, units: Mapping[str, str], verdict: str) -> None:
     """Show a gain, the proof, and the vertices of its polytope.
 
     Args:
@@ -195,7 +195,7 @@ def show_proof(result: dict[str, Any], title: str, units: Mapping[str, str], ver
     show_titled_table(f"{result['vertices']} vertices{covered or ', the systems on a grid of the ranges'}", vertices)
 
 
-def show_verification(result: dict[str, Any], json_wanted: bool) -> None:
+def show_verification(result: JsonObject, json_wanted: bool) -> None:
     """Show a line for each claim, or the JSON document.
 
     Args:
@@ -211,7 +211,7 @@ def show_verification(result: dict[str, Any], json_wanted: bool) -> None:
     return None
 
 
-def show_tuning(result: dict[str, Any], chosen: Scenario) -> None:
+def show_tuning(result: JsonObject, chosen: Scenario) -> None:
     """Show parameters, metrics and constraints before and after, and the course of the tuning.
 
     Args:
@@ -246,7 +246,7 @@ def show_tuning(result: dict[str, Any], chosen: Scenario) -> None:
     show_files(result)
 
 
-def format_shortfall(row: dict[str, Any]) -> str:
+def format_shortfall(row: JsonObject) -> str:
     """Return the amount by which a constraint is not met, in words.
 
     Args:
@@ -258,7 +258,7 @@ def format_shortfall(row: dict[str, Any]) -> str:
     return f"by {row['missed']:.3g}{part}"
 
 
-def show_identification(result: dict[str, Any]) -> None:
+def show_identification(result: JsonObject) -> None:
     """Show values with standard deviations, residuals and strong correlations.
 
     Args:
@@ -280,7 +280,7 @@ def show_identification(result: dict[str, Any]) -> None:
     show_files(result)
 
 
-def show_files(result: dict[str, Any]) -> None:
+def show_files(result: JsonObject) -> None:
     """Write the names of the written files to stderr.
 
     Args:
@@ -290,7 +290,7 @@ def show_files(result: dict[str, Any]) -> None:
         say(f"{name}: {path}")
 
 
-def format_brief(value: Any) -> str:
+def format_brief(value: Scalar) -> str:
     """Return a number with six digits, or the first four entries of a list.
 
     Args:
@@ -321,7 +321,7 @@ def _console() -> Console:
     return console
 
 
-def numbers_at_bounds(free: Mapping[str, Any]) -> Iterator[str]:
+def numbers_at_bounds(free: Params) -> Iterator[str]:
     """Yield each tuned number at a bound of its range, with the bound.
 
     A number is at a bound if its distance is at most `BOUND_SHARE` of the range.

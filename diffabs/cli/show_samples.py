@@ -1,16 +1,15 @@
 """Tables of the commands on many samples: a sweep, a small probability, a comparison of two sweeps."""
 
-from typing import Any
-
 from rich.table import Table
 
 from diffabs.cli.console import say
 from diffabs.cli.show import format_brief, show_titled_table
+from diffabs.core.types import JsonObject
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 
 
-def show_sweep(result: dict[str, Any], chosen: Scenario) -> None:
+def show_sweep(result: JsonObject, chosen: Scenario) -> None:
     """Show failures, statistics with intervals, sensitivities and the worst samples of a sweep.
 
     Args:
@@ -65,7 +64,7 @@ def show_sweep(result: dict[str, Any], chosen: Scenario) -> None:
     say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
 
 
-def _failures(found: dict[str, Any]) -> Table:
+def _failures(found: JsonObject) -> Table:
     """Return a table with a row for each failure that occurred, and one row for all others."""
     table = Table("failure", "runs", "probability", "low", "high")
     for name, row in found.items():
@@ -77,7 +76,7 @@ def _failures(found: dict[str, Any]) -> Table:
     return table
 
 
-def _statistics(metrics: dict[str, Any], chosen: Scenario) -> Table:
+def _statistics(metrics: JsonObject, chosen: Scenario) -> Table:
     """Return a table with a row for each metric; only the mean has its interval."""
     kinds = [
         kind for kind in next((row for row in metrics.values() if row), {}) if kind not in ("mean", "least", "greatest")
@@ -90,7 +89,7 @@ def _statistics(metrics: dict[str, Any], chosen: Scenario) -> Table:
     return table
 
 
-def show_rare_event(result: dict[str, Any], chosen: Scenario) -> None:
+def show_rare_event(result: JsonObject, chosen: Scenario) -> None:
     """Show a small probability, its levels, and the likeliest failures.
 
     Args:
@@ -120,7 +119,7 @@ def show_rare_event(result: dict[str, Any], chosen: Scenario) -> None:
     say(f"{result['runs']} runs and {result['gradients']} gradients; {result['diverged']} diverged")
 
 
-def show_comparison(result: dict[str, Any]) -> None:
+def show_comparison(result: JsonObject) -> None:
     """Show means of two sweeps, and their difference sample by sample.
 
     Args:
@@ -136,5 +135,5 @@ def show_comparison(result: dict[str, Any]) -> None:
     say("variance reduction: factor by which sweeps without common samples would need more samples")
 
 
-def _estimate(row: dict[str, Any]) -> list[str]:
+def _estimate(row: JsonObject) -> list[str]:
     return ["" if row[key] is None else format_brief(row[key]) for key in ("value", "low", "high")]

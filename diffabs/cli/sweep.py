@@ -22,6 +22,7 @@ from diffabs.cli import console, progress, report, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core import files
 from diffabs.core.pytree import elements
+from diffabs.core.types import JsonObject, PyTree
 from diffabs.core.values import ScenarioError, unknown_name_error
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
@@ -89,7 +90,7 @@ def sweep(
         _check_any(result, chosen)
 
 
-def _check_any(result: dict[str, Any], chosen: Scenario) -> None:
+def _check_any(result: JsonObject, chosen: Scenario) -> None:
     """Raise typer.Exit if every sample was refused."""
     if result["refused"]["count"] == result["samples"]:
         why = next(iter(result["refused"]["reasons"]))
@@ -128,7 +129,7 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     return dataclasses.replace(chosen, name=f"{chosen.name}, sample {number}", title="", loop=loop), key
 
 
-def _check_runnable(study: "Study", number: int) -> tuple[Any, jax.Array]:
+def _check_runnable(study: "Study", number: int) -> tuple[PyTree, jax.Array]:
     """Return loop and key of a sample. Raises ScenarioError for a refused sample."""
     loop, key = study.lane(number)
     if line := first_refusal(loop, {}, study.solver):
@@ -233,7 +234,7 @@ def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:
     return Dask(scheduler, workers)
 
 
-def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], Any]) -> "Results":
+def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], PyTree]) -> "Results":
     """Return the results. Raises KeyboardInterrupt after Ctrl-C: at once, or after the current chunks."""
     far = [progress.WorkProgress(progress.COMPILING)]
     ending = console.InterruptibleEnd("the chunks in hand")
@@ -267,7 +268,7 @@ def _list_numbers(numbers: tuple[int, ...]) -> str:
     return ", ".join(map(str, numbers[:8])) + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")
 
 
-def _warn(accuracy: dict[str, Any] | None) -> None:
+def _warn(accuracy: JsonObject | None) -> None:
     from diffabs.sweep.checking import accuracy_warnings
 
     for line in accuracy_warnings(accuracy) if accuracy else ():
@@ -276,7 +277,7 @@ def _warn(accuracy: dict[str, Any] | None) -> None:
 
 def _result(
     found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool, check: int
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the JSON document, which is also written into the folder."""
     from diffabs.sweep.checking import check_accuracy
     from diffabs.sweep.statistics.summary import summarise_sweep

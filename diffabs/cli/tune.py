@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import pathlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import jax
 import numpy as np
@@ -17,6 +17,7 @@ import typer
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
 from diffabs.cli.tune_document import Proved, Work, tuning_document
+from diffabs.core.types import JsonObject, Part
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.admissible import first_refusal
@@ -69,7 +70,7 @@ def tune(
         _leave_if_interrupted(result)
 
 
-def _leave_if_interrupted(result: dict[str, Any]) -> None:
+def _leave_if_interrupted(result: JsonObject) -> None:
     """Raise typer.Exit after Ctrl-C: the result shown is the best so far."""
     if result["interrupted"]:
         met = "" if result["met"] else f"; not met: {_unmet_constraints(result)}, so that no file is written"
@@ -77,18 +78,18 @@ def _leave_if_interrupted(result: dict[str, Any]) -> None:
         raise typer.Exit(console.INTERRUPTED)
 
 
-def _unmet_constraints(result: dict[str, Any]) -> str:
+def _unmet_constraints(result: JsonObject) -> str:
     return ", ".join(f"{row['name']} {show.format_shortfall(row)}" for row in result["constraints"] if not row["met"])
 
 
-def _show(result: dict[str, Any], told: str, chosen: Scenario, as_json: bool) -> None:
+def _show(result: JsonObject, told: str, chosen: Scenario, as_json: bool) -> None:
     show.as_json(result) if as_json else show.show_tuning(result, chosen)
     console.say(told)
 
 
 def _tune_and_document(
     chosen: Scenario, engine: str, out: pathlib.Path | None, picture: pathlib.Path | None
-) -> tuple[dict[str, Any], str]:
+) -> tuple[JsonObject, str]:
     """Return the JSON document and a sentence on the certificate; the files are written if all constraints are met.
 
     After Ctrl-C the document lacks the parts that are not computed yet.
@@ -119,7 +120,7 @@ def _draw_until_interrupt(draw: Callable[[], None], picture: pathlib.Path) -> bo
     return True
 
 
-def _without_proof(work: Work, result: dict[str, Any]) -> dict[str, Any]:
+def _without_proof(work: Work, result: JsonObject) -> JsonObject:
     """Return the document with the unchecked constraints added, as not met."""
     seen = [row["name"] for row in result["constraints"]]
     goal = work.chosen.tune
@@ -148,7 +149,7 @@ def build_work(chosen: Scenario) -> Work:
     batch = goal.batch(chosen.seed).check(chosen.loop)
     if line := first_refusal(chosen.loop, batch.values, chosen.solver):
         raise ScenarioError(f"tune.over: {line}")
-    constraints: dict[str, Any] = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
+    constraints: JsonObject = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
     task = certificates.build_proof_task(chosen) if goal.decay or goal.damping else None
     if task and goal.decay:
         constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
@@ -165,7 +166,7 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     goal, told = work.chosen.tune, list["TuningProgress"]()
     ending = console.InterruptibleEnd("the evaluation in hand", nothing=lambda: not told)
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
-    posed: dict[str, Any] = {
+    posed: JsonObject = {
         "free": goal.free,
         "objective": goal.objective,
         "over": work.batch,
@@ -246,7 +247,7 @@ def _draw(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in chosen.tune.objective.items())))
     solver = dataclasses.replace(chosen.solver, every=min(chosen.solver.every, chosen.solver.steps))
 
-    def roll_out(loop: Any) -> Trajectory:
+    def roll_out(loop: Part) -> Trajectory:
         run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=chosen.key()))
         assert run.trajectory is not None
         return run.trajectory

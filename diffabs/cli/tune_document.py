@@ -8,6 +8,7 @@ import numpy as np
 from diffabs.cli import certificates, console
 from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
+from diffabs.core.types import JsonObject, Part, Scalar
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ class Work(NamedTuple):
 
     chosen: Scenario
     batch: "Batch"
-    constraints: dict[str, Any]
+    constraints: JsonObject
     task: certificates.ProofTask | None
 
 
@@ -42,13 +43,13 @@ class Proved(NamedTuple):
         certified: True if there is a certificate.
     """
 
-    document: dict[str, Any]
+    document: JsonObject
     sentence: str
     task: certificates.ProofTask | None = None
     certified: bool = False
 
 
-def tuning_document(work: Work, found: "Tuned", proved: Proved) -> dict[str, Any]:
+def tuning_document(work: Work, found: "Tuned", proved: Proved) -> JsonObject:
     """Return the whole document, without the written files.
 
     Args:
@@ -82,14 +83,14 @@ def tuning_document(work: Work, found: "Tuned", proved: Proved) -> dict[str, Any
     }
 
 
-def _free(chosen: Scenario, found: "Tuned", path: str) -> dict[str, Any]:
+def _free(chosen: Scenario, found: "Tuned", path: str) -> JsonObject:
     spec = next(spec for name, spec, _ in parameters(chosen.loop) if name == path)
     low, high = chosen.tune.free[path] or (spec.low, spec.high)
     before, after = (_plain(get(loop, path)) for loop in (chosen.loop, found.loop))
     return {"before": before, "after": after, "low": _plain(low), "high": _plain(high), "unit": spec.unit}
 
 
-def _over_lanes(metrics: dict[str, Any], chosen: Scenario) -> dict[str, dict[str, float]]:
+def _over_lanes(metrics: JsonObject, chosen: Scenario) -> dict[str, dict[str, float]]:
     """Return mean and worst metrics; NaN if a run diverged, because a mean of the others would hide it."""
     each = {name: np.asarray(metrics[name], float) for name in chosen.objectives}
     return {
@@ -98,7 +99,7 @@ def _over_lanes(metrics: dict[str, Any], chosen: Scenario) -> dict[str, dict[str
     }
 
 
-def _constraints(work: Work, found: "Tuned", proved: Proved) -> list[dict[str, Any]]:
+def _constraints(work: Work, found: "Tuned", proved: Proved) -> list[JsonObject]:
     """Return a row for each constraint: its worst value before and after, and whether it is met."""
     goal, rows = work.chosen.tune, []
     for name, bound in goal.limits.items():
@@ -114,9 +115,7 @@ def _constraints(work: Work, found: "Tuned", proved: Proved) -> list[dict[str, A
     return rows
 
 
-def _constraint_row(
-    name: str, bound: float, before: float | None, after: float | None, *, at_most: bool
-) -> dict[str, Any]:
+def _constraint_row(name: str, bound: float, before: float | None, after: float | None, *, at_most: bool) -> JsonObject:
     """Return a row of the constraints.
 
     A constraint is met without tolerance. `missed` is the amount by which it is not met, null if unknown.
@@ -128,12 +127,12 @@ def _constraint_row(
     return {**row, "met": beyond <= 0, "missed": missed}
 
 
-def _least_damping(task: certificates.ProofTask, loop: Any) -> float:
+def _least_damping(task: certificates.ProofTask, loop: Part) -> float:
     """Return the least damping of the poles over the vertices."""
     from diffabs.tune import Poles
 
     return float(Poles(task.polytope).least_damping(loop))
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Scalar) -> Any:
     return np.asarray(value, float).tolist()

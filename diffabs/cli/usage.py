@@ -13,6 +13,7 @@ import typer
 import typer.core
 
 from diffabs.cli import console
+from diffabs.core.types import PyTree, Scalar
 from diffabs.scenario.registry import register_parts
 
 # The base class of all usage errors. It is taken from the Click that this Typer uses, which may be Typer's own copy.
@@ -26,7 +27,7 @@ Parts = Annotated[
 class Group(typer.core.TyperGroup):
     """The program. It reports a wrong argument in one line, like any other error."""
 
-    def main(self, *args: Any, standalone_mode: bool = True, **more: Any) -> Any:
+    def main(self, *args: PyTree, standalone_mode: bool = True, **more: Any) -> Scalar:
         """Run a command; exit with its status if `standalone_mode`, else return the status.
 
         `args` and `more` are those of Click.
@@ -42,7 +43,7 @@ class Group(typer.core.TyperGroup):
         return status
 
 
-def _format_error(error: Any) -> int:
+def _format_error(error: Scalar) -> int:
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
     else:
@@ -53,7 +54,7 @@ def _format_error(error: Any) -> int:
     return error.exit_code
 
 
-def add_command(app: typer.Typer, function: Callable[..., Any], example: str, name: str | None = None) -> None:
+def add_command(app: typer.Typer, function: Callable[..., PyTree], example: str, name: str | None = None) -> None:
     """Add a function as a command, with its example, --quiet and --parts.
 
     Args:
@@ -64,7 +65,7 @@ def add_command(app: typer.Typer, function: Callable[..., Any], example: str, na
     """
 
     @functools.wraps(function)
-    def command(*args: Any, quiet: bool, parts: list[str] | None, **given: Any) -> Any:
+    def command(*args: PyTree, quiet: bool, parts: list[str] | None, **given: PyTree) -> Any:
         console.quieten(quiet)
         with console.end_on_errors():
             register_parts(parts or ())

@@ -8,7 +8,7 @@ discrete-time matrices of one period. `diffabs.linear.lqg` computes K and L.
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ import numpy as np
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking, no_flow, no_memory
 from diffabs.core.pytree import Matrix, Scalar, Vector, param, pytree
+from diffabs.core.types import Part, PyTree
 
 STATE_NAMES = ("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate")
 MEASURED_NAMES = ("theta", "psi")
@@ -24,7 +25,7 @@ MEASURED_NAMES = ("theta", "psi")
 DEFAULT_BALANCE_GAIN = (24208.064, 2293.1921, 7667.1, 8683.2995, 889.36867, 2860.7285)
 
 
-def state_of(output: BalanceOutput) -> Any:
+def state_of(output: BalanceOutput) -> PyTree:
     """Return the state x = (theta, psi, phi, theta', psi', phi') of a plant output, shape (6,).
 
     Args:
@@ -63,7 +64,7 @@ class ObserverMemory(NamedTuple):
         voltage: Voltage u = K x^ for this estimate, before its limit [V].
     """
 
-    state: Any
+    state: PyTree
     voltage: Scalar
 
 
@@ -124,7 +125,7 @@ class ObserverFeedback:
         yield from _shape_problems(self, gain=(6,), transition=(6, 6), entry=(6,), correction=(6, 2))
 
 
-def _shape_problems(part: Any, **shapes: tuple[int, ...]) -> Iterator[str]:
+def _shape_problems(part: Part, **shapes: tuple[int, ...]) -> Iterator[str]:
     for name, shape in shapes.items():
         found = np.shape(getattr(part, name))
         if found != shape:

@@ -8,7 +8,6 @@ Source: Maeda and Sugiura, eqs. (18), (19), (23): tau1 = tau1* + K x.
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
 from diffabs.core.rules import Rule, order_rule
+from diffabs.core.types import Part
 
 
 @pytree
@@ -26,7 +26,7 @@ class StateFeedback:
     gain: Vector = param(default=(-11753.0, -48.0), unit="control/signal/s, control/signal")
     torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
     torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
-    antiwindup: Any = part(default=NoAntiWindup)
+    antiwindup: Part = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
         """Return the memory x1(0) = 0."""

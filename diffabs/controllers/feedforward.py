@@ -1,7 +1,5 @@
 """Feed-forward inputs: the control to which a controller adds its feedback."""
 
-from typing import Any
-
 from diffabs.core.protocols import BrakeOutput, Plant
 from diffabs.core.pytree import Scalar, param, pytree
 
@@ -12,7 +10,7 @@ class ConstantInput:
 
     value: Scalar = param(default=0.0, unit="control")
 
-    def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
+    def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Scalar:
         """Return the constant, in the unit of the plant's control."""
         del plant, output, target
         return self.value
@@ -24,6 +22,6 @@ class HoldingInput:
     for a controller with exact parameters.
     """
 
-    def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
+    def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Scalar:
         """Return tau*, in the unit of the plant's control."""
         return plant.holding(output, target)

@@ -10,7 +10,6 @@ scheduling, Automatica 36 (2000).
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from diffabs.core.numerics import interpolate_shares, interval_shares
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
 from diffabs.core.rules import Rule, increase_rule
+from diffabs.core.types import Part
 
 
 @pytree
@@ -41,15 +41,15 @@ class ScheduledFeedback:
     gains: Vector = param(default=(-58.0, -158.0), unit="control/signal", free=True)
     torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
     torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
-    antiwindup: Any = part(default=NoAntiWindup)
+    antiwindup: Part = part(default=NoAntiWindup)
 
     start, limits = StateFeedback.start, StateFeedback.limits
 
-    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
+    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return x1' = slip - target, as modified by the anti-windup strategy."""
         return self._here(signal).flow(t, memory, signal)
 
-    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
+    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return the control, for a brake its torque [N m]."""
         return self._here(signal).output(t, memory, signal)
 
@@ -95,7 +95,7 @@ class ProportionalFeedback:
     reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
     torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
     torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
-    antiwindup: Any = part(default=NoAntiWindup)
+    antiwindup: Part = part(default=NoAntiWindup)
 
     start, limits = StateFeedback.start, StateFeedback.limits
     problems, rules = StateFeedback.problems, StateFeedback.rules

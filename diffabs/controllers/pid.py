@@ -9,7 +9,7 @@ u brakes.
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.core.rules import Rule, order_rule
+from diffabs.core.types import Part
 
 
 class PIDMemory(NamedTuple):
@@ -42,7 +43,7 @@ class PID:
     cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
     low: Scalar = param(default=-np.inf, unit="control", infinite=True)
     high: Scalar = param(default=np.inf, unit="control", infinite=True)
-    antiwindup: Any = part(default=NoAntiWindup)
+    antiwindup: Part = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
         """Return the memory with integral and filter at zero."""

@@ -24,6 +24,7 @@ from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.core.rules import Rule, as_rule_array
 from diffabs.core.timing import whole_steps
 from diffabs.core.tracing import leaf_dependence
+from diffabs.core.types import Bool, Part, PyTree
 
 PERIOD_EPS = 16.0  # in machine epsilons of the time: closer instants count as equal
 
@@ -98,8 +99,8 @@ class Sampled:
         return Memory(flow, inner.held), output
 
     def compute_guarded(
-        self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking, lost: Any = False
-    ) -> tuple[Memory, Scalar, Any]:
+        self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking, lost: Bool = False
+    ) -> tuple[Memory, Scalar, PyTree]:
         """Return the result of `computed` for a usable sample, else the old memory and output; and whether the sample
         is skipped.
 
@@ -124,7 +125,7 @@ class Sampled:
         inner, output = jax.tree.map(lambda old, new: jnp.where(held, old, new), (memory, last), new)
         return inner, output, held
 
-    def _waits(self) -> Any:
+    def _waits(self) -> Scalar:
         """Return whether an output waits for the end of a delay, so that an event applies it."""
         return jnp.greater(self.delay, 0)
 
@@ -134,7 +135,7 @@ class Sampled:
             return self
         return _AlwaysWaits(controller=self.controller, period=self.period, delay=self.delay)
 
-    def _until(self, t: Scalar) -> Any:
+    def _until(self, t: Scalar) -> PyTree:
         """Return the time at which the output sampled at time t is applied [s].
 
         The time is a rounding early. An event exactly on a grid instant would not end a step. The maximum of a run at
@@ -144,12 +145,12 @@ class Sampled:
         early = jnp.maximum(jnp.minimum(rounding, self.delay), self.delay - (self.period - rounding))
         return t + self.delay - jax.lax.stop_gradient(early)
 
-    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: Any) -> tuple[Any]:
+    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: PyTree) -> tuple[PyTree]:
         """Return the time until the output changes."""
         del signal, rate
         return (jnp.where(memory.held.waits > 0.5, memory.held.until - t, 1.0),)
 
-    def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[Any]) -> Memory:
+    def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[PyTree]) -> Memory:
         """Return the memory after the waiting output is applied."""
         del t, signal
         m: SampledMemory = memory.held
@@ -160,7 +161,7 @@ class Sampled:
         """Return the inner controller's memory after its tick and after the events that it can only detect at a
         sampling instant.
         """
-        inner: Any = self.controller
+        inner: Part = self.controller
         if offers(inner, "margins"):
             late = tuple(margin < 0 for margin in inner.margins(clock.t, memory, signal, None))
             memory = inner.event(clock.t, memory, signal, late)
@@ -175,7 +176,7 @@ class Sampled:
         yield whole_steps("period", self.period, step)
 
 
-def replace_nan(signal: Any) -> Any:
+def replace_nan(signal: PyTree) -> PyTree:
     """Return a signal with 0 in place of NaN, so that a memory that starts from it is finite.
 
     Args:
@@ -197,7 +198,7 @@ class _AlwaysWaits(Sampled):
         return jnp.asarray(True)
 
 
-def inner_controller(controller: Any) -> Any:
+def inner_controller(controller: Part) -> PyTree:
     """Return the controller that a computer runs, or the controller itself if it is not `Sampled`.
 
     Args:
@@ -206,7 +207,7 @@ def inner_controller(controller: Any) -> Any:
     return controller.controller if isinstance(controller, Sampled) else controller
 
 
-def within_period(controller: Any, delay: Scalar, period: Scalar) -> Iterator[Rule]:
+def within_period(controller: Part, delay: Scalar, period: Scalar) -> Iterator[Rule]:
     """Yield the rules between a sampling period and the controller computed in it.
 
     Args:

@@ -1,7 +1,6 @@
 """Controllers without a plant model: constant torque, relay with hysteresis, sliding mode."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.core.rules import Rule, order_rule
+from diffabs.core.types import PyTree
 
 
 @pytree
@@ -51,13 +51,13 @@ class Relay:
         del t, signal
         return self.torque_min + memory.held * (self.torque_max - self.torque_min)
 
-    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: Any) -> tuple[Any]:
+    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: PyTree) -> tuple[PyTree]:
         """Return the distance from the slip to the edge of the band where the relay switches."""
         del t, rate
         excess = signal.measured[0] - signal.target
         return (self.band + jnp.where(memory.held > 0.5, -excess, excess),)
 
-    def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[Any]) -> Memory:
+    def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[PyTree]) -> Memory:
         """Return the memory after a switch: the brake released or applied."""
         del t, signal
         return Memory(held=jnp.where(fired[0], 1.0 - memory.held, memory.held))

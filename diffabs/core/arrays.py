@@ -7,9 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+
+from diffabs.core.types import Scalar
 
 
-def as_array(x: Any, dtype: Any) -> jax.Array:
+def as_array(x: Scalar, dtype: DTypeLike) -> jax.Array:
     """Return `jnp.asarray(x, dtype)`, but convert untraced values by NumPy, since JAX would compile a program for each.
 
     The array of a Python number is cached: its creation takes longer than many computations with it.

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.pytree import ParameterSpec, parameters, replace
+from diffabs.core.types import AnyArray, Part, PyTree, Scalar
 
 LOGARITHMIC_RATIO = 10.0  # ratio of the ends from which a range is mapped in the logarithm
 END_SHARE = 1e-9  # relative; the map is flat near an end, so a closer start could not leave it
@@ -36,7 +37,7 @@ class Interval:
     low: float
     high: float
 
-    def value(self, z: Any) -> Any:
+    def value(self, z: AnyArray) -> Scalar:
         """Return the value at `z`, inside (low, high)."""
         return self.low + (self.high - self.low) * jax.nn.sigmoid(z)
 
@@ -53,7 +54,7 @@ class Decades:
     logarithm: Interval
     sign: float
 
-    def value(self, z: Any) -> Any:
+    def value(self, z: AnyArray) -> Scalar:
         """Return the value at `z`, between two numbers of one sign."""
         return self.sign * jnp.exp(self.logarithm.value(z))
 
@@ -69,7 +70,7 @@ class HalfLine:
     end: float
     scale: float
 
-    def value(self, z: Any) -> Any:
+    def value(self, z: AnyArray) -> Scalar:
         """Return the value at `z`, on one side of `end`."""
         return self.end + self.scale * jnp.exp(z)
 
@@ -85,7 +86,7 @@ class UnboundedLine:
     start: float
     scale: float
 
-    def value(self, z: Any) -> Any:
+    def value(self, z: AnyArray) -> Scalar:
         """Return the value at `z`."""
         return self.start + self.scale * z
 
@@ -153,7 +154,7 @@ class FreeSpace:
         """Range (low, high) of each free element."""
         return [ends for entry in self.entries for ends in entry.ranges]
 
-    def values(self, z: Any) -> dict[str, Any]:
+    def values(self, z: AnyArray) -> dict[str, PyTree]:
         """Return the parameters at `z` by path. Differentiable."""
         found, first = {}, 0
         for entry in self.entries:
@@ -162,11 +163,11 @@ class FreeSpace:
             first += len(entry.maps)
         return found
 
-    def at(self, part: T, z: Any) -> T:
+    def at(self, part: T, z: AnyArray) -> T:
         """Return `part` with its free parameters at `z`. Differentiable."""
         return replace(part, self.values(z))
 
-    def place(self, part: Any) -> np.ndarray:
+    def place(self, part: Part) -> np.ndarray:
         """Return z of the present values of `part`.
 
         Raises:
@@ -185,7 +186,7 @@ class FreeSpace:
         # The logit of a uniform number is uniform over the range once s(z) maps it back.
         return (np.log(u) - np.log1p(-u)) * np.where(bounded, 1.0, RANGE_END_SHARE)
 
-    def _of(self, part: Any) -> list[tuple[FreeParameter, np.ndarray]]:
+    def _of(self, part: Part) -> list[tuple[FreeParameter, np.ndarray]]:
         there = {path: value for path, _, value in parameters(part)}
         return [(entry, np.asarray(there[entry.path], float)) for entry in self.entries]
 
@@ -196,7 +197,7 @@ class FreeSpace:
         return np.array([m.place(float(x)) for m, x in zip(entry.maps, value.ravel(), strict=True)])
 
 
-def parameter_space(part: Any, free: Sequence[str] | Mapping[str, Range | None]) -> FreeSpace:
+def parameter_space(part: Part, free: Sequence[str] | Mapping[str, Range | None]) -> FreeSpace:
     """Return the space of some parameters of a part.
 
     Args:

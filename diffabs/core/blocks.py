@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, part, pytree
 from diffabs.core.timing import steps_in_period
+from diffabs.core.types import Int, Part, PyTree
 
 
 class Passage(NamedTuple):
@@ -24,8 +25,8 @@ class Passage(NamedTuple):
 
     start: Scalar
     end: Scalar
-    values: tuple[Any, Any]
-    rates: tuple[Any, Any]
+    values: tuple[PyTree, PyTree]
+    rates: tuple[PyTree, PyTree]
 
 
 @pytree
@@ -35,7 +36,7 @@ class Direct:
     start = no_memory
     flow = no_flow
 
-    def output(self, t: Scalar, memory: Memory, signal: Any) -> Any:
+    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
         """Return the signal."""
         del t, memory
         return signal
@@ -47,7 +48,7 @@ class Series:
 
     blocks: tuple[Block, ...] = part(default=(Direct(),))
 
-    def start(self, signal: Any) -> Memory:
+    def start(self, signal: PyTree) -> Memory:
         """Return the memories, each started on the output of the blocks before it."""
         memories = []
         for block in self.blocks:
@@ -55,7 +56,7 @@ class Series:
             signal = block.output(0.0, memories[-1], signal)
         return _join_memories(memories)
 
-    def flow(self, t: Scalar, memory: Memory, signal: Any) -> Any:
+    def flow(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
         """Return the rates of the blocks."""
         rates = []
         for block, m in self._pairs(memory):
@@ -63,7 +64,7 @@ class Series:
             signal = block.output(t, m, signal)
         return tuple(rates)
 
-    def output(self, t: Scalar, memory: Memory, signal: Any) -> Any:
+    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
         """Return the output of the last block."""
         for block, m in self._pairs(memory):
             signal = block.output(t, m, signal)
@@ -73,7 +74,7 @@ class Series:
         """Return whether one of the blocks has this hook."""
         return any(offers(block, hook) for block in self.blocks)
 
-    def tick(self, clock: Clock, memory: Memory, signal: Any) -> Memory:
+    def tick(self, clock: Clock, memory: Memory, signal: PyTree) -> Memory:
         """Return the memories after the ticks of the blocks, in order; each block draws from its own random stream."""
         # `before` follows the signal before this instant: each block's old output is the next block's old input.
         memories, before = [], signal if clock.before is None else clock.before
@@ -84,16 +85,16 @@ class Series:
             memories.append(after)
         return _join_memories(memories)
 
-    def margins(self, t: Scalar, memory: Memory, signal: Any, rate: Callable[[], Any]) -> tuple[Any, ...]:
+    def margins(self, t: Scalar, memory: Memory, signal: PyTree, rate: Callable[[], PyTree]) -> tuple[PyTree, ...]:
         """Return the margins of all blocks, in order."""
-        found: tuple[Any, ...] = ()
+        found: tuple[PyTree, ...] = ()
         for block, m in self._pairs(memory):
             if offers(block, "margins"):
                 found += block.margins(t, m, signal, rate)
             signal, rate = block.output(t, m, signal), partial(_output_rate, block, t, m, signal, rate)
         return found
 
-    def event(self, t: Scalar, memory: Memory, signal: Any, fired: tuple[Any, ...]) -> Memory:
+    def event(self, t: Scalar, memory: Memory, signal: PyTree, fired: tuple[PyTree, ...]) -> Memory:
         """Return the memories after the events of the blocks, in order."""
         memories = []
         for block, m in self._pairs(memory):
@@ -105,9 +106,9 @@ class Series:
             signal = block.output(t, m, signal)
         return _join_memories(memories)
 
-    def recorded(self, t: Scalar, memory: Memory, signal: Any) -> tuple[Any, ...]:
+    def recorded(self, t: Scalar, memory: Memory, signal: PyTree) -> tuple[PyTree, ...]:
         """Return the inputs of the recording blocks, in order, for the input `signal` at time `t` with `memory`."""
-        found: tuple[Any, ...] = ()
+        found: tuple[PyTree, ...] = ()
         for block, m in self._pairs(memory):
             found += (record_signal(block, t, m, signal),) if offers(block, "record") else ()
             signal = block.output(t, m, signal)
@@ -129,7 +130,7 @@ class Series:
         return [(b, Memory(f, h)) for b, f, h in zip(self.blocks, memory.flow, memory.held, strict=True)]
 
 
-def offers(block: Any, *hooks: str) -> bool:
+def offers(block: Part, *hooks: str) -> bool:
     """Return whether a block has one of the hooks, by default a tick or margins; a composite block decides itself.
 
     Args:
@@ -140,7 +141,7 @@ def offers(block: Any, *hooks: str) -> bool:
     return any(asked(hook) if asked else hasattr(block, hook) for hook in hooks or ("tick", "margins"))
 
 
-def next_tick(block: Any, k: Any, h: Scalar) -> Any:
+def next_tick(block: Part, k: Int, h: Scalar) -> Scalar:
     """Return the number of the first grid instant after the k-th at which a block ticks.
 
     For a composite block, the first tick of any of its blocks counts.
@@ -155,7 +156,7 @@ def next_tick(block: Any, k: Any, h: Scalar) -> Any:
     return reduce(jnp.minimum, ((k // n + 1) * n for n in lengths))
 
 
-def record_signal(block: Any, t: Scalar, memory: Memory, signal: Any) -> Any:
+def record_signal(block: Part, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
     """Return the signals that a block records: its input, or for blocks in series the input of each recording block.
 
     Args:
@@ -172,7 +173,7 @@ def _join_memories(memories: Sequence[Memory]) -> Memory:
     return Memory(tuple(m.flow for m in memories), tuple(m.held for m in memories))
 
 
-def _output_rate(block: Block, t: Scalar, memory: Memory, signal: Any, rate: Callable[[], Any]) -> Any:
+def _output_rate(block: Block, t: Scalar, memory: Memory, signal: PyTree, rate: Callable[[], PyTree]) -> Scalar:
     """Return d(output)/dt of a block for the rate of its input."""
     t, moving = jnp.asarray(t), rate()
     moves = (jnp.ones_like(t), block.flow(t, memory, signal), moving)
@@ -183,7 +184,7 @@ def _output_rate(block: Block, t: Scalar, memory: Memory, signal: Any, rate: Cal
 class NoFeedforward:
     """A feed-forward input of zero."""
 
-    def input(self, plant: Any, output: Any, target: Scalar) -> Any:
+    def input(self, plant: Part, output: PyTree, target: Scalar) -> Scalar:
         """Return zero."""
         del plant, output
         return 0.0 * target  # zero with the shape and type of the target

@@ -17,8 +17,10 @@ import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from diffabs.core.modes import WORD_BITS, BitRange, ComparisonAnswers, ComparisonTrace, Mode
+from diffabs.core.types import PyTree, Scalar
 
 INLINED_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint")
 SEARCHSORTED = "searchsorted"  # of `jax.numpy` or `core.numerics`, in at most WORD_BITS knots
@@ -30,7 +32,7 @@ class _Op(NamedTuple):
     A comparing operation has a name, and for each of its comparisons the number and whether the comparison is reversed.
     """
 
-    apply: Callable[..., Sequence[Any]]
+    apply: Callable[..., Sequence[PyTree]]
     ins: tuple[int, ...]
     outs: tuple[int, ...]
     shape: tuple[int, ...]
@@ -45,15 +47,17 @@ class SwitchedProgram:
     of the arguments matter.
     """
 
-    def __init__(self, f: Callable[[Any, Any], Any], moving: Any, fixed: Any, counts: Callable[[Any], Any]):
+    def __init__(
+        self, f: Callable[[PyTree, PyTree], PyTree], moving: PyTree, fixed: PyTree, counts: Callable[[PyTree], PyTree]
+    ):
         """Trace `f` for arguments with the shapes of `moving` and `fixed`; `counts` picks outputs."""
         closed, shape = jax.make_jaxpr(f, return_shape=True)(moving, fixed)
         self.ops: list[_Op] = []
         self.places: list[BitRange] = []
-        self._constants: dict[int, Any] = {}
-        self._names: list[Any] = []  # of values; equal for the same operation on the same values
+        self._constants: dict[int, PyTree] = {}
+        self._names: list[PyTree] = []  # of values; equal for the same operation on the same values
         self._moves: list[bool] = []
-        self._known: dict[Any, int] = {}
+        self._known: dict[PyTree, int] = {}
         self._zero = self._value("zero", False)
         moves = [True] * len(jax.tree.leaves(moving)) + [False] * len(jax.tree.leaves(fixed))
         self._inputs = [self._value(("in", i), on) for i, on in enumerate(moves)]
@@ -72,15 +76,17 @@ class SwitchedProgram:
         """Number of words that hold the answers; at least one."""
         return max(1, -(-self.answers // WORD_BITS))
 
-    def __call__(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, mode: Mode) -> Any:
+    def __call__(self, pick: Callable[[PyTree], PyTree], moving: PyTree, fixed: PyTree, mode: Mode) -> Scalar:
         """Return the outputs that `pick` picks."""
         return self._run(pick, moving, fixed, mode, False)[0]
 
-    def look(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, mode: Mode) -> tuple[Any, ComparisonAnswers]:
+    def look(
+        self, pick: Callable[[PyTree], PyTree], moving: PyTree, fixed: PyTree, mode: Mode
+    ) -> tuple[PyTree, ComparisonAnswers]:
         """Return the outputs that `pick` picks at (`moving`, `fixed`) in `mode`, and the answers to all comparisons."""
         return self._run(pick, moving, fixed, mode, True)
 
-    def _run(self, pick: Any, moving: Any, fixed: Any, mode: Mode, look: bool) -> tuple[Any, Any]:
+    def _run(self, pick: Any, moving: PyTree, fixed: PyTree, mode: Mode, look: bool) -> tuple[PyTree, PyTree]:
         """Evaluate only the operations that the picked outputs need."""
         values = dict(self._constants)
         values.update(zip(self._inputs, map(jnp.asarray, jax.tree.leaves((moving, fixed))), strict=True))
@@ -113,7 +119,7 @@ class SwitchedProgram:
         self._moves.append(moves)
         return len(self._names) - 1
 
-    def _add_constants(self, constants: Sequence[Any]) -> list[int]:
+    def _add_constants(self, constants: Sequence[PyTree]) -> list[int]:
         """Return the numbers of new constants."""
         found = [self._value(("constant", len(self._names) + i), False) for i in range(len(constants))]
         self._constants.update(zip(found, constants, strict=True))
@@ -129,7 +135,7 @@ class SwitchedProgram:
         """Add the operations of a jaxpr, and return the numbers of its outputs."""
         at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
-        def read(atom: Any) -> int:
+        def read(atom: PyTree) -> int:
             return self._literal(atom) if isinstance(atom, jex.Literal) else at[atom]
 
         for eqn in jaxpr.eqns:
@@ -159,7 +165,7 @@ class SwitchedProgram:
 
     def _number_comparisons(self, counted: set[int]) -> None:
         """Number the comparisons on which the counted outputs depend."""
-        numbers: dict[Any, int] = {}
+        numbers: dict[PyTree, int] = {}
         for i, (op, on) in enumerate(zip(self.ops, self._needed_operations(counted), strict=True)):
             if on and op.name:
                 asks = [
@@ -168,7 +174,7 @@ class SwitchedProgram:
                 ]
                 self.ops[i] = op._replace(queries=tuple(asks))
 
-    def _number(self, numbers: dict[Any, int], x: int, y: int, strict: bool, shape: Any) -> tuple[int, bool]:
+    def _number(self, numbers: dict[PyTree, int], x: int, y: int, strict: bool, shape: PyTree) -> tuple[int, bool]:
         """Return the number of x > y or x >= y, and whether that number denotes the negation (y >= x or y > x)."""
         x, y = self._names[x], self._names[y]
         # One number for x > y and y >= x, which are negations of each other: the order of the names decides.
@@ -190,11 +196,11 @@ def _is_knot_search(eqn: Any) -> bool:
     return named and len(shapes) == 2 and shapes[1] == () and len(shapes[0]) == 1 and shapes[0][0] <= WORD_BITS
 
 
-def _bind_equation(eqn: Any) -> Callable[..., Sequence[Any]]:
+def _bind_equation(eqn: JaxprEqn) -> Callable[..., Sequence[PyTree]]:
     """Return an operation as a function; an operation with an inner function becomes a program of its own."""
     if not any(callable(x) or hasattr(x, "eqns") or hasattr(x, "jaxpr") for x in eqn.params.values()):
 
-        def bind(*ins: Any) -> Sequence[Any]:
+        def bind(*ins: Any) -> Sequence[PyTree]:
             outs = eqn.primitive.bind(*ins, **eqn.params)
             return outs if eqn.primitive.multiple_results else (outs,)
 
@@ -206,8 +212,8 @@ def _bind_equation(eqn: Any) -> Callable[..., Sequence[Any]]:
     body = jex.Jaxpr((), list(places), [eqn.outvars[i] for i in kept], [eqn], eqn.effects, told)
     run = jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))
 
-    def call(*ins: Any) -> Sequence[Any]:
-        outs: list[Any] = [None] * len(eqn.outvars)
+    def call(*ins: Any) -> Sequence[PyTree]:
+        outs: list[PyTree] = [None] * len(eqn.outvars)
         for i, out in zip(kept, run(*(ins[place] for place in places.values())), strict=True):
             outs[i] = out
         return outs
@@ -230,23 +236,23 @@ _COMPARISONS: dict[str, Callable[..., list[tuple[int, int, bool]]]] = {
 }
 
 
-def _sign(trace: ComparisonTrace, op: _Op, x: Any) -> list[Any]:
+def _sign(trace: ComparisonTrace, op: _Op, x: Scalar) -> list[PyTree]:
     zero = jnp.zeros_like(x)
     up, down = trace(op.queries[0], x, zero, True), trace(op.queries[1], zero, x, True)
     return [jnp.where(up, 1, jnp.where(down, -1, 0)).astype(x.dtype)]
 
 
-def _clamp(trace: ComparisonTrace, op: _Op, low: Any, x: Any, high: Any) -> list[Any]:
+def _clamp(trace: ComparisonTrace, op: _Op, low: Scalar, x: Scalar, high: Scalar) -> list[PyTree]:
     low, high = jnp.broadcast_to(low, jnp.shape(x)), jnp.broadcast_to(high, jnp.shape(x))
     return [jnp.where(trace(op.queries[0], low, x, True), low, jnp.where(trace(op.queries[1], x, high, True), high, x))]
 
 
-def _search(trace: ComparisonTrace, op: _Op, knots: Any, x: Any) -> list[Any]:
+def _search(trace: ComparisonTrace, op: _Op, knots: Scalar, x: Scalar) -> list[PyTree]:
     return [trace.search(op.queries[0], lambda: op.apply(knots, x)[0], knots, x)]
 
 
 # Result of an operation from the answers to its comparisons. `jnp.where` has the derivative of the selected branch.
-_RESULT_FROM_ANSWERS: dict[str, Callable[..., list[Any]]] = {
+_RESULT_FROM_ANSWERS: dict[str, Callable[..., list[PyTree]]] = {
     "gt": lambda trace, op, x, y: [trace(op.queries[0], x, y, True)],
     "ge": lambda trace, op, x, y: [trace(op.queries[0], x, y, False)],
     "lt": lambda trace, op, x, y: [trace(op.queries[0], y, x, True)],

@@ -12,21 +12,25 @@ from typing import Any, TypeVar
 import jax
 from jax.core import Tracer
 
+from diffabs.core.types import PyTree
+
 F = TypeVar("F", bound=Callable)
 
 # JAX 0.10: the older emitters give the same numbers as the newer ones in half the compilation time. Later versions of
 # JAX do not have this option. A program is split into 32 parts for parallel compilation, and each part has a cost: a
 # split into 4 parts takes a tenth less time.
-SAME_RESULT_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
+SAME_RESULT_OPTIONS: dict[str, PyTree] = (
+    {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
+)
 if SAME_RESULT_OPTIONS and "codegen_split_count" not in os.environ.get("XLA_FLAGS", ""):
     SAME_RESULT_OPTIONS["xla_cpu_parallel_codegen_split_count"] = 4
-QUICK_COMPILE_OPTIONS: dict[str, Any] = {
+QUICK_COMPILE_OPTIONS: dict[str, PyTree] = {
     **SAME_RESULT_OPTIONS,
     "xla_backend_optimization_level": 0,
 }  # results differ by rounding
 
 
-def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | None = None) -> Callable[[F], F]:
+def compile_once(static: Iterable[str] | int = (), options: dict[str, PyTree] | None = None) -> Callable[[F], F]:
     """Return a decorator like `jax.jit`, for a function that is mostly called with numbers, once for each of its
     shapes.
 
@@ -35,14 +39,14 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
         options: Options of XLA (`SAME_RESULT_OPTIONS`, `QUICK_COMPILE_OPTIONS`), used if nothing is traced.
     """
     leading, names = (static, ()) if isinstance(static, int) else (0, tuple(static))
-    fixed: dict[str, Any] = {"static_argnums": tuple(range(leading)), "static_argnames": names}
+    fixed: dict[str, PyTree] = {"static_argnums": tuple(range(leading)), "static_argnames": names}
 
     def decorate(function: F) -> F:
         plain: Any = jax.jit(function, **fixed)
         quick: Any = jax.jit(function, **fixed, compiler_options=options) if options else plain
 
         @functools.wraps(function)
-        def call(*args: Any, **more: Any) -> Any:
+        def call(*args: PyTree, **more: Any) -> Any:
             return (plain if is_traced(args, more) else quick)(*args, **more)
 
         call._cache_size = lambda: plain._cache_size() + quick._cache_size()  # pyright: ignore
@@ -51,7 +55,7 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
     return decorate
 
 
-def is_traced(*trees: Any) -> bool:
+def is_traced(*trees: PyTree) -> bool:
     """Return whether a trace is under way (jit), or a leaf is a tracer (also grad, vmap).
 
     XLA options apply only to a whole program, and a tracer has no value.

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp, later_of_larger
 from diffabs.core.pytree import Scalar
+from diffabs.core.types import PyTree
 
 NEWTON_ITERATIONS = 4  # from the secant's root, before the last: in a long step the cubic is far from a line
 
@@ -26,12 +27,12 @@ class Cubic(NamedTuple):
     start_slope: Scalar
     end_slope: Scalar
 
-    def __call__(self, x: Scalar) -> Any:
+    def __call__(self, x: Scalar) -> Scalar:
         """Return p(x)."""
         c1, c2, c3 = self._coefficients()
         return self.start + x * (c1 + x * (c2 + x * c3))
 
-    def slope(self, x: Scalar) -> Any:
+    def slope(self, x: Scalar) -> Scalar:
         """Return dp/dx at `x`."""
         c1, c2, c3 = self._coefficients()
         return c1 + x * (2.0 * c2 + x * 3.0 * c3)
@@ -44,17 +45,17 @@ class Cubic(NamedTuple):
         """Return the cubic `factor` p."""
         return Cubic(*(factor * x for x in self))
 
-    def integral(self, x: Scalar) -> Any:
+    def integral(self, x: Scalar) -> Scalar:
         """Return the integral of p from 0 to `x`, in units of the step."""
         c1, c2, c3 = self._coefficients()
         return x * (self.start + x * (c1 / 2.0 + x * (c2 / 3.0 + x * c3 / 4.0)))
 
-    def moment(self, x: Scalar) -> Any:
+    def moment(self, x: Scalar) -> Scalar:
         """Return the integral of x p from 0 to `x`, in units of the step."""
         c1, c2, c3 = self._coefficients()
         return x * x * (self.start / 2.0 + x * (c1 / 3.0 + x * (c2 / 4.0 + x * c3 / 5.0)))
 
-    def root(self) -> Any:
+    def root(self) -> Scalar:
         """Return the place x at which p changes sign, or 1 if both ends have the same sign.
 
         The derivative of x follows from the implicit function theorem.
@@ -77,7 +78,7 @@ class Cubic(NamedTuple):
         changes = ((still.start < 0) != (still.end < 0)) | (still.start == 0)
         return jnp.where(changes, x, 1.0)
 
-    def greatest(self) -> Any:
+    def greatest(self) -> Scalar:
         """Return the greatest value of p in [0, 1].
 
         Its derivative is the derivative of p at the place of the extremum. A Newton step moves that place; its effect
@@ -96,20 +97,20 @@ class Cubic(NamedTuple):
         return jnp.where(inside & (top > ends), top, ends)
 
     @property
-    def falls(self) -> Any:
+    def falls(self) -> Scalar:
         """Whether p falls at the start."""
         return jax.lax.stop_gradient(self.start_slope) < 0
 
     def _greater_end(self) -> Any:
         return later_of_larger(self.start, self.end, self.falls)
 
-    def _coefficients(self) -> tuple[Any, Any, Any]:
+    def _coefficients(self) -> tuple[PyTree, PyTree, PyTree]:
         rise = self.end - self.start
         c2 = 3.0 * rise - 2.0 * self.start_slope - self.end_slope
         return self.start_slope, c2, self.start_slope + self.end_slope - 2.0 * rise
 
 
-def _refine_zero(x: Any, function: Callable[[Any], Any], slope: Any) -> Any:
+def _refine_zero(x: Scalar, function: Callable[[PyTree], PyTree], slope: Scalar) -> PyTree:
     """Return x unchanged in value, with the derivatives of the zero of `function` near x.
 
     They are the derivatives of a Newton step, and their order is twice the order of x.
@@ -119,7 +120,7 @@ def _refine_zero(x: Any, function: Callable[[Any], Any], slope: Any) -> Any:
     return x - _quotient(left - jax.lax.stop_gradient(left), slope)
 
 
-def _quotient(x: Any, y: Any) -> Any:
+def _quotient(x: Scalar, y: Scalar) -> Scalar:
     """Return x/y without a derivative in y, and 0 where y is 0."""
     y = jax.lax.stop_gradient(y)
     return jnp.where(y == 0, 0.0, x / jnp.where(y == 0, 1.0, y))

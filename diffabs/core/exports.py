@@ -7,8 +7,10 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from diffabs.core.types import PyTree
 
-def lazy_getattr(package: str) -> Callable[[str], Any]:
+
+def lazy_getattr(package: str) -> Callable[[str], PyTree]:
     """Return the `__getattr__` of a package (PEP 562) that imports an exported name on its first use.
 
     The exports are the package's imports of the form `from m import x as x`, which only type checkers execute. The

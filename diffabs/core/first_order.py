@@ -12,10 +12,12 @@ import jax
 import jax.extend.core as jex
 from jax.interpreters import ad, batching, mlir
 
+from diffabs.core.types import PyTree, Scalar
+
 _operation = jex.Primitive("first_order")
 
 
-def first_order(tangents: Any, why: str) -> Any:
+def first_order(tangents: PyTree, why: str) -> PyTree:
     """Return tangents unchanged; their differentiation raises a ValueError with the message `why`.
 
     Args:
@@ -23,14 +25,14 @@ def first_order(tangents: Any, why: str) -> Any:
         why: Message of the error.
     """
 
-    def each(x: Any) -> Any:
+    def each(x: Scalar) -> Any:
         return x if getattr(x, "dtype", None) == jax.dtypes.float0 else _operation.bind(x, why=why)
 
     return jax.tree.map(each, tangents)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def without_derivative(path: str, x: Any) -> Any:
+def without_derivative(path: str, x: Scalar) -> Scalar:
     """Return x, the value of a parameter; its differentiation raises a ValueError that names the parameter.
 
     Args:
@@ -42,7 +44,7 @@ def without_derivative(path: str, x: Any) -> Any:
 
 
 @without_derivative.defjvp
-def _raise_for_parameter(path: str, at: Any, moves: Any) -> tuple[Any, Any]:
+def _raise_for_parameter(path: str, at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
     # JAX calls this rule only if x has a tangent that is not a symbolic zero.
     del at, moves
     raise ValueError(
@@ -51,7 +53,7 @@ def _raise_for_parameter(path: str, at: Any, moves: Any) -> tuple[Any, Any]:
     )
 
 
-def _raise_for_second_derivative(at: Any, moves: Any, *, why: str) -> Any:
+def _raise_for_second_derivative(at: Any, moves: PyTree, *, why: str) -> Any:
     del at, moves
     raise ValueError(why)
 

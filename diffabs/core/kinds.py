@@ -8,17 +8,19 @@ import functools
 import math
 import numbers
 import sys
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+
+from diffabs.core.types import Scalar
 
 FEWEST_BITS = 32  # of a float: with 16 bits, the time stops advancing by small steps after a second
 MAX_SHOWN_LENGTH = 60  # characters of a value in a message
 
 
-def find_value_objection(value: Any) -> str:
+def find_value_objection(value: Scalar) -> str:
     """Return why a value cannot be a number of a run or an array of numbers, such as `is text`; empty if it can.
 
     The function looks only at types, so the value may be traced.
@@ -41,12 +43,12 @@ def find_value_objection(value: Any) -> str:
     return "is complex" if isinstance(value, complex) else f"is of type {type(value).__name__}"
 
 
-def _overflows(value: Any) -> bool:
+def _overflows(value: Scalar) -> bool:
     return sys.float_info.max < abs(value) < math.inf
 
 
 @functools.cache
-def _of_type(dtype: Any) -> str:
+def _of_type(dtype: DTypeLike) -> str:
     """Return the objection to an array of this type, or an empty text."""
     if jnp.issubdtype(dtype, jax.dtypes.extended) or np.dtype(dtype).kind in "mM":  # keys, dates
         return f"is of type {dtype}"
@@ -57,7 +59,7 @@ def _of_type(dtype: Any) -> str:
     return next((line for kind, line in kinds.items() if jnp.issubdtype(dtype, kind)), f"is of type {dtype}")
 
 
-def value_shape(value: Any) -> tuple[int, ...]:
+def value_shape(value: Scalar) -> tuple[int, ...]:
     """Return the shape of an array, a number, or a list of them, which may be traced.
 
     Args:
@@ -68,7 +70,7 @@ def value_shape(value: Any) -> tuple[int, ...]:
     return np.shape(value)
 
 
-def format_value(value: Any) -> str:
+def format_value(value: Scalar) -> str:
     """Return a value for a message: on one line, of bounded length.
 
     Args:

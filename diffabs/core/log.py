@@ -12,6 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.types import PyTree, Scalar
+
 
 @partial(jax.tree_util.register_dataclass, data_fields=["rows", "place", "row"], meta_fields=["lent"])
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +27,9 @@ class Log:
         lent: Whether a solver holds the rows.
     """
 
-    rows: Any
-    place: Any
-    row: Any
+    rows: PyTree
+    place: Scalar
+    row: PyTree
     lent: bool = False
 
     @property
@@ -35,18 +37,18 @@ class Log:
         """Number of rows."""
         return len(self.rows)
 
-    def put(self, place: Any, row: Any) -> "Log":
+    def put(self, place: Scalar, row: PyTree) -> "Log":
         """Return the log with `row` at `place`, a whole number of the row's type."""
         rows = self.rows if self.lent else self.rows.at[place.astype(int)].set(row)
         return dataclasses.replace(self, rows=rows, place=place, row=row)
 
-    def read(self, places: Any) -> Any:
+    def read(self, places: Any) -> Scalar:
         """Return the rows at these `places` (k,), shape (k, n)."""
         rows = self.rows[places]
         return jnp.where((places == self.place.astype(int))[:, None], self.row, rows) if self.lent else rows
 
 
-def log_rows(tree: Any) -> list[Any]:
+def log_rows(tree: PyTree) -> list[PyTree]:
     """Return the rows of all logs in a pytree.
 
     Args:
@@ -55,7 +57,7 @@ def log_rows(tree: Any) -> list[Any]:
     return [log.rows for log in jax.tree.leaves(tree, is_leaf=_is_log) if _is_log(log)]
 
 
-def borrow(tree: Any, rows: list[Any] | None) -> Any:
+def borrow(tree: PyTree, rows: list[PyTree] | None) -> PyTree:
     """Return a tree whose logs are lent and have these rows, or no rows.
 
     Args:
@@ -66,7 +68,7 @@ def borrow(tree: Any, rows: list[Any] | None) -> Any:
     return _map_logs(lambda log: Log(next(each) if rows else None, log.place, log.row, lent=True), tree)
 
 
-def commit(tree: Any, rows: list[Any]) -> Any:
+def commit(tree: PyTree, rows: list[PyTree]) -> PyTree:
     """Return a tree whose logs have these rows and contain the row that was put while they were lent.
 
     Args:
@@ -77,7 +79,7 @@ def commit(tree: Any, rows: list[Any]) -> Any:
     return _map_logs(lambda log: Log(next(each), log.place, log.row).put(log.place, log.row), tree)
 
 
-def write_last_rows(tree: Any) -> list[Any]:
+def write_last_rows(tree: PyTree) -> list[PyTree]:
     """Return the rows of all logs, with the row written last.
 
     A write of the previous step's row followed by a read happens in place. A read before the write needs a copy, unless
@@ -89,9 +91,9 @@ def write_last_rows(tree: Any) -> list[Any]:
     return log_rows(commit(tree, log_rows(tree)))
 
 
-def _is_log(x: Any) -> bool:
+def _is_log(x: Scalar) -> bool:
     return isinstance(x, Log)
 
 
-def _map_logs(change: Any, tree: Any) -> Any:
+def _map_logs(change: Any, tree: PyTree) -> Any:
     return jax.tree.map(lambda x: change(x) if _is_log(x) else x, tree, is_leaf=_is_log)

@@ -29,22 +29,23 @@ from diffabs.core.protocols import (
     no_flow,
 )
 from diffabs.core.pytree import Scalar, part, parts, pytree
+from diffabs.core.types import Int, Part, PyTree
 
 
 class LoopState(NamedTuple):
     """The state of the plant and the memories of the blocks."""
 
-    plant: Any
+    plant: Part
     sensor: Memory
     reference: Memory
     controller: Memory
     actuator: Memory
 
-    def flow(self) -> tuple[Any, ...]:
+    def flow(self) -> tuple[PyTree, ...]:
         """Return the integrated part of the state: plant state and continuous memories."""
         return (self.plant, *(m.flow for m in self[1:]))
 
-    def with_flow(self, flow: tuple[Any, ...]) -> "LoopState":
+    def with_flow(self, flow: tuple[PyTree, ...]) -> "LoopState":
         """Return the state with the continuous memories in `flow` and the same held memories."""
         return LoopState(flow[0], *(m._replace(flow=f) for m, f in zip(self[1:], flow[1:], strict=True)))
 
@@ -60,9 +61,9 @@ class Signals(NamedTuple):
     """
 
     sample: Sample
-    measured: Any
+    measured: PyTree
     tracking: Tracking
-    recorded: dict[str, Any]
+    recorded: dict[str, PyTree]
 
 
 Margins = dict[str, tuple[Any, ...]]  # margins of the stop and of each block with events, by name
@@ -74,7 +75,7 @@ class Loop:
     """A closed loop of plant and controller with the blocks around them."""
 
     plant: Plant = part()
-    initial: Any = part()
+    initial: Part = part()
     sensor: Block = part(default=Direct)
     reference: Reference = part()
     feedforward: Feedforward = part(default=NoFeedforward)
@@ -109,7 +110,7 @@ class Loop:
         }
         return Signals(sample, measured, tracking, kept)
 
-    def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[Any, ...]:
+    def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[PyTree, ...]:
         """Return d(state.flow())/dt from the `signals` at (t, state)."""
         sample, measured, tracking, _ = signals
         return (
@@ -130,7 +131,7 @@ class Loop:
         """Whether a block has ticks."""
         return any(offers(getattr(self, name), "tick") for name in BLOCKS)
 
-    def next_tick(self, k: Any, h: Scalar) -> Any:
+    def next_tick(self, k: Int, h: Scalar) -> Scalar:
         """Return the number of the first grid instant after the `k`-th at which a block ticks; `h` is the grid's step
         [s].
         """
@@ -152,7 +153,7 @@ class Loop:
         """Names of the blocks that record their signal."""
         return tuple(name for name in BLOCKS if offers(getattr(self, name), "record"))
 
-    def margins(self, t: Scalar, state: LoopState, signals: Signals, flow: Callable[[], Any]) -> Margins:
+    def margins(self, t: Scalar, state: LoopState, signals: Signals, flow: Callable[[], PyTree]) -> Margins:
         """Return the margins of the stop and of the blocks; `flow()` is d(state.flow())/dt, for blocks that need a
         rate.
         """
@@ -160,7 +161,7 @@ class Loop:
         rates = cache(lambda: _block_inputs(self.signal_rates(t, state, flow())))
         seen = _block_inputs(signals)
 
-        def of(name: str) -> tuple[Any, ...]:
+        def of(name: str) -> tuple[PyTree, ...]:
             return getattr(self, name).margins(t, getattr(state, name), seen[name], lambda: rates()[name])
 
         found = {name: of(name) for name in BLOCKS if offers(getattr(self, name), "margins")}
@@ -191,7 +192,7 @@ class Loop:
         """
         was, moved = _block_inputs(before), False
 
-        def change_block(name: str, signal: Any) -> Memory:
+        def change_block(name: str, signal: PyTree) -> Memory:
             nonlocal state, moved
             block, memory = getattr(self, name), getattr(state, name)
             if name in fired:
@@ -218,31 +219,31 @@ class Loop:
         change_block("actuator", command)
         return state
 
-    def signal_rates(self, t: Scalar, state: LoopState, flow: Any) -> Signals:
+    def signal_rates(self, t: Scalar, state: LoopState, flow: PyTree) -> Signals:
         """Return d(signals)/dt at time `t` in `state`, away from jumps, for d(state.flow())/dt equal to `flow`."""
         moves = (jnp.ones_like(jnp.asarray(t)), flow)
         return jax.jvp(lambda t, z: self.signals(t, state.with_flow(z)), (jnp.asarray(t), state.flow()), moves)[1]
 
-    def _track(self, t: Scalar, reference: Memory, measured: Any) -> Tracking:
+    def _track(self, t: Scalar, reference: Memory, measured: PyTree) -> Tracking:
         target = self.reference.output(t, reference, measured)
         setpoint = self.reference.setpoint(reference)
         return Tracking(target, measured, self.feedforward.input(self.plant, measured, setpoint))
 
 
-def _jumps(one: Any) -> bool:
+def _jumps(one: PyTree) -> bool:
     """Return whether a part, or a part in it, declares jumps; a block without a flow has nothing to integrate."""
     if getattr(type(one), "flow", None) is no_flow:
         return False
     return getattr(one, "jumps", False) or any(map(_jumps, parts(one)))
 
 
-def _block_inputs(signals: Signals) -> dict[str, Any]:
+def _block_inputs(signals: Signals) -> dict[str, PyTree]:
     """Return the input of each block by its name."""
     sample, measured, tracking, _ = signals
     return {"sensor": sample.output, "reference": measured, "controller": tracking, "actuator": sample.command}
 
 
-def run_signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, Any]]:
+def run_signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, PyTree]]:
     """Return unit and values of the stored signals of a run by name: time, plant outputs, target, command, control.
 
     Args:

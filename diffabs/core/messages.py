@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from diffabs.core.cubic import Cubic
 from diffabs.core.pytree import Scalar
 from diffabs.core.timing import steps_in_period
+from diffabs.core.types import Bool, Int, Key, PyTree
 
 
 class BrakeOutput(NamedTuple):
@@ -56,8 +57,8 @@ class BalanceOutput(NamedTuple):
 class Memory(NamedTuple):
     """The memory of a block: `flow` is integrated with the plant, `held` changes only in ticks and events."""
 
-    flow: Any = ()
-    held: Any = ()
+    flow: PyTree = ()
+    held: PyTree = ()
 
 
 class Clock(NamedTuple):
@@ -74,12 +75,12 @@ class Clock(NamedTuple):
 
     t: Scalar
     h: Scalar
-    k: Any
-    key: Any
-    on_grid: Any = True
+    k: Int
+    key: Key | None
+    on_grid: Bool = True
     before: Any = None
 
-    def ticks(self, period: Scalar | None = None) -> tuple[Any, Any]:
+    def ticks(self, period: Scalar | None = None) -> tuple[PyTree, PyTree]:
         """Return whether a clock of this `period` [s] (None: the grid's) ticks now, and the number of its earlier
         ticks.
         """
@@ -93,7 +94,7 @@ class Tracking(NamedTuple):
     """The input of a controller: target (a slip, an angle), measured output, and feed-forward input."""
 
     target: Scalar
-    measured: Any
+    measured: PyTree
     feedforward: Scalar
 
 
@@ -101,7 +102,7 @@ class Sample(NamedTuple):
     """The signals of a run at an instant; the input of an objective."""
 
     t: Scalar  # [s]
-    output: Any  # true outputs of the plant, not the measurement
+    output: PyTree  # true outputs of the plant, not the measurement
     target: Scalar  # present target of the controller, in the unit of the first output
     setpoint: Scalar  # final value of the target
     feedforward: Scalar  # in the unit of the control
@@ -121,7 +122,7 @@ class Ending(NamedTuple):
     """
 
     sample: Sample
-    stopped: Any
+    stopped: Bool
     time_left: Scalar  # [s]
     distance_left: Scalar  # [m]
 
@@ -129,7 +130,7 @@ class Ending(NamedTuple):
 class Shown(NamedTuple):
     """The plant outputs and the setpoint of the first output, or their rates."""
 
-    output: Any
+    output: PyTree
     setpoint: Scalar
 
     @classmethod
@@ -164,10 +165,10 @@ class Segment(NamedTuple):
     step: Scalar
     shown_rates: Callable[[], tuple[Shown, Shown]]
     sample_rates: Callable[[], tuple[Sample, Sample]]
-    smooth: Any = False
-    within: tuple[Any, Any] = (True, True)
+    smooth: Bool = False
+    within: tuple[PyTree, PyTree] = (True, True)
 
-    def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
+    def output(self, read: Callable[[PyTree], Scalar] = lambda output: output[0]) -> Cubic:
         """Return the cubic of `read`(output), by default of the first plant output."""
         return self.shown_cubic(lambda shown: read(shown.output))
 
@@ -203,7 +204,7 @@ class Segment(NamedTuple):
         )
 
 
-def _read_cubic(read: Callable[[Any], Scalar], ends: Iterable[Any], slopes: Iterable[Any]) -> Cubic:
+def _read_cubic(read: Callable[[PyTree], Scalar], ends: Iterable[PyTree], slopes: Iterable[PyTree]) -> Cubic:
     """Return the cubic of `read` from its arguments at both ends, and their rates times the length of the step."""
     (a, da), (b, db) = (jax.jvp(read, (end,), (slope,)) for end, slope in zip(ends, slopes, strict=True))
     return Cubic(a, b, da, db)

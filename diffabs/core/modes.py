@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.types import PyTree, Scalar
+
 WORD_BITS = 32  # answers in a word
 ROUNDING_POWER = 0.75  # eps to this power is a relative difference that may come from rounding alone
 
@@ -24,7 +26,7 @@ class Mode(NamedTuple):
     """
 
     words: ModeBits | None
-    free: Any = None
+    free: PyTree = None
     released: ModeBits | None = None
 
 
@@ -40,10 +42,10 @@ class ComparisonAnswers(NamedTuple):
 
     words: ModeBits
     contradicted: ModeBits
-    margins: list[tuple[Any, Any]]
+    margins: list[tuple[PyTree, PyTree]]
 
 
-def single_bit(which: Any, words: int) -> ModeBits:
+def single_bit(which: Scalar, words: int) -> ModeBits:
     """Return the words with one bit set.
 
     Args:
@@ -54,7 +56,7 @@ def single_bit(which: Any, words: int) -> ModeBits:
     return tuple(jnp.where(word == i, jnp.uint32(1) << place, jnp.uint32(0)) for i in range(words))
 
 
-def find_contradicted(answers: ComparisonAnswers, which: Any, like: Any) -> tuple[Any, Any, Any, Any]:
+def find_contradicted(answers: ComparisonAnswers, which: Scalar, like: PyTree) -> tuple[PyTree, PyTree, PyTree, PyTree]:
     """Return which comparisons are contradicted: (other, crossed, chosen, margin).
 
     `other` is a contradicted comparison apart from `which`, or -1. `crossed` states whether `which` is contradicted.
@@ -90,12 +92,12 @@ class ComparisonTrace:
     def __init__(self, places: Sequence[BitRange], words: int, mode: Mode, look: bool):
         """Set the bits of the comparisons; `look` keeps the margins."""
         self.places, self.mode, self.look = places, mode, look
-        self.taken: dict[int, Any] = {}
-        self.against: list[Any] = [jnp.uint32(0)] * words
-        self.said: list[Any] = [jnp.uint32(0)] * words
-        self.margins: list[tuple[Any, Any]] = []
+        self.taken: dict[int, PyTree] = {}
+        self.against: list[PyTree] = [jnp.uint32(0)] * words
+        self.said: list[PyTree] = [jnp.uint32(0)] * words
+        self.margins: list[tuple[PyTree, PyTree]] = []
 
-    def __call__(self, ask: tuple[int, bool], x: Any, y: Any, strict: bool) -> Any:
+    def __call__(self, ask: tuple[int, bool], x: Scalar, y: Scalar, strict: bool) -> Scalar:
         """Return the answer to x > y if strict, else to x >= y."""
         number, turned = ask
         if number not in self.taken:
@@ -103,7 +105,7 @@ class ComparisonTrace:
         taken = self.taken[number]
         return ~taken if turned else taken
 
-    def _compare(self, number: int, x: Any, y: Any, strict: bool) -> Any:
+    def _compare(self, number: int, x: Scalar, y: Scalar, strict: bool) -> Scalar:
         """Return the frozen answer, or the answer of the numbers, and record the contradiction and the margin."""
         first, shape = self.places[number]
 
@@ -129,7 +131,7 @@ class ComparisonTrace:
         self._add(first, shape, margin)
         return taken
 
-    def search(self, ask: tuple[int, bool], says: Callable[[], Any], knots: Any, x: Any) -> Any:
+    def search(self, ask: tuple[int, bool], says: Callable[[], PyTree], knots: Scalar, x: Scalar) -> Scalar:
         """Return the number of knots below `x`, with one bit for each knot.
 
         `ask` is the number of the comparison, `says()` the search by the numbers, and `knots` (n,) are the knots.
@@ -156,10 +158,10 @@ class ComparisonTrace:
         loose = np.uint32(0) if self.mode.released is None else self.mode.released[word] >> shift
         return jax.lax.population_count(field ^ (against & loose)).astype(np.int32)
 
-    def _add(self, first: int, shape: tuple[int, ...], margin: Any) -> None:
+    def _add(self, first: int, shape: tuple[int, ...], margin: Scalar) -> None:
         self.margins.append((first + np.arange(np.prod(shape)).reshape(shape) if shape else first, margin))
 
-    def _between(self, first: int, below: Any, knots: Any, x: Any) -> tuple[Any, Any]:
+    def _between(self, first: int, below: Scalar, knots: Scalar, x: Scalar) -> tuple[PyTree, PyTree]:
         """Return the distances of x from the knots on either side of it."""
         count = len(knots)
         low = jnp.where(below > 0, x - knots[jnp.maximum(below - 1, 0)], jnp.inf)
@@ -167,7 +169,7 @@ class ComparisonTrace:
         self.margins += [(first + below - 1, low), (first + below, high)]
         return low, high
 
-    def _pack(self, words: list[Any], first: int, answer: Any) -> None:
+    def _pack(self, words: list[PyTree], first: int, answer: Scalar) -> None:
         """Set the bits of an answer in these words."""
         if not jnp.ndim(answer):
             words[first // WORD_BITS] |= jnp.where(answer, np.uint32(1 << first % WORD_BITS), np.uint32(0))
@@ -188,18 +190,18 @@ class ComparisonTrace:
         )
 
 
-def _ones(count: Any) -> Any:
+def _ones(count: Scalar) -> Scalar:
     """Return a word with the lowest `count` bits set."""
     return (jnp.uint32(1) << count.astype(jnp.uint32)) - 1
 
 
-def _rounding_error(x: Any) -> Any:
+def _rounding_error(x: Scalar) -> Scalar:
     """Return the difference from x below which a comparison is undecided by rounding."""
     most = jnp.finfo(jnp.result_type(x))
     return most.eps**ROUNDING_POWER * jnp.minimum(jnp.abs(x), most.max)
 
 
-def unpack_answers(words: ModeBits, first: int, shape: tuple[int, ...]) -> Any:
+def unpack_answers(words: ModeBits, first: int, shape: tuple[int, ...]) -> Scalar:
     """Return the answers of a comparison as booleans.
 
     Args:

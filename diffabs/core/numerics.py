@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.pytree import Scalar
+from diffabs.core.types import PyTree
 
 EQUAL_EPS = 1024.0  # in units of eps: difference of a signal between instants that are equal to rounding
 
 
-def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
+def clamp(x: Scalar, low: Scalar, high: Scalar) -> Scalar:
     """Return x limited to [low, high].
 
     The slope in x is 1 at a limit and 0 beyond it; the slope in a limit is 1 beyond that limit. The function uses
@@ -27,7 +28,7 @@ def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
     return jnp.where(jnp.less(x, low), low, jnp.where(jnp.greater(x, high), high, x))
 
 
-def larger(x: Scalar, y: Scalar) -> Any:
+def larger(x: Scalar, y: Scalar) -> Scalar:
     """Return max(x, y), with the slope in x where both are equal.
 
     `jnp.maximum` shares the slope between both, by a division in its tangent.
@@ -39,7 +40,7 @@ def larger(x: Scalar, y: Scalar) -> Any:
     return jnp.where(jnp.greater_equal(x, y), x, y)
 
 
-def later_of_larger(x: Scalar, y: Scalar, falls: Any = False) -> Any:
+def later_of_larger(x: Scalar, y: Scalar, falls: Scalar = False) -> PyTree:
     """Return max(x, y) of two successive values of a signal, with the slope of y where both are equal to rounding.
 
     The end y of a step of zero length moves with the event there; its start x does not. If the signal falls after x,
@@ -55,7 +56,7 @@ def later_of_larger(x: Scalar, y: Scalar, falls: Any = False) -> Any:
     return jnp.where(jnp.greater_equal(y, x + more), y, x)
 
 
-def smaller(x: Scalar, y: Scalar) -> Any:
+def smaller(x: Scalar, y: Scalar) -> Scalar:
     """Return min(x, y), with the slope in x where both are equal.
 
     Args:
@@ -66,7 +67,7 @@ def smaller(x: Scalar, y: Scalar) -> Any:
 
 
 @jax.custom_jvp
-def quotient(x: Scalar, y: Scalar) -> Any:
+def quotient(x: Scalar, y: Scalar) -> Scalar:
     """Return x/y; its derivatives (dx - (x/y) dy)/y share one 1/y. JAX's own derivatives divide three more times.
 
     Args:
@@ -77,13 +78,13 @@ def quotient(x: Scalar, y: Scalar) -> Any:
 
 
 @quotient.defjvp
-def _quotient_slope(at: Any, moves: Any) -> tuple[Any, Any]:
+def _quotient_slope(at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
     inverse = 1.0 / at[1]
     value = at[0] / at[1]
     return value, (moves[0] - value * moves[1]) * inverse
 
 
-def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Any:
+def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Scalar:
     """Return numerator/denominator, or `otherwise` with zero slope where the denominator is zero.
 
     Args:
@@ -96,7 +97,7 @@ def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> An
     return jnp.where(fine, quotient(numerator, jnp.where(fine, denominator, 1.0)), otherwise)
 
 
-def power(base: Scalar, exponent: Scalar) -> Any:
+def power(base: Scalar, exponent: Scalar) -> Scalar:
     """Return base ** exponent for base >= 0 and exponent > 1, with slope 0 at base = 0 in both arguments.
 
     The formula is exp(q log x): XLA's own power is three to four times slower on a CPU. It uses the square of the base.
@@ -113,7 +114,7 @@ def power(base: Scalar, exponent: Scalar) -> Any:
 
 
 @jax.jit
-def searchsorted(knots: Any, x: Scalar) -> Any:
+def searchsorted(knots: Scalar, x: Scalar) -> Scalar:
     """Return the number of knots that are not above x, for a few knots.
 
     `core.comparisons` recognises the search by this name, which JAX uses, too. JAX's own search looks for NaN among the
@@ -126,7 +127,7 @@ def searchsorted(knots: Any, x: Scalar) -> Any:
     return jnp.sum(x >= knots).astype(jnp.int32)
 
 
-def sign(x: Scalar) -> Any:
+def sign(x: Scalar) -> Scalar:
     """Return +1 for x >= 0, else -1; with it, the odd extension of a curve keeps its right-hand slope at 0.
 
     Args:
@@ -135,7 +136,7 @@ def sign(x: Scalar) -> Any:
     return jnp.where(jnp.greater_equal(x, 0), 1.0, -1.0)
 
 
-def odd(curve: Callable[[Any], Any], x: Scalar) -> Any:
+def odd(curve: Callable[[PyTree], PyTree], x: Scalar) -> Scalar:
     """Return the odd extension of a curve for x >= 0, with the curve's slope at 0 (|x| would give slope 0).
 
     Args:
@@ -146,7 +147,7 @@ def odd(curve: Callable[[Any], Any], x: Scalar) -> Any:
     return s * curve(s * x)
 
 
-def interval_shares(x: Scalar, nodes: Any) -> Any:
+def interval_shares(x: Scalar, nodes: PyTree) -> Scalar:
     """Return the share of each interval between the nodes that lies below x, from 0 to 1, shape (n - 1,).
 
     `interpolate_shares` sums over the shares. It looks up no index, to which derivatives would have to scatter.
@@ -159,7 +160,7 @@ def interval_shares(x: Scalar, nodes: Any) -> Any:
     return jnp.where(x >= nodes[1:], 1.0, jnp.where(x < nodes[:-1], 0.0, inside))
 
 
-def interpolate_shares(risen: Any, values: Any) -> Any:
+def interpolate_shares(risen: Scalar, values: PyTree) -> Scalar:
     """Return the piecewise linear interpolant of the values at the nodes, constant beyond the nodes.
 
     Args:
@@ -169,7 +170,7 @@ def interpolate_shares(risen: Any, values: Any) -> Any:
     return values[0] + jnp.sum(risen * jnp.diff(values))
 
 
-def axpy(a: Scalar, x: Any, y: Any) -> Any:
+def axpy(a: Scalar, x: Scalar, y: Scalar) -> PyTree:
     """Return a x + y on pytrees.
 
     Args:

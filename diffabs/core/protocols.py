@@ -68,6 +68,7 @@ from diffabs.core.messages import Shown as Shown
 from diffabs.core.messages import Tracking as Tracking
 from diffabs.core.messages import resting_segment as resting_segment
 from diffabs.core.pytree import Scalar
+from diffabs.core.types import Bool, Part, PyTree
 
 
 class Road(Protocol):
@@ -88,7 +89,7 @@ class Plant(Protocol):
     """
 
     @property
-    def shows(self) -> Any:
+    def shows(self) -> Scalar:
         """Type of `output`, a NamedTuple whose class has `units` by name; a class attribute."""
         ...
 
@@ -97,23 +98,23 @@ class Plant(Protocol):
         """Unit of the control: "N m", "V", or "1" for a command; a class attribute."""
         ...
 
-    def start(self, initial: Any) -> Any:
+    def start(self, initial: Part) -> PyTree:
         """Return the state at t = 0."""
         ...
 
-    def derivative(self, t: Scalar, state: Any, control: Scalar) -> Any:
+    def derivative(self, t: Scalar, state: PyTree, control: Scalar) -> PyTree:
         """Return dx/dt, with the structure of the state."""
         ...
 
-    def project(self, state: Any) -> Any:
+    def project(self, state: PyTree) -> PyTree:
         """Return the nearest admissible state, after every step: a stopped wheel does not turn backwards."""
         ...
 
-    def output(self, state: Any) -> Any:
+    def output(self, state: PyTree) -> PyTree:
         """Return the outputs in a state."""
         ...
 
-    def holding(self, output: Any, target: Scalar) -> Scalar:
+    def holding(self, output: PyTree, target: Scalar) -> Scalar:
         """Return the control that holds the plant at `target`: the feed-forward tau*."""
         ...
 
@@ -121,15 +122,15 @@ class Plant(Protocol):
 class Block(Protocol):
     """A dynamic block: Sensor, Reference, Controller or Actuator, depending on the signal that it maps."""
 
-    def start(self, signal: Any) -> Memory:
+    def start(self, signal: PyTree) -> Memory:
         """Return the memory at t = 0 for the first signal."""
         ...
 
-    def flow(self, t: Scalar, memory: Memory, signal: Any) -> Any:
+    def flow(self, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
         """Return d(memory.flow)/dt."""
         ...
 
-    def output(self, t: Scalar, memory: Memory, signal: Any) -> Any:
+    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
         """Return the block's output, without a change of the memory."""
         ...
 
@@ -137,7 +138,7 @@ class Block(Protocol):
 class Ticking(Block, Protocol):
     """A Block with a clock."""
 
-    def tick(self, clock: Clock, memory: Memory, signal: Any) -> Memory:
+    def tick(self, clock: Clock, memory: Memory, signal: PyTree) -> Memory:
         """Return the memory after an instant, which may be no tick of the block's own clock: `clock.ticks(period)`."""
         ...
 
@@ -145,14 +146,14 @@ class Ticking(Block, Protocol):
 class Switching(Block, Protocol):
     """A Block with events."""
 
-    def margins(self, t: Scalar, memory: Memory, signal: Any, rate: Callable[[], Any]) -> tuple[Scalar, ...]:
+    def margins(self, t: Scalar, memory: Memory, signal: PyTree, rate: Callable[[], PyTree]) -> tuple[Scalar, ...]:
         """Return numbers that are positive until an event; at the event, one of them falls through zero.
 
         `rate()` is d(signal)/dt. It costs an evaluation of the loop and of its derivative.
         """
         ...
 
-    def event(self, t: Scalar, memory: Memory, signal: Any, fired: tuple[Any, ...]) -> Memory:
+    def event(self, t: Scalar, memory: Memory, signal: PyTree, fired: tuple[PyTree, ...]) -> Memory:
         """Return the memory after the events whose `fired` is true."""
         ...
 
@@ -168,7 +169,7 @@ class Reference(Block, Protocol):
 class Feedforward(Protocol):
     """The input to which a controller adds its feedback."""
 
-    def input(self, plant: Any, output: Any, target: Scalar) -> Scalar:
+    def input(self, plant: Part, output: PyTree, target: Scalar) -> Scalar:
         """Return the control for a target, in the plant's unit."""
         ...
 
@@ -181,11 +182,11 @@ class Stop(Protocol):
         """Whether a run should reach the stop (a braking car) or should not (a fall); a class attribute."""
         ...
 
-    def margin(self, output: Any) -> Scalar:
+    def margin(self, output: PyTree) -> Scalar:
         """Return a number that is positive while the run goes on; the run ends at its zero crossing."""
         ...
 
-    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+    def remainder(self, sample: Sample, stopped: Bool) -> tuple[Scalar, Scalar]:
         """Return time [s] and distance [m] that remain after the last sample."""
         ...
 
@@ -206,11 +207,11 @@ class Objective(Protocol):
         """Return the accumulator before the first step."""
         ...
 
-    def flow(self, memory: Memory, sample: Sample) -> Any:
+    def flow(self, memory: Memory, sample: Sample) -> PyTree:
         """Return d(memory.flow)/dt, integrated with the plant at the order of the method."""
         ...
 
-    def update(self, memory: Memory, segment: Segment) -> Any:
+    def update(self, memory: Memory, segment: Segment) -> PyTree:
         """Return `memory.held` after a step."""
         ...
 
@@ -219,7 +220,7 @@ class Objective(Protocol):
         ...
 
 
-def no_memory(self: Any, signal: Any) -> Memory:
+def no_memory(self: Any, signal: PyTree) -> Memory:
     """Return an empty memory: `start` of a block without memory.
 
     Args:
@@ -230,7 +231,7 @@ def no_memory(self: Any, signal: Any) -> Memory:
     return Memory()
 
 
-def no_flow(self: Any, t: Scalar, memory: Memory, signal: Any) -> Any:
+def no_flow(self: Any, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
     """Return no rates: `flow` of a block without continuous memory.
 
     Args:

@@ -13,7 +13,7 @@ The construction of a part does not check ranges, because JAX rebuilds parts wit
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -25,11 +25,11 @@ from diffabs.core import kinds
 from diffabs.core.arrays import as_array
 from diffabs.core.compiling import is_traced
 from diffabs.core.rules import as_rule_array
+from diffabs.core.types import Matrix as Matrix
+from diffabs.core.types import Params, Part, PyTree
+from diffabs.core.types import Scalar as Scalar
+from diffabs.core.types import Vector as Vector
 from diffabs.core.units import Units, resolve_unit, units_of
-
-Scalar = Any  # a float, a NumPy or JAX scalar, a tracer; a batch of them under vmap
-Vector = Any  # the same with one axis
-Matrix = Any  # with two
 
 T = TypeVar("T")
 
@@ -71,7 +71,7 @@ class ParameterSpec:
         unit = resolve_unit(self.unit, units)
         return self if unit == self.unit else dataclasses.replace(self, unit=unit)
 
-    def within(self, value: Any) -> Any:
+    def within(self, value: Scalar) -> Scalar:
         """Return whether every element of `value` lies in the range, also for traced numbers. NaN does not."""
         x = as_rule_array(value)
         # Comparisons that must be true, not ones that must be false: NaN fails each of them.
@@ -95,7 +95,7 @@ def param(
     infinite: bool = False,
     tunable: bool = True,
     free: bool = False,
-) -> Any:
+) -> Scalar:
     """Return the field of a parameter: one differentiable leaf, with the shape of its default.
 
     Args:
@@ -126,7 +126,7 @@ def param(
     return dataclasses.field(default=default, metadata={"spec": spec})
 
 
-def part(*, default: Any = dataclasses.MISSING) -> Any:
+def part(*, default: Any = dataclasses.MISSING) -> PyTree:
     """Return a field that holds another part, or a tuple of parts.
 
     Args:
@@ -138,7 +138,7 @@ def part(*, default: Any = dataclasses.MISSING) -> Any:
     return dataclasses.field(default_factory=make, metadata={"part": True})
 
 
-def static(*, default: Any = dataclasses.MISSING) -> Any:
+def static(*, default: Any = dataclasses.MISSING) -> Scalar:
     """Return a field known at trace time; another value causes another compilation.
 
     Args:
@@ -180,20 +180,20 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
     the error.
     """
 
-    def flatten(part: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def flatten(part: Part) -> tuple[tuple[PyTree, ...], tuple[PyTree, ...]]:
         return tuple(getattr(part, name) for name in data), tuple(getattr(part, name) for name in meta)
 
-    def flatten_with_keys(part: Any) -> tuple[tuple[tuple[Any, Any], ...], tuple[Any, ...]]:
+    def flatten_with_keys(part: Part) -> tuple[tuple[tuple[PyTree, PyTree], ...], tuple[PyTree, ...]]:
         leaves, statics = flatten(part)
         return tuple(zip(map(jax.tree_util.GetAttrKey, data), leaves, strict=True)), statics
 
-    def unflatten(statics: tuple[Any, ...], leaves: Iterable[Any]) -> Any:
+    def unflatten(statics: tuple[PyTree, ...], leaves: Iterable[PyTree]) -> Any:
         return cls(**dict(zip(data, leaves, strict=True)), **dict(zip(meta, statics, strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
 
-def parameters(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[tuple[str, ParameterSpec, Any]]:
+def parameters(part: Part, prefix: str = "", units: Units | None = None) -> Iterator[tuple[str, ParameterSpec, PyTree]]:
     """Yield every parameter below a part as (dotted path, spec, value), in the order of declaration.
 
     Relative units are resolved below a part with a plant, or in the given `units`.
@@ -211,7 +211,7 @@ def parameters(part: Any, prefix: str = "", units: Units | None = None) -> Itera
             yield from parameters(value, f"{name}.", units)
 
 
-def children(part: Any, prefix: str) -> Iterator[tuple[str, dataclasses.Field[Any] | None, Any]]:
+def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[PyTree] | None, PyTree]]:
     """Yield the fields of a part as (dotted path, field, value), except static fields; items of a tuple have no field.
 
     Args:
@@ -227,7 +227,7 @@ def children(part: Any, prefix: str) -> Iterator[tuple[str, dataclasses.Field[An
                 yield prefix + field.name, field, getattr(part, field.name)
 
 
-def parts(part: Any) -> Iterator[Any]:
+def parts(part: Part) -> Iterator[PyTree]:
     """Yield the parts that a part holds.
 
     Args:
@@ -240,7 +240,7 @@ def parts(part: Any) -> Iterator[Any]:
             yield from value if isinstance(value, tuple) else (value,)
 
 
-def elements(part: Any) -> dict[str, ParameterSpec]:
+def elements(part: Part) -> dict[str, ParameterSpec]:
     """Return the declaration of each single number below a part by path; elements of a list have their index at the
     end.
 
@@ -254,7 +254,7 @@ def elements(part: Any) -> dict[str, ParameterSpec]:
     return found
 
 
-def get(part: Any, path: str) -> Any:
+def get(part: Part, path: str) -> PyTree:
     """Return the value in a part at a dotted path, `plant.road.scale`, or `controller.gain.0` for an element of a list.
 
     Args:
@@ -272,13 +272,13 @@ def get(part: Any, path: str) -> Any:
     return part
 
 
-def _names(part: Any) -> list[str]:
+def _names(part: Part) -> list[str]:
     if isinstance(part, tuple) or dataclasses.is_dataclass(part):
         return [child.rpartition(".")[2] for child, _, _ in children(part, "")]
     return [str(i) for i in range(np.shape(part)[0])] if np.ndim(part) else []
 
 
-def replace(part: T, values: Mapping[str, Any]) -> T:
+def replace(part: T, values: Params) -> T:
     """Return a copy of `part` with the parameters in `values`, by dotted path, replaced. Works under jit, grad and
     vmap.
 
@@ -300,7 +300,7 @@ def replace(part: T, values: Mapping[str, Any]) -> T:
     return part
 
 
-def _replace(part: Any, names: list[str], value: Any) -> Any:
+def _replace(part: Part, names: list[str], value: Scalar) -> Any:
     head, *rest = names
     if not dataclasses.is_dataclass(part) and not isinstance(part, tuple):
         return jnp.asarray(part).at[int(head)].set(_replace(part[int(head)], rest, value) if rest else value)
@@ -343,14 +343,14 @@ def canonical_dtypes(tree: T) -> T:
         return structure.unflatten([as_array(x, dtype) for x in leaves])
 
 
-def _first_unfit(tree: Any) -> str:
+def _first_unfit(tree: PyTree) -> str:
     """Return a line on the first leaf that cannot be a number of a run."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     path, leaf = next((path, leaf) for path, leaf in leaves if kinds.find_value_objection(leaf))
     return f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.format_value(leaf)} {kinds.find_value_objection(leaf)}"
 
 
-def prepare_parts(part: Any) -> Any:
+def prepare_parts(part: Part) -> PyTree:
     """Return the parts with all values precomputed that stay constant during a run.
 
     A part with a method `prepared()` is replaced by its result. Differentiable; a run does it once, inside its compiled
@@ -362,7 +362,7 @@ def prepare_parts(part: Any) -> Any:
     return _rebuild_parts(part, "prepared")
 
 
-def refine_parts(part: Any, times: int) -> Any:
+def refine_parts(part: Part, times: int) -> PyTree:
     """Return the parts for steps shorter by a factor `times`.
 
     A part whose memory covers a number of steps has a method `refined(times)`.
@@ -374,7 +374,7 @@ def refine_parts(part: Any, times: int) -> Any:
     return _rebuild_parts(part, "refined", times)
 
 
-def prepare_derivatives(part: Any, paths: Iterable[str], prefix: str = "") -> Any:
+def prepare_derivatives(part: Part, paths: Iterable[str], prefix: str = "") -> PyTree:
     """Return the parts for derivatives by the parameters at these paths.
 
     A part with a method `differentiated(names)` is replaced by its result for the names of its own parameters.
@@ -395,7 +395,7 @@ def prepare_derivatives(part: Any, paths: Iterable[str], prefix: str = "") -> An
     return part.enable_derivatives(own) if hasattr(part, "differentiated") else part
 
 
-def _rebuild_parts(part: Any, method: str, *args: Any) -> Any:
+def _rebuild_parts(part: Part, method: str, *args: PyTree) -> PyTree:
     """Return the parts, each with this method replaced by the method's result, from the innermost outwards."""
     if isinstance(part, tuple):
         return tuple(_rebuild_parts(item, method, *args) for item in part)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.types import PyTree, Scalar
 from diffabs.core.units import Units, insert_unit
 
 MAX_SHOWN_NUMBERS = 8  # numbers of a list in a message
@@ -35,7 +36,7 @@ class Rule(NamedTuple):
         return Rule(self.holds, prefix + self.broken, lambda: prefix + insert_unit(self.says(), units))
 
 
-def as_rule_array(x: Any) -> Any:
+def as_rule_array(x: Scalar) -> Scalar:
     """Return x as an array: traced numbers unchanged, other numbers in float64 for any default type of JAX.
 
     Args:
@@ -46,7 +47,7 @@ def as_rule_array(x: Any) -> Any:
     return np.asarray(x, float)
 
 
-def order_rule(low: tuple[str, Any], high: tuple[str, Any], unit: str, *, equal: bool = True) -> Rule:
+def order_rule(low: tuple[str, PyTree], high: tuple[str, PyTree], unit: str, *, equal: bool = True) -> Rule:
     """Return the rule that a lower limit does not exceed an upper limit, or lies below it.
 
     Args:
@@ -64,7 +65,7 @@ def order_rule(low: tuple[str, Any], high: tuple[str, Any], unit: str, *, equal:
     )
 
 
-def increase_rule(name: str, values: Any, broken: str, unit: str) -> Rule:
+def increase_rule(name: str, values: PyTree, broken: str, unit: str) -> Rule:
     """Return the rule that each number is greater than the one before.
 
     Args:

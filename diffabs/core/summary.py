@@ -3,14 +3,15 @@
 import dataclasses
 import html
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+
+from diffabs.core.types import PyTree, Scalar
 
 ZERO_TOLERANCE = 1e-14  # smaller numbers, in SI units, are rounding errors
 
 
-def round_for_table(value: Any, digits: int = 6) -> str:
+def round_for_table(value: Scalar, digits: int = 6) -> str:
     """Return a number as text for a table; numbers of the size of rounding errors give 0.
 
     Args:
@@ -21,7 +22,7 @@ def round_for_table(value: Any, digits: int = 6) -> str:
     return "0" if abs(value) < ZERO_TOLERANCE else f"{value:.{digits}g}"
 
 
-def format_cell(value: Any) -> str:
+def format_cell(value: Scalar) -> str:
     """Return a value as text for a table; of a list, the first four entries.
 
     Args:
@@ -41,7 +42,7 @@ class Summary:
 
     title: str
     columns: tuple[str, ...] = ()
-    rows: tuple[tuple[Any, ...], ...] = ()
+    rows: tuple[tuple[PyTree, ...], ...] = ()
     note: str = ""
 
     def __str__(self) -> str:
@@ -66,5 +67,5 @@ class Summary:
         return f"<p><strong>{html.escape(self.title)}</strong></p>{table}{note}"
 
 
-def _row(values: Sequence[Any]) -> str:
+def _row(values: Sequence[PyTree]) -> str:
     return f"<tr>{''.join(f'<td>{html.escape(format_cell(value))}</td>' for value in values)}</tr>"

@@ -1,7 +1,5 @@
 """Periods on the integration grid."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -9,7 +7,7 @@ from diffabs.core.pytree import Scalar
 from diffabs.core.rules import Rule, as_rule_array
 
 
-def steps_in_period(period: Scalar, h: Scalar) -> Any:
+def steps_in_period(period: Scalar, h: Scalar) -> Scalar:
     """Return the number of steps of length h in a period: an integer, so without a derivative.
 
     Args:

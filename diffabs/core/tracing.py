@@ -10,9 +10,10 @@ from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core.first_order import first_order
 from diffabs.core.pytree import parameters
+from diffabs.core.types import PyTree, Scalar
 
 
-def differentiated_paths(tangents: Any) -> frozenset[str]:
+def differentiated_paths(tangents: PyTree) -> frozenset[str]:
     """Return the paths of the parameters by which a part is differentiated.
 
     Args:
@@ -21,7 +22,9 @@ def differentiated_paths(tangents: Any) -> frozenset[str]:
     return frozenset(path for path, _, move in parameters(tangents) if type(move) is not SymbolicZero)
 
 
-def jvp_nonzero(function: Callable[..., Any], primals: Any, tangents: Any, once: str = "") -> tuple[Any, Any]:
+def jvp_nonzero(
+    function: Callable[..., PyTree], primals: PyTree, tangents: PyTree, once: str = ""
+) -> tuple[PyTree, PyTree]:
     """Return function(*primals) and its derivative along tangents, for a rule with `symbolic_zeros`.
 
     Only arguments with a tangent are differentiated, since zero tangents cost as much as others.
@@ -37,7 +40,7 @@ def jvp_nonzero(function: Callable[..., Any], primals: Any, tangents: Any, once:
     moves = tree.flatten_up_to(tangents)
     live = [type(move) is not SymbolicZero for move in moves]
 
-    def run(moving: list[Any]) -> Any:
+    def run(moving: list[PyTree]) -> Any:
         left = iter(moving)
         return function(*tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)]))
 
@@ -48,7 +51,7 @@ def jvp_nonzero(function: Callable[..., Any], primals: Any, tangents: Any, once:
     return found, first_order(rate, once)
 
 
-def split_batched(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[Any], Any]]:
+def split_batched(make: Callable[[PyTree], PyTree], batch: PyTree) -> tuple[PyTree, Callable[[PyTree], PyTree]]:
     """Return the batch-dependent leaves of `make` over a batch, and a function from the leaves of one member to its
     result.
 
@@ -69,17 +72,17 @@ def split_batched(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable
     moves = [not hasattr(v, "val") and v in depends for v in program.jaxpr.outvars]
     fixed, tree = jax.tree.leaves(make(one)), jax.tree.structure(shape)
 
-    def moving_outputs(member: Any) -> list[Any]:
+    def moving_outputs(member: PyTree) -> list[PyTree]:
         return [x for x, on in zip(jax.tree.leaves(make(member)), moves, strict=True) if on]
 
-    def whole(leaves: list[Any]) -> Any:
+    def whole(leaves: list[PyTree]) -> Any:
         rest = iter(leaves)
         return tree.unflatten([next(rest) if on else x for x, on in zip(fixed, moves, strict=True)])
 
     return jax.vmap(moving_outputs)(batch) if any(moves) else [], whole
 
 
-def depends_on_signal(function: Callable[[Any], Any], signal: Any) -> bool:
+def depends_on_signal(function: Callable[[PyTree], PyTree], signal: PyTree) -> bool:
     """Return whether the traced result of a function depends on its signal; a product with a literal zero does not.
 
     Args:
@@ -89,7 +92,7 @@ def depends_on_signal(function: Callable[[Any], Any], signal: Any) -> bool:
     return any(leaf_dependence(function, signal))
 
 
-def leaf_dependence(function: Callable[[Any], Any], signal: Any) -> list[bool]:
+def leaf_dependence(function: Callable[[PyTree], PyTree], signal: PyTree) -> list[bool]:
     """Return for each leaf of a signal whether the traced result of a function depends on it, as in
     `depends_on_signal`.
 
@@ -105,7 +108,7 @@ def leaf_dependence(function: Callable[[Any], Any], signal: Any) -> list[bool]:
     return [atom in needed for atom in program.invars]
 
 
-def moving_leaves(function: Callable[[Any, Any], Any], fixed: Any, batch: Any) -> Any:
+def moving_leaves(function: Callable[[PyTree, PyTree], PyTree], fixed: PyTree, batch: PyTree) -> PyTree:
     """Return for each leaf of `batch` whether function(fixed, batch) of one member has a derivative by it.
 
     Leaves that only enter decisions have no derivative.
@@ -118,7 +121,7 @@ def moving_leaves(function: Callable[[Any, Any], Any], fixed: Any, batch: Any) -
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (fixed, batch))
     program = jax.make_jaxpr(function)(*one).jaxpr
 
-    def moves(atom: Any) -> bool:
+    def moves(atom: PyTree) -> bool:
         return not hasattr(atom, "val") and jnp.issubdtype(atom.aval.dtype, jnp.inexact)
 
     # Integer and boolean values carry no derivative: a comparison ends the dependence.
@@ -130,6 +133,6 @@ def moving_leaves(function: Callable[[Any, Any], Any], fixed: Any, batch: Any) -
     return tree.unflatten([atom in needed for atom in program.invars[-len(leaves) :]])
 
 
-def _zero(step: Any) -> bool:
+def _zero(step: Scalar) -> bool:
     """Return whether an equation of a jaxpr multiplies by a literal zero."""
     return step.primitive.name == "mul" and any(np.all(v.val == 0) for v in step.invars if hasattr(v, "val"))

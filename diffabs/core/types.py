@@ -1,4 +1,7 @@
-"""Type names for annotations. An `Array` may be a tracer; a `pytree.Scalar` is a number or an array."""
+"""Names of types for annotations. An array may be a tracer, and under `vmap` a number stands for a batch of numbers.
+
+An alias of Any says what a reader may expect: a part satisfies a contract by its shape, and the
+structure of a pytree is the caller's."""
 
 from collections.abc import Mapping
 from typing import Any, TypeAlias
@@ -7,9 +10,15 @@ import jax
 import numpy as np
 
 Array: TypeAlias = jax.Array
+AnyArray: TypeAlias = jax.Array | np.ndarray
+Bool: TypeAlias = bool | np.bool_ | np.ndarray | jax.Array  # of one run, or of a batch
+Int: TypeAlias = int | np.integer | np.ndarray | jax.Array
 Key: TypeAlias = jax.Array  # a key of jax.random
-NumPyArray: TypeAlias = np.ndarray
-Bool: TypeAlias = bool | jax.Array  # of one run or of a batch
-Int: TypeAlias = int | jax.Array
-PyTree: TypeAlias = Any  # with any leaves and structure
-Params: TypeAlias = Mapping[str, Any]  # values by dotted path, "plant.mass"
+Scalar: TypeAlias = Any  # a float, a NumPy or JAX scalar, a tracer; a batch of them under vmap
+Vector: TypeAlias = Any  # the same with one axis
+Matrix: TypeAlias = Any  # with two
+PyTree: TypeAlias = Any  # leaves and structure are the caller's
+Part: TypeAlias = Any  # a plant, controller, sensor, ... of `core.protocols`, or a whole loop
+Params: TypeAlias = Mapping[str, Any]  # values by dotted path, "plant.mass", or by name
+Table: TypeAlias = Mapping[str, Any]  # of TOML: numbers, texts, lists and tables by key
+JsonObject: TypeAlias = dict[str, Any]  # for JSON

@@ -8,7 +8,9 @@
 
 import functools
 import re
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from diffabs.core.types import Part
 
 RELATIVE_UNIT = re.compile(r"\b(control|signal)\b")
 UNIT_FACTOR = re.compile(r"(/?)\s*([^\s/^]+)(?:\^(\d+))?")
@@ -21,7 +23,7 @@ class Units(NamedTuple):
     signal: str
 
 
-def units_of(plant: Any) -> Units | None:
+def units_of(plant: Part) -> Units | None:
     """Return the units of a plant's control and first output, or None if the plant declares none.
 
     Args:

@@ -6,19 +6,20 @@ parts in it.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from diffabs.core import kinds
 from diffabs.core.pytree import ParameterSpec, children, parameters
 from diffabs.core.rules import Rule
+from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import Units, insert_unit, units_of
 
 T = TypeVar("T")
 
 
-def find_problems(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[str]:
+def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> Iterator[str]:
     """Yield one line for each field that is out of range, and for each condition of the parts that fails.
 
     The conditions are first the shapes of fields (`problems`). If these are correct, the rules between numbers
@@ -50,7 +51,7 @@ def find_problems(part: Any, prefix: str = "", units: Units | None = None) -> It
         yield from (prefix + insert_unit(line, units) for line in shapes or find_broken(_own(part, "rules")))
 
 
-def part_rules(part: Any, prefix: str = "") -> Iterator[Rule]:
+def part_rules(part: Part, prefix: str = "") -> Iterator[Rule]:
     """Yield every rule of a part and of the parts in it, first the ranges of fields.
 
     These are the conditions of `find_problems` as arrays, for runs with different values. The shapes must be correct.
@@ -67,7 +68,7 @@ def part_rules(part: Any, prefix: str = "") -> Iterator[Rule]:
     yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "rules")
 
 
-def grid_rules(part: Any, step: float, prefix: str = "") -> Iterator[Rule]:
+def grid_rules(part: Part, step: float, prefix: str = "") -> Iterator[Rule]:
     """Yield the rules of the parts on an integration step.
 
     Args:
@@ -87,13 +88,13 @@ def find_broken(rules: Iterable[Rule]) -> Iterator[str]:
     yield from (rule.says() for rule in rules if not bool(rule.holds))
 
 
-def _own(part: Any, hook: str, *args: Any) -> Iterator[Rule]:
+def _own(part: Part, hook: str, *args: PyTree) -> Iterator[Rule]:
     """Yield the rules from a method of this part alone."""
     if hasattr(part, hook):
         yield from getattr(part, hook)(*args)
 
 
-def _below(part: Any, prefix: str, units: Units | None, hook: str, *args: Any) -> Iterator[Rule]:
+def _below(part: Part, prefix: str, units: Units | None, hook: str, *args: PyTree) -> Iterator[Rule]:
     """Yield the rules from a method of the part and of the parts in it, the innermost first."""
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:
@@ -101,7 +102,7 @@ def _below(part: Any, prefix: str, units: Units | None, hook: str, *args: Any) -
     yield from (rule.under(prefix, units) for rule in _own(part, hook, *args))
 
 
-def find_misshapen(part: Any, prefix: str = "") -> Iterator[str]:
+def find_misshapen(part: Part, prefix: str = "") -> Iterator[str]:
     """Yield one line for each parameter of an unbatched part that is not a number or has another shape than its field.
 
     The function does not look at values, so they may be traced.
@@ -117,13 +118,13 @@ def find_misshapen(part: Any, prefix: str = "") -> Iterator[str]:
             yield f"{name} = {kinds.format_value(value)} has shape {kinds.value_shape(value)}; it needs {spec.shape}"
 
 
-def _find_unfit(name: str, spec: ParameterSpec, value: Any) -> str:
+def _find_unfit(name: str, spec: ParameterSpec, value: Scalar) -> str:
     """Return a line for a value that is not a number of a run, or an empty text."""
     line = kinds.find_value_objection(value)
     return line and f"{name} = {kinds.format_value(value)} {line}; a number in {spec.interval()} is needed"
 
 
-def find_cautions(part: Any, prefix: str = "") -> Iterator[str]:
+def find_cautions(part: Part, prefix: str = "") -> Iterator[str]:
     """Yield one line for each setting that is allowed but hardly intended, from the methods `cautions` of the parts.
 
     Args:
@@ -154,6 +155,6 @@ def check_part(part: T, prefix: str = "") -> T:
     return part
 
 
-def _show(value: Any) -> str:
+def _show(value: Scalar) -> str:
     array = np.asarray(value, float)
     return f"{float(array):g}" if array.ndim == 0 else np.array2string(array, threshold=8, precision=4)

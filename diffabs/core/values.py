@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import Part, PyTree, Scalar
 
 FINITE_SPEC = ParameterSpec("1")
 POSITIVE_SPEC = ParameterSpec("1", low=0.0, open_low=True)
@@ -52,7 +53,7 @@ def dotted_path(path: str, key: str) -> str:
     return f"{path}.{key}" if path else key
 
 
-def format_given(value: Any, most: int = 60) -> str:
+def format_given(value: Scalar, most: int = 60) -> str:
     """Return a value for a message: on one line, of bounded length.
 
     Args:
@@ -86,7 +87,7 @@ def unknown_name_error(what: str, name: Any, there: Iterable[str]) -> ScenarioEr
 FORMER_FIELDS = {"torque_min": "low", "torque_max": "high"}
 
 
-def wrong_kind_error(path: str, value: Any, needed: str) -> ScenarioError:
+def wrong_kind_error(path: str, value: Scalar, needed: str) -> ScenarioError:
     """Return the error for a value of the wrong kind.
 
     Args:
@@ -99,7 +100,7 @@ def wrong_kind_error(path: str, value: Any, needed: str) -> ScenarioError:
     return ScenarioError(f"{path} = {format_given(value)} is {kind}; {needed} is needed")
 
 
-def read_number(value: Any, spec: ParameterSpec, path: str) -> float:
+def read_number(value: Scalar, spec: ParameterSpec, path: str) -> float:
     """Return a number as a float, without a check of its range.
 
     Args:
@@ -119,7 +120,7 @@ def read_number(value: Any, spec: ParameterSpec, path: str) -> float:
         raise ScenarioError(f"{path} = {format_given(value)} is too large for a number in {spec.interval()}") from None
 
 
-def read_number_in_range(value: Any, spec: ParameterSpec, path: str) -> float:
+def read_number_in_range(value: Scalar, spec: ParameterSpec, path: str) -> float:
     """Return a number as a float.
 
     Args:
@@ -136,7 +137,7 @@ def read_number_in_range(value: Any, spec: ParameterSpec, path: str) -> float:
     return found
 
 
-def read_whole(value: Any, low: int, high: int, path: str) -> int:
+def read_whole(value: Scalar, low: int, high: int, path: str) -> int:
     """Return a whole number.
 
     Args:
@@ -181,7 +182,7 @@ def choice_reader(*names: str) -> Reader:
         names: The allowed texts.
     """
 
-    def read(given: Any, path: str) -> str:
+    def read(given: PyTree, path: str) -> str:
         if not isinstance(given, str):
             raise wrong_kind_error(path, given, f"one of {', '.join(names)}")
         if given not in names:
@@ -198,7 +199,7 @@ def list_reader(item: Reader) -> Reader:
         item: Reader of the items.
     """
 
-    def read(given: Any, path: str) -> tuple[Any, ...]:
+    def read(given: PyTree, path: str) -> tuple[PyTree, ...]:
         if not isinstance(given, list | tuple):
             raise wrong_kind_error(path, given, "a list")
         return tuple(item(value, f"{path}.{i}") for i, value in enumerate(given))
@@ -214,7 +215,7 @@ def table_reader(item: Reader, what: str = "") -> Reader:
         what: Kind of the values, for messages.
     """
 
-    def read(given: Any, path: str) -> dict[str, Any]:
+    def read(given: PyTree, path: str) -> dict[str, PyTree]:
         if not isinstance(given, Mapping):
             raise wrong_kind_error(path, given, f"a table of {what}" if what else "a table")
         return {key: item(value, dotted_path(path, key)) for key, value in given.items()}
@@ -222,7 +223,7 @@ def table_reader(item: Reader, what: str = "") -> Reader:
     return read
 
 
-def read_as_given(value: Any, path: str) -> Any:
+def read_as_given(value: Scalar, path: str) -> Scalar:
     """Return the value unchanged.
 
     Args:
@@ -233,7 +234,7 @@ def read_as_given(value: Any, path: str) -> Any:
     return value
 
 
-def read_text(given: Any, path: str) -> str:
+def read_text(given: PyTree, path: str) -> str:
     """Return a text.
 
     Args:
@@ -248,7 +249,7 @@ def read_text(given: Any, path: str) -> str:
     return given
 
 
-def read_printable_line(given: Any, path: str) -> str:
+def read_printable_line(given: PyTree, path: str) -> str:
     """Return a text that is one printable line.
 
     Args:
@@ -264,7 +265,7 @@ def read_printable_line(given: Any, path: str) -> str:
     return found
 
 
-def read_printable_lines(given: Any, path: str) -> str:
+def read_printable_lines(given: PyTree, path: str) -> str:
     """Return a text of printable lines.
 
     Args:
@@ -289,7 +290,7 @@ def make_printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
-def read_switch(given: Any, path: str) -> bool:
+def read_switch(given: PyTree, path: str) -> bool:
     """Return true or false.
 
     Args:
@@ -304,7 +305,7 @@ def read_switch(given: Any, path: str) -> bool:
     return given
 
 
-def read_any_number(given: Any, path: str) -> float:
+def read_any_number(given: PyTree, path: str) -> float:
     """Return any number, also NaN and infinity, as a float.
 
     Args:
@@ -317,12 +318,12 @@ def read_any_number(given: Any, path: str) -> float:
     return read_number(given, FINITE_SPEC, path)
 
 
-def _choice(given: Any, path: str) -> float | str:
+def _choice(given: PyTree, path: str) -> float | str:
     """Return a text unchanged, or a number as a float."""
     return given if isinstance(given, str) else read_any_number(given, path)
 
 
-READER_BY_TYPE: dict[Any, Reader] = {
+READER_BY_TYPE: dict[PyTree, Reader] = {
     float: read_any_number,
     bool: read_switch,
     str: read_text,
@@ -333,7 +334,7 @@ READER_BY_TYPE: dict[Any, Reader] = {
 }
 
 
-def table_field(read: Reader, default: Any = dataclasses.MISSING) -> Any:
+def table_field(read: Reader, default: Any = dataclasses.MISSING) -> Scalar:
     """Return the field of a dataclass with this reader.
 
     Args:
@@ -345,7 +346,7 @@ def table_field(read: Reader, default: Any = dataclasses.MISSING) -> Any:
     return dataclasses.field(default=default, metadata={"read": read})
 
 
-def read_table(cls: type, given: Any, path: str, kind: str = "", **readers: Reader) -> Any:
+def read_table(cls: type, given: PyTree, path: str, kind: str = "", **readers: Reader) -> Scalar:
     """Return the instance of a dataclass that a table describes.
 
     Args:
@@ -378,7 +379,7 @@ def _reader(field: dataclasses.Field[Any]) -> Reader:
     return range_reader(spec) if spec else field.metadata.get("read") or READER_BY_TYPE[field.type]
 
 
-def read_one(kinds: Mapping[str, type], given: Any, path: str, **readers: Reader) -> Any:
+def read_one(kinds: Mapping[str, type], given: PyTree, path: str, **readers: Reader) -> Scalar:
     """Return the instance of one of several dataclasses, described by a table with a type or by a bare name.
 
     Args:
@@ -399,7 +400,7 @@ def read_one(kinds: Mapping[str, type], given: Any, path: str, **readers: Reader
     return read_table(kinds[kind], {k: v for k, v in table.items() if k != "type"}, path, kind, **readers)
 
 
-def check_sound(part: Any, name: str) -> Any:
+def check_sound(part: Part, name: str) -> PyTree:
     """Return the part.
 
     Args:
@@ -414,7 +415,7 @@ def check_sound(part: Any, name: str) -> Any:
     return part
 
 
-def as_plain(value: Any, *, brief: bool = False) -> Any:
+def as_plain(value: Scalar, *, brief: bool = False) -> PyTree:
     """Return a value as TOML and JSON represent it: parts as tables, their numbers at full precision.
 
     Args:
@@ -430,7 +431,7 @@ def as_plain(value: Any, *, brief: bool = False) -> Any:
     return value if type(value) in PLAIN_TYPES else np.asarray(value).tolist()
 
 
-def plain_fields(part: Any, *, brief: bool = False) -> dict[str, Any]:
+def plain_fields(part: Part, *, brief: bool = False) -> dict[str, PyTree]:
     """Return the fields of a dataclass by name, converted by `as_plain`.
 
     Args:
@@ -448,7 +449,7 @@ def plain_fields(part: Any, *, brief: bool = False) -> dict[str, Any]:
     return found
 
 
-def format_table(part: Any) -> str:
+def format_table(part: Part) -> str:
     """Return a dataclass as text for messages: `normal(5.75, 0.3, low = 5)`.
 
     Args:

@@ -13,10 +13,10 @@ no such proof, `design.pairs` looks for two vertices that exclude a common P.
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import Matrix
 from diffabs.design import pairs
 from diffabs.design.bounds import BOUND_LOOSENINGS, Bounds, decrease_matrix
 from diffabs.design.polytopes import Polytope, Schedule, as_gain_matrix
@@ -32,7 +32,9 @@ DECAY_TOLERANCE = 1e-3  # relative width at which the search for the fastest dec
 MAX_SEARCH_PROGRAMS = 20  # programs of the search for the fastest decay, at most
 
 
-def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False) -> Certificate:
+def certify(
+    gain: Matrix, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False
+) -> Certificate:
     """Return the proved properties of u = K x: quadratic stability or its impossibility, and each specification.
 
     A property without a proof raises no error: the certificate leaves it out.

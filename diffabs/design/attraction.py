@@ -22,6 +22,7 @@ import numpy as np
 
 from diffabs.controllers.balance import state_of
 from diffabs.core.loop import Loop
+from diffabs.core.types import Matrix, Params, Part, PyTree, Scalar
 from diffabs.design.capture import capture_ellipsoids
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.solution import Solver
@@ -93,16 +94,16 @@ class _Ellipsoids(NamedTuple):
     """
 
     roots: Any
-    hopeless: Any
-    system: Any
+    hopeless: Scalar
+    system: Part
 
-    def own(self, number: Any) -> Any:
+    def own(self, number: Scalar) -> Matrix:
         """Return R and the instability flag of run `number`."""
         # An empty slot of a packed batch has a number beyond the last run.
         mine = self.system[jnp.minimum(number, len(self.system) - 1)]
         return self.roots[mine], self.hopeless[mine]
 
-    def has_reached(self, own: Any, output: Any) -> Any:
+    def has_reached(self, own: PyTree, output: PyTree) -> Scalar:
         """Return whether a run is inside its ellipsoid, with a margin, or unstable."""
         root, hopeless = own
         return (jnp.sum((root @ state_of(output)) ** 2) <= CAPTURE_LEVEL) | hopeless
@@ -118,11 +119,11 @@ class _Ellipsoids(NamedTuple):
 
 def classify_starts(
     loop: Loop,
-    starts: Mapping[str, Any],
+    starts: Params,
     solver: Solver,
     *,
     band: float | None = None,
-    key: Any = None,
+    key: PyTree = None,
     engine: str = "xla",
 ) -> Outcomes:
     """Return the outcome of each run within the solver's duration, shape (runs,).
@@ -155,7 +156,7 @@ def _classify_starts(
     solver: Solver,
     inside: "_Ellipsoids",
     early: bool,
-    key: Any,
+    key: PyTree,
     engine: str,
 ) -> Outcomes:
     """Return the outcomes; with `early`, a run ends when it enters its ellipsoid."""
@@ -166,7 +167,7 @@ def _classify_starts(
         max(1, min(os.cpu_count() or 1, count // MIN_RUNS_PER_CORE)) if engine == "xla" else 1
     )  # a kernel has its threads
 
-    def part(runs: slice) -> Any:
+    def part(runs: slice) -> Matrix:
         """Return the batch of one strided slice of the runs."""
         mine = {path: column[runs] for path, column in starts.items()}
         own = None if keys is None else keys[runs]
@@ -194,7 +195,7 @@ def region_of_attraction(
     *,
     paths: tuple[str, str] = ("initial.theta", "initial.phi"),
     band: float | None = None,
-    key: Any = None,
+    key: PyTree = None,
     engine: str = "xla",
 ) -> Basin:
     """Return the region of attraction over the cells of two axes, the first axis in rows.
@@ -220,7 +221,7 @@ def region_of_attraction(
 
 def largest_recovered_multiples(
     loop: Loop,
-    rows: Mapping[str, Any],
+    rows: Params,
     direction: Mapping[str, float],
     multiples: np.ndarray,
     solver: Solver,
@@ -260,7 +261,7 @@ def recoverable_multiple(
     *,
     most: float = 1.0,
     band: float | None = None,
-    key: Any = None,
+    key: PyTree = None,
     engine: str = "xla",
 ) -> Reach:
     """Return the largest c in [0, most] such that the loop recovers from every tried multiple of `direction` up to c.

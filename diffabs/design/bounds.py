@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import Matrix, PyTree, Scalar
 from diffabs.design.polytopes import Polytope
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Claim
@@ -18,7 +18,7 @@ from diffabs.design.spec import Spec
 BOUND_LOOSENINGS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
-def decrease_matrix(p: Any, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
+def decrease_matrix(p: Matrix, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
     """Return -dV/dt - 2 rate V as a matrix, for V = x'Px and x' = C x.
 
     In discrete time, x+ = C x, it is exp(-2 rate) V - V+.
@@ -69,7 +69,7 @@ class Bounds:
         # Rounded up: the proof requires cot^2 (1 - zeta^2) >= zeta^2 exactly.
         cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)
 
-        def cone(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+        def cone(v: Scalar, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
             flow = v["P"] @ c / np.linalg.norm(c)
             skew = cot * (flow - np.swapaxes(flow, -1, -2))
             return [-symmetric_from_blocks([[he(flow)], [-skew, he(flow)]]) - v["t"] * np.eye(2 * len(c))]
@@ -95,7 +95,7 @@ class Bounds:
         at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
         given = None if l2.disturbance is None else at.inverse @ l2.disturbance / math.sqrt(at.tau)
 
-        def gain_inequalities(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+        def gain_inequalities(v: Scalar, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
             e = at.inverse @ b / math.sqrt(at.tau) if given is None else given
             limit = v["g"] * np.eye(e.shape[1])
             # 1e-10 keeps the answer strictly inside the inequality that the exact proof requires.
@@ -132,7 +132,7 @@ class Bounds:
         # P scales as 1/size^2: the unknown is P size^2, near the unit matrix for starts in any unit.
         starts_size = float(np.linalg.norm(starts, axis=0).max())
 
-        def input_inequalities(v: Any) -> list[np.ndarray]:
+        def input_inequalities(v: Scalar) -> list[np.ndarray]:
             p = v["P"]
             inside = [1 - starts_size**-2 * (x @ p @ x)[..., None, None] for x in starts.T]
             return inside + [symmetric_from_blocks([[p], [row[None] * starts_size, v["g"]]]) for row in rows]
@@ -155,11 +155,11 @@ class Bounds:
     def _solve_in_frame(
         self,
         at: Frame,
-        shapes: dict[str, Any],
-        objective: Callable[[Any], Any],
-        everywhere: Callable[[Any, np.ndarray, np.ndarray], list[np.ndarray]],
-        claim: Callable[[np.ndarray, Any, float], dict[str, Any]],
-        once: Callable[[Any], list[np.ndarray]] | None = None,
+        shapes: dict[str, PyTree],
+        objective: Callable[[PyTree], PyTree],
+        everywhere: Callable[[PyTree, np.ndarray, np.ndarray], list[np.ndarray]],
+        claim: Callable[[np.ndarray, PyTree, float], dict[str, PyTree]],
+        once: Callable[[PyTree], list[np.ndarray]] | None = None,
     ) -> Claim | None:
         """Return the claim of a solved program, loosened until its proof succeeds, or None.
 

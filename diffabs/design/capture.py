@@ -22,8 +22,7 @@ run integrates this equation numerically.
 Source: H. K. Khalil, Nonlinear Systems, 3rd ed., sec. 8.2.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -33,6 +32,7 @@ from diffabs.controllers import BalanceFeedback
 from diffabs.core.blocks import Direct
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
+from diffabs.core.types import Params, Part, PyTree
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.stops import Fallen
 
@@ -50,7 +50,7 @@ class _ClosedLoops(NamedTuple):
     The loop is linear where |row x| <= 1 for every row.
     """
 
-    plant: Any
+    plant: Part
     closed: np.ndarray
     gain: np.ndarray
     limits: np.ndarray
@@ -68,7 +68,7 @@ class CaptureEllipsoids(NamedTuple):
     unstable: np.ndarray
 
 
-def capture_ellipsoids(loop: Loop, values: Mapping[str, Any]) -> CaptureEllipsoids:
+def capture_ellipsoids(loop: Loop, values: Params) -> CaptureEllipsoids:
     """Return the capture ellipsoids of loops that differ in the values at these paths.
 
     Args:
@@ -107,7 +107,7 @@ def _largest_ellipsoids(systems: _ClosedLoops, slowest: np.ndarray) -> np.ndarra
     return best
 
 
-def _build_closed_loops(loop: Loop, values: Mapping[str, Any]) -> _ClosedLoops:
+def _build_closed_loops(loop: Loop, values: Params) -> _ClosedLoops:
     """Return the closed loops in float64, for a loop of any precision."""
     _check_supported(loop)
     # float64 on the CPU: an accelerator may have no float64.
@@ -174,7 +174,7 @@ def _scale_to_largest_level(systems: _ClosedLoops, p: np.ndarray) -> np.ndarray:
 def _growth(systems: _ClosedLoops, p: np.ndarray, inverse: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Return the sum over k in V' <= -2 V (g - sum), shape (n,)."""
 
-    def extent(row: Any) -> np.ndarray:
+    def extent(row: PyTree) -> np.ndarray:
         """Return the largest |row x| on the ellipsoid x'Px <= level."""
         row = np.broadcast_to(row, (len(p), 6))
         return np.sqrt(level * np.einsum("ni,nij,nj->n", row, inverse, row))

@@ -6,11 +6,12 @@ Lyapunov matrix is not necessarily unstable: the frozen loops show how stable it
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from diffabs.core.pytree import replace
+from diffabs.core.types import AnyArray, Part
 from diffabs.design.parameter_box import check_box_bounds, evaluate_systems
 from diffabs.design.polytopes import as_gain_matrix
 
@@ -33,7 +34,7 @@ class FrozenLoops(NamedTuple):
     at: dict[str, float]
 
 
-def analyse_frozen_loops(gain: Any, model: Any, over: Mapping[str, Sequence[float]]) -> FrozenLoops:
+def analyse_frozen_loops(gain: AnyArray, model: Part, over: Mapping[str, Sequence[float]]) -> FrozenLoops:
     """Return the stability of A + B K at the points of a grid over a box, corners included.
 
     Args:

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from diffabs.core.pytree import parameters, replace
+from diffabs.core.types import AnyArray, Matrix, Part, PyTree
 from diffabs.core.validity import check_part
 from diffabs.design.polytopes import MAX_VERTICES, Coverage, Polytope, Schedule
 
@@ -48,7 +49,7 @@ class _SystemRows(NamedTuple):
         return a.reshape(-1, n, n), b.reshape(-1, n, m)
 
 
-def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, most: int = 20_000) -> Polytope:
+def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9, most: int = 20_000) -> Polytope:
     """Return the polytope that covers `model` over a box {path: (low, high)}.
 
     The check uses a grid and 2000 random points, then twice as fine a grid, until a new check finds no system outside.
@@ -94,7 +95,7 @@ def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, 
 
 
 def schedule(
-    model: Any, over: Mapping[str, Sequence[float]], along: str, nodes: int | Sequence[float], **options: Any
+    model: Part, over: Mapping[str, Sequence[float]], along: str, nodes: int | Sequence[float], **options: Any
 ) -> Schedule:
     """Return a chain of polytopes: the box, cut along one of its parameters at `nodes`.
 
@@ -132,7 +133,7 @@ def _require_scipy() -> None:
         raise ModuleNotFoundError('a polytope needs SciPy: pip install ".[design]" in a clone') from None
 
 
-def check_box_bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
+def check_box_bounds(model: Part, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
     """Return the low and the high end of every interval, after a check of each.
 
     Args:
@@ -162,11 +163,11 @@ def check_box_bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[d
 
 
 @partial(jax.jit, static_argnums=1)
-def _batch(model: Any, free: tuple[str, ...], points: Any) -> Any:
+def _batch(model: Part, free: tuple[str, ...], points: PyTree) -> AnyArray:
     return jax.vmap(lambda p: replace(model, dict(zip(free, p, strict=True))).matrices())(points)
 
 
-def evaluate_systems(model: Any, free: tuple[str, ...], points: np.ndarray) -> _SystemRows:
+def evaluate_systems(model: Part, free: tuple[str, ...], points: np.ndarray) -> _SystemRows:
     """Return the matrices at points of the box, in float64.
 
     Args:
@@ -204,7 +205,7 @@ def _points(box: np.ndarray, grid: int, most: int, seed: int) -> np.ndarray:
 
 
 def _cover_box(
-    model: Any, free: tuple[str, ...], box: np.ndarray, corners: _SystemRows, grid: int, most: int
+    model: Part, free: tuple[str, ...], box: np.ndarray, corners: _SystemRows, grid: int, most: int
 ) -> tuple[np.ndarray, Sequence[int], Coverage]:
     """Return the vertices as rows, their corner numbers, and the coverage."""
     if not free:
@@ -332,7 +333,7 @@ def _extreme_points(v: np.ndarray) -> list[int]:
     return sorted(np.unique(v.round(12), axis=0, return_index=True)[1].tolist())
 
 
-def _facets(v: np.ndarray) -> Any:
+def _facets(v: np.ndarray) -> Matrix:
     """Return the hull of v (V, d) with its facets, or None.
 
     None stands for too many facets, or for facets that merge by rounding (64 points in 6-d).

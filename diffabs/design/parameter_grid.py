@@ -9,16 +9,16 @@ systems between the points is likely, not proved. A finer grid makes it more lik
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from diffabs.core.pytree import replace
+from diffabs.core.types import Part
 from diffabs.design.parameter_box import check_box_bounds, evaluate_systems
 from diffabs.design.polytopes import MAX_VERTICES, Polytope
 
 
-def grid_polytope(model: Any, over: Mapping[str, Sequence[float]], points: int = 3) -> Polytope:
+def grid_polytope(model: Part, over: Mapping[str, Sequence[float]], points: int = 3) -> Polytope:
     """Return the polytope whose vertices are the systems of `model` on a grid over a box, its ends included.
 
     Args:

@@ -9,9 +9,10 @@ B) of the same parameters.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+
+from diffabs.core.types import AnyArray, Matrix
 
 MAX_VERTICES = 2**12  # each vertex adds an LMI
 
@@ -81,7 +82,7 @@ class Polytope:
         """Number of inputs m."""
         return self.B.shape[2]
 
-    def closed_loop(self, gain: Any) -> np.ndarray:
+    def closed_loop(self, gain: Matrix) -> np.ndarray:
         """Return A + B K at each vertex for K = `gain`, shape (V, n, n).
 
         Raises:
@@ -110,7 +111,7 @@ class Schedule:
             raise ValueError("the cells of a schedule differ in order, inputs or period")
 
 
-def as_gain_matrix(gain: Any, shape: tuple[int, int]) -> np.ndarray:
+def as_gain_matrix(gain: AnyArray, shape: tuple[int, int]) -> np.ndarray:
     """Return a gain as a matrix of floats, shape (m, n); a gain of shape (n,) is one row.
 
     Args:

@@ -13,10 +13,10 @@ The speed of a braking car falls no faster than friction allows. A common P woul
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
 from diffabs.design.polytopes import Schedule, as_gain_matrix
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
@@ -30,7 +30,7 @@ SCHEDULE_DECAY_TOLERANCE = 0.01  # relative width at which the search for the fa
 FORM_LOOSENINGS = (1e-9, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
-def certify_schedule(gain: Any, system: Schedule, spec: Spec, *, fastest: bool = False) -> Certificate:
+def certify_schedule(gain: AnyArray, system: Schedule, spec: Spec, *, fastest: bool = False) -> Certificate:
     """Return the proved properties of a gain with a parameter-dependent P(p).
 
     Args:
@@ -68,7 +68,7 @@ def _fastest_decay_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Cla
     return best
 
 
-def gains_at_nodes(gain: Any, system: Schedule) -> np.ndarray:
+def gains_at_nodes(gain: AnyArray, system: Schedule) -> np.ndarray:
     """Return the gains at the nodes, shape (N + 1, m, n).
 
     Args:
@@ -120,7 +120,7 @@ def _find_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None
     return None
 
 
-def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: Frame) -> Iterator[Any]:
+def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: Frame) -> Iterator[PyTree]:
     """Yield for each cell, vertex and end of the rates the Bernstein coefficients as formulas of P at the nodes."""
     assert spec.rates is not None
     n = system.cells[0].order
@@ -140,7 +140,7 @@ def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: 
             for rate in sorted(set(spec.rates)):
                 # The defaults bind the loop variables at the definition: a formula may run after the loop has moved on.
                 def coefficients(
-                    v: Mapping[str, np.ndarray], i: int = i, c: Any = closed, q: Any = price, s: float = size,
+                    v: Mapping[str, np.ndarray], i: int = i, c: Scalar = closed, q: Matrix = price, s: float = size,
                     drift: float = rate / width / frame.tau,
                 ) -> list[np.ndarray]:  # fmt: skip
                     start, end = v[f"P{i}"], v[f"P{i + 1}"]

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import Matrix, Part, PyTree, Scalar
 from diffabs.linear.weights import as_weight_matrix
 
 
@@ -13,8 +14,8 @@ from diffabs.linear.weights import as_weight_matrix
 class InputLimit:
     """The bound |u_j(t)| <= limit_j at all times, from every start in the hull of `points` (k, n)."""
 
-    limit: Any
-    points: Any
+    limit: Scalar
+    points: PyTree
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -30,9 +31,9 @@ class L2Gain:
         bound: Bound of the gain; None asks for the smallest.
     """
 
-    output: Any
+    output: PyTree
     feedthrough: Any = None
-    disturbance: Any = None
+    disturbance: Part = None
     bound: float | None = None
 
 
@@ -50,8 +51,8 @@ class Spec:
         rates: Lowest and highest d(parameter)/dt of a `Schedule`.
     """
 
-    Q: Any = None
-    R: Any = None
+    Q: Matrix = None
+    R: Matrix = None
     decay: float = 0.0
     damping: float = 0.0
     input: InputLimit | None = None

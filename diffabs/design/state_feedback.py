@@ -12,7 +12,7 @@ model a discrete one. Gains of zero leave out the integral and the filter.
 import dataclasses
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ from diffabs.controllers import (
 from diffabs.controllers.sampled import Sampled, inner_controller
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.loop import Loop
+from diffabs.core.types import AnyArray, Part, PyTree
 from diffabs.core.units import insert_unit, units_of
 from diffabs.core.validity import check_part
 from diffabs.design.state_feedback_balance import reduce_balance_loop
@@ -94,7 +95,7 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
     return ReducedLoop(model, gain, exact and isinstance(loop.sensor, Direct | Noise | Bias), neglected)
 
 
-def feedback_gain(loop: Loop, states: Sequence[str]) -> Any:
+def feedback_gain(loop: Loop, states: Sequence[str]) -> AnyArray:
     """Return K (n,) of a loop's controller on the named states, with 0 for unused states.
 
     K is differentiable in the controller's parameters. The K of a `ProportionalFeedback` holds at its reference speed.
@@ -132,7 +133,7 @@ def _reduce_at_rest(loop: Loop) -> ReducedLoop:
     return ReducedLoop(model, np.asarray(model.gain(), float), True, tuple(neglected))
 
 
-def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:
+def _gains(controller: Part) -> tuple[PyTree, PyTree, PyTree, PyTree]:
     """Return the gains on integral, slip error, and slip error minus filtered slip error, and the filter's cutoff."""
     if isinstance(controller, StateFeedback | ProportionalFeedback):
         return controller.gain[0], controller.gain[1], 0.0, 0.0
@@ -142,7 +143,7 @@ def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:
     raise ValueError(f"controller {_part_name(controller)} is not linear: it cannot be brought to state feedback")
 
 
-def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
+def _actuator(actuator: Part) -> tuple[Direct | Lag, tuple[str, ...], bool]:
     """Return the linear actuator, its neglected parts, and whether it is exact near the target."""
     blocks = actuator.blocks if isinstance(actuator, Series) else (actuator,)
     lags, neglected, exact = [], [], True
@@ -172,7 +173,7 @@ def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
     return (lags[0] if lags else Direct()), tuple(neglected), exact
 
 
-def _controller_omissions(controller: Any) -> Iterator[str]:
+def _controller_omissions(controller: Part) -> Iterator[str]:
     low, high = map(float, controller.limits())
     if np.isfinite([low, high]).any():
         yield f"The controller's torque limits of {low:g} and {high:g} {{control}}."
@@ -194,6 +195,6 @@ def _loop_omissions(loop: Loop) -> Iterator[str]:
         yield f"The error of the feed-forward ({_part_name(loop.feedforward)}), a disturbance."
 
 
-def _part_name(part: Any) -> str:
+def _part_name(part: Part) -> str:
     """Return the name of a part in words: `sliding mode` for SlidingMode."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()

@@ -1,7 +1,6 @@
 """A balance's controller as static state feedback u = K x on its linear model about upright."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -10,6 +9,7 @@ from diffabs.controllers import BalanceFeedback
 from diffabs.controllers.sampled import Sampled, inner_controller
 from diffabs.core.blocks import Direct
 from diffabs.core.loop import Loop
+from diffabs.core.types import PyTree
 from diffabs.core.validity import check_part
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import Continuous, Sampling
@@ -36,7 +36,7 @@ def reduce_balance_loop(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tup
     return model, np.asarray(controller.gain, float), exact, tuple(_balance_omissions(loop))
 
 
-def _balance_omissions(loop: Loop) -> Iterator[Any]:
+def _balance_omissions(loop: Loop) -> Iterator[PyTree]:
     yield "Everything that is not linear: the proof is about small angles."
     yield "What lies between the points of the grid: a balance is rational in its masses, its hull covers no box."
     if isinstance(loop.actuator, VoltageLimit):

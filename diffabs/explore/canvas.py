@@ -1,21 +1,22 @@
 """A chart on the page, and the messages that change it."""
 
 import json
-from typing import Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
+
+from diffabs.core.types import JsonObject
 
 
 class Canvas:
     """A chart that changes piece by piece: a change keeps everything that it does not name."""
 
-    def __init__(self, options: dict[str, Any], classes: str, name: str = ""):
+    def __init__(self, options: JsonObject, classes: str, name: str = ""):
         """Put a chart with these `options` and CSS `classes` into the open element; `name` is its data-id."""
         self.element = ui.echart(options).classes(classes)
         if name:
             self.element.props(f"data-id={name}")
 
-    def change(self, option: dict[str, Any], edit: int = 0) -> None:
+    def change(self, option: JsonObject, edit: int = 0) -> None:
         """Apply the change `option` to the chart.
 
         `edit` is the browser's number of the user's edit that this change shows, or 0. A change that arrives before the
@@ -29,7 +30,7 @@ class Canvas:
         ui.run_javascript(f"explorer.change({self.element.id}, {change}, {int(edit)})")
 
 
-def encode_change(option: dict[str, Any]) -> str:
+def encode_change(option: JsonObject) -> str:
     """Return a change as JSON text.
 
     Args:

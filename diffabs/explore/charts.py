@@ -4,10 +4,10 @@ Numbers are stored in columns, once each.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import JsonObject, PyTree
 from diffabs.explore.curves import Curves, Fan, Panel
 from diffabs.explore.stability import Stability
 
@@ -24,7 +24,7 @@ LIMIT_ROOM = 1.5  # the control's axis ends at this multiple of its largest magn
 TOP, BOTTOM, BETWEEN = 6.0, 7.5, 6.5  # margins and gaps of the panels in percent of the height
 
 
-def run_chart(found: Curves) -> dict[str, Any]:
+def run_chart(found: Curves) -> JsonObject:
     """Return the options of the chart of a run: axes, legends, and all lines, also those without data yet.
 
     Args:
@@ -55,7 +55,7 @@ def run_chart(found: Curves) -> dict[str, Any]:
     }
 
 
-def change_curves(found: Curves, which: str = "now") -> dict[str, Any]:
+def change_curves(found: Curves, which: str = "now") -> JsonObject:
     """Return the change of the chart that shows a run.
 
     Args:
@@ -66,13 +66,13 @@ def change_curves(found: Curves, which: str = "now") -> dict[str, Any]:
     for i, panel in enumerate(found.panels):
         lines = panel.lines if which == "now" else panel.lines[:1]
         source |= {f"{i}.{j}": round_for_screen(line.values) for j, line in enumerate(lines)}
-    change: dict[str, Any] = {"dataset": [{"id": which, "source": source}]}
+    change: JsonObject = {"dataset": [{"id": which, "source": source}]}
     if which == "now":
         change["yAxis"] = [_limits(panel) for panel in found.panels]
     return change
 
 
-def change_fan(found: Fan | None) -> dict[str, Any]:
+def change_fan(found: Fan | None) -> JsonObject:
     """Return the change of the chart that shows a fan.
 
     Args:
@@ -89,7 +89,7 @@ def change_fan(found: Fan | None) -> dict[str, Any]:
     return {"dataset": [{"id": "fan", "source": source}]}
 
 
-def change_time_axis(end: float | None) -> dict[str, Any]:
+def change_time_axis(end: float | None) -> JsonObject:
     """Return the change of the chart that sets the time axis.
 
     Args:
@@ -102,7 +102,7 @@ def change_time_axis(end: float | None) -> dict[str, Any]:
     }
 
 
-def clear_curves(which: str) -> dict[str, Any]:
+def clear_curves(which: str) -> JsonObject:
     """Return the change of the chart that removes curves.
 
     Args:
@@ -111,7 +111,7 @@ def clear_curves(which: str) -> dict[str, Any]:
     return {"dataset": [{"id": which, "source": {"t": []}}]}
 
 
-def pole_chart() -> dict[str, Any]:
+def pole_chart() -> JsonObject:
     """Return the options of the empty map of poles in the s-plane; modes decay in the left half plane."""
     axis = {
         "type": "value",
@@ -151,7 +151,7 @@ POLE = (
 )
 
 
-def change_poles(found: Stability | None) -> dict[str, Any]:
+def change_poles(found: Stability | None) -> JsonObject:
     """Return the change of the map that shows the poles of a loop.
 
     Poles of a sampled loop are shown as ln(z)/T.
@@ -180,7 +180,7 @@ def _points(values: np.ndarray, period: float | None) -> list[list[float]]:
     return [[float(f"{p.real:.5g}"), float(f"{p.imag:.5g}")] for p in poles]
 
 
-def round_for_screen(values: Any) -> list[float | None]:
+def round_for_screen(values: PyTree) -> list[float | None]:
     """Return numbers rounded to the digits that a screen can show, with None for numbers that are not finite.
 
     Args:
@@ -195,14 +195,14 @@ def round_for_screen(values: Any) -> list[float | None]:
     return [None if math.isnan(x) else float(f"{x:.{CHART_DIGITS}g}") for x in near.tolist()]
 
 
-def _legend(panel: Panel, i: int, top: float) -> dict[str, Any]:
+def _legend(panel: Panel, i: int, top: float) -> JsonObject:
     names = [line.name for line in panel.lines] + ([BEFORE, OUTER, INNER] if i == 0 else [])
     style = {"fontSize": 11, "color": INK}
     place = {"right": 18, "top": f"{top - 5.2:.2f}%", "itemWidth": 18, "itemHeight": 8, "itemGap": 12, "icon": DASH}
     return {"data": names, "textStyle": style, **place}
 
 
-def _x(i: int, *, last: bool) -> dict[str, Any]:
+def _x(i: int, *, last: bool) -> JsonObject:
     name = {"name": "time [s]", "nameLocation": "middle", "nameGap": 26} if last else {}
     return {
         "type": "value",
@@ -217,7 +217,7 @@ def _x(i: int, *, last: bool) -> dict[str, Any]:
     }
 
 
-def _y(panel: Panel, i: int) -> dict[str, Any]:
+def _y(panel: Panel, i: int) -> JsonObject:
     return {
         "type": "value",
         "gridIndex": i,
@@ -243,7 +243,7 @@ def axis_label(panel: Panel) -> str:
     return f"{words} [{panel.unit}]"
 
 
-def _series(panel: Panel, i: int) -> list[dict[str, Any]]:
+def _series(panel: Panel, i: int) -> list[JsonObject]:
     place = {"type": "line", "xAxisIndex": i, "yAxisIndex": i, "showSymbol": False, "symbol": "none"}
     # The lowest band of the stack is transparent; it lifts the others to the 5 % quantile.
     hidden = {**place, "datasetId": "fan", "stack": f"fan {i}", "stackStrategy": "all", "silent": True}
@@ -274,7 +274,7 @@ def _series(panel: Panel, i: int) -> list[dict[str, Any]]:
     return found
 
 
-def _limits(panel: Panel) -> dict[str, Any]:
+def _limits(panel: Panel) -> JsonObject:
     """Return the limits of a control's axis from the delivered control, and nothing for other axes.
 
     The command may lie far beyond the control's range.

@@ -8,6 +8,7 @@ from typing import Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
+from diffabs.core.types import JsonObject, Scalar
 from diffabs.explore.curves import Fan
 from diffabs.explore.knobs import SLIDER_STEPS, Knob, unit_words
 from diffabs.explore.session import AS_GIVEN, EXCHANGEABLE_FAMILIES, Session
@@ -29,8 +30,8 @@ class Controls:
     def __init__(self, session: Session, turned: Turned, replaced: Replaced):
         """Prepare the controls of a `session` with the callbacks `turned` and `replaced`; the page stays unchanged."""
         self.session, self._change, self._replaced = session, turned, replaced
-        self.fields: dict[str, Any] = {}
-        self.sliders: dict[str, Any] = {}
+        self.fields: JsonObject = {}
+        self.sliders: JsonObject = {}
         self.sources = list(dict.fromkeys([session.source, *names()]))
 
     def build(self) -> None:
@@ -91,7 +92,7 @@ class Controls:
                 pass
             more.on_value_change(lambda event: self._more(more, rest) if event.value else None)
 
-    def _more(self, place: Any, keys: list[str]) -> None:
+    def _more(self, place: Scalar, keys: list[str]) -> None:
         """Build the rows of the other numbers when they are opened for the first time."""
         if not any(key in self.fields for key in keys):
             with place:
@@ -160,7 +161,7 @@ class Controls:
         self._change(key, str(text), 0)
 
     # The arguments come from the browser, so their types are checked.
-    def _take_slider(self, key: str, place: Any, edit: Any) -> None:
+    def _take_slider(self, key: str, place: Scalar, edit: Any) -> None:
         knob = self.session.knobs.get(key)
         if knob is None or knob.low is None or not isinstance(place, int | float) or not 0 <= place <= SLIDER_STEPS:
             return

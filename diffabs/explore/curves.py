@@ -2,12 +2,13 @@
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from diffabs.core.pytree import get, parameters
+from diffabs.core.types import Part
 from diffabs.explore.friction import FACTOR_PATH
 from diffabs.explore.knobs import is_vehicle, mass_path
 from diffabs.linear.robustness import low_discrepancy_points
@@ -211,7 +212,7 @@ def _quantiles(values: np.ndarray) -> np.ndarray:
     return np.nanquantile(values, QUANTILES, axis=0)
 
 
-def _panels(run: Run, plant: Any) -> tuple[np.ndarray, tuple[Panel, ...]]:
+def _panels(run: Run, plant: Part) -> tuple[np.ndarray, tuple[Panel, ...]]:
     """Return the instants [s] of one run and its panels, cut at the end of the run."""
     count = len(trajectory_columns(run, plant)["t"][1])
     assert run.trajectory is not None
@@ -222,7 +223,7 @@ def _panels(run: Run, plant: Any) -> tuple[np.ndarray, tuple[Panel, ...]]:
     return np.asarray(run.trajectory.sample.t)[:count], cut
 
 
-def _layout(run: Run, plant: Any) -> list[Panel]:
+def _layout(run: Run, plant: Part) -> list[Panel]:
     """Return the panels of one run or a batch, in full length.
 
     They are the first signals with target and setpoint, the signals of the next unit, and the control with its command.

@@ -5,9 +5,9 @@ the scenario become one level deeper. A factor that stays at 1 is removed again 
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
+from diffabs.core.types import JsonObject, Part, Table
 from diffabs.roads import Scaled
 from diffabs.scenario.scenario import Scenario
 
@@ -26,7 +26,7 @@ def with_factor(chosen: Scenario) -> Scenario:
     road = getattr(chosen.loop.plant, "road", None)
     if road is None or isinstance(road, Scaled):
         return chosen
-    plant: Any = chosen.loop.plant
+    plant: Part = chosen.loop.plant
     plant = dataclasses.replace(plant, road=Scaled(road=road))
     return _rename_paths(chosen, plant, lambda path: INNER + path[len(ROAD) :] if path.startswith(ROAD) else path)
 
@@ -42,13 +42,13 @@ def without_factor(chosen: Scenario, given: Scenario) -> Scenario:
     had = isinstance(getattr(given.loop.plant, "road", None), Scaled)
     if not isinstance(road, Scaled) or had or float(road.scale) != 1.0:
         return chosen
-    plant: Any = chosen.loop.plant
+    plant: Part = chosen.loop.plant
     plant = dataclasses.replace(plant, road=road.road)
     return _rename_paths(chosen, plant, lambda path: ROAD + path[len(INNER) :] if path.startswith(INNER) else path)
 
 
-def _rename_paths(chosen: Scenario, plant: Any, name: Callable[[str], str]) -> Scenario:
-    def keys(table: Mapping[str, Any]) -> dict[str, Any]:
+def _rename_paths(chosen: Scenario, plant: Part, name: Callable[[str], str]) -> Scenario:
+    def keys(table: Table) -> JsonObject:
         return {name(path): value for path, value in table.items()}
 
     tune, sweep = chosen.tune, chosen.sweep

@@ -12,8 +12,10 @@ import http.cookies
 import ipaddress
 import secrets
 import urllib.parse
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
+
+from diffabs.core.types import Table
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Any]]
@@ -57,7 +59,7 @@ class Guard:
         else:
             await _answer(send, 403, STRANGER)
 
-    def is_allowed(self, scope: Mapping[str, Any]) -> bool:
+    def is_allowed(self, scope: Table) -> bool:
         """Return whether the request with this `scope` comes from this machine and from a page of the explorer."""
         given = _headers(scope)
         host, origin = given.get(b"host", []), given.get(b"origin", [])
@@ -66,7 +68,7 @@ class Guard:
         own = origin in ([], [f"http://{host[0]}"]) if here else False
         return here and own and _loopback(scope.get("client"))
 
-    def is_known(self, scope: Mapping[str, Any]) -> bool:
+    def is_known(self, scope: Table) -> bool:
         """Return whether the request with this `scope` has the cookie that replaces the token."""
         given = []
         for line in _headers(scope).get(b"cookie", []):
@@ -82,7 +84,7 @@ class Guard:
         return len(given) == 1 and secrets.compare_digest(given[0].encode(), self.token.encode())
 
 
-def _headers(scope: Mapping[str, Any]) -> dict[bytes, list[str]]:
+def _headers(scope: Table) -> dict[bytes, list[str]]:
     given: dict[bytes, list[str]] = {}
     for name, value in scope["headers"]:
         given.setdefault(name.lower(), []).append(value.decode("latin-1"))

@@ -3,11 +3,11 @@
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
 from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import unit_at
 from diffabs.core.values import read_number_in_range, wrong_kind_error
 from diffabs.explore.friction import FACTOR_PATH
@@ -56,7 +56,7 @@ class Knob:
         """Path of this number, with its index in a list."""
         return self.path if self.place is None else f"{self.path}.{self.place}"
 
-    def read(self, given: Any) -> float:
+    def read(self, given: PyTree) -> float:
         """Return a typed or dragged value, `given` in the displayed unit, in SI.
 
         Raises:
@@ -116,7 +116,7 @@ def knobs(chosen: Scenario) -> dict[str, Knob]:
     return {knob.key: knob for knob in found}
 
 
-def is_vehicle(plant: Any) -> bool:
+def is_vehicle(plant: Part) -> bool:
     """Return whether a plant shows the speed of a wheel; such a plant's speeds are displayed in km/h.
 
     Args:
@@ -176,7 +176,7 @@ def mass_path(chosen: Scenario) -> str | None:
     return None
 
 
-def _knob(chosen: Scenario, path: str, spec: ParameterSpec, value: Any) -> Iterator[Knob]:
+def _knob(chosen: Scenario, path: str, spec: ParameterSpec, value: Scalar) -> Iterator[Knob]:
     """Yield the numbers of one parameter; a matrix has none."""
     tail = path.rpartition(".")[2]
     scale = KMH if spec.unit == "m/s" and tail in SPEED_FIELDS and is_vehicle(chosen.loop.plant) else 1.0

@@ -10,6 +10,7 @@ from typing import Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
+from diffabs.core.types import PyTree
 from diffabs.core.values import ScenarioError
 from diffabs.explore import charts, curves, stability
 from diffabs.explore.canvas import Canvas, encode_change
@@ -97,7 +98,7 @@ class Page:
         self.drawer.ask(partial(self._draw, now, self.version, edit, key))
         self.thinker.ask(partial(self._think, now, self.version))
 
-    def later(self, show: Callable[..., None], *given: Any) -> None:
+    def later(self, show: Callable[..., None], *given: PyTree) -> None:
         """Call show(*given) in the server's thread; for use in worker threads."""
 
         def do() -> None:
@@ -138,7 +139,7 @@ class Page:
         self.tuner.end()
 
     # Methods that run in the server's thread.
-    def _change(self, key: str, given: Any, edit: int) -> None:
+    def _change(self, key: str, given: PyTree, edit: int) -> None:
         """Apply a dragged or typed number."""
         try:
             self.session.put(key, given)

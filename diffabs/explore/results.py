@@ -1,10 +1,10 @@
 """The right column: verdict, map of poles, margins, and metrics of the run."""
 
 import math
-from typing import Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
+from diffabs.core.types import JsonObject, PyTree
 from diffabs.explore import charts
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words
@@ -63,7 +63,7 @@ class ResultsPanel:
         for line in (self.word, self.why, self.none, self.loop):
             line.set_text("")
         self.numbers.clear()
-        self.cells: dict[str, Any] = {}
+        self.cells: JsonObject = {}
         with self.numbers:
             for name, unit in self.units.items():
                 ui.label(name.replace("_", " "))
@@ -127,7 +127,7 @@ class ResultsPanel:
         self.none = ui.label("").classes("note").props("data-id=about-poles")
         self.poles_of = ui.label("").classes("note").props("data-id=poles-of")
         table = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
-        self.margin_cells: dict[str, tuple[Any, Any]] = {}
+        self.margin_cells: dict[str, tuple[PyTree, PyTree]] = {}
         with table.props("data-id=margins"):
             for words in ("margins", "here", "worst"):
                 ui.label(words).classes("head" if words == "margins" else "head number")

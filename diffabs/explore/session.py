@@ -6,12 +6,13 @@ edits.
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, get, replace
+from diffabs.core.types import PyTree, Scalar
 from diffabs.core.validity import find_problems
 from diffabs.core.values import ScenarioError, read_number_in_range, unknown_name_error, wrong_kind_error
 from diffabs.explore import friction, knobs, tuning
@@ -92,7 +93,7 @@ class Session:
         there = family == "controller" or hasattr(self.given.loop.plant, family)
         return [AS_GIVEN, *sorted(registry.family_types(family))] if there else []
 
-    def turn(self, key: str, given: Any) -> float:
+    def turn(self, key: str, given: PyTree) -> float:
         """Set the number `key` to a value `given` in its displayed unit, and return it in SI.
 
         Raises:
@@ -108,7 +109,7 @@ class Session:
         self.accept(now.loop)
         return value
 
-    def put(self, key: str, given: Any) -> float:
+    def put(self, key: str, given: PyTree) -> float:
         """Set the number `key` to a value `given` in its displayed unit, and return it in SI, without a check of the
         loop.
 
@@ -144,7 +145,7 @@ class Session:
         self.adopt(self._accepted)
         return [key for key, value in before.items() if value != self.value(key)]
 
-    def widen(self, name: str, given: Any) -> None:
+    def widen(self, name: str, given: PyTree) -> None:
         """Set the spread of the fan's members in `name` ("mass" or "road") to a value `given` in percent.
 
         Raises:
@@ -215,7 +216,7 @@ class Session:
         return {key: self.value(key) for key, knob in self.knobs.items() if knob.path in changed}
 
 
-def _value(value: Any, knob: Knob) -> float:
+def _value(value: Scalar, knob: Knob) -> float:
     return float(np.asarray(value, float)[() if knob.place is None else knob.place])
 
 

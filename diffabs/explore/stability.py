@@ -1,12 +1,13 @@
 """Poles and margins of the linearised loop, for the current values and at the corners of the [design.over] ranges."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from diffabs.core.pytree import replace
+from diffabs.core.types import PyTree
 from diffabs.linear.robustness import band
 from diffabs.linear.stability_margins import Margins, closed_loop_poles
 from diffabs.scenario.scenario import Scenario
@@ -55,14 +56,14 @@ class CornerLoops(NamedTuple):
         systems: Number of corners.
     """
 
-    of: tuple[Any, ...]
+    of: tuple[PyTree, ...]
     poles: np.ndarray
     worst: dict[str, float]
     unstable: int
     systems: int
 
 
-def corners_of(chosen: Scenario) -> tuple[Any, ...]:
+def corners_of(chosen: Scenario) -> tuple[PyTree, ...]:
     """Return a key for the corners: their ranges, and the loop with each ranged parameter at its lower end.
 
     Args:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
+from diffabs.core.types import PyTree, Scalar
 from diffabs.core.values import ScenarioError
 from diffabs.explore import curves, tuning
 from diffabs.explore.canvas import Canvas
@@ -87,7 +88,7 @@ class Tuner:
                 ui.button("start", on_click=start).props("unelevated no-caps data-id=start")
         dialog.open()
 
-    def _bounds(self, place: Any, now: Scenario, paths: list[str], fields: dict[str, Fields]) -> None:
+    def _bounds(self, place: Scalar, now: Scenario, paths: list[str], fields: dict[str, Fields]) -> None:
         """Show fields for the lower and upper bound of each free number."""
         known = self.page.session.knobs
         place.clear()
@@ -120,7 +121,7 @@ class Tuner:
         asked += [f"damping ≥ {task.damping:g}"] if task.damping else []
         return f"over {lanes}{'; such that ' + ', '.join(asked) if asked else ''}; at most {task.iterations} iterations"
 
-    def _start(self, paths: list[str], metric: str, bounded: dict[str, tuple[Any, Any]]) -> None:
+    def _start(self, paths: list[str], metric: str, bounded: dict[str, tuple[PyTree, PyTree]]) -> None:
         session = self.page.session
         try:
             chosen = tuning.scenario_with_goal(session.scenario(), paths, metric, session.knobs, bounded)

@@ -2,11 +2,12 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from diffabs.core.pytree import get, parameters
+from diffabs.core.types import PyTree
 from diffabs.core.values import ScenarioError
 from diffabs.explore.knobs import Knob
 from diffabs.scenario.scenario import Scenario
@@ -15,8 +16,8 @@ from diffabs.scenario.scenario import Scenario
 class TuningTask(NamedTuple):
     """The runs of a tuning, as a batch, and its constraints."""
 
-    batch: Any
-    constraints: Sequence[Any]
+    batch: PyTree
+    constraints: Sequence[PyTree]
 
 
 class TuningFound(NamedTuple):
@@ -95,7 +96,7 @@ def scenario_with_goal(
     paths: Sequence[str],
     metric: str,
     known: Mapping[str, Knob],
-    bounded: Mapping[str, tuple[Any, Any]] | None = None,
+    bounded: Mapping[str, tuple[PyTree, PyTree]] | None = None,
 ) -> Scenario:
     """Return the scenario with these free parameters and this metric as the objective.
 
@@ -156,8 +157,8 @@ def tune_scenario(
 
 
 def _range(
-    chosen: Scenario, path: str, known: Mapping[str, Knob], bounded: Mapping[str, tuple[Any, Any]]
-) -> tuple[Any, Any]:
+    chosen: Scenario, path: str, known: Mapping[str, Knob], bounded: Mapping[str, tuple[PyTree, PyTree]]
+) -> tuple[PyTree, PyTree]:
     """Return the lower and the upper bound of a parameter in SI, in its shape."""
     ends = {
         **bounds_on_page(chosen, path, known),

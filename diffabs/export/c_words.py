@@ -5,10 +5,10 @@ An operation without a translation raises Unsupported with its name.
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import Scalar
 from diffabs.kernel.graph import Node, is_real
 from diffabs.kernel.primitives import Unsupported
 
@@ -85,7 +85,7 @@ class Words:
             return "true" if x else "false"
         return self.literal(x) if is_real(node.dtype) else f"(({C_TYPES[node.dtype.name]}){int(x)})"
 
-    def literal(self, x: Any) -> str:
+    def literal(self, x: Scalar) -> str:
         """Return the C literal of the real number `x` (a NumPy scalar): the shortest decimal that reads back as `x`."""
         if np.isnan(x):
             return "NAN"

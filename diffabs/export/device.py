@@ -25,6 +25,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import ParameterSpec, as_arrays, canonical_dtypes, parameters, prepare_parts
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
+from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.simulate.rk4 import rk4_step
 
 MAX_STEPS_PER_SAMPLE = 64  # simulation steps in a period, for a target that moves by itself
@@ -42,8 +43,8 @@ class Input(NamedTuple):
         target: Target, if it comes from outside.
     """
 
-    measured: Any
-    target: Any = ()
+    measured: PyTree
+    target: Scalar = ()
 
 
 class State(NamedTuple):
@@ -57,17 +58,17 @@ class State(NamedTuple):
     """
 
     controller: Memory
-    samples: Any
-    command: Any
+    samples: PyTree
+    command: Scalar
     reference: Memory
 
 
 class Parts(NamedTuple):
     """The parts with variable parameters; the reference is empty if the target comes from outside."""
 
-    controller: Any
-    feedforward: Any
-    reference: Any = ()
+    controller: Part
+    feedforward: Part
+    reference: Part = ()
 
 
 class DeviceParameter(NamedTuple):
@@ -124,8 +125,8 @@ class ComputerProgram:
     """
 
     start: Callable[[Parts, Input], State]
-    step: Callable[[Parts, State, Input], tuple[Memory, Any, Any, Any]]
-    move: Callable[[Parts, State, Any], Memory]
+    step: Callable[[Parts, State, Input], tuple[Memory, PyTree, PyTree, PyTree]]
+    move: Callable[[Parts, State, PyTree], Memory]
     moves: int
     units: dict[str, str]
     input: Input
@@ -155,7 +156,7 @@ def computer_program(
             a period has more than MAX_STEPS_PER_SAMPLE steps.
     """
     loop = with_sampled_controller(loop)
-    controller: Any = loop.controller
+    controller: Part = loop.controller
     with jax.enable_x64(True):
         typed: Loop = jax.tree.map(lambda x: jnp.asarray(x, dtype), canonical_dtypes(as_arrays(loop)))
         computer: Any = typed.controller
@@ -183,7 +184,7 @@ def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Itera
     """Yield the parameters that the computer's calculation depends on."""
     measured = given.measured
 
-    def ahead(plant: Any) -> Any:
+    def ahead(plant: Part) -> Any:
         return typed.feedforward.input(plant, measured, measured[0])
 
     families = ["controller", "feedforward", *(() if given_target else ("reference",))]
@@ -204,7 +205,7 @@ def with_sampled_controller(loop: Loop) -> Loop:
     Raises:
         NotExported: The controller runs in continuous time.
     """
-    controller: Any = loop.controller
+    controller: Part = loop.controller
     if isinstance(controller, SampledOnGrid):
         inner, period = controller.controller, controller.sampling_period
         controller = Sampled(controller=inner, period=period, delay=controller.delay)
@@ -231,7 +232,7 @@ def _steps(period: float, step: float | None) -> int:
     return max(count, 1)
 
 
-def _check_reference(loop: Loop, measured: Any) -> None:
+def _check_reference(loop: Loop, measured: PyTree) -> None:
     """Raise NotExported for a target that depends on measurements between samples, ticks, or has events."""
     reference, name = loop.reference, type(loop.reference).__name__
     memory = reference.start(measured)
@@ -256,7 +257,7 @@ class _Work:
         zero = jnp.zeros_like(tracking.target)
         return State(loop.controller.controller.start(tracking), jnp.zeros((), jnp.int64), zero, reference)
 
-    def step(self, parts: Parts, state: State, given: Input) -> tuple[Memory, Any, Any, Any]:
+    def step(self, parts: Parts, state: State, given: Input) -> tuple[Memory, PyTree, PyTree, PyTree]:
         """Return the controller's memory after a sample, the number of samples, the command, and the truth `held`."""
         loop, t = self._with(parts), self._time(state)
         tracking, lost = self._track(loop, state.reference, given, t)
@@ -264,30 +265,30 @@ class _Work:
         inner, command, held = loop.controller.compute_guarded(clock, state.controller, state.command, tracking, lost)
         return inner, state.samples + 1, command, held
 
-    def move(self, parts: Parts, state: State, i: Any) -> Memory:
+    def move(self, parts: Parts, state: State, i: Scalar) -> Memory:
         """Return the reference's memory after the i-th simulation step in a period."""
         loop = self._with(parts)
         h, memory = loop.controller.period / self.count, state.reference
         # `_check_reference` has shown that the reference ignores measurements, so zeros stand for them.
         zero = jax.tree.map(jnp.zeros_like, self.given.measured)
 
-        def rate(t: Any, x: Any) -> Any:
+        def rate(t: Scalar, x: Scalar) -> Any:
             return loop.reference.flow(t, memory._replace(flow=x), zero)
 
         return memory._replace(flow=rk4_step(rate, self._time(state) + i * h, memory.flow, h))
 
-    def _with(self, parts: Parts) -> Any:
+    def _with(self, parts: Parts) -> PyTree:
         """Return the loop with these parts in it."""
         controller = dataclasses.replace(self.sampled, controller=prepare_parts(parts.controller))
         loop = dataclasses.replace(self.loop, controller=controller, feedforward=prepare_parts(parts.feedforward))
         return loop if self.given_target else dataclasses.replace(loop, reference=prepare_parts(parts.reference))
 
-    def _time(self, state: State) -> Any:
+    def _time(self, state: State) -> PyTree:
         """Return the time of the sample [s]."""
         period = self.sampled.period
         return state.samples.astype(jnp.result_type(period)) * period
 
-    def _track(self, loop: Loop, reference: Memory, given: Input, t: Any) -> tuple[Tracking, Any]:
+    def _track(self, loop: Loop, reference: Memory, given: Input, t: Scalar) -> tuple[Tracking, PyTree]:
         """Return the controller's input, and whether a NaN enters the feed-forward."""
         measured = replace_nan(given.measured)
         if self.given_target:
@@ -296,7 +297,7 @@ class _Work:
             target = loop.reference.output(t, reference, measured)
             setpoint = loop.reference.setpoint(reference)
 
-        def ahead(measured: Any) -> Any:
+        def ahead(measured: PyTree) -> Any:
             return loop.feedforward.input(loop.plant, measured, setpoint)
 
         # Only measurements that the feed-forward depends on can spoil it. The controller checks the others itself.

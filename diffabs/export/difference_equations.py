@@ -1,17 +1,16 @@
 """A sampled controller as linear difference equations, valid while no limit is active."""
 
-from typing import Any
-
 import numpy as np
 
 from diffabs.core.loop import Loop
+from diffabs.core.types import AnyArray, JsonObject, Scalar
 from diffabs.export.device import NotExported, with_sampled_controller
 from diffabs.linear.opened_loop import open_loop
 
 ENTRY_ROUNDING = 1e-12  # relative to a matrix's largest coefficient; smaller coefficients are rounding errors
 
 
-def difference_equations(loop: Loop, target: Any = None) -> dict[str, Any]:
+def difference_equations(loop: Loop, target: Scalar = None) -> JsonObject:
     """Return the coefficients of the controller, linearized at rest on the setpoint.
 
     x(k+1) = F x(k) + G y(k) and u(k) = H x(k) + J y(k), all as differences from rest.
@@ -42,6 +41,6 @@ def difference_equations(loop: Loop, target: Any = None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _round_entries(matrix: Any) -> np.ndarray:
+def _round_entries(matrix: AnyArray) -> np.ndarray:
     """Return a matrix with entries that are rounding errors set to 0."""
     return np.where(np.abs(matrix) > ENTRY_ROUNDING * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)

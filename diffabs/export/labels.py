@@ -9,10 +9,12 @@ If the source is not readable, the numbers get the names of their operations.
 import ast
 import functools
 import pathlib
-from typing import Any
 
 import jax
+from jax.extend.core import JaxprEqn
+from jax.typing import DTypeLike
 
+from diffabs.core.types import PyTree
 from diffabs.kernel.graph import Graph, Node, UpdateLevel
 
 PACKAGE = pathlib.Path(__file__).parents[1]
@@ -35,13 +37,13 @@ class Labelled(Graph):
         self.labels: dict[int, str] = {}
         self._label = ""
 
-    def begins(self, eqn: Any) -> None:
+    def begins(self, eqn: JaxprEqn) -> None:
         """Use the label of the operation `eqn` for the following nodes."""
         # Equations of an inner program have no label of their own: the one of the call stays.
         self._label = self.labels.get(id(eqn), self._label)
 
     def _make(
-        self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: UpdateLevel | None = None
+        self, op: str, args: tuple[Node, ...], dtype: DTypeLike, attr: PyTree = None, level: UpdateLevel | None = None
     ) -> Node:
         node = super()._make(op, args, dtype, attr, level)
         # Equal nodes are one, so the first use names it.
@@ -49,7 +51,7 @@ class Labelled(Graph):
         return node
 
 
-def source_label(eqn: Any) -> str:
+def source_label(eqn: JaxprEqn) -> str:
     """Return the name that the source gives to the result of an operation; empty if unknown.
 
     Args:

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from diffabs.core.types import PyTree
 from diffabs.export.device import ComputerProgram
 from diffabs.export.labels import Labelled, source_label
 from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel
@@ -91,7 +92,7 @@ class Lowered:
         return [name for name in self.state if name in kept]
 
 
-def number_leaves(shape: Any, graph: Graph, where: str, flat: Any) -> dict[str, Node]:
+def number_leaves(shape: PyTree, graph: Graph, where: str, flat: PyTree) -> dict[str, Node]:
     """Return an input node for each number of a pytree, by name.
 
     Args:
@@ -109,7 +110,7 @@ def number_leaves(shape: Any, graph: Graph, where: str, flat: Any) -> dict[str, 
     return found
 
 
-def fill_shapes(shape: Any, nodes: dict[str, Node]) -> list[Array]:
+def fill_shapes(shape: PyTree, nodes: dict[str, Node]) -> list[Array]:
     """Return some nodes as arrays in the shapes of a pytree's leaves.
 
     Args:
@@ -125,7 +126,7 @@ def fill_shapes(shape: Any, nodes: dict[str, Node]) -> list[Array]:
     return arrays
 
 
-def trace_outputs(graph: Labelled, function: Any, shape: Any, inputs: list[Array]) -> list[Node]:
+def trace_outputs(graph: Labelled, function: Any, shape: PyTree, inputs: list[Array]) -> list[Node]:
     """Return the results of a function, number by number; arrays it closes over become constants.
 
     Args:

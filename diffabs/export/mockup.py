@@ -19,6 +19,7 @@ from typing import Any
 from xml.etree import ElementTree as xml
 
 from diffabs.core.loop import Loop
+from diffabs.core.types import PyTree
 from diffabs.core.values import make_printable
 from diffabs.export.c_words import is_name
 from diffabs.export.device import NotExported
@@ -151,7 +152,7 @@ def _variable(parent: Any, one: FmuVariable, reference: int) -> None:
     )
 
 
-def _unknowns(structure: Any, variables: Sequence[FmuVariable]) -> None:
+def _unknowns(structure: PyTree, variables: Sequence[FmuVariable]) -> None:
     """Add the model structure: every output depends on the state, and in initialization on the parameters."""
     outputs = [k for k, one in enumerate(variables, 1) if one.role == "output"]
     for tag in ("Outputs", "InitialUnknowns"):

@@ -6,7 +6,7 @@ The text comes from the functions that the simulation calls, traced as for a con
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, canonical_dtypes, parameters, prepare_parts
+from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.export.c_words import Words
 from diffabs.export.device import NotExported
 from diffabs.export.labels import Labelled
@@ -113,7 +114,7 @@ def _limits(spec: ParameterSpec) -> tuple[float, float]:
 class _Written:
     """A writer of the plant's functions."""
 
-    def __init__(self, typed: tuple[Any, Any], variables: Sequence[FmuVariable]):
+    def __init__(self, typed: tuple[PyTree, PyTree], variables: Sequence[FmuVariable]):
         self.places = {one.name: k for k, one in enumerate(variables)}
         self.words = Words("double", self._place)
         graph = Labelled()
@@ -167,7 +168,7 @@ class _Written:
         yield "}\n"
 
 
-def _advance_state(plant: Any, state: Any, control: Any, t: Any, h: Any) -> Any:
+def _advance_state(plant: Part, state: PyTree, control: Scalar, t: Scalar, h: Scalar) -> PyTree:
     """Return the state after a step with constant control, as `FixedStep` computes it."""
     plant = prepare_parts(plant)
     return plant.project(rk4_step(lambda t, x: plant.derivative(t, x, control), t, state, h))

@@ -1,11 +1,12 @@
 """Protocol of measured data that `identify` can compare with a loop."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from diffabs.core.loop import Loop
+from diffabs.core.types import PyTree, Scalar
 from diffabs.identify.residuals import Residuals
 from diffabs.simulate.solution import Solver
 
@@ -21,9 +22,9 @@ class Comparison(NamedTuple):
     """
 
     residuals: Residuals
-    data: tuple[Any, ...]
+    data: tuple[PyTree, ...]
     sigma: np.ndarray | None
-    loops: Callable[[Any], list[Any]]
+    loops: Callable[[PyTree], list[PyTree]]
 
 
 class Data(Protocol):
@@ -43,7 +44,7 @@ class Data(Protocol):
         ...
 
 
-def check_positive(name: str, value: Any, unit: str) -> None:
+def check_positive(name: str, value: Scalar, unit: str) -> None:
     """Check that a standard deviation is positive and finite.
 
     Args:

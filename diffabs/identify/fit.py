@@ -13,7 +13,6 @@ Source: M. A. Branch, T. F. Coleman and Y. Li, SIAM J. Sci. Comput. 21 (1999).
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +23,7 @@ from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary, round_for_table
+from diffabs.core.types import AnyArray, JsonObject, Matrix, Part, PyTree, Table
 from diffabs.core.validity import check_part
 from diffabs.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
@@ -69,8 +69,8 @@ class Identified:
         diverged: Starts that could not be used.
     """
 
-    part: Any
-    values: dict[str, Any]
+    part: Part
+    values: JsonObject
     residuals: np.ndarray
     sigma: np.ndarray
     chi2: float
@@ -79,9 +79,9 @@ class Identified:
     history: list[float]
     evaluations: int
     reason: Reason
-    start: dict[str, Any]
+    start: JsonObject
     starts: tuple["Identified", ...] = ()
-    diverged: tuple[dict[str, Any], ...] = ()
+    diverged: tuple[JsonObject, ...] = ()
 
     def table(self) -> Summary:
         """Return a table of the parameters before and after the fit, with their standard deviations."""
@@ -102,18 +102,18 @@ class Identified:
 
 
 def fit(
-    part: Any,
+    part: Part,
     free: Sequence[str] | Mapping[str, Range | None],
     residuals: Residuals,
     *,
-    data: tuple[Any, ...] = (),
-    sigma: Any = None,
+    data: tuple[PyTree, ...] = (),
+    sigma: AnyArray | None = None,
     absolute: bool = True,
     prior: Prior | None = None,
-    starts: Sequence[Mapping[str, Any]] = (),
+    starts: Sequence[Table] = (),
     norm: float = 2.0,
     tolerances: Tolerances | None = None,
-    usable: Callable[[Any], bool] | None = None,
+    usable: Callable[[PyTree], bool] | None = None,
     progress: Callable[[int, float], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> Identified:
@@ -167,7 +167,7 @@ class _FitMonitor:
     before: int = 0
 
 
-def _check_fit(p: int, n: int, k: int, sigma: Any, norm: float, absolute: bool) -> None:
+def _check_fit(p: int, n: int, k: int, sigma: Matrix, norm: float, absolute: bool) -> None:
     if sigma is not None:
         given = np.asarray(sigma, float)
         if given.shape not in ((), (n,)):
@@ -313,9 +313,9 @@ def _parameter_uncertainty(
     return uncertainty(free.names, size, data, prior, scale or float(np.finfo(float).tiny))
 
 
-def _maps(free: FreeSpace) -> list[Any]:
+def _maps(free: FreeSpace) -> list[PyTree]:
     return [m for entry in free.entries for m in entry.maps]
 
 
-def _values_by_path(free: FreeSpace, z: np.ndarray) -> dict[str, Any]:
+def _values_by_path(free: FreeSpace, z: np.ndarray) -> JsonObject:
     return {path: np.asarray(value) for path, value in free.values(jnp.asarray(z)).items()}

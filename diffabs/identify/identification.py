@@ -8,13 +8,13 @@ the cost and the method, `uncertainty` the covariance and the directions that th
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 
 from diffabs.core.bijectors import Range
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.types import Part, Table
 from diffabs.core.validity import check_part
 from diffabs.identify.data import Comparison, Data
 from diffabs.identify.fit import Identified, Tolerances, fit
@@ -32,7 +32,7 @@ def identify(
     solver: Solver,
     absolute: bool = True,
     prior: Prior | None = None,
-    starts: Sequence[Mapping[str, Any]] = (),
+    starts: Sequence[Table] = (),
     norm: float = 2.0,
     tolerances: Tolerances | None = None,
     progress: Callable[[int, float], None] | None = None,
@@ -78,7 +78,7 @@ def identify(
     )
 
 
-def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], comparison: Comparison, solver: Solver) -> None:
+def _check_starts(loop: Loop, starts: Sequence[Table], comparison: Comparison, solver: Solver) -> None:
     """Check that every run is admissible at each start.
 
     Raises:
@@ -90,7 +90,7 @@ def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], comparison: C
             raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
 
 
-def _describe_refusal(loop: Any, comparison: Comparison, solver: Solver) -> str | None:
+def _describe_refusal(loop: Part, comparison: Comparison, solver: Solver) -> str | None:
     """Return the reason why the first refused run is not admissible, or None if all runs are."""
     asked = (
         batch_admissibility(None, jax.device_get(canonical_dtypes(batch)), solver) for batch in comparison.loops(loop)

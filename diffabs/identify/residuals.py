@@ -12,6 +12,7 @@ from jax.tree_util import Partial
 
 from diffabs.core.bijectors import FreeSpace
 from diffabs.core.pytree import get
+from diffabs.core.types import AnyArray, Part, PyTree, Scalar
 
 Residuals = Callable[..., Any]  # (part, *data) -> (n,)
 Prior = Callable[[Any], Any]  # part -> (k,), in standard deviations
@@ -23,13 +24,13 @@ class _GaussianPrior:
 
     paths: tuple[str, ...]
 
-    def __call__(self, means: Any, deviations: Any, part: Any) -> Any:
+    def __call__(self, means: Any, deviations: Any, part: Part) -> Scalar:
         """Return (p - mean)/deviation, concatenated over the parameters."""
         known = zip(self.paths, means, deviations, strict=True)
         return jnp.concatenate([jnp.ravel((get(part, path) - m) / s) for path, m, s in known])
 
 
-def gaussian(known: Mapping[str, tuple[Any, Any]]) -> Prior:
+def gaussian(known: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
     """Return a prior of independent normal distributions.
 
     Other means and deviations do not compile again.
@@ -59,7 +60,7 @@ def as_partial(prior: Prior | None) -> Prior:
     return prior if isinstance(prior, Partial) else Partial(prior or _empty_prior)
 
 
-def _empty_prior(part: Any) -> Any:
+def _empty_prior(part: Part) -> Any:
     del part
     return jnp.zeros(0)
 
@@ -75,7 +76,7 @@ class ResidualEvaluation(NamedTuple):
 
     residuals: Any
     prior: Any
-    slopes: tuple[Any, Any]
+    slopes: tuple[PyTree, PyTree]
 
     def finite(self) -> bool:
         """Return whether every number is finite."""
@@ -84,11 +85,11 @@ class ResidualEvaluation(NamedTuple):
 
 @partial(jax.jit, static_argnames=("free", "residuals"))
 def _evaluate_residuals(
-    free: FreeSpace, residuals: Residuals, prior: Prior, part: Any, data: Any, z: Any
+    free: FreeSpace, residuals: Residuals, prior: Prior, part: Part, data: Any, z: AnyArray
 ) -> ResidualEvaluation:
     """Return residuals, prior and derivatives at z; compiled once for equal functions, spaces and structures."""
 
-    def both(z: Any) -> tuple[Any, Any]:
+    def both(z: AnyArray) -> tuple[PyTree, PyTree]:
         at = free.at(part, z)
         values = jnp.ravel(residuals(at, *data)), prior(at)
         return values, values
@@ -106,12 +107,12 @@ class FitProblem:
     """
 
     space: FreeSpace
-    part: Any
+    part: Part
     residuals: Residuals
-    data: tuple[Any, ...]
+    data: tuple[PyTree, ...]
     prior: Prior  # a pytree: see `as_partial`
     norm: float
-    usable: Callable[[Any], bool] | None
+    usable: Callable[[PyTree], bool] | None
     evaluations: int = 0
     last: tuple[np.ndarray, ResidualEvaluation | None] | None = None
 

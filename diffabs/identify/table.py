@@ -11,6 +11,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
+from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.validity import check_part
 from diffabs.identify.data import Comparison, check_positive
 from diffabs.objectives import BRAKING
@@ -102,13 +103,13 @@ class _MetricResiduals:
     shared: tuple[str, ...]
     objectives: tuple[tuple[str, Objective], ...]
 
-    def each(self, part: Any, batches: Any, function: Callable[[Any], Any]) -> list[Any]:
+    def each(self, part: Part, batches: Any, function: Callable[[PyTree], PyTree]) -> list[PyTree]:
         """Return `function` of the rows of each batch, with the shared parameters taken from `part`."""
         values = {path: get(part, path) for path in self.shared}
         return [Batch(rows).each(loop, lambda row, key: function(replace(row, values))) for loop, rows in batches]
 
-    def __call__(self, part: Any, batches: Any, place: Any, target: Any) -> Any:
-        def row(loop: Any) -> Any:
+    def __call__(self, part: Part, batches: Any, place: Scalar, target: Scalar) -> Any:
+        def row(loop: Part) -> Any:
             metrics = measure(loop, self.solver, dict(self.objectives)).metrics
             return jnp.stack([metrics[name] for name, _ in self.objectives])
 

@@ -12,6 +12,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import clamp, ratio
 from diffabs.core.pytree import canonical_dtypes
+from diffabs.core.types import Params, Part, Scalar, Table
 from diffabs.identify.data import Comparison, check_positive
 from diffabs.identify.fit import Identified
 from diffabs.simulate.batch import Batch
@@ -39,11 +40,11 @@ class Traces:
         until: Last instant [s] of each run that is compared, a number or shape (runs,). None compares all instants.
     """
 
-    t: Any
-    columns: Mapping[str, Any]
-    sigma: Mapping[str, Any] | None = None
-    over: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    until: Any = None
+    t: Scalar
+    columns: Table
+    sigma: Table | None = None
+    over: Params = dataclasses.field(default_factory=dict)
+    until: Scalar = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -143,11 +144,11 @@ class _TraceResiduals:
     solver: Solver
     fields: tuple[str, ...]
 
-    def __call__(self, loop: Any, over: Any, t: Any, kept: Any, target: Any) -> Any:
+    def __call__(self, loop: Part, over: Any, t: Scalar, kept: Any, target: Scalar) -> Any:
         seen = Batch(over).each(canonical_dtypes(loop), lambda one, key: self._columns(one, t))
         return jnp.swapaxes(seen, 0, 1).ravel()[kept] - target
 
-    def _columns(self, loop: Any, t: Any) -> Any:
+    def _columns(self, loop: Part, t: Scalar) -> Scalar:
         """Return the simulated columns of one run at the instants t, shape (columns, n); NaN if the run diverged."""
         run = rollout(loop, self.solver)
         assert run.trajectory is not None

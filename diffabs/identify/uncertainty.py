@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from diffabs.core.types import PyTree
+
 # A direction with a larger relative spread counts as not determined: it is as wide as the parameters are large.
 MAX_RELATIVE_SPREAD = 1.0
 
@@ -117,7 +119,7 @@ def _directions(names: Sequence[str], known: np.ndarray) -> list[Direction]:
     return found
 
 
-def _padded_svd(matrix: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+def _padded_svd(matrix: np.ndarray) -> tuple[PyTree, np.ndarray, np.ndarray]:
     """Return p singular values and right singular vectors, with zeros for directions beyond the number of rows."""
     missing = max(0, matrix.shape[1] - matrix.shape[0])
     return np.linalg.svd(np.concatenate([matrix, np.zeros((missing, matrix.shape[1]))]), full_matrices=False)

@@ -4,14 +4,16 @@ import math
 from typing import Any
 
 import numpy as np
+from jax.extend.core import JaxprEqn
 
+from diffabs.core.types import PyTree
 from diffabs.kernel.elementwise import max_or_min
 from diffabs.kernel.graph import Array, Graph, Node
 from diffabs.kernel.primitives import Unsupported, as_node_array, constant_array, lowering_rule, map_entries
 
 
 @lowering_rule("broadcast_in_dim", "shape broadcast_dimensions sharding")
-def _broadcast(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _broadcast(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     shape = eqn.params["shape"]
     wide = [1] * len(shape)
     for i, dimension in enumerate(eqn.params["broadcast_dimensions"]):
@@ -29,19 +31,19 @@ def _reshape(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("slice", "start_indices limit_indices strides")
-def _slice(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _slice(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     p = eqn.params
     strides = p["strides"] or [1] * ins[0].ndim
     return [ins[0][tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]]
 
 
 @lowering_rule("concatenate", "dimension")
-def _concatenate(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _concatenate(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [np.concatenate(ins, eqn.params["dimension"])]
 
 
 @lowering_rule("pad", "padding_config")
-def _pad(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _pad(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Pad before, after and between the entries of each axis; a negative width crops."""
     x, value = ins[0], ins[1].item()
     # Order as in XLA: interior padding first, then a negative edge width crops the dilated array.
@@ -56,32 +58,32 @@ def _pad(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("transpose", "permutation")
-def _transpose(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _transpose(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [ins[0].transpose(eqn.params["permutation"])]
 
 
 @lowering_rule("rev", "dimensions")
-def _rev(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _rev(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [np.flip(ins[0], eqn.params["dimensions"])]
 
 
 @lowering_rule("stack", "axis")
-def _stack(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _stack(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [np.stack(ins, eqn.params["axis"])]
 
 
 @lowering_rule("unstack", "axis")
-def _unstack(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _unstack(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [as_node_array(x) for x in np.moveaxis(ins[0], eqn.params["axis"], 0)]
 
 
 @lowering_rule("split", "axis sizes")
-def _split(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _split(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return list(np.split(ins[0], np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"]))
 
 
 @lowering_rule("iota", "dtype shape dimension sharding")
-def _iota(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _iota(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     shape, dimension = eqn.params["shape"], eqn.params["dimension"]
     along = np.arange(shape[dimension], dtype=eqn.params["dtype"])
     along = along.reshape([-1 if i == dimension else 1 for i in range(len(shape))])
@@ -96,7 +98,7 @@ REDUCTION_OPERATIONS: dict[str, str] = {"sum": "add", "prod": "mul"}
 @lowering_rule("reduce_max", "axes out_sharding")
 @lowering_rule("reduce_min", "axes out_sharding")
 @lowering_rule("reduce_and reduce_or", "axes")
-def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _reduce(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Reduce by pairs, as a balanced tree: n entries give a dependency chain of about log2(n) operations."""
     kind, x = eqn.primitive.name.removeprefix("reduce_"), ins[0]
     name: Any = REDUCTION_OPERATIONS.get(kind, kind)
@@ -113,7 +115,7 @@ def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [x]
 
 
-def _reduce_nothing(graph: Graph, eqn: Any, shape: Any) -> Array:
+def _reduce_nothing(graph: Graph, eqn: Any, shape: PyTree) -> Array:
     """Return the neutral element of a reduction over an empty axis."""
     whole = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": True, "reduce_or": False}
     if eqn.primitive.name not in whole:
@@ -122,7 +124,7 @@ def _reduce_nothing(graph: Graph, eqn: Any, shape: Any) -> Array:
 
 
 @lowering_rule("cumsum", "axis reverse")
-def _cumsum(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _cumsum(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     order = slice(None, None, -1 if eqn.params["reverse"] else 1)
     # A reversed sum runs over the flipped rows, and the result is flipped back.
     rows = list(np.moveaxis(ins[0], eqn.params["axis"], 0)[order])
@@ -132,7 +134,7 @@ def _cumsum(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("argmin argmax", "axes index_dtype")
-def _first_extreme(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _first_extreme(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Return the index of the first extreme entry, or of the first NaN if there is one, as JAX does."""
     if len(eqn.params["axes"]) != 1:
         raise Unsupported(eqn.primitive.name, "over several axes")

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
+from diffabs.core.types import PyTree, Scalar
 from diffabs.kernel import tangents
 from diffabs.kernel.graph import UpdateLevel, is_real
 from diffabs.kernel.program import ScalarProgram, TracedFunctions
@@ -39,7 +40,7 @@ class LanePrograms:
     def __init__(
         self,
         functions: TracedFunctions,
-        launch: Callable[[ScalarProgram, list[Any], list[Any]], list[Any]],
+        launch: Callable[[ScalarProgram, list[PyTree], list[PyTree]], list[PyTree]],
         wanted: tuple[int, ...] | None = None,
     ):
         """Store the functions and lower them to the plain program, so that an error appears at once.
@@ -53,7 +54,7 @@ class LanePrograms:
             Unsupported: A function uses an operation without a lowering rule.
         """
         self.functions, self.launch, self.wanted = functions, launch, wanted
-        self._derivatives: dict[Any, Any] = {}
+        self._derivatives: dict[PyTree, PyTree] = {}
         self.derivative(None)
 
     def derivative(self, begins: tuple[tuple[UpdateLevel, int], ...] | None) -> DerivativeProgram:
@@ -74,7 +75,7 @@ class LanePrograms:
             )
         return self._derivatives[begins]
 
-    def program(self, begins: Any, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
+    def program(self, begins: PyTree, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
         """Return the program with `many` tangents for each seeded array in `begins`.
 
         `as_lanes` holds the numbers of uniform arrays that vmap has made arrays of each lane.
@@ -92,11 +93,11 @@ class LanePrograms:
         """Keys of the arrays without tangents, in the order of the primitive's arguments."""
         return [ArrayKey(level, i, False) for level in INPUT_LEVELS for i in range(len(self.functions.types[level]))]
 
-    def slopes(self, begins: Any) -> list[ArrayKey]:
+    def slopes(self, begins: PyTree) -> list[ArrayKey]:
         """Return the keys of the seed tangents for the arrays in `begins`; these arguments follow the values."""
         return [ArrayKey(level, i, True) for level, i in begins or ()]
 
-    def ends(self, begins: Any) -> list[ArrayKey]:
+    def ends(self, begins: PyTree) -> list[ArrayKey]:
         """Return the keys of the results for the seeds in `begins`: the carry's arrays, then the nonzero tangents."""
         carry = range(len(self.functions.types[UpdateLevel.STEP]))
         do = self.derivative(begins).moved_arrays[UpdateLevel.STEP]
@@ -110,7 +111,7 @@ run_lanes_primitive = jex.Primitive("run_lanes")
 run_lanes_primitive.multiple_results = True
 
 
-def bind_lanes(lanes: LanePrograms, arrays: Sequence[Any]) -> list[Any]:
+def bind_lanes(lanes: LanePrograms, arrays: Sequence[PyTree]) -> list[PyTree]:
     """Return the final carry of all lanes.
 
     Args:
@@ -121,13 +122,13 @@ def bind_lanes(lanes: LanePrograms, arrays: Sequence[Any]) -> list[Any]:
 
 
 @run_lanes_primitive.def_impl
-def _run(*arrays: Any, **how: Any) -> list[Any]:
+def _run(*arrays: PyTree, **how: Any) -> list[PyTree]:
     # The primitive has a lowering but no eager evaluation, so a call outside jit compiles as well.
     return jax.jit(functools.partial(run_lanes_primitive.bind, **how))(*arrays)
 
 
 @run_lanes_primitive.def_abstract_eval
-def _shapes(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, as_lanes: frozenset[int]) -> list[Any]:
+def _shapes(*arrays: PyTree, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: frozenset[int]) -> list[PyTree]:
     carry = arrays[len(lanes.keys) - len(lanes.functions.types[UpdateLevel.STEP]) : len(lanes.keys)]
 
     def shape(key: ArrayKey) -> Any:
@@ -138,7 +139,9 @@ def _shapes(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, as_lanes:
     return [shape(key) for key in lanes.ends(begins)]
 
 
-def _launch_in_parts(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, as_lanes: frozenset[int]) -> list[Any]:
+def _launch_in_parts(
+    *arrays: PyTree, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: frozenset[int]
+) -> list[PyTree]:
     """Launch the tangents in groups of equal size <= MAX_TANGENTS_PER_LAUNCH; zeros fill the last group."""
     keys = [*lanes.keys, *lanes.slopes(begins)]
     launches = max(1, math.ceil(many / MAX_TANGENTS_PER_LAUNCH))
@@ -148,8 +151,8 @@ def _launch_in_parts(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, 
     if not many:
         return _launch_once(lanes, begins, 0, as_lanes, given)
 
-    def part(first: int) -> list[Any]:
-        def cut(key: ArrayKey, x: Any) -> Any:
+    def part(first: int) -> list[PyTree]:
+        def cut(key: ArrayKey, x: Scalar) -> Any:
             # Tangents of arrays of lanes are (lanes, tangents, ...), of uniform arrays (tangents, ...).
             axis = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
             lacking = max(0, first + each - many)
@@ -170,8 +173,8 @@ mlir.register_lowering(run_lanes_primitive, mlir.lower_fun(_launch_in_parts, mul
 
 
 def _launch_once(
-    lanes: LanePrograms, begins: Any, many: int, as_lanes: frozenset[int], given: dict[ArrayKey, Any]
-) -> list[Any]:
+    lanes: LanePrograms, begins: PyTree, many: int, as_lanes: frozenset[int], given: dict[ArrayKey, PyTree]
+) -> list[PyTree]:
     """Return the results of one launch; arrays that need tangents but have no seed get zeros."""
 
     def array(key: ArrayKey) -> Any:
@@ -187,8 +190,8 @@ def _launch_once(
 
 
 def _jvp_rule(
-    arrays: Sequence[Any], slopes: Sequence[Any], *, lanes: LanePrograms, begins: Any, many: int, as_lanes: Any
-) -> Any:
+    arrays: Sequence[PyTree], slopes: Sequence[PyTree], *, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: Any
+) -> PyTree:
     """Return values and tangents of a kernel for `jax.jvp`."""
     if begins is not None:
         raise ValueError("a kernel has no second derivatives; engine = 'xla' has")
@@ -202,7 +205,7 @@ def _jvp_rule(
     # Build the derivative here: JAX 0.12 forbids tracing inside the abstract evaluation, where `ends` needs it.
     lanes.derivative(begins)
 
-    def alone(key: ArrayKey, x: Any) -> Any:
+    def alone(key: ArrayKey, x: Scalar) -> Any:
         return jnp.expand_dims(x, 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1)
 
     given = [alone(key, x) for key, x, on in zip(lanes.keys, slopes, moving, strict=True) if on]
@@ -217,13 +220,13 @@ def _jvp_rule(
 ad.primitive_jvps[run_lanes_primitive] = _jvp_rule
 
 
-def _zero_tangent(x: Any) -> Any:
+def _zero_tangent(x: Scalar) -> Any:
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
 def _batching_rule(
-    arrays: Sequence[Any], axes: Sequence[Any], *, lanes: LanePrograms, begins: Any, many: int, as_lanes: Any
-) -> Any:
+    arrays: Sequence[PyTree], axes: Sequence[PyTree], *, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: Any
+) -> PyTree:
     """Apply vmap: merge the batch axis into the tangent axis if only tangents are batched, else into the lane axis."""
     values = len(lanes.keys)
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
@@ -251,14 +254,14 @@ def _batching_rule(
 batching.primitive_batchers[run_lanes_primitive] = _batching_rule
 
 
-def _count(lanes: LanePrograms, arrays: Sequence[Any], axes: Sequence[Any]) -> int:
+def _count(lanes: LanePrograms, arrays: Sequence[PyTree], axes: Sequence[PyTree]) -> int:
     """Return the number of lanes without the batch axis."""
     # The last of the values is an array of the carry, so it always has a lane axis.
     last = len(lanes.keys) - 1
     return arrays[last].shape[1 if axes[last] == 0 else 0]
 
 
-def _merge_tangent_axes(key: ArrayKey, x: Any, axis: int | None, size: int, as_lanes: frozenset[int]) -> Any:
+def _merge_tangent_axes(key: ArrayKey, x: Scalar, axis: int | None, size: int, as_lanes: frozenset[int]) -> PyTree:
     """Return the seed tangents with the batch axis merged in front of the tangent axis: (batch*tangents, ...)."""
     at = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
     x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
@@ -267,8 +270,8 @@ def _merge_tangent_axes(key: ArrayKey, x: Any, axis: int | None, size: int, as_l
 
 
 def _merge_lane_axes(
-    key: ArrayKey, x: Any, axis: int | None, size: int, own: set[int], as_lanes: frozenset[int], count: int
-) -> Any:
+    key: ArrayKey, x: Scalar, axis: int | None, size: int, own: set[int], as_lanes: frozenset[int], count: int
+) -> Scalar:
     """Return an array with the batch axis merged in front of the lane axis: (batch*lanes, ...).
 
     A uniform array that is not batched stays as given. A batched one is repeated for every lane.
@@ -282,13 +285,13 @@ def _merge_lane_axes(
     return x.reshape(-1, *x.shape[2:])
 
 
-def _refuse_partial_evaluation(trace: Any, *tracers: Any, **how: Any) -> Any:
+def _refuse_partial_evaluation(trace: Any, *tracers: Any, **how: Any) -> Scalar:
     """Raise ValueError: JAX linearizes the kernel (`jax.grad`, `jax.linearize`), and no reverse mode exists."""
     del trace, tracers, how
     raise ValueError(NO_REVERSE_MODE)
 
 
-def _refuse_transpose(*args: Any, **how: Any) -> Any:
+def _refuse_transpose(*args: PyTree, **how: Any) -> Any:
     del args, how
     raise ValueError(NO_REVERSE_MODE)
 

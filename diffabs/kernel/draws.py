@@ -10,6 +10,7 @@ import jax
 import jax.extend.random as jer
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from diffabs.kernel.graph import Array, Graph, Node
 from diffabs.kernel.primitives import Unsupported, constant_array, inline_program, lowering_rule, map_entries
@@ -37,13 +38,13 @@ def key_shape(aval: Any) -> tuple[tuple[int, ...], np.dtype]:
 
 @lowering_rule("random_wrap", "impl")
 @lowering_rule("random_unwrap")
-def _wrap_key(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _wrap_key(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     key_shape((eqn.outvars if eqn.primitive.name == "random_wrap" else eqn.invars)[0].aval)
     return ins
 
 
 @lowering_rule("random_fold_in")
-def _fold_in(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _fold_in(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     if key_shape(eqn.invars[0].aval)[0] != (2,) or ins[1].ndim:
         raise Unsupported("random_fold_in", "of several keys")
     fold = jer.threefry_prng_impl.fold_in
@@ -52,7 +53,7 @@ def _fold_in(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("random_bits", "bit_width shape")
-def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _bits(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     width, shape = eqn.params["bit_width"], eqn.params["shape"]
     if key_shape(eqn.invars[0].aval)[0] != (2,) or math.prod(shape) > MAX_NUMBERS_PER_DRAW:
         raise Unsupported("random_bits", f"of {math.prod(shape)} numbers at once, or of several keys")
@@ -62,14 +63,14 @@ def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("iota_2x32_shape", "shape")
-def _iota_words(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _iota_words(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Return the position of each entry in an array as two words of 32 bits, high word first."""
     places = np.arange(math.prod(eqn.params["shape"]), dtype=np.uint32).reshape(eqn.params["shape"])
     return [constant_array(graph, 0 * places), constant_array(graph, places)]
 
 
 @lowering_rule("threefry2x32")
-def _threefry(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _threefry(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Return the two words of Threefry-2x32 with 20 rounds.
 
     Source: Salmon, Moraes, Dror and Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011).
@@ -139,7 +140,7 @@ ERF_INV_DOUBLE = (
 
 
 @lowering_rule("erf_inv", "accuracy")
-def _erf_inv(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _erf_inv(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [map_entries(lambda x: erf_inv(graph, x), *ins)]
 
 

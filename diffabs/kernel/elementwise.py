@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from diffabs.kernel.graph import Array, Graph, Node, is_real
 from diffabs.kernel.primitives import Unsupported, lowering_rule, map_entries
@@ -41,18 +42,18 @@ def _integer_quotient(graph: Graph, x: Node, y: Node) -> Node:
 
 
 @lowering_rule("add_any")
-def _sum_of_tangents(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _sum_of_tangents(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [map_entries(lambda x, y: graph.op("add", x, y), *ins)]
 
 
 @lowering_rule("stop_gradient copy copy_p optimization_barrier pvary")
 @lowering_rule("reshard", "dst_sharding concrete_mesh")
-def _identity(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _identity(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return ins
 
 
 @lowering_rule("max min")
-def _max_min(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _max_min(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Return the larger or smaller of two arrays, entry by entry; NaN if either is NaN."""
     return [map_entries(lambda x, y: max_or_min(graph, eqn.primitive.name, x, y), *ins)]
 
@@ -73,12 +74,12 @@ def max_or_min(graph: Graph, name: str, x: Node, y: Node) -> Node:
 
 
 @lowering_rule("abs")
-def _abs(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _abs(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [map_entries(lambda x: graph.op("abs", x), *ins)]
 
 
 @lowering_rule("sign")
-def _sign(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _sign(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Return the sign; NaN, 0 and -0 stay themselves."""
 
     def sign(x: Node) -> Node:
@@ -91,12 +92,12 @@ def _sign(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("square")
-def _square(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _square(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [map_entries(lambda x: graph.op("mul", x, x), *ins)]
 
 
 @lowering_rule("integer_pow", "y")
-def _integer_pow(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _integer_pow(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     def power(x: Node) -> Node:
         # Binary powers as in XLA. A negative exponent inverts the final product.
         n, result = abs(eqn.params["y"]), None
@@ -112,7 +113,7 @@ def _integer_pow(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("rsqrt logistic", "accuracy")
-def _inverse(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _inverse(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     if eqn.params["accuracy"] is not None:
         raise Unsupported(eqn.primitive.name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
 
@@ -126,7 +127,7 @@ def _inverse(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("rem")
-def _rem(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _rem(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     # A constant divisor other than 0 needs no guard.
     if ins[1].size and not is_real(ins[1].flat[0].dtype) and any(x.op != "const" or x.attr == 0 for x in ins[1].flat):
         return [map_entries(lambda x, y: _integer_remainder(graph, x, y), *ins)]
@@ -140,7 +141,7 @@ def _integer_remainder(graph: Graph, x: Node, y: Node) -> Node:
 
 
 @lowering_rule("round", "rounding_method")
-def _round(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _round(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     if eqn.params["rounding_method"].name == "TO_NEAREST_EVEN":
         return [map_entries(lambda x: graph.op("rint", x), *ins)]
 
@@ -165,13 +166,13 @@ def _select(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("clamp")
-def _clamp(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _clamp(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     low, x, high = ins
     return [map_entries(lambda a, b, c: max_or_min(graph, "min", max_or_min(graph, "max", a, b), c), low, x, high)]
 
 
 @lowering_rule("convert_element_type", "new_dtype weak_type sharding")
-def _convert(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _convert(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [map_entries(lambda x: graph.convert(x, eqn.params["new_dtype"]), *ins)]
 
 
@@ -183,7 +184,7 @@ def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("shift_left shift_right_logical")
-def _shift(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _shift(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Shift by a number of bits; a shift by the width or more gives 0, where C leaves it undefined."""
     name = eqn.primitive.name
 
@@ -203,7 +204,7 @@ def _shift(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("population_count")
-def _population(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _population(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Count the bits that are set: sums of pairs, of fours and of eights, then a product that adds the four bytes."""
 
     def count(x: Node) -> Node:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
+from diffabs.core.types import PyTree
 from diffabs.kernel import cuda, nvrtc
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.cpp import LaunchShape
@@ -39,7 +40,7 @@ class GpuDevice(Protocol):
         """Return the device address of a `buffer` of XLA."""
         ...
 
-    def start(self, code: pathlib.Path, arrays: Any, room: int, count: int, context: Any) -> None:
+    def start(self, code: pathlib.Path, arrays: PyTree, room: int, count: int, context: PyTree) -> None:
         """Start the kernels `begin_all` and then `run_all` of a program.
 
         Args:
@@ -63,7 +64,7 @@ def find_gpu() -> GpuDevice | None:
     return None if platform == "cpu" else _find_cuda_device(platform)
 
 
-def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[Any], results: list[Any]) -> list[Any]:
+def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[PyTree], results: list[PyTree]) -> list[PyTree]:
     """Return the final carry of all lanes, as an operation of XLA on the GPU.
 
     Args:
@@ -82,7 +83,7 @@ def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[Any], re
     sizes = [len(program.sizes[level]) for level in (UpdateLevel.UNIFORM, UpdateLevel.LANE, UpdateLevel.STEP)]
     count = given[-1].shape[0]
 
-    def start(context: Any, outs: Any, *ins: Any) -> None:
+    def start(context: PyTree, outs: Any, *ins: Any) -> None:
         *found, room = [on.address(buffer) for buffer in outs]
         if count:
             on.start(code, _pack_addresses([*map(on.address, ins), *found], [*sizes, sizes[-1]]), room, count, context)
@@ -105,7 +106,7 @@ def describe_gpu_compiler() -> dict[str, str]:
     return {"compiler": f"NVRTC {major}.{minor}", "flags": " ".join(nvrtc.NVRTC_FLAGS), "processor": on.architecture}
 
 
-def _pack_addresses(addresses: list[int], sizes: list[int]) -> Any:
+def _pack_addresses(addresses: list[int], sizes: list[int]) -> PyTree:
     """Return the struct `Arrays` of `threads.h`: each group of addresses ends with one more entry, a null pointer."""
     rest, found = iter(addresses), []
     for size in sizes:
@@ -135,9 +136,9 @@ class _LoadedCode(NamedTuple):
         blocks: Blocks of `run_all` that the device holds at a time.
     """
 
-    context: Any
+    context: PyTree
     begin: Any
-    run: Any
+    run: PyTree
     blocks: int
 
 
@@ -157,7 +158,7 @@ class CudaDevice:
         """Return the device address of a `buffer` of XLA."""
         return buffer.__cuda_array_interface__["data"][0]
 
-    def start(self, code: pathlib.Path, arrays: Any, room: int, count: int, context: Any) -> None:
+    def start(self, code: pathlib.Path, arrays: PyTree, room: int, count: int, context: PyTree) -> None:
         """Start `begin_all` and `run_all` on the device that holds `room`.
 
         The arguments `code`, `arrays`, `room`, `count` and `context` are those of `GpuDevice.start`.
@@ -208,14 +209,14 @@ def _load(code: pathlib.Path, ordinal: int) -> _LoadedCode:
     return _LoadedCode(context, begin, run, blocks * max(1, number.value))
 
 
-def _launch(kernel: Any, blocks: int, threads: int, stream: int, *args: Any) -> None:
+def _launch(kernel: Any, blocks: int, threads: int, stream: int, *args: PyTree) -> None:
     # cuLaunchKernel takes an array with the address of each argument.
     given = (ctypes.c_void_p * len(args))(*(ctypes.addressof(x) for x in args))
     nothing = ctypes.c_void_p()
     _call_driver("cuLaunchKernel", kernel, blocks, 1, 1, threads, 1, 1, 0, ctypes.c_void_p(stream), given, nothing)
 
 
-def _call_driver(name: str, *args: Any) -> None:
+def _call_driver(name: str, *args: PyTree) -> None:
     """Call a function of the driver; raise RuntimeError with the name of the error it returns."""
     if failed := getattr(_load_driver(), name)(*args):
         said = ctypes.c_char_p()

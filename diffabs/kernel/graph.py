@@ -10,7 +10,10 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax.extend.core import JaxprEqn
+from jax.typing import DTypeLike
 
+from diffabs.core.types import PyTree, Scalar
 from diffabs.kernel.operations import COMPARISONS, FOLDABLE, MIRRORED, NEGATED, SYMMETRIC
 
 Array = Any  # NumPy array of nodes
@@ -37,7 +40,7 @@ class Node:
 
     __slots__ = ("args", "attr", "dtype", "id", "label", "level", "op")
 
-    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: Any, level: UpdateLevel):
+    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: PyTree, level: UpdateLevel):
         """Store the fields. Only a `Graph` creates nodes."""
         self.id, self.op, self.args, self.dtype, self.attr, self.level = id, op, args, dtype, attr, level
         self.label = ""
@@ -65,14 +68,14 @@ class Graph:
     def __init__(self) -> None:
         """Create an empty graph."""
         self.nodes: list[Node] = []
-        self._known: dict[Any, Node] = {}
+        self._known: dict[PyTree, Node] = {}
         self._gates = 0
 
-    def begins(self, eqn: Any) -> None:
+    def begins(self, eqn: JaxprEqn) -> None:
         """Note that the following nodes come from the JAX equation `eqn`; a subclass may record labels."""
 
     def _make(
-        self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: UpdateLevel | None = None
+        self, op: str, args: tuple[Node, ...], dtype: DTypeLike, attr: PyTree = None, level: UpdateLevel | None = None
     ) -> Node:
         dtype = np.dtype(dtype)
         key = (op, tuple(arg.id for arg in args), dtype, attr)
@@ -82,7 +85,7 @@ class Graph:
             self._known[key] = self.nodes[-1]
         return self._known[key]
 
-    def const(self, value: Any, dtype: Any = None) -> Node:
+    def const(self, value: Scalar, dtype: DTypeLike | None = None) -> Node:
         """Return the constant `value` of type `dtype`."""
         x = np.asarray(value, dtype)[()]
         # The key has the bytes, because 0 == -0 and NaN != NaN.
@@ -92,7 +95,7 @@ class Graph:
             self._known[key] = self.nodes[-1]
         return self._known[key]
 
-    def input(self, dtype: Any, level: UpdateLevel, place: Any) -> Node:
+    def input(self, dtype: DTypeLike, level: UpdateLevel, place: Scalar) -> Node:
         """Return a number from outside: type `dtype`, rate of change `level`, origin `place`."""
         return self._make("input", (), dtype, place, level)
 
@@ -162,7 +165,7 @@ class Graph:
         """Return a marker for the truth over all lanes of the truth `which`; its value in a lane is `which` itself."""
         return which if which.op in ("const", "any") else self._make("any", (which,), bool)
 
-    def convert(self, x: Node, dtype: Any) -> Node:
+    def convert(self, x: Node, dtype: DTypeLike) -> Node:
         """Return the number `x` converted to `dtype`; to a truth, whether `x` differs from 0."""
         dtype = np.dtype(dtype)
         if x.dtype == dtype:
@@ -174,7 +177,7 @@ class Graph:
             return self.op("ne", x, self.const(0, x.dtype))
         return self._make("convert", (x,), dtype)
 
-    def bits(self, x: Node, dtype: Any) -> Node:
+    def bits(self, x: Node, dtype: DTypeLike) -> Node:
         """Return the bits of `x` as a number of the type `dtype`."""
         if x.dtype == np.dtype(dtype):
             return x
@@ -200,7 +203,7 @@ class Graph:
         return self.op(node.op, *args)
 
 
-def is_real(dtype: Any) -> bool:
+def is_real(dtype: DTypeLike) -> bool:
     """Return whether a type is real (floating point).
 
     Args:

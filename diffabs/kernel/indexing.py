@@ -3,10 +3,10 @@
 A graph of single numbers has no memory, so an index is compared with every candidate. Uniform columns become tables.
 """
 
-from typing import Any
-
 import numpy as np
+from jax.extend.core import JaxprEqn
 
+from diffabs.core.types import PyTree
 from diffabs.kernel.elementwise import max_or_min
 from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel
 from diffabs.kernel.primitives import Unsupported, as_node_array, lowering_rule, map_entries
@@ -20,7 +20,7 @@ def _clamp_index(graph: Graph, index: Node, most: int) -> Node:
 
 
 @lowering_rule("dynamic_slice", "slice_sizes")
-def _dynamic_slice(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _dynamic_slice(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     x, places = ins[0], [place.item() for place in ins[1:]]
     for axis, (size, place) in enumerate(zip(eqn.params["slice_sizes"], places, strict=True)):
         x = _part(graph, x, axis, place, size)
@@ -37,7 +37,7 @@ def _part(graph: Graph, x: Array, axis: int, place: Node, size: int) -> Array:
         start = int(np.clip(place.attr, 0, most))
         return np.moveaxis(rows[start : start + size], 0, axis)
     place = _clamp_index(graph, place, most)
-    taken: Any = [map_entries(lambda *x: _entry(graph, place, x), *rows[i : i + most + 1]) for i in range(size)]
+    taken: PyTree = [map_entries(lambda *x: _entry(graph, place, x), *rows[i : i + most + 1]) for i in range(size)]
     return np.moveaxis(np.stack(taken), 0, axis)
 
 
@@ -55,7 +55,7 @@ def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
 
 
 @lowering_rule("gather", "dimension_numbers slice_sizes indices_are_sorted unique_indices mode fill_value")
-def _gather(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _gather(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Return x[i] along the first axis for each index i."""
     x, places = ins
     n, p = eqn.params["dimension_numbers"], eqn.params
@@ -77,7 +77,7 @@ def _gather(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("dynamic_update_slice")
-def _dynamic_update(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _dynamic_update(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     x, new, places = ins[0], ins[1], [place.item() for place in ins[2:]]
     for axis, place in enumerate(places):
         _check_writable(eqn, x.shape[axis] if new.shape[axis] != x.shape[axis] and place.op != "const" else 0)
@@ -96,7 +96,7 @@ def _dynamic_update(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("scatter", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr")
-def _scatter(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _scatter(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Return x.at[i].set(value) for one index i along the first axis; an index outside changes nothing."""
     x, places, new = ins
     n = eqn.params["dimension_numbers"]
@@ -125,7 +125,7 @@ def _all_true(graph: Graph, truths: list[Node]) -> Node:
     return found
 
 
-def _check_writable(eqn: Any, count: int) -> None:
+def _check_writable(eqn: JaxprEqn, count: int) -> None:
     """Raise Unsupported for a write that compares an index with more than MAX_COMPARED_ENTRIES candidates."""
     if count > MAX_COMPARED_ENTRIES:
         raise Unsupported(eqn.primitive.name, f"into {count} entries; {MAX_COMPARED_ENTRIES} are the most")

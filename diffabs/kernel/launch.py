@@ -12,26 +12,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.types import PyTree, Scalar
 from diffabs.kernel import binding, compilers, cpp, gpu, program
 
 MAX_STEP_LINES = 10_000  # lines of a step; a larger program gets fewer vectors a block, or compiling takes too long
 VECTORS_PER_BLOCK = 4
 LIBRARY_NAME_PREFIX = "diffabs_kernel_"
 _lock = threading.Lock()
-_loaded: dict[str, Any] = {}
+_loaded: dict[str, PyTree] = {}
 
 
 def run_lanes(
-    renew: Callable[[Any, Any], Any],
-    step: Callable[[Any, Any], Any],
-    running: Callable[[Any, Any], Any],
-    lane: Any,
-    carry: Any,
+    renew: Callable[[PyTree, PyTree], PyTree],
+    step: Callable[[PyTree, PyTree], PyTree],
+    running: Callable[[PyTree, PyTree], PyTree],
+    lane: PyTree,
+    carry: PyTree,
     *,
     steps: int,
     rounds: int,
-    wanted: Any = None,
-) -> Any:
+    wanted: PyTree = None,
+) -> PyTree:
     """Return the final carry (pytree, leading axis of n lanes) of lanes that all run to their ends.
 
     The function works under jit and vmap, with forward-mode derivatives.
@@ -72,8 +73,8 @@ def run_lanes(
 
 
 def _launch_lanes(
-    made: program.ScalarProgram, before: list[Any], carry: list[Any], shape: cpp.LaunchShape
-) -> list[Any]:
+    made: program.ScalarProgram, before: list[PyTree], carry: list[PyTree], shape: cpp.LaunchShape
+) -> list[PyTree]:
     """Return the final carry of all lanes; `before` holds the uniform arrays and the arrays of the lanes."""
     first, results = len(before), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
     if gpu.find_gpu():
@@ -148,7 +149,7 @@ def library_path(name: str) -> pathlib.Path:
     return _loaded[name][1]
 
 
-def _handler(path: pathlib.Path) -> Any:
+def _handler(path: pathlib.Path) -> PyTree:
     """Return the library's entry point; raise NoCompiler if it does not load, as from a folder without execution
     rights.
     """
@@ -169,12 +170,12 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _lane_type(x: Any) -> Any:
+def _lane_type(x: Scalar) -> Scalar:
     """Return shape and type of one lane of an array."""
     return jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype)
 
 
-def unwrap_key(x: Any) -> Any:
+def unwrap_key(x: Scalar) -> Scalar:
     """Return an array, or the words (uint32) of random keys.
 
     Args:
@@ -185,11 +186,11 @@ def unwrap_key(x: Any) -> Any:
     return x if isinstance(x, jax.Array) else jnp.asarray(x)
 
 
-def _like(x: Any, leaf: Any) -> Any:
+def _like(x: Scalar, leaf: Any) -> Any:
     return jax.random.wrap_key_data(x) if is_key(leaf) else x
 
 
-def is_key(x: Any) -> bool:
+def is_key(x: Scalar) -> bool:
     """Return whether an array holds random keys.
 
     Args:

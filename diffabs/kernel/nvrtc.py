@@ -13,6 +13,7 @@ import re
 from typing import Any
 
 from diffabs.core import files
+from diffabs.core.types import Scalar
 from diffabs.kernel import binaries
 from diffabs.kernel.compilers import NATIVE_FOLDER, NoCompiler
 
@@ -78,7 +79,7 @@ def nvrtc_version() -> tuple[int, int]:
 
 
 @functools.cache
-def _load_nvrtc() -> Any:
+def _load_nvrtc() -> Scalar:
     """Load NVRTC from the package nvidia-cuda-nvrtc (CUDA 13) or nvidia-cuda-nvrtc-cu12, or from the system."""
     found = importlib.util.find_spec("nvidia")
     folders = [*(found.submodule_search_locations or ())] if found else []

@@ -1,10 +1,10 @@
 """NumPy's function for each operation that the graph folds, and the algebraic symmetries of operations."""
 
-from typing import Any
-
 import numpy as np
 
-COMPARISONS: dict[str, Any] = {
+from diffabs.core.types import PyTree
+
+COMPARISONS: dict[str, PyTree] = {
     "eq": np.equal,
     "ne": np.not_equal,
     "lt": np.less,
@@ -12,7 +12,7 @@ COMPARISONS: dict[str, Any] = {
     "gt": np.greater,
     "ge": np.greater_equal,
 }
-FOLDABLE: dict[str, Any] = COMPARISONS | {
+FOLDABLE: dict[str, PyTree] = COMPARISONS | {
     "add": np.add,
     "sub": np.subtract,
     "mul": np.multiply,

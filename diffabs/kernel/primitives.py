@@ -13,7 +13,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.extend.core as jex
 import numpy as np
+from jax.extend.core import JaxprEqn
+from jax.typing import DTypeLike
 
+from diffabs.core.types import PyTree, Scalar
 from diffabs.kernel.graph import Array, Graph, Node
 
 JAX = pathlib.Path(jax.__file__).parent
@@ -47,14 +50,14 @@ class LoweringRule(NamedTuple):
         known: Names of the parameters that the function handles.
     """
 
-    apply: Callable[[Graph, Any, list[Array]], Sequence[Array]]
+    apply: Callable[[Graph, PyTree, list[Array]], Sequence[Array]]
     known: frozenset[str]
 
 
 LOWERING_RULES: dict[str, LoweringRule] = {}
 
 
-def lowering_rule(names: str, known: str = "") -> Callable[[Any], Any]:
+def lowering_rule(names: str, known: str = "") -> Callable[[PyTree], PyTree]:
     """Return a decorator that registers a function (graph, eqn, inputs) -> outputs as the rule of some primitives.
 
     Args:
@@ -83,7 +86,7 @@ def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Se
     """
     at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
-    def read(atom: Any) -> Array:
+    def read(atom: PyTree) -> Array:
         return constant_array(graph, atom.val, _dtype(atom)) if isinstance(atom, jex.Literal) else at[atom]
 
     for eqn in jaxpr.eqns:
@@ -92,11 +95,11 @@ def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Se
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _dtype(atom: Any) -> Any:
+def _dtype(atom: PyTree) -> Any:
     return atom.aval.dtype
 
 
-def _apply_rule(graph: Graph, eqn: Any, inputs: list[Array]) -> Sequence[Array]:
+def _apply_rule(graph: Graph, eqn: JaxprEqn, inputs: list[Array]) -> Sequence[Array]:
     name = eqn.primitive.name
     try:
         if name not in LOWERING_RULES:
@@ -111,7 +114,7 @@ def _apply_rule(graph: Graph, eqn: Any, inputs: list[Array]) -> Sequence[Array]:
         raise
 
 
-def _calling_method(eqn: Any) -> str:
+def _calling_method(eqn: JaxprEqn) -> str:
     """Return the innermost method that the equation comes from, JAX and this package's helpers apart; empty if none."""
     traceback = getattr(getattr(eqn, "source_info", None), "traceback", None)
     for frame in getattr(traceback, "frames", ()):
@@ -122,7 +125,7 @@ def _calling_method(eqn: Any) -> str:
     return ""
 
 
-def constant_array(graph: Graph, x: Any, dtype: Any = None) -> Array:
+def constant_array(graph: Graph, x: Scalar, dtype: DTypeLike | None = None) -> Array:
     """Return an array of constants.
 
     Args:
@@ -145,7 +148,7 @@ def scalar_array(node: Node) -> Array:
     return out
 
 
-def map_entries(function: Callable[..., Node], *arrays: Any) -> Array:
+def map_entries(function: Callable[..., Node], *arrays: PyTree) -> Array:
     """Return a function of numbers, applied entry by entry with broadcasting.
 
     Args:
@@ -174,7 +177,7 @@ def inline_program(graph: Graph, program: Any, inputs: Sequence[Array]) -> list[
     return lower_jaxpr(graph, jaxpr, [constant_array(graph, x) for x in constants], inputs)
 
 
-def as_node_array(x: Any) -> Array:
+def as_node_array(x: Scalar) -> Array:
     """Return the result of indexing an array of nodes as an array, also if it is a single node.
 
     Args:

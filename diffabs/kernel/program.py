@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from diffabs.core.types import PyTree, Scalar
 from diffabs.kernel import arrays, draws, elementwise, indexing, nested
 from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel, is_real
 from diffabs.kernel.primitives import Unsupported, constant_array, lower_jaxpr
@@ -47,7 +48,7 @@ class ScalarProgram:
 
     inputs: dict[InputPlace, Node]
     results: dict[str, list[Node]]
-    uniform: list[Any]
+    uniform: list[PyTree]
     sizes: dict[UpdateLevel, list[int]]
     dtype: np.dtype
     tangents: int = 0
@@ -68,7 +69,7 @@ class TracedFunction(NamedTuple):
 
     jaxpr: Any
     closed: tuple[int, ...]
-    constants: tuple[Any, ...] = ()
+    constants: tuple[PyTree, ...] = ()
 
 
 class TracedFunctions(NamedTuple):
@@ -81,11 +82,13 @@ class TracedFunctions(NamedTuple):
     """
 
     each: dict[str, TracedFunction]
-    types: dict[UpdateLevel, list[Any]]
-    uniform: list[Any]
+    types: dict[UpdateLevel, list[PyTree]]
+    uniform: list[PyTree]
 
 
-def trace_functions(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any) -> TracedFunctions:
+def trace_functions(
+    functions: dict[str, Callable[[PyTree, PyTree], PyTree]], lane: PyTree, carry: PyTree
+) -> TracedFunctions:
     """Return functions of (lane, carry) as jaxprs.
 
     Args:
@@ -93,7 +96,7 @@ def trace_functions(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, 
         lane: Pytree with shapes and types of a lane's constants.
         carry: Pytree with shapes and types of a lane's carry.
     """
-    uniform: list[Any] = []
+    uniform: list[PyTree] = []
     numbers: dict[int, int] = {}
     each: dict[str, TracedFunction] = {}
     for name, function in functions.items():
@@ -112,7 +115,9 @@ def trace_functions(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, 
     return TracedFunctions(each, {level: [_type(x) for x in xs] for level, xs in types.items()}, uniform)
 
 
-def build_program(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any) -> ScalarProgram:
+def build_program(
+    functions: dict[str, Callable[[PyTree, PyTree], PyTree]], lane: PyTree, carry: PyTree
+) -> ScalarProgram:
     """Return the program of functions of (lane, carry).
 
     Args:
@@ -184,7 +189,7 @@ def _real_type(inputs: dict[InputPlace, Node]) -> np.dtype:
     return kinds.pop()
 
 
-def _type(x: Any) -> Any:
+def _type(x: Scalar) -> Scalar:
     """Return shape and type of an array without its sharding, because the program is for one lane."""
     aval = x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)
     return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=getattr(aval, "weak_type", False))

@@ -7,11 +7,12 @@ Only these tangents are repeated, as often as requested. All other tangents are 
 """
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.extend.core as jex
 
+from diffabs.core.types import PyTree
 from diffabs.kernel.graph import Graph, Node, UpdateLevel, is_real
 from diffabs.kernel.program import (
     InputPlace,
@@ -255,15 +256,15 @@ def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) ->
 
 def _jvp_function(
     functions: TracedFunctions, function: TracedFunction, differentiable: TangentArrays, moves: bool
-) -> Any:
+) -> PyTree:
     """Return a function of values and tangents that computes values and tangents; without `moves`, values alone."""
 
-    def call(arrays: dict[UpdateLevel, list[Any]]) -> list[Any]:
+    def call(arrays: dict[UpdateLevel, list[PyTree]]) -> list[PyTree]:
         shared = [*(arrays[UpdateLevel.UNIFORM][i] for i in function.closed), *function.constants]
         closed = jex.ClosedJaxpr(function.jaxpr, shared)
         return jex.jaxpr_as_fun(closed)(*arrays[UpdateLevel.LANE], *arrays[UpdateLevel.STEP])
 
-    def push(*given: Any) -> list[Any]:
+    def push(*given: PyTree) -> list[PyTree]:
         rest, arrays, slopes = iter(given), {}, {}
         for level in INPUT_LEVELS:
             arrays[level] = [next(rest) for _ in functions.types[level]]
@@ -271,7 +272,7 @@ def _jvp_function(
         if not moves:
             return call(arrays)
 
-        def call_at(moving: dict[UpdateLevel, list[Any]]) -> list[Any]:
+        def call_at(moving: dict[UpdateLevel, list[PyTree]]) -> list[PyTree]:
             now = {level: list(xs) for level, xs in arrays.items()}
             for level in INPUT_LEVELS:
                 for i, x in zip(differentiable[level], moving[level], strict=True):

@@ -15,6 +15,7 @@ import numpy as np
 from diffabs.controllers import ObserverFeedback, Sampled
 from diffabs.controllers.balance import MEASURED_NAMES, STATE_NAMES
 from diffabs.core.protocols import Plant
+from diffabs.core.types import AnyArray, Bool, Part
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.regulator import dlqr
@@ -33,12 +34,12 @@ class Filter(NamedTuple):
         stabilising: Whether P is proven to be the stabilising solution, as in `Riccati`.
     """
 
-    gain: Any
-    P: Any
-    stabilising: Any
+    gain: AnyArray
+    P: AnyArray
+    stabilising: Bool
 
 
-def kalman(A: Any, C: Any, W: Any, V: Any) -> Filter:
+def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
     """Return the steady-state Kalman filter of x+ = A x + w, y = C x + v; NaN where no such filter exists.
 
     The result is differentiable in every argument.
@@ -60,11 +61,11 @@ def kalman(A: Any, C: Any, W: Any, V: Any) -> Filter:
 
 def lqg(
     plant: Plant,
-    Q: Any,
-    R: Any,
+    Q: AnyArray,
+    R: AnyArray,
     *,
     period: float = 0.01,
-    disturbance: Any = (1.0, 1.0, 1.0),
+    disturbance: Part = (1.0, 1.0, 1.0),
     noise: Any = (1e-3, 1e-3),
     voltage_max: float = np.inf,
 ) -> Sampled:

@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes
+from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
 from diffabs.plants.wheel import FROZEN_OUTPUTS
 
 # Newton iterations that bring the remaining states to rest; one is enough where their equation is linear.
@@ -26,11 +27,11 @@ REMAINING_STATE_ITERATIONS = 10
 class StateSpace(NamedTuple):
     """A linear system x' = A x + B u, or x+ = A x + B u: A (n, n), B (n, m)."""
 
-    A: Any
-    B: Any
+    A: AnyArray
+    B: AnyArray
 
 
-def linearize(plant: Plant, state: Any, control: Any) -> StateSpace:
+def linearize(plant: Plant, state: PyTree, control: Scalar) -> StateSpace:
     """Return df/dx (n, n) and df/du (n, m) of a plant x' = f(x, u), at a state and a control.
 
     >>> from diffabs import BrakeStart, plants, roads
@@ -49,7 +50,11 @@ def linearize(plant: Plant, state: Any, control: Any) -> StateSpace:
 
 
 def tracking_dynamics(
-    plant: Plant, state: Any, control: Any, tracked: Sequence[str] = ("slip",), frozen: Sequence[str] = FROZEN_OUTPUTS
+    plant: Plant,
+    state: PyTree,
+    control: Scalar,
+    tracked: Sequence[str] = ("slip",),
+    frozen: Sequence[str] = FROZEN_OUTPUTS,
 ) -> StateSpace:
     """Return the linear dynamics of the tracked outputs and the remaining states, with the frozen outputs held.
 
@@ -75,7 +80,7 @@ def tracking_dynamics(
     unravel = ravel_pytree(state)[1]
     kept = independent_components(plant, state, (*tracked, *frozen))
 
-    def chart(x: Any) -> Any:
+    def chart(x: Scalar) -> AnyArray:
         y = plant.output(unravel(x))
         h, w = ([jnp.ravel(getattr(y, name)) for name in names] for names in (tracked, frozen))
         return jnp.concatenate([*h, x[kept], *w])
@@ -88,7 +93,7 @@ def tracking_dynamics(
     return StateSpace(jnp.linalg.solve(by_x.T, a.T).T[:n, :n], b[:n])
 
 
-def as_vectors(plant: Plant, state: Any, control: Any) -> Any:
+def as_vectors(plant: Plant, state: PyTree, control: Scalar) -> Matrix:
     """Return f(x, u) as a function of vectors, and the vectors x and u.
 
     Args:
@@ -99,7 +104,7 @@ def as_vectors(plant: Plant, state: Any, control: Any) -> Any:
     plant, state, control = canonical_dtypes((plant, state, control))
     (x, unravel), (u, unravel_control) = ravel_pytree(state), ravel_pytree(control)
 
-    def flow(x: Any, u: Any) -> Any:
+    def flow(x: Scalar, u: Scalar) -> Matrix:
         return ravel_pytree(plant.derivative(0.0, unravel(x), unravel_control(u)))[0]
 
     return flow, x, u
@@ -118,7 +123,7 @@ def _check_chart(by_x: Any, outputs: Sequence[str]) -> None:
             raise ValueError(f"{named} are no coordinates here: they depend on each other (singular Jacobian)")
 
 
-def independent_components(plant: Plant, state: Any, outputs: Sequence[str]) -> np.ndarray:
+def independent_components(plant: Plant, state: PyTree, outputs: Sequence[str]) -> np.ndarray:
     """Return the indices in the flattened state of the components on which none of the outputs depends.
 
     Args:
@@ -131,7 +136,7 @@ def independent_components(plant: Plant, state: Any, outputs: Sequence[str]) -> 
     return np.flatnonzero(np.repeat([not u for u in used], sizes))
 
 
-def used_leaves(plant: Plant, state: Any, outputs: Sequence[str]) -> list[bool]:
+def used_leaves(plant: Plant, state: PyTree, outputs: Sequence[str]) -> list[bool]:
     """Return for each leaf of the state whether at least one of the outputs depends on it.
 
     The traced program decides, and not values: the parameters may be tracers.
@@ -143,7 +148,7 @@ def used_leaves(plant: Plant, state: Any, outputs: Sequence[str]) -> list[bool]:
     """
     leaves, tree = jax.tree.flatten(state)
 
-    def select(*leaves: Any) -> Any:
+    def select(*leaves: PyTree) -> Matrix:
         y = plant.output(jax.tree.unflatten(tree, leaves))
         return [getattr(y, name) for name in outputs]
 

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from diffabs.core.types import Matrix, PyTree
+
 MAX_SMITH_STEPS = 50  # C^(2^50) is 0 for a spectral radius of 1 - 1e-13, and not for a radius of 1
 
 
@@ -26,11 +28,11 @@ class Lyapunov(NamedTuple):
         residual: Relative residual: the norm of the left side over the sum of the norms of its terms.
     """
 
-    P: Any
-    residual: Any
+    P: Matrix
+    residual: PyTree
 
 
-def lyapunov(A: Any, Q: Any) -> Lyapunov:
+def lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
     """Return P of A' P + P A + Q = 0 and its relative residual.
 
     For a stable A, P is the integral of exp(A't) Q exp(At). P is differentiable to any order in both modes; the
@@ -46,7 +48,7 @@ def lyapunov(A: Any, Q: Any) -> Lyapunov:
     return Lyapunov(P, relative_residual(A.T @ P + P @ A + Q, A.T @ P, P @ A, Q))
 
 
-def discrete_lyapunov(A: Any, Q: Any) -> Lyapunov:
+def discrete_lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
     """Return P of A' P A - P + Q = 0 and its relative residual.
 
     For a stable A, P is the sum of (A')^k Q A^k. P is differentiable to any order in both modes; the residual counts as
@@ -66,7 +68,7 @@ def _solve_vectorised(operator: jax.Array, Q: jax.Array) -> jax.Array:
     return jnp.linalg.solve(operator, -Q.ravel()).reshape(Q.shape)
 
 
-def as_float_arrays(*given: Any) -> tuple[Any, ...]:
+def as_float_arrays(*given: PyTree) -> tuple[PyTree, ...]:
     """Return the arguments as arrays of one common floating-point type."""
     given = tuple(jnp.asarray(x) if isinstance(x, list | tuple) else x for x in given)
     kind = jnp.result_type(float, *given)
@@ -173,11 +175,11 @@ def solve_stein(C: jax.Array, *right: jax.Array) -> tuple[jax.Array, ...]:
         right: One or more W, each of shape (n, n, batch).
     """
 
-    def goes_on(carry: tuple[Any, ...]) -> jax.Array:
+    def goes_on(carry: tuple[PyTree, ...]) -> jax.Array:
         k, C, _ = carry
         return (k < MAX_SMITH_STEPS) & jnp.any(frobenius_norm(C) > 1e-9)
 
-    def double(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+    def double(carry: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
         k, C, X = carry
         return k + 1, times(C, C), tuple(x + times(transpose(C), x, C) for x in X)
 

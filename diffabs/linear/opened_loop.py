@@ -26,6 +26,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.tracing import depends_on_signal
+from diffabs.core.types import Matrix, Part, PyTree, Scalar
 from diffabs.linear.linearization import StateSpace, independent_components
 from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer
@@ -65,7 +66,7 @@ class OpenLoop(NamedTuple):
         return _drop_unobserved_states(_series(plant, self.controller)._replace(delay=whole * self.period))
 
 
-def open_loop(loop: Loop, target: Any = None) -> OpenLoop:
+def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
     """Return a loop, linearised at rest on its setpoint and opened at the controller's command.
 
     Args:
@@ -121,7 +122,7 @@ def _check_continuous(loop: Loop) -> None:
             raise ValueError(f"{name} {type(block).__name__} acts at instants: it has no linear model{hint}")
 
 
-def _ticks_use_signal(block: Any, signal: Any) -> bool:
+def _ticks_use_signal(block: Part, signal: PyTree) -> bool:
     """Return whether a block's ticks depend on its signal. Ticks that only draw noise do not."""
     memory, clock = block.start(signal), Clock(0.0, 1e-3, 1, jax.random.key(0))
     return depends_on_signal(lambda signal: block.tick(clock, memory, signal).held, signal)
@@ -130,27 +131,27 @@ def _ticks_use_signal(block: Any, signal: Any) -> bool:
 class _SurroundingStates(NamedTuple):
     """Integrated states of the parts around the controller."""
 
-    plant: Any
-    sensor: Any
-    actuator: Any
+    plant: Part
+    sensor: Part
+    actuator: Part
 
 
 class _LinearHalves(NamedTuple):
     """Matrices (A, B, C, D) of both halves, and their distance from rest, relative to the state."""
 
-    plant: Any
-    controller: Any
-    residue: Any
+    plant: Part
+    controller: Part
+    residue: Scalar
 
 
-def _start_output_and_setpoint(loop: Loop) -> tuple[Any, Any]:
+def _start_output_and_setpoint(loop: Loop) -> tuple[PyTree, PyTree]:
     """Return the plant's output at the start, and the setpoint."""
     start = loop.start()
     return loop.plant.output(start.plant), loop.reference.setpoint(start.reference)
 
 
 @jax.jit
-def _linearize_halves(loop: Loop, setpoint: Any) -> _LinearHalves:
+def _linearize_halves(loop: Loop, setpoint: Scalar) -> _LinearHalves:
     loop, setpoint = canonical_dtypes((loop, setpoint))
     around, free, residue = _find_rest(loop, setpoint)
     z, command = free[:-1], free[-1]
@@ -171,7 +172,7 @@ class _Surroundings:
     Then follow the states of sensor and actuator, and the `held` frozen outputs.
     """
 
-    def __init__(self, loop: Loop, setpoint: Any):
+    def __init__(self, loop: Loop, setpoint: Scalar):
         state = loop.start()
         parts = _SurroundingStates(state.plant, state.sensor.flow, state.actuator.flow)
         self.loop, self.setpoint = loop, setpoint
@@ -185,20 +186,20 @@ class _Surroundings:
         )
         self.kept, self.size, self.held = kept, size, len(self.frozen)
 
-    def output(self, z: Any) -> Any:
+    def output(self, z: Matrix) -> Matrix:
         """Return the plant's output."""
         return self.loop.plant.output(self.unravel(z).plant)
 
-    def signal(self, z: Any) -> Tracking:
+    def signal(self, z: Matrix) -> Tracking:
         """Return the controller's input signal, with the target at the setpoint."""
         measured = self.loop.sensor.output(0.0, Memory(self.unravel(z).sensor, self.memory[0]), self.output(z))
         return Tracking(self.setpoint, measured, self.loop.feedforward.input(self.loop.plant, measured, self.setpoint))
 
-    def signals(self, z: Any) -> Any:
+    def signals(self, z: Matrix) -> Matrix:
         """Return the controller's input signal as a vector."""
         return ravel_pytree(self.signal(z))[0]
 
-    def flow(self, z: Any, command: Any) -> Any:
+    def flow(self, z: Matrix, command: Scalar) -> Matrix:
         """Return dz/dt."""
         x = self.unravel(z)
         actuator = Memory(x.actuator, self.memory[1])
@@ -210,7 +211,7 @@ class _Surroundings:
         )
         return ravel_pytree(rates)[0]
 
-    def chart(self, z: Any) -> Any:
+    def chart(self, z: Matrix) -> Matrix:
         """Return the coordinates."""
         if not self.frozen:
             return z
@@ -218,11 +219,11 @@ class _Surroundings:
         last = jnp.stack([getattr(y, name) for name in self.frozen])
         return jnp.concatenate([y[0][None], z[self.kept], z[self.size :], last])
 
-    def moves(self, z: Any, command: Any) -> Any:
+    def moves(self, z: Matrix, command: Scalar) -> Matrix:
         """Return the rates of the coordinates."""
         return jax.jvp(self.chart, (z,), (self.flow(z, command),))[1]
 
-    def rest_residual(self, free: Any) -> Any:
+    def rest_residual(self, free: PyTree) -> Matrix:
         """Return a vector that is zero at rest.
 
         It contains the rates of all coordinates except the frozen outputs, and the change of the frozen outputs since
@@ -234,7 +235,7 @@ class _Surroundings:
         return jnp.concatenate([rates, where, (self.output(z)[0] - self.setpoint)[None]])
 
 
-def _find_rest(loop: Loop, setpoint: Any) -> tuple[_Surroundings, Any, Any]:
+def _find_rest(loop: Loop, setpoint: Scalar) -> tuple[_Surroundings, PyTree, PyTree]:
     """Return the surroundings of the controller, (z, command) at rest, and the relative residual there."""
     around = _Surroundings(loop, setpoint)
     there = around.chart(around.start)
@@ -246,7 +247,7 @@ def _find_rest(loop: Loop, setpoint: Any) -> tuple[_Surroundings, Any, Any]:
     return around, free, jnp.max(jnp.abs(around.rest_residual(free))) / (1 + jnp.max(jnp.abs(free)))
 
 
-def _linearize_controller(loop: Loop, signal: Any, as_signal: Any, command: Any) -> Any:
+def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: Scalar) -> Matrix:
     """Return (A, B, C, D) of the controller from its signal to its command, at rest with the command that holds the
     plant.
     """
@@ -254,7 +255,7 @@ def _linearize_controller(loop: Loop, signal: Any, as_signal: Any, command: Any)
     sampled = isinstance(controller, Sampled)
     inside, unravel = ravel_pytree(memory.held.inner if sampled else memory)
 
-    def compute(c: Any, s: Any) -> tuple[Any, Any]:
+    def compute(c: Scalar, s: Scalar) -> tuple[PyTree, PyTree]:
         """Return the memory after a sample, or its rate in continuous time; and the command."""
         memory, tracking = unravel(c), as_signal(s)
         if not isinstance(controller, Sampled):
@@ -264,12 +265,12 @@ def _linearize_controller(loop: Loop, signal: Any, as_signal: Any, command: Any)
         after, output = controller.compute_sample(clock, memory, tracking)
         return ravel_pytree(after)[0], output
 
-    def rest_residual(c: Any, s: Any = signal) -> Any:
+    def rest_residual(c: Scalar, s: Scalar = signal) -> Matrix:
         """Return a vector that is zero where the memory is at rest and the command holds the plant."""
         after, output = compute(c, s)
         return jnp.append(after - c if sampled else after, output - command)
 
-    def find_rest(offset: Any) -> Any:
+    def find_rest(offset: Scalar) -> Matrix:
         """Return the memory at rest, and the size of the remaining residual. `offset` moves the target for the first
         step.
         """

@@ -21,6 +21,7 @@ from diffabs.core.blocks import Direct, NoFeedforward
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Feedforward, Memory, Plant, Reference, Tracking
 from diffabs.core.pytree import canonical_dtypes, part, pytree, static
+from diffabs.core.types import AnyArray, Matrix, Part, PyTree, Scalar
 from diffabs.linear.linearization import StateSpace
 from diffabs.stops import NoStop
 
@@ -38,10 +39,10 @@ class LinearLoop(NamedTuple):
         residue: Largest rate or error at the operating point, relative to the size of the state.
     """
 
-    A: Any
-    B: Any
-    K: Any
-    residue: Any
+    A: AnyArray
+    B: AnyArray
+    K: AnyArray
+    residue: Scalar
 
 
 @pytree
@@ -53,7 +54,7 @@ class OperatingPoint:
     """
 
     plant: Plant = part()
-    initial: Any = part()
+    initial: Part = part()
     sensor: Block = part(default=Direct)
     reference: Reference = part()
     feedforward: Feedforward = part(default=NoFeedforward)
@@ -80,7 +81,7 @@ class OperatingPoint:
         found, kept = _linearize_at_rest(self), np.array(self.kept, int)
         return StateSpace(found.A[kept][:, kept], found.B[kept])
 
-    def gain(self) -> Any:
+    def gain(self) -> AnyArray:
         """Return K (n,) of the loop's own controller."""
         return _linearize_at_rest(self).K[np.array(self.kept, int)]
 
@@ -111,7 +112,7 @@ def operating_point(loop: Loop) -> OperatingPoint:
     return dataclasses.replace(model, kept=_needed_states(found, plant))  # pyright: ignore[reportArgumentType]
 
 
-def loop_gain(loop: Loop, states: tuple[str, ...]) -> Any:
+def loop_gain(loop: Loop, states: tuple[str, ...]) -> AnyArray:
     """Return K (n,) of a loop's controller on the named states, differentiable in the loop's parameters.
 
     Args:
@@ -139,10 +140,10 @@ def _needed_states(found: LinearLoop, plant: np.ndarray) -> tuple[int, ...]:
 class _IntegratedStates(NamedTuple):
     """Integrated states of a loop, without those of the reference."""
 
-    plant: Any
-    sensor: Any
-    controller: Any
-    actuator: Any
+    plant: Part
+    sensor: Part
+    controller: Part
+    actuator: Part
 
 
 def _start(loop: Loop) -> _IntegratedStates:
@@ -165,21 +166,21 @@ class _VectorLoop(NamedTuple):
     """
 
     loop: Loop
-    setpoint: Any
+    setpoint: Scalar
     unravel: Any
 
-    def track(self, z: Any) -> tuple[Any, Tracking]:
+    def track(self, z: AnyArray) -> tuple[PyTree, Tracking]:
         """Return the plant's output and the controller's input signal."""
         loop, x = self.loop, self.unravel(z)
         y = loop.plant.output(x.plant)
         measured = loop.sensor.output(0.0, Memory(x.sensor), y)
         return y, Tracking(self.setpoint, measured, loop.feedforward.input(loop.plant, measured, self.setpoint))
 
-    def command(self, z: Any) -> Any:
+    def command(self, z: AnyArray) -> AnyArray:
         """Return the controller's command."""
         return self.loop.controller.output(0.0, Memory(self.unravel(z).controller), self.track(z)[1])
 
-    def flow(self, z: Any, v: Any) -> Any:
+    def flow(self, z: AnyArray, v: Scalar) -> AnyArray:
         """Return dz/dt."""
         loop, x = self.loop, self.unravel(z)
         y, seen = self.track(z)
@@ -201,7 +202,7 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     at = _IntegratedStates(*(np.size(ravel_pytree(part)[0]) for part in _start(loop)))
     inside = np.repeat(np.arange(4) == _IntegratedStates._fields.index("controller"), at)
 
-    def still(free: Any) -> Any:
+    def still(free: PyTree) -> Matrix:
         """Return the rates of everything but the controller, and the first signal minus the setpoint; zero at rest."""
         moved = z.at[~inside].set(free[:-1])
         return jnp.append(one.flow(moved, free[-1])[~inside], one.track(moved)[0][0] - setpoint)
@@ -210,7 +211,7 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     free = find_root(still, jnp.append(z[~inside], 0.0))
     z = z.at[~inside].set(free[:-1])
 
-    def rest_residual(memory: Any, z: Any = z) -> Any:
+    def rest_residual(memory: PyTree, z: Matrix = z) -> Matrix:
         """Return the rates of the controller's memory, and its command minus the command that holds the plant; zero at
         rest.
         """
@@ -223,7 +224,7 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     return LinearLoop(a, b[:, None], jax.jacfwd(one.command)(z), residue)
 
 
-def find_root(function: Any, x: Any) -> Any:
+def find_root(function: Any, x: Scalar) -> AnyArray:
     """Return a root of a function, or its least-squares minimiser, by the Gauss-Newton method.
 
     The result is differentiable twice in the parameters of the function.
@@ -233,7 +234,7 @@ def find_root(function: Any, x: Any) -> Any:
         x: Starting point, shape (n,).
     """
 
-    def step(x: Any, function: Any = function) -> Any:
+    def step(x: Scalar, function: Any = function) -> AnyArray:
         return x - jax.lax.stop_gradient(jnp.linalg.pinv(jax.jacfwd(function)(x))) @ function(x)
 
     if not x.size:

@@ -15,15 +15,14 @@ Source: T. Hu, Z. Lin, L. Qiu, Stabilization of exponentially unstable linear sy
 Trans. Autom. Control 46, 2001.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.types import AnyArray, PyTree, Scalar
 from diffabs.linear.riccati import care
 
 
-def recoverable_bound(A: Any, B: Any, start: Any, limit: Any) -> Any:
+def recoverable_bound(A: AnyArray, B: AnyArray, start: PyTree, limit: Scalar) -> AnyArray:
     """Return the largest multiple of `start` from which some |u| <= limit returns, for a system with one unstable pole.
 
     The result is differentiable; it is NaN if A has poles on the imaginary axis. With several unstable poles it is not
@@ -40,7 +39,7 @@ def recoverable_bound(A: Any, B: Any, start: Any, limit: Any) -> Any:
     return 2 * limit / jnp.sqrt((b @ p @ b) * (d @ p @ d))
 
 
-def mode_bounds(A: Any, B: Any, start: Any, limit: float) -> dict[float, float]:
+def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[float, float]:
     """Return for each unstable real pole the largest multiple of `start` from which some |u| <= limit returns this
     mode.
 
@@ -63,7 +62,7 @@ def mode_bounds(A: Any, B: Any, start: Any, limit: float) -> dict[float, float]:
     return found
 
 
-def transmission_zeros(A: Any, B: Any, output: Any) -> np.ndarray:
+def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
     """Return the finite transmission zeros of x' = A x + B u, y = c'x with one input: where the Rosenbrock matrix loses
     rank.
 

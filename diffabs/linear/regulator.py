@@ -7,13 +7,14 @@ Both are pure JAX: compiled, batched and differentiable in every matrix. If the 
 before the equation is solved. Inside `jit` and `vmap` the flag `stabilising` reports a failure, and K is NaN.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
+from diffabs.core.types import AnyArray, Bool, Matrix, PyTree
 from diffabs.linear.riccati import care, dare
 from diffabs.linear.weights import as_weight_matrix
 
@@ -31,13 +32,13 @@ class Regulator(NamedTuple):
         stabilising: Whether P is proven to be the stabilising solution, as in `Riccati`.
     """
 
-    gain: Any
-    P: Any
-    residual: Any
-    stabilising: Any
+    gain: AnyArray
+    P: AnyArray
+    residual: PyTree
+    stabilising: Bool
 
 
-def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
+def lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Regulator:
     """Return the regulator that minimises the integral of x'Q x + 2 x'S u + u'R u for x' = A x + B u.
 
     >>> import jax
@@ -63,7 +64,7 @@ def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
     return _solve_lqr(A, B, Q, R, S)
 
 
-def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
+def dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Regulator:
     """Return the regulator that minimises the sum of x'Q x + 2 x'S u + u'R u for x(k+1) = A x(k) + B u(k).
 
     >>> import jax
@@ -88,21 +89,21 @@ def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
-def _solve_lqr(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
+def _solve_lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Regulator:
     found = care(A, B, Q, R, S)
     turned = jnp.asarray(B).T @ found.P + (0.0 if S is None else jnp.asarray(S).T)
     return Regulator(-jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned), *found)
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
-def _solve_dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
+def _solve_dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Regulator:
     found = dare(A, B, Q, R, S)
     b = jnp.asarray(B)
     turned = b.T @ found.P @ jnp.asarray(A) + (0.0 if S is None else jnp.asarray(S).T)
     return Regulator(-jnp.linalg.solve(jnp.asarray(R) + b.T @ found.P @ b, turned), *found)
 
 
-def _check_matrices(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool) -> None:
+def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, *, discrete: bool) -> None:
     """Raise ValueError for matrices of numbers that have no regulator; accept traced ones."""
     if any(isinstance(x, Tracer) for x in (A, B, Q, R)):
         return
@@ -123,7 +124,7 @@ def _check_matrices(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool) -> None:
         raise ValueError(f"the pair (A, B) is not stabilisable: the input does not move the mode at {unmoved:.6g}")
 
 
-def unstabilisable_mode(A: Any, B: Any, *, discrete: bool = False) -> complex | None:
+def unstabilisable_mode(A: AnyArray, B: AnyArray, *, discrete: bool = False) -> complex | None:
     """Return an unstable eigenvalue of A that the input cannot move, or None.
 
     At such an eigenvalue s, (A - s I, B) has a rank below n (test of Popov, Belevitch and Hautus).

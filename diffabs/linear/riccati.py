@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
+from diffabs.core.types import AnyArray, Bool, Matrix, PyTree
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.lyapunov import discrete_lyapunov as _discrete_lyapunov
 from diffabs.linear.lyapunov import lyapunov as _lyapunov
@@ -52,12 +53,12 @@ class Riccati(NamedTuple):
         stabilising: Whether P is proven to be the stabilising solution.
     """
 
-    P: Any
-    residual: Any
-    stabilising: Any
+    P: AnyArray
+    residual: PyTree
+    stabilising: Bool
 
 
-def care(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
+def care(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Riccati:
     """Return the stabilising solution P of the continuous Riccati equation, with its proof.
 
         A' P + P A - (P B + S) R^-1 (P B + S)' + Q = 0,     u = -R^-1 (B' P + S') x
@@ -78,7 +79,7 @@ def care(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
     return _riccati(_solve_continuous, A, B, Q, R, S)
 
 
-def dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
+def dare(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Riccati:
     """Return the stabilising solution P of the discrete Riccati equation, with its proof.
 
         A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0,     u = -(R + B' P B)^-1 (B' P A + S') x
@@ -98,7 +99,7 @@ def dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
     return _riccati(_solve_discrete, A, B, Q, R, S)
 
 
-def _riccati(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Riccati:
+def _riccati(solution: Callable, A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Riccati:
     A, B, Q, R = as_float_arrays(A, B, Q, R)
     S = jnp.zeros_like(B) if S is None else as_float_arrays(S)[0].astype(B.dtype)
     if jnp.iscomplexobj(B) or jnp.iscomplexobj(S):
@@ -115,7 +116,7 @@ def _riccati(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Ricc
 
 
 @compile_once(static=1, options=SAME_RESULT_OPTIONS)
-def _solve_compiled(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Riccati:
+def _solve_compiled(solution: Callable, A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray) -> Riccati:
     P, residual = solution(A, B, (Q + Q.T) / 2, (R + R.T) / 2, S)
     return Riccati(P, residual, jnp.all(jnp.isfinite(P)))
 
@@ -136,11 +137,11 @@ def _solve_discrete(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @_solve_continuous.defjvp
-def _solve_continuous_jvp(data: Any, tangents: Any) -> Any:
+def _solve_continuous_jvp(data: Any, tangents: PyTree) -> Matrix:
     """Solve Ac' dP + dP Ac + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_continuous(*data)
 
-    def left_side(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
+    def left_side(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix:
         PA, T = P @ A, P @ B + S
         return PA + PA.T - T @ jnp.linalg.solve(R, T.T) + Q
 
@@ -150,11 +151,11 @@ def _solve_continuous_jvp(data: Any, tangents: Any) -> Any:
 
 
 @_solve_discrete.defjvp
-def _solve_discrete_jvp(data: Any, tangents: Any) -> Any:
+def _solve_discrete_jvp(data: Any, tangents: PyTree) -> Matrix:
     """Solve Ac' dP Ac - dP + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_discrete(*data)
 
-    def left_side(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
+    def left_side(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix:
         T = A.T @ P @ B + S
         return A.T @ P @ A - T @ jnp.linalg.solve(R + B.T @ P @ B, T.T) + Q
 

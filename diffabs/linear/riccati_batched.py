@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
+from diffabs.core.types import Matrix, PyTree, Scalar
 from diffabs.linear.lyapunov import (
     cholesky,
     eye,
@@ -51,7 +52,7 @@ def _batch_over_matrices(solver: Callable) -> Callable:
     """
 
     @custom_vmap
-    def many(*data: jax.Array) -> Any:
+    def many(*data: jax.Array) -> Matrix:
         lanes = len(data[0])
         width = min(CHUNK_MATRICES, lanes)
         # The padding repeats the last equation. Zeros have no solution, and would start the fallback for the chunk.
@@ -63,7 +64,7 @@ def _batch_over_matrices(solver: Callable) -> Callable:
         return P.reshape(-1, *P.shape[2:])[:lanes], residual.ravel()[:lanes]
 
     @many.def_vmap
-    def rule(axis_size: int, batched: Any, *data: jax.Array) -> Any:
+    def rule(axis_size: int, batched: Any, *data: jax.Array) -> Matrix:
         full = [x if b else jnp.broadcast_to(x, (axis_size, *x.shape)) for x, b in zip(data, batched, strict=True)]
         P, residual = many(*(x.reshape(-1, *x.shape[2:]) for x in full))
         return (P.reshape(axis_size, -1, *P.shape[1:]), residual.reshape(axis_size, -1)), (True, True)
@@ -72,7 +73,7 @@ def _batch_over_matrices(solver: Callable) -> Callable:
 
 
 @_batch_over_matrices
-def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
+def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Matrix:
     """Return (P, residual) of continuous equations; P is NaN where it is not proven.
 
     Args:
@@ -95,7 +96,7 @@ def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
 
 
 @_batch_over_matrices
-def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
+def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Matrix:
     """Return (P, residual) of discrete equations; P is NaN where it is not proven.
 
     Args:
@@ -138,7 +139,7 @@ def _blocks(*blocks: jax.Array) -> jax.Array:
 # Steps 1 and 2
 
 
-def _reduce_and_balance(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
+def _reduce_and_balance(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix:
     """Return B L^-T and S L^-T, the balanced equation with R = I and S = 0, and scales d of the state.
 
     L is the Cholesky factor, L L' = R. The balanced matrices are those of A - B R^-1 S', B L^-T and Q - S R^-1 S'.
@@ -150,7 +151,7 @@ def _reduce_and_balance(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
     return B, S, a * d / d[:, None], B / d[:, None], q * d * d[:, None], d
 
 
-def _shift_weights(A: Any, B: Any, Q: Any, R: Any, S: Any, definite: jax.Array) -> tuple[Any, ...]:
+def _shift_weights(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix, definite: jax.Array) -> tuple[PyTree, ...]:
     """Return Q, R, S of the discrete equation for P - shift, and the diagonal matrix `shift`.
 
     The shift is 0 where R is definite, and NaN where R is not semidefinite. In balanced coordinates it is as large as
@@ -210,11 +211,11 @@ def _solve_by_doubling(A: jax.Array, G: jax.Array, Q: jax.Array) -> tuple[jax.Ar
     """
     n = len(A)
 
-    def goes_on(carry: Any) -> jax.Array:
+    def goes_on(carry: PyTree) -> jax.Array:
         k, A, _, _ = carry
         return (k < MAX_DOUBLINGS) & jnp.any(frobenius_norm(A) > 1e-5)  # the error of Q is its square
 
-    def double(carry: Any) -> Any:
+    def double(carry: PyTree) -> Matrix:
         k, A, G, Q = carry
         W = gauss_jordan_solve(eye(n, A) + times(G, Q), jnp.concatenate([A, G], 1))[0]
         T = transpose(A)
@@ -233,11 +234,11 @@ def _fill_unsolved(found: jax.Array, P: jax.Array, otherwise: Callable) -> jax.A
 def _sign(Z: jax.Array) -> jax.Array:
     """Return the matrix sign by Newton's iteration Z <- (c Z + (c Z)^-1)/2, c = abs(det Z)^(-1/size)."""
 
-    def goes_on(carry: Any) -> jax.Array:
+    def goes_on(carry: PyTree) -> jax.Array:
         k, _, moved = carry
         return (k < MAX_SIGN_ITERATIONS) & jnp.any(moved > 1e-5)  # converges quadratically
 
-    def step(carry: Any) -> Any:
+    def step(carry: PyTree) -> Matrix:
         k, Z, _ = carry
         inverse, log = gauss_jordan_solve(Z, eye(len(Z), Z))
         c = jnp.exp(-log / len(Z))
@@ -258,17 +259,17 @@ def _solution_from_sign(Z: jax.Array) -> jax.Array:
 # Steps 3 and 4
 
 
-def _refine_and_prove(newton: Callable, P: jax.Array, shift: Any = 0.0) -> jax.Array:
+def _refine_and_prove(newton: Callable, P: jax.Array, shift: Scalar = 0.0) -> jax.Array:
     """Return P after Newton-Kleinman steps until it moves by less than 1e-7, or NaN where the last step proves no
     solution.
 
     Errors are relative to P + shift.
     """
 
-    def goes_on(carry: Any) -> jax.Array:
+    def goes_on(carry: PyTree) -> jax.Array:
         return ~carry[0]
 
-    def step(carry: Any) -> Any:
+    def step(carry: PyTree) -> Matrix:
         _, k, P, moved, *_ = carry
         last = (k >= MAX_KLEINMAN_STEPS) | ~jnp.any(moved > 1e-7)
         # Only the last step needs X. A second copy of the step for it would take as long to compile.
@@ -298,13 +299,13 @@ def _unscale_with_residual(P: jax.Array, d: jax.Array, terms: Callable) -> tuple
     return jnp.where(residual <= MAX_RELATIVE_RESIDUAL, P, jnp.nan), residual
 
 
-def _terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
+def _terms(A: Matrix, B: Matrix, Q: Matrix, S: Matrix, P: Matrix) -> tuple[PyTree, ...]:
     """Return the terms of the continuous equation with R = I."""
     PA, T = times(P, A), times(P, B) + S
     return PA, transpose(PA), -times(T, transpose(T)), Q
 
 
-def _discrete_terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
+def _discrete_terms(A: Matrix, B: Matrix, Q: Matrix, S: Matrix, P: Matrix) -> tuple[PyTree, ...]:
     """Return the terms of the discrete equation with R = I."""
     PA, PB = times(P, A), times(P, B)
     T = times(transpose(B), PA) + transpose(S)
@@ -312,7 +313,7 @@ def _discrete_terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
     return times(transpose(A), PA), -P, -times(transpose(T), gain), Q
 
 
-def _kleinman(A: Any, B: Any, Q: Any, scale: Any, P: Any, *extra: Any) -> tuple[Any, ...]:
+def _kleinman(A: Matrix, B: Matrix, Q: Matrix, scale: Scalar, P: Matrix, *extra: Scalar) -> tuple[PyTree, ...]:
     """Return the size of the terms, the Newton step D, and one X for each E of `extra`.
 
         Ac' D + D Ac + (left side at P) = 0,     Ac' X + X Ac + E = 0
@@ -327,7 +328,7 @@ def _kleinman(A: Any, B: Any, Q: Any, scale: Any, P: Any, *extra: Any) -> tuple[
     return sum(map(frobenius_norm, terms)), *solve_stein(I + 2 * scale * M, *right)
 
 
-def _hewer(A: Any, B: Any, Q: Any, P: Any, *extra: Any) -> tuple[Any, ...]:
+def _hewer(A: Matrix, B: Matrix, Q: Matrix, P: Matrix, *extra: Scalar) -> tuple[PyTree, ...]:
     """Return the size of the terms, the Newton step D, and one X for each E of `extra`, in discrete time.
 
         Ac' D Ac - D + (left side at P) = 0,     Ac' X Ac - X + E = 0

@@ -3,12 +3,13 @@
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
+from diffabs.core.types import Scalar
 from diffabs.linear.opened_loop import OpenLoop, open_loop
 from diffabs.linear.stability_margins import Margins, margins
 
@@ -63,7 +64,7 @@ class Band(NamedTuple):
         return {name: max(self.systems, key=lambda one, bad=bad: bad(one.margins)) for name, bad in BADNESS.items()}
 
 
-def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, target: Any = None) -> Band:
+def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, target: Scalar = None) -> Band:
     """Return the margins of a loop over a box {path: (low, high)}: at its corners, and at samples that fill it evenly.
 
     Args:
@@ -91,7 +92,7 @@ def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, tar
     )
 
 
-def _system(loop: Loop, values: dict[str, float], target: Any) -> System:
+def _system(loop: Loop, values: dict[str, float], target: Scalar) -> System:
     opened = open_loop(replace(loop, values), target)
     return System(values, opened, margins(opened))
 

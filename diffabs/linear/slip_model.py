@@ -15,6 +15,7 @@ from diffabs.actuators import Lag
 from diffabs.core.blocks import Direct
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import Scalar, canonical_dtypes, param, part, pytree, static
+from diffabs.core.types import AnyArray, PyTree
 from diffabs.linear.linearization import (
     REMAINING_STATE_ITERATIONS,
     StateSpace,
@@ -111,7 +112,7 @@ class SlipModel:
         self._check_supported()
         return _matrices(self)
 
-    def point(self) -> tuple[Any, Any]:
+    def point(self) -> tuple[PyTree, PyTree]:
         """Return state and control of the linearisation: the slip is held, the remaining states are at rest, the speed
         falls.
         """
@@ -122,10 +123,10 @@ class SlipModel:
             return start, control
         flow, x, u = as_vectors(self.plant, start, control)
 
-        def rate(z: Any) -> Any:
+        def rate(z: AnyArray) -> AnyArray:
             return flow(x.at[kept].set(z), u)[kept]
 
-        def newton(_: Any, z: Any) -> Any:
+        def newton(_: Any, z: AnyArray) -> AnyArray:
             return z - jnp.linalg.solve(jax.jacfwd(rate)(z), rate(z))
 
         # A fixed number of iterations: a loop until convergence has no reverse-mode derivative.
@@ -172,7 +173,7 @@ def _matrices(model: SlipModel) -> StateSpace:
     return model.with_memory(model.controlled_system())
 
 
-def _behind_lag(system: StateSpace, time_constant: Any) -> StateSpace:
+def _behind_lag(system: StateSpace, time_constant: Scalar) -> StateSpace:
     """Return the system behind a lag T x' = u - x, whose state becomes the last one."""
     a, b = system
     n, rate = len(a), 1 / time_constant

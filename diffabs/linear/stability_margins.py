@@ -10,10 +10,11 @@ are close, and bisected to rounding.
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.types import Matrix, Scalar
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.transfer import Transfer
 
@@ -236,7 +237,7 @@ def _refine_grid(system: Transfer, w: np.ndarray) -> np.ndarray:
     return w
 
 
-def _response(system: Transfer, w: Any) -> Any:
+def _response(system: Transfer, w: Scalar) -> Matrix:
     return system.response(w)[:, 0, 0]
 
 

@@ -6,9 +6,11 @@
 Matrices are NumPy arrays. The delay is exact: its response is e^(-j w delay), without an approximation.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+
+from diffabs.core.types import Matrix, Part, Scalar
 
 WHOLE_PERIOD_TOLERANCE = 1e-9  # of a period: how far from whole periods the delay of a sampled system may be
 
@@ -25,10 +27,10 @@ class Transfer(NamedTuple):
         delay: Pure delay [s].
     """
 
-    A: Any
-    B: Any
-    C: Any
-    D: Any
+    A: Matrix
+    B: Matrix
+    C: Matrix
+    D: Matrix
     period: float | None = None
     delay: float = 0.0
 
@@ -37,7 +39,7 @@ class Transfer(NamedTuple):
         """Poles (n,) of the rational part: in s, or in z if sampled."""
         return np.linalg.eigvals(self.A) if len(self.A) else np.zeros(0)
 
-    def rational_response(self, w: Any) -> np.ndarray:
+    def rational_response(self, w: Scalar) -> np.ndarray:
         """Return the response (k, p, m) at frequencies w (k,) [rad/s], without the delay; infinite at a pole."""
         w = np.atleast_1d(np.asarray(w, float))
         point = 1j * w if self.period is None else np.exp(1j * w * self.period)
@@ -45,7 +47,7 @@ class Transfer(NamedTuple):
         with np.errstate(all="ignore"):
             return self.C @ _solve_or_infinite(shifted, np.asarray(self.B, complex)) + self.D
 
-    def response(self, w: Any) -> np.ndarray:
+    def response(self, w: Scalar) -> np.ndarray:
         """Return the response (k, p, m) at frequencies w (k,) [rad/s]."""
         return self.rational_response(w) * np.exp(-1j * np.atleast_1d(np.asarray(w, float)) * self.delay)[:, None, None]
 
@@ -92,7 +94,7 @@ def _delay_one_period(system: Transfer) -> Transfer:
     return system._replace(A=a, B=b, C=np.hstack([system.C, system.D]), D=np.zeros_like(system.D))
 
 
-def to_control(system: Transfer, *, pade: int | None = None) -> Any:
+def to_control(system: Transfer, *, pade: int | None = None) -> Matrix:
     """Return a system as python-control's `StateSpace`, with whole periods of delay as states.
 
     Args:
@@ -103,7 +105,7 @@ def to_control(system: Transfer, *, pade: int | None = None) -> Any:
         ModuleNotFoundError: python-control is not installed.
         ValueError: The system has a delay in continuous time and `pade` is None.
     """
-    control: Any = _import_control()
+    control: Scalar = _import_control()
     if system.period is None and system.delay:
         if pade is None:
             raise ValueError(
@@ -115,7 +117,7 @@ def to_control(system: Transfer, *, pade: int | None = None) -> Any:
     return control.ss(found.A, found.B, found.C, found.D, 0 if found.period is None else found.period)
 
 
-def from_control(system: Any) -> Transfer:
+def from_control(system: Part) -> Transfer:
     """Return the `Transfer` of a python-control `StateSpace` or `TransferFunction`.
 
     Args:
@@ -125,7 +127,7 @@ def from_control(system: Any) -> Transfer:
         ModuleNotFoundError: python-control is not installed.
         ValueError: The system is sampled with an unknown period (dt=True).
     """
-    control: Any = _import_control()
+    control: Scalar = _import_control()
     found = control.ss(system)
     if found.dt is True:
         raise ValueError("dt is True: the system is sampled, but nothing says how often; give it a period [s]")
@@ -133,7 +135,7 @@ def from_control(system: Any) -> Transfer:
     return Transfer(*matrices, period=float(found.dt) if found.dt else None)
 
 
-def _import_control() -> Any:
+def _import_control() -> Matrix:
     try:
         import control
     except ModuleNotFoundError as error:

@@ -1,11 +1,11 @@
 """Weights of a quadratic cost."""
 
-from typing import Any
-
 import numpy as np
 
+from diffabs.core.types import Scalar
 
-def as_weight_matrix(name: str, value: Any, size: int, *, definite: bool) -> np.ndarray:
+
+def as_weight_matrix(name: str, value: Scalar, size: int, *, definite: bool) -> np.ndarray:
     """Return a weight as a symmetric matrix (size, size).
 
     Args:

@@ -1,16 +1,15 @@
 """Discretisation of a linear system whose input is held over a period, with a computing delay."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.types import AnyArray, Scalar
 from diffabs.linear.linearization import StateSpace
 
 TERMS, EXPONENTIAL_SQUARINGS = 14, 16  # terms of the Taylor series and largest number of squarings of e^a
 
 
-def discretise_held_input(system: StateSpace, period: Any, delay: Any) -> StateSpace:
+def discretise_held_input(system: StateSpace, period: Scalar, delay: Scalar) -> StateSpace:
     """Return the discrete system over one period, whose last states are the previous input.
 
     The previous input acts until `delay` d, then the new one until the period T ends.
@@ -29,7 +28,7 @@ def discretise_held_input(system: StateSpace, period: Any, delay: Any) -> StateS
     return StateSpace(both, jnp.concatenate([after[:n, n:], jnp.eye(m, dtype=a.dtype)]))
 
 
-def _exponential(a: Any) -> Any:
+def _exponential(a: Scalar) -> AnyArray:
     """Return e^a by scaling and squaring of its Taylor series, to about rounding for norms up to
     2^(EXPONENTIAL_SQUARINGS - 1).
 

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, larger, later_of_larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, pytree
+from diffabs.core.types import PyTree
 from diffabs.objectives.tracking import FinalError, held_value, integral_value, keep_memory, no_integral
 
 RATE_NAMES = ("theta_rate", "psi_rate", "phi_rate")
 ANGLE_NAMES = ("theta", "psi", "phi")
 
 
-def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
+def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Scalar:
     """Return |x| weighted by `weights`, with slope 0 at x = 0."""
     square = sum(w * getattr(output, name) ** 2 for w, name in zip(weights, ANGLE_NAMES + RATE_NAMES, strict=True))
     # Two selects: the square root has an infinite slope at 0, and 0 * inf in the branch not taken would be NaN.
@@ -55,7 +56,7 @@ class FinalNorm:
         return _norm(ending.sample.output)
 
 
-def _greatest_angle(name: str) -> tuple[Any, Any, Any, Any]:
+def _greatest_angle(name: str) -> tuple[PyTree, PyTree, PyTree, PyTree]:
     """Return start, flow, update and value of the greatest |angle|, from the cubic of every step."""
 
     def start(self: Any, sample: Sample) -> Memory:
@@ -94,7 +95,7 @@ class PeakArmAngle:
     start, flow, update, value = _greatest_angle("psi")
 
 
-def _greatest_size(size: Any) -> tuple[Any, Any, Any, Any]:
+def _greatest_size(size: Scalar) -> tuple[PyTree, PyTree, PyTree, PyTree]:
     """Return start, flow, update and value of the greatest size(sample).
 
     The search covers both ends of every step. It covers the inside only of a smooth step, in which no limit is reached:
@@ -128,7 +129,7 @@ class PeakVoltage:
     start, flow, update, value = _greatest_size(lambda sample: jnp.abs(sample.control))
 
 
-def motor_torque(sample: Sample) -> Any:
+def motor_torque(sample: Sample) -> Scalar:
     """Return the motor's torque without its friction [N m].
 
     Args:

@@ -17,11 +17,12 @@ from diffabs.core.numerics import larger, later_of_larger, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, parts, pytree
 from diffabs.core.rules import Rule, order_rule
+from diffabs.core.types import Part, PyTree
 
 MIN_SETPOINT = 0.01  # least denominator of an overshoot, in the unit of the first signal
 
 
-def no_integral(self: Any, memory: Memory, sample: Sample) -> Any:
+def no_integral(self: Any, memory: Memory, sample: Sample) -> Scalar:
     """Return (): the `flow` of an objective without an integral.
 
     Args:
@@ -33,7 +34,7 @@ def no_integral(self: Any, memory: Memory, sample: Sample) -> Any:
     return ()
 
 
-def keep_memory(self: Any, memory: Memory, segment: Segment) -> Any:
+def keep_memory(self: Any, memory: Memory, segment: Segment) -> PyTree:
     """Return the held memory unchanged: the `update` of an objective that is only an integral.
 
     Args:
@@ -77,7 +78,7 @@ def tracking_error(sample: Sample) -> Scalar:
     return sample.output[0] - sample.setpoint
 
 
-def highest_signal(output: Any) -> float:
+def highest_signal(output: PyTree) -> float:
     """Return the greatest possible value of the first signal; infinity if the output has no `highest`.
 
     Args:
@@ -86,12 +87,12 @@ def highest_signal(output: Any) -> float:
     return getattr(output, "highest", math.inf)
 
 
-def _side(sample: Sample) -> Any:
+def _side(sample: Sample) -> PyTree:
     """Return -1 for a negative setpoint, else 1."""
     return jnp.where(sample.setpoint < 0, -1.0, 1.0)
 
 
-def absolute_integral(cubic: Cubic, integral: Callable[[Any], Any]) -> Any:
+def absolute_integral(cubic: Cubic, integral: Callable[[PyTree], PyTree]) -> Scalar:
     """Return the integral of |p| over [0, 1], for a cubic p with at most one sign change.
 
     Args:
@@ -275,7 +276,7 @@ class SettlingTime:
         outside = jnp.abs(tracking_error(last)) > self._width(last, memory.held.first)
         return jnp.where(outside, self.unreached, memory.held.entered)
 
-    def _width(self, seen: Any, first: Scalar) -> Any:
+    def _width(self, seen: PyTree, first: Scalar) -> PyTree:
         """Return half the width of the band, for a sample or another tuple with a `setpoint`."""
         return larger(self.share * jnp.abs(seen.setpoint - first), self.band)
 
@@ -315,7 +316,7 @@ class ShareAtLimit:
         yield order_rule(("low", self.low), ("high", self.high), "{control}")
 
 
-def at_limits(loop: Any) -> ShareAtLimit:
+def at_limits(loop: Part) -> ShareAtLimit:
     """Return the objective that measures the share of a run in which the command of a loop is at its limits.
 
     >>> import diffabs as d

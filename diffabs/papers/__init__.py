@@ -9,8 +9,10 @@ imported only on use.
 
 import importlib
 import pathlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
+
+from diffabs.core.types import JsonObject, Table
 
 if TYPE_CHECKING:
     from diffabs.papers.digest import Digest
@@ -20,7 +22,7 @@ Reproduction = Callable[[pathlib.Path, Progress], dict[str, Any]]
 
 
 def _paper(module: str) -> Reproduction:
-    def reproduce(folder: pathlib.Path, progress: Progress) -> dict[str, Any]:
+    def reproduce(folder: pathlib.Path, progress: Progress) -> JsonObject:
         """Write figures and `summary.json` into the folder, and return the summary."""
         return importlib.import_module(f"diffabs.papers.{module}").reproduce(folder, progress)
 
@@ -31,7 +33,7 @@ MODULES = {"slip-lmi": "slip_lmi", "slip-estimator": "slip_estimator", "arm-bala
 PAPERS: dict[str, Reproduction] = {name: _paper(module) for name, module in MODULES.items()}
 
 
-def compact(summary: Mapping[str, Any]) -> "Digest":
+def compact(summary: Table) -> "Digest":
     """Return the digest of a summary that a reproduction wrote.
 
     Args:

@@ -19,6 +19,7 @@ from diffabs.controllers import BalanceFeedback
 from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
+from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Table
 from diffabs.design.attraction import Basin, Cells, Reach, largest_recovered_multiples, region_of_attraction
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.linearization import StateSpace
@@ -90,7 +91,7 @@ SHOWN_QUANTITIES = (
 )  # first words of the quantities that the digest shows
 
 
-def upright_model(plant: Any) -> StateSpace:
+def upright_model(plant: Part) -> StateSpace:
     """Return the linear model (A, B) of a plant about the upright position.
 
     Args:
@@ -99,7 +100,7 @@ def upright_model(plant: Any) -> StateSpace:
     return BalanceModel(plant=plant).matrices()
 
 
-def lqr_gain(plant: Any, weights: Any = (1.0,) * 6, effort: float = 1.0) -> np.ndarray:
+def lqr_gain(plant: Part, weights: PyTree = (1.0,) * 6, effort: float = 1.0) -> np.ndarray:
     """Return the LQR gain K of u = K x about the upright position, shape (6,).
 
     Args:
@@ -110,7 +111,7 @@ def lqr_gain(plant: Any, weights: Any = (1.0,) * 6, effort: float = 1.0) -> np.n
     return np.asarray(lqr(*upright_model(plant), np.diag(weights), effort * np.eye(1)).gain[0])
 
 
-def loop(plant: Any, gain: Any, start: Any = PAPER_START, voltage: float = 48.0) -> Loop:
+def loop(plant: Part, gain: Matrix, start: PyTree = PAPER_START, voltage: float = 48.0) -> Loop:
     """Return the closed loop from a start.
 
     Args:
@@ -143,7 +144,7 @@ def runs() -> dict[str, Run]:
     }
 
 
-def recovered_multiples(one: Loop, rows: Mapping[str, Any]) -> list[Reach]:
+def recovered_multiples(one: Loop, rows: Table) -> list[Reach]:
     """Return the largest recovered one of MULTIPLES of the paper's start, for each parameter value.
 
     Args:
@@ -199,7 +200,7 @@ def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
     return found
 
 
-def robust_gains(progress: Callable[[str], None]) -> dict[str, Any]:
+def robust_gains(progress: Callable[[str], None]) -> JsonObject:
     """Return gains for riders of 40 to 100 kg with their recovered multiples: LQR of one rider, LMI of all, and tuned
     weights.
 
@@ -224,7 +225,7 @@ def robust_gains(progress: Callable[[str], None]) -> dict[str, Any]:
     return found
 
 
-def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[dict[str, Any]]:
+def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[JsonObject]:
     """Return the rows that compare our numbers with the independent ones.
 
     Args:
@@ -282,7 +283,7 @@ def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[dict[str
     return rows
 
 
-def compact(summary: Mapping[str, Any]) -> Digest:
+def compact(summary: Table) -> Digest:
     """Return the digest: falls, bounds of any control, and recovered starts of the hanging arm.
 
     Args:
@@ -302,7 +303,7 @@ def compact(summary: Mapping[str, Any]) -> Digest:
     return digest(summary, ("", "quantity", "ours", "known"), lines, CLAIMS, (where, printed), independent)
 
 
-def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
+def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObject:
     """Write figures and `summary.json` into the folder, and return the summary.
 
     Args:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.types import AnyArray, JsonObject, Scalar
 from diffabs.papers import record
 from diffabs.plants import ArmBalance
 
@@ -19,7 +20,7 @@ Energy = Callable[[ArmBalance, Any, Any], Any]
 RODS = {"body": "body_height", "arm": "arm_length", "rider": "rider_height"}
 
 
-def kinetic(p: ArmBalance, q: Any, v: Any) -> Any:
+def kinetic(p: ArmBalance, q: AnyArray, v: Scalar) -> Scalar:
     """Return the kinetic energy, the sum of eqs. (1), (3), (5) [J].
 
     Args:
@@ -42,7 +43,7 @@ def kinetic(p: ArmBalance, q: Any, v: Any) -> Any:
     return k1 + k2 + k3 + (p.rider_inertia + m3 * (hg**2 + l * hg * jnp.cos(t3))) * v1 * v3
 
 
-def potentials(p: ArmBalance, q: Any) -> Any:
+def potentials(p: ArmBalance, q: AnyArray) -> Scalar:
     """Return eqs. (2), (4), (6) as printed, shape (3,); the second and third add kg m to J.
 
     Args:
@@ -56,7 +57,7 @@ def potentials(p: ArmBalance, q: Any) -> Any:
     return jnp.stack([u1, u2, u3])
 
 
-def lagrangian(p: ArmBalance, q: Any, v: Any) -> Any:
+def lagrangian(p: ArmBalance, q: AnyArray, v: Scalar) -> Scalar:
     """Return eq. (7) [J]: the kinetic energy of the sums theta1 + theta2, minus a potential of the differences.
 
     Args:
@@ -70,7 +71,7 @@ def lagrangian(p: ArmBalance, q: Any, v: Any) -> Any:
     return kinetic(p, q, v) - p.gravity * (heights + p.rider_mass * p.rider_height * jnp.cos(t1 - t3))
 
 
-def euler_lagrange(energy: Energy, p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
+def euler_lagrange(energy: Energy, p: ArmBalance, q: AnyArray, v: Scalar, a: Scalar) -> Scalar:
     """Return d/dt(dL/dv) - dL/dq, shape (3,), by automatic differentiation.
 
     Args:
@@ -84,7 +85,7 @@ def euler_lagrange(energy: Energy, p: ArmBalance, q: Any, v: Any, a: Any) -> Any
     return jax.jvp(lambda q, v: by_rate(p, q, v), (q, v), (v, a))[1] - jax.grad(energy, 1)(p, q, v)
 
 
-def printed_equations(p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
+def printed_equations(p: ArmBalance, q: AnyArray, v: Scalar, a: Scalar) -> Scalar:
     """Return the left sides of eqs. (8), (9), (10), shape (3,).
 
     Args:
@@ -120,7 +121,7 @@ def gravity_stiffness(p: ArmBalance) -> np.ndarray:
     return np.asarray(jax.jacfwd(lambda q: printed_equations(p, q, zero, zero))(zero))
 
 
-def judge_equations(p: ArmBalance) -> list[dict[str, Any]]:
+def judge_equations(p: ArmBalance) -> list[JsonObject]:
     """Return the rows that judge the printed equations, one for each number.
 
     Args:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from diffabs import plot
+from diffabs.core.types import JsonObject, PyTree
 from diffabs.design.attraction import Basin, Reach
 from diffabs.linear.recoverable import mode_bounds
 from diffabs.simulate.solution import Run
@@ -15,11 +16,11 @@ def figures(
     seen: Mapping[str, Run],
     basins: Mapping[str, Basin],
     riders: np.ndarray,
-    over_riders: Mapping[str, tuple[Any, list[Reach]]],
+    over_riders: Mapping[str, tuple[PyTree, list[Reach]]],
     limit: np.ndarray,
     start: np.ndarray,
     hanging: Any,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the figures by file name.
 
     Args:
@@ -87,7 +88,7 @@ def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
     return figure
 
 
-def _riders(riders: np.ndarray, found: Mapping[str, tuple[Any, list[Reach]]], limit: np.ndarray) -> Any:
+def _riders(riders: np.ndarray, found: Mapping[str, tuple[PyTree, list[Reach]]], limit: np.ndarray) -> Any:
     figure, (ax,) = plot.sheet(title="One gain for every rider, hanging arm, 48 V", size=(6.6, 4.0))
     ax.plot(riders, limit, color="black", linewidth=1.2, label="no control beyond (linear)")
     for i, (name, (_, reaches)) in enumerate(found.items()):

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import Decimal
 from typing import Any, NamedTuple
 
+from diffabs.core.types import Table
+
 RELATIVE_TOLERANCE = 1e-3  # of independent numbers
 Row = Mapping[str, Any]
 
@@ -52,7 +54,7 @@ class Digest(NamedTuple):
 
 
 def digest(
-    summary: Mapping[str, Any],
+    summary: Table,
     headings: Sequence[str],
     lines: Sequence[Sequence[str]],
     claims: Iterable[Refuted],

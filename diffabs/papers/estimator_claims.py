@@ -6,11 +6,11 @@ tables.
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
 
+from diffabs.core.types import JsonObject, Table
 from diffabs.papers import record
 from diffabs.roads import peak
 from diffabs.simulate.solution import Run
@@ -107,7 +107,7 @@ def _at(v: np.ndarray, one: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.interp(v, one["speed"][::-1], one["deceleration"][::-1])
 
 
-def judge_estimator_claims(runs: Mapping[str, Run], roads: Mapping[str, Any]) -> list[dict[str, Any]]:
+def judge_estimator_claims(runs: Mapping[str, Run], roads: Table) -> list[JsonObject]:
     """Return the rows that judge the statements, one for each number.
 
     Args:

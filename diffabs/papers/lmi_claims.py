@@ -4,11 +4,10 @@ published gain.
 The paper models a car of a tonne by 5 kg.
 """
 
-from typing import Any
-
 import numpy as np
 from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
+from diffabs.core.types import AnyArray, JsonObject, Matrix
 from diffabs.design import Polytope
 from diffabs.papers import record
 from diffabs.papers.lmi_design import DESIGN_BOX, K1, PUBLISHED_GAIN
@@ -51,7 +50,7 @@ def corner(system: Polytope, mass: float, speed: float) -> tuple[np.ndarray, np.
     return np.asarray(system.A[i]), np.asarray(system.B[i])
 
 
-def cost(A: np.ndarray, B: np.ndarray, gain: Any, weights: tuple[float, float]) -> float:
+def cost(A: np.ndarray, B: np.ndarray, gain: Matrix, weights: tuple[float, float]) -> float:
     """Return trace P of the cost (24) with R = 1 under a stabilising gain; infinity under any other gain.
 
     Args:
@@ -79,7 +78,7 @@ def optimum(A: np.ndarray, B: np.ndarray, weights: tuple[float, float]) -> tuple
     return -(B.T @ P)[0], float(np.trace(P))
 
 
-def holding_mass(system: Polytope, gain: Any) -> float:
+def holding_mass(system: Polytope, gain: AnyArray) -> float:
     """Return the greatest mass [kg] at which a gain is stable at the top speed.
 
     alpha, eq. (17), is affine in the mass, and the closed loop is stable while alpha < beta |k2|.
@@ -110,7 +109,7 @@ def nearest_speed(system: Polytope) -> float:
     return float(low * ((k - ratio) ** 2 - ratio**2) * B[1, 0] / (2 * K1))
 
 
-def judge_lmi_claims(system: Polytope, gains: dict[tuple[float, float], np.ndarray]) -> list[dict[str, Any]]:
+def judge_lmi_claims(system: Polytope, gains: dict[tuple[float, float], np.ndarray]) -> list[JsonObject]:
     """Return the rows that judge the statements, one for each number.
 
     Args:

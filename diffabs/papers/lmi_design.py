@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from diffabs import plot
+from diffabs.core.types import JsonObject
 from diffabs.design import Certificate, Design, Polytope, Spec, certify, design
 from diffabs.design.parameter_box import polytope, schedule
 from diffabs.linear.slip_model import SlipModel
@@ -123,7 +124,7 @@ def _as_printed(system: Polytope) -> Polytope:
     return Polytope(A=system.A, B=system.B[swap], states=system.states)
 
 
-def table(found: Designed, braked: Mapping[str, Run]) -> list[dict[str, Any]]:
+def table(found: Designed, braked: Mapping[str, Run]) -> list[JsonObject]:
     """Return the rows of gains, costs, certificates, poles and overshoots.
 
     Args:
@@ -205,18 +206,18 @@ def slowest_pole(system: Polytope, gain: tuple[float, float]) -> tuple[float, fl
     return float(np.real(pole)), float(np.imag(pole)), float(-np.real(pole) / abs(pole))
 
 
-def design_summary(found: Designed) -> dict[str, Any]:
+def design_summary(found: Designed) -> JsonObject:
     """Return the part of `summary.json` on section 4.
 
     Args:
         found: Results of section 4.
     """
 
-    def one(answer: Design) -> dict[str, Any]:
+    def one(answer: Design) -> JsonObject:
         numbers = {name: getattr(answer, name) for name in ("trace_cost", "lower_bound", "gap", "residual")}
         return {"gain": answer.gain[0].tolist(), **numbers, "certificate": answer.certificate.summary()}
 
-    def name_answers(answers: Mapping[tuple[float, float], Design]) -> list[dict[str, Any]]:
+    def name_answers(answers: Mapping[tuple[float, float], Design]) -> list[JsonObject]:
         return [{"Q": list(weights), "R": 1.0, **one(answer)} for weights, answer in answers.items()]
 
     verdicts = [{"gain": [-K1, k2], **proof.summary()} for k2, proof in found.verdicts.items()]
@@ -230,7 +231,7 @@ def design_summary(found: Designed) -> dict[str, Any]:
     }
 
 
-def figures(found: Designed, braked: Mapping[str, Run]) -> dict[str, Any]:
+def figures(found: Designed, braked: Mapping[str, Run]) -> JsonObject:
     """Return the figures of the gains that explain the overshoot: poles and damping over speed, and trajectories.
 
     Args:

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -15,6 +15,7 @@ from rich.table import Table
 
 from diffabs import plot
 from diffabs.core import files, provenance
+from diffabs.core.types import JsonObject, Params, Scalar
 from diffabs.simulate.solution import FixedStep, Run
 
 
@@ -30,7 +31,7 @@ def lane(run: Run, i: int) -> Run:
 
 def computed_row(
     name: str, quantity: str, unit: str, ours: Any, *, published: float | None = None, reference: float | None = None
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return a row of a table with our number and, if known, the paper's or an independent number.
 
     Args:
@@ -47,7 +48,7 @@ def computed_row(
     return {**line, "published": published, "reference": reference, "difference": difference}
 
 
-def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float, digits: int = 2) -> dict[str, Any]:
+def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float, digits: int = 2) -> JsonObject:
     """Return a row of a table whose published number is rounded; `matches` tells whether ours rounds to it.
 
     Args:
@@ -62,7 +63,7 @@ def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float
     return {**line, "matches": round(line["ours"], digits) == round(published, digits)}
 
 
-def format_time(time: Any) -> float | str:
+def format_time(time: Scalar) -> float | str:
     """Return a time [s] for a summary: "never" if it is infinite.
 
     Args:
@@ -71,7 +72,7 @@ def format_time(time: Any) -> float | str:
     return "never" if math.isinf(float(time)) else float(time)
 
 
-def solver_settings(step: FixedStep, **more: Any) -> dict[str, Any]:
+def solver_settings(step: FixedStep, **more: Any) -> JsonObject:
     """Return the settings of the integration for a summary.
 
     Args:
@@ -87,7 +88,7 @@ def origin_of_numbers() -> dict[str, str]:
     return provenance.describe_platform("jaxlib", "numpy", "matplotlib") | provenance.source_commit()
 
 
-def write_summary(folder: pathlib.Path, summary: dict[str, Any], name: str = "summary.json") -> dict[str, Any]:
+def write_summary(folder: pathlib.Path, summary: JsonObject, name: str = "summary.json") -> JsonObject:
     """Write a summary atomically, and return it as a reader of the file gets it.
 
     Args:
@@ -103,7 +104,7 @@ def write_summary(folder: pathlib.Path, summary: dict[str, Any], name: str = "su
     return json.loads(text)
 
 
-def save_figures(figures: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
+def save_figures(figures: Params, folder: pathlib.Path) -> list[str]:
     """Write figures into a folder, and return the names of their files.
 
     Args:
@@ -113,7 +114,7 @@ def save_figures(figures: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
     return [plot.save_figure(figure, folder / f"{name}.png").name for name, figure in figures.items()]
 
 
-def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+def print_rows(title: str, rows: Sequence[Params]) -> None:
     """Print rows of equal keys as a table, with floats at five significant digits or four decimals.
 
     Args:
@@ -131,13 +132,13 @@ def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     console.print(table)
 
 
-def _short(value: Any) -> str:
+def _short(value: Scalar) -> str:
     if not isinstance(value, float):
         return "" if value is None else str(value)
     return f"{value:.5g}" if abs(value) < 1 or abs(value) >= 1000 else f"{value:.4f}"
 
 
-def experiment(config: Any, results: Mapping[str, Any], figures: Mapping[str, Any]) -> dict[str, Any]:
+def experiment(config: Any, results: Params, figures: Params) -> JsonObject:
     """Write an experiment's figures and `results.json` with config and versions, and return the contents of this file.
 
     Args:

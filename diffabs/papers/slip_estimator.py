@@ -18,6 +18,7 @@ from diffabs.controllers import PID, ConstantTorque
 from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Reference
+from diffabs.core.types import JsonObject, Table
 from diffabs.objectives import BRAKING
 from diffabs.papers import estimator_claims, record
 from diffabs.papers.digest import Digest, Refuted, digest
@@ -138,7 +139,7 @@ def run_all(progress: Callable[[str], None]) -> EstimatorResults:
     return EstimatorResults(runs, coarse, run_literal())
 
 
-def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
+def table(runs: Mapping[str, Run]) -> list[JsonObject]:
     """Return the rows of the twenty numbers of Tables 1 and 2; "no ABS" is in both tables and counts twice.
 
     Args:
@@ -154,7 +155,7 @@ def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     return rows
 
 
-def worst_difference(rows: list[dict[str, Any]], quantity: str) -> float:
+def worst_difference(rows: list[JsonObject], quantity: str) -> float:
     """Return the largest absolute difference from a published number.
 
     Args:
@@ -195,7 +196,7 @@ def shortest_distances(car: QuarterCar, locked: Run) -> dict[str, float]:
     return {"unlimited": y.speed[0] ** 2 / length, "90 N m": distance + speed**2 / length}
 
 
-def extra_rows(results: EstimatorResults) -> list[dict[str, Any]]:
+def extra_rows(results: EstimatorResults) -> list[JsonObject]:
     """Return the rows of the Magic Formula, the locked time, the literal estimator and the bounds.
 
     Args:
@@ -221,7 +222,7 @@ def extra_rows(results: EstimatorResults) -> list[dict[str, Any]]:
     return rows
 
 
-def figures(results: EstimatorResults) -> dict[str, Any]:
+def figures(results: EstimatorResults) -> JsonObject:
     """Return the figures by file name.
 
     Args:
@@ -254,7 +255,7 @@ def figures(results: EstimatorResults) -> dict[str, Any]:
     return drawn
 
 
-def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
+def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObject:
     """Write figures and `summary.json` into the folder, and return the summary.
 
     Args:
@@ -310,7 +311,7 @@ CLAIMS = (
 )
 
 
-def compact(summary: Mapping[str, Any]) -> Digest:
+def compact(summary: Table) -> Digest:
     """Return the digest: Tables 1 and 2 with our numbers beside the paper's.
 
     Args:

@@ -18,6 +18,7 @@ from diffabs import plot
 from diffabs.controllers import HoldingInput, StateFeedback
 from diffabs.core import provenance
 from diffabs.core.loop import Loop
+from diffabs.core.types import JsonObject, Part, Table
 from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_claims, lmi_design, record
 from diffabs.papers.digest import Digest, digest
@@ -116,7 +117,7 @@ NOTES = [
 ]
 
 
-def loop(case: Case, reference: Any = None) -> Loop:
+def loop(case: Case, reference: Part = None) -> Loop:
     """Return the closed loop of section 5.
 
     Args:
@@ -174,7 +175,7 @@ def convergence_order(errors: list[float], points: slice) -> float:
     return float(np.polyfit(np.log(HALVINGS[points]), np.log(errors[points]), 1)[0])
 
 
-def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
+def table(runs: Mapping[str, Run]) -> list[JsonObject]:
     """Return the rows of the braking runs and of the runs with the car's inertia.
 
     Args:
@@ -198,7 +199,7 @@ def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     return rows
 
 
-def extra_rows(filtered: Run, errors: Errors) -> list[dict[str, Any]]:
+def extra_rows(filtered: Run, errors: Errors) -> list[JsonObject]:
     """Return the rows of the filtered reference, the friction curve and the measured order of convergence.
 
     Args:
@@ -222,7 +223,7 @@ def extra_rows(filtered: Run, errors: Errors) -> list[dict[str, Any]]:
     return rows
 
 
-def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> dict[str, Any]:
+def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> JsonObject:
     """Return the figures by file name.
 
     Args:
@@ -230,7 +231,7 @@ def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> dict[str,
         filtered: Run with a filtered reference.
         errors: Relative errors by case and quantity.
     """
-    seen: dict[str, Any] = {name: one.trajectory for name, one in runs.items()}
+    seen: JsonObject = {name: one.trajectory for name, one in runs.items()}
     drawn = {}
     for case, number in ((CASES[0], 4), (CASES[3], 6)):
         name, mass = case.name, f"{case.mass:g} kg"
@@ -256,7 +257,7 @@ def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> dict[str,
     return drawn
 
 
-def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
+def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObject:
     """Write figures and `summary.json` into the folder, and return the summary.
 
     Args:
@@ -289,7 +290,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
     return record.write_summary(folder, summary)
 
 
-def compact(summary: Mapping[str, Any]) -> Digest:
+def compact(summary: Table) -> Digest:
     """Return the digest: the braking runs, and the largest relative difference of each from the independent solution.
 
     Args:
@@ -308,9 +309,7 @@ def compact(summary: Mapping[str, Any]) -> Digest:
     return digest(summary, headings, lines, lmi_design.CLAIMS, (words, []), independent)
 
 
-def _design_section(
-    runs: Mapping[str, Run], filtered: Run
-) -> tuple[list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
+def _design_section(runs: Mapping[str, Run], filtered: Run) -> tuple[list[JsonObject], JsonObject, JsonObject]:
     """Return rows, figures and summary entries of section 4; only a note if its solver is not installed."""
     try:
         found = lmi_design.Designed()

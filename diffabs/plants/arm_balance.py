@@ -34,6 +34,7 @@ from diffabs.controllers import BalanceFeedback
 from diffabs.core.numerics import clamp, quotient
 from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.types import AnyArray, PyTree
 from diffabs.objectives import BALANCE
 from diffabs.plants.audit import BalanceAudit
 from diffabs.references import Upright
@@ -76,7 +77,7 @@ class BalanceStart:
     phi_rate: Scalar = param(default=0.0, unit="rad/s")
 
 
-def usual_parts(self: Any) -> dict[str, Any]:
+def usual_parts(self: Any) -> dict[str, PyTree]:
     """Return the default loop around a two-wheeler: feedback that holds it upright until it falls.
 
     Args:
@@ -87,7 +88,7 @@ def usual_parts(self: Any) -> dict[str, Any]:
     return {"initial": BalanceStart(), **around}
 
 
-def usual_objectives(self: Any) -> dict[str, Any]:
+def usual_objectives(self: Any) -> dict[str, PyTree]:
     """Return the default objectives of a two-wheeler, by name.
 
     Args:
@@ -141,7 +142,7 @@ class ArmBalance:
             b3=self.rider_mass * self.rider_height,
         )
 
-    def torque(self, psi_rate: Scalar, control: Scalar) -> Any:
+    def torque(self, psi_rate: Scalar, control: Scalar) -> Scalar:
         """Return tau [N m], eq. (11): N Kt i - fm psi', with i = (u - N Kb psi')/Rm clamped to its limit.
 
         Args:
@@ -235,7 +236,7 @@ class ArmBalance:
         """
         return self.torque(state.psi_rate, control) * state.psi_rate, self.damping * state.phi_rate**2
 
-    def limits(self, gain: Any) -> np.ndarray:
+    def limits(self, gain: AnyArray) -> np.ndarray:
         """Return the rows of the motor's linear range, shape (..., 1, 6): the current is within its limit where |row x|
         <= 1.
 
@@ -247,7 +248,7 @@ class ArmBalance:
         current[..., 4] -= self.gear * self.back_emf / self.resistance
         return (current / np.asarray(self.current_max)[..., None])[..., None, :]
 
-    def remainder(self, linear: Any, extent: Callable[[Any], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def remainder(self, linear: Any, extent: Callable[[PyTree], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return D (..., 6, 3) and the bound Y (..., 3) of the nonlinear remainder D y, |y| <= Y.
 
         The equations are x' = linear x + D y. The bound holds wherever |row x| <= extent(row) for all rows. If all
@@ -299,14 +300,14 @@ class ArmBalance:
             )
 
 
-def _mass(lumps: Lumps, cos2: Scalar, cos3: Scalar, rotor: Scalar) -> tuple[Any, ...]:
+def _mass(lumps: Lumps, cos2: Scalar, cos3: Scalar, rotor: Scalar) -> tuple[PyTree, ...]:
     """Return m11, m12, m13, m22, m33 of the mass matrix [kg m^2]; m23 is 0."""
     m12, m13 = lumps.p2 + lumps.c2 * cos2, lumps.p3 + lumps.c3 * cos3
     m11 = lumps.a + m12 + m13 + lumps.c2 * cos2 + lumps.c3 * cos3
     return m11, m12, m13, lumps.p2 + rotor, lumps.p3
 
 
-def _at_rest(lumps: Lumps, rotor: Any) -> np.ndarray:
+def _at_rest(lumps: Lumps, rotor: Scalar) -> np.ndarray:
     """Return the mass matrix of the upright position, shape (..., 3, 3) [kg m^2]."""
     m11, m12, m13, m22, m33 = _mass(lumps, 1.0, 1.0, rotor)
     zero = 0.0 * m11

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, param, part, pytree, static
+from diffabs.core.types import Part
 from diffabs.objectives.tracking import no_integral
 
 FORGIVEN = 0.01  # tolerance for a whole run, as a fraction of the energy scale
@@ -27,7 +28,7 @@ SWING = 4.0  # factor on the decelerations at both ends: the slip may pass the f
 MIN_STEP_ENERGY = 10.0  # m/s^2, deceleration that is always accepted, as is 1e-3 of the speed
 
 
-def _driving_power(before: Any, after: Any) -> Any:
+def _driving_power(before: Any, after: Any) -> Scalar:
     """Return the greater of both values, and 0 where both are negative."""
     return jnp.maximum(jnp.maximum(before, after), 0.0)
 
@@ -66,7 +67,7 @@ class BrakeAudit:
 
     start, flow, value = _zero, no_integral, _excess
 
-    def update(self, memory: Memory, segment: Segment) -> Any:
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the step's gain of energy without work; infinity after a step that no car can make."""
         # An audit decides on validity only, so it needs no derivatives.
         before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))
@@ -77,7 +78,7 @@ class BrakeAudit:
         return memory.held + jnp.where(_leaps(a, b, h), jnp.inf, jnp.maximum(gain - SPEED_ROUNDING * self.scale, 0.0))
 
 
-def _leaps(a: BrakeOutput, b: BrakeOutput, h: Scalar) -> Any:
+def _leaps(a: BrakeOutput, b: BrakeOutput, h: Scalar) -> Scalar:
     """Return whether no car can go from a to b in the time h.
 
     Three conditions are impossible: to move backwards, to move farther than the speed allows, or to decelerate more
@@ -102,13 +103,13 @@ class BalanceAudit:
         scale: Energy scale of the tolerance [J].
     """
 
-    plant: Any = part()
+    plant: Part = part()
     first: Scalar = param(unit="J")
     scale: Scalar = param(unit="J", above=0.0)
 
     start, flow = _zero, no_integral
 
-    def update(self, memory: Memory, segment: Segment) -> Any:
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the work that the motor may have done in the step, from torques and rates of the same
         sign.
         """

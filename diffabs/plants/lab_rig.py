@@ -32,6 +32,7 @@ from diffabs.core.numerics import clamp, larger, quotient, smaller
 from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.core.rules import Rule, as_rule_array
+from diffabs.core.types import PyTree
 from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import (
     FROZEN_OUTPUTS,
@@ -117,7 +118,7 @@ class LabRig:
             self.drum_radius * state.drum,
         )
 
-    def contact(self, state: LabRigState) -> tuple[Any, Any, Any]:
+    def contact(self, state: LabRigState) -> tuple[PyTree, PyTree, PyTree]:
         """Return the friction coefficient [1], the normal force [N], and the torque that brakes the wheel, with its
         bearing's [N m].
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from diffabs.controllers import PID
 from diffabs.core.numerics import larger, quotient
 from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.types import Part, PyTree
 from diffabs.objectives import BRAKING
 from diffabs.references import FixedSlip
 from diffabs.stops import Standstill
@@ -28,7 +29,7 @@ class BrakeStart:
     slip: Scalar = param(default=0.0, unit="1", low=0.0, high=1.0)
 
 
-def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Any:
+def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Scalar:
     """Return the slip (v - w)/max(v, w, crawl) [1]: (v - w)/v in braking, (v - w)/w in driving, always in [-1, 1].
 
     The slip is C1 at v = w. Below the crawl speed it goes to zero with v - w, so there is no division by zero.
@@ -41,7 +42,7 @@ def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Any:
     return quotient(speed - wheel_speed, larger(larger(speed, wheel_speed), crawl))
 
 
-def halt_at_zero(speed: Scalar, rate: Scalar) -> Any:
+def halt_at_zero(speed: Scalar, rate: Scalar) -> Scalar:
     """Return the rate of a speed that cannot become negative: at standstill only a positive rate acts.
 
     Brake friction balances a negative rate at standstill, as dry friction does.
@@ -53,7 +54,7 @@ def halt_at_zero(speed: Scalar, rate: Scalar) -> Any:
     return jnp.where(jnp.greater(speed, 0), rate, larger(rate, 0.0))
 
 
-def forward_speed(speed: Scalar) -> Any:
+def forward_speed(speed: Scalar) -> Scalar:
     """Return the speed, or 0 where a step went past standstill.
 
     Args:
@@ -62,7 +63,7 @@ def forward_speed(speed: Scalar) -> Any:
     return jnp.where(jnp.greater(speed, 0), speed, 0.0)
 
 
-def usual_parts(self: Any) -> dict[str, Any]:
+def usual_parts(self: Any) -> dict[str, PyTree]:
     """Return the default loop around a brake: a PID with limits of 0 and 90 N m that holds a fixed slip until
     standstill.
 
@@ -78,7 +79,7 @@ def usual_parts(self: Any) -> dict[str, Any]:
     }
 
 
-def usual_objectives(self: Any) -> dict[str, Any]:
+def usual_objectives(self: Any) -> dict[str, PyTree]:
     """Return the default objectives of a brake, by name.
 
     Args:
@@ -88,7 +89,7 @@ def usual_objectives(self: Any) -> dict[str, Any]:
     return dict(BRAKING)
 
 
-def probes(self: Any, initial: BrakeStart, setpoint: Scalar, stop: Any) -> BrakeStart:
+def probes(self: Any, initial: BrakeStart, setpoint: Scalar, stop: Part) -> BrakeStart:
     """Return k starts at which the loop may be stiffest, as a `BrakeStart` of arrays (k,).
 
     The speeds go down to the stop's speed. Some slips are close to the setpoint, where the controller is not at a

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import PyTree
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.robustness import frequencies
 from diffabs.linear.stability_margins import Margins
@@ -15,7 +16,7 @@ LIGHT = 0.25  # opacity of the band
 LEAST_DB = -80.0  # lower end of the magnitude axis; half of it for the sensitivities
 
 
-def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *, title: str = "") -> Any:
+def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *, title: str = "") -> PyTree:
     """Return a figure of the open loop L with its sensitivities.
 
     The panels are the magnitude and phase of L, its Nyquist plot, and |S| and |T|. The Nyquist plot has the circle of

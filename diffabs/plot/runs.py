@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from diffabs.core.protocols import Plant, Road
+from diffabs.core.types import Table
 from diffabs.objectives.balance import motor_torque
 from diffabs.plot.style import (
     COLOURS,
@@ -291,7 +292,7 @@ def draw_friction(
 
 
 def draw_convergence(
-    panels: Mapping[str, Mapping[str, Any]], steps: Sequence[float], *, orders: Sequence[int], title: str = ""
+    panels: Mapping[str, Table], steps: Sequence[float], *, orders: Sequence[int], title: str = ""
 ) -> Figure:
     """Return a figure of error over step length in logarithmic axes, with one panel per case.
 

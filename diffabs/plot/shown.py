@@ -8,13 +8,14 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import to_hex
 from matplotlib.patches import StepPatch
 
+from diffabs.core.types import JsonObject, PyTree, Scalar
 from diffabs.plot.style import Axes, Figure
 
 AXES_DIGITS = 6  # significant digits
 MAX_SERIES_POINTS = 1000  # points of a curve or cloud; more are thinned out evenly, with both ends
 
 
-def describe_axes(figure: Figure) -> list[dict[str, Any]]:
+def describe_axes(figure: Figure) -> list[JsonObject]:
     """Return a description of each axes of a drawn figure.
 
     - `box`: left, top, right and bottom as shares of the figure.
@@ -31,7 +32,7 @@ def describe_axes(figure: Figure) -> list[dict[str, Any]]:
     return [one for ax in figure.axes if (one := _axes(ax))]
 
 
-def _axes(ax: Axes) -> dict[str, Any] | None:
+def _axes(ax: Axes) -> JsonObject | None:
     scales = {"x": ax.get_xscale(), "y": ax.get_yscale()}
     series = list(_series(ax))
     if not series or not ax.get_visible() or not set(scales.values()) <= {"linear", "log"}:
@@ -47,7 +48,7 @@ def _axes(ax: Axes) -> dict[str, Any] | None:
     }
 
 
-def _series(ax: Axes) -> Iterator[dict[str, Any]]:
+def _series(ax: Axes) -> Iterator[JsonObject]:
     for line in ax.lines:
         # Guide lines such as axhline use another transform: their points are not in the axes' units.
         if line.get_visible() and line.get_transform() == ax.transData:
@@ -63,7 +64,7 @@ def _series(ax: Axes) -> Iterator[dict[str, Any]]:
             yield from _points(cloud.get_label(), colours[0] if len(colours) else "black", *offsets.T)
 
 
-def _points(name: Any, colour: Any, x: Any, y: Any) -> Iterator[dict[str, Any]]:
+def _points(name: Any, colour: Any, x: Scalar, y: Scalar) -> Iterator[JsonObject]:
     """Yield a series of the finite points, or nothing if there are none."""
     x, y = (np.ma.filled(np.ma.asarray(values, float), np.nan).ravel() for values in (x, y))
     there = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
@@ -74,5 +75,5 @@ def _points(name: Any, colour: Any, x: Any, y: Any) -> Iterator[dict[str, Any]]:
         yield {"name": name, "colour": to_hex(colour), "x": _short(x[some]), "y": _short(y[some])}
 
 
-def _short(values: Any) -> list[float]:
+def _short(values: PyTree) -> list[float]:
     return [float(f"{value:.{AXES_DIGITS}g}") for value in values]

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.core import files, pictures
+from diffabs.core.types import PyTree, Scalar
 
 try:
     from matplotlib.axes import Axes
@@ -112,7 +113,7 @@ def make_logarithmic(ax: Axes, axis: str) -> None:
 class _Decades(LogLocator):
     """A locator of decades, with 2 and 5 of each over less than two decades."""
 
-    def tick_values(self, vmin: float, vmax: float) -> Any:
+    def tick_values(self, vmin: float, vmax: float) -> Scalar:
         """Return the places of the labels between `vmin` and `vmax`."""
         decades = np.log10(vmax / vmin) if vmin > 0 else np.inf
         self.set_params(subs=(1.0, 2.0, 5.0) if decades < FEW_DECADES else (1.0,))
@@ -178,7 +179,7 @@ def control_label(unit: str) -> str:
     return {"N m": "brake torque [N m]", "V": "voltage [V]"}.get(unit, f"control [{unit}]")
 
 
-def signal_label(output: Any) -> str:
+def signal_label(output: PyTree) -> str:
     """Return the axis label of the first signal of an output.
 
     Args:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import Scalar, Table
 from diffabs.plot.style import COLOURS, GREY, Axes, Figure, label_axes, make_logarithmic, save_figure, sheet
 from diffabs.plot.sweep_view import AxisVariable, SweepView, assign_cells
 from diffabs.sweep.engines import describe_wrong_end
@@ -139,7 +140,7 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
     return figure
 
 
-def draw_sensitivity(found: Results, document: Mapping[str, Any]) -> Figure | None:
+def draw_sensitivity(found: Results, document: Table) -> Figure | None:
     """Return bars with intervals for each metric, or None if the document has no sensitivities.
 
     The bars are rank correlations, or Sobol' indices for a Saltelli design.
@@ -241,7 +242,7 @@ def _exceedance_corners(ordered: np.ndarray, low: float, high: float) -> tuple[n
     return np.array([low, *np.repeat(x, 2), high]), np.array([n, *np.stack(sides, axis=1).ravel(), 0])
 
 
-def _bars(ax: Axes, rows: Sequence[Mapping[str, Any]], kinds: Sequence[str]) -> None:
+def _bars(ax: Axes, rows: Sequence[Table], kinds: Sequence[str]) -> None:
     """Draw one row per variable with a bar for each kind; the interval is left out if the document has none."""
     for j, kind in enumerate(kinds):
         at = np.arange(len(rows)) + (j + 0.5) * 0.8 / len(kinds) - 0.4
@@ -281,7 +282,7 @@ def _limits(ax: Axes, low: float, high: float, bound: float | None) -> tuple[flo
     return low - 0.03 * width, high + 0.03 * width
 
 
-def _panels(names: Sequence[str], title: str, size: tuple[float, float] = (5.0, 3.1), **kwargs: Any) -> Any:
+def _panels(names: Sequence[str], title: str, size: tuple[float, float] = (5.0, 3.1), **kwargs: Any) -> Scalar:
     """Return a figure and one axes for each name, or None and no axes without names."""
     if not names:
         return None, []

@@ -1,10 +1,10 @@
 """Figures of a tuning: convergence, runs before and after, the front of two objectives, and the worst case."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import PyTree, Scalar, Table
 from diffabs.plot.style import (
     COLOURS,
     DASHES,
@@ -24,7 +24,7 @@ MAX_DECADES = 5.0  # an objective that falls by less is easier to read on a line
 SETTLED_MULTIPLE = 1.5  # length of the time axis, in transients
 
 
-def draw_history(points: Sequence[Any], *, title: str = "") -> Figure:
+def draw_history(points: Sequence[PyTree], *, title: str = "") -> Figure:
     """Return a figure of the objective and the gradient over the number of computed gradients.
 
     Args:
@@ -38,7 +38,7 @@ def draw_history(points: Sequence[Any], *, title: str = "") -> Figure:
 
 
 def draw_tuning(
-    points: Sequence[Any], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
+    points: Sequence[PyTree], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
 ) -> Figure:
     """Return the figure of `diffabs tune`: convergence above, the runs before and after below.
 
@@ -57,7 +57,7 @@ def draw_tuning(
 
 
 def draw_pareto(
-    fronts: Mapping[str, tuple[Any, Any]],
+    fronts: Mapping[str, tuple[PyTree, PyTree]],
     *,
     marks: Mapping[str, tuple[float, float]] | None = None,
     x: str = "effort [N² m² s]",
@@ -87,7 +87,7 @@ def draw_pareto(
     return figure
 
 
-def pareto_front(x: Any, y: Any) -> np.ndarray:
+def pareto_front(x: Scalar, y: Scalar) -> np.ndarray:
     """Return the indices of the Pareto-optimal points, in the order of x.
 
     A point is Pareto-optimal if no other point is smaller in both objectives. Points with NaN are left out.
@@ -108,7 +108,7 @@ def pareto_front(x: Any, y: Any) -> np.ndarray:
 
 
 def draw_worst_case(
-    nominal: Trajectory, worst: Trajectory, parameters: Mapping[str, Any], *, metric: str = "", title: str = ""
+    nominal: Trajectory, worst: Trajectory, parameters: Table, *, metric: str = "", title: str = ""
 ) -> Figure:
     """Return a figure of the nominal run and the worst run, with the parameters of the worst run.
 
@@ -132,7 +132,7 @@ def draw_worst_case(
     return figure
 
 
-def _objective(ax: Axes, points: Sequence[Any]) -> None:
+def _objective(ax: Axes, points: Sequence[PyTree]) -> None:
     """Draw the objective and, on an axis of its own, the largest violation of a constraint."""
     n, values = [p.evaluations for p in points], np.array([p.objective for p in points])
     ax.plot(n, values, "o-", markersize=3.5, color=COLOURS[0], label="objective")
@@ -149,7 +149,7 @@ def _objective(ax: Axes, points: Sequence[Any]) -> None:
     label_axes(ax, "gradients computed", "objective", legend=False)
 
 
-def _gradient(ax: Axes, points: Sequence[Any]) -> None:
+def _gradient(ax: Axes, points: Sequence[PyTree]) -> None:
     ax.plot([p.evaluations for p in points], [p.gradient for p in points], "o-", markersize=3.5, color=COLOURS[2])
     make_logarithmic(ax, "y")
     label_axes(ax, "gradients computed", "gradient, greatest component")
@@ -184,6 +184,6 @@ def _arrival_time(runs: Mapping[str, Trajectory]) -> float:
     return min(whole, SETTLED_MULTIPLE * max(ends)) or whole
 
 
-def _short(value: Any) -> str:
+def _short(value: Scalar) -> str:
     array = np.asarray(value, float)
     return f"{float(array):.4g}" if array.ndim == 0 else f"[{', '.join(f'{x:.4g}' for x in array.ravel())}]"

@@ -9,7 +9,6 @@ more slip, more deceleration, more slip.
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,7 +48,7 @@ class SlipByDeceleration:
         del t, signal
         return self.setpoint(memory)
 
-    def setpoint(self, memory: Memory) -> Any:
+    def setpoint(self, memory: Memory) -> Scalar:
         """Return the present target slip [1].
 
         Raises:

@@ -25,6 +25,7 @@ from diffabs.core.numerics import clamp, larger
 from diffabs.core.protocols import BrakeOutput, Memory
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.core.rules import Rule, order_rule
+from diffabs.core.types import PyTree
 
 
 class SeekingMemory(NamedTuple):
@@ -79,11 +80,11 @@ class ExtremumSeeking:
         del signal
         return self.setpoint(memory) * (1 + self.dither * jnp.sin(self.frequency * t))
 
-    def setpoint(self, memory: Memory) -> Any:
+    def setpoint(self, memory: Memory) -> Scalar:
         """Return the estimate of the best slip [1]."""
         return jnp.exp(memory.flow.logarithm)
 
-    def elasticity(self, memory: Memory) -> Any:
+    def elasticity(self, memory: Memory) -> PyTree:
         """Return the estimate of d ln(deceleration)/d ln(slip) from `memory` [1]: positive below the peak, negative
         beyond it.
         """

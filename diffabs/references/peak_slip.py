@@ -20,6 +20,7 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.types import PyTree
 
 # A later maximum counts only if it exceeds the greatest by this fraction. A controller that holds the best slip keeps
 # the deceleration equal to its maximum up to rounding; comparisons of equal numbers would then decide the derivatives.
@@ -43,7 +44,7 @@ class PeakMemory(NamedTuple):
     target: Scalar
 
 
-def _size(signal: BrakeOutput) -> Any:
+def _size(signal: BrakeOutput) -> Scalar:
     """Return |a|, as in the paper.
 
     The absolute value matters for an accelerometer with a forward bias. Such a sensor shows an acceleration before the
@@ -111,13 +112,13 @@ class PeakLatch:
         """Return the memory without a maximum."""
         return Memory(held=_fresh_memory(self.slip, _size(signal), signal.slip))
 
-    def margins(self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]) -> tuple[Any]:
+    def margins(self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]) -> tuple[PyTree]:
         """Return d|a|/dt where |a| exceeds its maximum, else the absolute value of d|a|/dt."""
         del t
         m: PeakMemory = memory.held
         return (_falling_rate(_rate(_size, signal, rate()), _size(signal), m),)
 
-    def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[Any]) -> Memory:
+    def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[PyTree]) -> Memory:
         """Return the memory latched at a new maximum."""
         del t
         m: PeakMemory = _record_peak(memory.held, fired[0], _size(signal), signal.slip)
@@ -168,7 +169,7 @@ class PeakRobust:
 
     def margins(
         self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]
-    ) -> tuple[Any, Any]:
+    ) -> tuple[PyTree, PyTree]:
         """Return the margin of a new maximum, and the filtered deceleration's distance to the threshold.
 
         Before the latch, the second margin is the filtered deceleration minus the threshold. Afterwards it is an
@@ -182,7 +183,7 @@ class PeakRobust:
         moving = self.flow(t, memory, signal).deceleration
         return _falling_rate(moving, a, m), jnp.where(waits, level, jnp.abs(level))
 
-    def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[Any, Any]) -> Memory:
+    def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[PyTree, PyTree]) -> Memory:
         """Return the memory after a new maximum or the latch; once latched, a new maximum moves the target."""
         del t, signal
         a, s = memory.flow
@@ -192,11 +193,11 @@ class PeakRobust:
         return Memory(memory.flow, m._replace(latched=latched, target=jnp.where(moves, m.slip, m.target)))
 
 
-def _rate(size: Callable[[BrakeOutput], Any], signal: BrakeOutput, rate: BrakeOutput) -> Any:
+def _rate(size: Callable[[BrakeOutput], PyTree], signal: BrakeOutput, rate: BrakeOutput) -> Any:
     return jax.jvp(size, (signal,), (rate,))[1]
 
 
-def _falling_rate(rate: Scalar, deceleration: Scalar, m: PeakMemory) -> Any:
+def _falling_rate(rate: Scalar, deceleration: Scalar, m: PeakMemory) -> Scalar:
     """Return the rate where the deceleration exceeds its maximum, else its absolute value.
 
     This margin falls through zero only at a new maximum.
@@ -204,5 +205,5 @@ def _falling_rate(rate: Scalar, deceleration: Scalar, m: PeakMemory) -> Any:
     return jnp.where(deceleration > (1 + SLIP_MARGIN) * m.greatest, rate, jnp.abs(rate))
 
 
-def _record_peak(m: PeakMemory, new: Any, deceleration: Scalar, slip: Scalar) -> PeakMemory:
+def _record_peak(m: PeakMemory, new: PyTree, deceleration: Scalar, slip: Scalar) -> PeakMemory:
     return m._replace(greatest=jnp.where(new, deceleration, m.greatest), slip=jnp.where(new, slip, m.slip))

@@ -1,9 +1,8 @@
 """References with a known target: a constant for the plant's first signal, or a slip, fixed or filtered."""
 
-from typing import Any
-
 from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.types import PyTree
 
 
 @pytree
@@ -15,7 +14,7 @@ class Setpoint:
     start = no_memory
     flow = no_flow
 
-    def output(self, t: Scalar, memory: Memory, signal: Any) -> Scalar:
+    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
         """Return the target."""
         del t, memory, signal
         return self.value

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.types import Params, PyTree, Scalar, Table
 from diffabs.reliability.importance_sampling import DESIGN_POINT_STARTS, Gradient
 from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
 from diffabs.simulate.admissible import batch_admissibility
@@ -89,7 +90,7 @@ def find_metric_objection(study: Study, metric: str) -> str | None:
         return native.kernel_objection(*_cast_arguments(study, metric, values))
 
 
-def _cast_arguments(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
+def _cast_arguments(study: Study, metric: str, values: Params) -> PyTree:
     """Return loop, values, solver and objectives; loop and objectives have the study's number type."""
     given = study.loop, {metric: study.objectives[metric]}
     loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), given)
@@ -105,7 +106,7 @@ def _run_scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
         return np.asarray(_measure_metric(study, metric, values), float)[: len(z)]
 
 
-def _measure_metric(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
+def _measure_metric(study: Study, metric: str, values: Params) -> Scalar:
     """Return the metric of runs (n,) that share one sequence of noise."""
     loop, _, solver, objective = _cast_arguments(study, metric, values)
     # The same key for every run, so that the score is a deterministic function of z.
@@ -140,14 +141,14 @@ def _make_gradient(study: Study, metric: str) -> Gradient:
     return gradient
 
 
-def _compile_derivatives(study: Study, metric: str) -> Callable[[Mapping[str, Any]], Any]:
+def _compile_derivatives(study: Study, metric: str) -> Callable[[Table], PyTree]:
     """Return a compiled function from values to the metric of each run and its derivatives by the values of that run.
 
     XLA computes the derivatives in reverse mode, a kernel in forward mode.
     """
 
-    def forward(values: Mapping[str, Any]) -> Any:
-        def along(way: Mapping[str, Any]) -> Any:
+    def forward(values: Params) -> Any:
+        def along(way: Table) -> Any:
             return jax.jvp(lambda values: _measure_metric(study, metric, values), (values,), (way,))
 
         # One tangent for each parameter. Runs are independent, so a tangent of ones gives each run's own derivative.
@@ -156,7 +157,7 @@ def _compile_derivatives(study: Study, metric: str) -> Callable[[Mapping[str, An
         scores, rates = jax.vmap(along, out_axes=(None, 0))(ways)
         return scores, dict(zip(values, rates, strict=True))
 
-    def slopes(values: Mapping[str, Any]) -> Any:
+    def slopes(values: Params) -> Any:
         # Runs are independent, so the gradient of their sum holds each run's own derivative.
         scores, pull = jax.vjp(lambda values: _measure_metric(study, metric, values), values)
         return scores, *pull(jnp.ones_like(scores))

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from diffabs.core import files
+from diffabs.core.types import JsonObject
 from diffabs.papers import PAPERS
 
 MAX_DOCUMENT_BYTES = 2**27  # bytes of a document
@@ -39,7 +40,7 @@ class Document(NamedTuple):
     """
 
     kind: str
-    content: dict[str, Any]
+    content: JsonObject
     path: pathlib.Path
 
     @property
@@ -115,7 +116,7 @@ def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
             return
 
 
-def _home(kind: str, content: dict[str, Any], path: pathlib.Path) -> pathlib.Path:
+def _home(kind: str, content: JsonObject, path: pathlib.Path) -> pathlib.Path:
     """Return the path of a document.
 
     The output of `sweep --json` counts as the summary in the sweep's folder, because its figures and manifest are

@@ -1,9 +1,9 @@
 """Reproductions of papers as sections of a report."""
 
 import pathlib
-from collections.abc import Mapping
 from typing import Any
 
+from diffabs.core.types import Table
 from diffabs.papers import MODULES, compact
 from diffabs.report.documents import Document
 from diffabs.report.page import (
@@ -68,7 +68,7 @@ def existing_figures(names: Any, folder: pathlib.Path) -> list[Figure]:
     return [figure for figure in found if figure]
 
 
-def _tables(content: Mapping[str, Any]) -> list[ReportTable]:
+def _tables(content: Table) -> list[ReportTable]:
     titles = {"rows": "Every number", "judged": "What the paper prints of its machine"}
     return [
         ReportTable(title, tuple(COLUMNS.values()), [[row.get(key) for key in COLUMNS] for row in content[part]])
@@ -77,7 +77,7 @@ def _tables(content: Mapping[str, Any]) -> list[ReportTable]:
     ]
 
 
-def _certificates(design: Mapping[str, Any] | None) -> list[ReportVerdict]:
+def _certificates(design: Table | None) -> list[ReportVerdict]:
     designs = (design or {}).get("designs") or []
     return [
         ReportVerdict(VERDICT_NAMES[one["certificate"]["quadratically_stable"]],
@@ -88,7 +88,7 @@ def _certificates(design: Mapping[str, Any] | None) -> list[ReportVerdict]:
     ]  # fmt: skip
 
 
-def _designs(design: Mapping[str, Any] | None) -> list[ReportTable]:
+def _designs(design: Table | None) -> list[ReportTable]:
     designs = (design or {}).get("designs") or []
     rows = [
         [one["Q"], one["R"], one["gain"], one["certificate"]["decay_rate"], one["certificate"]["guaranteed_cost"]]

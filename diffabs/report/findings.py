@@ -1,9 +1,10 @@
 """Tunings and identifications as sections of a report."""
 
 import pathlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
+from diffabs.core.types import Table
 from diffabs.report import proofs
 from diffabs.report.charts import draw_lines
 from diffabs.report.documents import Document
@@ -57,11 +58,11 @@ def tuning_section(document: Document) -> Section:
     )  # fmt: skip
 
 
-def _seed(content: Mapping[str, Any]) -> Any:
+def _seed(content: Table) -> Any:
     return ((content.get("model") or {}).get("solver") or {}).get("seed")
 
 
-def _constraint_row(row: Mapping[str, Any]) -> ReportVerdict:
+def _constraint_row(row: Table) -> ReportVerdict:
     after = "not known" if row["after"] is None else f"{row['after']:.6g}"
     return ReportVerdict("met" if row["met"] else "not met", f"{row['name']}: {after}, bound {row['bound']:.6g}")
 
@@ -81,7 +82,7 @@ def _figures(document: Document) -> Iterator[Figure]:
                 return
 
 
-def _tuning_tables(content: Mapping[str, Any]) -> Iterator[ReportTable]:
+def _tuning_tables(content: Table) -> Iterator[ReportTable]:
     units = (content.get("model") or {}).get("metrics") or {}
     keys = ("before", "after", "low", "high")
     rows = [[path, *(row[key] for key in keys), table_unit(row["unit"])] for path, row in content["free"].items()]
@@ -128,12 +129,12 @@ def identification_section(document: Document) -> Section:
     )  # fmt: skip
 
 
-def _determined_tables(content: Mapping[str, Any]) -> list[ReportVerdict]:
+def _determined_tables(content: Table) -> list[ReportVerdict]:
     loose = [ReportVerdict("not determined", row["direction"]) for row in content["undetermined"]]
     return loose or [ReportVerdict("determined", "every parameter that was free")]
 
 
-def _identification_tables(content: Mapping[str, Any]) -> Iterator[ReportTable]:
+def _identification_tables(content: Table) -> Iterator[ReportTable]:
     rows = []
     for name, row in content["values"].items():
         value, deviation = row["value"], row["deviation"]

@@ -5,11 +5,12 @@ import dataclasses
 import json
 import math
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from diffabs.core import files, pictures
 from diffabs.core.summary import round_for_table
+from diffabs.core.types import Params, PyTree, Scalar, Table
 
 IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 LARGEST_IMAGE = 2**25  # bytes
@@ -32,7 +33,7 @@ class ReportTable(NamedTuple):
 
     title: str
     headings: Sequence[str]
-    rows: Sequence[Sequence[Any]]
+    rows: Sequence[Sequence[PyTree]]
     note: str = ""
 
 
@@ -92,11 +93,11 @@ class Section:
     certificate: list[ReportVerdict] = dataclasses.field(default_factory=list)
     certificate_tables: list[ReportTable] = dataclasses.field(default_factory=list)
     notes: list[str] = dataclasses.field(default_factory=list)
-    provenance: list[tuple[str, Any]] = dataclasses.field(default_factory=list)
+    provenance: list[tuple[str, PyTree]] = dataclasses.field(default_factory=list)
     again: list[str] = dataclasses.field(default_factory=list)
 
 
-def shown_numbers(value: Any) -> list[ShownNumber | str]:
+def shown_numbers(value: Scalar) -> list[ShownNumber | str]:
     """Return the texts and numbers that a cell shows.
 
     A list shows its first `MAX_SHOWN_ENTRIES` entries and its length; nested lists are flattened.
@@ -149,15 +150,15 @@ def _axes(text: str) -> str:
     return json.dumps(good, separators=(",", ":")) if good else ""
 
 
-def _is_series(one: Any) -> bool:
+def _is_series(one: PyTree) -> bool:
     return _finite(one["x"]) and _finite(one["y"]) and len(one["x"]) == len(one["y"]) > 0
 
 
-def _finite(values: Any) -> bool:
+def _finite(values: PyTree) -> bool:
     return isinstance(values, list) and all(isinstance(x, int | float) and math.isfinite(x) for x in values)
 
 
-def model_tables(model: Mapping[str, Any] | None) -> list[ReportTable]:
+def model_tables(model: Table | None) -> list[ReportTable]:
     """Return tables of parts, parameters and solver.
 
     Args:
@@ -186,7 +187,7 @@ def table_unit(text: str | None) -> str:
     return "" if text is None else "1" if text == "" else text
 
 
-def describe_origin(content: Mapping[str, Any], **more: Any) -> list[tuple[str, Any]]:
+def describe_origin(content: Table, **more: Any) -> list[tuple[str, PyTree]]:
     """Return the origin of a document as rows of name and value: date, commit, machine and versions.
 
     Args:
@@ -211,7 +212,7 @@ def describe_origin(content: Mapping[str, Any], **more: Any) -> list[tuple[str, 
     ]
 
 
-def format_pairs(values: Mapping[str, Any]) -> str:
+def format_pairs(values: Params) -> str:
     """Return names with their values on one line; values that are None are left out.
 
     Args:
@@ -220,7 +221,7 @@ def format_pairs(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in values.items() if value is not None)
 
 
-def original_command(content: Mapping[str, Any], otherwise: str = "") -> list[str]:
+def original_command(content: Table, otherwise: str = "") -> list[str]:
     """Return the command that made a document, as a list of one line; the list is empty if the command is unknown.
 
     Args:
@@ -231,7 +232,7 @@ def original_command(content: Mapping[str, Any], otherwise: str = "") -> list[st
     return [str(line)] if line else []
 
 
-def join_words(words: Iterable[Any]) -> str:
+def join_words(words: Iterable[PyTree]) -> str:
     """Return words joined by commas and "and"; "nothing" without words.
 
     Args:

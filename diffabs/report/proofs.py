@@ -1,8 +1,6 @@
 """Designs, certificates and their claims as sections of a report."""
 
-from collections.abc import Mapping
-from typing import Any
-
+from diffabs.core.types import Table
 from diffabs.design.verify import verify_file
 from diffabs.report.documents import Document
 from diffabs.report.page import (
@@ -60,7 +58,7 @@ def design_section(document: Document) -> Section:
     )  # fmt: skip
 
 
-def proof_verdicts(proof: Mapping[str, Any]) -> list[ReportVerdict]:
+def proof_verdicts(proof: Table) -> list[ReportVerdict]:
     """Return the verdicts of a certificate: proved, disproved or undecided.
 
     Without a certificate, one verdict gives the reason.
@@ -83,7 +81,7 @@ def proof_verdicts(proof: Mapping[str, Any]) -> list[ReportVerdict]:
     return found
 
 
-def _value(kind: str, proof: Mapping[str, Any]) -> str:
+def _value(kind: str, proof: Table) -> str:
     key = {"decay": "decay_rate", "cost": "guaranteed_cost"}.get(kind, kind)
     value = proof.get(key)
     return "" if value is None else f": {value:.8g}{_unit(PROOF_UNITS.get(key))}"
@@ -93,7 +91,7 @@ def _unit(text: str | None) -> str:
     return "" if text in (None, "", "1") else f" {text}"
 
 
-def proof_tables(proof: Mapping[str, Any], content: Mapping[str, Any]) -> list[ReportTable]:
+def proof_tables(proof: Table, content: Table) -> list[ReportTable]:
     """Return tables of the numbers of a certificate, and of its vertices with their poles.
 
     Args:
@@ -119,7 +117,7 @@ def proof_tables(proof: Mapping[str, Any], content: Mapping[str, Any]) -> list[R
             ReportTable(f"{proof['vertices']} vertices", ("vertex", *heads, pole), rows)]  # fmt: skip
 
 
-def _notes(content: Mapping[str, Any]) -> list[str]:
+def _notes(content: Table) -> list[str]:
     notes = [f"Neglected: {line}" for line in content["neglected"]]
     if not content["exact"]:
         notes.append("The linear model differs from the loop's linearisation; the proof is about the model.")

@@ -3,9 +3,9 @@
 import json
 import pathlib
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 from diffabs.core import files
+from diffabs.core.types import JsonObject, Table
 from diffabs.report.documents import MANIFEST, MAX_DOCUMENT_BYTES, Document
 from diffabs.report.page import (
     UNKNOWN_ORIGIN,
@@ -71,16 +71,16 @@ def sweep_section(document: Document) -> Section:
     )  # fmt: skip
 
 
-def _manifest(folder: pathlib.Path) -> dict[str, Any]:
+def _manifest(folder: pathlib.Path) -> JsonObject:
     return json.loads(files.read_content(folder / MANIFEST, MAX_DOCUMENT_BYTES))
 
 
-def _commit(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def _commit(manifest: Table) -> JsonObject:
     commit = manifest.get("commit")
     return dict(commit) if isinstance(commit, dict) else {"commit": commit} if commit else {}
 
 
-def _scenario_model(source: Mapping[str, Any], folder: pathlib.Path) -> tuple[dict[str, Any] | None, str]:
+def _scenario_model(source: Table, folder: pathlib.Path) -> tuple[JsonObject | None, str]:
     """Return the model in a manifest and a note; None and the reason for a manifest without a readable scenario."""
     if "scenario" not in source:
         return None, "The sweep ran from Python, without a scenario: the model is in that script."
@@ -92,7 +92,7 @@ def _scenario_model(source: Mapping[str, Any], folder: pathlib.Path) -> tuple[di
         return None, f"The scenario in the manifest cannot be read here: {error}"
 
 
-def _space(space: Mapping[str, Any], units: Mapping[str, str]) -> ReportTable:
+def _space(space: Table, units: Mapping[str, str]) -> ReportTable:
     """Return a table of the distributions."""
     variables = space["variables"]
     keys = list(dict.fromkeys(key for one in variables.values() for key in one if key != "type"))
@@ -104,7 +104,7 @@ def _space(space: Mapping[str, Any], units: Mapping[str, str]) -> ReportTable:
     return ReportTable("Varied parameters", ("parameter", "distribution", *keys, "unit"), rows, f"sampling: {design}")
 
 
-def _failure_tables(content: Mapping[str, Any], percent: str) -> str:
+def _failure_tables(content: Table, percent: str) -> str:
     one = content["failures"].get("any")
     lost = content["diverged"]["count"]
     line = f"{content['samples']:,} runs; {lost:,} diverged, {content['refused']['count']:,} were refused."
@@ -122,7 +122,7 @@ def _figures(folder: pathlib.Path) -> list[Figure]:
     ]
 
 
-def _tables(content: Mapping[str, Any], units: Mapping[str, str], percent: str) -> Iterator[ReportTable]:
+def _tables(content: Table, units: Mapping[str, str], percent: str) -> Iterator[ReportTable]:
     bounds = (f"low ({percent})", f"high ({percent})")
     failures = [[name, row["count"], *(row[key] for key in INTERVAL)] for name, row in content["failures"].items()]
     yield ReportTable(
@@ -156,14 +156,14 @@ def _tables(content: Mapping[str, Any], units: Mapping[str, str], percent: str) 
         yield ReportTable(title, ("metric", "median", "largest", "in sample"), rows)
 
 
-def _notes(content: Mapping[str, Any]) -> Iterator[str]:
+def _notes(content: Table) -> Iterator[str]:
     for reason, count in (content["refused"].get("reasons") or {}).items():
         yield f"{count} samples were refused, and are left out of all numbers: {reason}"
     if content["diverged"]["count"]:
         yield f"Diverged samples: {join_words(content['diverged']['samples'][:20])}."
 
 
-def _sample(content: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
+def _sample(content: Table, folder: pathlib.Path) -> list[str]:
     worst = next((rows[0]["sample"] for rows in content["worst"].values() if rows), None)
     return [] if worst is None else [f"diffabs simulate --from-sweep {folder} --sample {worst}"]
 

@@ -10,7 +10,6 @@ Source: C. de Boor, A Practical Guide to Splines, ch. IX, XI.
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +42,7 @@ class ScaledAlong:
         """Return mu [1] at a `slip` [1], vehicle `speed` [m/s] and `distance` on the road [m]."""
         return self.factor(distance) * self.road.friction(slip, speed, distance)
 
-    def factor(self, distance: Scalar) -> Any:
+    def factor(self, distance: Scalar) -> Scalar:
         """Return f [1] at a `distance` on the road [m]."""
         c = jnp.asarray(self.factors)
         ends = jnp.ones(FIRST_NODE + LAST)

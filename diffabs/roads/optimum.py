@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, ratio
 from diffabs.core.protocols import Road
 from diffabs.core.pytree import Scalar
+from diffabs.core.types import PyTree
 
 GRID = 1024  # intervals of (0, 1]: resolves the peak of every road with a peak slip above 0.001
 BISECTIONS = 50  # 2^-50 of an interval is below the resolution of float64
@@ -16,8 +17,8 @@ BISECTIONS = 50  # 2^-50 of an interval is below the resolution of float64
 class Peak(NamedTuple):
     """Best slip [1] and the friction coefficient there [1]."""
 
-    slip: Any
-    mu: Any
+    slip: Scalar
+    mu: Scalar
 
 
 def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
@@ -39,10 +40,10 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
         distance: Place on the road [m].
     """
 
-    def mu(s: Any) -> Any:
+    def mu(s: Scalar) -> Any:
         return road.friction(s, speed, distance)
 
-    def slope(s: Any) -> Any:
+    def slope(s: Scalar) -> Any:
         return jax.jvp(mu, (s,), (jnp.ones_like(s),))[1]
 
     grid = jnp.linspace(0.0, 1.0, GRID + 1)
@@ -51,7 +52,7 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     inside = jnp.any(falls)
     top = jnp.argmax(falls)  # the first fall is after the top grid point
 
-    def halve(_: Any, bracket: tuple[Any, Any]) -> tuple[Any, Any]:
+    def halve(_: Any, bracket: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
         low, high = bracket
         middle = 0.5 * (low + high)
         rising = slope(middle) > 0

@@ -40,7 +40,7 @@ class RationalCurve:
         """Yield the rule that friction is not negative."""
         yield opposes(Partial(type(self).friction, self))
 
-    def _curve(self, s: Any) -> Any:
+    def _curve(self, s: Scalar) -> Any:
         p = power(s, self.q)
         return quotient(self.w4 * p, self.a + p) + s * (self.w1 + s * (self.w2 + s * self.w3))
 

@@ -1,7 +1,5 @@
 """Rules on friction curves: friction is not negative, and it stays below a limit of the machine."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +8,7 @@ from jax.tree_util import Partial
 
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
 from diffabs.core.rules import Rule
+from diffabs.core.types import Scalar
 
 # At smaller slips a fitted polynomial may be negative by a millionth, as the rig's is.
 SLIPS = np.linspace(0.05, 1.0, 20)
@@ -30,7 +29,7 @@ def opposes(friction: Partial) -> Rule:
     return Rule((mu >= 0).all(), "friction is negative at some slip: such a road drives", says)
 
 
-def stays_below(friction: Partial, limit: Any, name: str, then: str) -> Rule:
+def stays_below(friction: Partial, limit: Scalar, name: str, then: str) -> Rule:
     """Return the rule that mu(s) < limit at slips of 0.05 to 1.
 
     Args:
@@ -48,13 +47,13 @@ def stays_below(friction: Partial, limit: Any, name: str, then: str) -> Rule:
     return Rule((mu < limit).all(), f"friction is not below {name} at some slip: {then}", says)
 
 
-def _at_slips(friction: Partial) -> Any:
+def _at_slips(friction: Partial) -> Scalar:
     """Return mu at SLIPS in the active precision, as a NumPy array unless traced."""
     mu = _along(friction, SLIPS.astype(jnp.result_type(float)))
     return mu if isinstance(mu, Tracer) else np.asarray(mu)
 
 
 @compile_once(options=QUICK_COMPILE_OPTIONS)
-def _along(friction: Partial, slips: Any) -> Any:
+def _along(friction: Partial, slips: Scalar) -> Scalar:
     """Return the friction at these slips, compiled as one program: one operation alone takes as long to compile."""
     return jax.vmap(friction)(slips)

@@ -98,14 +98,14 @@ class PiecewiseCubic:
         del speed, distance
         return odd(self._curve, slip)
 
-    def _curve(self, s: Any) -> Any:
+    def _curve(self, s: Scalar) -> Any:
         i = searchsorted(self.knots[1:-1], s)
         x, c0, c1, c2, c3 = self.rows[i]
         z = jnp.minimum(s, self.knots[-1]) - x
         return c0 + z * (c1 + z * (c2 + z * c3))
 
 
-def slopes(x: Any, y: Any) -> Any:
+def slopes(x: Scalar, y: Scalar) -> Scalar:
     """Return the slopes at the knots: the weighted harmonic mean of the neighbouring secants, 0 where they differ in
     sign.
 
@@ -125,7 +125,7 @@ def slopes(x: Any, y: Any) -> Any:
     return jnp.concatenate([first[None], inner, last[None]])
 
 
-def _end_slope(h0: Any, h1: Any, m0: Any, m1: Any) -> Any:
+def _end_slope(h0: Scalar, h1: Scalar, m0: Scalar, m1: Scalar) -> Any:
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
     steep = (jnp.sign(m0) != jnp.sign(m1)) & (jnp.abs(d) > 3 * jnp.abs(m0))
     return jnp.where(jnp.sign(d) != jnp.sign(m0), 0.0, jnp.where(steep, 3 * m0, d))

@@ -10,6 +10,7 @@ import jax
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Objective, Sample, resting_segment
 from diffabs.core.pytree import canonical_dtypes
+from diffabs.core.types import PyTree
 from diffabs.core.values import kebab_case
 from diffabs.scenario.registry import join_path
 from diffabs.simulate.advance import initial_point
@@ -42,7 +43,7 @@ def _trials(loop: Loop, objectives: Mapping[str, Objective]) -> Any:
     return _trace_loop(loop), [_read(objective, sample) for objective in objectives.values()]
 
 
-def _trace_loop(loop: Loop) -> Any:
+def _trace_loop(loop: Loop) -> PyTree:
     """Trace the loop once around, and through an instant."""
     return initial_point(loop, {}, Clock(0.0, 1e-3, 0, jax.random.key(0)))
 
@@ -60,7 +61,7 @@ def _read(objective: Objective, sample: Sample) -> Any:
     return objective.flow(memory, sample), objective.update(memory, resting_segment(sample, 1e-3))
 
 
-def _trial(path: str, trace: Any) -> Any:
+def _trial(path: str, trace: Any) -> PyTree:
     """Return the result of `trace`, or one line if a part reads an attribute that its input lacks."""
     try:
         return trace()

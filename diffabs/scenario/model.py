@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.pytree import parameters
+from diffabs.core.types import JsonObject, Scalar
 from diffabs.core.units import units_of
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.solution import describe_solver
 
 
-def describe_model(chosen: Scenario) -> dict[str, Any]:
+def describe_model(chosen: Scenario) -> JsonObject:
     """Return a scenario as JSON values: title, description, parts, parameters with units, solver, and units of the
     metrics.
 
@@ -29,7 +30,7 @@ def describe_model(chosen: Scenario) -> dict[str, Any]:
     }
 
 
-def describe_parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
+def describe_parts(chosen: Scenario) -> dict[str, JsonObject]:
     """Return every part by its path: its type, and its fields that are not parameters.
 
     Args:
@@ -41,7 +42,7 @@ def describe_parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
     return found
 
 
-def describe_numbers(chosen: Scenario) -> dict[str, dict[str, Any]]:
+def describe_numbers(chosen: Scenario) -> dict[str, JsonObject]:
     """Return value (in SI) and unit of every parameter by its path.
 
     JSON has no infinity and no NaN: these become texts, which an override accepts.
@@ -50,7 +51,7 @@ def describe_numbers(chosen: Scenario) -> dict[str, dict[str, Any]]:
         chosen: Scenario to describe.
     """
 
-    def plain(value: Any) -> Any:
+    def plain(value: Scalar) -> Any:
         return value if math.isfinite(value) else str(value)
 
     objectives = (

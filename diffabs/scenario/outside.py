@@ -16,6 +16,8 @@ from functools import cache
 from types import ModuleType
 from typing import Any
 
+from diffabs.core.types import PyTree
+
 ENTRY_POINT_GROUP = "diffabs.parts"
 
 _named: dict[str, ModuleType] = {}
@@ -59,7 +61,7 @@ def registered_modules() -> tuple[ModuleType, ...]:
     return tuple({module.__name__: module for module in (*installed_modules(), *_named.values())}.values())
 
 
-def exported_parts(module: ModuleType) -> Iterator[tuple[str, Any]]:
+def exported_parts(module: ModuleType) -> Iterator[tuple[str, PyTree]]:
     """Yield name and part for each class made with `pytree` and each named instance in a module.
 
     Classes imported from diffabs are left out.

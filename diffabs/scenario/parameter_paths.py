@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
 from diffabs.core.values import (
     FORMER_FIELDS,
     ScenarioError,
@@ -47,7 +48,7 @@ class ParameterEntry:
 
     path: str
     where: str
-    given: Any
+    given: PyTree
     spec: ParameterSpec
     shape: tuple[int, ...]
     scale: float
@@ -107,7 +108,7 @@ class ParameterEntry:
             )
         return tuple(scale_to_si(end, self.scale) for end in ends)
 
-    def _end(self, given: Any, path: str) -> Any:
+    def _end(self, given: PyTree, path: str) -> Scalar:
         """Return one end of a range: a number, or a tuple with as many numbers as the parameter."""
         if not self.shape or not isinstance(given, list):
             return read_number(given, self.spec, path)
@@ -117,7 +118,7 @@ class ParameterEntry:
         return tuple(read_number(item, self.spec, f"{path}.{i}") for i, item in enumerate(given))
 
 
-def scale_to_si(value: Any, scale: float) -> Any:
+def scale_to_si(value: Scalar, scale: float) -> Scalar:
     """Return a number, or a tuple of numbers, in SI.
 
     Args:
@@ -127,7 +128,7 @@ def scale_to_si(value: Any, scale: float) -> Any:
     return tuple(scale_to_si(item, scale) for item in value) if isinstance(value, tuple) else value / scale
 
 
-def to_canonical_form(table: dict[str, Any]) -> dict[str, Any]:
+def to_canonical_form(table: JsonObject) -> JsonObject:
     """Return the table of a scenario in canonical form, changed in place.
 
     The road becomes a section of its own, and the tables with parameter keys get dotted paths.
@@ -150,7 +151,7 @@ def to_canonical_form(table: dict[str, Any]) -> dict[str, Any]:
     return table
 
 
-def forget_replaced_part(table: dict[str, Any], replaced: str) -> None:
+def forget_replaced_part(table: JsonObject, replaced: str) -> None:
     """Remove the entries for parameters of a replaced part from the tables with parameter keys.
 
     The new part has other parameters.
@@ -176,7 +177,7 @@ def join_path_keys(keys: list[str]) -> list[str]:
     return keys
 
 
-def flatten_table(table: Mapping[str, Any], section: str) -> dict[str, Any]:
+def flatten_table(table: Table, section: str) -> JsonObject:
     """Return the values of nested tables by dotted path.
 
     A table with the key `type` or `choices` is a value.
@@ -188,7 +189,7 @@ def flatten_table(table: Mapping[str, Any], section: str) -> dict[str, Any]:
     Raises:
         ScenarioError: A path is given twice, or nested more than `MAX_DEPTH` deep.
     """
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     pending = list(table.items())
     while pending:
         path, value = pending.pop(0)
@@ -215,7 +216,7 @@ def canonical_path(path: str) -> str:
 
 
 def read_entries(
-    table: Mapping[str, Any], section: str, there: Mapping[str, tuple[ParameterSpec, tuple[int, ...]]], otherwise: str
+    table: Table, section: str, there: Mapping[str, tuple[ParameterSpec, tuple[int, ...]]], otherwise: str
 ) -> Iterator[ParameterEntry]:
     """Yield one entry for each parameter in a table.
 
@@ -252,7 +253,7 @@ def _current_path(path: str) -> str | None:
     return f"{section}.{older[name]}" if section.startswith("controller") and name in older else None
 
 
-def parameters_of(loop: Any) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]]:
+def parameters_of(loop: Part) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]]:
     """Return spec and shape of every parameter by path.
 
     Args:

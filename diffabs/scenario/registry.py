@@ -11,7 +11,7 @@ methods among the contracts that fit. The attribute `family` of its class overri
 import dataclasses
 import inspect
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -22,6 +22,7 @@ from diffabs import actuators, controllers, objectives, plants, references, road
 from diffabs.core import blocks, protocols
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
 from diffabs.core.units import Units, resolve_unit, units_of
 from diffabs.core.values import (
     FORMER_FIELDS,
@@ -65,7 +66,7 @@ FAMILIES: dict[str, tuple[tuple[ModuleType, ...], frozenset[str]]] = {
 }
 
 
-def family_types(family: str) -> Mapping[str, Any]:
+def family_types(family: str) -> Table:
     """Return the parts of a family by name: an instance of each class with its defaults, and the named constants.
 
     Parts from outside are included.
@@ -103,9 +104,9 @@ def register_parts(names: Iterable[str]) -> None:
 
 
 @cache
-def _outside_parts(family: str, modules: tuple[ModuleType, ...]) -> Mapping[str, Any]:
+def _outside_parts(family: str, modules: tuple[ModuleType, ...]) -> Table:
     """Return the parts of outside modules by name. Raises ScenarioError for a name that is already used."""
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     for module in modules:
         for exported, part in _parts_of(module).items():
             name = kebab_case(exported)
@@ -119,7 +120,7 @@ def _outside_parts(family: str, modules: tuple[ModuleType, ...]) -> Mapping[str,
 
 
 @cache
-def _parts_of(module: ModuleType) -> Mapping[str, Any]:
+def _parts_of(module: ModuleType) -> Table:
     """Return an instance of every part that a module exports. Raises ScenarioError for a field without default."""
     try:
         return {name: item() if isinstance(item, type) else item for name, item in outside.exported_parts(module)}
@@ -142,7 +143,7 @@ def _families_of(cls: type) -> set[str]:
 
 
 @cache
-def _packaged_parts(family: str) -> Mapping[str, Any]:
+def _packaged_parts(family: str) -> Table:
     """Return the parts of diffabs itself by name."""
     modules, contract = FAMILIES[family]
     found = {}
@@ -153,7 +154,7 @@ def _packaged_parts(family: str) -> Mapping[str, Any]:
     return found
 
 
-def name_of(family: str, part: Any) -> str:
+def name_of(family: str, part: Part) -> str:
     """Return the name of a named constant, else the name of the part's class.
 
     Args:
@@ -176,7 +177,7 @@ def family_of(field: str, enclosing: str) -> str:
     return next((name for name in (field, field.removesuffix("s")) if name in FAMILIES), enclosing)
 
 
-def type_name(given: Any) -> Any:
+def type_name(given: PyTree) -> Scalar:
     """Return the type that a section of a scenario names, as a bare word or in its table; None without a name.
 
     Args:
@@ -197,7 +198,7 @@ def inner_fields(family: str, name: str) -> list[str]:
     return [field for field in own if family_of(field, "") == family and not isinstance(getattr(part, field), tuple)]
 
 
-def part_summary(part: Any) -> str:
+def part_summary(part: Part) -> str:
     """Return the first paragraph of a part's docstring, on one line.
 
     Args:
@@ -206,7 +207,7 @@ def part_summary(part: Any) -> str:
     return " ".join((inspect.getdoc(type(part)) or "").split("\n\n")[0].split())
 
 
-def unit_of(objective: Any, plant: Any = None) -> str:
+def unit_of(objective: Any, plant: Part = None) -> str:
     """Return the unit of an objective's value; empty if the objective declares none.
 
     Args:
@@ -216,7 +217,7 @@ def unit_of(objective: Any, plant: Any = None) -> str:
     return resolve_unit(getattr(objective, "unit", ""), units_of(plant) or DEFAULT_UNITS)
 
 
-def build_part(family: str, given: Any, default: Any, path: str, units: Units | None = None) -> Any:
+def build_part(family: str, given: PyTree, default: Any, path: str, units: Units | None = None) -> PyTree:
     """Return the part that a table, or the bare name of a type, describes.
 
     A table without `type` changes fields of `default`. Ranges of numbers are checked later, by `diffabs.check`.
@@ -246,7 +247,7 @@ def build_part(family: str, given: Any, default: Any, path: str, units: Units | 
     return fill_part(template, {k: v for k, v in table.items() if k != "type"}, family, path, units)
 
 
-def fill_part(template: Any, table: dict[str, Any], family: str, path: str, units: Units | None = None) -> Any:
+def fill_part(template: Any, table: JsonObject, family: str, path: str, units: Units | None = None) -> PyTree:
     """Return a copy of a part with the fields of a table.
 
     Args:
@@ -285,7 +286,7 @@ def fill_part(template: Any, table: dict[str, Any], family: str, path: str, unit
     return dataclasses.replace(template, **values) if values else template
 
 
-def _find_inner_field(part: Any, key: str) -> str:
+def _find_inner_field(part: Part, key: str) -> str:
     """Return the path of a field of this name in a part inside this one, or an empty text."""
     pending = [("", part)]
     while pending:
@@ -299,7 +300,7 @@ def _find_inner_field(part: Any, key: str) -> str:
     return ""
 
 
-def build_loop(sections: dict[str, Any]) -> Loop:
+def build_loop(sections: JsonObject) -> Loop:
     """Return the loop that the sections of a scenario describe.
 
     A section that is left out gets the plant's usual part.
@@ -336,7 +337,9 @@ def join_path(path: str, key: str) -> str:
     return "road" if (path, key) == ("plant", "road") else dotted_path(path, key)
 
 
-def _value(given: Any, field: dataclasses.Field[Any], default: Any, place: tuple[str, str], units: Units | None) -> Any:
+def _value(
+    given: PyTree, field: dataclasses.Field[Any], default: Any, place: tuple[str, str], units: Units | None
+) -> Any:
     family, path = place
     if "part" in field.metadata:
         inner = family_of(field.name, family)
@@ -357,7 +360,9 @@ def _value(given: Any, field: dataclasses.Field[Any], default: Any, place: tuple
     return np.array([read_number(item, spec, f"{path}.{i}") for i, item in enumerate(given)], float)
 
 
-def _parts(family: str, given: Any, default: tuple[Any, ...], path: str, units: Units | None) -> tuple[Any, ...]:
+def _parts(
+    family: str, given: PyTree, default: tuple[PyTree, ...], path: str, units: Units | None
+) -> tuple[PyTree, ...]:
     """Return a tuple of parts from a list, or from a table that changes default parts by number or adds the next."""
     if isinstance(given, list) and given:
         return tuple(build_part(family, item, None, f"{path}.{i}", units) for i, item in enumerate(given))
@@ -382,7 +387,7 @@ def in_kmh(spec: ParameterSpec) -> ParameterSpec:
     return dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
 
 
-def describe_part(family: str, part: Any) -> dict[str, dict[str, Any]]:
+def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
     """Return the fields of a part as plain values: default, unit and range of each.
 
     A default that is a part is given by its name.
@@ -415,7 +420,7 @@ def describe_part(family: str, part: Any) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def part_choices(part: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+def part_choices(part: Part, path: str = "") -> Iterator[tuple[str, JsonObject]]:
     """Yield path and choices of this part and every part below it: its type, and its fields that are not parameters.
 
     Args:

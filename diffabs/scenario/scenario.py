@@ -26,6 +26,7 @@ import numpy as np
 from diffabs.core import files
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
+from diffabs.core.types import JsonObject, Table
 from diffabs.core.units import units_of
 from diffabs.core.validity import find_cautions, find_problems
 from diffabs.core.values import (
@@ -181,14 +182,14 @@ def loads(
     return scenario
 
 
-def _retitle(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+def _retitle(name: str, overrides: Sequence[str]) -> JsonObject:
     """Return title and description of an overridden scenario, without the texts that an override sets itself."""
     said = {override.partition("=")[0].strip() for override in overrides}
     new = {"title": make_printable(f"{name} with {', '.join(overrides)}"), "description": ""}
     return {key: text for key, text in new.items() if key not in said}
 
 
-def _without_inner(before: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
+def _without_inner(before: Table, table: Table) -> Iterator[str]:
     """Yield a line for each section whose new part encloses another part that the override does not name.
 
     Without this check the default inner part would silently replace the scenario's own part.
@@ -230,7 +231,7 @@ def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
     return make_printable(path.stem), raw
 
 
-def _parse(raw: bytes, origin: str) -> dict[str, Any]:
+def _parse(raw: bytes, origin: str) -> JsonObject:
     quoted = format_given(origin, MAX_PATH_LENGTH)
     try:
         return parameter_paths.to_canonical_form(toml.parse_toml(raw.decode()))
@@ -243,7 +244,7 @@ def _parse(raw: bytes, origin: str) -> dict[str, Any]:
         raise ScenarioError(f"{quoted} is not TOML: {error}") from None
 
 
-def _override(table: dict[str, Any], override: str) -> None:
+def _override(table: JsonObject, override: str) -> None:
     path, equals, text = override.partition("=")
     keys = path.strip().split(".")
     if not equals or not all(keys):
@@ -292,7 +293,7 @@ def _place(node: Any, key: str, path: str) -> Any:
     return int(key)
 
 
-def _assemble(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenario:
+def _assemble(name: str, table: JsonObject, folder: pathlib.Path) -> Scenario:
     texts = {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
     sections = {key: value for key, value in table.items() if key not in OTHER_SECTIONS}
     if "road" in table:

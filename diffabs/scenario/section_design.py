@@ -21,6 +21,7 @@ from diffabs.controllers import Sampled
 from diffabs.core.blocks import Series
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Scalar
 from diffabs.core.values import (
     ScenarioError,
     format_given,
@@ -41,7 +42,7 @@ ENTRY = ParameterSpec("1")
 Range = tuple[float, float]
 
 
-def _weight(given: Any, path: str) -> Any:
+def _weight(given: PyTree, path: str) -> Scalar:
     """Return a weight as a number or nested tuples, which can be compared.
 
     The size is not checked here: only the linear model has the order.
@@ -63,7 +64,7 @@ def _weight(given: Any, path: str) -> Any:
     return value
 
 
-def _numbers(given: Any, path: str) -> Any:
+def _numbers(given: PyTree, path: str) -> Any:
     if not isinstance(given, list):
         return read_number(given, ENTRY, path)
     return tuple(_numbers(item, f"{path}.{i}") for i, item in enumerate(given))
@@ -81,8 +82,8 @@ class DesignTask:
         over: Ranges (low, high), in SI, by path of the loop.
     """
 
-    Q: Any = table_field(_weight, None)
-    R: Any = table_field(_weight, None)
+    Q: Matrix = table_field(_weight, None)
+    R: Matrix = table_field(_weight, None)
     decay: float = table_field(range_reader(ParameterSpec("1/s", low=0.0)), 0.0)
     damping: float = table_field(range_reader(ParameterSpec("1", low=0.0, high=1.0, open_high=True)), 0.0)
     over: Mapping[str, Range] = dataclasses.field(default_factory=dict)
@@ -111,7 +112,7 @@ class DesignTask:
             over.setdefault("initial.speed", (float(end), float(start)))
         return over
 
-    def table(self) -> dict[str, Any]:
+    def table(self) -> JsonObject:
         """Return the section as TOML values."""
         return {name: value for name, value in plain_fields(self).items() if value is not None}
 
@@ -125,7 +126,7 @@ class _Parameter:
     shape: tuple[int, ...] = ()
 
 
-def read_design_section(table: Any, loop: Loop) -> DesignTask:
+def read_design_section(table: PyTree, loop: Loop) -> DesignTask:
     """Return the task that a section describes.
 
     Args:
@@ -142,7 +143,7 @@ def read_design_section(table: Any, loop: Loop) -> DesignTask:
     return task
 
 
-def _over(given: Any, path: str, loop: Loop) -> dict[str, Range]:
+def _over(given: PyTree, path: str, loop: Loop) -> dict[str, Range]:
     table = table_reader(read_as_given, "ranges")(given, path)
     there = {name: (parameter.spec, parameter.shape) for name, parameter in _rangeable_parameters(loop).items()}
     found = read_entries(table, path, there, "not a parameter of this loop's linear model")
@@ -171,5 +172,5 @@ def _rangeable_parameters(loop: Loop) -> dict[str, _Parameter]:
     return found
 
 
-def _parameter(part: Any, prefix: str, name: str, model: str) -> dict[str, _Parameter]:
+def _parameter(part: Part, prefix: str, name: str, model: str) -> dict[str, _Parameter]:
     return {path: _Parameter(model, spec) for path, spec, _ in parameters(part, prefix) if path == prefix + name}

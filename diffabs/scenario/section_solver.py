@@ -5,9 +5,9 @@ Without a type, `step` or `kinks` select fixed steps. Otherwise, and always with
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import JsonObject, PyTree, Table
 from diffabs.core.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.solution import SOLVER_TYPES, Adaptive, FixedStep, Solver
@@ -43,7 +43,7 @@ class _Adaptive(_Any):
 SECTIONS = {"fixed": _Fixed, "adaptive": _Adaptive}
 
 
-def read_solver_section(given: Any) -> tuple[Solver, int]:
+def read_solver_section(given: PyTree) -> tuple[Solver, int]:
     """Return solver and seed of a section.
 
     Args:
@@ -60,12 +60,12 @@ def read_solver_section(given: Any) -> tuple[Solver, int]:
     return SOLVER_TYPES[kind](**said), seed
 
 
-def _default_type(given: Mapping[str, Any]) -> str:
+def _default_type(given: Table) -> str:
     """Return the type of a section that names none."""
     return "fixed" if {"step", "kinks"} & given.keys() and "rtol" not in given else "adaptive"
 
 
-def write_solver_section(solver: Solver, seed: int) -> dict[str, Any]:
+def write_solver_section(solver: Solver, seed: int) -> JsonObject:
     """Return the section that `read_solver_section` reads back to the same solver and seed.
 
     Args:

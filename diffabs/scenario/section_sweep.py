@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get
+from diffabs.core.types import JsonObject, Params, PyTree, Table
 from diffabs.core.values import (
     ScenarioError,
     as_plain,
@@ -68,9 +69,9 @@ class Choice:
         parts: The part of each name.
     """
 
-    given: Any
+    given: PyTree
     names: distributions.Categorical
-    parts: Mapping[str, Any]
+    parts: Table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,11 +89,11 @@ class SweepSection:
     check: int = table_field(whole_reader(0, 4096), 16)
     dtype: str = table_field(choice_reader("float64", "float32"), "float64")
     design: sampling.SamplingDesign = table_field(sampling.read_sampling_design, sampling.Random)
-    over: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    over: Params = dataclasses.field(default_factory=dict)
     correlation: Correlation | None = None
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
-    def table(self) -> dict[str, Any]:
+    def table(self) -> JsonObject:
         """Return the section as TOML values, with short forms for common values."""
         design = as_plain(self.design, brief=True)
         given = {"design": design["type"] if len(design) == 1 else design}
@@ -101,7 +102,7 @@ class SweepSection:
         return plain_fields(dataclasses.replace(self, over={}, correlation=None)) | given
 
 
-def _format_item(item: Any) -> Any:
+def _format_item(item: Any) -> PyTree:
     """Return a distribution, or a choice of parts, as a TOML value."""
     if isinstance(item, distributions.Uniform):
         return [item.low, item.high]
@@ -109,7 +110,7 @@ def _format_item(item: Any) -> Any:
 
 
 def read_sweep_section(
-    table: Any, loop: Loop, objectives: Mapping[str, Objective], folder: pathlib.Path
+    table: PyTree, loop: Loop, objectives: Mapping[str, Objective], folder: pathlib.Path
 ) -> SweepSection:
     """Return the sweep that a section describes.
 
@@ -136,7 +137,7 @@ def read_sweep_section(
     return dataclasses.replace(plan, correlation=correlation)
 
 
-def _over(given: Mapping[str, Any], loop: Loop, folder: pathlib.Path) -> dict[str, Any]:
+def _over(given: Table, loop: Loop, folder: pathlib.Path) -> JsonObject:
     """Return distributions and choices by path of the loop, in the order given."""
     there = {path: (spec, ()) for path, spec in elements(loop).items()}
     numbers = {path: item for path, item in given.items() if path not in PARTS}
@@ -152,7 +153,7 @@ def _over(given: Mapping[str, Any], loop: Loop, folder: pathlib.Path) -> dict[st
     return found
 
 
-def _distribution(item: ParameterEntry, folder: pathlib.Path) -> Any:
+def _distribution(item: ParameterEntry, folder: pathlib.Path) -> PyTree:
     """Return the distribution of one parameter, in SI; a pair of numbers is uniform."""
     given = item.given
     if isinstance(given, list):
@@ -169,7 +170,7 @@ def _distribution(item: ParameterEntry, folder: pathlib.Path) -> Any:
     return distributions.convert_distribution_to_si(found, item.scale)
 
 
-def _with_numbers(given: Mapping[str, Any], where: str, folder: pathlib.Path) -> Mapping[str, Any]:
+def _with_numbers(given: Table, where: str, folder: pathlib.Path) -> Table:
     """Return the table of a distribution, with the numbers of a file in the place of its name."""
     if given.get("type") != "empirical" or "file" not in given:
         return given
@@ -189,7 +190,7 @@ def _with_numbers(given: Mapping[str, Any], where: str, folder: pathlib.Path) ->
     return {key: value for key, value in given.items() if key not in ("file", "column")} | {"values": values.tolist()}
 
 
-def _choice(key: str, given: Any, default: Any) -> Choice:
+def _choice(key: str, given: PyTree, default: Any) -> Choice:
     """Return a choice of parts; a part given as a table has its number as its name."""
     where = f"sweep.over.{key}"
     table = {"choices": given} if isinstance(given, list) else given

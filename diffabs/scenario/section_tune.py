@@ -26,13 +26,13 @@ Paths are those of `parameter_paths`. Reading the section needs no extra; tuning
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import JsonObject, PyTree, Table
 from diffabs.core.values import (
     Reader,
     ScenarioError,
@@ -58,7 +58,7 @@ DECLARED_RANGE = "declared"
 MOST_LANES = 100_000
 
 
-def _aggregate(given: Any, path: str) -> dict[str, Any]:
+def _aggregate(given: PyTree, path: str) -> JsonObject:
     """Return type and fields of an aggregate."""
     part = read_one(risk.AGGREGATE_TYPES, given, path)
     return {
@@ -67,7 +67,7 @@ def _aggregate(given: Any, path: str) -> dict[str, Any]:
     }
 
 
-def _mean() -> dict[str, Any]:
+def _mean() -> JsonObject:
     return {"type": "mean"}
 
 
@@ -98,10 +98,10 @@ class Goal:
     free: Mapping[str, Ends | None] = dataclasses.field(default_factory=dict)
     objective: Mapping[str, float] = dataclasses.field(default_factory=dict)
     over: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
-    aggregate: Mapping[str, Any] = table_field(_aggregate, _mean)
+    aggregate: Table = table_field(_aggregate, _mean)
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
-    def table(self) -> dict[str, Any]:
+    def table(self) -> JsonObject:
         """Return the section as TOML values."""
         free = {path: DECLARED_RANGE if ends is None else as_plain(ends) for path, ends in self.free.items()}
         return plain_fields(self) | {"free": free}
@@ -140,7 +140,7 @@ class Goal:
         return read_one(risk.AGGREGATE_TYPES, self.aggregate, "tune.aggregate")
 
 
-def read_tune_section(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
+def read_tune_section(table: PyTree, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
     """Return the goal that a section describes.
 
     Args:
@@ -177,7 +177,7 @@ def metric_reader(
         unit: Function from an objective to the unit of its number.
     """
 
-    def read(given: Any, path: str) -> dict[str, float]:
+    def read(given: PyTree, path: str) -> dict[str, float]:
         for name in table_reader(read_as_given, what)(given, path):
             if name not in objectives:
                 raise unknown_name_error(
@@ -191,11 +191,11 @@ def metric_reader(
     return read
 
 
-def _entries(table: dict[str, Any], section: str, loop: Loop) -> Iterable[ParameterEntry]:
+def _entries(table: JsonObject, section: str, loop: Loop) -> Iterable[ParameterEntry]:
     return read_entries(table, section, parameters_of(loop), "not a parameter of this loop")
 
 
-def free_ranges(table: dict[str, Any], loop: Loop, section: str) -> dict[str, Ends | None]:
+def free_ranges(table: JsonObject, loop: Loop, section: str) -> dict[str, Ends | None]:
     """Return the ranges of the free parameters by path of the loop, in SI; None for a declared range.
 
     Args:
@@ -214,7 +214,7 @@ def free_ranges(table: dict[str, Any], loop: Loop, section: str) -> dict[str, En
     return found
 
 
-def _over(table: dict[str, Any], loop: Loop) -> dict[str, tuple[float, ...]]:
+def _over(table: JsonObject, loop: Loop) -> dict[str, tuple[float, ...]]:
     return {item.path: item.single("differ between lanes").values() for item in _entries(table, "tune.over", loop)}
 
 

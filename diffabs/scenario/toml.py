@@ -3,15 +3,15 @@
 import json
 import re
 import tomllib
-from typing import Any
 
+from diffabs.core.types import JsonObject, PyTree, Scalar
 from diffabs.core.values import ScenarioError, format_given
 
 MOST_LEVELS = 50  # of nested tables and lists; a scenario has fewer than 5
 MAX_INTEGER = 2**63  # bound of whole numbers: TOML has 64 bits
 
 
-def parse_toml(text: str) -> dict[str, Any]:
+def parse_toml(text: str) -> JsonObject:
     """Return the table that a TOML text describes.
 
     Args:
@@ -29,9 +29,9 @@ def parse_toml(text: str) -> dict[str, Any]:
     return table
 
 
-def _refuse_extremes(table: dict[str, Any]) -> None:
+def _refuse_extremes(table: JsonObject) -> None:
     # A loop with its own stack: recursion would fail on the deep nesting that it must refuse.
-    pending: list[tuple[str, int, Any]] = [(key, 1, item) for key, item in table.items()]
+    pending: list[tuple[str, int, PyTree]] = [(key, 1, item) for key, item in table.items()]
     while pending:
         where, level, item = pending.pop()
         if level > MOST_LEVELS:
@@ -43,7 +43,7 @@ def _refuse_extremes(table: dict[str, Any]) -> None:
             raise ScenarioError(f"{format_given(where)} is a whole number outside [-2^63, 2^63)")
 
 
-def parse_value(text: str) -> Any:
+def parse_value(text: str) -> Scalar:
     """Return the value that a text on the command line stands for.
 
     A TOML value is read as such, `1,2` is a list of numbers, and any other text is itself.
@@ -67,7 +67,7 @@ def parse_value(text: str) -> Any:
     return text
 
 
-def write_toml(top: dict[str, Any], sections: dict[str, dict[str, Any]]) -> str:
+def write_toml(top: JsonObject, sections: dict[str, JsonObject]) -> str:
     """Return the text of a TOML file.
 
     Args:
@@ -80,7 +80,7 @@ def write_toml(top: dict[str, Any], sections: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _write_value(value: Any) -> str:
+def _write_value(value: Scalar) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, list):

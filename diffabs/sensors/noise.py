@@ -13,6 +13,7 @@ from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow, no_memor
 from diffabs.core.pytree import Scalar, Vector, param, pytree
 from diffabs.core.rules import Rule
 from diffabs.core.timing import whole_steps
+from diffabs.core.types import Key, PyTree
 
 
 @pytree
@@ -129,7 +130,7 @@ class PlayedWheelNoise:
 
 
 @jax.custom_jvp
-def draw_noise(deviation: Any, key: Any, number: Any) -> Any:
+def draw_noise(deviation: Scalar, key: Key, number: Scalar) -> PyTree:
     """Return deviation * z with a standard normal z, drawn only if the deviation is nonzero or has a tangent.
 
     The tangent is z times the deviation's tangent, also at deviation 0.
@@ -142,7 +143,7 @@ def draw_noise(deviation: Any, key: Any, number: Any) -> Any:
     return jax.lax.cond(deviation != 0, lambda: deviation * _normal(deviation, key, number), lambda: 0.0 * deviation)
 
 
-def _rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _rule(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     value, moving = draw_noise(*primals), type(tangents[0]) is not SymbolicZero
     return value, tangents[0] * _normal(*primals) if moving else jnp.zeros_like(value)
 
@@ -151,7 +152,7 @@ def _rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
 draw_noise.defjvp(_rule, symbolic_zeros=True)
 
 
-def _normal(like: Any, key: Any, number: Any) -> Any:
+def _normal(like: PyTree, key: Key, number: Scalar) -> Any:
     return jax.random.normal(jax.random.fold_in(key, number), (), like.dtype)
 
 

@@ -24,6 +24,7 @@ from diffabs.core.blocks import offers
 from diffabs.core.loop import BLOCKS, Loop
 from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import refine_parts
+from diffabs.core.types import Bool, Int, Key, Part, PyTree, Scalar
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import Run, Solver, refine_solver
 
@@ -44,15 +45,15 @@ class ErrorEstimate(NamedTuple):
         error: Estimated error of `value`.
     """
 
-    value: Any
-    difference: Any
+    value: Scalar
+    difference: Scalar
     finer: Any
     order: Any
-    converges: Any
-    error: Any
+    converges: Bool
+    error: Scalar
 
     @property
-    def relative(self) -> Any:
+    def relative(self) -> Scalar:
         """Error as a fraction of the value: 0 for a zero error, infinite for a zero value with an error."""
         return relative_difference(self.error, self.value)
 
@@ -67,11 +68,13 @@ class Accuracy(NamedTuple):
     """
 
     estimates: dict[str, ErrorEstimate]
-    comparable: Any
+    comparable: Bool
     alike: Any
 
 
-def estimate_accuracy(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Any = None) -> Accuracy:
+def estimate_accuracy(
+    loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Key | None = None
+) -> Accuracy:
     """Return error estimates for the metrics that `measure` returns for the same arguments.
 
     The cost is that of seven runs of `measure` (one with the step h, one with h/2, one with h/4). The function is pure:
@@ -94,7 +97,7 @@ def estimate_accuracy(loop: Loop, solver: Solver, objectives: Mapping[str, Objec
 
 
 def measure_finer(
-    loop: Loop, solver: Solver, objectives: Mapping[str, Objective], times: int, *, key: Any = None
+    loop: Loop, solver: Solver, objectives: Mapping[str, Objective], times: int, *, key: Key | None = None
 ) -> Run:
     """Return the result of `measure` with steps that are `times` shorter, over the same number of original steps.
 
@@ -108,7 +111,7 @@ def measure_finer(
     return measure(refine_parts(loop, times), refine_solver(solver, times), objectives, key=key)
 
 
-def runs_end_alike(*runs: Run) -> Any:
+def runs_end_alike(*runs: Run) -> PyTree:
     """Return True if no run diverged and either all or none of the runs reached their stop.
 
     Args:
@@ -118,7 +121,7 @@ def runs_end_alike(*runs: Run) -> Any:
     return ~jnp.stack([run.diverged for run in runs]).any(0) & (stopped.all(0) | ~stopped.any(0))
 
 
-def relative_difference(difference: Any, value: Any) -> Any:
+def relative_difference(difference: Scalar, value: Scalar) -> Scalar:
     """Return |difference/value|: 0 for a zero difference, infinite for a nonzero difference from a zero value.
 
     Args:
@@ -129,7 +132,7 @@ def relative_difference(difference: Any, value: Any) -> Any:
     return jnp.where(size == 0, 0.0, size / jnp.where(of > 0, of, 1.0) + jnp.where(of > 0, 0.0, jnp.inf))
 
 
-def is_comparable(loop: Loop, solver: Solver, key: Any = None) -> Any:
+def is_comparable(loop: Loop, solver: Solver, key: Key | None = None) -> Bool:
     """Return True if a shorter step changes neither the noise of the loop nor a block's computations.
 
     Args:
@@ -141,7 +144,7 @@ def is_comparable(loop: Loop, solver: Solver, key: Any = None) -> Any:
     return steady & (has_same_noise(loop, solver, 2, key) & has_same_noise(loop, solver, 4, key))
 
 
-def incomparability_reasons(loop: Loop, solver: Solver, key: Any = None) -> list[str]:
+def incomparability_reasons(loop: Loop, solver: Solver, key: Key | None = None) -> list[str]:
     """Return one line for each reason why runs with other steps are not comparable; an empty list if they are.
 
     Args:
@@ -184,7 +187,7 @@ def needs_key(loop: Loop) -> bool:
     return False
 
 
-def has_same_noise(loop: Loop, solver: Solver, times: int, key: Any) -> Any:
+def has_same_noise(loop: Loop, solver: Solver, times: int, key: PyTree) -> Bool:
     """Return True if the sensor shows the same values at the common instants with steps that are `times` shorter.
 
     The plant's signal is held constant, so only noise can differ. At most `MAX_COMPARED_INSTANTS` instants are
@@ -206,16 +209,16 @@ def has_same_noise(loop: Loop, solver: Solver, times: int, key: Any) -> Any:
     return jnp.all(jnp.stack(same))
 
 
-def _draws(loop: Loop, h: float, times: int, count: int, key: Any) -> Any:
+def _draws(loop: Loop, h: float, times: int, count: int, key: PyTree) -> Scalar:
     """Return the sensor's output after each `times` steps, with a leading axis (count,), for a plant that rests at its
     start.
     """
     signal = loop.plant.output(loop.plant.start(loop.initial))
     signal = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), signal)
-    sensor: Any = loop.sensor
+    sensor: Part = loop.sensor
     start = sensor.start(signal)
 
-    def step(memory: Memory, k: Any) -> tuple[Memory, Any]:
+    def step(memory: Memory, k: Int) -> tuple[Memory, PyTree]:
         ticked = sensor.tick(Clock(k * h, h, k, key), memory, signal) if offers(sensor, "tick") else memory
         held = jax.tree.map(lambda x, old: jnp.asarray(x, jnp.result_type(old)), ticked.held, start.held)
         return Memory(start.flow, held), sensor.output(k * h, Memory(start.flow, held), signal)
@@ -224,7 +227,7 @@ def _draws(loop: Loop, h: float, times: int, count: int, key: Any) -> Any:
     return jax.tree.map(lambda x: x[::times], seen)
 
 
-def _estimate(coarse: Any, half: Any, quarter: Any, fine: Any) -> ErrorEstimate:
+def _estimate(coarse: Scalar, half: Scalar, quarter: Scalar, fine: Bool) -> ErrorEstimate:
     d1, d2 = half - coarse, quarter - half
     # The inner `where` replaces a zero divisor: the quotient of the branch not taken stays finite.
     q = jnp.where(d1 == 0, jnp.where(d2 == 0, 0.0, jnp.inf), jnp.abs(d2) / jnp.where(d1 == 0, 1.0, jnp.abs(d1)))

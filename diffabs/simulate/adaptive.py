@@ -22,6 +22,7 @@ from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.modes import ComparisonAnswers, Mode, find_contradicted
 from diffabs.core.protocols import Clock, Memory, Segment, Shown
+from diffabs.core.types import Matrix, PyTree, Scalar
 from diffabs.simulate.advance import SurfaceCrossing, mode_after_changes, mode_at_end, start_state
 from diffabs.simulate.checkpoint import any_lane, jit_barrier
 from diffabs.simulate.condition import RunStatus, status_after_step
@@ -76,7 +77,7 @@ CROSSING_OVERREACH = 1.5
 FIELDS_AFTER_END = ("tries", "status")  # fields of the carry that must stay valid when a run is over
 
 
-def init_carry(loop: Loop, objectives: Objectives, control: StepSizeControl, key: Any) -> AdaptiveCarry:
+def init_carry(loop: Loop, objectives: Objectives, control: StepSizeControl, key: PyTree) -> AdaptiveCarry:
     """Return the carry at t = 0.
 
     Args:
@@ -109,7 +110,12 @@ def init_carry(loop: Loop, objectives: Objectives, control: StepSizeControl, key
 
 
 def step(
-    loop: Loop, objectives: Objectives, control: StepSizeControl, key: Any, carry: AdaptiveCarry, until: Any = None
+    loop: Loop,
+    objectives: Objectives,
+    control: StepSizeControl,
+    key: PyTree,
+    carry: AdaptiveCarry,
+    until: Scalar = None,
 ) -> AdaptiveCarry:
     """Return the carry after one attempt of a step, unchanged if the run is over or has reached the instant `until`.
 
@@ -224,7 +230,7 @@ def _next_carry(
 
 
 def attempt_step(
-    system: Dynamics, carry: AdaptiveCarry, end: Any, refreshing: Any, lands: Any, control: StepSizeControl
+    system: Dynamics, carry: AdaptiveCarry, end: PyTree, refreshing: Scalar, lands: Scalar, control: StepSizeControl
 ) -> AdaptiveAttempt:
     """Return the result of one attempt.
 
@@ -245,7 +251,7 @@ def attempt_step(
         within = Mode(point.words, carry.unrestricted)
         at = mode_at_end(system, point.words, carry.search.which, lands, carry.unrestricted | refreshing)
 
-    def flow(t: Any, z: Any) -> Any:
+    def flow(t: Scalar, z: Matrix) -> Any:
         return system.rates(t, z, held, within)
 
     # The error estimate waits for the rate at the end, which `ahead` computes together with everything else there.
@@ -285,7 +291,7 @@ def attempt_step(
     return AdaptiveAttempt(new, seen.signals, off, scale, late, kink)
 
 
-def _surface_crossing(found: LoopEvaluationWithRates, which: Any, h: Any) -> SurfaceCrossing:
+def _surface_crossing(found: LoopEvaluationWithRates, which: Scalar, h: Scalar) -> SurfaceCrossing:
     """Return the comparisons whose answers at the end of a step contradict the mode of the step."""
     margins = [(one.numbers, one.value) for one in found.comparisons]
     return SurfaceCrossing(*find_contradicted(ComparisonAnswers(found.words, found.contradicted, margins), which, h))
@@ -298,8 +304,8 @@ def commit_step(
     begun: AdaptivePoint,
     here: AdaptiveAttempt,
     fired: Margins,
-    error_limited: Any,
-    logs: list[Any],
+    error_limited: Scalar,
+    logs: list[PyTree],
     mode: Mode,
 ) -> AdaptivePoint:
     """Return the point at which the run continues, after the triggered events and the ticks of the clock.
@@ -328,7 +334,7 @@ def commit_step(
     return _evaluate_point(system, control, point.t, state, point.accumulators, error_limited, mode)
 
 
-def build_passages(start: Any, end: Any) -> dict[str, Passage]:
+def build_passages(start: PyTree, end: PyTree) -> dict[str, Passage]:
     """Return the step between two points as a `Passage` for each block that records its signal, by the block's name.
 
     Args:
@@ -339,7 +345,7 @@ def build_passages(start: Any, end: Any) -> dict[str, Passage]:
     return {n: Passage(start.t, end.t, (values[n], last[n]), (rates[n], falls[n])) for n in values}
 
 
-def is_before(control: StepSizeControl, carry: AdaptiveCarry, instant: Any) -> Any:
+def is_before(control: StepSizeControl, carry: AdaptiveCarry, instant: Scalar) -> Scalar:
     """Return True if the run goes on and has not reached this instant of the grid.
 
     Args:
@@ -350,7 +356,7 @@ def is_before(control: StepSizeControl, carry: AdaptiveCarry, instant: Any) -> A
     return carry.running & (carry.point.t < instant * control.h)
 
 
-def _end(point: AdaptivePoint) -> Any:
+def _end(point: AdaptivePoint) -> PyTree:
     """Return time, flow state and rate of a point: the end of a `HermiteStep`, before the changes there."""
     return point.t, point.state.flow(), point.rate[0]
 
@@ -358,10 +364,10 @@ def _end(point: AdaptivePoint) -> Any:
 def _evaluate_point(
     system: Dynamics,
     control: StepSizeControl,
-    t: Any,
+    t: Scalar,
     state: LoopState,
     accumulators: Accumulators,
-    length: Any,
+    length: Scalar,
     mode: Mode,
 ) -> AdaptivePoint:
     seen, moving, recording, _, words, _, comparisons = system.ahead(t, state, accumulators, mode)
@@ -374,7 +380,7 @@ def _evaluate_point(
 
 
 def _decide(
-    carry: AdaptiveCarry, here: AdaptiveAttempt, count: int, active: Any, last: Any, control: StepSizeControl
+    carry: AdaptiveCarry, here: AdaptiveAttempt, count: int, active: Scalar, last: PyTree, control: StepSizeControl
 ) -> AdaptiveDecision:
     """Return the decision on an attempt: accept it, search within it, or end the run."""
     running, landing = carry.status == RunStatus.RUNNING, carry.status == RunStatus.LANDING
@@ -392,7 +398,7 @@ def _decide(
     return AdaptiveDecision(fine, taken, seeks, fired, over)
 
 
-def pack_events(fired: Margins) -> Any:
+def pack_events(fired: Margins) -> Scalar:
     """Return the triggered events as a bit mask, one bit for each event.
 
     Args:
@@ -403,7 +409,7 @@ def pack_events(fired: Margins) -> Any:
 
 def _error_limited_length(
     carry: AdaptiveCarry, here: AdaptiveAttempt, verdict: AdaptiveDecision, control: StepSizeControl
-) -> Any:
+) -> Scalar:
     """Return the step length that the error allows [s].
 
     A step that was cut short cannot reduce this length, nor can a step with a switching surface inside.
@@ -419,7 +425,7 @@ def _error_limited_length(
     return jnp.maximum(error_limited, control.least)
 
 
-def _continue_search(carry: AdaptiveCarry, here: AdaptiveAttempt, count: int) -> tuple[EventSearch, Any, Any]:
+def _continue_search(carry: AdaptiveCarry, here: AdaptiveAttempt, count: int) -> tuple[EventSearch, PyTree, PyTree]:
     """Return the search, the next length and the next status after an attempt with an event or a switching surface
     inside.
     """
@@ -438,6 +444,6 @@ def _continue_search(carry: AdaptiveCarry, here: AdaptiveAttempt, count: int) ->
     return search, length, status.astype(carry.status.dtype)
 
 
-def _margins(carry: AdaptiveCarry, here: AdaptiveAttempt) -> tuple[list[Any], list[Any]]:
+def _margins(carry: AdaptiveCarry, here: AdaptiveAttempt) -> tuple[list[PyTree], list[PyTree]]:
     """Return the margins at the beginning and at the end of the attempt."""
     return jax.tree.leaves(carry.point.margins), jax.tree.leaves(here.point.margins)

@@ -22,6 +22,7 @@ from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once, is_trace
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.rules import Rule
+from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.core.validity import check_part as check_parts
 from diffabs.core.validity import find_broken, grid_rules, part_rules
 from diffabs.simulate.solution import Adaptive, Solver
@@ -143,7 +144,7 @@ def find_unstable_step(loop: Loop, solver: Solver) -> Iterator[str]:
         )
 
 
-def batch_admissibility(loop: Loop | None, values: Any, solver: Solver) -> Admissibility:
+def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Admissibility:
     """Return the result of `check` for each run of a batch, with one compiled program for all runs.
 
     Args:
@@ -172,7 +173,7 @@ def batch_admissibility(loop: Loop | None, values: Any, solver: Solver) -> Admis
     return _name_reasons(loop, values, solver.step, codes)
 
 
-def _name_reasons(loop: Loop | None, values: Any, step: float, codes: np.ndarray) -> Admissibility:
+def _name_reasons(loop: Loop | None, values: PyTree, step: float, codes: np.ndarray) -> Admissibility:
     """Return the codes renumbered to the reasons that occur; code -1 is an unstable step."""
     there = [code for code in np.unique(codes).tolist() if code] if codes.any() else []
     named = {-1: f"solver.step = {step:g} s is not stable"}
@@ -184,7 +185,7 @@ def _name_reasons(loop: Loop | None, values: Any, step: float, codes: np.ndarray
     return Admissibility(numbers, ("", *(named[code] for code in there)))
 
 
-def first_refusal(loop: Loop, values: Mapping[str, Any], solver: Solver) -> str | None:
+def first_refusal(loop: Loop, values: Params, solver: Solver) -> str | None:
     """Return one line about the first refused run and the reason, with its numbers; None if all runs are accepted.
 
     Args:
@@ -210,7 +211,7 @@ def first_refusal(loop: Loop, values: Mapping[str, Any], solver: Solver) -> str 
     return f"lane {i}: {why}"
 
 
-def _lane(loop: Loop | None, values: Any) -> Loop:
+def _lane(loop: Loop | None, values: PyTree) -> Loop:
     return values if loop is None else replace(loop, values)
 
 
@@ -222,10 +223,10 @@ def _rules(loop: Loop, step: float) -> Iterator[Rule]:
 
 
 @partial(jax.jit, static_argnames="step")
-def _codes(loop: Loop | None, values: Any, *, step: float) -> Any:
+def _codes(loop: Loop | None, values: PyTree, *, step: float) -> Scalar:
     """Return the number of the first broken rule of each run, from 1, shape (runs,); 0 if no rule is broken."""
 
-    def code(values: Any) -> Any:
+    def code(values: PyTree) -> Any:
         holds = jnp.stack([jnp.asarray(rule.holds) for rule in _rules(canonical_dtypes(_lane(loop, values)), step)])
         return jnp.where(jnp.all(holds), 0, 1 + jnp.argmin(holds))  # argmin finds the first False
 
@@ -234,7 +235,7 @@ def _codes(loop: Loop | None, values: Any, *, step: float) -> Any:
 
 # One compiled program: the operations one by one would each cost as much as the whole function.
 @compile_once(options=QUICK_COMPILE_OPTIONS)
-def _margin(plant: Any, initial: Any, stop: Any) -> jax.Array:
+def _margin(plant: Part, initial: Part, stop: Part) -> jax.Array:
     """Return the margin of the stop at the start."""
     return stop.margin(plant.output(plant.start(initial)))
 

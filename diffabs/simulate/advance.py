@@ -16,6 +16,7 @@ from diffabs.core.log import borrow
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.modes import Mode, ModeBits, find_contradicted, single_bit
 from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
+from diffabs.core.types import Matrix, PyTree, Scalar
 from diffabs.simulate.checkpoint import jit_barrier
 from diffabs.simulate.dynamics import Accumulators, Dynamics, Objectives, build_dynamics, split_flow_and_held
 from diffabs.simulate.rk4 import rk4_step_from
@@ -34,11 +35,11 @@ class FixedStepPoint(NamedTuple):
         mode: Answers to the comparisons in these rates.
     """
 
-    t: Any
+    t: Scalar
     state: LoopState
     accumulators: Accumulators
     sample: Sample
-    rate: tuple[Any, Any]
+    rate: tuple[PyTree, PyTree]
     margins: Margins
     mode: ModeBits
 
@@ -56,7 +57,7 @@ class SurfaceCrossing(NamedTuple):
     other: Any
     contradicted: Any
     chosen: Any
-    margin: Any
+    margin: Scalar
 
 
 class FixedStepAttempt(NamedTuple):
@@ -74,11 +75,11 @@ class FixedStepAttempt(NamedTuple):
         passed: The step as a `Passage` for each block that records its signal.
     """
 
-    t: Any
+    t: Scalar
     state: LoopState
     accumulators: Accumulators
     signals: Signals
-    rate: tuple[Any, Any]
+    rate: tuple[PyTree, PyTree]
     margins: Margins
     kink: SurfaceCrossing
     mode: ModeBits
@@ -98,13 +99,13 @@ class StepRequest(NamedTuple):
         lands: True if the step ends on the switching surface of that comparison.
     """
 
-    h: Any
-    end: Any
-    step: Any
-    unrestricted: Any
+    h: Scalar
+    end: PyTree
+    step: Scalar
+    unrestricted: Scalar
     refresh: Any
-    which: Any
-    lands: Any
+    which: Scalar
+    lands: Scalar
 
 
 def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopState, Accumulators]:
@@ -138,7 +139,7 @@ def initial_point(loop: Loop, objectives: Objectives, clock: Clock, *, kinks: bo
     return _evaluate_point(system, clock.t, state, accumulators, Mode(None))
 
 
-def attempt_step(system: Dynamics, point: FixedStepPoint, one: StepRequest, active: Any) -> FixedStepAttempt:
+def attempt_step(system: Dynamics, point: FixedStepPoint, one: StepRequest, active: Scalar) -> FixedStepAttempt:
     """Return the end of one Runge-Kutta step from a point.
 
     Args:
@@ -149,7 +150,7 @@ def attempt_step(system: Dynamics, point: FixedStepPoint, one: StepRequest, acti
     """
     loop, (z, held) = system.loop, split_flow_and_held(point.state, point.accumulators)
 
-    def flow(t: Any, z: Any, given: tuple[Any, Mode]) -> Any:
+    def flow(t: Scalar, z: Matrix, given: tuple[PyTree, Mode]) -> Any:
         return system.rates(t, z, *given)
 
     z = rk4_step_from(flow, point.t, z, point.rate, one.h, (held, Mode(point.mode, one.unrestricted)))
@@ -184,7 +185,7 @@ def attempt_step(system: Dynamics, point: FixedStepPoint, one: StepRequest, acti
 
 
 def commit_step(
-    system: Dynamics, clock: Clock, here: FixedStepAttempt, fired: Margins, one: StepRequest, logs: list[Any]
+    system: Dynamics, clock: Clock, here: FixedStepAttempt, fired: Margins, one: StepRequest, logs: list[PyTree]
 ) -> FixedStepPoint:
     """Return the point at which the run continues, after the triggered events and the ticks of the clock.
 
@@ -208,13 +209,13 @@ def commit_step(
 
 
 def _evaluate_point(
-    system: Dynamics, t: Any, state: LoopState, accumulators: Accumulators, mode: Mode
+    system: Dynamics, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode
 ) -> FixedStepPoint:
     seen, answers = system.look(t, state, accumulators, mode)
     return FixedStepPoint(t, state, accumulators, seen.signals.sample, seen[:2], seen.margins, answers.words)
 
 
-def mode_at_end(system: Dynamics, words: ModeBits, which: Any, lands: Any, free: Any) -> Mode:
+def mode_at_end(system: Dynamics, words: ModeBits, which: Scalar, lands: Scalar, free: PyTree) -> Mode:
     """Return the mode for the end of a step made in the mode `words`.
 
     It is the same mode, or the comparisons are evaluated where it is `free`. A step that lands on a switching surface
@@ -236,7 +237,7 @@ def mode_at_end(system: Dynamics, words: ModeBits, which: Any, lands: Any, free:
     return Mode(flipped, free, loose)
 
 
-def mode_after_changes(system: Dynamics, words: ModeBits, which: Any, lands: Any) -> Mode:
+def mode_after_changes(system: Dynamics, words: ModeBits, which: Scalar, lands: Scalar) -> Mode:
     """Return the mode after the ticks and events at the end of a step.
 
     All comparisons are evaluated, except for the comparison on whose switching surface the step lands: it keeps its
@@ -252,7 +253,7 @@ def mode_after_changes(system: Dynamics, words: ModeBits, which: Any, lands: Any
     return Mode(words, ~lands, tuple(~bit for bit in kept))
 
 
-def _build_segment(system: Dynamics, point: FixedStepPoint, end: Any, sample: Sample, one: StepRequest) -> Segment:
+def _build_segment(system: Dynamics, point: FixedStepPoint, end: PyTree, sample: Sample, one: StepRequest) -> Segment:
     within = Mode(point.mode, one.unrestricted)
     ends = ((point.t, point.state, point.accumulators, point.rate[0]), end)
 
@@ -266,14 +267,14 @@ def _build_segment(system: Dynamics, point: FixedStepPoint, end: Any, sample: Sa
     return Segment(point.sample, sample, one.h, one.step, *rates, smooth, (True, True))
 
 
-def _build_passages(system: Dynamics, point: FixedStepPoint, end: Any, one: StepRequest) -> dict[str, Passage]:
+def _build_passages(system: Dynamics, point: FixedStepPoint, end: PyTree, one: StepRequest) -> dict[str, Passage]:
     """Return the recorded signals of each block at both ends of a step, and their rates within its mode."""
     loop, within = system.loop, Mode(point.mode, one.unrestricted)
 
-    def recorded_rates(t: Any, state: LoopState, accumulators: Accumulators, rate: Any) -> Any:
+    def recorded_rates(t: Scalar, state: LoopState, accumulators: Accumulators, rate: PyTree) -> Any:
         (flow, still), held = split_flow_and_held(state, accumulators)
 
-        def recorded(t: Any, flow: Any) -> Any:
+        def recorded(t: Scalar, flow: PyTree) -> Any:
             if system.program is None:
                 return loop.signals(t, state.with_flow(flow)).recorded
             fixed = (held, loop, system.objectives)

@@ -14,6 +14,7 @@ from diffabs.core.compiling import is_traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import as_arrays, get, parameters, replace
+from diffabs.core.types import Bool, Key, Params, Part, PyTree
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.engine import check_process, run_with_engine
 from diffabs.simulate.packed import EarlyEnd, run_packed
@@ -40,9 +41,9 @@ class Batch:
             durations, so that short runs do not wait for long ones. Without them all runs have `solver.duration`.
     """
 
-    values: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    keys: Any = None
-    weights: Any = None
+    values: Params = dataclasses.field(default_factory=dict)
+    keys: PyTree = None
+    weights: PyTree = None
     durations: Any = None
 
     @property
@@ -60,7 +61,7 @@ class Batch:
             raise ValueError(f"the lanes' values have different lengths, or none: {listed}")
         return next(iter(lengths.values()), 1)
 
-    def check(self, loop: Any, solver: Solver | None = None) -> "Batch":
+    def check(self, loop: Part, solver: Solver | None = None) -> "Batch":
         """Return the batch itself if its values fit the loop.
 
         Args:
@@ -97,11 +98,11 @@ class Batch:
         members = [np.flatnonzero(classes == i) for i in np.unique(classes)]
         return [(lanes, float(wanted[lanes].max())) for lanes in members]
 
-    def lane(self, loop: Any, i: int) -> Any:
+    def lane(self, loop: Part, i: int) -> PyTree:
         """Return the loop of run `i`, given the common `loop`."""
         return replace(loop, {path: np.asarray(column)[i] for path, column in self.values.items()})
 
-    def each(self, loop: Any, function: Callable[[Any, Any], Any], lanes: Any = None) -> Any:
+    def each(self, loop: Part, function: Callable[[PyTree, PyTree], PyTree], lanes: Any = None) -> PyTree:
         """Return function(loop, key) of every run with a leading axis (runs,), by `jax.vmap`; differentiable.
 
         Args:
@@ -130,7 +131,7 @@ def run_batch(
     *,
     trajectories: bool = False,
     together: bool | None = None,
-    accepted: Any = None,
+    accepted: Bool | None = None,
     enough: EarlyEnd | None = None,
     engine: str = "xla",
 ) -> Run:
@@ -178,7 +179,7 @@ def run_batch(
         check_process()
 
     # Everything that may lie on devices is an argument, so that `run_on_auto_mesh` sees it.
-    def run(loop: Loop, values: Any, keys: Any, objectives: Any, accepted: Any, enough: Any) -> Run:
+    def run(loop: Loop, values: PyTree, keys: Key, objectives: Any, accepted: Bool, enough: Any) -> Run:
         lanes = dataclasses.replace(batch, values=values, keys=keys)
         return _dispatch_batch(loop, lanes, solver, objectives, trajectories, together, accepted, enough, engine)
 
@@ -192,7 +193,7 @@ def _dispatch_batch(
     objectives: dict[str, Objective],
     trajectories: bool,
     together: bool | None,
-    accepted: Any,
+    accepted: Bool,
     enough: EarlyEnd | None,
     engine: str,
 ) -> Run:
@@ -255,7 +256,7 @@ def _run_vmapped(
     return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *(run_group(*group) for group in groups))
 
 
-def _mark_refused(run: Run, accepted: Any) -> Run:
+def _mark_refused(run: Run, accepted: Bool) -> Run:
     """Return the runs with the results of refused runs replaced as in a packed batch: diverged, with NaN metrics."""
     if accepted is True:
         return run
@@ -265,19 +266,19 @@ def _mark_refused(run: Run, accepted: Any) -> Run:
     return run._replace(metrics=metrics, diverged=run.diverged | ~accepted, **flags)
 
 
-def group_by_structure(loops: Sequence[Any]) -> list[list[int]]:
+def group_by_structure(loops: Sequence[PyTree]) -> list[list[int]]:
     """Return the indices of the loops in groups of equal structure and shapes; each group can be one batch.
 
     Args:
         loops: Loops to group.
     """
-    groups: dict[Any, list[int]] = {}
+    groups: dict[PyTree, list[int]] = {}
     for place, loop in enumerate(map(as_arrays, loops)):
         groups.setdefault((jax.tree.structure(loop), *map(np.shape, jax.tree.leaves(loop))), []).append(place)
     return list(groups.values())
 
 
-def stack_loops(loops: Sequence[Any]) -> tuple[Any, Batch]:
+def stack_loops(loops: Sequence[PyTree]) -> tuple[PyTree, Batch]:
     """Return loops of one structure as a batch for `run_batch`: the first loop, and every parameter of each, shape
     (runs, ...).
 

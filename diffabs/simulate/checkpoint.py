@@ -8,12 +8,14 @@ import jax
 import jax.custom_batching
 import jax.numpy as jnp
 
+from diffabs.core.types import Bool, PyTree
+
 X = TypeVar("X")
 SCAN_GROUP_STEPS = 32  # steps that are skipped together, in scans of at most MAX_SAVED_CARRIES steps
 MAX_SAVED_CARRIES = 1800  # carries that reverse mode keeps in one scan: some 0.2 MB for each run of a batch
 
 
-def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X], Any]) -> X:
+def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X], PyTree]) -> X:
     """Return the carry after `capacity` applications of `step`, in nested scans.
 
     Groups of steps are skipped while `on(carry)` is False; there, `step` must return its argument. In a batch under
@@ -53,7 +55,7 @@ def nested_scan_lengths(count: int) -> tuple[int, int]:
 
 
 @jax.custom_batching.custom_vmap
-def any_lane(running: Any) -> Any:
+def any_lane(running: Bool) -> Bool:
     """Return True if any run of a batch under `jax.vmap` is still running, the same value for all runs.
 
     With one condition for all runs `jax.lax.cond` skips the work. With one condition for each run JAX would execute
@@ -66,13 +68,13 @@ def any_lane(running: Any) -> Any:
 
 
 @any_lane.def_vmap
-def _(size: int, batched: Any, running: Any) -> tuple[Any, bool]:
+def _(size: int, batched: Any, running: Bool) -> tuple[PyTree, bool]:
     del size
     # The result is unbatched, and `any_lane` again covers a further `vmap` around this one.
     return (any_lane(jnp.any(running, axis=0)), False) if batched[0] else (any_lane(running), False)
 
 
-def jit_barrier(active: Any, work: Callable[[], X]) -> X:
+def jit_barrier(active: Bool, work: Callable[[], X]) -> X:
     """Return work(), compiled as one unit; zeros if no run of a batch is active.
 
     XLA would otherwise compile a copy of `work` into each expression that uses the result.
@@ -86,7 +88,7 @@ def jit_barrier(active: Any, work: Callable[[], X]) -> X:
     return jax.lax.cond(any_lane(active), work, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape))
 
 
-def rematerialise(body: Any) -> Any:
+def rematerialise(body: Any) -> PyTree:
     """Return `body` with checkpointing: reverse mode keeps only its arguments and computes everything else again.
 
     Args:

@@ -1,12 +1,12 @@
 """Status of a run: running, searching for an event, or over, and the reason."""
 
 import enum
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, Margins
+from diffabs.core.types import Bool, PyTree, Scalar
 
 # A landing on the stop may leave at most this fraction of the margin's change in the step.
 MAX_MISSED_FRACTION = 0.1
@@ -30,7 +30,7 @@ class RunStatus(enum.IntEnum):
     RUNNING, SEEKING, PROBING, REFINING, LANDING, REFRESHING, STOPPED, TIMED_OUT, DIVERGED = range(9)
 
 
-def is_running(carry: Any) -> Any:
+def is_running(carry: PyTree) -> Bool:
     """Return True if the run needs another attempt.
 
     Args:
@@ -39,7 +39,7 @@ def is_running(carry: Any) -> Any:
     return carry.status <= RunStatus.REFRESHING
 
 
-def status_after_step(loop: Loop, carry: Any, margins: Margins, verdict: Any) -> Any:
+def status_after_step(loop: Loop, carry: PyTree, margins: Margins, verdict: PyTree) -> Scalar:
     """Return the status after an accepted step.
 
     A landing whose margin is too far from zero (`MAX_MISSED_FRACTION`) makes the run diverge.

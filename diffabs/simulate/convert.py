@@ -1,7 +1,6 @@
 """Conversion of a run to a summary, a pandas.DataFrame, an xarray.Dataset or a figure."""
 
 import importlib
-from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,12 +9,13 @@ import numpy as np
 from jax.core import Tracer
 
 from diffabs.core.summary import Summary, round_for_table
+from diffabs.core.types import Params, Part, PyTree, Scalar
 
 NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
 DEFAULT_CONTROL_UNIT = "control"  # unit of the control if no plant is given
 
 
-def is_concrete(run: Any) -> bool:
+def is_concrete(run: PyTree) -> bool:
     """Return True if a run holds numbers, False inside a function that JAX traces.
 
     Args:
@@ -25,7 +25,7 @@ def is_concrete(run: Any) -> bool:
     return all(isinstance(x, NUMBER_TYPES) and not isinstance(x, Tracer) for x in leaves)
 
 
-def summarise_run(run: Any) -> Summary:
+def summarise_run(run: PyTree) -> Summary:
     """Return a summary of a run: how it ended, and its metrics. A batch gets mean, least and greatest value of each
     metric.
 
@@ -44,7 +44,7 @@ def summarise_run(run: Any) -> Summary:
     return Summary(f"Run that {how}{seen}", ("metric", "value"), rows)
 
 
-def _summarise_runs(run: Any, count: int) -> Summary:
+def _summarise_runs(run: PyTree, count: int) -> Summary:
     lost, stopped = np.asarray(run.diverged).reshape(-1), int(np.sum(run.stopped))
     rows = []
     for name, values in run.metrics.items():
@@ -54,7 +54,7 @@ def _summarise_runs(run: Any, count: int) -> Summary:
     return Summary(title, ("metric", "mean", "least", "greatest"), tuple(rows), "of those that did not diverge")
 
 
-def trajectory_columns(run: Any, plant: Any = None) -> dict[str, tuple[str, np.ndarray]]:
+def trajectory_columns(run: PyTree, plant: Part = None) -> dict[str, tuple[str, np.ndarray]]:
     """Return unit and values (instants,) of each signal up to the end of a run, by name; the time is `t`.
 
     Args:
@@ -80,7 +80,7 @@ def trajectory_columns(run: Any, plant: Any = None) -> dict[str, tuple[str, np.n
     return {name: (unit, np.asarray(values)[:count]) for name, (unit, values) in every.items()}
 
 
-def to_pandas(run: Any, plant: Any = None) -> Any:
+def to_pandas(run: PyTree, plant: Part = None) -> Scalar:
     """Return the trajectory as a pandas.DataFrame indexed by time; without a trajectory, a row of metrics for each run.
 
     Args:
@@ -104,7 +104,7 @@ def to_pandas(run: Any, plant: Any = None) -> Any:
     return frame
 
 
-def to_xarray(run: Any, plant: Any = None) -> Any:
+def to_xarray(run: PyTree, plant: Part = None) -> Scalar:
     """Return the trajectory as an xarray.Dataset over the time, each variable with its `units`.
 
     Args:
@@ -121,7 +121,7 @@ def to_xarray(run: Any, plant: Any = None) -> Any:
     return xarray.Dataset(each, coords={"t": each.pop("t")}, attrs=_attributes(run))
 
 
-def to_figure(run: Any, plant: Any = None, title: str = "") -> Any:
+def to_figure(run: PyTree, plant: Part = None, title: str = "") -> Scalar:
     """Return a figure of the run; the plant's output type selects the kind of figure.
 
     Args:
@@ -138,7 +138,7 @@ def to_figure(run: Any, plant: Any = None, title: str = "") -> Any:
     return plot.figure_for(shown)(run, title=title, **({"unit": unit} if unit else {}))
 
 
-def _attributes(run: Any) -> Mapping[str, Any]:
+def _attributes(run: PyTree) -> Params:
     """Return metrics and end flags of a run as plain numbers."""
     flags = {name: int(getattr(run, name)) for name in ("stopped", "diverged", "timed_out")}
     return {**{name: float(value) for name, value in run.metrics.items()}, **flags}

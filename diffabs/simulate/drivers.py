@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.types import Bool, Int, PyTree
 from diffabs.simulate.checkpoint import any_lane, rematerialise, repeat_step
 
 Carry = Any  # pytree of the stepping method, with an attribute `running`
@@ -50,13 +51,13 @@ def run_to_end(step: Step, renew: Step, carry: Carry) -> Carry:
 def run_with_trajectory(
     step: Step,
     renew: Step,
-    before: Callable[[Carry, Any], Any],
-    look: Callable[[Carry, Any], Any],
+    before: Callable[[Carry, PyTree], PyTree],
+    look: Callable[[Carry, PyTree], PyTree],
     carry: Carry,
     every: Any,
-    count: Any,
+    count: Int,
     room: int,
-) -> tuple[Carry, Any]:
+) -> tuple[Carry, PyTree]:
     """Return the carry after `count` times `every` steps of the grid, and a sample after each `every`-th step.
 
     The samples have a leading axis of `room`; those beyond `count` are zero. Not for reverse mode.
@@ -73,7 +74,7 @@ def run_with_trajectory(
     """
     seen = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(look, carry, count))
 
-    def segment(i: Any, at: tuple[Carry, Any]) -> tuple[Carry, Any]:
+    def segment(i: Int, at: tuple[Carry, PyTree]) -> tuple[Carry, PyTree]:
         until = (i + 1) * every
 
         def some(carry: Carry) -> Carry:
@@ -98,14 +99,14 @@ def scan_to_end(step: Step, carry: Carry, room: int) -> Carry:
 
 def scan_with_trajectory(
     step: Step,
-    before: Callable[[Carry, Any], Any],
-    look: Callable[[Carry, Any], Any],
+    before: Callable[[Carry, PyTree], PyTree],
+    look: Callable[[Carry, PyTree], PyTree],
     carry: Carry,
     every: int,
-    count: Any,
+    count: Int,
     instants: int,
     room: int,
-) -> tuple[Carry, Any]:
+) -> tuple[Carry, PyTree]:
     """Return the result of `run_with_trajectory` with room for `instants` samples; for derivatives.
 
     Args:
@@ -119,7 +120,7 @@ def scan_with_trajectory(
         room: Capacity for attempts between two samples.
     """
 
-    def segment(carry: Carry, i: Any) -> tuple[Carry, Any]:
+    def segment(carry: Carry, i: Int) -> tuple[Carry, PyTree]:
         until = (i + 1) * every
 
         def on(carry: Carry) -> Any:
@@ -135,6 +136,6 @@ def scan_with_trajectory(
     return jax.lax.scan(rematerialise(segment), carry, jnp.arange(instants))
 
 
-def _any_running(running: Any) -> Any:
+def _any_running(running: Bool) -> Bool:
     """Return `any_lane(running)` without a derivative."""
     return any_lane(jax.lax.stop_gradient(running))

@@ -15,6 +15,7 @@ from diffabs.core.comparisons import SwitchedProgram
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.modes import ComparisonAnswers, Mode, ModeBits
 from diffabs.core.protocols import Memory, Objective, Sample
+from diffabs.core.types import AnyArray, PyTree, Scalar
 from diffabs.simulate.foresight import SwitchingFunction
 
 Objectives = dict[str, Objective]
@@ -22,7 +23,7 @@ Accumulators = dict[str, Memory]
 
 UNCONSTRAINED = Mode(None)  # no frozen answers: every comparison is evaluated
 MAX_CACHED_PROGRAMS = 256  # greatest number of programs that are kept
-_programs: dict[Any, SwitchedProgram] = {}
+_programs: dict[PyTree, SwitchedProgram] = {}
 
 
 class LoopEvaluation(NamedTuple):
@@ -35,7 +36,7 @@ class LoopEvaluation(NamedTuple):
         margins: Margins of the stop and of the blocks' events.
     """
 
-    rate: Any
+    rate: PyTree
     accumulator_rates: Any
     signals: Signals
     margins: Margins
@@ -56,7 +57,7 @@ class LoopEvaluationWithRates(NamedTuple):
 
     seen: LoopEvaluation
     moving: Sample
-    recorded: dict[str, Any]
+    recorded: dict[str, PyTree]
     falls: Margins
     words: ModeBits
     contradicted: ModeBits
@@ -86,12 +87,12 @@ class Dynamics(NamedTuple):
         """Number of comparisons whose switching surfaces are located."""
         return self.program.answers if self.program else 0
 
-    def rates(self, t: Any, z: Any, held: Any, mode: Mode) -> Any:
+    def rates(self, t: Scalar, z: AnyArray, held: PyTree, mode: Mode) -> Scalar:
         """Return dz/dt at time `t` within a `mode`, with z and `held` as `split_flow_and_held` returns them."""
         return self._at(lambda seen: seen[:2], (t, *z), held, mode)
 
     def look(
-        self, t: Any, state: LoopState, accumulators: Accumulators, mode: Mode
+        self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode
     ) -> tuple[LoopEvaluation, ComparisonAnswers]:
         """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`, and the answers to the
         comparisons.
@@ -103,7 +104,7 @@ class Dynamics(NamedTuple):
         return self.program.look(lambda seen: seen, moving, fixed, mode)
 
     def ahead(
-        self, t: Any, state: LoopState, accumulators: Accumulators, mode: Mode = UNCONSTRAINED
+        self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode = UNCONSTRAINED
     ) -> "LoopEvaluationWithRates":
         """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`, with the rates along the flow.
 
@@ -114,7 +115,7 @@ class Dynamics(NamedTuple):
         fixed = (held, self.loop, self.objectives)
         now = program.look(lambda seen: seen, (t, *z), fixed, mode)[0]
 
-        def moves(t: Any, z: Any) -> Any:
+        def moves(t: Scalar, z: AnyArray) -> Any:
             one, answers = program.look(lambda seen: seen, (t, *z), fixed, mode)
             values = [value for _, value in answers.margins]
             return (one.signals.sample, one.signals.recorded, one.margins, values), answers
@@ -126,7 +127,9 @@ class Dynamics(NamedTuple):
         comparisons = [SwitchingFunction(*one) for one in zip(numbers, values, rates, strict=True)]
         return LoopEvaluationWithRates(now, sample, recorded, falls, answers.words, answers.contradicted, comparisons)
 
-    def rate_of(self, of: Callable[[Sample], Any], end: tuple[Any, LoopState, Accumulators, Any], mode: Mode) -> Any:
+    def rate_of(
+        self, of: Callable[[Sample], PyTree], end: tuple[PyTree, LoopState, Accumulators, PyTree], mode: Mode
+    ) -> PyTree:
         """Return d(of(sample))/dt within a `mode`.
 
         `end` holds time, state, accumulators and d(state.flow())/dt; `of` is a function of the sample.
@@ -134,18 +137,18 @@ class Dynamics(NamedTuple):
         t, state, accumulators, rate = end
         (flow, still), held = split_flow_and_held(state, accumulators)
 
-        def evaluate(t: Any, flow: Any) -> Any:
+        def evaluate(t: Scalar, flow: PyTree) -> Any:
             return self._at(lambda evaluate: of(evaluate.signals.sample), (t, flow, still), held, mode)
 
         return jax.jvp(evaluate, (t, flow), (jnp.ones_like(t), rate))[1]
 
-    def _at(self, pick: Callable[[LoopEvaluation], Any], moving: Any, held: Any, mode: Mode) -> Any:
+    def _at(self, pick: Callable[[LoopEvaluation], PyTree], moving: PyTree, held: PyTree, mode: Mode) -> Any:
         fixed = (held, self.loop, self.objectives)
         return self.program(pick, moving, fixed, mode) if self.program else pick(_evaluate_loop(moving, fixed))
 
 
 def build_dynamics(
-    loop: Loop, objectives: Objectives, t: Any, state: LoopState, accumulators: Accumulators, *, kinks: bool
+    loop: Loop, objectives: Objectives, t: Scalar, state: LoopState, accumulators: Accumulators, *, kinks: bool
 ) -> Dynamics:
     """Return the dynamics of a loop. A program is traced once for each structure and for arguments of these shapes.
 
@@ -172,7 +175,7 @@ def build_dynamics(
     return Dynamics(_programs[key], loop, objectives)
 
 
-def accumulator_rates(objectives: Objectives, accumulators: Accumulators, sample: Sample) -> dict[str, Any]:
+def accumulator_rates(objectives: Objectives, accumulators: Accumulators, sample: Sample) -> dict[str, PyTree]:
     """Return the rates of the objectives' integrals, by name.
 
     Args:
@@ -183,7 +186,7 @@ def accumulator_rates(objectives: Objectives, accumulators: Accumulators, sample
     return {name: one.flow(accumulators[name], sample) for name, one in objectives.items()}
 
 
-def split_flow_and_held(state: LoopState, accumulators: Accumulators) -> tuple[Any, Any]:
+def split_flow_and_held(state: LoopState, accumulators: Accumulators) -> tuple[PyTree, PyTree]:
     """Return the integrated part of loop and objectives, and the part that is constant between two instants.
 
     Args:
@@ -194,7 +197,7 @@ def split_flow_and_held(state: LoopState, accumulators: Accumulators) -> tuple[A
     return flow, ([memory.held for memory in state[1:]], {name: memory.held for name, memory in accumulators.items()})
 
 
-def _evaluate_loop(moving: Any, fixed: Any) -> LoopEvaluation:
+def _evaluate_loop(moving: PyTree, fixed: PyTree) -> LoopEvaluation:
     """Return the dynamics for (time, flow, accumulator flow) and ((held, accumulator held), loop, objectives)."""
     (t, flow, tally_flow), ((held, tally_held), loop, objectives) = moving, fixed
     state = LoopState(flow[0], *(Memory(*both) for both in zip(flow[1:], held, strict=True)))

@@ -5,11 +5,12 @@ ahead or in the past. A step that ends there has its kink at its end, where the 
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 
 from diffabs.core.modes import WORD_BITS, ModeBits
+from diffabs.core.types import PyTree, Scalar
 
 NEVER_S = 1e9  # s; time to the next crossing if no crossing is predicted
 
@@ -29,9 +30,9 @@ class SwitchingFunction(NamedTuple):
         rate: Rates of the margins [1/s].
     """
 
-    numbers: Any
-    value: Any
-    rate: Any
+    numbers: PyTree
+    value: Scalar
+    rate: PyTree
 
 
 class CrossingForecast(NamedTuple):
@@ -43,12 +44,12 @@ class CrossingForecast(NamedTuple):
             ends.
     """
 
-    ahead: Any
-    late: Any
+    ahead: Scalar
+    late: Scalar
 
 
 def forecast_crossings(
-    margins: Sequence[SwitchingFunction], natural: Any, shortest: Any, changed: ModeBits, length: Any
+    margins: Sequence[SwitchingFunction], natural: Scalar, shortest: Scalar, changed: ModeBits, length: Scalar
 ) -> CrossingForecast:
     """Return the predicted and past crossings from the margins at the end of a step.
 
@@ -75,7 +76,7 @@ def forecast_crossings(
     return CrossingForecast(-next, jnp.where(first > low, first, 0.0))
 
 
-def valid_end_rates(margins: Sequence[SwitchingFunction], changed: ModeBits, length: Any) -> tuple[Any, Any]:
+def valid_end_rates(margins: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> tuple[PyTree, PyTree]:
     """Return two flags: the rate at the start, and the rate at the end of a step, is the rate inside. No comparison
     changes there.
 
@@ -93,7 +94,7 @@ def valid_end_rates(margins: Sequence[SwitchingFunction], changed: ModeBits, len
     return start, end
 
 
-def read_bits(words: ModeBits, numbers: Any) -> Any:
+def read_bits(words: ModeBits, numbers: PyTree) -> Scalar:
     """Return the bits with these numbers, bool.
 
     Args:

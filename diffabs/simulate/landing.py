@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.numerics import ratio
+from diffabs.core.types import AnyArray, Bool, Int, PyTree, Scalar
 
 NEWTON_RADIUS_STEPS = 1e-4  # steps: a Newton step from here misses the zero by some 1e-8 steps
 PROBE_EXPONENT = 0.2  # the probe is eps**PROBE_EXPONENT steps away
@@ -37,19 +38,19 @@ MAX_SLOPE_CHANGE = 0.5
 class EventSearch(NamedTuple):
     """State of an event search. A margin is infinite where it is not known."""
 
-    which: Any  # number of the sought margin
+    which: Int  # number of the sought margin
     full: Any  # length of the first attempt [s]
     at_full: Any  # margin there
-    near: Any  # shorter length of the bracket [s]
+    near: Scalar  # shorter length of the bracket [s]
     at_near: Any
     far: Any  # longer length of the bracket [s]
     at_far: Any
-    tries: Any  # number of attempts
-    place: Any  # length of the attempt that ended near the zero [s]
-    margin: Any  # margin there; 0 if the search found no zero
+    tries: Int  # number of attempts
+    place: Scalar  # length of the attempt that ended near the zero [s]
+    margin: Scalar  # margin there; 0 if the search found no zero
     found: Any  # True if the search found a zero
-    at_once: Any  # True if the zero lies at the beginning of the step
-    fall: Any  # slope of the margin at the end of the final step [1/s]; 0 if the event's time has no derivative
+    at_once: Bool  # True if the zero lies at the beginning of the step
+    fall: Scalar  # slope of the margin at the end of the final step [1/s]; 0 if the event's time has no derivative
 
 
 class EventCrossing(NamedTuple):
@@ -61,9 +62,9 @@ class EventCrossing(NamedTuple):
         start: Margin at its beginning.
     """
 
-    which: Any
-    end: Any
-    start: Any
+    which: Int
+    end: PyTree
+    start: PyTree
 
 
 class AttemptCrossings(NamedTuple):
@@ -77,12 +78,12 @@ class AttemptCrossings(NamedTuple):
     """
 
     sought: EventCrossing
-    falls: Any
+    falls: Scalar
     other: EventCrossing
     another: Any
 
 
-def init_search(h: Any) -> EventSearch:
+def init_search(h: Scalar) -> EventSearch:
     """Return an empty search.
 
     Args:
@@ -92,7 +93,7 @@ def init_search(h: Any) -> EventSearch:
     return EventSearch(zero, h, none, none, none, h, none, zero, h, none, no, no, none)
 
 
-def falls_through(before: list[Any], after: list[Any]) -> list[Any]:
+def falls_through(before: list[PyTree], after: list[PyTree]) -> list[PyTree]:
     """Return True for each margin that falls through zero between the beginning and the end of a step.
 
     Args:
@@ -102,7 +103,7 @@ def falls_through(before: list[Any], after: list[Any]) -> list[Any]:
     return [(a >= 0) & (b < 0) for a, b in zip(before, after, strict=True)]
 
 
-def find_event_crossings(which: Any, first: int, before: list[Any], after: list[Any]) -> AttemptCrossings:
+def find_event_crossings(which: Scalar, first: int, before: list[PyTree], after: list[PyTree]) -> AttemptCrossings:
     """Return the crossings of events within an attempt.
 
     Args:
@@ -122,8 +123,8 @@ def find_event_crossings(which: Any, first: int, before: list[Any], after: list[
 
 
 def bracket_event(
-    search: EventSearch, x: Any, new: Any, tells: AttemptCrossings, h: Any
-) -> tuple[EventSearch, Any, Any]:
+    search: EventSearch, x: Scalar, new: PyTree, tells: AttemptCrossings, h: Scalar
+) -> tuple[EventSearch, PyTree, PyTree]:
     """Return the search for the earliest event after an attempt, the length to try next, and True if that is the probe.
 
     The next length is the probe once `x` is near enough to the zero.
@@ -168,7 +169,7 @@ def bracket_event(
     return search, jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier
 
 
-def locate_event(search: EventSearch, x: Any, tells: AttemptCrossings, beyond: Any) -> tuple[EventSearch, Any]:
+def locate_event(search: EventSearch, x: Scalar, tells: AttemptCrossings, beyond: Scalar) -> tuple[EventSearch, PyTree]:
     """Return the search with the margin's slope, and the length of the step that ends on the zero, after the probe.
 
     The slope is that of the parabola through the place, the probe, and one end of the first attempt. This is the end on
@@ -215,7 +216,7 @@ def locate_event(search: EventSearch, x: Any, tells: AttemptCrossings, beyond: A
     return search._replace(fall=jnp.where(known, slope, 0.0)), jnp.where(search.at_once, at_once, moved) + beyond
 
 
-def refine(search: EventSearch, x: Any, tells: AttemptCrossings) -> Any:
+def refine(search: EventSearch, x: Scalar, tells: AttemptCrossings) -> Scalar:
     """Return x with the second derivatives of the event's time.
 
     The value is unchanged. The derivatives come from a Newton step on the margin at the end of an attempt of length x.
@@ -229,7 +230,7 @@ def refine(search: EventSearch, x: Any, tells: AttemptCrossings) -> Any:
     return x - (left - jax.lax.stop_gradient(left)) / jnp.where(search.fall < 0, search.fall, -1.0)
 
 
-def accept_location(search: EventSearch, x: Any, length: Any) -> tuple[Any, Any]:
+def accept_location(search: EventSearch, x: Scalar, length: Scalar) -> tuple[PyTree, PyTree]:
     """Return the length to try after the probe, and True if the search continues from the middle of the bracket.
 
     It continues if the final step would end farther from `place` than the probe, or if the margin does not fall there.
@@ -246,7 +247,7 @@ def accept_location(search: EventSearch, x: Any, length: Any) -> tuple[Any, Any]
     return jnp.where(again, 0.5 * (search.near + search.far), length), again
 
 
-def _length_tangent(search: EventSearch, x: Any, g: Any, zero: Any, fall: Any) -> Any:
+def _length_tangent(search: EventSearch, x: Scalar, g: AnyArray, zero: Scalar, fall: Scalar) -> Scalar:
     """Return a number with value 0 and the derivatives of the event's length.
 
     They come from the derivatives of the margin at the place and at the probe x. Linear extrapolation continues them to
@@ -259,13 +260,13 @@ def _length_tangent(search: EventSearch, x: Any, g: Any, zero: Any, fall: Any) -
     return -rises / jnp.where(known, fall, -1.0)
 
 
-def _shows_curvature(end: tuple[Any, Any], place: Any, probe: Any) -> Any:
+def _shows_curvature(end: tuple[PyTree, PyTree], place: Scalar, probe: Scalar) -> Scalar:
     """Return True if the margin at an end of an attempt determines the curvature between the place and the probe."""
     length, margin = end
     return (jnp.abs(length - place) > 4 * jnp.abs(place - probe)) & jnp.isfinite(margin)
 
 
-def _falls_from_start(search: EventSearch, fall: Any, start: Any) -> Any:
+def _falls_from_start(search: EventSearch, fall: Scalar, start: PyTree) -> Scalar:
     """Return True if the margin is smooth and falls at the beginning of the step at `GRAZING_FRACTION` of its mean rate
     or faster.
 
@@ -280,7 +281,7 @@ def _falls_from_start(search: EventSearch, fall: Any, start: Any) -> Any:
     return smooth & (fall < 0) & (fall <= GRAZING_FRACTION * jax.lax.stop_gradient(mean))
 
 
-def _narrow_bracket(old: EventSearch, x: Any, first: Any, sought: EventCrossing) -> tuple[EventSearch, Any]:
+def _narrow_bracket(old: EventSearch, x: Scalar, first: Any, sought: EventCrossing) -> tuple[EventSearch, PyTree]:
     """Return the search whose bracket ends at the attempt x, and the margin's slope in the length there.
 
     The slope is that of the parabola through the ends of the bracket and this point; 0 for a new bracket.
@@ -292,13 +293,13 @@ def _narrow_bracket(old: EventSearch, x: Any, first: Any, sought: EventCrossing)
     return select(first, new, closer), slope
 
 
-def _bracket(old: EventSearch, x: Any, sought: EventCrossing) -> EventSearch:
+def _bracket(old: EventSearch, x: Scalar, sought: EventCrossing) -> EventSearch:
     """Return a search with the bracket from the beginning of the step to the attempt of length x."""
     g, start = jax.lax.stop_gradient(sought[1:])
     return old._replace(which=sought.which, full=x, at_full=g, near=0.0 * x, at_near=start, far=x, at_far=g)
 
 
-def _slope(search: EventSearch, x: Any, g: Any) -> Any:
+def _slope(search: EventSearch, x: Scalar, g: AnyArray) -> Scalar:
     """Return d(margin)/d(length) at x, from the parabola through the ends of the bracket and (x, g)."""
     right = jnp.where(jnp.isfinite(search.at_far), ratio(search.at_far - g, search.far - x), 0.0)
     left = ratio(g - search.at_near, x - search.near)
@@ -306,14 +307,14 @@ def _slope(search: EventSearch, x: Any, g: Any) -> Any:
     return jnp.where(jnp.isfinite(search.at_near) & jnp.isfinite(search.at_far), bent, right)
 
 
-def _pick(which: Any, values: list[Any]) -> Any:
+def _pick(which: Int, values: list[PyTree]) -> Any:
     found = values[0]
     for i, value in enumerate(values[1:], 1):
         found = jnp.where(which == i, value, found)
     return found
 
 
-def select(which: Any, a: Any, b: Any) -> Any:
+def select(which: Scalar, a: Scalar, b: Scalar) -> Scalar:
     """Return a if `which`, else b.
 
     Args:

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Sample
+from diffabs.core.types import Int, PyTree, Scalar
 from diffabs.simulate.foresight import MIN_CROSSING_STEP_FRACTION
 
 INITIAL_STEP_S = 1e-4  # s, the first step
@@ -37,18 +38,18 @@ class StepSizeControl:
         notes: True if the run is logged for a replay with derivatives.
     """
 
-    h: Any
-    steps: Any
-    rtol: Any
+    h: Scalar
+    steps: Int
+    rtol: Scalar
     keeps: bool = False
     notes: bool = False
 
     @property
-    def least(self) -> Any:
+    def least(self) -> Scalar:
         """Shortest step [s]."""
         return self.h * self.steps * jnp.maximum(MIN_STEP_FRACTION, 4 * jnp.finfo(self.h.dtype).eps)
 
-    def next_strike(self, loop: Loop, k: Any) -> Any:
+    def next_strike(self, loop: Loop, k: Int) -> PyTree:
         """Return the number of the first instant after the k-th at which a clock of the `loop` strikes or the run ends.
 
         `k` is the number of an instant on the grid.
@@ -56,7 +57,7 @@ class StepSizeControl:
         return jnp.minimum(loop.next_tick(k, self.h), self.steps) if loop.ticks else self.steps
 
 
-def error_scales(state: LoopState, sample: Sample) -> Any:
+def error_scales(state: LoopState, sample: Sample) -> PyTree:
     """Return the scales of the error: the size of the first signal or of its setpoint, and the size of every state.
 
     Args:
@@ -67,7 +68,7 @@ def error_scales(state: LoopState, sample: Sample) -> Any:
     return first, jax.tree.map(jnp.abs, state.flow())
 
 
-def error_norm(loop: Loop, state: LoopState, off: Any, scale: Any, sample: Sample) -> Any:
+def error_norm(loop: Loop, state: LoopState, off: Scalar, scale: Scalar, sample: Sample) -> PyTree:
     """Return the greatest error of all states and of the first signal, as a fraction of their scales.
 
     The errors of the states lie in the middle of the step. The first signal is evaluated with them at the end of the
@@ -86,7 +87,7 @@ def error_norm(loop: Loop, state: LoopState, off: Any, scale: Any, sample: Sampl
     return jnp.max(jnp.stack([jnp.max(jnp.abs(d) / jnp.where(c > 0, c, 1.0)) for d, c in pairs if jnp.size(c)]))
 
 
-def propose_length(length: Any, error: Any) -> Any:
+def propose_length(length: Scalar, error: Scalar) -> Scalar:
     """Return the length that an error allows [s]: 0.85/error^(1/4) times the present length, within limits.
 
     Args:
@@ -96,7 +97,7 @@ def propose_length(length: Any, error: Any) -> Any:
     return length * clamp(SAFETY / jnp.sqrt(jnp.sqrt(error + MIN_ERROR)), MIN_STEP_RATIO, MAX_STEP_RATIO)
 
 
-def plan_step(length: Any, ahead: Any, left: Any, control: StepSizeControl) -> tuple[Any, Any]:
+def plan_step(length: Scalar, ahead: Scalar, left: Scalar, control: StepSizeControl) -> tuple[PyTree, PyTree]:
     """Return the length of the next step [s], and True if the step ends where a clock strikes.
 
     Args:
@@ -115,7 +116,7 @@ def plan_step(length: Any, ahead: Any, left: Any, control: StepSizeControl) -> t
     return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends
 
 
-def spectral_step_limit(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
+def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) -> Scalar:
     """Return the stability limit of a step, 3/rho [s], with an estimate rho of the spectral radius of the flow's
     Jacobian.
 
@@ -132,7 +133,7 @@ def spectral_step_limit(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any
     size = ravel_pytree(scale[1])[0]
     size = jnp.where(size > 0, size, 1.0)
 
-    def rates(flow: Any) -> Any:
+    def rates(flow: PyTree) -> Any:
         at = state.with_flow(unflatten(flow))
         return ravel_pytree(loop.flow(t, at, loop.signals(t, at)))[0]
 
@@ -141,10 +142,10 @@ def spectral_step_limit(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any
     # Scalars instead of a matrix product: for such small sums XLA on a CPU calls a library, at ten times the cost.
     rows = [[columns[j, i] for j in range(size.size)] for i in range(size.size)]
 
-    def longest(vector: list[Any]) -> Any:
+    def longest(vector: list[PyTree]) -> Any:
         return reduce(jnp.maximum, map(jnp.abs, vector)) + MIN_NORM
 
-    def multiply(at: tuple[list[Any], Any], counts: Any) -> tuple[tuple[list[Any], Any], None]:
+    def multiply(at: tuple[list[PyTree], PyTree], counts: Int) -> tuple[tuple[list[PyTree], PyTree], None]:
         vector, log = at
         norm = longest(vector)
         vector = [x / norm for x in vector]

@@ -6,6 +6,7 @@ from typing import Any
 
 from diffabs.core.loop import run_signals
 from diffabs.core.protocols import Plant
+from diffabs.core.types import Params, PyTree
 from diffabs.simulate.solution import Run
 
 
@@ -25,7 +26,7 @@ def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
     assert run.trajectory is not None
     kept = run_signals(run.trajectory.sample, plant)
     rows = int(run.trajectory.running.sum()) + 1  # after the end the last sample is repeated
-    content: dict[str, Any] = {name: values[:rows] for name, (_, values) in kept.items()}
+    content: dict[str, PyTree] = {name: values[:rows] for name, (_, values) in kept.items()}
     content["units"] = {name: unit for name, (unit, _) in kept.items()}
     content["metrics"] = {name: float(value) for name, value in run.metrics.items()}
     content |= {name: _struct(value) if isinstance(value, Mapping) else value for name, value in more.items()}
@@ -33,5 +34,5 @@ def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
         savemat(file, content, do_compression=True, long_field_names=True, oned_as="column")
 
 
-def _struct(values: Mapping[str, Any]) -> dict[str, Any]:
+def _struct(values: Params) -> dict[str, PyTree]:
     return {name.replace(".", "_"): value for name, value in values.items()}

@@ -2,16 +2,17 @@
 
 import dataclasses
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from diffabs.core.arrays import as_array
 from diffabs.core.compiling import is_traced
 from diffabs.core.log import borrow
 from diffabs.core.loop import Loop
+from diffabs.core.types import Int, Key, PyTree, Scalar
 from diffabs.simulate import adaptive, stepper
 from diffabs.simulate.checkpoint import any_lane
 from diffabs.simulate.dynamics import Objectives
@@ -38,17 +39,17 @@ class FixedStepping:
         refines: True if the times of events have second derivatives.
     """
 
-    h: Any
-    steps: Any
+    h: Scalar
+    steps: Int
     kinks: bool | None = None
     refines: bool = False
 
-    def start(self, loop: Loop, objectives: Objectives, key: Any) -> stepper.FixedStepCarry:
+    def start(self, loop: Loop, objectives: Objectives, key: Key) -> stepper.FixedStepCarry:
         """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
         return stepper.init_carry(loop, objectives, self.h, key, kinks=self._locates(loop))
 
     def step(
-        self, loop: Loop, objectives: Objectives, key: Any, carry: stepper.FixedStepCarry, until: Any = None
+        self, loop: Loop, objectives: Objectives, key: Key, carry: stepper.FixedStepCarry, until: Scalar = None
     ) -> stepper.FixedStepCarry:
         """Return the `carry` after one attempt of a step, unchanged if the run is over or has reached the instant
         `until`.
@@ -63,11 +64,11 @@ class FixedStepping:
         del loop
         return carry
 
-    def before(self, carry: stepper.FixedStepCarry, instant: Any) -> Any:
+    def before(self, carry: stepper.FixedStepCarry, instant: Scalar) -> PyTree:
         """Return True if the run with this `carry` goes on and has not reached this `instant`."""
         return carry.running & (carry.k < instant)
 
-    def observe_at(self, loop: Loop, carry: stepper.FixedStepCarry, instant: Any) -> Trajectory:
+    def observe_at(self, loop: Loop, carry: stepper.FixedStepCarry, instant: Scalar) -> Trajectory:
         """Return the signals of the `loop` at this `instant` of the grid, which the `carry` has reached."""
         del instant
         return observe(loop, carry.point.t, carry.point.state, carry.running)
@@ -93,12 +94,12 @@ class FixedStepping:
 class AdaptiveStepping(StepSizeControl):
     """Steps of an `Adaptive` solver."""
 
-    def start(self, loop: Loop, objectives: Objectives, key: Any) -> AdaptiveCarry:
+    def start(self, loop: Loop, objectives: Objectives, key: Key) -> AdaptiveCarry:
         """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
         return adaptive.init_carry(loop, objectives, self, key)
 
     def step(
-        self, loop: Loop, objectives: Objectives, key: Any, carry: AdaptiveCarry, until: Any = None
+        self, loop: Loop, objectives: Objectives, key: Key, carry: AdaptiveCarry, until: Scalar = None
     ) -> AdaptiveCarry:
         """Return the `carry` after one attempt of a step, unchanged if the run is over or has reached the instant
         `until`.
@@ -116,11 +117,11 @@ class AdaptiveStepping(StepSizeControl):
         )
         return carry._replace(limit=limit, tries_at_renewal=jnp.where(due, carry.tries, carry.tries_at_renewal))
 
-    def before(self, carry: AdaptiveCarry, instant: Any) -> Any:
+    def before(self, carry: AdaptiveCarry, instant: Scalar) -> PyTree:
         """Return True if the run with this `carry` goes on and has not reached this `instant`."""
         return adaptive.is_before(self, carry, instant)
 
-    def observe_at(self, loop: Loop, carry: AdaptiveCarry, instant: Any) -> Trajectory:
+    def observe_at(self, loop: Loop, carry: AdaptiveCarry, instant: Scalar) -> Trajectory:
         """Return the signals of the `loop` at this `instant` of the grid, which lies within the last step of the
         `carry`.
         """
@@ -147,7 +148,7 @@ class AdaptiveStepping(StepSizeControl):
         return dataclasses.replace(self, notes=True, rtol=_clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol))
 
 
-def build_stepping(solver: Solver, dtype: Any) -> FixedStepping | AdaptiveStepping:
+def build_stepping(solver: Solver, dtype: DTypeLike) -> FixedStepping | AdaptiveStepping:
     """Return the stepping method of a solver, with numbers of one data type.
 
     Args:
@@ -162,7 +163,7 @@ def build_stepping(solver: Solver, dtype: Any) -> FixedStepping | AdaptiveSteppi
     return FixedStepping(h, steps, solver.kinks)
 
 
-def _clip_rtol(rtol: Any) -> Any:
+def _clip_rtol(rtol: Scalar) -> Scalar:
     """Return rtol, but at least the multiple `MIN_RTOL_EPS` of the machine epsilon of its type."""
     most = np if isinstance(rtol, np.ndarray) else jnp
     return most.maximum(rtol, MIN_RTOL_EPS * jnp.finfo(rtol.dtype).eps)

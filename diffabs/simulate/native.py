@@ -18,6 +18,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero, moving_leaves
+from diffabs.core.types import Params, PyTree, Scalar
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
@@ -36,11 +37,11 @@ MAX_LANES_PER_LAUNCH = 1 << 17  # runs that are started together: the carries of
 
 def run_native(
     loop: Loop,
-    values: Mapping[str, Any],
-    keys: Any,
+    values: Params,
+    keys: PyTree,
     solver: Solver,
     objectives: Mapping[str, Objective],
-    accepted: Any,
+    accepted: Scalar,
     enough: EarlyEnd | None = None,
 ) -> Run:
     """Return the result of `packed.run_packed`, equal to rounding and with forward derivatives.
@@ -67,7 +68,7 @@ def run_native(
     own = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
     lanes = values, keys, accepted, own
 
-    def run_lanes(mine: Any) -> Run:
+    def run_lanes(mine: PyTree) -> Run:
         given = loop, mine[0], dict(objectives), method, *mine[1:], enough
         # A call through a derivative rule costs more than a short run.
         return _run_differentiable(given) if is_traced(given) else _run(*given)
@@ -82,19 +83,19 @@ def run_native(
 
 
 @jax.custom_jvp
-def _run_differentiable(given: Any) -> Run:
+def _run_differentiable(given: PyTree) -> Run:
     """Return the runs of (loop, values, objectives, method, keys, accepted, data for early ends, early ends)."""
     return _run(*given)
 
 
-def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
+def _rule(primals: PyTree, tangents: PyTree) -> tuple[Run, Run]:
     """Return the runs and their tangents, by steps that end on switching surfaces, as in `run`."""
 
     moves, (given_loop, _, measured, method, *_) = tangents[0], primals[0]
     refuse_derivative(given_loop, measured, method)
     paths = differentiated_paths(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
 
-    def run(given: Any) -> Run:
+    def run(given: PyTree) -> Run:
         # Only paths with a nonzero tangent are prepared for derivatives.
         loop, values, objectives, method, *rest = given
         loop = prepare_derivatives(loop, paths)
@@ -114,26 +115,26 @@ _run_differentiable.defjvp(_rule, symbolic_zeros=True)
 @jax.jit
 def _run(
     loop: Loop,
-    values: dict[str, Any],
+    values: dict[str, PyTree],
     objectives: dict[str, Objective],
-    method: Any,
-    keys: Any,
-    accepted: Any,
-    own: Any,
+    method: PyTree,
+    keys: PyTree,
+    accepted: Scalar,
+    own: PyTree,
     enough: EarlyEnd | None,
 ) -> Run:
     leaves, built = split_by_lane(loop, values, objectives)
 
-    def start(mine: Any, key: Any, accepted: Any) -> Any:
+    def start(mine: PyTree, key: PyTree, accepted: Scalar) -> Any:
         return _stop_unaccepted(accepted, method.start(*built(mine), key))
 
-    def is_running(lane: Any, carry: Any) -> Any:
+    def is_running(lane: PyTree, carry: PyTree) -> Scalar:
         if enough is None:
             return carry.running
         output = built(lane[0])[0].plant.output(carry.point.state.plant)
         return carry.running & ~enough.has_reached(lane[2], output)
 
-    def finish(mine: Any, carry: Any) -> Run:
+    def finish(mine: PyTree, carry: PyTree) -> Run:
         return finish_run(*built(mine), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)
@@ -151,7 +152,7 @@ def _run(
     return jax.vmap(finish)(leaves, carry)
 
 
-def _stop_unaccepted(accepted: Any, carry: Any) -> Any:
+def _stop_unaccepted(accepted: Scalar, carry: PyTree) -> PyTree:
     """Return the carry, over from the beginning if the run is not accepted."""
     if isinstance(carry, LaggedReplay):
         return carry._replace(ahead=_stop_unaccepted(accepted, carry.ahead))
@@ -159,9 +160,7 @@ def _stop_unaccepted(accepted: Any, carry: Any) -> Any:
     return carry._replace(status=status.astype(carry.status.dtype))
 
 
-def kernel_objection(
-    loop: Loop, values: Mapping[str, Any], solver: Solver, objectives: Mapping[str, Objective]
-) -> str | None:
+def kernel_objection(loop: Loop, values: Params, solver: Solver, objectives: Mapping[str, Objective]) -> str | None:
     """Return the reason why a kernel cannot make these runs, or None.
 
     Reasons are an operation of a part without a translation, no compiler on this machine, and traced numbers. No run is

@@ -15,6 +15,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.tracing import split_batched
+from diffabs.core.types import Params, PyTree, Scalar
 from diffabs.simulate.condition import RunStatus
 from diffabs.simulate.drivers import STEPS_PER_BLOCK, Carry
 from diffabs.simulate.result import finish_run, prepare
@@ -28,22 +29,22 @@ STEPS_PER_EXCHANGE = 64  # steps between two exchanges of runs
 class EarlyEnd(Protocol):
     """A condition that ends a run before its stop and its duration, because its outcome is already known; a pytree."""
 
-    def own(self, number: Any) -> Any:
+    def own(self, number: Scalar) -> PyTree:
         """Return the data for run `number` that the condition needs, a pytree."""
         ...
 
-    def has_reached(self, own: Any, output: Any) -> Any:
+    def has_reached(self, own: PyTree, output: PyTree) -> Scalar:
         """Return True if the run ends, given its `own` data and the present `output` of its plant."""
         ...
 
 
 def run_packed(
     loop: Loop,
-    values: Mapping[str, Any],
-    keys: Any,
+    values: Params,
+    keys: PyTree,
     solver: Solver,
     objectives: Mapping[str, Objective],
-    accepted: Any,
+    accepted: Scalar,
     enough: EarlyEnd | None = None,
 ) -> Run:
     """Return the result of `jax.vmap` of `measure` for runs that differ in their values and keys. Not for reverse mode.
@@ -67,8 +68,8 @@ def run_packed(
 
 
 def split_by_lane(
-    loop: Loop, values: dict[str, Any], objectives: dict[str, Objective]
-) -> tuple[Any, Callable[[Any], tuple[Any, Any]]]:
+    loop: Loop, values: dict[str, PyTree], objectives: dict[str, Objective]
+) -> tuple[PyTree, Callable[[PyTree], tuple[PyTree, PyTree]]]:
     """Return the leaves of the prepared loops that depend on the values, and a function from the leaves of one run to
     loop and objectives.
 
@@ -81,7 +82,7 @@ def split_by_lane(
     """
     leaves, whole = split_batched(lambda v: prepare(replace(loop, v)), values)
 
-    def build_lane(mine: Any) -> tuple[Loop, dict[str, Objective]]:
+    def build_lane(mine: PyTree) -> tuple[Loop, dict[str, Objective]]:
         one, audit = whole(mine)
         return one, objectives | audit
 
@@ -100,10 +101,10 @@ class _LaneSlots(NamedTuple):
         ended: Results of the runs that have ended, by number.
     """
 
-    leaves: Any
-    keys: Any
+    leaves: PyTree
+    keys: PyTree
     carry: Carry
-    number: Any
+    number: Scalar
     next: Any
     ended: Run
 
@@ -111,11 +112,11 @@ class _LaneSlots(NamedTuple):
 @partial(jax.jit, static_argnames="width")
 def _run(
     loop: Loop,
-    values: dict[str, Any],
+    values: dict[str, PyTree],
     objectives: dict[str, Objective],
-    method: Any,
-    keys: Any,
-    accepted: Any,
+    method: PyTree,
+    keys: PyTree,
+    accepted: Scalar,
     enough: EarlyEnd | None,
     *,
     width: int,
@@ -127,7 +128,7 @@ def _run(
     start = jax.vmap(lambda mine, key: method.start(*built(mine), key))
     over = jax.vmap(lambda mine, carry: finish_run(*built(mine), carry)[0])
 
-    def take_lanes(number: Any) -> tuple[Any, Any, Carry]:
+    def take_lanes(number: Scalar) -> tuple[PyTree, PyTree, Carry]:
         """Return leaves, keys and carries of these runs at t = 0; beyond the last run a copy that does not step."""
         mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
         carry = start(mine, key)
@@ -138,7 +139,7 @@ def _run(
         def some(carry: Carry, _: Any) -> tuple[Carry, None]:
             return step_all(slots.leaves, slots.keys, carry), None
 
-        def rounds(carry: Any, _: Any) -> tuple[Any, None]:
+        def rounds(carry: PyTree, _: Any) -> tuple[PyTree, None]:
             return jax.lax.scan(some, renew_all(slots.leaves, carry), length=STEPS_PER_BLOCK)[0], None
 
         slots = slots._replace(carry=jax.lax.scan(rounds, slots.carry, length=STEPS_PER_EXCHANGE // STEPS_PER_BLOCK)[0])
@@ -153,7 +154,7 @@ def _run(
     return jax.lax.while_loop(lambda slots: jnp.any(slots.number < count), round_, slots).ended
 
 
-def _lanes_ended_early(enough: EarlyEnd | None, built: Callable[[Any], Any], slots: _LaneSlots) -> Any:
+def _lanes_ended_early(enough: EarlyEnd | None, built: Callable[[PyTree], PyTree], slots: _LaneSlots) -> PyTree:
     """Return True for each slot whose run ends early; `built` returns the loop and objectives of one run."""
     if enough is None:
         return jnp.zeros_like(slots.carry.running)
@@ -162,7 +163,7 @@ def _lanes_ended_early(enough: EarlyEnd | None, built: Callable[[Any], Any], slo
 
 
 def _exchange_lanes(
-    slots: _LaneSlots, free: Any, over: Callable[[Any, Carry], Run], taken: Callable[[Any], Any], count: int
+    slots: _LaneSlots, free: PyTree, over: Callable[[PyTree, Carry], Run], taken: Callable[[PyTree], PyTree], count: int
 ) -> _LaneSlots:
     """Return the slots with the results (`over`) of free slots stored, and the next runs (`taken`) in their place."""
     place, runs = jnp.where(free, slots.number, count), over(slots.leaves, slots.carry)
@@ -175,7 +176,7 @@ def _exchange_lanes(
     return _LaneSlots(mine, key, carry, jnp.minimum(number, count), slots.next + jnp.sum(free), ended)
 
 
-def _select_lanes(which: Any, a: Any, b: Any) -> Any:
+def _select_lanes(which: Scalar, a: Scalar, b: Scalar) -> Any:
     if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_select_lanes(which, jax.random.key_data(a), jax.random.key_data(b)))
     return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)

@@ -7,11 +7,12 @@ opposite order.
 
 import dataclasses
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 
 from diffabs.core.loop import Loop
+from diffabs.core.types import Key, PyTree, Scalar
 from diffabs.simulate.checkpoint import any_lane
 from diffabs.simulate.dynamics import Objectives
 from diffabs.simulate.methods import AdaptiveStepping
@@ -31,12 +32,12 @@ class LaggedReplay(NamedTuple):
     point: ReplayState
 
     @property
-    def running(self) -> Any:
+    def running(self) -> Scalar:
         """True if the run for values needs another attempt."""
         return self.ahead.running
 
     @property
-    def status(self) -> Any:
+    def status(self) -> Scalar:
         """Status of the run for values."""
         return self.ahead.status
 
@@ -52,12 +53,12 @@ class LaggedReplayStepping:
 
     pace: AdaptiveStepping
 
-    def start(self, loop: Loop, objectives: Objectives, key: Any) -> LaggedReplay:
+    def start(self, loop: Loop, objectives: Objectives, key: Key) -> LaggedReplay:
         """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
         ahead = self.pace.start(_stop_gradients(loop), _stop_gradients(objectives), key)
         return LaggedReplay(ahead, start_replay(loop, objectives, self.pace, key))
 
-    def step(self, loop: Loop, objectives: Objectives, key: Any, carry: LaggedReplay) -> LaggedReplay:
+    def step(self, loop: Loop, objectives: Objectives, key: Key, carry: LaggedReplay) -> LaggedReplay:
         """Return the `carry` after one attempt of the run for values, and its replay if the attempt was accepted.
 
         `loop`, `objectives` and `key` are those of `start`.
@@ -79,6 +80,6 @@ class LaggedReplayStepping:
         )
 
 
-def _stop_gradients(tree: Any) -> Any:
+def _stop_gradients(tree: PyTree) -> PyTree:
     """Return the tree without derivatives."""
     return jax.tree.map(jax.lax.stop_gradient, tree)

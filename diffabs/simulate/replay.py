@@ -23,6 +23,7 @@ from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.modes import Mode, ModeBits
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment, Shown
+from diffabs.core.types import Matrix, PyTree, Scalar
 from diffabs.simulate.adaptive import build_passages
 from diffabs.simulate.advance import start_state
 from diffabs.simulate.checkpoint import any_lane, rematerialise
@@ -68,14 +69,14 @@ class StepLog(NamedTuple):
     """
 
     moved: Any
-    t: Any
-    length: Any
-    base: Any
-    k: Any
-    triggered: Any
+    t: Scalar
+    length: Scalar
+    base: Scalar
+    k: Scalar
+    triggered: PyTree
     words: ModeBits
-    unrestricted: Any
-    lands: Any
+    unrestricted: Scalar
+    lands: Scalar
 
 
 class ReplayState(NamedTuple):
@@ -89,11 +90,11 @@ class ReplayState(NamedTuple):
         k: Number of the grid instant at which a clock struck last.
     """
 
-    t: Any
-    late: Any
+    t: Scalar
+    late: Scalar
     state: LoopState
     accumulators: Accumulators
-    k: Any
+    k: Scalar
 
 
 class RecordedSignals(NamedTuple):
@@ -104,8 +105,8 @@ class RecordedSignals(NamedTuple):
         recorded: Signals and their rates, each by block.
     """
 
-    t: Any
-    recorded: tuple[dict[str, Any], dict[str, Any]]
+    t: Scalar
+    recorded: tuple[dict[str, PyTree], dict[str, PyTree]]
 
 
 class ReplayedRun(NamedTuple):
@@ -117,7 +118,7 @@ class ReplayedRun(NamedTuple):
     """
 
     point: ReplayState
-    status: Any
+    status: Scalar
 
     running = property(is_running)  # always False
 
@@ -150,8 +151,8 @@ def log_attempt(old: AdaptiveCarry, new: AdaptiveCarry) -> StepLog:
 
 
 def log_steps(
-    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, tries: int
-) -> tuple[StepLog, Any]:
+    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: PyTree, tries: int
+) -> tuple[StepLog, PyTree]:
     """Return the log of a run and its status at the end; a run with more attempts than the capacity has diverged.
 
     Args:
@@ -176,18 +177,20 @@ def log_steps(
     return notes, jnp.where(carry.running, RunStatus.DIVERGED, carry.status)
 
 
-def _scan_active(work: Any, on: Any, carry: Any, xs: Any, length: int | None = None, reverse: bool = False) -> Any:
+def _scan_active(
+    work: Any, on: Scalar, carry: PyTree, xs: PyTree, length: int | None = None, reverse: bool = False
+) -> PyTree:
     """Return the result of a scan of work(carry) or, with xs, work(carry, x), with the steps skipped if no run is
     on(carry, x).
 
     A skipped step returns zeros.
     """
 
-    def body(carry: Any, x: Any) -> tuple[Any, Any]:
-        def run() -> tuple[Any, Any]:
+    def body(carry: PyTree, x: Scalar) -> tuple[PyTree, PyTree]:
+        def run() -> tuple[PyTree, PyTree]:
             return work(carry) if x is None else work(carry, x)
 
-        def skip() -> tuple[Any, Any]:
+        def skip() -> tuple[PyTree, PyTree]:
             return carry, jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(run)[1])
 
         return jax.lax.cond(any_lane(on(carry, x)), run, skip)
@@ -196,7 +199,7 @@ def _scan_active(work: Any, on: Any, carry: Any, xs: Any, length: int | None = N
 
 
 def replay_run(
-    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, notes: StepLog, status: Any
+    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: PyTree, notes: StepLog, status: Scalar
 ) -> ReplayedRun:
     """Return the replayed run, differentiable with respect to every leaf of loop and objectives.
 
@@ -212,7 +215,13 @@ def replay_run(
 
 
 def replay_with_trajectory(
-    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, notes: StepLog, status: Any, instants: Any
+    loop: Loop,
+    objectives: Objectives,
+    stepping: AdaptiveStepping,
+    key: PyTree,
+    notes: StepLog,
+    status: Scalar,
+    instants: PyTree,
 ) -> tuple[ReplayedRun, Trajectory, Trajectory]:
     """Return the replayed run, the sample at its beginning, and the samples at these instants of the grid.
 
@@ -232,7 +241,7 @@ def replay_with_trajectory(
     starts = jnp.where(jnp.any(notes.moved, axis=1)[:, None], jax.lax.stop_gradient(spans.t), jnp.inf)
     spans = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), spans)
 
-    def observe_at(instant: Any) -> Trajectory:
+    def observe_at(instant: Scalar) -> Trajectory:
         t = instant * stepping.h
         place = jnp.searchsorted(starts.ravel(), t, side="right") - 1
         span = jax.tree.map(lambda x: x[place], spans)
@@ -243,23 +252,23 @@ def replay_with_trajectory(
 
 
 def _replay_steps(
-    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, notes: StepLog
-) -> tuple[ReplayState, Any]:
+    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: PyTree, notes: StepLog
+) -> tuple[ReplayState, PyTree]:
     """Return the state at the end of the run and, with a trajectory, the `HermiteStep` of each attempt."""
     begun = start_replay(loop, objectives, stepping, key)
 
-    def step(place: ReplayState, one: StepLog) -> tuple[ReplayState, Any]:
+    def step(place: ReplayState, one: StepLog) -> tuple[ReplayState, PyTree]:
         return replay_attempt(loop, objectives, stepping, key, place, one)
 
     # Checkpoints on both levels: memory for the states of the blocks plus those of one block.
     @rematerialise
-    def block(place: ReplayState, some: StepLog) -> tuple[ReplayState, Any]:
+    def block(place: ReplayState, some: StepLog) -> tuple[ReplayState, PyTree]:
         return jax.lax.scan(rematerialise(step), place, some)
 
     return _scan_active(block, lambda _, some: jnp.any(some.moved), begun, notes)
 
 
-def start_replay(loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any) -> ReplayState:
+def start_replay(loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: PyTree) -> ReplayState:
     """Return the state of a replay at t = 0.
 
     Args:
@@ -276,8 +285,8 @@ def start_replay(loop: Loop, objectives: Objectives, stepping: AdaptiveStepping,
 
 
 def replay_attempt(
-    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, place: ReplayState, one: StepLog
-) -> tuple[ReplayState, Any]:
+    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: PyTree, place: ReplayState, one: StepLog
+) -> tuple[ReplayState, PyTree]:
     """Return the state after a logged attempt, unchanged if the attempt was not accepted, and with a trajectory its
     `HermiteStep`.
 
@@ -299,11 +308,11 @@ def _step(
     loop: Loop,
     objectives: Objectives,
     stepping: AdaptiveStepping,
-    key: Any,
+    key: PyTree,
     place: ReplayState,
     one: StepLog,
-    logs: list[Any],
-) -> tuple[ReplayState, Any]:
+    logs: list[PyTree],
+) -> tuple[ReplayState, PyTree]:
     """Return the state after one step within its mode, with the changes at its end, and with a trajectory its
     `HermiteStep`.
 
@@ -314,7 +323,7 @@ def _step(
     begin = system.ahead(place.t, place.state, place.accumulators, within)
     z, held = split_flow_and_held(place.state, place.accumulators)
 
-    def flow(t: Any, z: Any, given: tuple[Any, Mode]) -> Any:
+    def flow(t: Scalar, z: Matrix, given: tuple[PyTree, Mode]) -> Any:
         return system.rates(t, z, *given)
 
     # `h` is the logged length less the shift of the step's beginning: the step still ends at the logged time.
@@ -351,7 +360,7 @@ def _step(
     return ReplayState(t, shift, state, accumulators, one.k), span
 
 
-def _with_flow(place: ReplayState, z: Any) -> tuple[LoopState, Accumulators]:
+def _with_flow(place: ReplayState, z: Matrix) -> tuple[LoopState, Accumulators]:
     """Return state and accumulators with other integrated values, without projection: a projection may end on a
     switching surface.
     """
@@ -360,7 +369,7 @@ def _with_flow(place: ReplayState, z: Any) -> tuple[LoopState, Accumulators]:
     }
 
 
-def _shift(end: LoopEvaluationWithRates, one: StepLog, strikes: Any) -> Any:
+def _shift(end: LoopEvaluationWithRates, one: StepLog, strikes: Scalar) -> Scalar:
     """Return the time [s] from the logged end of a step to its event or to the zero of its comparison.
 
     The time is 0 without an event or comparison, or if a clock determines the end.
@@ -381,7 +390,7 @@ def _shift(end: LoopEvaluationWithRates, one: StepLog, strikes: Any) -> Any:
     return shift
 
 
-def _time_to_zero(on: Any, margin: Any, fall: Any, most: Any) -> tuple[Any, Any]:
+def _time_to_zero(on: Scalar, margin: Scalar, fall: Scalar, most: Scalar) -> tuple[PyTree, PyTree]:
     """Return True if a margin is zero within `most` seconds, and the time to its zero [s]."""
     close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(most) * fall))
     # The fall may be frozen: its derivative is multiplied by the margin, which is 0 except for rounding.

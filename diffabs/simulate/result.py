@@ -5,13 +5,13 @@ the zero of the stop's margin, a metric is outside its physical range, or the pl
 """
 
 import math
-from typing import Any
 
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.protocols import Ending, Objective
 from diffabs.core.pytree import prepare_parts
+from diffabs.core.types import Bool, PyTree, Scalar
 from diffabs.simulate.condition import RunStatus
 from diffabs.simulate.solution import Run, Trajectory
 
@@ -32,7 +32,7 @@ def prepare(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
     return loop, {AUDIT_METRIC: audit(loop.initial)} if audit else {}
 
 
-def finish_run(loop: Loop, objectives: dict[str, Objective], carry: Any) -> tuple[Run, Trajectory]:
+def finish_run(loop: Loop, objectives: dict[str, Objective], carry: PyTree) -> tuple[Run, Trajectory]:
     """Return the result of a run that is over, and its last instant.
 
     Args:
@@ -51,7 +51,7 @@ def finish_run(loop: Loop, objectives: dict[str, Objective], carry: Any) -> tupl
     return Run(metrics, stopped & ~diverged, diverged, timed_out, ending, None), last
 
 
-def observe(loop: Loop, t: Any, state: LoopState, running: Any) -> Trajectory:
+def observe(loop: Loop, t: Scalar, state: LoopState, running: Bool) -> Trajectory:
     """Return the signals of the loop at an instant.
 
     Args:
@@ -64,7 +64,7 @@ def observe(loop: Loop, t: Any, state: LoopState, running: Any) -> Trajectory:
     return Trajectory(signals.sample, signals.measured, state.plant, running)
 
 
-def _is_impossible(name: str, objective: Objective, value: Any) -> Any:
+def _is_impossible(name: str, objective: Objective, value: Scalar) -> Bool:
     """Return True if no real run has this value: more than 1 for an audit, outside its range or not finite for a
     metric.
     """

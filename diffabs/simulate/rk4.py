@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import axpy
 from diffabs.core.pytree import Scalar
 from diffabs.core.tracing import jvp_nonzero
+from diffabs.core.types import PyTree
 from diffabs.simulate.checkpoint import rematerialise
 
 X = TypeVar("X")
@@ -37,7 +38,9 @@ def rk4_step(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, h: Scalar) -
     return _unrolled_step(derivative, t, x, derivative(t, x), h)
 
 
-def rk4_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, rate: X, h: Scalar, given: Any) -> X:
+def rk4_step_from(
+    derivative: Callable[[Scalar, X, PyTree], X], t: Scalar, x: X, rate: X, h: Scalar, given: PyTree
+) -> X:
     """Return x(t + h) after one step of dx/dt = derivative(t, x, given) with a known first rate k1, for the body of a
     scan.
 
@@ -54,7 +57,7 @@ def rk4_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, ra
     return _step(derivative, t, x, rate, h, (given, *constants))
 
 
-def _unrolled_step(f: Any, t: Any, x: Any, rate: Any, h: Any) -> Any:
+def _unrolled_step(f: Any, t: Scalar, x: Scalar, rate: PyTree, h: Scalar) -> Scalar:
     """Return x(t + h) with the stages written out."""
     total = rate
     for place, weight in STAGES:
@@ -65,14 +68,14 @@ def _unrolled_step(f: Any, t: Any, x: Any, rate: Any, h: Any) -> Any:
 # XLA fuses across everything but a loop. With unrolled stages it would compute the tangents of the first stage again in
 # each later one: a gradient would take two to three times as long. For values alone the scan does not pay.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _step(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
+def _step(f: Any, t: Scalar, x: Scalar, rate: PyTree, h: Scalar, constants: PyTree) -> Any:
     return _unrolled_step(lambda t, x: f(t, x, *constants), t, x, rate, h)
 
 
-def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
+def _scan(f: Any, t: Scalar, x: Scalar, rate: PyTree, h: Scalar, constants: PyTree) -> Scalar:
     """Return x(t + h) with a scan over the stages."""
 
-    def stage(carry: tuple[Any, Any], at: Any) -> tuple[tuple[Any, Any], None]:
+    def stage(carry: tuple[PyTree, PyTree], at: Any) -> tuple[tuple[PyTree, PyTree], None]:
         rates = _stage(lambda t, x: f(t, x, *constants), t, x, h, *carry, *at)
         return jax.tree.map(lambda rate, zero: jnp.asarray(rate, zero.dtype), rates, carry), None
 
@@ -82,13 +85,15 @@ def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
     return axpy(h / 6, total, x)
 
 
-def _rule(f: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _rule(f: Any, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     return jvp_nonzero(lambda *step: _scan(f, *step), primals, tangents)
 
 
 _step.defjvp(_rule, symbolic_zeros=True)
 
 
-def _stage(f: Any, t: Any, x: Any, h: Any, rate: Any, total: Any, place: Any, weight: Any) -> tuple[Any, Any]:
+def _stage(
+    f: Any, t: Scalar, x: Scalar, h: Scalar, rate: PyTree, total: Scalar, place: Scalar, weight: Scalar
+) -> tuple[PyTree, PyTree]:
     rate = f(t + place * h, axpy(place * h, rate, x))
     return rate, axpy(weight, rate, total)

@@ -20,6 +20,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import as_arrays, canonical_dtypes, parameters, prepare_derivatives, replace
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero
+from diffabs.core.types import Key, Params, PyTree, Scalar
 from diffabs.core.validity import find_broken, find_misshapen, part_rules
 from diffabs.objectives import Variation
 from diffabs.simulate.admissible import find_impossible_values
@@ -39,7 +40,9 @@ OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an object
 MAX_COUNTED_STEPS = 2**31 - 8  # greatest number of steps that a 32-bit counter holds, including the landing
 
 
-def rollout(loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | None = None, *, key: Any = None) -> Run:
+def rollout(
+    loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | None = None, *, key: Key | None = None
+) -> Run:
     """Run a loop and return a `Run` with its trajectory and metrics.
 
     The function is pure and compiled once per structure of the loop: new values and another duration do not compile
@@ -70,7 +73,7 @@ def rollout(loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | No
     return run_unchecked(loop, solver, objectives, key, solver.every)
 
 
-def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Any = None) -> Run:
+def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Key | None = None) -> Run:
     """Run a loop and return a `Run` with metrics only: memory does not grow with the number of steps.
 
     Args:
@@ -93,7 +96,7 @@ def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, 
     return run_unchecked(loop, solver, objectives, key, 0)
 
 
-def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
+def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: PyTree, every: int) -> Run:
     """Return a run without a check of the parameters' values; a run with impossible values has diverged.
 
     Args:
@@ -133,11 +136,11 @@ class RunCapacity(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=1)
-def _truncate_trajectory(trajectory: Any, count: int) -> Any:
+def _truncate_trajectory(trajectory: PyTree, count: int) -> Any:
     return jax.tree.map(lambda x: x[:count], trajectory)
 
 
-def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
+def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, PyTree, PyTree]:
     """Return loop, objectives and stepping method of one data type.
 
     Args:
@@ -156,7 +159,7 @@ def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objec
     return loop, objectives, build_stepping(solver, jax.tree.leaves(loop)[0].dtype)
 
 
-def forbid_derivatives(loop: Loop, values: Mapping[str, Any]) -> dict[str, Any]:
+def forbid_derivatives(loop: Loop, values: Params) -> dict[str, PyTree]:
     """Return the values on which a run does not depend smoothly, wrapped so that a derivative raises a ValueError.
 
     Args:
@@ -235,24 +238,24 @@ def _find_number_fault(solver: Solver, name: str) -> str:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _run_differentiable(places: RunCapacity, run: Any) -> Run:
+def _run_differentiable(places: RunCapacity, run: PyTree) -> Run:
     """Return the run of (loop, objectives, method, key)."""
     loop, objectives, method, key = run
     return _run(loop, objectives, method, key, jax.device_put(places.every), places=places.instants)
 
 
-def _rule(places: RunCapacity, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _rule(places: RunCapacity, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     loop, objectives, method, _ = primals[0]
     refuse_derivative(loop, objectives, method)
     paths = differentiated_paths(tangents[0][0])
 
-    def reversible(run: Any) -> Run:
+    def reversible(run: PyTree) -> Run:
         return _run_reversible(prepare_derivatives(run[0], paths), *run[1:], places=places)
 
     return jvp_nonzero(reversible, primals, tangents, once=_second_derivative_objection(loop, method))
 
 
-def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: Any) -> None:
+def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: PyTree) -> None:
     """Check that the derivatives of a run are right.
 
     Args:
@@ -273,7 +276,7 @@ def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: A
             )
 
 
-def _second_derivative_objection(loop: Loop, method: Any) -> str:
+def _second_derivative_objection(loop: Loop, method: PyTree) -> str:
     """Return the reason why a run has no second derivatives, or an empty string."""
     if isinstance(method, AdaptiveStepping):
         return "runs with adaptive steps have no second derivatives; d.FixedStep has"
@@ -286,7 +289,7 @@ _run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 
 @compile_once(static=("places",), options=SAME_RESULT_OPTIONS)
-def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, every: Any, *, places: int) -> Run:
+def _run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key, every: Any, *, places: int) -> Run:
     """Return a run for values, with capacity for `places` instants of a trajectory, 0 without one."""
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
     carry = method.start(loop, objectives, key)
@@ -301,7 +304,9 @@ def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, ev
 
 
 @partial(jax.jit, static_argnames="places")
-def _run_reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, *, places: RunCapacity) -> Run:
+def _run_reversible(
+    loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key, *, places: RunCapacity
+) -> Run:
     """Return a run for derivatives in both modes."""
     if isinstance(method, AdaptiveStepping):
         return _run_by_replay(loop, objectives, method.for_replay(), key, places)
@@ -318,7 +323,7 @@ def _run_reversible(loop: Loop, objectives: dict[str, Objective], method: Any, k
 
 
 def _run_by_replay(
-    loop: Loop, objectives: dict[str, Objective], method: AdaptiveStepping, key: Any, places: RunCapacity
+    loop: Loop, objectives: dict[str, Objective], method: AdaptiveStepping, key: Key, places: RunCapacity
 ) -> Run:
     loop, audit = prepare(loop)
     objectives, (tries, instants, every) = objectives | audit, places
@@ -331,17 +336,17 @@ def _run_by_replay(
     return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
 
 
-def _prepare_run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any) -> tuple[Loop, Any, Any]:
+def _prepare_run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key) -> tuple[Loop, PyTree, PyTree]:
     loop, audit = prepare(loop)
     objectives = objectives | audit
     return loop, objectives, partial(method.step, loop, objectives, key)
 
 
-def _attach_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: Any) -> Run:
+def _attach_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: PyTree) -> Run:
     """Return the run with its trajectory: first and later instants, and the last one repeated after the end."""
     run, last = judged
 
-    def join(a: Any, b: Any, c: Any) -> Any:
+    def join(a: Scalar, b: Scalar, c: Scalar) -> Any:
         # Rows after the end contain anything, so the last instant replaces them.
         b = jnp.where(jnp.expand_dims(seen.running, range(1, b.ndim)), b, c)
         return jnp.concatenate([jnp.asarray(a)[None], b])

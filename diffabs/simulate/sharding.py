@@ -11,13 +11,15 @@ import jax
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding
 
+from diffabs.core.types import PyTree, Scalar
+
 TRACED_EXPLICIT_AXES = (
     "lanes lie on a mesh with axes of type Explicit, within jit or a derivative; there they need Auto ones:"
     " jax.make_mesh(..., axis_types=(jax.sharding.AxisType.Auto,))"
 )
 
 
-def run_on_auto_mesh(run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+def run_on_auto_mesh(run: Callable[..., PyTree], given: tuple[PyTree, ...]) -> PyTree:
     """Return run(*given), with arrays on meshes of Explicit axes moved to Auto axes of the same devices.
 
     No data move between devices. Results return to the original mesh.
@@ -33,7 +35,7 @@ def run_on_auto_mesh(run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
     if not meshes:
         return run(*given)
 
-    def back(x: Any) -> Any:
+    def back(x: Scalar) -> Any:
         mesh = getattr(getattr(x, "sharding", None), "mesh", None)
         return _put_on_mesh(x, meshes[mesh]) if mesh in meshes else x
 
@@ -46,7 +48,7 @@ def run_on_auto_mesh(run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
     return jax.tree.map(back, found)
 
 
-def _has_explicit_axes(x: Any) -> bool:
+def _has_explicit_axes(x: Scalar) -> bool:
     """Return True if an array lies on a mesh whose axes are part of its type; raise a ValueError if it is traced."""
     if not isinstance(x, jax.Array):
         return False

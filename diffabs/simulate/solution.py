@@ -2,12 +2,13 @@
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from diffabs.core.protocols import Ending, Sample
+from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar
 from diffabs.simulate import convert
 
 
@@ -71,7 +72,7 @@ class Adaptive:
 
 
 Solver = FixedStep | Adaptive
-SOLVER_TYPES: dict[str, type[Any]] = {"fixed": FixedStep, "adaptive": Adaptive}  # by their names in a scenario
+SOLVER_TYPES: dict[str, type[PyTree]] = {"fixed": FixedStep, "adaptive": Adaptive}  # by their names in a scenario
 ADAPTIVE_ERROR_ORDER = 4  # order of the error of an adaptive step in its length
 
 
@@ -90,7 +91,7 @@ def refine_solver(solver: Solver, times: int) -> Solver:
     return shorter
 
 
-def describe_solver(solver: Solver) -> dict[str, Any]:
+def describe_solver(solver: Solver) -> dict[str, PyTree]:
     """Return the numbers of a solver that determine a run's results, for a file.
 
     Args:
@@ -104,11 +105,11 @@ class Trajectory(NamedTuple):
     """Signals of a run with a leading time axis (instants,). After the end of a run the last sample is repeated."""
 
     sample: Sample
-    measured: Any  # output of the sensor
-    state: Any  # state of the plant
-    running: Any  # bool: False after the end of the run
+    measured: PyTree  # output of the sensor
+    state: PyTree  # state of the plant
+    running: AnyArray  # bool: False after the end of the run
 
-    def finite(self) -> Any:
+    def finite(self) -> Scalar:
         """Return True if every number of the run is finite."""
         return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self.sample)]))
 
@@ -116,10 +117,10 @@ class Trajectory(NamedTuple):
 class Run(NamedTuple):
     """The result of a run: metrics by name (NaN for a run that diverged), end flags, and a requested trajectory."""
 
-    metrics: dict[str, Any]
-    stopped: Any  # bool: the run reached its stop in time
-    diverged: Any  # bool: invalid numbers (one is infinite, NaN or impossible), or a start beyond the stop
-    timed_out: Any  # bool: the duration ended before the stop. At most one of the three is True; none if ended early
+    metrics: dict[str, PyTree]
+    stopped: Bool  # bool: the run reached its stop in time
+    diverged: Bool  # bool: invalid numbers (one is infinite, NaN or impossible), or a start beyond the stop
+    timed_out: Bool  # bool: the duration ended before the stop. At most one of the three is True; none if ended early
     ending: Ending
     trajectory: Trajectory | None
 
@@ -131,7 +132,7 @@ class Run(NamedTuple):
         """Return the summary for a notebook."""
         return convert.summarise_run(self)._repr_html_()
 
-    def pandas(self, plant: Any = None) -> Any:
+    def pandas(self, plant: Part = None) -> Scalar:
         """Return the trajectory as a pandas.DataFrame indexed by time, with `attrs["units"]`; without one, a row of
         metrics for each run.
 
@@ -139,14 +140,14 @@ class Run(NamedTuple):
         """
         return convert.to_pandas(self, plant)
 
-    def xarray(self, plant: Any = None) -> Any:
+    def xarray(self, plant: Part = None) -> Scalar:
         """Return the trajectory as an xarray.Dataset over the time, each variable with `units`.
 
         The `plant` defines the unit of the control. A run without a trajectory or a batch raises a ValueError.
         """
         return convert.to_xarray(self, plant)
 
-    def plot(self, plant: Any = None, *, title: str = "") -> Any:
+    def plot(self, plant: Part = None, *, title: str = "") -> Scalar:
         """Return the run as a matplotlib figure (extra `plot`) with this `title`.
 
         The `plant` defines the unit of the control. A run without a trajectory raises a ValueError.

@@ -1,6 +1,6 @@
 """The run between the ends of a step: the cubic through the states and the rates there."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from diffabs.core.cubic import Cubic
 from diffabs.core.loop import LoopState
 from diffabs.core.numerics import clamp
+from diffabs.core.types import PyTree, Scalar
 
 
 class HermiteStep(NamedTuple):
@@ -22,14 +23,14 @@ class HermiteStep(NamedTuple):
         last_rate: Rates before these changes.
     """
 
-    t: Any
+    t: Scalar
     state: LoopState
-    rate: Any
-    until: Any
-    flow: Any
-    last_rate: Any
+    rate: PyTree
+    until: Scalar
+    flow: PyTree
+    last_rate: Scalar
 
-    def at(self, t: Any) -> LoopState:
+    def at(self, t: Scalar) -> LoopState:
         """Return the state at a time `t` [s] within the step."""
         h = self.until - self.t
         x = clamp((t - self.t) / jnp.where(h > 0, h, 1.0), 0.0, 1.0)

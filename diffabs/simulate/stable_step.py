@@ -26,6 +26,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Memory, Reference
 from diffabs.core.pytree import Scalar, canonical_dtypes, part, pytree, replace
 from diffabs.core.tracing import split_batched
+from diffabs.core.types import Part, PyTree
 
 BOUND_SQUARINGS = 4  # k = 16: within 3 % of the spectral radius for the loops of the papers
 LANES_PER_CHUNK = 256  # runs whose matrices stay in a processor's cache
@@ -64,7 +65,7 @@ def _largest_stable_steps(matrices: np.ndarray) -> np.ndarray:
     return limits.min(axis=tuple(range(1, limits.ndim)), initial=np.inf)
 
 
-def is_step_stable(loop: Any, values: Any, step: float) -> np.ndarray:
+def is_step_stable(loop: Part, values: PyTree, step: float) -> np.ndarray:
     """Return True for each run for which the step is stable, bool, shape (runs,).
 
     Args:
@@ -86,17 +87,17 @@ def is_step_stable(loop: Any, values: Any, step: float) -> np.ndarray:
     return fine
 
 
-def _as_single_precision(*trees: Any) -> Any:
+def _as_single_precision(*trees: PyTree) -> PyTree:
     """Return the trees in single precision."""
     # NumPy arrays, because `enable_x64` is not consistent for JAX arrays made by several threads at once.
     return jax.tree.map(lambda x: np.asarray(x, np.float32), trees)
 
 
-def _at(values: Any, lanes: np.ndarray) -> Any:
+def _at(values: PyTree, lanes: np.ndarray) -> Any:
     return jax.tree.map(lambda x: np.asarray(x)[lanes], values)
 
 
-def _is_known_stable(loop: Any, values: Any, step: float, squarings: int | None) -> np.ndarray:
+def _is_known_stable(loop: Part, values: PyTree, step: float, squarings: int | None) -> np.ndarray:
     """Return True for each run whose step is known to be stable: by a bound with so many squarings, or with None by the
     eigenvalues.
     """
@@ -109,20 +110,20 @@ def _is_known_stable(loop: Any, values: Any, step: float, squarings: int | None)
 
 
 @jax.jit
-def _build_loops(loop: Any, values: Any) -> Loop:
+def _build_loops(loop: Part, values: PyTree) -> Loop:
     return canonical_dtypes(jax.vmap(_lane(loop))(values))
 
 
-def _lane(loop: Any) -> Callable[[Any], Loop]:
+def _lane(loop: Part) -> Callable[[PyTree], Loop]:
     return lambda values: canonical_dtypes(values if loop is None else replace(loop, values))
 
 
 @partial(jax.jit, static_argnames="squarings")
-def _bounds(loop: Any, values: Any, *, squarings: int) -> jax.Array:
+def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
     """Return an upper bound on |lambda| of all modes for each run [1/s], shape (runs,); infinite if unknown."""
     count = len(jax.tree.leaves(values)[0])
 
-    def matrices(values: Any) -> jax.Array:
+    def matrices(values: PyTree) -> jax.Array:
         return jnp.reshape(found := _jacobians_of(_lane(loop)(values)), (-1, *found.shape[-2:]))
 
     one = matrices(jax.tree.map(lambda x: x[0], values))
@@ -133,7 +134,7 @@ def _bounds(loop: Any, values: Any, *, squarings: int) -> jax.Array:
     places = jnp.minimum(jnp.arange(-(-count // LANES_PER_CHUNK) * LANES_PER_CHUNK), count - 1)
     filled = jax.tree.map(lambda x: x[places], values) if count > LANES_PER_CHUNK else values
 
-    def bound(values: Any) -> jax.Array:
+    def bound(values: PyTree) -> jax.Array:
         if squarings or len(one) * count < MIN_ENTRYWISE_MATRICES:
             return _power_norm_bound(matrices(values), balance, squarings)
         return _norm(_map_over_probes(_entries, _lane(loop)(values)), balance)
@@ -213,7 +214,7 @@ def _jacobians_of(loop: Loop) -> jax.Array:
     return _map_over_probes(_flow_jacobian, loop)
 
 
-def _map_over_probes(function: Callable[[Loop], Any], loop: Loop) -> Any:
+def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
     """Return the results of a function (k, ...) for the loop at the points where the plant says that it may be stiffest
     (`probes`).
 
@@ -246,13 +247,13 @@ class _AtTarget:
 
     reference: Reference = part()
 
-    def start(self, signal: Any) -> Memory:
+    def start(self, signal: PyTree) -> Memory:
         return self.reference.start(signal)
 
-    def flow(self, t: Scalar, memory: Memory, signal: Any) -> Any:
+    def flow(self, t: Scalar, memory: Memory, signal: PyTree) -> Any:
         return self.reference.flow(t, memory, signal)
 
-    def output(self, t: Scalar, memory: Memory, signal: Any) -> Scalar:
+    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
         del t, memory
         return jax.lax.stop_gradient(signal[0])
 

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from diffabs.core.log import borrow, commit, log_rows
 from diffabs.core.loop import Loop, Margins
 from diffabs.core.protocols import Clock
+from diffabs.core.types import PyTree, Scalar
 from diffabs.simulate.advance import (
     FixedStepAttempt,
     FixedStepPoint,
@@ -66,13 +67,13 @@ class FixedStepCarry(NamedTuple):
     """State of a run between two attempts."""
 
     point: FixedStepPoint
-    k: Any  # number of the last instant of the grid
-    length: Any  # length of the next attempt [s]
+    k: Scalar  # number of the last instant of the grid
+    length: Scalar  # length of the next attempt [s]
     search: EventSearch
     extra_attempts: Any  # attempts that did not end on the grid
     here: Any  # such attempts since the last instant of the grid
-    unrestricted: Any  # True if steps are unrestricted
-    status: Any
+    unrestricted: Scalar  # True if steps are unrestricted
+    status: Scalar
 
     running = property(is_running)
 
@@ -88,9 +89,9 @@ class FixedStepDecision(NamedTuple):
         over: True if the run ends there.
     """
 
-    fine: Any
-    taken: Any
-    on_grid: Any
+    fine: Scalar
+    taken: PyTree
+    on_grid: Scalar
     triggered: Margins
     over: Any
 
@@ -111,7 +112,7 @@ def attempt_capacity(loop: Loop, steps: int, *, kinks: bool = False) -> int:
     return steps + SPARE_ATTEMPTS + about + about // 3
 
 
-def init_carry(loop: Loop, objectives: Objectives, h: Any, key: Any, *, kinks: bool = False) -> FixedStepCarry:
+def init_carry(loop: Loop, objectives: Objectives, h: Scalar, key: PyTree, *, kinks: bool = False) -> FixedStepCarry:
     """Return the carry at t = 0.
 
     Args:
@@ -130,11 +131,11 @@ def init_carry(loop: Loop, objectives: Objectives, h: Any, key: Any, *, kinks: b
 def step(
     loop: Loop,
     objectives: Objectives,
-    h: Any,
-    key: Any,
-    steps: Any,
+    h: Scalar,
+    key: PyTree,
+    steps: Scalar,
     carry: FixedStepCarry,
-    until: Any = None,
+    until: Scalar = None,
     *,
     kinks: bool = False,
     refines: bool = False,
@@ -195,8 +196,8 @@ def step(
 
 
 def _plan_next_step(
-    loop: Loop, carry: FixedStepCarry, here: FixedStepAttempt, verdict: FixedStepDecision, h: Any, left: Any
-) -> tuple[Any, ...]:
+    loop: Loop, carry: FixedStepCarry, here: FixedStepAttempt, verdict: FixedStepDecision, h: Scalar, left: Scalar
+) -> tuple[PyTree, ...]:
     """Return next length, unrestricted flag and status after an accepted attempt that ended `left` seconds before the
     grid.
     """
@@ -207,7 +208,9 @@ def _plan_next_step(
     return left, carry.unrestricted & ~calm, ended
 
 
-def _decide(carry: FixedStepCarry, here: FixedStepAttempt, kinks: int, active: Any, steps: Any) -> FixedStepDecision:
+def _decide(
+    carry: FixedStepCarry, here: FixedStepAttempt, kinks: int, active: Scalar, steps: Scalar
+) -> FixedStepDecision:
     """Return the decision on an attempt: accept it, search within it, or end the run."""
     to_grid, landing = carry.status == RunStatus.RUNNING, carry.status == RunStatus.LANDING
     fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(here.state.flow())]))
@@ -222,7 +225,7 @@ def _decide(carry: FixedStepCarry, here: FixedStepAttempt, kinks: int, active: A
     return FixedStepDecision(fine, taken, on_grid, fired, over)
 
 
-def _is_plausible(carry: FixedStepCarry, here: FixedStepAttempt) -> Any:
+def _is_plausible(carry: FixedStepCarry, here: FixedStepAttempt) -> Scalar:
     """Return True if the state has changed roughly as the rates at both ends predict."""
     ends = [jax.tree.leaves(point.state.flow()) for point in (carry.point, here)]
     rates = [jax.tree.leaves(point.rate[0]) for point in (carry.point, here)]
@@ -236,8 +239,8 @@ def _is_plausible(carry: FixedStepCarry, here: FixedStepAttempt) -> Any:
 
 
 def _continue_search(
-    carry: FixedStepCarry, here: FixedStepAttempt, fine: Any, kinks: int, h: Any, refines: bool
-) -> tuple[EventSearch, Any, Any, Any]:
+    carry: FixedStepCarry, here: FixedStepAttempt, fine: Scalar, kinks: int, h: Scalar, refines: bool
+) -> tuple[EventSearch, PyTree, PyTree, PyTree]:
     """Return search, next length, unrestricted flag and status after an attempt that is not accepted."""
     tells = find_crossings(carry.search.which, kinks, here.kink, *_margins(carry, here))
     new = carry.status == RunStatus.RUNNING
@@ -262,14 +265,16 @@ def _continue_search(
     return search, length, unrestricted, status.astype(carry.status.dtype)
 
 
-def _land(carry: FixedStepCarry, search: EventSearch, length: Any, refines: bool) -> tuple[EventSearch, Any, Any]:
+def _land(
+    carry: FixedStepCarry, search: EventSearch, length: Scalar, refines: bool
+) -> tuple[EventSearch, PyTree, PyTree]:
     """Return the search, the next length and the status after a probe: a step that lands, or a further search."""
     length, again = accept_location(search, carry.length, length)
     return search, length, jnp.where(again, RunStatus.SEEKING, RunStatus.REFINING if refines else RunStatus.LANDING)
 
 
 def find_crossings(
-    which: Any, kinks: int, kink: SurfaceCrossing, before: list[Any], after: list[Any]
+    which: Scalar, kinks: int, kink: SurfaceCrossing, before: list[PyTree], after: list[PyTree]
 ) -> AttemptCrossings:
     """Return the crossings of switching surfaces and events within an attempt; comparisons come first.
 
@@ -288,7 +293,7 @@ def find_crossings(
     return AttemptCrossings(sought, kink.contradicted | events.falls, other, bends | events.another)
 
 
-def _margins(carry: FixedStepCarry, here: FixedStepAttempt) -> tuple[list[Any], list[Any]]:
+def _margins(carry: FixedStepCarry, here: FixedStepAttempt) -> tuple[list[PyTree], list[PyTree]]:
     """Return the margins at the beginning and at the end of the attempt."""
     return jax.tree.leaves(carry.point.margins), jax.tree.leaves(here.margins)
 
@@ -298,7 +303,7 @@ def _last(here: FixedStepAttempt, point: FixedStepPoint) -> FixedStepPoint:
     return point._replace(state=here.state, accumulators=here.accumulators, sample=here.signals.sample)
 
 
-def cast_floats(tree: Any, dtype: Any) -> Any:
+def cast_floats(tree: PyTree, dtype: Any) -> PyTree:
     """Return the tree with strong types throughout, and its floating-point leaves cast to one type.
 
     Args:
@@ -307,7 +312,7 @@ def cast_floats(tree: Any, dtype: Any) -> Any:
     """
 
     # A scan rejects a carry whose type weakens or strengthens.
-    def cast(x: Any) -> Any:
+    def cast(x: Scalar) -> Any:
         x = jnp.asarray(x)
         return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(x.dtype)
 

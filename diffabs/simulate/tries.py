@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 from diffabs.core.loop import LoopState, Margins, Signals
 from diffabs.core.modes import ModeBits
 from diffabs.core.protocols import Sample
+from diffabs.core.types import Bool, Int, PyTree, Scalar
 from diffabs.simulate.condition import is_running
 from diffabs.simulate.dynamics import Accumulators
 from diffabs.simulate.landing import EventSearch
@@ -26,16 +27,16 @@ class AdaptivePoint(NamedTuple):
         ahead: Predicted time to the first change of an answer [s].
     """
 
-    t: Any
+    t: Scalar
     state: LoopState
     accumulators: Accumulators
     sample: Sample
     moving: Sample
-    recorded: tuple[dict[str, Any], dict[str, Any]]
-    rate: tuple[Any, Any]
+    recorded: tuple[dict[str, PyTree], dict[str, PyTree]]
+    rate: tuple[PyTree, PyTree]
     margins: Margins
     words: ModeBits
-    ahead: Any
+    ahead: Scalar
 
 
 class AdaptiveAttempt(NamedTuple):
@@ -52,9 +53,9 @@ class AdaptiveAttempt(NamedTuple):
 
     point: AdaptivePoint
     signals: Signals
-    error: Any
-    scale: Any
-    late: Any
+    error: Scalar
+    scale: Scalar
+    late: Scalar
     kink: Any
 
 
@@ -62,23 +63,23 @@ class AdaptiveCarry(NamedTuple):
     """State of a run between two attempts."""
 
     point: AdaptivePoint
-    k: Any  # number of the last instant of the grid at which a clock struck
-    since: Any  # time since that instant [s]: a difference of times would lose digits
-    error_limited: Any  # length that the error allows [s]
-    length: Any  # length of the next attempt [s]
-    ends: Any  # True if the attempt ends where a clock strikes, or with the run
-    limit: Any  # longest stable step [s]
-    scale: Any  # largest values of the states so far
-    base: Any  # length of the attempt that first contained the sought event [s]
+    k: Int  # number of the last instant of the grid at which a clock struck
+    since: Scalar  # time since that instant [s]: a difference of times would lose digits
+    error_limited: Scalar  # length that the error allows [s]
+    length: Scalar  # length of the next attempt [s]
+    ends: PyTree  # True if the attempt ends where a clock strikes, or with the run
+    limit: Scalar  # longest stable step [s]
+    scale: Scalar  # largest values of the states so far
+    base: Scalar  # length of the attempt that first contained the sought event [s]
     search: EventSearch
-    tries: Any  # number of attempts so far
+    tries: Int  # number of attempts so far
     tries_at_renewal: Any  # number of attempts at the last update of the stability limit
     last_step: Any  # last step, a `HermiteStep`; () without a trajectory
-    turns: Any  # number of consecutive steps that ended on switching surfaces
+    turns: Int  # number of consecutive steps that ended on switching surfaces
     stability_fraction: Any  # fraction of the longest stable step that a step may have after an event
-    unrestricted: Any  # True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode
-    triggered: Any  # bit mask of the events at the end of the last attempt
-    status: Any
+    unrestricted: Bool  # True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode
+    triggered: PyTree  # bit mask of the events at the end of the last attempt
+    status: Scalar
 
     running = property(is_running)
 
@@ -94,8 +95,8 @@ class AdaptiveDecision(NamedTuple):
         over: True if the run ends there.
     """
 
-    fine: Any
-    taken: Any
-    searches_event: Any
+    fine: Bool
+    taken: PyTree
+    searches_event: Bool
     triggered: Margins
     over: Any

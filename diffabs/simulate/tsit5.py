@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import axpy
 from diffabs.core.pytree import Scalar
 from diffabs.core.tracing import jvp_nonzero
+from diffabs.core.types import PyTree
 from diffabs.simulate.checkpoint import rematerialise
 
 X = TypeVar("X")
@@ -79,7 +80,9 @@ def midpoint_error(so_far: X, last: X, h: Scalar) -> X:
     return jax.tree.map(lambda a, b: h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b), so_far, last)
 
 
-def tsit5_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, rate: X, h: Scalar, given: Any) -> X:
+def tsit5_step_from(
+    derivative: Callable[[Scalar, X, PyTree], X], t: Scalar, x: X, rate: X, h: Scalar, given: PyTree
+) -> X:
     """Return x(t + h) after one step of dx/dt = derivative(t, x, given) with a known first rate k1, for the body of a
     scan.
 
@@ -98,7 +101,7 @@ def tsit5_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, 
 
 
 def _weighted_sum(weights: Sequence[float], rates: Sequence[X]) -> X:
-    def total(*rates: Any) -> Any:
+    def total(*rates: PyTree) -> Any:
         first, *others = (weight * rate for weight, rate in zip(weights, rates, strict=True))
         return sum(others, first)
 
@@ -106,25 +109,25 @@ def _weighted_sum(weights: Sequence[float], rates: Sequence[X]) -> X:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _step(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
+def _step(f: Any, t: Scalar, x: Scalar, rate: PyTree, h: Scalar, constants: PyTree) -> Any:
     return tsit5_step_with_error(lambda t, x: f(t, x, *constants), t, x, rate, h)[0]
 
 
-def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
+def _scan(f: Any, t: Scalar, x: Scalar, rate: PyTree, h: Scalar, constants: PyTree) -> Scalar:
     """Return x(t + h) with a scan over the stages, which fills a table of rates."""
     count = len(STEP_WEIGHTS)
     # Rows of equal length, padded with zeros: rates that do not exist yet are zero in the table.
     rows = [[*weights, *(count - len(weights)) * [0.0]] for weights in STAGE_COEFFICIENTS]
 
-    def weigh(weights: Any, rates: Any) -> Any:
+    def weigh(weights: PyTree, rates: PyTree) -> Any:
         return jax.tree.map(lambda k: jnp.sum(weights.reshape(-1, *(k.ndim - 1) * [1]) * k, axis=0), rates)
 
-    def stage(rates: Any, at: tuple[Any, Any, Any]) -> tuple[Any, None]:
+    def stage(rates: PyTree, at: tuple[PyTree, PyTree, PyTree]) -> tuple[PyTree, None]:
         new, place, weights = at
         rate = f(t + place * h, axpy(h, weigh(weights, rates), x), *constants)
         return jax.tree.map(lambda k, one: k.at[new].set(jnp.asarray(one, k.dtype)), rates, rate), None
 
-    def table(rate: Any) -> Any:
+    def table(rate: PyTree) -> Any:
         rate = jnp.asarray(rate)
         return jnp.zeros((count, *rate.shape), rate.dtype).at[0].set(rate)
 
@@ -135,7 +138,7 @@ def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
     return axpy(h, weigh(jnp.asarray(STEP_WEIGHTS, dtype), rates), x)
 
 
-def _rule(f: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _rule(f: Any, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     return jvp_nonzero(lambda *step: _scan(f, *step), primals, tangents)
 
 

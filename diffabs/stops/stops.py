@@ -1,12 +1,12 @@
 """Stops of a run, and the time and distance that remain after the last sample."""
 
 import math
-from typing import Any
 
 import jax.numpy as jnp
 
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Sample
 from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.types import Bool, PyTree
 
 EXTRAPOLATED = "stop_time and stop_distance are extrapolated with the last deceleration"
 LEAST_DECELERATION = 1e-3  # m/s^2; a car that only rolls gets a finite, very long stopping distance
@@ -27,7 +27,7 @@ class SpeedReached:
         """Return the speed above the stop's speed [m/s]."""
         return output.speed - self.speed
 
-    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+    def remainder(self, sample: Sample, stopped: Bool) -> tuple[Scalar, Scalar]:
         """Return 0 and 0 after a stop, else (v - v_end)/a [s] and (v^2 - v_end^2)/(2 a) [m]."""
         time, distance = _rest_of_braking(sample, self.speed, False)
         return jnp.where(stopped, 0.0, time), jnp.where(stopped, 0.0, distance)
@@ -47,7 +47,7 @@ class Standstill:
     otherwise = EXTRAPOLATED
     margin = SpeedReached.margin
 
-    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+    def remainder(self, sample: Sample, stopped: Bool) -> tuple[Scalar, Scalar]:
         """Return v/a [s] and v^2/(2 a) [m]."""
         return _rest_of_braking(sample, 0.0, stopped)
 
@@ -65,7 +65,7 @@ class Fallen:
         """Return angle^2 - theta^2 [rad^2]."""
         return self.angle**2 - output.theta**2
 
-    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+    def remainder(self, sample: Sample, stopped: Bool) -> tuple[Scalar, Scalar]:
         """Return 0 s and 0 m."""
         del stopped
         return 0.0 * sample.t, 0.0 * sample.t
@@ -78,12 +78,12 @@ class NoStop:
     success = False
     remainder = Fallen.remainder
 
-    def margin(self, output: Any) -> Scalar:
+    def margin(self, output: PyTree) -> Scalar:
         """Return 1, which never crosses zero."""
         return 1.0 + 0.0 * output[0]
 
 
-def _rest_of_braking(sample: Sample, end: Scalar, stopped: Any) -> tuple[Any, Any]:
+def _rest_of_braking(sample: Sample, end: Scalar, stopped: Bool) -> tuple[PyTree, PyTree]:
     """Return time [s] and distance [m] to the speed `end` at the last deceleration.
 
     For a run that stopped, the deceleration is at least half its mean. Slip may chatter at the very end, and the last

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.types import JsonObject, Key, Part, PyTree
 from diffabs.simulate.accuracy import is_comparable, measure_finer, relative_difference
 from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
 from diffabs.simulate.solution import Run, describe_solver
@@ -20,7 +20,7 @@ NEGLIGIBLE_CHANGE = 1e-9  # smaller changes, or changes below solver.rtol, give 
 MAX_RELATIVE_CHANGE = 0.01  # largest relative change by a half step without a warning
 
 
-def check_accuracy(study: Study, found: Results, count: int) -> dict[str, Any]:
+def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
     """Return the change of each metric under a half step, for at most `count` runs that did not diverge.
 
     The seed chooses the runs. For each metric the result holds the median and the largest change, and the sample with
@@ -53,7 +53,7 @@ def check_accuracy(study: Study, found: Results, count: int) -> dict[str, Any]:
     }
 
 
-def accuracy_warnings(result: dict[str, Any]) -> list[str]:
+def accuracy_warnings(result: JsonObject) -> list[str]:
     """Return warnings for a reader of the statistics, one line each.
 
     Args:
@@ -104,11 +104,11 @@ def _rerun_halved_step(study: Study, samples: np.ndarray) -> Iterator[tuple[list
         yield places, run, known
 
 
-def _measure_half_step(study: Study, loop: Any, key: Any) -> tuple[Run, Any]:
+def _measure_half_step(study: Study, loop: Part, key: Key) -> tuple[Run, PyTree]:
     return measure_finer(loop, study.solver, study.objectives, 2, key=key), is_comparable(loop, study.solver, key)
 
 
-def _summarise_changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> dict[str, Any]:
+def _summarise_changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> JsonObject:
     known = np.isfinite(values) & np.isfinite(half)  # a run that never settles has an infinite settling time
     values, half, samples = values[known], half[known], samples[known]
     if not len(values):

@@ -27,6 +27,7 @@ from distributed import Client, KilledWorker, LocalCluster, Security, as_complet
 from distributed.comm.core import connect
 
 from diffabs.core import files, provenance
+from diffabs.core.types import PyTree, Scalar
 from diffabs.kernel import launch
 from diffabs.sweep.engines import DECISIVE_PACKAGES, ComputedChunk, encode_computed_chunk
 from diffabs.sweep.manifest import Seals, describe_owner
@@ -100,7 +101,7 @@ def _silence_dask_logs() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _start_workers(workers: int) -> Iterator[Any]:
+def _start_workers(workers: int) -> Iterator[PyTree]:
     """Start workers on this machine, with all pages and ports on the loopback interface.
 
     Raises:
@@ -183,7 +184,7 @@ def _compute_chunks(
 ) -> Iterator[ComputedChunk]:
     """Yield chunks as they finish, with at most CHUNKS_PER_THREAD chunks for each worker thread in progress."""
     rest, deaths, finished = iter(chunks), dict.fromkeys(chunks, 0), as_completed()
-    inside: dict[Any, int] = {}
+    inside: dict[PyTree, int] = {}
 
     def give(chunk: int) -> None:
         # `pure=False` makes a new key, so that the result of another client is not reused.
@@ -212,7 +213,7 @@ def _compute_chunks(
             fill()
 
 
-def _wait_for_chunk(client: Client, finished: Any, stopping: Callable[[], bool]) -> bool:
+def _wait_for_chunk(client: Client, finished: Scalar, stopping: Callable[[], bool]) -> bool:
     """Wait for the next chunk and return True, or False if none will come.
 
     Ctrl-C in a terminal also ends workers, and some of them do not return.
@@ -229,7 +230,7 @@ def _convert_to_numpy(study: Study) -> Study:
     digits.
     """
 
-    def plain(x: Any) -> Any:
+    def plain(x: Scalar) -> Any:
         return np.asarray(x) if isinstance(x, jax.Array) else x
 
     # One by one: `tree.map` over the dictionaries would sort their keys, and so change the order of the columns.

@@ -2,13 +2,14 @@
 
 import dataclasses
 import reprlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import PyTree, Table
 from diffabs.core.values import (
     FINITE_SPEC,
     POSITIVE_SPEC,
@@ -152,7 +153,7 @@ class Empirical(_Discrete):
             yield f"{name}: values = {reprlib.repr(list(self.values))} are not all in {FINITE_SPEC.interval()}"
 
 
-def _read_columns(given: Any, where: str) -> dict[str, np.ndarray]:
+def _read_columns(given: PyTree, where: str) -> dict[str, np.ndarray]:
     return {
         path: np.array(column)
         for path, column in table_reader(list_reader(read_as_given), "lists")(given, where).items()
@@ -170,8 +171,8 @@ class Rows(_Discrete):
         weights: Numbers in proportion to the probabilities of the rows; None for equal probabilities.
     """
 
-    columns: Mapping[str, Any] = table_field(_read_columns)
-    weights: Any = table_field(list_reader(read_any_number), None)
+    columns: Table = table_field(_read_columns)
+    weights: PyTree = table_field(list_reader(read_any_number), None)
 
     @property
     def size(self) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffabs.core.pytree import ParameterSpec, param
+from diffabs.core.types import PyTree, Scalar
 from diffabs.core.values import check_sound, format_table, kebab_case, read_one
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
@@ -53,8 +54,8 @@ class Distribution(Protocol):
 class _Continuous:
     """Common methods of distributions between `low` and `high`: quantiles by p and q, ranges of the fields."""
 
-    low: Any
-    high: Any
+    low: Scalar
+    high: Scalar
 
     def value(self, u: ArrayLike) -> np.ndarray:
         return self._at(np.asarray(u), 1 - np.asarray(u))
@@ -205,7 +206,7 @@ DISTRIBUTION_TYPES = {
 }
 
 
-def read_distribution(given: Any, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Any:
+def read_distribution(given: PyTree, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Scalar:
     """Return the distribution of a table.
 
     Args:
@@ -220,7 +221,7 @@ def read_distribution(given: Any, where: str, kinds: Mapping[str, type] = DISTRI
     return check_sound(read_one(kinds, given, where), where)
 
 
-def convert_distribution_to_si(distribution: Any, scale: float) -> Any:
+def convert_distribution_to_si(distribution: Any, scale: float) -> Scalar:
     """Return the distribution of a parameter in SI units.
 
     Args:
@@ -228,7 +229,7 @@ def convert_distribution_to_si(distribution: Any, scale: float) -> Any:
         scale: Number of these units in one SI unit.
     """
 
-    def divide(value: Any) -> Any:
+    def divide(value: Scalar) -> Any:
         return tuple(x / scale for x in value) if isinstance(value, tuple) else value / scale
 
     return dataclasses.replace(distribution, **{n: divide(getattr(distribution, n)) for n in distribution.scaled})

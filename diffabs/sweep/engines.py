@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
+from diffabs.core.types import Bool, PyTree
 from diffabs.sweep.manifest import DECISIVE_PACKAGES as DECISIVE_PACKAGES
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.runner import Columns, Runner
@@ -55,7 +56,7 @@ class Local:
     With P processes (`jax.distributed`), each process takes every P-th chunk.
     """
 
-    def __init__(self, devices: Sequence[Any] | None = None):
+    def __init__(self, devices: Sequence[PyTree] | None = None):
         """Set the `devices`; by default all local ones."""
         self.devices = list(devices or jax.local_devices())
 
@@ -96,7 +97,7 @@ def encode_computed_chunk(study: Study, seal: Seal, columns: Columns) -> Compute
     return ComputedChunk(seal.chunk, encode_chunk(columns, seal, study.units()), *counts)
 
 
-def is_accepted(refused: Any) -> np.ndarray:
+def is_accepted(refused: Bool) -> np.ndarray:
     """Return which samples were run, shape (samples,).
 
     Args:
@@ -119,7 +120,7 @@ def has_failed(study: Study, columns: Any) -> np.ndarray:
     return failed & is_accepted(columns["refused"])
 
 
-def has_wrong_end(stopped: Any, success: bool) -> np.ndarray:
+def has_wrong_end(stopped: Bool, success: bool) -> np.ndarray:
     """Return which runs had a wrong end, shape (samples,).
 
     The end is wrong if a run misses a stop that is a success, or reaches a stop that is not.

@@ -16,10 +16,10 @@ import json
 import pathlib
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 from diffabs.core import files, provenance
 from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import JsonObject, PyTree, Table
 from diffabs.core.values import (
     FINITE_SPEC,
     ScenarioError,
@@ -57,7 +57,7 @@ EARLIER_FORMATS = (1, 2)
 EARLIER_FORMAT_MESSAGE = "written by an earlier diffabs: read its chunks with pandas, or sweep again"
 
 
-def describe_owner(study: Study) -> dict[str, Any]:
+def describe_owner(study: Study) -> JsonObject:
     """Return the owner of a study's chunks when this process computes them now: format, study and versions.
 
     Args:
@@ -80,7 +80,7 @@ class Seals:
         columns: Names of the columns of a chunk.
     """
 
-    def __init__(self, manifest: Mapping[str, Any]):
+    def __init__(self, manifest: Table):
         """Compute from the `manifest` the entries that all seals share."""
         self.study = manifest["study"]
         self.owner = json_digest({name: manifest[name] for name in OWNER_KEYS})
@@ -95,7 +95,7 @@ class Seals:
         return Seal(self.owner, chunk, self.study["seed"], rows, self.columns)
 
 
-def encode_manifest(manifest: Mapping[str, Any]) -> bytes:
+def encode_manifest(manifest: Table) -> bytes:
     """Return the bytes of the manifest's file, with its digest.
 
     Args:
@@ -104,7 +104,7 @@ def encode_manifest(manifest: Mapping[str, Any]) -> bytes:
     return json.dumps({**manifest, "digest": json_digest(manifest)}, indent=1).encode()
 
 
-def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
+def read_manifest(folder: pathlib.Path) -> JsonObject:
     """Return the manifest of a folder, without its digest.
 
     Args:
@@ -126,7 +126,7 @@ def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
         raise SweepError(f"{folder} is no sweep that can be read: {MANIFEST_NAME}: {why}") from None
 
 
-def _check_manifest(given: Any) -> dict[str, Any]:
+def _check_manifest(given: PyTree) -> JsonObject:
     if not isinstance(given, dict):
         raise wrong_kind_error("it", given, "a table")
     if given.get("format") in EARLIER_FORMATS:
@@ -151,7 +151,7 @@ def _check_study(manifest: "_Manifest") -> None:
         raise ScenarioError(f"study.objectives.{name}: another column of the table has this name")
 
 
-def _read_utf8(given: Any, path: str) -> str:
+def _read_utf8(given: PyTree, path: str) -> str:
     try:
         read_text(given, path).encode()
     except UnicodeEncodeError:
@@ -170,7 +170,7 @@ class _Adaptive(_Solver):
     rtol: float = table_field(range_reader(FINITE_SPEC))
 
 
-def _read_solver(given: Any, path: str) -> _Solver:
+def _read_solver(given: PyTree, path: str) -> _Solver:
     table = {"type": "fixed", **given} if isinstance(given, Mapping) else given
     return read_one({"fixed": _Solver, "adaptive": _Adaptive}, table, path)
 
@@ -190,9 +190,9 @@ class _Study:
     success: bool = table_field(read_switch)
     solver: _Solver = table_field(_read_solver)
     space: Space = table_field(variables.read_space)
-    loop: Mapping[str, Any] = table_field(table_reader(read_as_given))
-    parts: Mapping[str, Any] = table_field(table_reader(table_reader(read_as_given)))
-    objectives: Mapping[str, Any] = table_field(table_reader(read_as_given))
+    loop: Table = table_field(table_reader(read_as_given))
+    parts: Table = table_field(table_reader(table_reader(read_as_given)))
+    objectives: Table = table_field(table_reader(read_as_given))
     engine: Mapping[str, str] = table_field(table_reader(read_text), dict)  # empty for XLA
 
 

@@ -4,7 +4,6 @@ import contextlib
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +11,7 @@ import pyarrow.parquet as pq
 
 from diffabs.core import files
 from diffabs.core.summary import Summary
+from diffabs.core.types import JsonObject, Matrix, PyTree, Scalar
 from diffabs.sweep import seal
 from diffabs.sweep.engines import describe_wrong_end, has_wrong_end, is_accepted
 from diffabs.sweep.manifest import Seals, read_manifest
@@ -50,7 +50,7 @@ class Results:
             raise SweepError(f"{self.folder} has no finished chunk yet; --resume continues it")
 
     @property
-    def study(self) -> dict[str, Any]:
+    def study(self) -> JsonObject:
         """Table of the study, as JSON values."""
         return self.manifest["study"]
 
@@ -161,20 +161,20 @@ class Results:
         """
         return self.table([name]).column(name).to_numpy()
 
-    def pandas(self) -> Any:
+    def pandas(self) -> PyTree:
         """Return a pandas.DataFrame indexed by sample, with a column `failed`, and units in `attrs["units"]`."""
         frame = self.table().to_pandas().set_index("sample").assign(failed=self.failed_samples())
         frame.attrs["units"] = self.units
         return frame
 
-    def polars(self) -> Any:
+    def polars(self) -> Scalar:
         """Return a polars.DataFrame with a column `failed`."""
         import polars  # pyright: ignore[reportMissingImports]  # optional
 
-        frame: Any = polars.from_arrow(self.table())
+        frame: Matrix = polars.from_arrow(self.table())
         return frame.with_columns(polars.Series("failed", self.failed_samples()))
 
-    def xarray(self) -> Any:
+    def xarray(self) -> PyTree:
         """Return an xarray.Dataset over the dimension `sample`, with `units` at its variables."""
         data = self.pandas().to_xarray()
         for name, unit in self.units.items():

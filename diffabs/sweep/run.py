@@ -3,7 +3,7 @@
 import contextlib
 import pathlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from diffabs.core import provenance, stopwatch
+from diffabs.core.types import PyTree, Scalar, Table
 from diffabs.sweep.engines import Engine, Local
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.results import Results
@@ -58,7 +59,7 @@ def sweep(
     on: Engine | None = None,
     progress: Callable[[SweepProgress], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
-    source: Mapping[str, Any] | None = None,
+    source: Table | None = None,
 ) -> Results:
     """Compute every chunk of a study that the folder lacks, and return the results.
 
@@ -95,9 +96,7 @@ def sweep(
 
 
 @contextlib.contextmanager
-def _begin_sweep(
-    store: Store, study: Study, resume: bool, source: Mapping[str, Any]
-) -> Iterator[tuple[list[int], list[int]]]:
+def _begin_sweep(store: Store, study: Study, resume: bool, source: Table) -> Iterator[tuple[list[int], list[int]]]:
     """Yield the missing chunks, and the damaged ones among them.
 
     The first process holds the folder's lock until every process is done.
@@ -124,7 +123,7 @@ def _begin_sweep(
         _synchronise(multihost_utils.sync_global_devices, "chunks")
 
 
-def _synchronise(meet: Callable[[Any], Any], what: Any) -> Any:
+def _synchronise(meet: Callable[[PyTree], PyTree], what: Any) -> Scalar:
     """Meet all other processes and return the result; a single process returns `what`.
 
     Raises:

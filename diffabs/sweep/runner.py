@@ -12,7 +12,7 @@ the last block of each structure.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from diffabs.core.types import Bool, JsonObject, Params, Part, PyTree
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch, run_batch
@@ -50,12 +51,12 @@ class _Block(NamedTuple):
 class Runner:
     """A runner of a study's chunks on devices of this process; it compiles once for each structure of the loop."""
 
-    def __init__(self, study: Study, devices: Sequence[Any] | None = None):
+    def __init__(self, study: Study, devices: Sequence[PyTree] | None = None):
         """Set the `study` and the `devices`; by default all local ones."""
         self.study = study
         self.devices = list(devices or jax.local_devices())
         self.size = study.chunk if not study.parts else -(-study.chunk // BLOCKS_PER_CHUNK)
-        self._programs: dict[tuple[str, ...], Any] = {}
+        self._programs: dict[tuple[str, ...], PyTree] = {}
         self._pool = ThreadPoolExecutor(len(self.devices))
 
     def run(self, chunks: Sequence[int]) -> list[Columns]:
@@ -103,7 +104,7 @@ class Runner:
             lambda block, device: self._run_on_device(loop, program, block, device), blocks, self.devices
         )
 
-    def _run_on_device(self, loop: Any, program: Any, block: _Block, device: Any) -> Columns:
+    def _run_on_device(self, loop: Part, program: Any, block: _Block, device: Any) -> Columns:
         with jax.default_device(device):
             asked = batch_admissibility(loop, block.values, self.study.solver)
         with precision(self.study.dtype), _convert_compiler_errors():
@@ -111,7 +112,7 @@ class Runner:
             found = jax.device_get(program(*jax.device_put(given, device)))
         return found | {"refused": asked.texts.astype(object)}
 
-    def _arguments(self, block: _Block, accepted: Any) -> tuple[Any, ...]:
+    def _arguments(self, block: _Block, accepted: Bool) -> tuple[PyTree, ...]:
         values = {path: column.astype(self.study.dtype) for path, column in block.values.items()}
         return values, block.samples.astype(np.uint32), accepted
 
@@ -160,7 +161,7 @@ def find_study_objection(study: Study) -> str | None:
     return None
 
 
-def _measure_block(study: Study, loop: Any, values: Mapping[str, Any], samples: Any, accepted: Any) -> dict[str, Any]:
+def _measure_block(study: Study, loop: Part, values: Params, samples: PyTree, accepted: Bool) -> JsonObject:
     """Return metrics and flags of a block; only the accepted samples run."""
     keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples)
     given = (loop, Batch(values, keys), study.solver, study.objectives)

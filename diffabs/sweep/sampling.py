@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.types import PyTree, Table
 from diffabs.core.values import (
     check_sound,
     format_table,
@@ -49,7 +50,7 @@ class SamplingDesign(Protocol):
         """
         ...
 
-    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+    def count(self, variables: Table, samples: int | None) -> int:
         """Return the number of samples for these `variables`; `samples` is the wanted number, or None.
 
         Raises:
@@ -57,7 +58,7 @@ class SamplingDesign(Protocol):
         """
         ...
 
-    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+    def problems(self, name: str, variables: Table | None = None) -> Iterator[str]:
         """Yield an error for each field that is wrong, alone or with these variables."""
         del name, variables
         yield from ()
@@ -75,14 +76,14 @@ class Random(SamplingDesign):
         # 32 + 20 bits and half of the last one: never 0 or 1, and exact in float64.
         return (high * 2.0**20 + (low >> 12) + 0.5) * 2.0**-52
 
-    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+    def count(self, variables: Table, samples: int | None) -> int:
         """Return `samples`, for any `variables`."""
         del variables
         return _check_samples(samples)
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
-def _random_words(seed: Any, start: Any, count: int, dimension: int) -> jax.Array:
+def _random_words(seed: Any, start: PyTree, count: int, dimension: int) -> jax.Array:
     key = jax.random.key(seed, impl="threefry2x32")
     numbers = start + jax.lax.iota(jnp.uint32, count)
     return jax.vmap(lambda i: jax.random.bits(jax.random.fold_in(key, i), (dimension, 2), jnp.uint32))(numbers)
@@ -107,12 +108,12 @@ class Sobol(SamplingDesign):
             points.append(_sobol_points(seed, r, first, last, dimension))
         return np.concatenate(points)
 
-    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+    def count(self, variables: Table, samples: int | None) -> int:
         """Return `samples` if it is a multiple of the replicates, for any `variables`."""
         del variables
         return _check_multiple(_check_samples(samples), self.replicates, "the number of replicates")
 
-    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+    def problems(self, name: str, variables: Table | None = None) -> Iterator[str]:
         if self.replicates < 1:
             yield f"{name}: replicates = {self.replicates} is not positive"
 
@@ -139,7 +140,7 @@ class LatinHypercube(SamplingDesign):
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         return _hypercube_points(seed, samples, dimension)[start:stop]
 
-    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+    def count(self, variables: Table, samples: int | None) -> int:
         """Return `samples` if it is at most MAX_HYPERCUBE_SAMPLES, for any `variables`."""
         del variables
         if (count := _check_samples(samples)) > MAX_HYPERCUBE_SAMPLES:
@@ -159,7 +160,7 @@ def _hypercube_points(seed: int, samples: int, dimension: int) -> np.ndarray:
     return points
 
 
-def _read_level(given: Any, where: str) -> Any:
+def _read_level(given: PyTree, where: str) -> Any:
     return (
         list_reader(read_any_number)(given, where)
         if isinstance(given, list | tuple)
@@ -167,7 +168,7 @@ def _read_level(given: Any, where: str) -> Any:
     )
 
 
-def _read_levels(given: Any, where: str) -> Any:
+def _read_levels(given: PyTree, where: str) -> Any:
     return (
         table_reader(_read_level)(given, where)
         if isinstance(given, Mapping)
@@ -187,7 +188,7 @@ class Grid(SamplingDesign):
 
     levels: int | Mapping[str, int | tuple[float, ...]] = table_field(_read_levels)
 
-    def over(self, variables: Mapping[str, Any]) -> "Grid":
+    def over(self, variables: Table) -> "Grid":
         """Return the grid with the levels u of each of these `variables`, in their order."""
         return Grid({name: tuple(map(float, self._axis(name, item))) for name, item in variables.items()})
 
@@ -207,7 +208,7 @@ class Grid(SamplingDesign):
         places = np.unravel_index(np.arange(start, stop), [len(axis) for axis in axes])
         return np.stack([axis[place] for axis, place in zip(axes, places, strict=True)], 1)
 
-    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+    def count(self, variables: Table, samples: int | None) -> int:
         """Return the number of points of the grid over `variables`.
 
         Raises:
@@ -216,7 +217,7 @@ class Grid(SamplingDesign):
         sizes = [len(self._axis(name, item)) for name, item in variables.items()]
         return _check_exact_count(math.prod(sizes), samples, f"the grid {' x '.join(map(str, sizes))}")
 
-    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+    def problems(self, name: str, variables: Table | None = None) -> Iterator[str]:
         given = {"levels": self.levels} if isinstance(self.levels, int) else self.levels
         for path, levels in given.items():
             if isinstance(levels, int) and levels < 2:
@@ -241,7 +242,7 @@ class Corners(SamplingDesign):
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         return Grid(2).unit(seed, start, stop, dimension, samples)
 
-    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+    def count(self, variables: Table, samples: int | None) -> int:
         """Return the number of corners, 2^d for d `variables`.
 
         Raises:
@@ -249,7 +250,7 @@ class Corners(SamplingDesign):
         """
         return _check_exact_count(2 ** len(variables), samples, "the corners")
 
-    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+    def problems(self, name: str, variables: Table | None = None) -> Iterator[str]:
         for path, variable in (variables or {}).items():
             if not hasattr(variable, "middles"):
                 yield from _support_problems(name, path, variable, "corners")
@@ -275,7 +276,7 @@ class Saltelli(SamplingDesign):
         from_b = (which[:, None] - 2 == np.arange(dimension)) | (which[:, None] == 1)
         return np.where(from_b, b, a)
 
-    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+    def count(self, variables: Table, samples: int | None) -> int:
         """Return `samples` if it is a multiple of the number of `variables` plus 2."""
         return _check_multiple(_check_samples(samples), len(variables) + 2, "the number of variables plus 2")
 
@@ -283,7 +284,7 @@ class Saltelli(SamplingDesign):
 DESIGN_TYPES = {kebab_case(cls.__name__): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
 
 
-def read_sampling_design(given: Any, where: str) -> SamplingDesign:
+def read_sampling_design(given: PyTree, where: str) -> SamplingDesign:
     """Return the design of a table, or of the bare name of a type.
 
     Args:

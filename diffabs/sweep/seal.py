@@ -12,12 +12,13 @@ import json
 import pathlib
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from diffabs.core.types import Scalar
 from diffabs.core.values import ScenarioError
 
 CHUNK_NAME_PATTERN = re.compile(r"part-(\d{8,})-([0-9a-f]{16})\.parquet")
@@ -55,7 +56,7 @@ class Seal(NamedTuple):
         return {f"diffabs.{name}".encode(): value.encode() for name, value in told.items()}
 
 
-def json_digest(value: Any) -> str:
+def json_digest(value: Scalar) -> str:
     """Return the SHA-256 of JSON values.
 
     The order of names counts, because it is the order of a design's columns.

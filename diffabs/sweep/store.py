@@ -10,12 +10,13 @@ contents. There is no index to keep, and nothing to repair after a kill. One pro
 import contextlib
 import json
 import pathlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import filelock
 
 from diffabs.core import files
+from diffabs.core.types import JsonObject, PyTree, Scalar, Table
 from diffabs.sweep import seal
 from diffabs.sweep.manifest import MANIFEST_NAME as MANIFEST_NAME
 from diffabs.sweep.manifest import Seals, encode_manifest
@@ -55,7 +56,7 @@ class Store:
         finally:
             lock.release()
 
-    def begin(self, manifest: Mapping[str, Any], *, resume: bool) -> None:
+    def begin(self, manifest: Table, *, resume: bool) -> None:
         """Write the `manifest`, or compare it with the existing one if `resume` is set.
 
         A sweep without a finished chunk (because its scheduler did not answer, for example) starts again from the
@@ -82,7 +83,7 @@ class Store:
             raise SweepError(f"{self.folder} holds another sweep: {'; '.join(found[:3])}{more}")
         self.chunks.mkdir(exist_ok=True)
 
-    def _begin_new(self, manifest: Mapping[str, Any]) -> None:
+    def _begin_new(self, manifest: Table) -> None:
         if self.chunks.is_dir() and any(self.chunks.iterdir()):
             raise SweepError(f"{self.folder} has chunks but no {MANIFEST_NAME}; it cannot be continued")
         names = (path.name for path in self.folder.iterdir())
@@ -135,7 +136,7 @@ def list_chunks(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathli
     return named, strays
 
 
-def check_owner(folder: pathlib.Path, manifest: Mapping[str, Any], sample: int) -> None:
+def check_owner(folder: pathlib.Path, manifest: Table, sample: int) -> None:
     """Check that a chunk belongs to the manifest: the chunk with this sample, or the first one if that is missing.
 
     Args:
@@ -171,12 +172,12 @@ def read_chunk(path: pathlib.Path) -> bytes:
         raise SweepError(f"{path} cannot be read: {error.strerror}; move it away") from None
 
 
-def describe_differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
+def describe_differences(there: Any, wanted: PyTree, path: str = "") -> Iterator[str]:
     """Yield one line for each difference between two documents.
 
     Args:
-        there: Document that exists.
-        wanted: Document to compare with.
+        there: JsonObject that exists.
+        wanted: JsonObject to compare with.
         path: Path of both documents, for messages.
     """
     if isinstance(there, dict) and isinstance(wanted, dict):
@@ -187,11 +188,11 @@ def describe_differences(there: Any, wanted: Any, path: str = "") -> Iterator[st
         yield f"{path} is {_abbreviate(there)} there, {_abbreviate(wanted)} here"
 
 
-def _decisive_entries(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def _decisive_entries(manifest: Table) -> JsonObject:
     """Return the entries that decide the results: all except the notes on commit, source and units."""
     return {key: value for key, value in manifest.items() if key not in ("commit", "source", "units")}
 
 
-def _abbreviate(value: Any) -> str:
+def _abbreviate(value: Scalar) -> str:
     text = json.dumps(value)
     return text if len(text) <= MAX_VALUE_CHARACTERS else f"{text[: MAX_VALUE_CHARACTERS - 3]}..."

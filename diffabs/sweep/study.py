@@ -16,6 +16,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, parameters, replace
+from diffabs.core.types import Int, JsonObject, Params, Table
 from diffabs.core.units import resolve_unit, units_of
 from diffabs.core.validity import find_problems
 from diffabs.core.values import as_plain, unknown_name_error
@@ -63,7 +64,7 @@ class Study:
     chunk: int = 4096
     dtype: str = "float64"
     engine: str = "xla"
-    parts: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    parts: Mapping[str, Table] = dataclasses.field(default_factory=dict)
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -127,17 +128,17 @@ class Study:
         with precision("float64"):
             return replace(self.variant(values), numeric_values(values)), noise_key(self.seed, i)
 
-    def variant(self, values: Mapping[str, Any]) -> Loop:
+    def variant(self, values: Params) -> Loop:
         """Return the loop with the parts whose names are in `values`."""
         return replace(self.loop, {path: self.parts[path][str(values[path])] for path in self.parts})
 
-    def table(self) -> dict[str, Any]:
+    def table(self) -> JsonObject:
         """Return everything that decides the results, as JSON values.
 
         Raises:
             NoCompiler: The engine is a kernel, and there is no compiler.
         """
-        own: dict[str, Any] = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
+        own: JsonObject = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
         own |= {"failures": self.failure_bounds, "success": self.success}
         if self.engine != "xla":
             own |= {"engine": {"name": self.engine, **launch.describe_kernel_build()}}
@@ -196,7 +197,7 @@ class Study:
                 yield str(error)
 
 
-def _part_problems(path: str, distribution: Any, choices: Mapping[str, Any], loop: Loop) -> Iterator[str]:
+def _part_problems(path: str, distribution: Any, choices: Table, loop: Loop) -> Iterator[str]:
     try:
         get(loop, path)
     except KeyError as error:
@@ -211,7 +212,7 @@ def _part_problems(path: str, distribution: Any, choices: Mapping[str, Any], loo
         yield from find_problems(part, f"{path} {name}: ")
 
 
-def numeric_values(values: Mapping[str, Any]) -> dict[str, Any]:
+def numeric_values(values: Params) -> JsonObject:
     """Return the values that are numbers, and not names.
 
     Args:
@@ -231,7 +232,7 @@ def precision(dtype: str) -> Iterator[None]:
         yield
 
 
-def noise_key(seed: Any, i: Any) -> jax.Array:
+def noise_key(seed: Any, i: Int) -> jax.Array:
     """Return the random key for the sensors of sample i.
 
     Args:

@@ -8,6 +8,7 @@ import numpy as np
 
 from diffabs.core import values
 from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import AnyArray, JsonObject, Matrix, Params, PyTree, Table
 from diffabs.core.values import (
     as_plain,
     check_sound,
@@ -41,12 +42,10 @@ class Correlation:
     """
 
     paths: tuple[str, ...]
-    matrix: Any = table_field(list_reader(list_reader(read_any_number)))
+    matrix: Matrix = table_field(list_reader(list_reader(read_any_number)))
 
     @staticmethod
-    def from_covariance(
-        paths: tuple[str, ...], covariance: Any, variables: Mapping[str, Any] | None = None
-    ) -> "Correlation":
+    def from_covariance(paths: tuple[str, ...], covariance: AnyArray, variables: Table | None = None) -> "Correlation":
         """Return the correlation of the variables `paths` with a `covariance` matrix.
 
         Raises:
@@ -73,7 +72,7 @@ class Correlation:
             for i, path in enumerate(self.paths)
         }
 
-    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+    def problems(self, name: str, variables: Table | None = None) -> Iterator[str]:
         """Yield an error for each field that is wrong, alone or with these variables."""
         for path in dict.fromkeys(self.paths):
             if self.paths.count(path) > 1:
@@ -101,7 +100,7 @@ class Correlation:
             yield f"{name}: matrix is not positive definite: {low}"
 
 
-def read_correlation(given: Any, where: str) -> Correlation:
+def read_correlation(given: PyTree, where: str) -> Correlation:
     """Return the correlation of a table.
 
     Args:
@@ -114,7 +113,7 @@ def read_correlation(given: Any, where: str) -> Correlation:
     return check_sound(values.read_table(Correlation, given, where), where)
 
 
-def _read_variable(given: Any, where: str) -> Any:
+def _read_variable(given: PyTree, where: str) -> Any:
     return distributions.read_distribution(given, where, distributions.DISTRIBUTION_TYPES | {"rows": Rows})
 
 
@@ -178,7 +177,7 @@ class Space:
         }
         return _flatten_rows(drawn)
 
-    def normal(self, z: Any) -> dict[str, np.ndarray]:
+    def normal(self, z: AnyArray) -> dict[str, np.ndarray]:
         """Return the values at independent standard normal coordinates z (n, dimension) by path, each of shape (n,).
 
         They are correct to their last digits in both tails.
@@ -217,14 +216,14 @@ class Space:
             elif name in specs and (line := describe_out_of_range(item, specs[name], prefix + name)):
                 yield line
 
-    def table(self) -> dict[str, Any]:
+    def table(self) -> JsonObject:
         """Return the space as TOML values, the input of `read_space`."""
         correlation = {"correlation": plain_fields(self.correlation)} if self.correlation else {}
         variables = {name: as_plain(item, brief=True) for name, item in self.variables.items()}
         return {"variables": variables, **correlation, "design": as_plain(self.design, brief=True)}
 
 
-def read_space(given: Any, where: str) -> Space:
+def read_space(given: PyTree, where: str) -> Space:
     """Return the space of a table with `variables`, and optionally `correlation` and `design`.
 
     Args:
@@ -241,7 +240,7 @@ def _variable_paths(name: str, item: Any) -> tuple[str, ...]:
     return tuple(item.columns) if isinstance(item, Rows) else (name,)
 
 
-def _flatten_rows(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _flatten_rows(values: Params) -> dict[str, np.ndarray]:
     """Return the values with `Rows` replaced by their columns."""
     flat = {}
     for name, drawn in values.items():

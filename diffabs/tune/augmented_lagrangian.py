@@ -12,7 +12,6 @@ Source: J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +19,7 @@ import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
+from diffabs.core.types import PyTree
 from diffabs.simulate.engine import describe_engine
 from diffabs.tune.descent import Descent, DescentPoint, DescentState, Optimiser, lbfgs, slice_start
 from diffabs.tune.problem import Multipliers, ObjectiveEvaluation, Problem
@@ -189,7 +189,7 @@ class AugmentedLagrangianSearch:
             engine=describe_engine(self.problem.engine),
         )
 
-    def _values(self, z: np.ndarray) -> dict[str, Any]:
+    def _values(self, z: np.ndarray) -> dict[str, PyTree]:
         return {path: np.asarray(value) for path, value in self.problem.space.values(z).items()}
 
 

@@ -6,12 +6,12 @@ there is no tolerance.
 """
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop
+from diffabs.core.types import Params, PyTree, Scalar
 from diffabs.design.interior.differentiable import certified_decay
 from diffabs.design.polytopes import Polytope
 from diffabs.design.state_feedback import feedback_gain
@@ -22,7 +22,7 @@ MIN_POLE_MAGNITUDE = 1e-9  # |z| below which a discrete pole decays within one p
 class Constraint(Protocol):
     """A requirement on a loop and on the metrics of its runs."""
 
-    def excess(self, loop: Loop, metrics: Mapping[str, Any]) -> Any:
+    def excess(self, loop: Loop, metrics: Params) -> PyTree:
         """Return the excesses (k,) of `loop`, <= 0 where the constraint holds; each of `metrics` has shape (runs,)."""
         ...
 
@@ -37,9 +37,9 @@ class AtMost:
     """
 
     metric: str
-    bound: Any
+    bound: Scalar
 
-    def excess(self, loop: Loop, metrics: Mapping[str, Any]) -> Any:
+    def excess(self, loop: Loop, metrics: Params) -> PyTree:
         """Return (metric - bound)/|bound| from `metrics`, shape (runs,); `loop` is not used."""
         del loop
         bound = jnp.asarray(self.bound)
@@ -66,18 +66,18 @@ class Poles:
     decay: float = 0.0
     damping: float = 0.0
 
-    def excess(self, loop: Loop, metrics: Mapping[str, Any]) -> Any:
+    def excess(self, loop: Loop, metrics: Params) -> PyTree:
         """Return (decay + Re s)/decay and damping + Re s/|s| of each vertex and pole of `loop`; `metrics` is unused."""
         del metrics
         real, ratios = self._modes(loop)
         rates = (self.decay + real) / (self.decay or 1.0)
         return jnp.concatenate([rates.ravel(), (self.damping - ratios).ravel() if self.damping else jnp.zeros(0)])
 
-    def least_damping(self, loop: Loop) -> Any:
+    def least_damping(self, loop: Loop) -> PyTree:
         """Return the least damping ratio -Re s/|s| of `loop` over the poles s of all vertices."""
         return jnp.min(self._modes(loop)[1])
 
-    def _modes(self, loop: Loop) -> tuple[Any, Any]:
+    def _modes(self, loop: Loop) -> tuple[PyTree, PyTree]:
         """Return Re s and -Re s/|s| of the poles, each of shape (vertices, n)."""
         modes = jnp.linalg.eigvals(_closed_loop_matrices(self.system, loop))
         if self.system.period is not None:
@@ -104,7 +104,7 @@ class CertifiedDecay:
     system: Polytope
     decay: float
 
-    def excess(self, loop: Loop, metrics: Mapping[str, Any]) -> Any:
+    def excess(self, loop: Loop, metrics: Params) -> PyTree:
         """Return (decay - proved decay)/max(|decay|, 1) of `loop`, shape (1,); `metrics` is not used."""
         del metrics
         system = self.system
@@ -112,7 +112,7 @@ class CertifiedDecay:
         return ((self.decay - proved) / max(abs(self.decay), 1.0))[None]
 
 
-def _closed_loop_matrices(system: Polytope, loop: Loop) -> Any:
+def _closed_loop_matrices(system: Polytope, loop: Loop) -> PyTree:
     """Return A + B K of every vertex, shape (vertices, n, n), with the gain K of the loop's controller."""
     gain = feedback_gain(loop, system.states)
     return jnp.asarray(system.A) + jnp.asarray(system.B) @ gain[None, :]

@@ -21,6 +21,7 @@ import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
+from diffabs.core.types import Matrix, PyTree, Scalar
 from diffabs.tune.problem import LossEvaluation, Multipliers
 
 ARMIJO_FRACTION, WOLFE_FRACTION = 1e-4, 0.9
@@ -80,7 +81,7 @@ class DescentState:
     t: float = 1.0
     low: float = 0.0  # greatest t known to be too short; `better` is the point there
     high: float = np.inf  # least t known to be too long
-    better: tuple[np.ndarray, Any] | None = None
+    better: tuple[np.ndarray, PyTree] | None = None
     trials: int = 0
     idle: int = 0
     jumps: int = 0
@@ -151,7 +152,7 @@ class Descent:
     def __init__(
         self,
         evaluate: Evaluate,
-        loss: Callable[[Any, Any], Any],
+        loss: Callable[[PyTree, PyTree], PyTree],
         steady: Callable[[np.ndarray], np.ndarray],
         optimiser: Optimiser,
         stopping: Stopping,
@@ -174,7 +175,7 @@ class Descent:
         self.searches = optimiser.searches
         self._init = jax.jit(jax.vmap(optimiser.transformation.init))
 
-        def update(g: Any, state: Any, z: Any, value: Any, m: Any) -> Any:
+        def update(g: Matrix, state: PyTree, z: Matrix, value: Scalar, m: Scalar) -> Any:
             more = {"value": value, "grad": g, "value_fn": lambda z: loss(z, m)}
             return optimiser.transformation.update(g, state, z, **more)
 
@@ -334,12 +335,12 @@ def _is_descent_direction(update: np.ndarray, gradient: np.ndarray) -> bool:
     return bool(np.isfinite(size) and update @ gradient < -1e-10 * size)
 
 
-def _select_by_start(which: np.ndarray, a: Any, b: Any) -> Any:
+def _select_by_start(which: np.ndarray, a: Scalar, b: Scalar) -> PyTree:
     """Return the leaves of `a` for the starts in `which` and the leaves of `b` for the others."""
     return jax.tree.map(lambda x, y: jnp.where(which.reshape(-1, *[1] * (jnp.ndim(x) - 1)), x, y), a, b)
 
 
-def slice_start(tree: Any, i: int) -> Any:
+def slice_start(tree: PyTree, i: int) -> PyTree:
     """Return the leaves of one start.
 
     Args:

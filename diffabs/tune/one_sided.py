@@ -1,7 +1,7 @@
 """Warnings for points with a one-sided derivative by a parameter (listed in `docs/gradients.md`)."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -12,6 +12,7 @@ from diffabs.actuators import Delay
 from diffabs.controllers import ConstantInput, NoFeedforward, Relay, SampledOnGrid, SlidingMode
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import as_arrays, replace
+from diffabs.core.types import Params, Part, PyTree
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.solution import FixedStep, Solver
 from diffabs.tune.problem import build_subject_loop
@@ -20,7 +21,7 @@ EQUAL_ROUNDING_STEPS = 64.0  # tolerance of equality, in units of the relative p
 ADVICE = "a search may end there without a minimum: start it from other values, or hold one of these parameters"
 
 
-def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, Any, Any]]:
+def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, PyTree, PyTree]]:
     """Yield the name and the two compared numbers of each condition under which a derivative of `loop` is one-sided.
 
     The derivative is one-sided where the two numbers are equal. The name depends on the parts of the loop alone, so
@@ -31,7 +32,7 @@ def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, Any,
         solver: Solver of the runs; its step takes part in some conditions.
     """
     sampled: Any = loop.controller
-    inner: Any = getattr(sampled, "controller", sampled)
+    inner: Part = getattr(sampled, "controller", sampled)
     prefix = "controller." if inner is sampled else "controller.controller."
     if inner is not sampled and hasattr(sampled, "delay"):
         period = next(name for name in ("period", "sampling_period") if hasattr(sampled, name))
@@ -58,7 +59,7 @@ def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, Any,
         yield "the relay starts on its target, where its first state jumps", signals.measured[0], signals.sample.target
 
 
-def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, where: str) -> None:
+def warn(subject: Part, values: Params, batch: Batch, solver: Solver, where: str) -> None:
     """Warn of parameters whose derivative is one-sided in some run of the batch.
 
     Args:
@@ -69,7 +70,7 @@ def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, 
         where: First words of the warning.
     """
 
-    def compare(values: Mapping[str, Any]) -> Any:
+    def compare(values: Params) -> PyTree:
         """Return both numbers of each pair in each run, shape (2, runs, pairs)."""
         loop = as_arrays(build_subject_loop(replace(subject, values)))
         both = batch.each(loop, lambda loop, _: [jnp.stack(two) for _, *two in one_sided_candidates(loop, solver)])
@@ -94,7 +95,7 @@ def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, 
             warnings.warn(f"{where}: {name}{runs}, so {side}; {ADVICE}", stacklevel=3)
 
 
-def _actuators(actuator: Any) -> Iterator[tuple[str, Any]]:
+def _actuators(actuator: Part) -> Iterator[tuple[str, PyTree]]:
     """Yield the path and the part of an actuator, or of each actuator in a series."""
     series = getattr(actuator, "blocks", None)
     if isinstance(series, tuple):

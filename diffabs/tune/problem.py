@@ -24,6 +24,7 @@ from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes
+from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar, Vector
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.batch import Batch, run_batch
@@ -49,27 +50,27 @@ class ObjectiveEvaluation(NamedTuple):
 
     objective: Any
     excess: Any
-    diverged: Any
-    metrics: dict[str, Any]
+    diverged: Bool
+    metrics: dict[str, PyTree]
 
 
 class LossEvaluation(NamedTuple):
     """The loss, its gradient (p,) and the evaluation of the objective, with a leading axis of starts if batched."""
 
-    loss: Any
-    gradient: Any
+    loss: Scalar
+    gradient: Vector
     evaluation: ObjectiveEvaluation
 
 
 class Multipliers(NamedTuple):
     """The multipliers (k,), penalty and margin of the augmented Lagrangian; a margin of None means zero."""
 
-    values: Any
-    penalty: Any
-    margin: Any = None
+    values: PyTree
+    penalty: Scalar
+    margin: Scalar = None
 
 
-def build_subject_loop(subject: Any) -> Loop:
+def build_subject_loop(subject: Part) -> Loop:
     """Return the closed loop of `subject`: the subject itself, or the result of its method `closed()`.
 
     Args:
@@ -96,7 +97,7 @@ class Problem:
         engine: Engine of the runs, "xla" or "kernel".
     """
 
-    subject: Any
+    subject: Part
     space: FreeSpace
     solver: Solver
     measured: Mapping[str, Objective]
@@ -107,7 +108,7 @@ class Problem:
     mode: DerivativeMode
     engine: str = "xla"
 
-    def runs(self, z: Any) -> Run:
+    def runs(self, z: AnyArray) -> Run:
         """Return all runs at `z`, without trajectories."""
         together = True if self.engine == "xla" else None
         loop = build_subject_loop(self.space.at(self.subject, z))
@@ -151,7 +152,7 @@ class Problem:
             return str(EngineError.of(error))
         return None
 
-    def evaluate(self, z: Any) -> ObjectiveEvaluation:
+    def evaluate(self, z: AnyArray) -> ObjectiveEvaluation:
         """Return objective, excesses, number of diverged runs and metrics at `z`."""
         runs = self.runs(z)
         each = sum(weight * runs.metrics[name] for name, weight in self.weights.items())
@@ -171,21 +172,21 @@ class Problem:
             lambda metrics: self._excess(build_subject_loop(self.space.at(self.subject, z)), metrics), lanes
         ).size
 
-    def _excess(self, loop: Loop, metrics: dict[str, Any]) -> Any:
+    def _excess(self, loop: Loop, metrics: dict[str, PyTree]) -> Any:
         excess = [jnp.ravel(c.excess(loop, metrics)) for c in self.constraints]
         return jnp.concatenate(excess) if excess else jnp.zeros(0)
 
-    def loss(self, scale: Any) -> Callable[[Any, Multipliers], tuple[Any, tuple[Any, ObjectiveEvaluation]]]:
+    def loss(self, scale: Scalar) -> Callable[[PyTree, Multipliers], tuple[PyTree, tuple[PyTree, ObjectiveEvaluation]]]:
         """Return the function (z, multipliers) -> (L, (L, evaluation)) for an objective divided by `scale`."""
 
-        def loss(z: Any, m: Multipliers) -> tuple[Any, tuple[Any, ObjectiveEvaluation]]:
+        def loss(z: AnyArray, m: Multipliers) -> tuple[PyTree, tuple[PyTree, ObjectiveEvaluation]]:
             seen = self.evaluate(z)
             value = seen.objective / scale + _penalty(seen.excess, m)
             return value, (value, seen)
 
         return loss
 
-    def evaluator(self, scale: float) -> Callable[[Any, Multipliers], LossEvaluation]:
+    def evaluator(self, scale: float) -> Callable[[PyTree, Multipliers], LossEvaluation]:
         """Return the compiled function (z, multipliers) -> LossEvaluation for an objective divided by `scale`.
 
         z has shape (starts, p), and the multipliers have a leading axis of starts. One call evaluates all starts, and
@@ -197,14 +198,14 @@ class Problem:
     def _evaluate(self) -> Any:
         derivative = jax.jacfwd if self.mode is DerivativeMode.FORWARD else jax.grad
 
-        def evaluate(z: Any, m: Multipliers, scale: Any) -> LossEvaluation:
+        def evaluate(z: AnyArray, m: Multipliers, scale: Scalar) -> LossEvaluation:
             gradient, (value, seen) = derivative(self.loss(scale), has_aux=True)(z, m)
             return LossEvaluation(value, gradient, seen)
 
         options = SAME_RESULT_OPTIONS if self.batch.size <= MAX_QUICK_COMPILE_RUNS else None
         return jax.jit(jax.vmap(evaluate, in_axes=(0, 0, None)), compiler_options=options)
 
-    def objective_evaluator(self) -> Callable[[Any], ObjectiveEvaluation]:
+    def objective_evaluator(self) -> Callable[[PyTree], ObjectiveEvaluation]:
         """Return the compiled function z (starts, p) -> ObjectiveEvaluation, without a gradient."""
         return jax.jit(jax.vmap(self.evaluate))
 
@@ -219,7 +220,7 @@ class Problem:
         compiled once.
         """
 
-        def loops(z: Any) -> Loop:
+        def loops(z: AnyArray) -> Loop:
             return self.batch.each(
                 canonical_dtypes(build_subject_loop(self.space.at(self.subject, z))),
                 lambda loop, key: canonical_dtypes(loop),
@@ -244,7 +245,7 @@ def choose_gradient_mode(space: FreeSpace) -> DerivativeMode:
     return DerivativeMode.FORWARD if space.size <= MAX_FORWARD_PARAMETERS else DerivativeMode.REVERSE
 
 
-def _penalty(excess: Any, m: Multipliers) -> Any:
+def _penalty(excess: Any, m: Multipliers) -> Scalar:
     """Return the sum over the excesses of [max(0, m + c (g + d))^2 - m^2]/(2 c)."""
     aimed = excess if m.margin is None else excess + m.margin
     return jnp.sum(jnp.maximum(0.0, m.values + m.penalty * aimed) ** 2 - m.values**2) / (2 * m.penalty)

@@ -1,13 +1,14 @@
 """Settings and results of a tuning search."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary
+from diffabs.core.types import Part, PyTree
 from diffabs.tune.descent import DescentPoint, Stopping
 from diffabs.tune.problem import DerivativeMode, build_subject_loop
 
@@ -53,7 +54,7 @@ class TuningProgress(NamedTuple):
 class StartResult(NamedTuple):
     """The result from one start: parameters by path, objective J, greatest excess, reason for the end, and history."""
 
-    values: dict[str, Any]
+    values: dict[str, PyTree]
     objective: float
     violation: float
     reason: Reason
@@ -79,11 +80,11 @@ class Tuned:
         engine: Engine of the runs, with compiler and flags if it is a kernel.
     """
 
-    part: Any
-    values: dict[str, Any]
+    part: Part
+    values: dict[str, PyTree]
     objective: tuple[float, float]
     violation: tuple[float, float]
-    metrics: tuple[dict[str, Any], dict[str, Any]]
+    metrics: tuple[dict[str, PyTree], dict[str, PyTree]]
     met: bool
     reason: Reason
     history: list[DescentPoint]
@@ -94,7 +95,7 @@ class Tuned:
 
     def table(self) -> Summary:
         """Return a table of the free parameters and of mean metrics and objective before and after."""
-        rows: list[tuple[Any, ...]] = [(name, "", value) for name, value in self.values.items()]
+        rows: list[tuple[PyTree, ...]] = [(name, "", value) for name, value in self.values.items()]
         rows += [(f"mean {name}", *(_finite_mean(one[name]) for one in self.metrics)) for name in self.metrics[0]]
         rows.append(("objective", *self.objective))
         lanes = np.size(next(iter(self.metrics[0].values()), ()))
@@ -111,7 +112,7 @@ class Tuned:
         return self.table()._repr_html_()
 
     @property
-    def loop(self) -> Any:
+    def loop(self) -> PyTree:
         """Tuned closed loop."""
         return build_subject_loop(self.part)
 
@@ -126,7 +127,7 @@ class Tuned:
         return self.history[-1].evaluations
 
 
-def _finite_mean(values: Any) -> float:
+def _finite_mean(values: PyTree) -> float:
     """Return the mean over the finite values, NaN if there are none."""
     good = np.asarray(values)[np.isfinite(values)]
     return float(good.mean()) if good.size else float("nan")

@@ -1,7 +1,7 @@
 """Aggregates: maps from one number for each run of a batch to the one number that a search minimises."""
 
 import math
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ class Aggregate(Protocol):
 class Mean:
     """The mean over the runs."""
 
-    def __call__(self, values: Vector) -> Any:
+    def __call__(self, values: Vector) -> Scalar:
         """Return the mean of `values`."""
         return jnp.mean(values)
 
@@ -38,7 +38,7 @@ class SmoothWorst:
 
     softness: Scalar = param(default=0.02, unit="1", above=0.0)
 
-    def __call__(self, values: Vector) -> Any:
+    def __call__(self, values: Vector) -> Scalar:
         """Return the smooth maximum of `values`."""
         # The bound keeps values / w finite if every value is zero.
         w = self.softness * jnp.maximum(jnp.mean(jnp.abs(values)), 1e-300)
@@ -59,7 +59,7 @@ class CVaR:
 
     level: Scalar = param(default=0.9, unit="1", low=0.0, below=1.0)
 
-    def __call__(self, values: Vector) -> Any:
+    def __call__(self, values: Vector) -> Scalar:
         """Return the mean of the tail of `values`."""
         n = len(values)
         share = n * (1 - self.level)
@@ -78,7 +78,7 @@ class Quantile:
 
     level: Scalar = param(default=0.9, unit="1", low=0.0, high=1.0)
 
-    def __call__(self, values: Vector) -> Any:
+    def __call__(self, values: Vector) -> Scalar:
         """Return the quantile of `values`."""
         return jnp.quantile(values, self.level)
 

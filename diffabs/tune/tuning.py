@@ -8,6 +8,7 @@ import numpy as np
 from diffabs.core.bijectors import Range, parameter_space
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import get
+from diffabs.core.types import Part
 from diffabs.core.validity import check_part
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.objectives import default_objectives
@@ -23,7 +24,7 @@ from diffabs.tune.risk import Aggregate, Mean
 
 
 def tune(
-    subject: Any,
+    subject: Part,
     *,
     free: Sequence[str] | Mapping[str, Range | None],
     objective: Mapping[str, float],
@@ -96,7 +97,7 @@ def tune(
 
 
 def build_problem(
-    subject: Any,
+    subject: Part,
     *,
     free: Sequence[str] | Mapping[str, Range | None],
     objective: Mapping[str, float],

@@ -17,6 +17,7 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree, replace, static
+from diffabs.core.types import AnyArray, Part, PyTree
 from diffabs.design.interior.differentiable import robust_gain
 from diffabs.design.polytopes import Polytope
 from diffabs.linear.regulator import dlqr, lqr
@@ -47,7 +48,7 @@ class LQWeights:
     design: GainDesign = static()
     path: str = static(default="controller.gain")
 
-    def weights(self) -> tuple[Any, Any]:
+    def weights(self) -> tuple[PyTree, PyTree]:
         """Return Q (n, n) and R (1, 1)."""
         n = len(self.log_diagonal)
         diagonal = jnp.exp(jnp.asarray(self.log_diagonal))
@@ -60,7 +61,7 @@ class LQWeights:
         return replace(self.loop, {self.path: self.design(*self.weights())[0]})
 
 
-def lq_weights(loop: Loop, Q: Any, R: float, design: GainDesign, path: str = "controller.gain") -> LQWeights:
+def lq_weights(loop: Loop, Q: AnyArray, R: float, design: GainDesign, path: str = "controller.gain") -> LQWeights:
     """Return a loop with the LQ weights Q and R as its parameters.
 
     Args:
@@ -88,7 +89,7 @@ def lq_weights(loop: Loop, Q: Any, R: float, design: GainDesign, path: str = "co
     )
 
 
-def lqr_gain_design(model: Any) -> GainDesign:
+def lqr_gain_design(model: Part) -> GainDesign:
     """Return the function (Q, R) -> LQ gain of a linear model, in discrete time if the model is discrete.
 
     Args:

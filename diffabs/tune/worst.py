@@ -22,6 +22,7 @@ from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import replace
 from diffabs.core.reason import Reason
+from diffabs.core.types import Part, PyTree
 from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import first_refusal
@@ -56,16 +57,16 @@ class WorstCase:
     """
 
     metric: str
-    values: dict[str, Any]
+    values: dict[str, PyTree]
     value: float
     corners: int
     corner: float
     screened: float
     metrics: dict[str, float]
-    loop: Any
+    loop: Part
     rollouts: float
     bound: float | None
-    diverged: dict[str, Any] | None
+    diverged: dict[str, PyTree] | None
     reasons: list[Reason]
 
     @property
@@ -107,7 +108,7 @@ class WorstCase:
 
 
 def worst_case(
-    loop: Any,
+    loop: Part,
     *,
     over: Mapping[str, Range],
     metric: str,
@@ -162,7 +163,7 @@ def worst_case(
     return _build_worst_case(loop, free, metric, bound, points, len(corners), screened, lanes, cost)
 
 
-def _check_objectives(loop: Any, metric: str, measured: Mapping[str, Objective] | None) -> Mapping[str, Objective]:
+def _check_objectives(loop: Part, metric: str, measured: Mapping[str, Objective] | None) -> Mapping[str, Objective]:
     """Return the given or the default objectives.
 
     Raises:
@@ -179,7 +180,7 @@ def _gradient_price(problem: Problem) -> float:
     return 1 + 1.5 * problem.space.size if problem.mode is DerivativeMode.FORWARD else 6.0
 
 
-def _run_screening(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective], engine: str) -> Run:
+def _run_screening(loop: Part, lanes: Batch, solver: Solver, measured: Mapping[str, Objective], engine: str) -> Run:
     """Run every point.
 
     Raises:
@@ -203,7 +204,7 @@ def _draw_points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
     return low + (high - low) * sequence.random_base2(max(screen - 1, 0).bit_length())[:screen]
 
 
-def _values_by_path(free: FreeSpace, point: Any) -> dict[str, Any]:
+def _values_by_path(free: FreeSpace, point: Any) -> dict[str, PyTree]:
     """Return the parameters by path from a vector (p,), or from the rows of a matrix (runs, p)."""
     found, first = {}, 0
     for entry in free.entries:
@@ -237,7 +238,7 @@ def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[Desce
 
 
 def _build_worst_case(
-    loop: Any,
+    loop: Part,
     free: FreeSpace,
     metric: str,
     bound: float | None,

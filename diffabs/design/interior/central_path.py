@@ -26,6 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from diffabs.core.types import Matrix, PyTree, Scalar
+
 MAX_PATH_STEPS = 600  # steps; the rig with weights over ten decades takes 30 to 90, at 1 kHz up to 340
 CENTRING_DECREMENT = 0.5  # below this decrement the path goes on to the next centre
 STEP_LENGTHS = (1.0, 0.5, 0.2, 0.1, 0.03, 0.01, 0.003, 0.001)  # lengths of the step, with 1/(1 + decrement) as another
@@ -35,17 +37,17 @@ FINAL_CENTRE_STEPS = 3  # steps at the last centre: the decrement is squared in 
 class GuaranteedCostProblem(NamedTuple):
     """The vertices A (V, n, n) and B (V, n, m) and the weights Q (n, n) and R (m, m) of a problem."""
 
-    A: Any
-    B: Any
-    Q: Any
-    R: Any
+    A: Matrix
+    B: Matrix
+    Q: Matrix
+    R: Matrix
 
 
 class PathPoint(NamedTuple):
     """A point of the path: T (n, n) with T T' = X, and K = F X^-1 (m, n)."""
 
-    T: Any
-    K: Any
+    T: Matrix
+    K: Matrix
 
 
 class CentralPathState(NamedTuple):
@@ -61,27 +63,27 @@ class CentralPathState(NamedTuple):
         stuck: Whether no last centre exists.
     """
 
-    steps: Any
+    steps: Scalar
     point: PathPoint
-    shift: Any
-    mu: Any
-    decrement: Any
-    settled: Any
-    stuck: Any
+    shift: Scalar
+    mu: Scalar
+    decrement: Scalar
+    settled: Scalar
+    stuck: Scalar
 
 
 class LocalProblem(NamedTuple):
     """A problem in the coordinates of a point: closed loops c (V, n, n), b, k, q, r, and w with trace(w) = trace P."""
 
-    c: Any
-    b: Any
-    k: Any
-    q: Any
+    c: Scalar
+    b: Scalar
+    k: Scalar
+    q: Matrix
     r: Any
-    w: Any
+    w: Scalar
 
 
-def start_path(T: Any, K: Any, mu: Any) -> CentralPathState:
+def start_path(T: Matrix, K: Matrix, mu: Scalar) -> CentralPathState:
     """Return the initial state of the path; `follow_path` sets its shift.
 
     Args:
@@ -111,7 +113,7 @@ def follow_path(
     rounding = jnp.finfo(first.dtype).eps ** 0.5 * jnp.max(jnp.abs(here.c))
     path = path._replace(shift=jnp.maximum(2 * first, 0.0) + 1e-3 * jnp.abs(first) + rounding)
 
-    def goes_on(path: CentralPathState) -> Any:
+    def goes_on(path: CentralPathState) -> Matrix:
         """Return whether another Newton step is necessary."""
         return (
             (path.steps < MAX_PATH_STEPS)
@@ -144,7 +146,7 @@ def localise_problem(problem: GuaranteedCostProblem, point: PathPoint) -> LocalP
     return LocalProblem(closed, inverse @ problem.B, point.K @ t, t.T @ problem.Q @ t, problem.R, inverse @ inverse.T)
 
 
-def least_shift(here: LocalProblem, *, discrete: bool) -> Any:
+def least_shift(here: LocalProblem, *, discrete: bool) -> Matrix:
     """Return the smallest s for which no S_i has a negative eigenvalue at the point itself.
 
     Args:
@@ -156,7 +158,7 @@ def least_shift(here: LocalProblem, *, discrete: bool) -> Any:
     return jnp.max(jnp.linalg.eigvalsh(flow + here.q + here.k.T @ here.r @ here.k))
 
 
-def gradient_and_hessian(here: LocalProblem, shift: Any, mu: Any, *, discrete: bool) -> tuple[Any, Any]:
+def gradient_and_hessian(here: LocalProblem, shift: Scalar, mu: Scalar, *, discrete: bool) -> tuple[PyTree, PyTree]:
     """Return gradient (d,) and Hessian (d, d) of phi in (X, F) at the point itself, in the basis of `directions`.
 
     Args:
@@ -197,7 +199,7 @@ def directions(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     return y, g
 
 
-def solve_newton_system(hessian: Any, right: Any) -> Any:
+def solve_newton_system(hessian: Matrix, right: Any) -> Matrix:
     """Return H^-1 b for a positive definite H, solved with a unit diagonal.
 
     Args:
@@ -209,7 +211,7 @@ def solve_newton_system(hessian: Any, right: Any) -> Any:
     return unit * jnp.linalg.solve(hessian * unit * unit[:, None], unit * right)
 
 
-def _newton(problem: GuaranteedCostProblem, path: CentralPathState, *, discrete: bool) -> tuple[PathPoint, Any]:
+def _newton(problem: GuaranteedCostProblem, path: CentralPathState, *, discrete: bool) -> tuple[PathPoint, PyTree]:
     """Return the point after the best of several lengths of Newton's step, and the decrement before it."""
     here = localise_problem(problem, path.point)
     gradient, hessian = gradient_and_hessian(here, path.shift, path.mu, discrete=discrete)
@@ -227,14 +229,14 @@ def _newton(problem: GuaranteedCostProblem, path: CentralPathState, *, discrete:
     return PathPoint(t @ jnp.linalg.cholesky(x), k + best * g @ jnp.linalg.inv(t @ x)), decrement
 
 
-def _phi(here: LocalProblem, y: Any, g: Any, shift: Any, mu: Any, *, discrete: bool) -> Any:
+def _phi(here: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, mu: Scalar, *, discrete: bool) -> Matrix:
     """Return phi at changes (Y, G), or stacks of them."""
     x = jnp.eye(y.shape[-1]) + y
     inside = logdet(_slacks(here, y, g, shift, discrete=discrete))
     return _trace(jnp.linalg.inv(x) @ here.w) / mu - logdet(x) - jnp.sum(inside, -1)
 
 
-def _slacks(here: LocalProblem, y: Any, g: Any, shift: Any, *, discrete: bool) -> Any:
+def _slacks(here: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, *, discrete: bool) -> Matrix:
     """Return S_i (..., V, n, n), or in discrete time the block matrix (..., V, 2n, 2n) above."""
     x = jnp.eye(y.shape[-1]) + y
     f = here.k @ x + g
@@ -242,7 +244,7 @@ def _slacks(here: LocalProblem, y: Any, g: Any, shift: Any, *, discrete: bool) -
     return _linear_part(here, x, g, discrete=discrete) + _pad_to_block(rest, y.shape[-1], discrete)[..., None, :, :]
 
 
-def _linear_part(here: LocalProblem, x: Any, g: Any, *, discrete: bool) -> Any:
+def _linear_part(here: LocalProblem, x: Scalar, g: Matrix, *, discrete: bool) -> Matrix:
     """Return the part that is linear in (X, G): -He[c X + b G], or [[X, .], [c X + b G, X]]."""
     x = x[..., None, :, :]
     flow = here.c @ x + here.b @ g[..., None, :, :]
@@ -252,16 +254,16 @@ def _linear_part(here: LocalProblem, x: Any, g: Any, *, discrete: bool) -> Any:
     return jnp.concatenate([jnp.concatenate([x, _t(flow)], -1), jnp.concatenate([flow, x], -1)], -2)
 
 
-def _pad_to_block(x: Any, n: int, discrete: bool) -> Any:
+def _pad_to_block(x: Scalar, n: int, discrete: bool) -> Matrix:
     """Return x in the first rows and columns of a block matrix, in discrete time only."""
     return jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, n)] * 2) if discrete else x
 
 
-def _t(x: Any) -> Any:
+def _t(x: Scalar) -> Matrix:
     return jnp.swapaxes(x, -1, -2)
 
 
-def he(x: Any) -> Any:
+def he(x: Scalar) -> Matrix:
     """Return He[M] = M + M'.
 
     Args:
@@ -270,11 +272,11 @@ def he(x: Any) -> Any:
     return x + _t(x)
 
 
-def _trace(x: Any) -> Any:
+def _trace(x: Scalar) -> Matrix:
     return jnp.trace(x, axis1=-2, axis2=-1)
 
 
-def logdet(x: Any) -> Any:
+def logdet(x: Scalar) -> Matrix:
     """Return log det of positive definite matrices; NaN for other matrices.
 
     Args:

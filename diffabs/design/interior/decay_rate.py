@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from diffabs.core.first_order import first_order
+from diffabs.core.types import Matrix, PyTree, Scalar
 from diffabs.design.interior.central_path import (
     CENTRING_DECREMENT,
     FINAL_CENTRE_STEPS,
@@ -52,16 +53,16 @@ class _DecayPathState(NamedTuple):
     Fields: steps, steps for this mu, T with T T' = X, s, mu, Newton's decrement, steps at the last centre.
     """
 
-    steps: Any
+    steps: Scalar
     patience: Any
-    T: Any
-    s: Any
-    mu: Any
-    decrement: Any
-    settled: Any
+    T: Matrix
+    s: Scalar
+    mu: Scalar
+    decrement: Scalar
+    settled: Scalar
 
 
-def certified_decay(gain: Any, A: Any, B: Any, period: Any = None) -> Any:
+def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -> Matrix:
     """Return the largest decay rate [1/s] for which a common P > 0 proves |x| <= c exp(-rate t) at all vertices.
 
         He[P C_i] + 2 rate P <= 0,   C_i'P C_i <= exp(-2 rate period) P,      C_i = A_i + B_i K
@@ -89,13 +90,13 @@ def certified_decay(gain: Any, A: Any, B: Any, period: Any = None) -> Any:
 
 # The implicit derivative at the optimum, instead of one through some hundred iterations.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _least_shift(discrete: bool, closed: Any) -> Any:
+def _least_shift(discrete: bool, closed: Matrix) -> Matrix:
     """Return the smallest s."""
     return _follow_path(discrete, closed)[0]
 
 
 @_least_shift.defjvp
-def _least_shift_jvp(discrete: bool, primals: Any, tangents: Any) -> Any:
+def _least_shift_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -> Matrix:
     """Return s and ds = sum <W_i, dL_i(X)>/sum <W_i, X>, in the coordinates where X is the unit matrix."""
     s, T, weights = _follow_path(discrete, *primals)
     c, change = (jnp.linalg.inv(T) @ x @ T for x in (primals[0], first_order(tangents[0], NO_SECOND_DERIVATIVES)))
@@ -107,7 +108,7 @@ def _least_shift_jvp(discrete: bool, primals: Any, tangents: Any) -> Any:
 
 
 @partial(jax.jit, static_argnums=0)
-def _follow_path(discrete: bool, closed: Any) -> tuple[Any, Any, Any]:
+def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree]:
     """Return s, T with T T' = X, and the multipliers W (V, n, n) at X = I, at the path's end."""
     vertices, n, _ = closed.shape
     one = jnp.eye(n, dtype=closed.dtype)
@@ -118,7 +119,7 @@ def _follow_path(discrete: bool, closed: Any) -> tuple[Any, Any, Any]:
     # The initial s exceeds the largest eigenvalue of all L_i(I), so that every S_i > 0.
     start = _DecayPathState(0, 0, T, jnp.max(jnp.linalg.eigvalsh(L)) + size, size / vertices / n, 0.0 * size, 0)
 
-    def goes_on(path: _DecayPathState) -> Any:
+    def goes_on(path: _DecayPathState) -> Matrix:
         return (path.steps < MAX_DECAY_STEPS) & (path.settled < FINAL_CENTRE_STEPS) & jnp.isfinite(path.decrement)
 
     path = lax.while_loop(goes_on, lambda path: _advance_path(closed, path, inverse, discrete), start)
@@ -126,7 +127,7 @@ def _follow_path(discrete: bool, closed: Any) -> tuple[Any, Any, Any]:
     return jnp.where(jnp.isfinite(path.decrement), path.s, jnp.nan), path.T, jnp.linalg.inv(slack)
 
 
-def _advance_path(closed: Any, path: _DecayPathState, inverse: Any, discrete: bool) -> _DecayPathState:
+def _advance_path(closed: Matrix, path: _DecayPathState, inverse: Matrix, discrete: bool) -> _DecayPathState:
     """Return the state after a step, with the next mu if the step began near the centre.
 
     `inverse` holds 1/unit of each state.
@@ -145,7 +146,7 @@ def _advance_path(closed: Any, path: _DecayPathState, inverse: Any, discrete: bo
     return _DecayPathState(path.steps + 1, patience, T, s, mu, decrement, path.settled + (last & (decrement < 0.1)))
 
 
-def _step(c: Any, path: _DecayPathState, m: Any, discrete: bool) -> tuple[Any, Any, Any]:
+def _step(c: Scalar, path: _DecayPathState, m: Scalar, discrete: bool) -> tuple[PyTree, PyTree, PyTree]:
     """Return T and s after a step, and the decrement before it.
 
     `c` and `m` = M/trace M are in the coordinates of the point.
@@ -175,7 +176,7 @@ def _step(c: Any, path: _DecayPathState, m: Any, discrete: bool) -> tuple[Any, A
     return path.T @ jnp.linalg.cholesky(one + x[best]), s + t[best], decrement
 
 
-def _newton_step_in_plane(gradient: Any, hessian: Any, normal: Any) -> tuple[Any, Any]:
+def _newton_step_in_plane(gradient: Matrix, hessian: Matrix, normal: Matrix) -> tuple[PyTree, PyTree]:
     """Return Newton's step in the plane with a normal, and its decrement."""
     unit = 1 / jnp.sqrt(jnp.diagonal(hessian))
     hessian, normal = hessian * unit * unit[:, None], normal * unit
@@ -186,26 +187,26 @@ def _newton_step_in_plane(gradient: Any, hessian: Any, normal: Any) -> tuple[Any
     return unit * step, jnp.sqrt(jnp.maximum(step @ hessian @ step, 0.0))
 
 
-def _lyapunov_operator(c: Any, x: Any, discrete: bool) -> Any:
+def _lyapunov_operator(c: Scalar, x: Scalar, discrete: bool) -> Matrix:
     """Return L(X), for one X or a stack."""
     return c @ x @ jnp.swapaxes(c, -1, -2) - x if discrete else he(c @ x)
 
 
-def _transform_loops(closed: Any, T: Any) -> Any:
+def _transform_loops(closed: Matrix, T: Matrix) -> Matrix:
     return jnp.linalg.inv(T) @ closed @ T
 
 
-def _largest_norm(left: Any) -> Any:
+def _largest_norm(left: Scalar) -> Matrix:
     """Return the largest of the vertices' norms; 1 if all are zero."""
     size = jnp.max(jnp.linalg.norm(left, axis=(1, 2)))
     return jnp.where(size == 0, 1.0, size)
 
 
-def _balancing_units(size: Any) -> Any:
+def _balancing_units(size: Scalar) -> Matrix:
     """Return units d (n,), x = d z, that give rows and columns of `size` about equal sums without the diagonal."""
     size = size * (1 - jnp.eye(len(size)))
 
-    def sweep(_: Any, d: Any) -> Any:
+    def sweep(_: Any, d: Any) -> Matrix:
         row, column = size @ d / d, size.T @ (1 / d) * d
         # A state without coupling keeps its unit; the inner where avoids 0/0 for it.
         fine = (row > 0) & (column > 0)

@@ -10,11 +10,12 @@ point and not proved; `design` and `certify` prove them.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
 from diffabs.design.interior import central_path
 from diffabs.design.interior.central_path import CentralPathState, GuaranteedCostProblem, PathPoint
 from diffabs.design.interior.decay_rate import certified_decay as certified_decay
@@ -35,11 +36,11 @@ class RobustFeedback(NamedTuple):
     x'P x is the guaranteed cost from x, and trace P is the cost of `design`.
     """
 
-    gain: Any
-    P: Any
+    gain: AnyArray
+    P: AnyArray
 
 
-def robust_gain(system: Polytope, Q: Any, R: Any) -> Any:
+def robust_gain(system: Polytope, Q: AnyArray, R: AnyArray) -> AnyArray:
     """Return the gain with the smallest guaranteed cost over a polytope, shape (m, n).
 
     It is NaN if no such gain exists; see `robust_design`.
@@ -52,7 +53,7 @@ def robust_gain(system: Polytope, Q: Any, R: Any) -> Any:
     return robust_design(system.A, system.B, Q, R, discrete=system.period is not None).gain
 
 
-def robust_design(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool = False) -> RobustFeedback:
+def robust_design(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, *, discrete: bool = False) -> RobustFeedback:
     """Return the gain that minimises trace P over the vertices, and P: eqs. (29)-(32) of Maeda and Sugiura.
 
     The function works under jit, vmap and both modes of differentiation, in all arguments. Only the symmetric parts of
@@ -92,7 +93,7 @@ def robust_design(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool = False) -> 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 @partial(jax.jit, static_argnums=0)
-def _solve_central_path(discrete: bool, problem: GuaranteedCostProblem) -> tuple[Any, Any, Any]:
+def _solve_central_path(discrete: bool, problem: GuaranteedCostProblem) -> tuple[PyTree, PyTree, PyTree]:
     """Return K, P and mu of the last centre; NaN if the path does not reach it."""
     path = central_path.follow_path(
         problem, _start_from_riccati(problem, discrete), _advance_parameters, discrete=discrete
@@ -104,14 +105,14 @@ def _solve_central_path(discrete: bool, problem: GuaranteedCostProblem) -> tuple
 
 
 @_solve_central_path.defjvp
-def _solve_central_path_jvp(discrete: bool, primals: Any, tangents: Any) -> Any:
+def _solve_central_path_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -> Matrix:
     """Return the implicit derivative: H dx + d(gradient of phi at constant x) = 0, in the coordinates of the point."""
     (problem,), (change,) = primals, tangents
     K, P, mu = _solve_central_path(discrete, problem)
     # T from P: the primal's own T is no output, and any T with T T' = P^-1 gives the same derivative.
     T = jnp.linalg.inv(jnp.linalg.cholesky(P).T)
 
-    def gradient(problem: GuaranteedCostProblem) -> Any:
+    def gradient(problem: GuaranteedCostProblem) -> Matrix:
         return central_path.gradient_and_hessian(
             central_path.localise_problem(problem, PathPoint(T, K)), 0.0, mu, discrete=discrete
         )
@@ -131,7 +132,7 @@ def _start_from_riccati(problem: GuaranteedCostProblem, discrete: bool) -> Centr
     """
     A, B, Q, R = problem
 
-    def alone(a: Any, b: Any) -> tuple[Any, PathPoint, Any]:
+    def alone(a: Scalar, b: Scalar) -> tuple[PyTree, PathPoint, PyTree]:
         """Return the shift, the point and trace P of one vertex's Riccati solution."""
         P = (dare if discrete else care)(a, b, Q, R).P
         K = -jnp.linalg.solve(R + b.T @ P @ b, b.T @ P @ a) if discrete else -jnp.linalg.solve(R, b.T @ P)
@@ -148,7 +149,7 @@ def _start_from_riccati(problem: GuaranteedCostProblem, discrete: bool) -> Centr
     return central_path.start_path(points.T[best], points.K[best], traces[best] + 0 * jnp.sum(shift))
 
 
-def _advance_parameters(path: CentralPathState, least: Any, cost: Any) -> CentralPathState:
+def _advance_parameters(path: CentralPathState, least: Scalar, cost: Scalar) -> CentralPathState:
     """Return the state with the next shift, or with the next mu once the shift is zero."""
     found, last = path.shift == 0, path.mu <= 1.01 * FINAL_MU * cost
     return path._replace(

@@ -21,11 +21,11 @@ import pathlib
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
 from diffabs.core import files
+from diffabs.core.types import Matrix, Params, PyTree, Scalar
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact, schema, serialise
 
@@ -88,7 +88,7 @@ class Certificate:
         """Whether the certificate has a claim and all its claims are proved."""
         return bool(self.claims) and all(self.verify())
 
-    def proved_data(self, *kinds: str) -> Iterator[Mapping[str, Any]]:
+    def proved_data(self, *kinds: str) -> Iterator[Params]:
         """Yield the data of the proved claims of these `kinds`."""
         for claim, verdict in zip(self.claims, self.verify(), strict=True):
             if verdict and claim.kind in kinds:
@@ -135,7 +135,7 @@ class Certificate:
         """Trace P of the first proved cost claim, rounded up; for a scheduled claim the largest over the nodes."""
         return self._cost(self.proved_data("cost", "scheduled"))
 
-    def _cost(self, claims: Iterator[Mapping[str, Any]]) -> float | None:
+    def _cost(self, claims: Iterator[Params]) -> float | None:
         """Return trace P of the first of these claims that has a cost."""
         for data in claims:
             if "Q" in data or "R" in data:
@@ -184,7 +184,7 @@ class Certificate:
         return found
 
     @property
-    def worst_vertex(self) -> dict[str, Any] | None:
+    def worst_vertex(self) -> dict[str, PyTree] | None:
         """The vertex with the smallest margin: index (over all cells in order), cell, corner, claim and margin."""
         all_of = [
             (value, i, kind) for kind, each in self._margins for i, value in each.items() if i != exact.ALL_VERTICES
@@ -215,7 +215,7 @@ class Certificate:
             found += np.max(pair, axis=0).tolist()
         return tuple(found)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, PyTree]:
         """Return the proved properties for JSON: `trace_cost` is claimed, `guaranteed_cost` is proved."""
         limit = self.input_limit
         return {
@@ -271,7 +271,7 @@ class Certificate:
             raise ValueError(f"{os.fspath(path)}: {' '.join(str(error).split())}") from None
 
 
-def as_read_only_array(value: Any) -> np.ndarray:
+def as_read_only_array(value: Scalar) -> np.ndarray:
     """Return a copy as floats that cannot be written to.
 
     Args:
@@ -282,7 +282,7 @@ def as_read_only_array(value: Any) -> np.ndarray:
     return array
 
 
-def as_read_only_system(system: Polytope | Schedule) -> Any:
+def as_read_only_system(system: Polytope | Schedule) -> Matrix:
     """Return a copy whose arrays cannot be written to.
 
     Args:
@@ -298,7 +298,7 @@ def as_read_only_system(system: Polytope | Schedule) -> Any:
     return copy
 
 
-def round_up(value: Any) -> float:
+def round_up(value: Scalar) -> float:
     """Return the smallest float that is not below a rational number.
 
     Args:

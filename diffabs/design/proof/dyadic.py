@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import PyTree, Scalar
+
 RELATIVE_ERROR_BITS = 40  # a relative error of 2^-40 covers the rounding in computing the matrices from a model
 Matrix = Any  # an array of floats, or Dyadic
 
@@ -24,7 +26,7 @@ class Dyadic:
     __slots__ = ("bits", "error", "ints")
     __array_ufunc__ = None  # makes NumPy leave array * Dyadic to __rmul__ instead of an element-wise product
 
-    def __init__(self, ints: Any, bits: int, error: Any = None) -> None:
+    def __init__(self, ints: Any, bits: int, error: Scalar = None) -> None:
         """Store `ints`, `bits` and `error` unchanged; `as_dyadic` and `as_uncertain_dyadic` convert floats."""
         self.ints, self.bits, self.error = ints, bits, error
 
@@ -38,7 +40,7 @@ class Dyadic:
         """The array with its last two axes exchanged."""
         return self.each(lambda array: array.mT)
 
-    def each(self, function: Callable[[Any], Any], bits: int = 0) -> "Dyadic":
+    def each(self, function: Callable[[PyTree], PyTree], bits: int = 0) -> "Dyadic":
         """Apply `function` to integers and errors, and make the scale finer by `bits`."""
         return Dyadic(function(self.ints), self.bits + bits, None if self.error is None else function(self.error))
 
@@ -47,7 +49,7 @@ class Dyadic:
         finer = bits - self.bits
         return self.each(lambda array: array * (1 << finer), finer) if finer else self
 
-    def product(self, other: Any, times: Callable[[Any, Any], Any]) -> "Dyadic":
+    def product(self, other: Any, times: Callable[[PyTree, PyTree], PyTree]) -> "Dyadic":
         """Return the product with `other` by the bilinear `times`, with its error |a| db + da |b| + da db."""
         other = as_dyadic(other)
         a, b, da, db = self.ints, other.ints, self.error, other.error
@@ -84,7 +86,7 @@ class Dyadic:
     __radd__, __rmul__ = __add__, __mul__
 
 
-def as_dyadic(value: Any) -> Dyadic:
+def as_dyadic(value: Scalar) -> Dyadic:
     """Return the numbers of `value` as integers times a power of two, without error.
 
     Args:
@@ -109,7 +111,7 @@ def as_dyadic(value: Any) -> Dyadic:
     return Dyadic(np.left_shift(ints, shift), 53 - lowest)
 
 
-def as_uncertain_dyadic(value: Any) -> Dyadic:
+def as_uncertain_dyadic(value: Scalar) -> Dyadic:
     """Return the numbers of `value` with a relative error of at most 2^-RELATIVE_ERROR_BITS each.
 
     Args:

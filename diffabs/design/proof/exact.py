@@ -17,10 +17,11 @@ He(M) = M + M', C = A + B K.
 import functools
 import operator
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.types import Params, PyTree
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof.dyadic import Dyadic, Matrix, as_dyadic, as_uncertain_dyadic, is_positive_definite
 from diffabs.design.proof.schema import check_claim
@@ -67,7 +68,7 @@ def block_matrix(rows: list[list[Matrix]]) -> Matrix:
     flat = [each for row in rows for each in row]
     lead = np.broadcast_shapes(*(each.shape[:-2] for each in flat))
 
-    def join_blocks(get: Callable[[Matrix], Any]) -> Any:
+    def join_blocks(get: Callable[[Matrix], PyTree]) -> Matrix:
         """Return the block matrix of one array of each block."""
         return np.block([[np.broadcast_to(get(each), (*lead, *each.shape[-2:])) for each in row] for row in rows])
 
@@ -252,9 +253,7 @@ CLAIM_CONDITIONS = {
 }
 
 
-def conditions(
-    kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any], proof: bool
-) -> Iterator[Inequality]:
+def conditions(kind: str, system: Polytope | Schedule, gain: Matrix, data: Params, proof: bool) -> Iterator[Inequality]:
     """Yield the inequalities of a claim.
 
     Args:
@@ -322,7 +321,7 @@ def is_robustly_positive(matrix: np.ndarray, error: np.ndarray, bits: int) -> bo
     return is_positive_definite(rows)
 
 
-def is_proved(kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any]) -> bool:
+def is_proved(kind: str, system: Polytope | Schedule, gain: Matrix, data: Params) -> bool:
     """Return whether a claim is proved, exactly and rounded outward.
 
     Args:
@@ -337,7 +336,7 @@ def is_proved(kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[s
     return all(map(is_satisfied, conditions(kind, system, gain, data, proof=True)))
 
 
-def vertex_margins(kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any]) -> dict[int, float]:
+def vertex_margins(kind: str, system: Polytope | Schedule, gain: Matrix, data: Params) -> dict[int, float]:
     """Return for each vertex the smallest eigenvalue of a claim's inequality relative to its largest term, in floats.
 
     The margin of an inequality about all vertices together has the key ALL_VERTICES. Side conditions are left out.

@@ -1,10 +1,10 @@
 """Names, shapes and ranges of the data of each kind of claim."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
+from diffabs.core.types import Params, PyTree, Scalar
 from diffabs.design.polytopes import Polytope, Schedule
 
 # A letter for each axis: n states, m inputs, V vertices, N nodes, others free; "|" separates alternatives. A field with
@@ -18,7 +18,7 @@ FIELD_SHAPES = {
     "infeasible": {"W": "Vnn", "rate?": "", "factor?": ""},
     "scheduled": {"P": "Nnn", "rates": "2", "rate?": "", "Q?": "nn", "R?": "mm"},
 }
-FIELD_RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
+FIELD_RANGES: dict[str, tuple[str, Callable[[PyTree], PyTree]]] = {
     "rate": ("not be negative", lambda value: value >= 0),
     "factor": ("lie in (0, 1]", lambda value: 0 < value <= 1),
     "zeta": ("lie in [0, 1)", lambda value: 0 <= value < 1),
@@ -31,7 +31,7 @@ FIELD_RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
 INFEASIBLE_RANGES = {"factor": ("be positive", FIELD_RANGES["gamma"][1])}
 
 
-def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Mapping[str, Any]) -> None:
+def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Params) -> None:
     """Raise ValueError for a claim that does not fit the system and gain.
 
     Args:
@@ -90,7 +90,7 @@ def check_gain(system: Polytope | Schedule, gain: np.ndarray) -> dict[str, int]:
     return sizes
 
 
-def matches_shape(value: Any, letters: str, sizes: dict[str, int]) -> bool:
+def matches_shape(value: Scalar, letters: str, sizes: dict[str, int]) -> bool:
     """Return whether the axes of `value` have the sizes of the letters.
 
     Args:

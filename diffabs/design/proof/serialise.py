@@ -3,19 +3,19 @@
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
 
 from diffabs.core import files
+from diffabs.core.types import Matrix, Params, PyTree, Scalar
 from diffabs.design.polytopes import Polytope, Schedule
 
 CERTIFICATE_FORMAT, CERTIFICATE_VERSION = "diffabs certificate", 1
 MAX_CERTIFICATE_BYTES, MAX_STATES_PLUS_INPUTS = 2**24, 64  # bytes; states and inputs together
 
 
-def convert_to_list(value: float | np.ndarray) -> Any:
+def convert_to_list(value: float | np.ndarray) -> Matrix:
     """Return a number or nested lists for JSON.
 
     Args:
@@ -24,7 +24,7 @@ def convert_to_list(value: float | np.ndarray) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
-def describe_system(system: Polytope | Schedule) -> dict[str, Any]:
+def describe_system(system: Polytope | Schedule) -> dict[str, PyTree]:
     """Return a system for JSON, without `coverage`, which no claim needs.
 
     Args:
@@ -38,7 +38,7 @@ def describe_system(system: Polytope | Schedule) -> dict[str, Any]:
     return {"A": system.A.tolist(), "B": system.B.tolist(), **names}
 
 
-def reject_duplicate_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def reject_duplicate_names(pairs: list[tuple[str, PyTree]]) -> dict[str, PyTree]:
     """Return a JSON object from its members, if their names differ.
 
     Args:
@@ -53,7 +53,7 @@ def reject_duplicate_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def read_members(value: Any, where: str, *names: str) -> list[Any]:
+def read_members(value: Scalar, where: str, *names: str) -> list[PyTree]:
     """Return the values of an object with exactly these members, in their order.
 
     Args:
@@ -70,7 +70,7 @@ def read_members(value: Any, where: str, *names: str) -> list[Any]:
     return [value[name] for name in names]
 
 
-def read_list(value: Any, where: str, kind: type = dict) -> list[Any]:
+def read_list(value: Scalar, where: str, kind: type = dict) -> list[PyTree]:
     """Return a list of JSON values of one type, after a check.
 
     Args:
@@ -86,7 +86,7 @@ def read_list(value: Any, where: str, kind: type = dict) -> list[Any]:
     return value
 
 
-def read_numbers(value: Any, where: str = "a number") -> Any:
+def read_numbers(value: Scalar, where: str = "a number") -> Matrix:
     """Return a finite number, or lists of them of equal lengths, as an array.
 
     Args:
@@ -102,9 +102,7 @@ def read_numbers(value: Any, where: str = "a number") -> Any:
     return array.astype(float)
 
 
-def format_certificate(
-    system: Polytope | Schedule, gain: np.ndarray, claims: Iterable[tuple[str, Mapping[str, Any]]]
-) -> str:
+def format_certificate(system: Polytope | Schedule, gain: np.ndarray, claims: Iterable[tuple[str, Params]]) -> str:
     """Return the content of a certificate's file.
 
     Args:
@@ -124,7 +122,7 @@ def format_certificate(
 
 def read_certificate(
     path: str | os.PathLike[str],
-) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
+) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, PyTree]]]]:
     """Return system, gain, and (kind, data) of the claims in a file.
 
     Args:
@@ -144,7 +142,7 @@ def read_certificate(
     )
 
 
-def certificate_from_json(value: Any) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
+def certificate_from_json(value: Scalar) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, PyTree]]]]:
     """Return system, gain, and (kind, data) of the claims in a JSON value.
 
     Args:
@@ -171,7 +169,7 @@ def certificate_from_json(value: Any) -> tuple[Polytope | Schedule, np.ndarray, 
     return read_system(system), read_numbers(gain, "gain"), found
 
 
-def read_system(value: Any) -> Polytope | Schedule:
+def read_system(value: Scalar) -> Polytope | Schedule:
     """Return a polytope or a schedule from a JSON value.
 
     Args:
@@ -191,7 +189,7 @@ def read_system(value: Any) -> Polytope | Schedule:
     return read_polytope(value, "system")
 
 
-def read_polytope(value: Any, where: str) -> Polytope:
+def read_polytope(value: Scalar, where: str) -> Polytope:
     """Return a polytope from a JSON value, without its corners.
 
     Nothing ties the labels of a file to its matrices, so no output shows them beside a proof.

@@ -13,9 +13,11 @@ import functools
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+
+from diffabs.core.types import Part, PyTree, Scalar
 
 SOLVERS = ("CLARABEL", "MOSEK", "CVXOPT")  # in order of preference; SCS has errors of 1e-3 and is not used
 OPTIONS = {"CLARABEL": {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}}
@@ -76,18 +78,18 @@ class Unknowns:
         """Return the matrices in a vector `y`."""
         return {name: np.tensordot(y, unit, 1) for name, unit in self.basis.items()}
 
-    def blocks(self, formulas: Callable[[Mapping[str, np.ndarray]], list[Any]]) -> list[SdpBlock]:
+    def blocks(self, formulas: Callable[[Mapping[str, np.ndarray]], list[PyTree]]) -> list[SdpBlock]:
         """Return the blocks h + sum y_d G_d of `formulas`, which are affine in the unknowns and accept stacks."""
         values = formulas(self.stacked)
         # A formula without unknowns gives one matrix, with G = 0.
         wholes = [np.broadcast_to(value, (self.size + 1, *value.shape[-2:])) for value in values]
         return [SdpBlock(whole[:1], (whole[1:] - whole[0])[None]) for whole in wholes]
 
-    def affine(self, formula: Callable[[Mapping[str, np.ndarray]], Any]) -> SdpBlock:
+    def affine(self, formula: Callable[[Mapping[str, np.ndarray]], PyTree]) -> SdpBlock:
         """Return the block of one affine `formula`."""
         return self.blocks(lambda v: [formula(v)])[0]
 
-    def row(self, formula: Callable[[Mapping[str, np.ndarray]], Any]) -> np.ndarray:
+    def row(self, formula: Callable[[Mapping[str, np.ndarray]], PyTree]) -> np.ndarray:
         """Return the coefficients c of a `formula` that is linear in the unknowns."""
         return np.asarray(formula(self.basis), float).reshape(self.size)
 
@@ -112,7 +114,7 @@ def he(m: np.ndarray) -> np.ndarray:
     return m + np.swapaxes(m, -1, -2)
 
 
-def symmetric_from_blocks(rows: list[list[Any]]) -> np.ndarray:
+def symmetric_from_blocks(rows: list[list[PyTree]]) -> np.ndarray:
     """Return a symmetric matrix, or a stack of them, from the blocks on and below its diagonal.
 
     Args:
@@ -199,12 +201,12 @@ def solve_sdp(c: np.ndarray, blocks: list[SdpBlock], solver: str = "CLARABEL") -
 
 
 class _Program(NamedTuple):
-    problem: Any
-    y: Any
-    cost: Any
-    h: list[Any]
-    g: list[Any]
-    constraints: list[list[Any]]
+    problem: Part
+    y: Scalar
+    cost: Scalar
+    h: list[PyTree]
+    g: list[PyTree]
+    constraints: list[list[PyTree]]
 
 
 @functools.lru_cache(maxsize=64)
@@ -227,7 +229,7 @@ def _program(unknowns: int, shapes: tuple[tuple[int, int], ...]) -> _Program:
     return _Program(problem, y, cost, h, g, constraints)
 
 
-def _run(problem: Any, solver: str) -> str:
+def _run(problem: Part, solver: str) -> str:
     """Solve a program and return its status; an exception in the solver becomes a status."""
     import cvxpy as cp
 

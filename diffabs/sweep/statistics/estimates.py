@@ -31,6 +31,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
+from diffabs.core.types import PyTree
+
 BOOTSTRAP_REPLICATES = 999
 MIN_TAIL_SAMPLES = 10  # samples in the tail from which CVaR's interval covers 92 to 95 %
 # Atoms of a resampled tail: the largest half are single samples, the others are means of neighbours.
@@ -60,7 +62,7 @@ class IntervalEstimate(NamedTuple):
         return self._asdict()
 
 
-def as_column(values: Any, least: int = 1) -> np.ndarray:
+def as_column(values: PyTree, least: int = 1) -> np.ndarray:
     """Return values as float64, shape (n,).
 
     Args:
@@ -125,7 +127,7 @@ class Moments:
     second: float
 
     @classmethod
-    def of(cls, values: Any) -> "Moments":
+    def of(cls, values: PyTree) -> "Moments":
         """Return the moments of `values` (n,), in two passes.
 
         Raises:
@@ -198,7 +200,7 @@ class Tail:
     indices: np.ndarray
 
     @classmethod
-    def of(cls, values: Any, indices: Any, k: int) -> "Tail":
+    def of(cls, values: PyTree, indices: Any, k: int) -> "Tail":
         """Return the k largest of `values` (n,), with `indices` (n,) of the samples.
 
         Raises:
@@ -214,7 +216,7 @@ class Tail:
         return cls(k, x[order], index[order])
 
 
-def quantile(values: Any, level: float, *, confidence: float = 0.95) -> IntervalEstimate:
+def quantile(values: PyTree, level: float, *, confidence: float = 0.95) -> IntervalEstimate:
     """Return the value that a fraction `level` of the law does not exceed, with an interval between two order
     statistics.
 
@@ -233,7 +235,7 @@ def quantile(values: Any, level: float, *, confidence: float = 0.95) -> Interval
 
 
 def cvar(
-    values: Any, level: float, *, confidence: float = 0.95, replicates: int = BOOTSTRAP_REPLICATES, seed: int = 0
+    values: PyTree, level: float, *, confidence: float = 0.95, replicates: int = BOOTSTRAP_REPLICATES, seed: int = 0
 ) -> IntervalEstimate:
     """Return the mean of the largest fraction 1 - level of the samples; the sample at the edge counts in part.
 
@@ -268,7 +270,7 @@ def mean_of_replicates(estimates: Any, *, confidence: float = 0.95) -> IntervalE
 
 
 def summarise_column(
-    values: Any, confidence: float = 0.95, levels: Sequence[float] = (0.05, 0.5, 0.95), tail: float = 0.95
+    values: PyTree, confidence: float = 0.95, levels: Sequence[float] = (0.05, 0.5, 0.95), tail: float = 0.95
 ) -> dict[str, dict[str, float]]:
     """Return mean, deviation, quantiles and CVaR by name (`quantile 0.05`).
 

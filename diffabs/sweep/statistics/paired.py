@@ -10,10 +10,11 @@ Source: P. Glasserman and D. D. Yao, Some guidelines and guarantees for common r
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.types import Scalar
 from diffabs.sweep.statistics.estimates import Count, IntervalEstimate, Moments, as_column, quantile
 from diffabs.sweep.statistics.sensitivity import pearson
 
@@ -38,7 +39,7 @@ class PairedComparison(NamedTuple):
     reduction: float
 
 
-def compare_pairs(a: Any, b: Any, *, confidence: float = 0.95) -> PairedComparison:
+def compare_pairs(a: Scalar, b: Scalar, *, confidence: float = 0.95) -> PairedComparison:
     """Return the comparison of two variants, sample by sample.
 
     Args:

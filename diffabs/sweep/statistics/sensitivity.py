@@ -26,11 +26,12 @@ Phys. Commun. 181 (2010). M. J. W. Jansen, Analysis of variance designs for mode
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
+from diffabs.core.types import AnyArray, Scalar
 from diffabs.sweep.statistics.estimates import (
     BOOTSTRAP_REPLICATES,
     REPLICATES_PER_BLOCK,
@@ -68,7 +69,7 @@ class SobolIndices(NamedTuple):
     total: list[IntervalEstimate]
 
 
-def correlations(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = True) -> Correlations:
+def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95, binormal: bool = True) -> Correlations:
     """Return the correlations of each column of x with y; NaN between -1 and 1 where one of the two is constant.
 
     Args:
@@ -91,7 +92,7 @@ def correlations(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = T
     return found
 
 
-def pearson(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = True) -> IntervalEstimate:
+def pearson(x: Scalar, y: Scalar, *, confidence: float = 0.95, binormal: bool = True) -> IntervalEstimate:
     """Return the Pearson correlation of two columns; NaN between -1 and 1 where one of the two is constant.
 
     Args:
@@ -112,7 +113,13 @@ def pearson(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = True) 
 
 
 def sobol_indices(
-    a: Any, b: Any, ab: Any, *, confidence: float = 0.95, replicates: int = BOOTSTRAP_REPLICATES, seed: int = 0
+    a: Scalar,
+    b: Scalar,
+    ab: AnyArray,
+    *,
+    confidence: float = 0.95,
+    replicates: int = BOOTSTRAP_REPLICATES,
+    seed: int = 0,
 ) -> SobolIndices:
     """Return the Sobol' indices of d inputs; NaN with infinite ends if f is constant.
 

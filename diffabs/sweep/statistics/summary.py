@@ -12,10 +12,10 @@ read one at a time, so that ten million rows fit into memory. The design decides
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
+from diffabs.core.types import JsonObject, PyTree
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail, cvar, mean_of_replicates, quantile
 from diffabs.sweep.statistics.estimates import summarise_column as summarised
@@ -36,7 +36,7 @@ INTERVAL_NOTES = {
 }
 
 
-def summarise_sweep(found: Results, confidence: float = 0.95) -> dict[str, Any]:
+def summarise_sweep(found: Results, confidence: float = 0.95) -> JsonObject:
     """Return the summary of the finished chunks.
 
     Diverged runs are counted, and enter the failures but no other statistic. Refused samples are counted, and enter
@@ -70,7 +70,7 @@ def summarise_sweep(found: Results, confidence: float = 0.95) -> dict[str, Any]:
     }
 
 
-def _summarise_refused(found: Results, accepted: np.ndarray) -> dict[str, Any]:
+def _summarise_refused(found: Results, accepted: np.ndarray) -> JsonObject:
     """Return the number of refused samples, the first of them, and the count of each reason."""
     reasons, counts = np.unique(found.column("refused")[~accepted].astype(str), return_counts=True)
     return {
@@ -99,7 +99,7 @@ class _RowSelection:
         values = np.where(self.good, self.found.column(name), np.nan)
         return [block[np.isfinite(block)] for block in np.split(values, self.replicates)]
 
-    def never(self, name: str) -> dict[str, Any]:
+    def never(self, name: str) -> JsonObject:
         """Return the runs with an infinite value, which never reach the measured event. No other statistic includes
         them.
         """
@@ -107,7 +107,7 @@ class _RowSelection:
         return {"count": int(rows.sum()), "samples": self.found.column("sample")[rows][:MAX_LISTED_SAMPLES].tolist()}
 
 
-def _failure_probabilities(found: Results, view: _RowSelection, confidence: float) -> Iterator[tuple[str, Any]]:
+def _failure_probabilities(found: Results, view: _RowSelection, confidence: float) -> Iterator[tuple[str, PyTree]]:
     kinds = found.failures()
     kinds["any"] = np.any(list(kinds.values()), axis=0)
     asked = view.rows & view.accepted
@@ -124,7 +124,7 @@ def _failure_probabilities(found: Results, view: _RowSelection, confidence: floa
         yield name, {"count": count.failures, **_json_estimate(one, view.random)}
 
 
-def _summarise_metric(view: _RowSelection, name: str, confidence: float) -> dict[str, Any]:
+def _summarise_metric(view: _RowSelection, name: str, confidence: float) -> JsonObject:
     values = view.column(name)
     values = values[np.isfinite(values)]
     if len(values) < MIN_SAMPLES:
@@ -132,7 +132,7 @@ def _summarise_metric(view: _RowSelection, name: str, confidence: float) -> dict
     found = summarised(values, confidence, QUANTILE_LEVELS, CVAR_LEVEL)
     if view.replicates > 1:
         blocks = view.blocks(name)
-        kinds: dict[str, Any] = {"mean": np.mean}
+        kinds: JsonObject = {"mean": np.mean}
         kinds |= {f"quantile {level:g}": lambda x, level=level: quantile(x, level).value for level in QUANTILE_LEVELS}
         kinds[f"cvar {CVAR_LEVEL:g}"] = lambda x: cvar(x, CVAR_LEVEL, replicates=100).value
         found |= {
@@ -143,7 +143,7 @@ def _summarise_metric(view: _RowSelection, name: str, confidence: float) -> dict
     return {**{kind: _json_estimate(one, view.random) for kind, one in found.items()}, **ends}
 
 
-def _summarise_sensitivity(found: Results, view: _RowSelection, confidence: float) -> dict[str, Any]:
+def _summarise_sensitivity(found: Results, view: _RowSelection, confidence: float) -> JsonObject:
     """Return by metric and variable the correlations, or the Sobol' indices of a Saltelli design."""
     variables = [path for path in found.variables if found.is_number(path)]
     metrics = {name: found.column(name) for name in found.metrics}
@@ -168,7 +168,7 @@ def _summarise_sensitivity(found: Results, view: _RowSelection, confidence: floa
     return result
 
 
-def _summarise_indices(values: np.ndarray, view: _RowSelection, names: list[str], confidence: float) -> dict[str, Any]:
+def _summarise_indices(values: np.ndarray, view: _RowSelection, names: list[str], confidence: float) -> JsonObject:
     """Return the Sobol' indices of one metric, without rows in which a run diverged or has an infinite value."""
     whole = len(values) // view.period * view.period
     table, good = values[:whole].reshape(-1, view.period), view.good[:whole] & np.isfinite(values[:whole])
@@ -183,14 +183,14 @@ def _summarise_indices(values: np.ndarray, view: _RowSelection, names: list[str]
     }
 
 
-def _worst_samples(found: Results, view: _RowSelection, name: str) -> list[dict[str, Any]]:
+def _worst_samples(found: Results, view: _RowSelection, name: str) -> list[JsonObject]:
     known = view.good & np.isfinite(found.column(name))
     values, samples = found.column(name)[known], found.column("sample")[known]
     tail = Tail.of(values, samples, MAX_LISTED_SAMPLES)
     return [{"sample": int(i), "value": float(v)} for i, v in zip(tail.indices, tail.values, strict=True)]
 
 
-def _json_estimate(estimate: dict[str, Any], random: bool) -> dict[str, Any]:
+def _json_estimate(estimate: JsonObject, random: bool) -> JsonObject:
     """Return an estimate with null for ends that are infinite or do not exist."""
     ends = {end: estimate[end] if random and math.isfinite(estimate[end]) else None for end in ("low", "high")}
     value = estimate["value"]
