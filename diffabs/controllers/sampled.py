@@ -101,8 +101,8 @@ class Sampled:
     def compute_guarded(
         self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking, lost: Bool = False
     ) -> tuple[Memory, Scalar, PyTree]:
-        """Return the result of `computed` for a usable sample, else the old memory and output; and whether the sample
-        is skipped.
+        """Return the result of `compute_sample` for a usable sample, else the old memory and output, and whether the
+        sample is skipped.
 
         Args:
             clock: Clock of the sampling period: its h is the period.

@@ -106,7 +106,7 @@ class Series:
             signal = block.output(t, m, signal)
         return _join_memories(memories)
 
-    def recorded(self, t: Scalar, memory: Memory, signal: PyTree) -> tuple[PyTree, ...]:
+    def recorded_signals(self, t: Scalar, memory: Memory, signal: PyTree) -> tuple[PyTree, ...]:
         """Return the inputs of the recording blocks, in order, for the input `signal` at time `t` with `memory`."""
         found: tuple[PyTree, ...] = ()
         for block, m in self._pairs(memory):
@@ -165,7 +165,7 @@ def record_signal(block: Part, t: Scalar, memory: Memory, signal: PyTree) -> Sca
         memory: Memory of the block.
         signal: Input of the block.
     """
-    inner = getattr(block, "recorded", None)
+    inner = getattr(block, "recorded_signals", None)
     return inner(t, memory, signal) if inner else signal
 
 

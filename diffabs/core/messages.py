@@ -142,7 +142,7 @@ class Shown(NamedTuple):
 class Segment(NamedTuple):
     """A step of a run between two instants, without a jump inside.
 
-    `output`, `error`, `shown` and `sample` return the cubic of a signal from values and rates at both ends. Its
+    `output`, `error`, `shown_cubic` and `sample` return the cubic of a signal from values and rates at both ends. Its
     extrema, roots and integrals are those of the run to the order of the method.
 
     Attributes:

@@ -377,7 +377,7 @@ def refine_parts(part: Part, times: int) -> PyTree:
 def prepare_derivatives(part: Part, paths: Iterable[str], prefix: str = "") -> PyTree:
     """Return the parts for derivatives by the parameters at these paths.
 
-    A part with a method `differentiated(names)` is replaced by its result for the names of its own parameters.
+    A part with a method `enable_derivatives(names)` is replaced by its result for the names of its own parameters.
 
     Args:
         part: Part.
@@ -392,7 +392,7 @@ def prepare_derivatives(part: Part, paths: Iterable[str], prefix: str = "") -> P
     inner = {name: prepare_derivatives(getattr(part, name), paths, f"{prefix}{name}.") for name in fields}
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
     own = {path.removeprefix(prefix) for path in paths if path.startswith(prefix)}
-    return part.enable_derivatives(own) if hasattr(part, "differentiated") else part
+    return part.enable_derivatives(own) if hasattr(part, "enable_derivatives") else part
 
 
 def _rebuild_parts(part: Part, method: str, *args: PyTree) -> PyTree:

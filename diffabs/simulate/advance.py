@@ -274,13 +274,13 @@ def _build_passages(system: Dynamics, point: FixedStepPoint, end: PyTree, one: S
     def recorded_rates(t: Scalar, state: LoopState, accumulators: Accumulators, rate: PyTree) -> Any:
         (flow, still), held = split_flow_and_held(state, accumulators)
 
-        def recorded(t: Scalar, flow: PyTree) -> Any:
+        def read_recorded(t: Scalar, flow: PyTree) -> Any:
             if system.program is None:
                 return loop.signals(t, state.with_flow(flow)).recorded
             fixed = (held, loop, system.objectives)
             return system.program(lambda recorded: recorded.signals.recorded, (t, flow, still), fixed, within)
 
-        return jax.jvp(recorded, (t, flow), (jnp.ones_like(t), rate))
+        return jax.jvp(read_recorded, (t, flow), (jnp.ones_like(t), rate))
 
     if not loop.recorders:
         return {}

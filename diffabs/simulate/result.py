@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.protocols import Ending, Objective
 from diffabs.core.pytree import prepare_parts
-from diffabs.core.types import Bool, PyTree, Scalar
+from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
 from diffabs.simulate.condition import RunStatus
 from diffabs.simulate.solution import Run, Trajectory
 
@@ -51,7 +51,7 @@ def finish_run(loop: Loop, objectives: dict[str, Objective], carry: PyTree) -> t
     return Run(metrics, stopped & ~diverged, diverged, timed_out, ending, None), last
 
 
-def observe(loop: Loop, t: Scalar, state: LoopState, running: Bool) -> Trajectory:
+def observe(loop: Loop, t: Scalar, state: LoopState, running: AnyArray) -> Trajectory:
     """Return the signals of the loop at an instant.
 
     Args:

@@ -63,7 +63,7 @@ def warn(subject: Part, values: Params, batch: Batch, solver: Solver, where: str
     """Warn of parameters whose derivative is one-sided in some run of the batch.
 
     Args:
-        subject: Loop, or a part with a method `closed()`.
+        subject: Loop, or a part with a method `closed_loop()`.
         values: Values of the parameters by path.
         batch: The runs.
         solver: Solver of the runs.

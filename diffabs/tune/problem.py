@@ -71,10 +71,10 @@ class Multipliers(NamedTuple):
 
 
 def build_subject_loop(subject: Part) -> Loop:
-    """Return the closed loop of `subject`: the subject itself, or the result of its method `closed()`.
+    """Return the closed loop of `subject`: the subject itself, or the result of its method `closed_loop()`.
 
     Args:
-        subject: Loop, or a part with a method `closed()`.
+        subject: Loop, or a part with a method `closed_loop()`.
     """
     return subject if isinstance(subject, Loop) else subject.closed_loop()
 
@@ -84,7 +84,7 @@ class Problem:
     """A tuning problem: a part, its free parameters, and the objective and constraints of a choice of them.
 
     Attributes:
-        subject: Loop, or a part with a method `closed()`. The parameters of such a part may be of any kind that
+        subject: Loop, or a part with a method `closed_loop()`. The parameters of such a part may be of any kind that
             determines a loop, for example LQ weights.
         space: Map from the unbounded vector z to the free parameters.
         solver: Solver of every run.

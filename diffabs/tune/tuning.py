@@ -44,7 +44,7 @@ def tune(
     the result. A search may end at such a point without a minimum.
 
     Args:
-        subject: A Loop, or a part with a method `closed()`.
+        subject: A Loop, or a part with a method `closed_loop()`.
         free: Dotted paths of the free parameters, with the ranges that bound them (None: the declared range).
         objective: Weight of each metric of `measured` in the objective, `{"stop_distance": 1.0, "effort": 1e-4}`.
         over: The runs, as parameters of the loop by path; None is one run of the loop itself.

@@ -126,7 +126,7 @@ def worst_case(
     """Return the greatest value of a metric found in a box, by a screening of points and then gradient ascent.
 
     Args:
-        loop: A Loop, or a part with a method `closed()`.
+        loop: A Loop, or a part with a method `closed_loop()`.
         over: The box {path: (low, high)}.
         metric: Name of the metric to maximise.
         solver: Solver of every run.

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 import typer
 from commands import assert_one_error_line, left_in, run, umask
-from marks import readable_id
 from project import ROOT
 from seams import replace_seam
 
@@ -176,26 +175,6 @@ def test_lab_rig_commands_have_no_torque_unit(tmp_path, simulated):
     assert header.endswith("command [1],control [1]")
 
 
-BAD = [
-    (("slip-lim",), "did you mean slip-lmi?"),
-    (("none.toml",), "No such file"),
-    (("slip-lmi", "--set", "plant.mass=-1"), "plant.mass = -1 is outside (0, inf) kg"),
-    (("slip-lmi", "--set", "road.w4=nan"), "road.w4 = nan is outside [0, inf)"),
-    (("slip-lmi", "--set", "contrller.gain=1,2"), "did you mean controller?"),
-    (("slip-lmi", "--set", "controller.gain=hello"), 'controller.gain = "hello" is text; a list of numbers'),
-    (("slip-lmi", "--set", "plant.mass"), "section.field=value"),
-    (("slip-lmi", "--seed", "-1"), "solver.seed = -1 is outside [0, 4294967295]"),
-]
-
-
-@pytest.mark.parametrize(("args", "needed"), BAD, ids=[readable_id(" ".join(args)) for args, _ in BAD])
-def test_bad_scenario_is_one_line_and_leaves_nothing(tmp_path, args, needed):
-    result = run("simulate", *args, "--json", "--csv", tmp_path / "a.csv", status=2)
-    assert_one_error_line(result)
-    assert needed in result.stderr
-    assert left_in(tmp_path) == set()
-
-
 def test_step_that_is_not_stable(monkeypatch):
     replace_seam(monkeypatch, "stable_step", stable_step)
     result = run("simulate", "slip-lmi", "--set", "solver.step=0.01", status=2)
@@ -331,24 +310,6 @@ def test_every_help_has_an_example_that_is_right(command, monkeypatch):
     given = group.commands[name].make_context(name, list(args)).params
     if "changes" in given:
         scenario.load(given["scenario"], given["changes"] or (), integrated=False)
-
-
-USAGE = [
-    (("sweep", "slip-lmi", "--workers", "0", "--on", "dask"), "--workers 0 is outside [1, 8]"),
-    (("sweep", "slip-lmi", "--devices", "0"), "--devices 0 is outside [1, 8]"),
-    (("rare", "slip-lmi", "iae", "--samples", "many"), "--samples: "),
-    (("simulate", "--nonsense"), "no such option: --nonsense"),
-    (("design",), "missing argument"),
-    (("simulat",), "Did you mean 'simulate'?"),
-    (("simulate", "a", "b\nc"), "unexpected extra argument"),
-]
-
-
-@pytest.mark.parametrize(("args", "needed"), USAGE, ids=[readable_id(" ".join(args)) for args, _ in USAGE])
-def test_wrong_usage_is_one_line(args, needed):
-    result = run(*args, status=2)
-    assert_one_error_line(result)
-    assert needed.lower() in result.stderr.lower()
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
-from marks import readable_id
 from mutants import killed_by
 from project import ROOT
 from seams import replace_seam
@@ -348,31 +347,6 @@ def test_a_gain_that_follows_the_speed_is_proved_as_one():
 
 
 # bad input
-
-
-BAD = [
-    (("--gain=1,2,3",), '--gain "1,2,3" has 3 of 2 numbers, one for each of integral of slip error, slip error'),
-    (("--gain=1;2",), '--gain "1;2": numbers are needed, as in --gain=-11753,-48'),
-    (("--gain=",), '--gain "": numbers are needed'),
-    (("--gain=nan,1",), '--gain "nan,1" is outside (-inf, inf)'),
-    (("--set", "design.Q=1,1,1"), "design.Q has shape (3,); it needs (2, 2), or its diagonal (2,); the states are"),
-    (("--set", "design.R=1,1"), "design.R has shape (2,); it needs (1, 1)"),
-    (("--set", "controller=relay"), "controller relay is not linear"),
-    (("--set", "design.over.plant.mas=1,2"), "did you mean plant.mass?"),
-    (("--out", "none/c.json"), "No such file or directory"),
-    (("--out", "."), "is not a regular file"),
-]
-
-
-@killed_by("cli/certificates.py", "    if len(values) != len(states):", "    if False:")
-@pytest.mark.parametrize(("args", "needed"), BAD, ids=[readable_id(" ".join(args)) for args, _ in BAD])
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, no_polytope, args, needed):
-    monkeypatch.chdir(tmp_path)
-    out = () if "--out" in args else ("--out", "c.json")
-    result = run("certify", "slip-lmi", *args, *out, "--json", status=2)
-    assert_one_error_line(result)
-    assert needed in result.stderr
-    assert left_in(tmp_path) == set()
 
 
 def test_vertex_without_a_solution_is_bad_input(monkeypatch):

@@ -9,7 +9,7 @@ from commands import assert_one_error_line, left_in, run
 from marks import readable_id
 from mutants import killed_by
 from seams import replace_seam
-from sweeping import rig
+from small_scenarios import IDENTIFY as SMALL
 
 import diffabs.identify.identification as library
 from diffabs.cli import identify as commands_identify
@@ -41,11 +41,6 @@ KEYS = [
 UNITS = BrakeOutput.units
 HEADER = "t [s],wheel_speed [m/s],slip [1],command [N m]"
 ROWS = ["0,13.8,0.0,1", "0.1,12.9,0.05,1", "0.3,11.0,0.1,2"]
-SMALL = f"""{rig(50.0, 48.0)}
-[solver]
-step = 1e-3
-duration = 0.5
-"""
 
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")  # it has tests of its own
@@ -275,37 +270,6 @@ def test_interrupted_it_leaves_nothing_half_written(small, csv, tmp_path, monkey
     replace_seam(monkeypatch, "identify", interrupted)
     args = ("--data", csv(HEADER, *ROWS), *FREE, "--out", tmp_path / "out.toml")
     assert run("identify", small, *args, status=130).stderr == "interrupted\n"
-    assert left_in(tmp_path) == {"small.toml", "run.csv"}
-
-
-BAD = [
-    (("--free", "plant.mas"), "--free plant.mas is not a parameter of this loop; did you mean plant.mass?"),
-    (("--free", "plant.mass=5"), '--free "plant.mass=5" is not of the form path or path=low:high'),
-    (("--free", "=1:2"), '--free "=1:2" is not of the form'),
-    (("--free", "plant.mass=a:8"), '--free plant.mass.0 = "a" is text; a number in (0, inf) kg is needed'),
-    (("--free", "plant.mass=8:4"), "--free plant.mass = [8.0, 4.0] is empty: a range [low, high] in (0, inf) kg"),
-    (("--free", "plant.mass=-1:4"), "--free plant.mass = [-1.0, 4.0] is outside (0, inf) kg"),
-    (("--free", "plant.mass=6:8"), "plant.mass = 5.3 is outside (6, 8) kg, its range in --free"),
-    (("--free", "road.w4", "--free", "plant.road.w4"), "--free road.w4 is given twice"),
-    ((*FREE, "--sigma", "slip"), '--sigma "slip" is not of the form column=number'),
-    ((*FREE, "--sigma", "slp=1"), '--sigma "slp" is not a column of the data; did you mean slip?'),
-    ((*FREE, "--sigma", "slip=0"), "--sigma slip = 0 is outside (0, inf)"),
-    ((*FREE, "--sigma", "wheel_speed=much"), '--sigma wheel_speed = "much" is no number in (0, inf) m/s'),
-    ((*FREE, "--column", "speed"), '--column "speed" is not in the data; did you mean wheel_speed?'),
-    ((*FREE, "--out", "found"), "--out found: the name must end in .toml"),
-    ((*FREE, "--set", "plant.mass=0"), "plant.mass = 0 is outside (0, inf) kg"),
-    ((*FREE, "--set", "solver.duration=0.1"), "t = 0 ... 0.3 s leaves [0, 0.1] s, the solver's duration"),
-]
-
-
-@pytest.mark.parametrize(("args", "needed"), BAD, ids=[readable_id(" ".join(args)) for args, _ in BAD])
-def test_bad_input_is_one_line_and_leaves_nothing(small, csv, tmp_path, monkeypatch, args, needed):
-    monkeypatch.chdir(tmp_path)
-    path = csv(HEADER, *ROWS)
-    out = () if "--out" in args else ("--out", "c.toml")
-    result = run("identify", small, "--data", path, *args, *out, "--json", status=2)
-    assert_one_error_line(result)
-    assert needed in result.stderr
     assert left_in(tmp_path) == {"small.toml", "run.csv"}
 
 

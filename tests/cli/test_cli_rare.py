@@ -12,7 +12,8 @@ from marks import cases
 from project import ROOT
 from scipy.stats import norm
 from seams import replace_seam
-from sweeping import SCENARIO, described
+from small_scenarios import RARE
+from sweeping import described
 
 from diffabs.reliability.failure import failure_probability
 from diffabs.scenario.scenario import load
@@ -20,7 +21,6 @@ from diffabs.simulate.batch import Batch, run_batch
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
-RARE = SCENARIO.replace("[28.0, 34.0]", "{ type = 'normal', mean = 30.0, deviation = 1.0, low = 26.0, high = 40.0 }")
 PAGE = (ROOT / "docs" / "sweeps.md").read_text()
 NUMBER = r"\d\S*"
 
@@ -52,26 +52,6 @@ def test_tables_for_a_person(scenario, runs, monkeypatch):
     assert "stop_distance >= 2.8 m" in text
     assert re.search(rf"probability {NUMBER}, 95 % interval {NUMBER} to {NUMBER}", text)
     assert re.search(r"initial\.speed +\S +\d", text)
-
-
-@pytest.mark.parametrize(
-    ("args", "needed"),
-    [
-        (["stop_distanc=3"], "stop_distanc is not a metric of this scenario; did you mean stop_distance? There is "),
-        (["overshoot"], "overshoot has no bound in [sweep.failures]: say overshoot=BOUND"),
-        (["overshoot=nan"], "threshold must be finite, not nan"),
-        (["overshoot=much"], 'overshoot = "much" is text; a number in (-inf, inf) is needed'),
-        (["overshoot=1", "--samples", 7], "--samples 7 is not a multiple of 10 in [20, inf)"),
-        (["overshoot=1", "--samples", -20], "--samples -20 is not a multiple of 10 in [20, inf)"),
-        (["overshoot=1", "--seed", -1], "sweep.seed = -1 is outside [0, "),
-        (["overshoot=1", "--set", "sweep.over.plant.mas=1,2"], "sweep.over.plant.mas is not a parameter of this loop"),
-        (["overshoot=1", "--set", 'sweep.over.road=["rig"]'], "plant.road: alternatives of parts have no normal coord"),
-    ],
-)
-def test_what_cannot_be_asked(scenario, args, needed):
-    result = run("rare", scenario, *args, status=2)
-    assert_one_error_line(result)
-    assert needed in result.stderr
 
 
 @pytest.mark.slow

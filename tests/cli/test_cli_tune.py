@@ -17,10 +17,9 @@ import pytest
 from commands import assert_one_error_line, left_in, run, umask
 from invented import HISTORY
 from invented import tuned as invention
-from marks import readable_id
 from mutants import killed_by
 from seams import replace_seam
-from sweeping import rig, tune_section
+from small_scenarios import TUNE as SMALL
 
 import diffabs.tune as library
 from diffabs.cli import certificates, console, progress, tune_document
@@ -31,12 +30,6 @@ from diffabs.scenario.scenario import load
 from diffabs.simulate.run import measure
 from diffabs.tune import DerivativeMode, Reason, StartError, Tuned
 
-SMALL = f"""title = "small"{rig(50.0, 48.0)}
-[solver]
-step = 1e-3
-duration = 0.15
-seed = 3
-{tune_section(2, 0.5)}"""
 KEYS = [
     *("scenario", "model", "made", "lanes", "free", "objective", "metrics", "constraints", "met", "reason"),
     "gradient_norm",
@@ -492,38 +485,6 @@ def test_interrupted_while_it_draws_there_is_no_picture(small, invented, tmp_pat
 
 
 # Bad input
-
-
-BAD = [
-    (("--set", "tune.free={}"), "tune.free is empty", '"controller.gain" = '),
-    (("--set", "tune.objective={}"), "tune.objective is empty", "iae = 1.0"),
-    (("--set", "controller=relay"), "tune.free is empty"),
-    (("--set", "controller.gain=-4000,-70"), "controller.gain.1 = -70 is outside (-60, -20) N m/s, N m, its range in"),
-    (("--set", "tune.free.plant.mass=5.3,6"), "plant.mass = 5.3 is outside (5.3, 6) kg, its range in tune.free"),
-    (("--set", "tune.over.initial.speed_kmh=30,50"), "tune.over.initial.speed = 8.33333 m/s is not above stop.speed"),
-    (("--starts", "0"), "tune.starts = 0 is outside [1, 1000]"),
-    (
-        ("--set", "tune.limits.overshot=1"),
-        "tune.limits.overshot is not a metric of this scenario; did you mean overshoot?",
-    ),
-    (("--plot", "a.bmp"), "--plot a.bmp: the name must end in .png, .pdf, .svg"),
-    (("--out", "tuned"), "--out tuned: the name must end in .toml"),
-    (("--out", "none/c.toml"), "No such file or directory"),
-    (("--set", "tune.decay=9", "--set", "controller=relay", "--set", "tune.free.reference.slip=0.1,0.3"), "not linear"),
-]
-
-
-@pytest.mark.parametrize("case", BAD, ids=[readable_id(" ".join(case[0])) for case in BAD])
-def test_bad_input_is_one_line_and_leaves_nothing(small, tmp_path, monkeypatch, case):
-    args, *needed = case
-    monkeypatch.chdir(tmp_path)
-    replace_seam(monkeypatch, "tune_tune", lambda *_, **__: pytest.fail("tuned"))
-    out = () if "--out" in args else ("--out", "c.toml")
-    result = run("tune", small, *args, *out, "--json", status=2)
-    assert_one_error_line(result)
-    for text in needed:
-        assert text in result.stderr
-    assert left_in(tmp_path) == {"small.toml"}
 
 
 @pytest.mark.parametrize("module", ["optax", "scipy"])

@@ -260,8 +260,8 @@ def test_the_integral_of_an_error_that_changes_sign(h):
 )
 @killed_by(
     "core/messages.py",
-    "Shown.of(self.end)), self.shown_rates())",
-    "Shown.of(self.end)), [rate._replace(setpoint=0.0 * rate.setpoint) for rate in self.shown_rates()])",
+    "self.h * rate, rates) for rates in self.shown_rates())",
+    "self.h * rate, rates._replace(setpoint=0.0 * rates.setpoint)) for rates in self.shown_rates())",
 )
 @pytest.mark.parametrize(
     ("solver", "rtol"),

@@ -37,7 +37,7 @@ def both(system, gain, kind, **data):
     """The verdict of both verifiers, which must agree."""
     one = Certificate(system, gain, (Claim(kind, data),))
     stored = json.loads(json.dumps(plain(one)), parse_int=float)
-    verdict = checker.proved_data(stored["system"], stored["gain"], kind, stored["claims"][0]["data"])
+    verdict = checker.proved(stored["system"], stored["gain"], kind, stored["claims"][0]["data"])
     assert one.verified_exactly == verdict, (kind, data)
     return verdict
 

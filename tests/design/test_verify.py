@@ -83,7 +83,7 @@ def test_each_kind_is_proved_if_it_is_true_and_only_then(tmp_path, pair):
         stored = json.loads((tmp_path / "c.json").read_text(), parse_int=float)
         claim = stored["claims"][0]
         assert (not verdict.reason) is true
-        assert checker.proved_data(stored["system"], stored["gain"], claim["kind"], claim["data"]) is true
+        assert checker.proved(stored["system"], stored["gain"], claim["kind"], claim["data"]) is true
         assert verdict.says
 
 
@@ -102,7 +102,7 @@ def test_it_agrees_with_the_checker_of_the_tests(tmp_path):
         stored = json.loads((tmp_path / "c.json").read_text(), parse_int=float)
         claim = stored["claims"][0]
         seen.append(not verdict.reason)
-        assert seen[-1] is checker.proved_data(stored["system"], stored["gain"], claim["kind"], claim["data"])
+        assert seen[-1] is checker.proved(stored["system"], stored["gain"], claim["kind"], claim["data"])
     assert 10 < sum(seen) < len(seen) - 10
 
 
@@ -198,7 +198,7 @@ def test_one_bit_of_a_proof_matters_or_leaves_it_true(tmp_path):
                 continue
             claim = json.loads(json.dumps(changed), parse_int=float)
             first = claim["claims"][0]
-            assert (not verdict.reason) is checker.proved_data(claim["system"], claim["gain"], "cost", first["data"])
+            assert (not verdict.reason) is checker.proved(claim["system"], claim["gain"], "cost", first["data"])
 
 
 # The command

@@ -1,5 +1,5 @@
-"""Every function that a package exports says what it returns, and names each of its arguments. Examples run. What texts
-name is there."""
+"""Every public function of the package says what it returns, and describes each of its arguments. Examples run. What
+texts name is there."""
 
 import ast
 import doctest
@@ -34,18 +34,76 @@ def exported():
 EXPORTED = exported()
 
 
-@pytest.mark.parametrize("name", EXPORTED)
-def test_it_has_a_docstring_that_begins_with_a_sentence(name):
-    first = (inspect.getdoc(EXPORTED[name]) or "").split("\n\n")[0]
-    assert re.search(r"[.:;]($|\s)", first), first
+HOME = pathlib.Path(diffabs.__file__).parent
+FILES = sorted(str(path.relative_to(HOME)) for path in HOME.rglob("*.py"))
+NO_VERBS = {
+    *("A", "An", "The", "What", "Whether", "How", "Which", "Why", "Where", "When", "Those", "That", "This", "If"),
+    *("For", "By", "In", "Of", "One", "All", "Each", "Every"),
+}
+ENTRY = re.compile(r"^    \**([\w, *]+?)(?: \(.*?\))?:", re.MULTILINE)
 
 
-@pytest.mark.parametrize("name", [name for name, item in EXPORTED.items() if inspect.isfunction(item)])
-def test_every_argument_is_named(name):
-    """As python-control asks it of its own functions. What a run is asked for stands in the contract, protocols.py."""
-    text = inspect.getdoc(EXPORTED[name])
-    missing = [arg for arg in inspect.signature(EXPORTED[name]).parameters if not re.search(rf"\b{arg}\b", text)]
-    assert missing == []
+def public_functions(path):
+    """Yield the public functions and classes at the top of a module, and the public methods of such classes."""
+    for node in ast.parse((HOME / path).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            yield node, ""
+            if isinstance(node, ast.ClassDef):
+                inner = [one for one in node.body if isinstance(one, ast.FunctionDef) and not one.name.startswith("_")]
+                yield from ((one, f"{node.name}.") for one in inner)
+
+
+def contract_methods():
+    """Return the names of the methods that contracts describe, in protocols.py: parts need not say it again."""
+    tree = ast.parse((HOME / "core/protocols.py").read_text(encoding="utf-8"))
+    offered = re.findall(r"(\w+)\(", ast.get_docstring(tree) or "")
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    return {one.name for node in classes for one in node.body if isinstance(one, ast.FunctionDef)} | set(offered)
+
+
+def arguments(node):
+    given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+    return [arg.arg for arg in given if arg.arg not in ("self", "cls")]
+
+
+def is_command(node):
+    """Whether a function is a command: its docstring is its help, and each option has one of its own."""
+    annotations = " ".join(ast.unparse(arg.annotation) for arg in node.args.args if arg.annotation)
+    return re.search(r"typer\.(Option|Argument)|console\.(ScenarioName|Changes|Json)", annotations)
+
+
+@killed_by("core/cubic.py", '"""Return dp/dx at', '"""The slope dp/dx at')
+@pytest.mark.parametrize("path", FILES)
+def test_a_docstring_begins_with_a_sentence(path):
+    """Of a function with a verb, of a property or a class with a noun."""
+    contract = contract_methods()
+    for node, owner in public_functions(path):
+        text = ast.get_docstring(node) or ""
+        decorators = " ".join(map(ast.unparse, getattr(node, "decorator_list", [])))
+        if not text and ((owner and node.name in contract) or "overload" in decorators):
+            continue
+        assert re.search(r"[.:;]($|\s)", text.split("\n\n")[0]), owner + node.name
+        if isinstance(node, ast.FunctionDef) and "property" not in decorators and not (owner and node.name in contract):
+            assert text.split()[0] not in NO_VERBS, f"{owner}{node.name}: {text.splitlines()[0]}"
+
+
+@killed_by("roads/optimum.py", "        speed: Vehicle", "        velocity: Vehicle")
+@pytest.mark.parametrize("path", FILES)
+def test_every_argument_is_described(path):
+    """Under Args for a function, in the text for a method. The classes in protocols.py describe those of contracts."""
+    contract = contract_methods()
+    for node, owner in public_functions(path):
+        text = ast.get_docstring(node) or ""
+        if not isinstance(node, ast.FunctionDef) or is_command(node) or (owner and node.name in contract):
+            continue
+        if owner:
+            missing = [arg for arg in arguments(node) if not re.search(rf"\b{arg}\b", text)]
+        else:
+            listed = re.search(r"^Args:\n((?:    .*\n?|\n)*)", text + "\n", re.MULTILINE)
+            entries = ENTRY.findall(listed[1]) if listed else []
+            named = {name.strip(" *") for entry in entries for name in entry.split(",")}
+            missing = [arg for arg in arguments(node) if arg not in named]
+        assert missing == [], owner + node.name
 
 
 SHOWN = {
@@ -80,11 +138,10 @@ def test_the_example_prints_what_it_says(name):
     assert doctest.DocTestRunner().run(EXAMPLES[name], out=told.append).failed == 0, "".join(told)
 
 
-HOME = pathlib.Path(diffabs.__file__).parent
 OURS = "|".join(sorted(path.parent.name for path in HOME.glob("*/__init__.py")))
 DOTTED = re.compile(rf"`(?:diffabs\.)?((?:{OURS})(?:\.[A-Za-z_]\w*)+)[`(]")
 PLACE = re.compile(rf"`(?:diffabs/)?((?:{OURS})/\w[\w/]*\w)")
-FILES = {"html"}  # endings of files that have a package's name
+ENDINGS = {"html"}  # endings of files that have a package's name
 
 
 def is_there(dotted):
@@ -109,6 +166,6 @@ def test_what_is_named_is_there():
     """In the text of the package and on the pages: dotted names, and places such as `simulate/batch`."""
     for path in [*HOME.rglob("*.py"), *(HOME.parent / "docs").rglob("*.md")]:
         text = path.read_text(encoding="utf-8")
-        names = [name for name in DOTTED.findall(text) if name.rpartition(".")[2] not in FILES]
+        names = [name for name in DOTTED.findall(text) if name.rpartition(".")[2] not in ENDINGS]
         assert [name for name in names if not is_there(name)] == [], path
         assert [place for place in PLACE.findall(text) if not is_a_place(place)] == [], path

@@ -660,5 +660,5 @@ def test_the_command_writes_a_function_block(tmp_path):
     assert "speed : LREAL; (* [m/s] *)" in text
     assert str(tmp_path) not in text
     assert Block(text)(slip=0.0, speed=13.9) == pytest.approx(2.6912710579228354, rel=1e-12)
-    assert "FUNCTION_BLOCK brake_law, to be called once a period" in result.stderr
+    assert "call FUNCTION_BLOCK brake_law once a period" in result.stderr
     assert " : REAL;" in command("export", "slip-cured", "--to", "st", "--float32").stdout

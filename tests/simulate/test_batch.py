@@ -75,7 +75,7 @@ class Slow(NamedTuple):
     def own(self, number):
         return number
 
-    def reached(self, number, output):
+    def has_reached(self, number, output):
         return output.speed < self.speeds[jnp.minimum(number, len(self.speeds) - 1)]
 
 

@@ -259,7 +259,7 @@ def test_points_with_one_side_are_named_in_any_run_and_subject():
     class Twice:
         half: float = param(default=4.5, unit="N m")
 
-        def closed(self):
+        def closed_loop(self):
             controller = controllers.SlidingMode(gain=2 * self.half, high=9.0)
             return braking(controller=controller, feedforward=controllers.NoFeedforward())
 

@@ -19,7 +19,7 @@ class Processor:
     def __init__(self):
         self.rooms = {}  # needed and given, by address
 
-    def compiled(self, text):
+    def compile(self, text):
         before, after = ((HERE / name).read_text() for name in ("stand_ins.h", "one_by_one.h"))
         return compilers.build_library(before + text + after)
 

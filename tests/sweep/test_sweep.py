@@ -17,7 +17,8 @@ from commands import assert_one_error_line, left_in, run
 from marks import cases, readable_id
 from mutants import killed_by
 from seams import replace_seam
-from sweeping import described, rig
+from small_scenarios import SWEEP as SMALL
+from sweeping import described
 
 import diffabs as d
 from diffabs import roads
@@ -29,26 +30,6 @@ from diffabs.sweep.trajectories import write_trajectories
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
-SMALL = f"""title = "small"{rig(30.0, 25.0)}
-[sensor]
-type = "noise"
-slip = 0.005
-period = 4e-3
-[solver]
-step = 2e-3
-duration = 0.25
-[sweep]
-samples = 150
-chunk = 64
-seed = 3
-[sweep.over]
-"plant.mass" = [5.3, 6.2]
-"initial.speed_kmh" = [28.0, 34.0]
-"controller.gain.0" = {{ type = "triangular", low = -5e3, mode = -4e3, high = -3e3 }}
-"controller.gain.1" = {{ type = "categorical", choices = [-40.0, 1e308], weights = [0.9, 0.1] }}
-[sweep.failures]
-overshoot = 0.3
-"""
 ROAD = 'road = ["rig", { type = "scaled", road = "rig-unrounded", scale = 0.9 }]\n[sweep.failures]'
 ROADS = SMALL.replace("[sweep.failures]", ROAD)
 SINGLE = SMALL.replace("1e308", "3e38")  # diverges in float32
@@ -356,40 +337,6 @@ def test_a_sample_that_is_simulated_again_is_its_row(by_command):
 
 
 # What cannot be
-
-
-BAD = [
-    (("--samples", "0"), "--samples 0 is not positive"),
-    (("--samples", "-5"), "--samples -5 is not positive"),
-    (("--set", "sweep.samples=-5"), "sweep.samples = -5 is outside [0, 4294967295]"),
-    (("--set", "sweep.chunk=0"), "sweep.chunk = 0 is outside [1, 1048576]"),
-    (("--seed", "-1"), "sweep.seed = -1 is outside"),
-    (("--set", "sweep.over.plant.mas=1,2"), "sweep.over.plant.mas is not a parameter of this loop; did you mean"),
-    (("--set", "sweep.over.plant.mass=-1,2"), "sweep.over.plant.mass", "(0, inf) kg"),
-    (("--set", "sweep.over.plant.mass=[6,5]"), "sweep.over.plant.mass"),
-    (("--set", "sweep.over.controller.gain.7=1,2"), "sweep.over.controller.gain.7 is not a parameter of this loop"),
-    (("--set", 'sweep.over.road=["glass"]'), "sweep.over.road.0"),
-    (
-        ("--set", "sweep.failures.overshot=1"),
-        "sweep.failures.overshot is not a metric of this scenario; did you mean overshoot?",
-    ),
-    (("--engine", "spark"), "--engine spark is unknown"),
-    (("--on", "mars"), "--on mars is unknown"),
-    (("--scheduler", "tcp://127.0.0.1:1"), "--scheduler tcp://127.0.0.1:1 needs --on dask"),
-    (("--devices", "2", "--on", "dask"), "--devices 2 needs --on local"),
-    (("--keep", "1,150"), "--keep 150 is outside [0, 149]"),
-    (("--keep", "first"), "--keep first is no list of sample numbers"),
-]
-
-
-@pytest.mark.parametrize("case", BAD, ids=[readable_id(" ".join(case[0])) for case in BAD])
-def test_bad_input_is_one_line_and_leaves_nothing(file, tmp_path, case):
-    args, *needed = case
-    result = run("sweep", file(SMALL), "--out", tmp_path / "out", *args, status=2)
-    assert_one_error_line(result)
-    for text in needed:
-        assert text in result.stderr
-    assert left_in(tmp_path) == {"mine.toml"}
 
 
 def test_nothing_varies(file, tmp_path):

@@ -138,7 +138,7 @@ def killed_before(name, calls):
 
 for LAST in range(1, 8):
     store = Store(pathlib.Path(folder) / str(LAST))
-    with store.locked():
+    with store.lock():
         if (child := os.fork()) == 0:
             calls = []
             for name in ("fsync", "replace", "rename"):

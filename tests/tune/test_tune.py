@@ -276,7 +276,7 @@ class Constrained:
     def evaluator(self, scale):
         return self._evaluate
 
-    def refused(self):
+    def find_refusal(self):
         return None
 
     def steady(self):

@@ -1,0 +1,253 @@
+"""What commands refuse: one table of command, exit status and the texts that the message contains.
+
+A refusal is one line on stderr, nothing on stdout, no file, and nothing dear is computed first."""
+
+import shlex
+
+import pytest
+from commands import assert_one_error_line, left_in, run
+from marks import readable_id
+from mutants import killed_by
+from seams import replace_seam
+from small_scenarios import IDENTIFY, MEASUREMENTS, RARE, SWEEP, TUNE
+
+FILES = {
+    "identify.toml": IDENTIFY,
+    "rare.toml": f"{RARE}[sweep.failures]\nstop_distance = 2.8\n",
+    "run.csv": MEASUREMENTS,
+    "sweep.toml": SWEEP,
+    "tune.toml": TUNE,
+}
+# Options that a command is given if it has none of its own: a file that must not be written.
+TARGETS = {
+    "certify": "--out c.json --json",
+    "identify": "--out c.toml --json",
+    "simulate": "--csv c.csv --json",
+    "sweep": "--out out",
+    "tune": "--out c.toml --json",
+}
+REFUSALS = [
+    # usage
+    ("sweep slip-lmi --workers 0 --on dask", 2, ["--workers 0 is outside [1, 8]"]),
+    ("sweep slip-lmi --devices 0", 2, ["--devices 0 is outside [1, 8]"]),
+    ("rare slip-lmi iae --samples many", 2, ["--samples: "]),
+    ("simulate --nonsense", 2, ["no such option: --nonsense"]),
+    ("design", 2, ["missing argument"]),
+    ("simulat", 2, ["Did you mean 'simulate'?"]),
+    ("simulate a 'b\nc'", 2, ["unexpected extra argument"]),
+    # simulate
+    ("simulate slip-lim", 2, ["did you mean slip-lmi?"]),
+    ("simulate none.toml", 2, ["No such file"]),
+    ("simulate slip-lmi --set plant.mass=-1", 2, ["plant.mass = -1 is outside (0, inf) kg"]),
+    ("simulate slip-lmi --set road.w4=nan", 2, ["road.w4 = nan is outside [0, inf)"]),
+    ("simulate slip-lmi --set contrller.gain=1,2", 2, ["did you mean controller?"]),
+    ("simulate slip-lmi --set controller.gain=hello", 2, ['controller.gain = "hello" is text; a list of numbers']),
+    ("simulate slip-lmi --set plant.mass", 2, ["section.field=value"]),
+    ("simulate slip-lmi --seed -1", 2, ["solver.seed = -1 is outside [0, 4294967295]"]),
+    ("simulate arm-hanging --set plant.body_inertia=-1", 2, ["plant.body_inertia = -1 is outside [0, inf) kg m^2"]),
+    ("simulate arm-hanging --set plant.arm_inertia=-1", 2, ["plant.arm_inertia = -1 is outside (0, inf) kg m^2"]),
+    ("simulate arm-hanging --set plant.resistance=0", 2, ["plant.resistance = 0 is outside (0, inf) ohm"]),
+    ("simulate arm-hanging --set actuator.voltage_max=-48", 2, ["actuator.voltage_max = -48 is outside (0, inf) V"]),
+    ("simulate arm-hanging --set controller=proportional-feedback", 2, ["proportional-feedback needs speed"]),
+    ("simulate arm-hanging --set stop=standstill", 2, ["standstill needs speed"]),
+    ("simulate arm-hanging --set objective.overshoot=max-slip", 2, ["objective.overshoot: max-slip needs slip"]),
+    ("simulate arm-hanging --set initial=brake-start", 2, ["arm-balance needs theta; there is only speed, slip"]),
+    # identify
+    (
+        "identify identify.toml --data run.csv --free plant.mas",
+        2,
+        ["--free plant.mas is not a parameter of this loop; did you mean plant.mass?"],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=5",
+        2,
+        ['--free "plant.mass=5" is not of the form path or path=low:high'],
+    ),
+    ("identify identify.toml --data run.csv --free =1:2", 2, ['--free "=1:2" is not of the form']),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=a:8",
+        2,
+        ['--free plant.mass.0 = "a" is text; a number in (0, inf) kg is needed'],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=8:4",
+        2,
+        ["--free plant.mass = [8.0, 4.0] is empty: a range [low, high] in (0, inf) kg"],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=-1:4",
+        2,
+        ["--free plant.mass = [-1.0, 4.0] is outside (0, inf) kg"],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=6:8",
+        2,
+        ["plant.mass = 5.3 is outside (6, 8) kg, its range in --free"],
+    ),
+    ("identify identify.toml --data run.csv --free road.w4 --free plant.road.w4", 2, ["--free road.w4 is given twice"]),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --sigma slip",
+        2,
+        ['--sigma "slip" is not of the form column=number'],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --sigma slp=1",
+        2,
+        ['--sigma "slp" is not a column of the data; did you mean slip?'],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --sigma slip=0",
+        2,
+        ["--sigma slip = 0 is outside (0, inf)"],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --sigma wheel_speed=much",
+        2,
+        ['--sigma wheel_speed = "much" is no number in (0, inf) m/s'],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --column speed",
+        2,
+        ['--column "speed" is not in the data; did you mean wheel_speed?'],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --out found",
+        2,
+        ["--out found: the name must end in .toml"],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --set plant.mass=0",
+        2,
+        ["plant.mass = 0 is outside (0, inf) kg"],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --set solver.duration=0.1",
+        2,
+        ["t = 0 ... 0.3 s leaves [0, 0.1] s, the solver's duration"],
+    ),
+    # certify
+    (
+        "certify slip-lmi --gain=1,2,3",
+        2,
+        ['--gain "1,2,3" has 3 of 2 numbers, one for each of integral of slip error, slip error'],
+    ),
+    ("certify slip-lmi '--gain=1;2'", 2, ['--gain "1;2": numbers are needed, as in --gain=-11753,-48']),
+    ("certify slip-lmi --gain=", 2, ['--gain "": numbers are needed']),
+    ("certify slip-lmi --gain=nan,1", 2, ['--gain "nan,1" is outside (-inf, inf)']),
+    (
+        "certify slip-lmi --set design.Q=1,1,1",
+        2,
+        ["design.Q has shape (3,); it needs (2, 2), or its diagonal (2,); the states are"],
+    ),
+    ("certify slip-lmi --set design.R=1,1", 2, ["design.R has shape (2,); it needs (1, 1)"]),
+    ("certify slip-lmi --set controller=relay", 2, ["controller relay is not linear"]),
+    ("certify slip-lmi --set design.over.plant.mas=1,2", 2, ["did you mean plant.mass?"]),
+    ("certify slip-lmi --out none/c.json", 2, ["No such file or directory"]),
+    ("certify slip-lmi --out .", 2, ["is not a regular file"]),
+    # tune
+    ("tune tune.toml --set 'tune.free={}'", 2, ["tune.free is empty", '"controller.gain" = ']),
+    ("tune tune.toml --set 'tune.objective={}'", 2, ["tune.objective is empty", "iae = 1.0"]),
+    ("tune tune.toml --set controller=relay", 2, ["tune.free is empty"]),
+    (
+        "tune tune.toml --set controller.gain=-4000,-70",
+        2,
+        ["controller.gain.1 = -70 is outside (-60, -20) N m/s, N m, its range in"],
+    ),
+    (
+        "tune tune.toml --set tune.free.plant.mass=5.3,6",
+        2,
+        ["plant.mass = 5.3 is outside (5.3, 6) kg, its range in tune.free"],
+    ),
+    (
+        "tune tune.toml --set tune.over.initial.speed_kmh=30,50",
+        2,
+        ["tune.over.initial.speed = 8.33333 m/s is not above stop.speed"],
+    ),
+    ("tune tune.toml --starts 0", 2, ["tune.starts = 0 is outside [1, 1000]"]),
+    (
+        "tune tune.toml --set tune.limits.overshot=1",
+        2,
+        ["tune.limits.overshot is not a metric of this scenario; did you mean overshoot?"],
+    ),
+    ("tune tune.toml --plot a.bmp", 2, ["--plot a.bmp: the name must end in .png, .pdf, .svg"]),
+    ("tune tune.toml --out tuned", 2, ["--out tuned: the name must end in .toml"]),
+    ("tune tune.toml --out none/c.toml", 2, ["No such file or directory"]),
+    (
+        "tune tune.toml --set tune.decay=9 --set controller=relay --set tune.free.reference.slip=0.1,0.3",
+        2,
+        ["not linear"],
+    ),
+    # sweep
+    ("sweep sweep.toml --samples 0", 2, ["--samples 0 is not positive"]),
+    ("sweep sweep.toml --samples -5", 2, ["--samples -5 is not positive"]),
+    ("sweep sweep.toml --set sweep.samples=-5", 2, ["sweep.samples = -5 is outside [0, 4294967295]"]),
+    ("sweep sweep.toml --set sweep.chunk=0", 2, ["sweep.chunk = 0 is outside [1, 1048576]"]),
+    ("sweep sweep.toml --seed -1", 2, ["sweep.seed = -1 is outside"]),
+    (
+        "sweep sweep.toml --set sweep.over.plant.mas=1,2",
+        2,
+        ["sweep.over.plant.mas is not a parameter of this loop; did you mean"],
+    ),
+    ("sweep sweep.toml --set sweep.over.plant.mass=-1,2", 2, ["sweep.over.plant.mass", "(0, inf) kg"]),
+    ("sweep sweep.toml --set 'sweep.over.plant.mass=[6,5]'", 2, ["sweep.over.plant.mass"]),
+    (
+        "sweep sweep.toml --set sweep.over.controller.gain.7=1,2",
+        2,
+        ["sweep.over.controller.gain.7 is not a parameter of this loop"],
+    ),
+    ("sweep sweep.toml --set 'sweep.over.road=[\"glass\"]'", 2, ["sweep.over.road.0"]),
+    (
+        "sweep sweep.toml --set sweep.failures.overshot=1",
+        2,
+        ["sweep.failures.overshot is not a metric of this scenario; did you mean overshoot?"],
+    ),
+    ("sweep sweep.toml --engine spark", 2, ["--engine spark is unknown"]),
+    ("sweep sweep.toml --on mars", 2, ["--on mars is unknown"]),
+    ("sweep sweep.toml --scheduler tcp://127.0.0.1:1", 2, ["--scheduler tcp://127.0.0.1:1 needs --on dask"]),
+    ("sweep sweep.toml --devices 2 --on dask", 2, ["--devices 2 needs --on local"]),
+    ("sweep sweep.toml --keep 1,150", 2, ["--keep 150 is outside [0, 149]"]),
+    ("sweep sweep.toml --keep first", 2, ["--keep first is no list of sample numbers"]),
+    # rare
+    (
+        "rare rare.toml stop_distanc=3",
+        2,
+        ["stop_distanc is not a metric of this scenario; did you mean stop_distance? There is "],
+    ),
+    ("rare rare.toml overshoot", 2, ["overshoot has no bound in [sweep.failures]: say overshoot=BOUND"]),
+    ("rare rare.toml overshoot=nan", 2, ["threshold must be finite, not nan"]),
+    ("rare rare.toml overshoot=much", 2, ['overshoot = "much" is text; a number in (-inf, inf) is needed']),
+    ("rare rare.toml overshoot=1 --samples 7", 2, ["--samples 7 is not a multiple of 10 in [20, inf)"]),
+    ("rare rare.toml overshoot=1 --samples -20", 2, ["--samples -20 is not a multiple of 10 in [20, inf)"]),
+    ("rare rare.toml overshoot=1 --seed -1", 2, ["sweep.seed = -1 is outside [0, "]),
+    (
+        "rare rare.toml overshoot=1 --set sweep.over.plant.mas=1,2",
+        2,
+        ["sweep.over.plant.mas is not a parameter of this loop"],
+    ),
+    (
+        "rare rare.toml overshoot=1 --set 'sweep.over.road=[\"rig\"]'",
+        2,
+        ["plant.road: alternatives of parts have no normal coord"],
+    ),
+]
+
+
+@killed_by(
+    "cli/certificates.py", "    if len(values) != len(states):", "    if False:", case="certify slip-lmi --gain=1,2,3"
+)
+@pytest.mark.usefixtures("any_step_is_stable")
+@pytest.mark.parametrize(("command", "status", "needed"), REFUSALS, ids=[readable_id(row[0]) for row in REFUSALS])
+def test_a_refusal_is_one_line_and_leaves_nothing(command, status, needed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seam in ("tune_tune", "polytope", "launch_lanes"):
+        replace_seam(monkeypatch, seam, lambda *_, **__: pytest.fail("computed something first"))
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    words = shlex.split(command)
+    more = TARGETS.get(words[0], "").split()
+    words += more if "--out" not in words else more[2:]
+    result = run(*words, status=status)
+    assert_one_error_line(result)
+    for text in needed:
+        assert text.lower() in result.stderr.lower()
+    assert left_in(tmp_path) == set(FILES)

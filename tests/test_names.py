@@ -1,0 +1,94 @@
+"""One name has one meaning in the whole package, and a function's name is a verb or the noun that it returns."""
+
+import ast
+import collections
+import pathlib
+import re
+
+import pytest
+from mutants import killed_by
+from project import ROOT
+
+PACKAGE = ROOT / "diffabs"
+TREES = {path.relative_to(PACKAGE): ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+
+# The same verb, the same meaning: a command and the function that it calls; the methods of a paper's module; of a
+# plant; a step of fixed and of adaptive runs; a formula of a checker that imports nothing of the package.
+SHARED_FUNCTIONS = {
+    *("certify", "check_accuracy", "design", "identify", "margins", "sweep", "tune"),
+    *("compact", "extra_rows", "figures", "loop", "reproduce", "run", "table"),
+    *("usual_objectives", "usual_parts"),
+    *("attempt_step", "commit_step", "init_carry", "step"),
+    *("he", "is_positive_definite"),
+}
+# The parts of a paper's module, and tables of a checker that imports nothing of the package.
+SHARED_CONSTANTS = {"TITLE", "SOLVER", "NOTES", "CLAIMS", "FIELD_SHAPES", "FIELD_RANGES"}
+# Methods by which a part from outside meets its contract, factories of whole loops, nouns, and a name of NumPy.
+PARTICIPLES = {"prepared", "refined", "holding", "braking", "balancing", "damping", "embed", "seed", "searchsorted"}
+IRREGULAR = {
+    *("given", "taken", "seen", "drawn", "known", "shown", "told", "made", "found", "kept", "said", "held", "sent"),
+    *("lent", "built", "left", "chosen", "written", "broken"),
+}
+
+
+def homes(kind, trees=TREES):
+    """Return the files in which each public class or function is defined at the top of a module, by name."""
+    found = collections.defaultdict(set)
+    for path, tree in trees.items():
+        for node in tree.body:
+            if isinstance(node, kind) and not node.name.startswith("_"):
+                found[node.name].add(str(path))
+    return found
+
+
+def several(found):
+    return {name: sorted(files) for name, files in found.items() if len(files) > 1}
+
+
+def constants():
+    """Return the values of each constant at the top of a module, as written, by name and file."""
+    found = collections.defaultdict(dict)
+    for path, tree in TREES.items():
+        for node in tree.body:
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                for target in targets:
+                    if isinstance(target, ast.Name) and target.id.isupper():
+                        found[target.id][str(path)] = ast.unparse(node.value)
+    return found
+
+
+def functions(tree):
+    """Yield every function of a file, methods and inner ones too, but no property."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef) and "property" not in " ".join(map(ast.unparse, node.decorator_list)):
+            yield node
+
+
+def test_a_public_class_has_one_home():
+    assert several(homes(ast.ClassDef)) == {}
+
+
+def test_a_public_function_has_one_meaning():
+    shared = several(homes(ast.FunctionDef))
+    assert {name: files for name, files in shared.items() if name not in SHARED_FUNCTIONS} == {}
+    assert set(shared) >= SHARED_FUNCTIONS  # the list names no function that has one home
+
+
+def test_two_homes_are_found():
+    trees = {pathlib.Path(name): ast.parse("def find(x):\n    pass\n") for name in ("a.py", "b.py")}
+    assert several(homes(ast.FunctionDef, trees)) == {"find": ["a.py", "b.py"]}
+
+
+@killed_by("design/parameter_box.py", "MIN_ENTRY_EXTENT", "CORRELATION_TOLERANCE")
+def test_a_constant_has_one_meaning():
+    several_values = {name: files for name, files in constants().items() if len(set(files.values())) > 1}
+    assert {name: files for name, files in several_values.items() if name not in SHARED_CONSTANTS} == {}
+
+
+@killed_by("stops/stops.py", "_rest_of_braking", "_braked")
+@pytest.mark.parametrize("path", TREES, ids=str)
+def test_no_function_is_named_by_a_participle(path):
+    names = {node.name.strip("_") for node in functions(TREES[path])}
+    found = {name for name in names if re.fullmatch(r"[a-z]+(ed|ing)", name) or name in IRREGULAR}
+    assert found - PARTICIPLES == set()
