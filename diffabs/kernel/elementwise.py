@@ -128,16 +128,21 @@ def _inverse(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("rem")
 def _rem(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
-    # A constant divisor other than 0 needs no guard.
-    if ins[1].size and not is_real(ins[1].flat[0].dtype) and any(x.op != "const" or x.attr == 0 for x in ins[1].flat):
+    # A constant divisor other than 0 and -1 needs no guard.
+    divisors = ins[1].flat
+    if ins[1].size and not is_real(divisors[0].dtype) and any(x.op != "const" or x.attr in (0, -1) for x in divisors):
         return [map_entries(lambda x, y: _integer_remainder(graph, x, y), *ins)]
     return [map_entries(lambda x, y: graph.op("rem", x, y), *ins)]
 
 
 def _integer_remainder(graph: Graph, x: Node, y: Node) -> Node:
-    """Return an integer remainder with the sign of x; x itself for y = 0, where a processor would stop the process."""
-    zero = graph.op("eq", y, graph.const(0, y.dtype))
-    return graph.select(zero, graph.op("rem", x, graph.select(zero, y, graph.const(1, y.dtype))), x)
+    """Return an integer remainder with the sign of x, and x itself for y = 0, without the cases that stop a process."""
+    zero, unit = graph.op("eq", y, graph.const(0, y.dtype)), graph.const(False)
+    if y.dtype.kind == "i":
+        # The least integer divided by -1 overflows, which stops the process on x86. The remainder by 1 is the same.
+        unit = graph.op("eq", y, graph.const(-1, y.dtype))
+    safe = graph.select(graph.op("or", zero, unit), y, graph.const(1, y.dtype))
+    return graph.select(zero, graph.op("rem", x, safe), x)
 
 
 @lowering_rule("round", "rounding_method")

@@ -3,6 +3,7 @@ texts name is there."""
 
 import ast
 import doctest
+import functools
 import importlib
 import inspect
 import pathlib
@@ -53,6 +54,7 @@ def public_functions(path):
                 yield from ((one, f"{node.name}.") for one in inner)
 
 
+@functools.cache
 def contract_methods():
     """Return the names of the methods that contracts describe, in protocols.py: parts need not say it again."""
     tree = ast.parse((HOME / "core/protocols.py").read_text(encoding="utf-8"))

@@ -101,6 +101,10 @@ RULES = {
     "powers": lambda x, y, k: jnp.stack([x**2, x**3, x**-2, jnp.square(y)]),
     "rests": lambda x, y, k: jnp.stack([jnp.fmod(x, 0.7), jnp.remainder(y, 0.7)]),
     "whole rests": lambda x, y, k: jnp.stack([k % 5, -k % 7, k // 3, -k // 4, k // (k - 3), k % (k - 3)]),
+    "rests of the least": lambda x, y, k: jnp.stack(
+        [jax.lax.rem(jnp.where(k < 99, jnp.iinfo(k.dtype).min, k), jnp.where(k < by, -1, k)) for by in (-99, 99)]
+    ),
+    "least rest of -1": lambda x, y, k: jax.lax.rem(jnp.where(k < 99, jnp.iinfo(k.dtype).min, k), jnp.full_like(k, -1)),
     "rounded": lambda x, y, k: jnp.stack([jax.lax.round(x), jnp.round(x), jnp.trunc(y)]),
     "bits that are set": lambda x, y, k: jax.lax.population_count(jnp.uint32(k) * jnp.uint32(2654435761)),
     "converted": lambda x, y, k: jnp.stack([(100 * x).astype(int), k + (x > y), x.astype(bool) + k]),
