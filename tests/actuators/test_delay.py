@@ -99,6 +99,7 @@ def delayed_decay(t, k, late):
 
 
 @pytest.mark.parametrize("kinks", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
 def test_converges_to_the_method_of_steps(kinks):
     """The command's second derivative jumps, once, in the midst of a step: third order."""
     k, late, end = 40.0, 0.03137, 0.25
@@ -116,6 +117,7 @@ def test_converges_to_the_method_of_steps(kinks):
 @killed_by("actuators/delay.py", "jnp.where(at[0] <= 1.0, moves[0], 0.0)", "0.0 * moves[0]", case="jacfwd-0.0317")
 @pytest.mark.parametrize("late", [0.0317, pytest.param(0.03, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_derivatives_of_the_method_of_steps(late, derivative):
     """With respect to gain and delay; also of a delay that is a whole number of steps, whose second derivatives jump on
     the grid: to second order there."""

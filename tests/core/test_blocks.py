@@ -371,6 +371,7 @@ def test_latch_waits_for_the_brake():
     close(target, [0.2] * 10 + [0.1093] * 2, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_latch_follows_later_maxima():
     """The second one is higher: the target moves there. Past the peak from the start, the best slip was the first."""
     parts = {"reference": PeakLatch(), "controller": ConstantTorque()}

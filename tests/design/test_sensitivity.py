@@ -93,6 +93,7 @@ def agrees(system, weights, tolerance):
     "weights",
     [pytest.param(w, id=name, marks=pytest.mark.slow if name != "middle" else ()) for name, w in PUBLISHED.items()],
 )
+@pytest.mark.slow
 def test_derivatives_of_a_design_are_differences(weights):
     agrees(RIG, weights, 1e-4)
 

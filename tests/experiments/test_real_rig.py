@@ -112,6 +112,7 @@ CONTROLLERS = [pytest.param(path, id=path.stem, marks=() if path.stem in EXAMPLE
     case="estimated-sliding-mode-cma-es",
 )
 @pytest.mark.parametrize("path", CONTROLLERS)
+@pytest.mark.slow
 def test_each_committed_controller_runs_elsewhere(rig, path):
     """The documents of docs/controllers, on a rig that is not the nominal one."""
     document = json.loads(path.read_text())
@@ -196,6 +197,7 @@ def let_go(rig, rest):
 
 
 @killed_by("sensors/speed_estimator.py", "(slip < self.gate) | (braked >= self.rest)", "(slip < 2.0)")
+@pytest.mark.slow
 def test_a_brake_that_was_let_go_by_mistake_bites_again(rig):
     """The wheel that seems to slip does not push, so it is believed in the end; the same in NumPy. Where nobody looks
     at that, the car rolls for ever."""

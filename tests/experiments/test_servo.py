@@ -86,6 +86,7 @@ def by_hand(motor, gains):
     "objectives/tracking.py", "jnp.where(sample.setpoint < 0, -1.0, 1.0)", "jnp.where(sample.setpoint < 0, 1.0, 1.0)"
 )
 @killed_by("objectives/tracking.py", 'getattr(output, "highest", math.inf)', 'getattr(output, "highest_signal", 1.0)')
+@pytest.mark.slow
 def test_the_linear_servo_follows_its_closed_form(servo):
     """exp(A t) with the closed loop written by hand, at every instant; and what is measured, from that curve."""
     loop, gains = linear(servo)

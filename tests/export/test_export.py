@@ -345,6 +345,7 @@ def test_the_target_can_come_from_outside(tmp_path):
     assert "target; /* [1] */" in text
 
 
+@pytest.mark.slow
 def test_difference_equations_are_the_controllers():
     found = difference_equations(
         rig(PID(kp=60.0, ki=400.0, kd=0.3, cutoff=55.0, high=np.inf, low=0.0), feedforward=HoldingInput())

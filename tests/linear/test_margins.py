@@ -224,6 +224,7 @@ def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
     "delay = float(sum(block.time for block in blocks if isinstance(block, Delay)))",
     "delay = 0.0",
 )
+@pytest.mark.slow
 def test_a_pure_delay_turns_the_phase_and_nothing_else():
     w = np.geomspace(1, 2000, 40)
     plain = open_loop(rig(actuator=Lag(time_constant=1e-3))).transfer()

@@ -239,6 +239,7 @@ def iae_of_one(gain, speed):
         pytest.param(jax.jacrev, jax.grad, id="jacrev", marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_derivatives_are_those_of_single_runs(mode, single):
     """In the loop, which lanes share, and in their values."""
     slopes_of_one = jax.jit(single(iae_of_one, (0, 1)))

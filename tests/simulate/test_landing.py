@@ -76,6 +76,7 @@ def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
 @pytest.mark.parametrize(
     "solver", [pytest.param(d.FixedStep(H, 0.03), id="fixed"), pytest.param(d.Adaptive(1e-5, 0.03, H), id="adaptive")]
 )
+@pytest.mark.slow
 def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
     """A computer says the time, each 5 ms, and takes a while for it. Some of these moments are a rounding after the
     beginning of a step: an event at once has its derivatives as any other. Where it takes all the time that it may, a

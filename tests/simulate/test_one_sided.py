@@ -86,6 +86,7 @@ def test_a_delay_has_the_derivative_of_differences(loop, path, places, solver):
         np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-6, err_msg=f"{path} = {x}")
 
 
+@pytest.mark.slow
 def test_without_delay_the_derivative_is_from_the_right():
     loop, path, places = DELAYS[0].values
     found, differences = beside(*run(loop, path, d.FixedStep(STEP, 0.02)), *places[0])

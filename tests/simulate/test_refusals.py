@@ -226,6 +226,7 @@ class TestAfterARun:
         "zero + RunStatus.RUNNING, zero + RunStatus.DIVERGED",
         "zero + RunStatus.RUNNING, zero + RunStatus.STOPPED",
     )
+    @pytest.mark.slow
     def test_a_traced_start_beyond_the_stop_is_no_run(self):
         braked = jax.jit(lambda start: d.measure(replace(RIG, {"initial.speed": start}), SOLVER, BRAKING))
         for start in (1.0, 5 / 3.6):

@@ -75,6 +75,7 @@ def curvature(loop, path, solver, metrics=METRICS, outer=jax.jacfwd, inner=jax.j
 
 
 @pytest.mark.parametrize("name", ["a stop", *(pytest.param(n, marks=pytest.mark.slow) for n in list(LOOPS)[1:])])
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_differences(name):
     """To 1e-4 of the largest of each metric, or to three times what two widths differ by: a kink may move through a
     step between them."""
@@ -114,6 +115,7 @@ DELAYED = rig(feedback(), actuator=actuators.Delay(time=1e-3, capacity=8))
     ],
     ids=["adaptive", "delay"],
 )
+@pytest.mark.slow
 def test_a_run_without_second_derivatives_says_so(loop, solver, line):
     """First derivatives it has."""
 

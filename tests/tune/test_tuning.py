@@ -395,6 +395,7 @@ class TestWorstCase:
         worst = float(np.max(d.run_batch(RIG, lanes, SOLVER, BRAKING).metrics["iae"]))
         np.testing.assert_allclose([found.value, found.rollouts], [worst, len(points)], rtol=1e-12)
 
+    @pytest.mark.slow
     def test_the_report_says_what_is_known(self):
         """Of runs that another test has compiled."""
         given = {"measured": {"max_slip": BRAKING["max_slip"]}, "screen": 16, "starts": 3, "iterations": 1}
