@@ -69,7 +69,7 @@ def excess(config: Config, reference: Any, values: dict[str, Any]) -> np.ndarray
     one = braking(
         plant=QuarterCar(inertia=INERTIA, mass=config.mass, road=road),
         reference=reference,
-        controller=PID(kp=3893.0, ki=config.ki),
+        controller=PID(kp=3893.0, ki=config.ki, low=0.0, high=config.torque),
         stop=Standstill(speed=config.stop),
     )
     lanes = {path: value for path, value in values.items() if "." in path}

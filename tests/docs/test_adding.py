@@ -17,8 +17,8 @@ def project(tmp_path_factory):
     """A copy of the project with the files and exports of the page, but not yet its lines in tests/support/parts.py."""
     root = tmp_path_factory.mktemp("project")
     shutil.copytree(ROOT / "diffabs", root / "diffabs", ignore=shutil.ignore_patterns("__pycache__"))
-    (root / "tests").mkdir()
-    for name in ("conftest.py", "parts.py", "test_conformance.py"):
+    shutil.copytree(ROOT / "tests/support", root / "tests/support", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("conftest.py", "test_conformance.py"):
         shutil.copy(ROOT / "tests" / name, root / "tests")
     shutil.copy(ROOT / "pyproject.toml", root)
     for target, text in BLOCKS:
@@ -58,7 +58,7 @@ def test_new_parts_pass_once_they_are_listed(project):
     assert before.returncode == 1, before.stdout
     assert "Brush" in before.stdout
     assert "Scheduled" in before.stdout
-    parts = project / "tests" / "parts.py"
+    parts = project / "tests" / "support" / "parts.py"
     text = parts.read_text()
     for target, line in BLOCKS:
         if family := re.search(r"add to (\w+)", target):
