@@ -15,8 +15,8 @@ TREES = {path.relative_to(PACKAGE): ast.parse(path.read_text("utf-8")) for path 
 # The same verb, the same meaning: a command and the function that it calls; the methods of a paper's module; of a
 # plant; a step of fixed and of adaptive runs; a formula of a checker that imports nothing of the package.
 SHARED_FUNCTIONS = {
-    *("certify", "check_accuracy", "design", "identify", "margins", "sweep", "tune"),
-    *("compact", "extra_rows", "figures", "loop", "reproduce", "run", "table"),
+    *("certify", "design", "identify", "margins", "sweep", "tune"),
+    *("compact", "figures", "loop", "reproduce", "run", "table"),
     *("usual_objectives", "usual_parts"),
     *("attempt_step", "commit_step", "init_carry", "step"),
     *("he", "is_positive_definite"),

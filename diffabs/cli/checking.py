@@ -21,7 +21,7 @@ CLOSER = 16  # `rtol` of the run with adaptive steps is divided by this for the 
 LOOSE, LEAST = 100, 0.01  # a change above LOOSE * rtol * max(|metric|, LEAST) is reported
 
 
-def check_accuracy(chosen: Scenario, key: Key) -> JsonObject:
+def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
     """Return the accuracy of each metric as JSON values.
 
     They hold the changes by a half step (absolute and relative), by a further quarter step, and by single precision.
@@ -92,7 +92,7 @@ def describe_check(found: JsonObject) -> list[str]:
     """Return the warnings of a check, a line each.
 
     Args:
-        found: Values of `check_accuracy`.
+        found: Values of `check_run_accuracy`.
     """
     lines = [f"accuracy unknown: {why}" for why in found["reasons"]]
     if found["comparable"] and not found["ended alike"]:

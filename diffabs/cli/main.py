@@ -41,7 +41,7 @@ from diffabs.cli import (
     tune,
     usage,
 )
-from diffabs.cli.checking import check_accuracy, describe_check, describe_loose_metrics
+from diffabs.cli.checking import check_run_accuracy, describe_check, describe_loose_metrics
 from diffabs.core import interrupt, provenance
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Key, PyTree, Scalar
@@ -146,7 +146,9 @@ def simulate(
             if picture:
                 console.run_with_progress(lambda: _draw(chosen, run, picture), "drawing")
             found = (
-                console.run_with_progress(lambda: check_accuracy(chosen, key), "shortening the step") if check else None
+                console.run_with_progress(lambda: check_run_accuracy(chosen, key), "shortening the step")
+                if check
+                else None
             )
             lines = describe_check(found) if found else _find_loose_metrics(chosen, run, key, kept)
         result = _result(chosen, run, limited, {"csv": csv, "mat": mat, "plot": plot}) | (

@@ -90,7 +90,7 @@ def show_accuracy(found: JsonObject) -> None:
     """Show the changes of the metrics by shorter steps and by single precision.
 
     Args:
-        found: Values of `check_accuracy`.
+        found: Values of `check_run_accuracy`.
     """
     table = Table("metric", "half step", "relative", "order", "error", "float32")
     for name, row in found["metrics"].items():

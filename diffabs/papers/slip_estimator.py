@@ -196,7 +196,7 @@ def shortest_distances(car: QuarterCar, locked: Run) -> dict[str, float]:
     return {"unlimited": y.speed[0] ** 2 / length, "90 N m": distance + speed**2 / length}
 
 
-def extra_rows(results: EstimatorResults) -> list[JsonObject]:
+def bound_rows(results: EstimatorResults) -> list[JsonObject]:
     """Return the rows of the Magic Formula, the locked time, the literal estimator and the bounds.
 
     Args:
@@ -269,7 +269,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
     summary = {
         "paper": "slip-estimator",
         "title": TITLE,
-        "rows": rows + extra_rows(results),
+        "rows": rows + bound_rows(results),
         "matches": {"of": len(rows), "to the printed digit": sum(row["matches"] for row in rows)},
         "judged": estimator_claims.judge_estimator_claims(
             results.runs["spline B"], {name: car.road for name, car in CARS.items()}

@@ -199,7 +199,7 @@ def table(runs: Mapping[str, Run]) -> list[JsonObject]:
     return rows
 
 
-def extra_rows(filtered: Run, errors: Errors) -> list[JsonObject]:
+def reference_and_order_rows(filtered: Run, errors: Errors) -> list[JsonObject]:
     """Return the rows of the filtered reference, the friction curve and the measured order of convergence.
 
     Args:
@@ -277,7 +277,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
     summary = {
         "paper": "slip-lmi",
         "title": TITLE,
-        "rows": table(runs) + extra_rows(filtered, errors) + rows,
+        "rows": table(runs) + reference_and_order_rows(filtered, errors) + rows,
         "figures": names,
         "notes": NOTES + more["notes"],
         "design": more["design"],
