@@ -47,7 +47,7 @@ from diffabs.simulate.tries import AdaptiveCarry
 from diffabs.simulate.tsit5 import tsit5_step_from
 
 # Capacity of the log: attempts at an rtol of 1e-5, and attempts for each instant of a grid with clocks.
-BASE_LOG_CAPACITY, LOG_CAPACITY_PER_TICK = 4096, 2
+BASE_LOG_CAPACITY, LOG_CAPACITY_PER_TICK = 4096, 3
 # Fraction of the attempt with the first sign of an event. No event or crossing at the end of a step is farther from its
 # zero than this: a larger Newton step would come from a margin that hardly falls.
 MAX_SHIFT_FRACTION = 1e-3

@@ -363,7 +363,7 @@ def test_there_is_room_for_smaller_steps():
     loop, sampled = rig().loop, load("slip-cured").loop
     assert log_capacity(loop, d.Adaptive(1e-5, 2.5)) == BASE_LOG_CAPACITY
     assert log_capacity(loop, d.Adaptive(1e-9, 2.5)) == 10 * BASE_LOG_CAPACITY
-    assert log_capacity(sampled, d.Adaptive(1e-5, 2.0, 1e-3)) == BASE_LOG_CAPACITY + 2 * 2000
+    assert log_capacity(sampled, d.Adaptive(1e-5, 2.0, 1e-3)) == BASE_LOG_CAPACITY + 3 * 2000
 
 
 @pytest.mark.parametrize(
