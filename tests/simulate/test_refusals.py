@@ -340,6 +340,8 @@ class TestWhoeverRuns:
         assert found["refused"]["samples"][0] == np.flatnonzero(below)[0]
         assert sum(found["refused"]["reasons"].values()) == below.sum()
         assert found["failures"]["diverged"]["count"] == 0
+        none = 1 - 0.025 ** (1 / np.sum(~below))  # Clopper-Pearson's end for no failure among the runs that were made
+        assert found["failures"]["diverged"]["high"] == pytest.approx(none, rel=1e-9)
         assert found["failures"]["not stopped"]["value"] < 0.5
         assert found["failures"]["any"]["high"] < 1 / 2
 
