@@ -102,7 +102,6 @@ def test_burckhardt_peak(name):
     np.testing.assert_allclose(mu, c1 - c3 / c2 - c3 * s, rtol=1e-12, atol=0)
 
 
-@killed_by("roads/optimum.py", "s0 - ratio(slope(s0), curvature)", "s0")
 def test_gradient_of_burckhardt_peak():
     """d/dc1 = 1/(c1 c2), d/dc2 = (1/c2 - s)/c2, d/dc3 = -1/(c2 c3); of mu at its peak: the partial derivatives."""
     c1, c2, c3 = TABLE["WET_ASPHALT"]

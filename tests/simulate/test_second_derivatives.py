@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, roads, stops
@@ -161,17 +162,18 @@ def test_the_certified_decay_has_first_derivatives_only():
         jax.eval_shape(jax.hessian(rate), jnp.array([[-2.0, -2.0]]))
 
 
+@killed_by("roads/optimum.py", "s0 - ratio(slope(s0), curvature)", "s0")
 def test_a_road_peak_has_closed_form_second_derivatives():
-    """mu = s exp(-a s): the peak is at 1/a, its height exp(-1)/a."""
+    """mu = s exp(-(a s)^2): the peak is at 1/(sqrt(2) a), its height exp(-1/2)/(sqrt(2) a)."""
 
     class Hump:
         def __init__(self, a):
             self.a = a
 
         def friction(self, slip, speed=0.0, distance=0.0):
-            return slip * jnp.exp(-self.a * slip)
+            return slip * jnp.exp(-((self.a * slip) ** 2))
 
-    for part, factor in (("slip", 1.0), ("mu", np.exp(-1.0))):
+    for part, factor in (("slip", 0.5**0.5), ("mu", 0.5**0.5 * np.exp(-0.5))):
         found = jax.jacfwd(jax.jacfwd(lambda a, part=part: getattr(roads.peak(Hump(a)), part)))(5.0)
         assert found == pytest.approx(factor * 2 / 5.0**3, rel=1e-6)
 

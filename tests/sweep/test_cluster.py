@@ -386,6 +386,13 @@ def pretended(folder, name, version):
     return folder
 
 
+def renumbered(folder, version):
+    """A folder that makes diffabs say another version of itself."""
+    folder.mkdir(parents=True)
+    (folder / "sitecustomize.py").write_text(f'import diffabs\n\ndiffabs.__version__ = "{version}"\n')
+    return folder
+
+
 def without(folder, name):
     """A folder that makes a package look as if it were not installed."""
     (folder / f"{name}.py").parent.mkdir(parents=True)
@@ -398,7 +405,7 @@ def without(folder, name):
 def test_a_worker_with_other_versions(scenario, tmp_path):
     """Of the package and of JAX; and one that has no diffabs at all."""
     there = {
-        'diffabs is "9.9" there, ': pretended(tmp_path / "a", "diffabs", "9.9"),
+        'diffabs is "9.9" there, ': renumbered(tmp_path / "a", "9.9"),
         'jax is "0.1" there, ': pretended(tmp_path / "b", "jax", "0.1"),
         "a worker cannot say its versions: ModuleNotFoundError(\"No module named 'diffabs'\")": without(
             tmp_path / "c", "diffabs"
