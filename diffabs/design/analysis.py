@@ -37,17 +37,26 @@ def certify(
 ) -> Certificate:
     """Return the proved properties of u = K x: quadratic stability or its impossibility, and each specification.
 
-    A property without a proof raises no error: the certificate leaves it out.
+    A property without a proof raises no error: the certificate leaves it out. If no common P proves `spec.decay`,
+    damping, L2 gain and input limit are not tried. A disproof of a positive `spec.decay` leaves stability open:
+    `quadratically_stable` is then None, unless the cost is proved.
+
+    A schedule is proved by `certify_schedule`, with a P that varies along its parameter. It needs `spec.rates`,
+    continuous time, and no specifications but decay and cost.
 
     Args:
-        gain: Gain K, shape (m, n) or (n,); for a schedule also one gain for each node, shape (N + 1, m, n).
+        gain: Gain K, shape (m, n) or (n,). For a schedule of N cells also one gain for each node, shape (N + 1, m, n).
         system: A polytope, within which the system may vary arbitrarily fast, or a schedule along a measured parameter.
-        spec: Specification to prove; None stands for stability alone.
-        fastest: Whether to search for the largest decay rate that a common P proves, with a few more programs.
-            Otherwise the claimed rate is the larger of the specified rate and the rate that the first P proves.
+        spec: Specification to prove; None stands for stability alone, which a polytope accepts and a schedule does not.
+        fastest: Whether to search for the largest decay rate that has a proof, with a few more programs. Otherwise, on
+            a polytope, the claimed rate is at least `spec.decay`: the largest that the first P proves.
+
+    Returns:
+        Certificate with the proved claims; it has none if nothing is proved.
 
     Raises:
-        ValueError: Shapes that do not fit.
+        ValueError: Shapes that do not fit, a field of `spec` out of its range, damping of a discrete loop, or for a
+            schedule a specification as above.
         ModuleNotFoundError: cvxpy is not installed.
 
     Examples:

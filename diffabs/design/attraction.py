@@ -3,12 +3,13 @@
     recovered   the run entered an ellipsoid about rest from which the nonlinear loop, with its limits, provably
                 returns (`design.capture`); the run ends there
     fell        the run reached its stop
-    unstable    the linear loop about rest grows; almost no start comes to rest, so the start is not run
+    diverged    the run has invalid numbers, or starts beyond its stop
+    unstable    the linear loop about rest grows; almost no start comes to rest, so the run ends at its start
     undecided   none of these within the solver's duration; choose the duration so that no run is undecided
 
 The starts of a map are the centres of equal cells, so a share of them is a share of the box by area. A share is a count
-and has no derivative. `SoftLoss` is its differentiable surrogate: the mean of a sigmoid of log |x(T)| over the same
-starts. Its time T is so early that a run that will fall has not yet landed.
+and has no derivative. `objectives.SoftLoss` is its differentiable surrogate: the mean of a sigmoid of log |x(T)| over
+the same starts. Its time T is so early that a run that will fall has not yet landed.
 """
 
 import concurrent.futures
@@ -35,7 +36,17 @@ CAPTURE_LEVEL = 0.98  # value of x'Sx at which a run ends: rounding cannot take 
 
 
 class Outcomes(NamedTuple):
-    """The outcome of each run, shape (runs,), and the time [s] at which it is decided."""
+    """The outcome of each run, as one array of booleans for each kind of outcome.
+
+    The kinds are those of the module `design.attraction`. All arrays have the shape (runs,), or (n, m) in a `Basin`.
+
+    Attributes:
+        recovered: Whether the run came to rest, by its ellipsoid or by the band.
+        fell: Whether the run reached its stop.
+        unstable: Whether the linear loop about rest grows.
+        diverged: Whether the run is invalid.
+        time: Time [s] at which the run ended.
+    """
 
     recovered: np.ndarray
     fell: np.ndarray
@@ -45,7 +56,7 @@ class Outcomes(NamedTuple):
 
     @property
     def undecided(self) -> np.ndarray:
-        """Whether the run is finite but has no outcome at the end of its time, shape (runs,)."""
+        """Whether the run has none of the four outcomes at the end of its time, in the shape of the outcomes."""
         return ~(self.recovered | self.fell | self.unstable | self.diverged)
 
 
@@ -76,12 +87,17 @@ class Basin(NamedTuple):
 
     @property
     def undecided(self) -> float:
-        """Share [1] of the box by area whose runs neither recover, fall, diverge nor are unstable."""
+        """Share [1] of the box by area whose runs have no outcome."""
         return float(np.mean(self.outcomes.undecided))
 
 
 class Reach(NamedTuple):
-    """The largest recovered multiple, and whether the next tried one is undecided: then more may be recovered."""
+    """The largest multiple up to which every tried start recovers.
+
+    Attributes:
+        multiple: This multiple; 0 if the smallest tried start does not recover.
+        undecided: Whether the run at the next larger tried multiple is undecided. A longer duration may then give more.
+    """
 
     multiple: float
     undecided: bool
@@ -129,20 +145,20 @@ def classify_starts(
     """Return the outcome of each run within the solver's duration, shape (runs,).
 
     Args:
-        loop: Closed loop about upright.
-        starts: Values by path in which the runs differ, each of shape (runs,).
+        loop: Closed loop of a balance, which rests upright.
+        starts: Values by path in which the runs differ, each of shape (runs,). Paths outside `initial` are allowed.
         solver: Solver with the duration of the runs.
-        band: Bound on |x| at the end of a run: the run counts as recovered below it. For loops without a known
-            ellipsoid
-            (noise, observers, samples); it proves nothing about the time after the run.
+        band: None for a proof by the capture ellipsoid. A number replaces it: a run is recovered if |x| <= band at its
+            end. The norm |x| is Euclidean, over three angles [rad] and three rates [rad/s]. The band proves nothing
+            about the time after the run. It serves loops without an ellipsoid (noise, observers, sampled control).
         key: Random key of a noisy loop; run i draws from fold_in(key, i).
         engine: Engine of the runs, as in `run_batch`.
 
     Returns:
-        Outcomes, each of shape (runs,).
+        Outcomes, each of shape (runs,). `unstable` is False everywhere with a band.
 
     Raises:
-        ValueError: A loop without a known ellipsoid, and no band.
+        ValueError: A loop with a part for which no ellipsoid is known, and no band.
     """
     starts = {path: np.asarray(column) for path, column in starts.items()}
     count = len(next(iter(starts.values())))
@@ -201,17 +217,20 @@ def region_of_attraction(
     """Return the region of attraction over the cells of two axes, the first axis in rows.
 
     Args:
-        loop: Closed loop about upright.
-        first: Cells of the first axis.
-        second: Cells of the second axis.
+        loop: Closed loop of a balance, which rests upright.
+        first: Cells of the first axis, in the unit of its path (rad for the default).
+        second: Cells of the second axis, likewise.
         solver: Solver with the duration of the runs.
-        paths: Paths of the values on the two axes.
+        paths: Paths of the values on the two axes; all other values are those of `loop`.
         band: Bound on |x| at the end, as for `classify_starts`.
         key: Random key, as for `classify_starts`.
         engine: Engine of the runs, as in `run_batch`.
 
+    Returns:
+        Basin with outcomes of shape (n, m) for n and m cells.
+
     Raises:
-        ValueError: A loop without a known ellipsoid, and no band.
+        ValueError: A loop with a part for which no ellipsoid is known, and no band.
     """
     grid = np.meshgrid(first.centres, second.centres, indexing="ij")
     starts = {path: axis.ravel() for path, axis in zip(paths, grid, strict=True)}
@@ -233,15 +252,19 @@ def largest_recovered_multiples(
     It is 0 if the first multiple is not recovered. All runs are one batch.
 
     Args:
-        loop: Closed loop about upright.
-        rows: Values by path, each of shape (rows, ...): one loop for each row.
-        direction: Values of the initial state by path.
-        multiples: Increasing multiples of `direction` to try.
+        loop: Closed loop of a balance, which rests upright.
+        rows: Values by path, each of shape (rows, ...): one loop for each row; at least one path.
+        direction: Values of the initial state by path. A run starts from the multiple times these values; it does not
+            add them to the loop's own start.
+        multiples: Increasing multiples of `direction` to try, shape (k,).
         solver: Solver with the duration of the runs.
         engine: Engine of the runs, as in `run_batch`.
 
+    Returns:
+        One `Reach` for each row.
+
     Raises:
-        ValueError: A loop without a known ellipsoid.
+        ValueError: A loop with a part for which no ellipsoid is known.
     """
     count = len(next(iter(rows.values())))
     runs = {path: np.repeat(np.asarray(column), len(multiples), axis=0) for path, column in rows.items()}
@@ -266,11 +289,13 @@ def recoverable_multiple(
 ) -> Reach:
     """Return the largest c in [0, most] such that the loop recovers from every tried multiple of `direction` up to c.
 
-    The search ends at a relative width of 1e-4. Every refinement is one batch.
+    The search tries 33 multiples in a batch, and then refines the interval up to the first failure. It ends at a
+    relative width of 1e-4.
 
     Args:
-        loop: Closed loop about upright.
-        direction: Values of the initial state by path.
+        loop: Closed loop of a balance, which rests upright.
+        direction: Values of the initial state by path, such as {"initial.theta": 1.0}. A run starts from c times these
+            values; other initial values are those of `loop`.
         solver: Solver with the duration of the runs.
         most: Upper end of the search.
         band: Bound on |x| at the end, as for `classify_starts`.
@@ -278,7 +303,7 @@ def recoverable_multiple(
         engine: Engine of the runs, as in `run_batch`.
 
     Raises:
-        ValueError: A path outside the initial state, or a loop without a known ellipsoid and no band.
+        ValueError: A path outside the initial state, or a loop with a part for which no ellipsoid is known and no band.
     """
     if others := [path for path in direction if not path.startswith(INITIAL_PREFIX)]:
         raise ValueError(f"{', '.join(others)}: a direction is one of the initial state")

@@ -19,14 +19,15 @@ BOUND_LOOSENINGS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
 def decrease_matrix(p: Matrix, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
-    """Return -dV/dt - 2 rate V as a matrix, for V = x'Px and x' = C x.
+    """Return the symmetric matrix of -dV/dt - 2 rate V, for V = x'Px and x' = C x, shape (..., n, n).
 
-    In discrete time, x+ = C x, it is exp(-2 rate) V - V+.
+    In discrete time, x+ = C x, it is the matrix of exp(-2 rate) V - V+. The matrix is positive definite if V falls
+    faster than the rate.
 
     Args:
         p: Symmetric P, shape (..., n, n).
         c: Closed loop C, shape (n, n).
-        rate: Decay rate; in discrete time per step.
+        rate: Decay rate of |x|, per unit of the loop's time; in discrete time per step.
         discrete: Whether the system is in discrete time.
     """
     if discrete:
@@ -64,7 +65,9 @@ class Bounds:
         )
 
     def damping(self) -> Claim | None:
-        """Return the claim that the poles of every frozen system lie in the cone of the specified damping."""
+        """Return the claim that every frozen system has at least the specified damping ratio; the ratio is not
+        maximised.
+        """
         zeta = self.spec.damping
         # Rounded up: the proof requires cot^2 (1 - zeta^2) >= zeta^2 exactly.
         cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)
@@ -84,7 +87,7 @@ class Bounds:
         )
 
     def l2(self) -> Claim | None:
-        """Return the claim with the smallest L2 gain."""
+        """Return the claim with the smallest L2 gain; the bound of the specification plays no part."""
         l2 = self.spec.l2
         assert l2 is not None
         z = l2.output + l2.feedthrough @ self.k

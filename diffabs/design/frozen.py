@@ -24,8 +24,9 @@ class FrozenLoops(NamedTuple):
     Attributes:
         systems: Number of systems on the grid.
         stable: Number of these systems that the gain stabilises.
-        slowest: Decay rate [1/s] of the slowest mode of all systems, negative if it grows.
-        at: Parameters of the system with the slowest mode.
+        slowest: Smallest decay rate [1/s] of any mode of any system, negative if the mode grows. In discrete time it is
+            -ln |pole| / period.
+        at: Value by path of every parameter of the box, at the system with this mode.
     """
 
     systems: int
@@ -37,13 +38,15 @@ class FrozenLoops(NamedTuple):
 def analyse_frozen_loops(gain: AnyArray, model: Part, over: Mapping[str, Sequence[float]]) -> FrozenLoops:
     """Return the stability of A + B K at the points of a grid over a box, corners included.
 
+    Each parameter has 17 grid points, or fewer so that there are at most 5000 systems, but at least 2.
+
     Args:
-        gain: Gain K, shape (m, n) or (n,).
+        gain: Gain K of u = K x, shape (m, n) or (n,).
         model: Model with `matrices()`, `states` and `period`.
-        over: Box {path: (low, high)}.
+        over: Box {path: (low, high)}; a parameter with low = high is fixed.
 
     Raises:
-        ValueError: A gain that does not fit, or a box as in `parameter_box.polytope`.
+        ValueError: A gain that does not fit, a box that `check_box_bounds` refuses, or matrices that are not finite.
     """
     low, high = check_box_bounds(model, over)
     free = tuple(path for path in over if low[path] < high[path])

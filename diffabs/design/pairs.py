@@ -71,9 +71,9 @@ def witnesses(closed: np.ndarray, factor: float | None = None) -> Iterator[np.nd
 
 
 def unstable_pairs(flows: np.ndarray, inverses: np.ndarray) -> Iterator[Pair]:
-    """Yield the ranges of k on which M(k) is unstable.
+    """Yield the ranges of k on which the determinant proves M(k) unstable, for every pair of vertices.
 
-    A range lies between two sign changes of det M(k), or extends from the last one by the factor RANGE_EXTENSION.
+    A range lies between two neighbouring values of `singular_factors`.
 
     Args:
         flows: Closed loops C, shape (vertices, n, n).
@@ -91,7 +91,10 @@ def unstable_pairs(flows: np.ndarray, inverses: np.ndarray) -> Iterator[Pair]:
 
 
 def singular_factors(product: np.ndarray) -> list[float]:
-    """Return every k > 0 for which -k is an eigenvalue, increasing, with one value far below and one far above.
+    """Return the ends of the ranges of k, increasing: every k > 0 for which -k is an eigenvalue of `product`.
+
+    The list also has one value a factor of 1000 below the smallest and one as far above the largest. It is empty
+    without such an eigenvalue.
 
     Args:
         product: Product of two closed loops, shape (n, n).

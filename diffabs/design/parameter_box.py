@@ -52,24 +52,28 @@ class _SystemRows(NamedTuple):
 def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9, most: int = 20_000) -> Polytope:
     """Return the polytope that covers `model` over a box {path: (low, high)}.
 
-    The check uses a grid and 2000 random points, then twice as fine a grid, until a new check finds no system outside.
-    If systems lie outside the corners' hull, the corners are spread about their mean by the smallest factor that covers
-    them. `coverage.spread` is that factor, 1 if the corners suffice.
+    Each check uses a grid and 2000 new random points; from the second check on, the grid is twice as fine. The checks
+    end when one finds no system outside, or after six. The final hull covers all checked systems.
 
-    If the factor exceeds 2, a box along the systems' principal directions replaces the corners. The factor is inf if
-    the systems leave the plane of the corners (a curved dependence on one parameter). `corners` of a box is empty.
+    If systems lie outside the corners' hull, the corners are spread about their mean by the smallest factor that covers
+    them. `coverage.spread` is that factor with a small margin, 1 if the corners suffice.
+
+    If the factor exceeds 2, a box along the systems' principal directions replaces the corners, if it has few enough
+    vertices. The factor is inf if the systems leave the plane of the corners (a curved dependence on one parameter).
+    `corners` of such a polytope is empty.
 
     Vertices inside the hull of the others are dropped. Coverage holds to 1e-9 of the range of an entry.
 
     Args:
         model: Model with `matrices()`, `states` and `period`.
-        over: Box {path: (low, high)} of parameters of the model.
+        over: Box {path: (low, high)} of parameters of the model; a parameter with low = high is fixed.
         grid: Points per parameter of the first check.
-        most: Largest number of grid points in one check.
+        most: Largest number of grid points in one check; the grid gets coarser to stay below it.
 
     Raises:
         ValueError: A path that is no parameter of the model; an interval that is inverted, not finite or out of range;
             a period that varies; more than 2^12 vertices; matrices that are not finite.
+        ModuleNotFoundError: SciPy is not installed.
 
     Examples:
         >>> from diffabs.design import polytope
@@ -101,14 +105,16 @@ def schedule(
 
     Args:
         model: Model with `matrices()`, `states` and `period`.
-        over: Box {path: (low, high)} of parameters of the model.
+        over: Box {path: (low, high)} of parameters of the model, `along` among them.
         along: Path of the parameter to cut along.
-        nodes: Increasing nodes from the low to the high end, or a number of cells. A number cuts in geometric
-            progression, or linearly if the interval reaches 0 or below.
+        nodes: Increasing nodes from the low to the high end, or the number N of cells, an int >= 1. N cells have N + 1
+            nodes in geometric progression, or evenly spaced if the low end is not positive.
         options: Options of `polytope`.
 
     Raises:
-        ValueError: A parameter outside the box, or nodes that do not increase from its low to its high end.
+        ValueError: A parameter outside the box, nodes that do not increase from its low to its high end, or a box that
+            `polytope` refuses.
+        ModuleNotFoundError: SciPy is not installed.
     """
     if along not in over:
         raise ValueError(f"along = '{along}' is not a parameter of the box; there is {', '.join(over) or 'nothing'}")

@@ -21,10 +21,14 @@ MAX_VERTICES = 2**12  # each vertex adds an LMI
 class Coverage:
     """The check of a hull against systems of the box.
 
+    The gauge of a system is 0 at the mean of the vertices and 1 on the boundary of the hull; above 1 it lies outside.
+
     Attributes:
-        checked: Number of systems of a dense grid over the box that were checked.
-        furthest: Largest gauge of these systems: 1 on the boundary, relative to the centre.
-        spread: Factor by which the corners were spread to cover all systems.
+        checked: Number of systems that were checked: corners, grid points and random points. Large hulls check only the
+            extreme ones.
+        furthest: Largest gauge [1] of these systems.
+        spread: Factor [1] by which the corners were spread about their mean to cover all systems; above 2 a box
+            replaced the corners.
     """
 
     checked: int
@@ -93,9 +97,15 @@ class Polytope:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Schedule:
-    """A chain of polytopes: `cells[i]` holds for values of `parameter` between `nodes[i]` and `nodes[i + 1]`.
+    """A chain of N polytopes along one measured parameter.
 
-    The nodes increase.
+    Attributes:
+        parameter: Path of the parameter.
+        nodes: Increasing values of the parameter, shape (N + 1,).
+        cells: Polytopes; `cells[i]` holds between `nodes[i]` and `nodes[i + 1]`.
+
+    Raises:
+        ValueError: Nodes that do not increase or do not fit the cells, or cells that differ in order, inputs or period.
     """
 
     parameter: str

@@ -31,16 +31,20 @@ FORM_LOOSENINGS = (1e-9, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
 def certify_schedule(gain: AnyArray, system: Schedule, spec: Spec, *, fastest: bool = False) -> Certificate:
-    """Return the proved properties of a gain with a parameter-dependent P(p).
+    """Return the proved properties of a gain on a schedule, with a parameter-dependent P(p).
+
+    The first claim proves `spec.decay` (0 for stability alone), and the cost if `spec` has Q and R. Without a proof it
+    is left out, and the search for the fastest decay too.
 
     Args:
-        gain: Gain, constant of shape (m, n), or linear between the nodes, shape (N + 1, m, n).
+        gain: Gain K, constant of shape (m, n) or (n,), or linear between the nodes, shape (N + 1, m, n) for N cells.
         system: A schedule in continuous time.
         spec: Specification with `rates`; only decay and cost have a proof here.
-        fastest: Whether to add the claim with the fastest decay that a P(p) proves.
+        fastest: Whether to add a claim with the fastest decay that a P(p) proves, to 1 %.
 
     Raises:
         ValueError: Shapes that do not fit, missing rates, discrete time, or a specification other than decay and cost.
+        ModuleNotFoundError: cvxpy is not installed.
     """
     first = system.cells[0]
     spec = spec.check(first.order, first.inputs)

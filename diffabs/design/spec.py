@@ -12,7 +12,14 @@ from diffabs.linear.weights import as_weight_matrix
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class InputLimit:
-    """The bound |u_j(t)| <= limit_j at all times, from every start in the hull of `points` (k, n)."""
+    """The bound |u_j(t)| <= limit_j at all times, from every start in the hull of the points.
+
+    `certify` proves the smallest bounds in the ratio of `limit`; they may be above it.
+
+    Attributes:
+        limit: Bounds in the units of the inputs, shape (m,), or a number for one input; > 0.
+        points: Starts, shape (k, n), or (n,) for one; not all zero.
+    """
 
     limit: Scalar
     points: PyTree
@@ -28,7 +35,8 @@ class L2Gain:
         output: C, shape (z, n).
         feedthrough: D, shape (z, m); None stands for 0.
         disturbance: E, shape (n, w); None lets w act at the input, E = B.
-        bound: Bound of the gain; None asks for the smallest.
+        bound: Bound of the gain that `design` keeps. None lets `design` minimise the gain, which excludes Q and R.
+            `certify` ignores it and proves the smallest gain.
     """
 
     output: PyTree
@@ -43,12 +51,13 @@ class Spec:
 
     Attributes:
         Q: State weight, shape (n, n), or its diagonal. The cost is the integral of x'Qx + u'Ru, a sum in discrete time.
-        R: Input weight, shape (m, m), its diagonal, or a number.
-        decay: Decay rate [1/s]: |x| <= c exp(-decay t).
-        damping: Smallest damping ratio [1] of the poles of every frozen system.
+            Q and R come together.
+        R: Input weight, positive definite: shape (m, m), its diagonal, or a number.
+        decay: Decay rate [1/s], >= 0: |x| <= c exp(-decay t).
+        damping: Smallest damping ratio [1] of the poles of every frozen system, in [0, 1); continuous time only.
         input: Limit of the inputs.
         l2: Bound of the L2 gain.
-        rates: Lowest and highest d(parameter)/dt of a `Schedule`.
+        rates: Lowest and highest d(parameter)/dt of a `Schedule`, in the parameter's unit per second.
     """
 
     Q: Matrix = None

@@ -54,12 +54,18 @@ class SpeedScaled:
 
 
 def greatest_speed_fall(deceleration: float, speed: float, period: float) -> float:
-    """Return the largest fall v/v+ - 1 of the speed [1] over a period.
+    """Return v/v+ - 1 [1] for a speed v that falls at a constant deceleration over one period.
+
+    The lower the speed, the larger the result. It has no meaning unless `speed` exceeds deceleration times period, and
+    the function does not check this.
 
     Args:
-        deceleration: Deceleration [m/s^2].
-        speed: Lowest speed at the start of a period [m/s].
+        deceleration: Greatest deceleration [m/s^2].
+        speed: Lowest speed v at the start of a period [m/s].
         period: Sampling period [s].
+
+    Raises:
+        ZeroDivisionError: The speed falls to exactly 0 within the period.
     """
     return deceleration * period / (speed - deceleration * period)
 

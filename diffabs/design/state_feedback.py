@@ -47,8 +47,10 @@ class ReducedLoop(NamedTuple):
     Attributes:
         model: Linear model of the plant, the actuator and the filter.
         gain: Gain K, shape (n,).
-        exact: Whether this is the loop's own linearisation near the target, inside all limits and at a frozen speed.
-        neglected: Neglected parts of the loop, in sentences.
+        exact: Whether the model with this gain is the loop's own linearisation near the target, at a frozen speed.
+            Limits do not count against it, because they are inactive there. A delay does, and so does a sensor with
+            dynamics or rounding.
+        neglected: Neglected parts of the loop, in sentences; an exact loop may have some.
     """
 
     model: SlipModel | BalanceModel | OperatingPoint
@@ -58,14 +60,15 @@ class ReducedLoop(NamedTuple):
 
 
 def reduce_loop(loop: Loop) -> ReducedLoop:
-    """Return the loop at its initial speed and its setpoint as state feedback.
+    """Return the loop as state feedback, linearised at its initial speed and its setpoint at t = 0.
 
     Args:
-        loop: Closed loop with a linear controller and actuator.
+        loop: Closed loop with a linear controller; the actuator may have limits, one lag and a delay. A loop of a
+            balance, or around a plant that is no brake, is linearised at rest.
 
     Raises:
-        ValueError: A controller or an actuator that is not linear, a parameter out of its range, a setpoint of 1, or a
-            loop that does not come to rest.
+        ValueError: A controller or an actuator that is not linear, or several lags. Also a parameter out of its range,
+            a setpoint of 1, or a loop that does not come to rest.
     """
     check_part(loop)
     if isinstance(inner_controller(loop.controller), BalanceFeedback):

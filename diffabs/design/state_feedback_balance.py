@@ -16,13 +16,18 @@ from diffabs.linear.slip_model import Continuous, Sampling
 
 
 def reduce_balance_loop(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tuple[str, ...]]:
-    """Return model, gain (6,), whether this is the loop's own linearisation, and its neglected parts in sentences.
+    """Return the linear model about upright, the gain (6,), whether they are exact, and the neglected parts in
+    sentences.
+
+    They are exact if the sensor passes the output unchanged. A voltage limit is neglected but does not count against
+    it.
 
     Args:
         loop: Closed loop of a balance.
 
     Raises:
-        ValueError: A controller other than feedback of the whole state, or an actuator with dynamics.
+        ValueError: A controller other than feedback of the whole state, an actuator other than none or a voltage limit,
+            or a parameter out of its range.
     """
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     controller = inner_controller(loop.controller)

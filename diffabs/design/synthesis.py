@@ -49,14 +49,17 @@ class Design:
     """A gain and its proof.
 
     Attributes:
-        gain: Gain K, shape (m, n), or (N + 1, m, n) at the nodes of a schedule.
+        gain: Gain K of u = K x, shape (m, n), or (N + 1, m, n) at the nodes of a schedule of N cells.
         certificate: Proof of the specifications.
-        trace_cost: Trace Z, the smallest guaranteed cost; for a schedule its mean over the nodes. None without Q, R.
-        lower_bound: Largest trace of the vertices' own Riccati solutions, which no common gain can beat.
-        gap: Bound on (objective - optimum)/objective.
-        residual: Largest eigenvalue over the vertices of He[P(A + BK)] + K'RK + Q relative to Q + K'RK. At the active
-            vertices it is 0 up to rounding.
-        attempts: Result of each attempt, in words.
+        trace_cost: Trace Z in floats, the smallest guaranteed cost; for a schedule its mean over the nodes. None
+            without Q, R.
+        lower_bound: Largest trace of the vertices' own Riccati solutions, which no common gain can beat. None without
+            Q, R, and for a schedule.
+        gap: Bound [1] on (objective - optimum)/objective.
+        residual: Largest eigenvalue over the vertices of He[P(A + BK)] + K'RK + Q, relative to that of Q + K'RK. Both
+            are taken in coordinates with P = I. At the active vertices it is 0 up to rounding. None where `lower_bound`
+            is.
+        attempts: Solver and result of each attempt, in words.
     """
 
     gain: np.ndarray
@@ -71,15 +74,19 @@ class Design:
 def design(system: Polytope | Schedule, spec: Spec) -> Design:
     """Return the gain that minimises the guaranteed cost (with Q, R), or else the L2 gain, under all specifications.
 
+    Exactly one objective is needed: Q and R, or an `L2Gain` without a bound. An `L2Gain` beside Q and R needs a bound.
+    A schedule needs Q, R and `rates` in continuous time, and accepts no other specification but a decay.
+
     Every answer is checked: exact proof of every specification (`certify`), duality gap, lower bound. After a failed
     check the search tries other coordinates, then other solvers.
 
     Args:
         system: A polytope, or a schedule along a measured parameter.
-        spec: Weights, decay, damping, input limit and L2 gain that hold at every vertex.
+        spec: Weights, decay, damping, input limit and L2 gain that hold everywhere in the system.
 
     Raises:
-        ValueError: A specification that does not fit, nothing to minimise, or a vertex that is not stabilisable.
+        ValueError: A specification that does not fit, none or two objectives, damping in discrete time, or a vertex
+            that is not stabilisable.
         DesignError: No gain passes the checks; the message has the reason for each attempt.
         ModuleNotFoundError: cvxpy or a solver is missing.
 

@@ -57,7 +57,13 @@ FIELD_RANGES = {
 
 
 class ClaimVerdict(NamedTuple):
-    """The statement of a claim, and the reason why it is not proved; the reason of a proved claim is empty."""
+    """The verdict about one claim.
+
+    Attributes:
+        kind: Kind of the claim.
+        says: Statement of the claim, in words.
+        reason: Reason why it is not proved; empty if it is proved.
+    """
 
     kind: str
     says: str
@@ -90,7 +96,9 @@ class StoredCertificate(NamedTuple):
 
 
 def verify_file(path: str | os.PathLike[str], seconds: float = MAX_SECONDS) -> list[ClaimVerdict]:
-    """Return a verdict for each claim of a certificate file.
+    """Return a verdict for each claim of a certificate file, in its order.
+
+    A claim that is false, or not proved, raises no error: its verdict has the reason.
 
     Args:
         path: Path of the file.
@@ -335,10 +343,10 @@ def bordered_matrix(a: Matrix, b: Matrix, d: Matrix) -> Matrix:
 
 
 def is_positive_definite(m: Matrix, semi: bool = False) -> bool:
-    """Return whether M is symmetric and all its pivots are positive.
+    """Return whether M is symmetric and positive definite: all its pivots are positive.
 
-    The method is elimination in integers (Bareiss, 1968). `rows` holds the upper triangle. Every entry is a minor of M
-    times the common denominator. Divisions therefore leave no remainder, and no number grows beyond a minor.
+    The method is elimination in integers (Bareiss, 1968) on the upper triangle. Every entry is a minor of M times the
+    common denominator. Divisions therefore leave no remainder, and no number grows beyond a minor.
 
     Args:
         m: Square matrix.

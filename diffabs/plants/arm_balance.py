@@ -78,7 +78,9 @@ class BalanceStart:
 
 
 def usual_parts(self: Any) -> dict[str, PyTree]:
-    """Return the default loop around a two-wheeler: feedback that holds it upright until it falls.
+    """Return the default parts of a loop around a two-wheeler: feedback that holds it upright until it falls.
+
+    The keys are `initial`, `reference`, `controller`, `actuator` and `stop`.
 
     Args:
         self: The plant; it has no effect.
@@ -207,7 +209,9 @@ class ArmBalance:
         return 0.5 * (m11 * v1**2 + m22 * v2**2 + m33 * v3**2) + (m12 * v2 + m13 * v3) * v1
 
     def potential_energy(self, state: ArmState) -> Scalar:
-        """Return the energy of a `state` in gravity, 0 at the ground, and in the rider's spring [J]."""
+        """Return the potential energy of a `state` [J]: gravity, 0 for masses at the height of the ground, and the
+        rider's spring.
+        """
         lumps = self.lumps()
         heights = (
             lumps.b1 * jnp.cos(state.theta)
@@ -221,14 +225,18 @@ class ArmBalance:
         return self.kinetic_energy(state) + self.potential_energy(state)
 
     def audit(self, initial: BalanceStart) -> BalanceAudit:
-        """Return the audit of runs from `initial`: more energy than the motor's work is instability."""
+        """Return the audit of runs from `initial`: a gain of energy beyond the motor's work reveals an unstable
+        integration.
+        """
         lumps, start = self.lumps(), self.start(initial)
         fall = self.gravity * (lumps.b1 + abs(lumps.b2) + abs(lumps.b3))
         scale = fall + self.kinetic_energy(start) + 0.5 * self.stiffness * start.phi**2
         return BalanceAudit(plant=self, first=self.energy(start), scale=scale)
 
     def power(self, state: ArmState, control: Scalar) -> tuple[Scalar, Scalar]:
-        """Return the motor's input tau psi' and the dissipation of the rider's damper d phi'^2 [W].
+        """Return the mechanical power tau psi' of the motor and the dissipation d phi'^2 of the rider's damper [W].
+
+        Energy' is the first minus the second. The motor's power is negative where the motor brakes the arm.
 
         Args:
             state: Angles [rad] and rates [rad/s].
@@ -237,8 +245,10 @@ class ArmBalance:
         return self.torque(state.psi_rate, control) * state.psi_rate, self.damping * state.phi_rate**2
 
     def limits(self, gain: AnyArray) -> np.ndarray:
-        """Return the rows of the motor's linear range, shape (..., 1, 6): the current is within its limit where |row x|
+        """Return one row of the motor's linear range, shape (..., 1, 6): its current is within the limit where |row x|
         <= 1.
+
+        The state x is (theta, psi, phi) and their rates, in the order of `ArmState`.
 
         Args:
             gain: K of the feedback u = K x, shape (..., 6) [V/rad, V s/rad]. The plant's parameters may be NumPy arrays

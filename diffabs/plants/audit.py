@@ -68,7 +68,11 @@ class BrakeAudit:
     start, flow, value = _zero, no_integral, _excess
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
-        """Return the sum with the step's gain of energy without work; infinity after a step that no car can make."""
+        """Return the sum of the steps' unexplained gains of energy [J], this step included.
+
+        A step's gain counts beyond the work of a driving torque and the rounding. The sum is infinite after a step that
+        no car can make.
+        """
         # An audit decides on validity only, so it needs no derivatives.
         before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))
         a, b = before.output, sample.output
@@ -110,8 +114,9 @@ class BalanceAudit:
     start, flow = _zero, no_integral
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
-        """Return the sum with the work that the motor may have done in the step, from torques and rates of the same
-        sign.
+        """Return the sum of the work [J] that the motor may have done, this step included.
+
+        Only torques and rates of the same sign do work on the vehicle.
         """
         before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))
         w0, w1 = before.output.psi_rate, sample.output.psi_rate
@@ -121,7 +126,7 @@ class BalanceAudit:
         )
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Return the unexplained gain of energy relative to the tolerance [1]."""
+        """Return the unexplained gain of energy relative to the tolerance [1]; above 1 the run is not physical."""
         y: BalanceOutput = ending.sample.output
         gain = self.plant.energy(self.plant.start(y)) - self.first - memory.held
         return gain / (FORGIVEN * self.scale)

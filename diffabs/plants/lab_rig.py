@@ -119,8 +119,10 @@ class LabRig:
         )
 
     def contact(self, state: LabRigState) -> tuple[PyTree, PyTree, PyTree]:
-        """Return the friction coefficient [1], the normal force [N], and the torque that brakes the wheel, with its
-        bearing's [N m].
+        """Return the friction coefficient [1], the normal force [N], and the braking torque on the wheel [N m].
+
+        The torque is the brake's plus the bearing's friction. On a stopped wheel it is at most the torque that holds
+        the wheel. The normal force is infinite where the lever locks itself.
 
         Args:
             state: State of the rig.
@@ -141,7 +143,7 @@ class LabRig:
         return mu, normal, torque
 
     def project(self, state: LabRigState) -> LabRigState:
-        """Return the state with no wheel turning backwards."""
+        """Return the state with neither wheel turning backwards."""
         return LabRigState(forward_speed(state.wheel), forward_speed(state.drum), state.brake, state.distance)
 
     def output(self, state: LabRigState) -> BrakeOutput:
@@ -152,8 +154,10 @@ class LabRig:
         return BrakeOutput(slip_ratio(v, w, self.crawl_speed), v, w, deceleration, state.distance)
 
     def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
-        """Return the brake command whose steady torque keeps the slip constant, from omega1' = (1 - slip) (r2/r1)
-        omega2'.
+        """Return the brake command [1] whose steady torque keeps the slip at `target` while both wheels slow down.
+
+        The condition is omega1' = (1 - slip) (r2/r1) omega2'. The command is not clamped to [0, 1] and ignores the
+        threshold.
         """
         drum = output.speed / self.drum_radius
         spin = (1 - target) * output.speed / self.wheel_radius

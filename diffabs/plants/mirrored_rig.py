@@ -70,7 +70,7 @@ class MirroredRig:
         return RigState(halt_at_zero(state.wheel, wheel), halt_at_zero(state.body, body), y.speed)
 
     def project(self, state: RigState) -> RigState:
-        """Return the state with no wheel turning backwards."""
+        """Return the state with neither wheel turning backwards."""
         return RigState(forward_speed(state.wheel), forward_speed(state.body), state.distance)
 
     def output(self, state: RigState) -> BrakeOutput:
@@ -87,13 +87,13 @@ class MirroredRig:
         return mu * GRAVITY * (self.mass * self.wheel_radius + wheel)
 
     def audit(self, initial: BrakeStart) -> BrakeAudit:
-        """Return the audit of runs from `initial`: a gain of energy without a negative torque is a numerical
-        instability.
+        """Return the audit of runs from `initial`; only a negative torque, which drives the wheel, explains a gain of
+        energy.
         """
         car, wheel = self.inertia_factor * self.mass, self.wheel_inertia / self.wheel_radius**2
         return BrakeAudit(car=car, wheel=wheel, radius=self.wheel_radius, scale=self.energy(self.start(initial)))
 
     def energy(self, state: RigState) -> Scalar:
-        """Return the kinetic energy of a `state` [J]."""
+        """Return the kinetic energy of both wheels in a `state` [J]."""
         body = self.inertia_factor * self.mass * self.body_radius**2
         return 0.5 * (self.wheel_inertia * state.wheel**2 + body * state.body**2)

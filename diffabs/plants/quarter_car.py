@@ -69,7 +69,7 @@ class QuarterCar:
         return QuarterCarState(forward_speed(state.speed), forward_speed(state.spin), state.distance)
 
     def output(self, state: QuarterCarState) -> BrakeOutput:
-        """Return slip, speeds, deceleration mu g, and distance."""
+        """Return slip [1], speeds of car and wheel rim [m/s], deceleration mu g [m/s^2], and distance [m]."""
         v, w = state.speed, self.radius * state.spin
         slip = slip_ratio(v, w, self.crawl_speed)
         mu = self.road.friction(slip, v, state.distance)
@@ -81,12 +81,12 @@ class QuarterCar:
         return mu * GRAVITY * (self.mass * self.radius + (1 - target) * self.inertia / self.radius)
 
     def audit(self, initial: BrakeStart) -> BrakeAudit:
-        """Return the audit of runs from `initial`: a gain of energy without a negative torque is a numerical
-        instability.
+        """Return the audit of runs from `initial`; only a negative torque, which drives the wheel, explains a gain of
+        energy.
         """
         wheel, scale = self.inertia / self.radius**2, self.energy(self.start(initial))
         return BrakeAudit(car=self.mass, wheel=wheel, radius=self.radius, scale=scale)
 
     def energy(self, state: QuarterCarState) -> Scalar:
-        """Return the kinetic energy of a `state` [J]."""
+        """Return the kinetic energy of car and wheel in a `state` [J]."""
         return 0.5 * (self.mass * state.speed**2 + self.inertia * state.spin**2)

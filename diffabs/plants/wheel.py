@@ -30,20 +30,20 @@ class BrakeStart:
 
 
 def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Scalar:
-    """Return the slip (v - w)/max(v, w, crawl) [1]: (v - w)/v in braking, (v - w)/w in driving, always in [-1, 1].
+    """Return the slip (v - w)/max(v, w, crawl) [1], in [-1, 1]: positive in braking, negative in driving, 0 at rest.
 
     The slip is C1 at v = w. Below the crawl speed it goes to zero with v - w, so there is no division by zero.
 
     Args:
-        speed: Vehicle speed v [m/s].
-        wheel_speed: Speed of the wheel's rim w [m/s].
+        speed: Vehicle speed v [m/s], >= 0.
+        wheel_speed: Speed of the wheel's rim w [m/s], >= 0.
         crawl: Least denominator [m/s], > 0.
     """
     return quotient(speed - wheel_speed, larger(larger(speed, wheel_speed), crawl))
 
 
 def halt_at_zero(speed: Scalar, rate: Scalar) -> Scalar:
-    """Return the rate of a speed that cannot become negative: at standstill only a positive rate acts.
+    """Return the rate of a speed that cannot become negative: at standstill a negative rate becomes 0.
 
     Brake friction balances a negative rate at standstill, as dry friction does.
 
@@ -64,8 +64,10 @@ def forward_speed(speed: Scalar) -> Scalar:
 
 
 def usual_parts(self: Any) -> dict[str, PyTree]:
-    """Return the default loop around a brake: a PID with limits of 0 and 90 N m that holds a fixed slip until
-    standstill.
+    """Return the default parts of a loop around a brake: a PID that holds a fixed slip until standstill.
+
+    The keys are `initial`, `reference`, `controller` and `stop`. The PID has limits of 0 and 90 in the plant's control
+    unit.
 
     Args:
         self: The plant; it has no effect.
@@ -92,8 +94,8 @@ def usual_objectives(self: Any) -> dict[str, PyTree]:
 def probes(self: Any, initial: BrakeStart, setpoint: Scalar, stop: Part) -> BrakeStart:
     """Return k starts at which the loop may be stiffest, as a `BrakeStart` of arrays (k,).
 
-    The speeds go down to the stop's speed. Some slips are close to the setpoint, where the controller is not at a
-    limit. Other slips cover the friction curve, which is steepest near 0.
+    They combine 6 speeds from the start's to the stop's with 23 slips. Some slips are close to the setpoint, where the
+    controller is not at a limit. Other slips cover the friction curve, which is steepest near 0.
 
     Args:
         self: The plant; it has no effect.

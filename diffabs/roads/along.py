@@ -25,8 +25,10 @@ FIRST_NODE, LAST = 2, 1  # intervals before 0 and beyond the last factor after w
 
 @pytree
 class ScaledAlong:
-    """f(x) mu of another road, with a cubic spline f through the B-spline coefficients `factors` (n,), one every
-    `spacing`.
+    """f(x) mu of another road, with f a cubic B-spline along the distance x.
+
+    The coefficients are `factors` (n,): factor i belongs to the distance i * `spacing` [m]. The spline smooths them and
+    does not pass through them.
 
     >>> from diffabs.roads import RIG, ScaledAlong
     >>> road = ScaledAlong(road=RIG, factors=(1.0, 1.0, 1.0, 0.5, 0.5, 0.5), spacing=2.0)

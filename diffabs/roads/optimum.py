@@ -22,12 +22,14 @@ class Peak(NamedTuple):
 
 
 def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
-    """Return the first local maximum of mu over slip in (0, 1]; slip 1 where mu only rises (ice).
+    """Return the first local maximum of mu over slip in (0, 1], as a pair (slip, mu); slip 1 where mu never falls.
 
     A braking wheel meets the first maximum first. It is not always the greatest: the rig's curve rises again towards
-    lock. A grid brackets the maximum, and bisection of the slope locates it. Two Newton steps s - mu'/mu'' polish it
-    and carry its derivative by the implicit function theorem. Slip and mu are thus differentiable in every parameter of
-    the road.
+    lock. A grid of 1024 intervals brackets the maximum, so it misses narrower maxima. Bisection of the slope locates
+    it.
+
+    Two Newton steps s - mu'/mu'' polish it and carry its derivative by the implicit function theorem. Slip and mu are
+    thus differentiable in every parameter of the road.
 
     >>> from diffabs.roads import DRY_ASPHALT, peak
     >>> slip, mu = peak(DRY_ASPHALT)
@@ -36,7 +38,7 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
 
     Args:
         road: Friction curve.
-        speed: Vehicle speed [m/s].
+        speed: Vehicle speed [m/s]; the default is the limit of a slow vehicle.
         distance: Place on the road [m].
     """
 

@@ -15,10 +15,12 @@ SLIPS = np.linspace(0.05, 1.0, 20)
 
 
 def opposes(friction: Partial) -> Rule:
-    """Return the rule that mu(s) >= 0 at slips of 0.05 to 1: negative friction would accelerate the car.
+    """Return the rule that mu(s) >= 0 at 20 slips from 0.05 to 1: negative friction would accelerate the car.
+
+    A violation raises nothing here: the check of the loop's rules reports it.
 
     Args:
-        friction: Friction curve, mu as a function of slip.
+        friction: Friction curve, mu as a function of slip alone.
     """
     mu = _at_slips(friction)
 
@@ -30,10 +32,10 @@ def opposes(friction: Partial) -> Rule:
 
 
 def stays_below(friction: Partial, limit: Scalar, name: str, then: str) -> Rule:
-    """Return the rule that mu(s) < limit at slips of 0.05 to 1.
+    """Return the rule that mu(s) < limit at 20 slips from 0.05 to 1.
 
     Args:
-        friction: Friction curve, mu as a function of slip.
+        friction: Friction curve, mu as a function of slip alone.
         limit: Upper limit of mu [1].
         name: Name of the limit in messages.
         then: Consequence of a violation in messages.

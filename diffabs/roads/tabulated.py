@@ -94,7 +94,9 @@ class PiecewiseCubic:
     rows: Vector = param(unit="1")
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
-        """Return mu [1] at a `slip` [1]; `speed` and `distance` have no effect."""
+        """Return mu [1] at a `slip` [1], odd in slip and constant beyond the last knot; `speed` and `distance` have no
+        effect.
+        """
         del speed, distance
         return odd(self._curve, slip)
 
@@ -106,8 +108,10 @@ class PiecewiseCubic:
 
 
 def slopes(x: Scalar, y: Scalar) -> Scalar:
-    """Return the slopes at the knots: the weighted harmonic mean of the neighbouring secants, 0 where they differ in
-    sign.
+    """Return the slopes dy/dx at the knots, shape (n,): inside, the weighted harmonic mean of the two neighbouring
+    secants.
+
+    The slope is 0 where these secants differ in sign. At both ends it is a limited three-point slope.
 
     The result is differentiable in x and y. At a local extremum the slope stays 0, so the derivative with respect to
     the knot's value is one-sided.

@@ -147,7 +147,9 @@ def localise_problem(problem: GuaranteedCostProblem, point: PathPoint) -> LocalP
 
 
 def least_shift(here: LocalProblem, *, discrete: bool) -> Matrix:
-    """Return the smallest s for which no S_i has a negative eigenvalue at the point itself.
+    """Return the smallest s, a scalar, for which no S_i has a negative eigenvalue at the point itself.
+
+    It is at most 0 if the point satisfies all inequalities.
 
     Args:
         here: Problem in the coordinates of the point.

@@ -50,15 +50,16 @@ class Claim:
 class Certificate:
     """Claims about the loops A + B K of a polytope or of a schedule.
 
-    The certificate holds read-only copies, so a verdict stays true.
+    The certificate holds read-only copies, so a verdict stays true. A property whose claim is missing or not proved is
+    None.
 
     Attributes:
         system: A polytope or a schedule.
-        gain: Gain K, shape (m, n), or one gain for each node, shape (N, m, n).
+        gain: Gain K, shape (m, n). For a schedule of N cells also one gain for each node, shape (N + 1, m, n).
         claims: Claims of the certificate.
 
     Raises:
-        ValueError: Claims that do not fit.
+        ValueError: Claims or a gain that do not fit the system.
     """
 
     system: Polytope | Schedule
@@ -76,7 +77,10 @@ class Certificate:
             schema.check_claim(claim.kind, self.system, self.gain, claim.data)
 
     def verify(self) -> tuple[bool, ...]:
-        """Return for each claim whether it is proved, exactly and for relative errors of 2^-40 in the vertices."""
+        """Return for each claim, in order, whether exact arithmetic proves it.
+
+        The proof also covers relative errors of up to 2^-40 in each entry of the vertices' matrices.
+        """
         return self._verdicts
 
     @functools.cached_property
@@ -119,12 +123,18 @@ class Certificate:
 
     @property
     def stable(self) -> bool | None:
-        """True if stability is proved, with one P or with a P that depends on a schedule's parameter; else None."""
+        """True if any proved claim except `infeasible` implies stability; else None, never False.
+
+        Every such claim has a P, or a P that depends on a schedule's parameter, that decreases along all trajectories.
+        """
         return True if any(self.proved_data(*QUADRATIC_KINDS, "scheduled")) else None
 
     @property
     def decay_rate(self) -> float | None:
-        """Largest proved decay rate of |x| [1/s]."""
+        """Largest proved decay rate of |x| [1/s], from decay and scheduled claims; None without such a claim.
+
+        A cost claim of a polytope proves no rate. A scheduled claim without a rate counts as 0.
+        """
         rates = [data.get("rate", 0.0) for data in self.proved_data("decay", "scheduled")]
         if self.period is not None:
             rates = [-math.log(data.get("factor", 1.0)) / self.period for data in self.proved_data("decay")]
@@ -132,7 +142,10 @@ class Certificate:
 
     @property
     def guaranteed_cost(self) -> float | None:
-        """Trace P of the first proved cost claim, rounded up; for a scheduled claim the largest over the nodes."""
+        """Trace P of the first proved cost claim, rounded up; for a scheduled claim the largest over the nodes.
+
+        It is the cost summed over starts at the unit vectors. It is None without a proved cost.
+        """
         return self._cost(self.proved_data("cost", "scheduled"))
 
     def _cost(self, claims: Iterator[Params]) -> float | None:
@@ -177,7 +190,11 @@ class Certificate:
 
     @property
     def margins(self) -> dict[str, float]:
-        """Smallest margin of each kind over its claims and the vertices, relative and in floats."""
+        """Smallest margin [1] by kind of claim, in floats; also of claims that are not proved.
+
+        A margin is the smallest eigenvalue of a claim's inequality, relative to the largest eigenvalue of its terms by
+        magnitude. A negative margin contradicts the claim up to rounding. Side conditions such as P > 0 do not count.
+        """
         found: dict[str, float] = {}
         for kind, margins in self._margins:
             found[kind] = min(found.get(kind, math.inf), *margins.values())
@@ -185,7 +202,11 @@ class Certificate:
 
     @property
     def worst_vertex(self) -> dict[str, PyTree] | None:
-        """The vertex with the smallest margin: index (over all cells in order), cell, corner, claim and margin."""
+        """The vertex with the smallest margin, or None without a claim about single vertices.
+
+        Keys: `index` over the vertices of all cells in order, `cell` (its number), `corner` (parameters by path, or
+        None), `claim` (its kind) and `margin` [1].
+        """
         all_of = [
             (value, i, kind) for kind, each in self._margins for i, value in each.items() if i != exact.ALL_VERTICES
         ]
@@ -200,9 +221,10 @@ class Certificate:
 
     @property
     def frozen(self) -> tuple[float, ...]:
-        """Spectral abscissa of A + B K at each vertex (spectral radius in discrete time), in floats; not a proof.
+        """Largest real part [1/s] of the poles of A + B K at each vertex, over all cells in order.
 
-        For a schedule it is the worse value of the gains at the cell's two nodes.
+        In discrete time it is their spectral radius [1]. The values are floats and no proof. For a schedule a value is
+        the worse one for the gains at the cell's two nodes.
         """
         # Within a cell K is linear between its two nodes: each vertex is checked with both gains.
         gains = (
@@ -216,7 +238,11 @@ class Certificate:
         return tuple(found)
 
     def summary(self) -> dict[str, PyTree]:
-        """Return the proved properties for JSON: `trace_cost` is claimed, `guaranteed_cost` is proved."""
+        """Return the proved properties for JSON.
+
+        The keys are the names of the properties, `gain`, `trace_cost` and `claims`. `trace_cost` is the cost of the
+        first cost claim, proved or not; `guaranteed_cost` is proved.
+        """
         limit = self.input_limit
         return {
             "gain": self.gain.tolist(),

@@ -52,8 +52,8 @@ class Frame(NamedTuple):
 def whitening_matrix(weight: np.ndarray) -> np.ndarray:
     """Return D with D' `weight` D = I, except in directions with less than 1e-12 of the largest weight.
 
-    A slow closed loop beside a fast one has a small cost per unit of time. The congruence D M D' makes a solver's
-    tolerance relative.
+    A slow closed loop beside a fast one has a small cost per unit of time. The congruence D' M D of an inequality M >=
+    0 makes a solver's tolerance relative.
 
     Args:
         weight: Symmetric positive semidefinite matrix, shape (n, n).
@@ -86,7 +86,7 @@ def lyapunov_frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: boo
 def design_frames(system: Polytope, q: np.ndarray, r: np.ndarray) -> Iterator[tuple[Frame, float]]:
     """Yield frames for a design from the vertices' Riccati solutions P, in decreasing order of trace P.
 
-    Each frame comes with this trace, a lower bound of every guaranteed cost.
+    Each frame comes with its trace. No gain has a guaranteed cost below any of these traces.
 
     Args:
         system: Polytope.
