@@ -15,10 +15,10 @@ class Comparison(NamedTuple):
     """A least-squares comparison of data with a loop.
 
     Attributes:
-        residuals: Function residuals(loop, *data), which returns shape (n,).
+        residuals: Function residuals(loop, *data), which returns simulated minus measured values, shape (n,).
         data: Arrays that are passed to `residuals`.
         sigma: Standard deviations of the residuals, shape (n,), or None if they are unknown.
-        loops: Function of a loop that returns the batches of loops to run.
+        loops: Function of a loop that returns the loops of all runs, stacked into batches of equal structure.
     """
 
     residuals: Residuals

@@ -33,7 +33,7 @@ SCIPY_REASONS = {0: Reason.LIMIT, 1: Reason.GRADIENT, 2: Reason.CHANGE, 3: Reaso
 
 @dataclasses.dataclass(frozen=True)
 class Tolerances:
-    """Stopping criteria of a fit.
+    """Stopping criteria of a fit, for each start.
 
     Attributes:
         cost: Relative change of the cost.
@@ -56,17 +56,17 @@ class Identified:
         part: The given part with its free parameters changed.
         values: Values of the free parameters by path.
         residuals: Residuals in their own units, shape (n,).
-        sigma: Standard deviations of the residuals, shape (n,).
+        sigma: Given standard deviations of the residuals, shape (n,); ones if none were given.
         chi2: sum (residual/sigma)^2.
-        cost: Minimised value: the norm of the weighted residuals plus the prior.
+        cost: Minimised value: sum |residual/sigma|^norm plus the sum of the squared prior terms.
         uncertainty: Covariance, standard deviations, correlation, and the directions that the data do not determine. It
             is always that of least squares at this point, for every norm.
         history: Cost at the start and after every accepted step.
-        evaluations: Number of evaluations, rejected points included.
+        evaluations: Number of evaluations from this start, rejected points included.
         reason: Reason for the end of the iteration.
         start: Values at the start by path.
-        starts: Fits from all starts, in their order.
-        diverged: Starts that could not be used.
+        starts: Fits from all usable starts, in their order.
+        diverged: Values by path of each start that could not be used.
     """
 
     part: Part
@@ -124,23 +124,27 @@ def fit(
         free: Paths of the free parameters, each with a range, or with None for the declared range.
         residuals: JAX function residuals(part, *data) that returns shape (n,).
         data: Arrays that are passed to `residuals`. Other arrays of the same shapes do not compile again.
-        sigma: Standard deviations, a number or shape (n,). Without it all residuals have equal weight and s^2 is
-            estimated.
-        absolute: False if only the ratios of sigma are known, so that s^2 is estimated as well.
+        sigma: Standard deviations of the residuals, a number or shape (n,). Without it all residuals have equal weight,
+            and
+            the residuals estimate the variance s^2 of one residual.
+        absolute: False if only the ratios of sigma are known. The residuals then estimate a factor s^2 of all
+            variances.
         prior: JAX function of the part that returns deviations from prior knowledge, in standard deviations. `gaussian`
             makes one; a roughness penalty is another. Arguments in a `jax.tree_util.Partial` are traced.
         starts: Initial values by path, instead of the part's own. The best fit is returned.
         norm: Norm of the weighted residuals, >= 2: 2 is least squares, larger norms approach the largest residual.
-        tolerances: Stopping criteria, with the maximum number of evaluations.
-        usable: Function that tests on the host whether a part may be evaluated.
+        tolerances: Stopping criteria of each start, with the maximum number of evaluations.
+        usable: Function of a part that returns whether it may be evaluated; it runs outside jit.
         progress: Callback at each accepted point, with the number of evaluations over all starts so far and the cost.
         stopping: Callback before every evaluation. True ends the fit at the last accepted point and skips further
             starts.
 
     Raises:
-        ValueError: A path or range does not fit, sigma <= 0, or norm < 2.
-        ValueError: There are fewer residuals than parameters without a prior, or a prior without sigma.
-        ValueError: The residuals are not finite at any start.
+        ValueError: A path or range does not fit, sigma is not positive and finite, or norm is outside [2, inf).
+        ValueError: There are fewer residuals than parameters and no prior. An estimate of s^2 needs one residual more,
+            also with a prior.
+        ValueError: There is a prior without sigma.
+        ValueError: No start can be used: at each one a residual or derivative is not finite, or `usable` returns False.
     """
     part = canonical_dtypes(check_part(part))
     where = parameter_space(part, free)

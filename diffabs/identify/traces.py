@@ -24,16 +24,17 @@ from diffabs.simulate.solution import Solver
 class Traces:
     """Measured signals over time.
 
-    The simulated outputs are interpolated linearly between the instants that the solver keeps (`solver.every`).
-    A run that ends before its data stays at its last sample. If the rest was left out, an early end would lower the
-    cost.
-    If the loop's stop ends a run other than at rest, cut longer data with `until`.
+    The simulated signals are those behind the loop's sensor. They are interpolated linearly between the instants that
+    the
+    solver keeps (`solver.every`). A run that ends before its data stays at its last sample. If the rest was left out,
+    an
+    early end would lower the cost. If the loop's stop ends a run other than at rest, cut longer data with `until`.
 
     Attributes:
-        t: Instants [s] from the start of braking, shape (n,), increasing, not necessarily equally spaced.
+        t: Instants [s] from the start of the run, shape (n,), increasing, not necessarily equally spaced.
         columns: Measured values by the name of a field of the plant's output, shape (n,), or (runs, n) for several
             runs.
-        sigma: Standard deviation of each column's noise, in its unit: a number, or of the column's shape. None if
+        sigma: Standard deviation of each column's noise, in its unit: a number, shape (n,) or (runs, n). None if
             unknown,
             with one column only.
         over: Parameters that differ between runs, by path, with one row for each run.

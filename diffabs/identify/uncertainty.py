@@ -26,10 +26,10 @@ MAX_RELATIVE_SPREAD = 1.0
 
 
 class Direction(NamedTuple):
-    """A unit vector of relative parameter changes.
+    """A unit vector of relative parameter changes p/size.
 
     Attributes:
-        spread: 1/(singular value), infinite if the singular value is zero to rounding.
+        spread: Relative standard deviation along the vector, 1/(singular value); infinite if that is zero to rounding.
         singular: Singular value.
         components: Components by parameter name; the largest one is positive.
     """
@@ -54,11 +54,11 @@ class Uncertainty:
 
     Attributes:
         names: Names of the parameters, p of them.
-        covariance: Covariance with the prior, shape (p, p). A direction that neither data nor prior determine has a
-            huge, finite variance.
-        deviations: Standard deviations by name.
-        correlation: Correlation with the prior, shape (p, p).
-        scale: s.
+        covariance: Covariance from data and prior, shape (p, p), in the parameters' units. A direction that neither
+            determines has a huge, finite variance.
+        deviations: Standard deviations by name, in the parameters' units.
+        correlation: Correlation from data and prior, shape (p, p).
+        scale: Factor s of the residuals' standard deviations; 1 if these are known absolutely.
         degrees: Degrees of freedom n - p.
         directions: p directions from the data alone, the best determined first.
     """
@@ -72,7 +72,7 @@ class Uncertainty:
     directions: list[Direction]
 
     def undetermined_directions(self, beyond: float = MAX_RELATIVE_SPREAD) -> list[Direction]:
-        """Return the directions that the data leave open: their relative spread is larger than `beyond`."""
+        """Return the directions that the data leave open: their spread is larger than `beyond`, by default 100 %."""
         return [one for one in self.directions if not one.spread <= beyond]
 
     @property
@@ -86,10 +86,10 @@ def uncertainty(names: Sequence[str], size: np.ndarray, data: Any, prior: Any, s
 
     Args:
         names: Names of the parameters, p of them.
-        size: Sizes of the parameters, shape (p,).
-        data: A, shape (n, p).
-        prior: P, shape (k, p).
-        scale: s.
+        size: Sizes of the parameters, shape (p,), in their units.
+        data: Jacobian A of residual/sigma by the parameters, shape (n, p).
+        prior: Jacobian P of the prior by the parameters, shape (k, p).
+        scale: Factor s of the residuals' standard deviations.
     """
     degrees, known = len(data) - len(names), data * size / scale
     # An SVD of the Jacobian avoids the normal equations, whose condition number is squared.

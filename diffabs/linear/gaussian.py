@@ -42,7 +42,9 @@ class Filter(NamedTuple):
 def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
     """Return the steady-state Kalman filter of x+ = A x + w, y = C x + v; NaN where no such filter exists.
 
-    The result is differentiable in every argument.
+    The gain L corrects the prediction: x^ = x^- + L (y - C x^-). The predictor's gain is A L. The result is
+    differentiable
+    in every argument.
 
     Args:
         A: State matrix, shape (n, n).
@@ -51,7 +53,7 @@ def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
         V: Covariance of v, shape (p, p), positive definite.
 
     Raises:
-        ValueError: The same cases as in `dare`.
+        ValueError: The shapes do not fit, or the matrices are complex or float32.
     """
     A, C, W, V = as_float_arrays(A, C, W, V)
     found = dare(A.T, C.T, W, V)
@@ -69,13 +71,16 @@ def lqg(
     noise: Any = (1e-3, 1e-3),
     voltage_max: float = np.inf,
 ) -> Sampled:
-    """Return a sampled controller for a balancing plant that measures only theta and psi: LQR on a Kalman filter's
-    estimate.
+    """Return an LQG controller for a balancing plant, sampled, which measures only theta and psi.
+
+    It is an LQR on the estimate of a steady-state Kalman filter. Each sample corrects the estimate before the command
+    is
+    computed, without a computing delay.
 
     Args:
         plant: Two-wheeler; it is linearised upright.
-        Q: Weight of the states in the integral of x'Q x + R u^2, shape (6, 6). A sum over the samples stands for the
-            integral.
+        Q: Weight of the states in the integral of x'Q x + R u^2, shape (6, 6). The design replaces the integral by
+            `period` times a sum over the samples.
         R: Weight of the control in the same integral, a number.
         period: Sampling period of the controller [s].
         disturbance: Standard deviations of unknown accelerations of theta, psi, phi [rad/s^2], constant over a period.

@@ -72,8 +72,8 @@ def tracking_dynamics(
         frozen: Names of the outputs w.
 
     Raises:
-        ValueError: Outputs and remaining states are no coordinates: too many, too few, or dependent. Dependence is
-            found outside of jit only; inside, the matrices are not finite.
+        ValueError: F is not a change of coordinates: its components are more or fewer than the states, or dependent.
+            Inside jit dependence raises no error; A and B are then not finite.
     """
     plant, state, control = canonical_dtypes((plant, state, control))
     flow, x, u = as_vectors(plant, state, control)
@@ -94,7 +94,7 @@ def tracking_dynamics(
 
 
 def as_vectors(plant: Plant, state: PyTree, control: Scalar) -> Matrix:
-    """Return f(x, u) as a function of vectors, and the vectors x and u.
+    """Return (flow, x, u): f(x, u) as a function of two vectors, the state as vector x, and the control as vector u.
 
     Args:
         plant: Plant whose `derivative` is f.
@@ -139,7 +139,9 @@ def independent_components(plant: Plant, state: PyTree, outputs: Sequence[str]) 
 def used_leaves(plant: Plant, state: PyTree, outputs: Sequence[str]) -> list[bool]:
     """Return for each leaf of the state whether at least one of the outputs depends on it.
 
-    The traced program decides, and not values: the parameters may be tracers.
+    Dependence is read from the traced computation, not from values. A leaf counts even if its coefficient is zero, and
+    the
+    parameters may be tracers.
 
     Args:
         plant: Plant with an `output`.

@@ -55,7 +55,12 @@ class OpenLoop(NamedTuple):
         return self.controller.period
 
     def transfer(self, more: float = 0.0) -> Transfer:
-        """Return the open loop L, from the command to minus the controller's command. `more` adds to the delay [s]."""
+        """Return the open loop L from the command to minus the controller's command, so the feedback is negative.
+
+        With a sampled controller L is discrete. States that do not influence its output are left out. `more` adds to
+        the delay
+        [s].
+        """
         delay = self.delay + more
         if self.period is None:
             return _drop_unobserved_states(_series(self.plant, self.controller)._replace(delay=delay))
@@ -71,12 +76,15 @@ def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
 
     Args:
         loop: Loop to open.
-        target: Setpoint to use instead, in the unit of the first signal. If the reference searches for its target, the
-            value that it will find.
+        target: Setpoint in the unit of the first signal; None takes the setpoint of the loop's reference. A reference
+            that
+            searches for its target has no setpoint yet: state the value that it will find.
 
     Raises:
         ValueError: A block acts at instants (a relay, a controller that computes in every step but is not `Sampled`);
-            or the plant does not come to rest at the setpoint; or the command depends on no measured signal.
+            or the plant does not come to rest at the setpoint; or the command does not respond to a measured signal
+            there,
+            for example at a limit.
     """
     rational, delay = _split_off_delays(loop)
     _check_continuous(rational)

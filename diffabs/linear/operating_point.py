@@ -72,7 +72,9 @@ class OperatingPoint:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of the states. The state of a block has the name of the block in front."""
+        """Names of the states; a state of the sensor, controller or actuator begins with that word, as in
+        `controller.integral`.
+        """
         names = _names(self.loop)
         return tuple(names[i] for i in self.kept)
 
@@ -87,14 +89,14 @@ class OperatingPoint:
 
 
 def operating_point(loop: Loop) -> OperatingPoint:
-    """Return the linear model of a loop at rest on its setpoint.
+    """Return the linear model of a loop at rest on its setpoint, in continuous time.
 
     Args:
         loop: Loop to linearise.
 
     Raises:
         ValueError: A block acts at instants (sampled, delayed, a relay); or the plant does not come to rest at the
-            setpoint; or the control is at a limit there.
+            setpoint; or there the control is at a limit or has no effect.
     """
     start = loop.start()
     for name in ("sensor", "controller", "actuator"):
@@ -225,9 +227,10 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
 
 
 def find_root(function: Any, x: Scalar) -> AnyArray:
-    """Return a root of a function, or its least-squares minimiser, by the Gauss-Newton method.
+    """Return a root of a vector function, shape (n,), by the Gauss-Newton method.
 
-    The result is differentiable twice in the parameters of the function.
+    If there is none, the result is the least-squares minimiser. It is differentiable twice in the parameters of the
+    function.
 
     Args:
         function: Function of a vector that returns a vector.

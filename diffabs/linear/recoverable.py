@@ -25,8 +25,9 @@ from diffabs.linear.riccati import care
 def recoverable_bound(A: AnyArray, B: AnyArray, start: PyTree, limit: Scalar) -> AnyArray:
     """Return the largest multiple of `start` from which some |u| <= limit returns, for a system with one unstable pole.
 
-    The result is differentiable; it is NaN if A has poles on the imaginary axis. With several unstable poles it is not
-    a bound: use `mode_bounds`.
+    The result is a scalar, differentiable in all arguments. It is NaN if A has poles on the imaginary axis. With
+    several
+    unstable poles it is not a bound: use `mode_bounds`.
 
     Args:
         A: State matrix, shape (n, n), with one unstable pole.
@@ -40,11 +41,14 @@ def recoverable_bound(A: AnyArray, B: AnyArray, start: PyTree, limit: Scalar) ->
 
 
 def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[float, float]:
-    """Return for each unstable real pole the largest multiple of `start` from which some |u| <= limit returns this
+    """Return {pole: multiple} over the unstable real poles [1/s], the largest recoverable multiple of `start` for each
     mode.
 
-    Each mode is taken alone. No control returns from more than the smallest of these multiples. With one unstable pole,
-    some control returns from every smaller multiple.
+    Some |u| <= limit returns the mode from every smaller multiple, and none from a larger one. Each mode is taken
+    alone, so
+    no control returns from more than the smallest multiple. If only one pole is unstable, some control returns from
+    every
+    smaller multiple. A multiple is infinite where `start` does not excite the mode. Complex pairs are left out.
 
     Args:
         A: State matrix, shape (n, n).
@@ -63,13 +67,15 @@ def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[f
 
 
 def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
-    """Return the finite transmission zeros of x' = A x + B u, y = c'x with one input: where the Rosenbrock matrix loses
-    rank.
+    """Return the finite transmission zeros of x' = A x + B u, y = c'x, shape (n - r,) for relative
+    degree r.
 
-    They are the poles of the inverse system, whose states keep y at 0. With relative degree r they are eigenvalues of
-    the matrix below; its other r eigenvalues are zero and come from the projection.
+    At a zero the Rosenbrock matrix loses rank. The zeros are the poles of the inverse system, whose states keep y at 0.
+    They are eigenvalues of the matrix below, without its r eigenvalues nearest to zero, which come from the projection.
 
         (I - B (c'A^(r-1)B)^-1 c'A^(r-1)) A
+
+    The result is empty if u does not influence y.
 
     Args:
         A: State matrix, shape (n, n).

@@ -125,9 +125,10 @@ def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, *, discr
 
 
 def unstabilisable_mode(A: AnyArray, B: AnyArray, *, discrete: bool = False) -> complex | None:
-    """Return an unstable eigenvalue of A that the input cannot move, or None.
+    """Return an eigenvalue of A that is not stable and that the input cannot move, or None.
 
-    At such an eigenvalue s, (A - s I, B) has a rank below n (test of Popov, Belevitch and Hautus).
+    At such an eigenvalue s, (A - s I, B) has a rank below n (test of Popov, Belevitch and Hautus). Eigenvalues on the
+    stability boundary count as not stable.
 
     Args:
         A: State matrix, shape (n, n).

@@ -46,7 +46,7 @@ class Band(NamedTuple):
 
     Attributes:
         systems: The systems at the corners, then those at the samples inside.
-        corners: Number of corners.
+        corners: Number of distinct corners.
     """
 
     systems: tuple[System, ...]
@@ -58,7 +58,11 @@ class Band(NamedTuple):
         return tuple(one for one in self.systems if not one.margins.stable)
 
     def worst(self) -> dict[str, System]:
-        """Return for each margin in `BADNESS` the system with the worst value; empty unless all systems are stable."""
+        """Return the system with the worst value of each margin, by its name in `BADNESS`; empty if a system is
+        unstable.
+
+        The names are `gain_up`, `gain_down`, `phase`, `delay`, `modulus`, `sensitivity` and `complementary`.
+        """
         if self.unstable:
             return {}
         return {name: max(self.systems, key=lambda one, bad=bad: bad(one.margins)) for name, bad in BADNESS.items()}
@@ -67,6 +71,8 @@ class Band(NamedTuple):
 def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, target: Scalar = None) -> Band:
     """Return the margins of a loop over a box {path: (low, high)}: at its corners, and at samples that fill it evenly.
 
+    Equal corners count once, so a range with low = high adds none. If all ranges are such, there are no samples.
+
     Args:
         loop: Loop to examine.
         over: Range (low, high) of each parameter, by path, in the parameter's unit.
@@ -74,7 +80,7 @@ def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, tar
         target: Setpoint, as in `open_loop`.
 
     Raises:
-        ValueError: A range is inverted, the box has too many corners, or the loop has no linear model.
+        ValueError: A range is inverted, there are more than 10 ranges, or the loop has no linear model at a point.
         KeyError: A path does not exist.
     """
     free = {path: (float(low), float(high)) for path, (low, high) in over.items()}
@@ -115,8 +121,9 @@ def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:
 
 
 def frequencies(systems: Sequence[OpenLoop], decades: float = 1.5, count: int = 400) -> np.ndarray:
-    """Return frequencies (count,) [rad/s] for a plot of these loops, around their crossovers up to half the sampling
-    rate.
+    """Return logarithmically spaced frequencies (count,) [rad/s] for a plot of these loops, around their crossovers.
+
+    They end at half the lowest sampling rate at most. Without any crossover they surround 1 rad/s.
 
     Args:
         systems: Open loops.

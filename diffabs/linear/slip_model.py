@@ -113,8 +113,9 @@ class SlipModel:
         return _matrices(self)
 
     def point(self) -> tuple[PyTree, PyTree]:
-        """Return state and control of the linearisation: the slip is held, the remaining states are at rest, the speed
-        falls.
+        """Return (state, control) of the linearisation.
+
+        The control holds the slip, and the remaining states are at rest. The speed falls, so this is no equilibrium.
         """
         start = self.plant.start(BrakeStart(speed=self.speed, slip=self.slip))
         control = self.plant.holding(self.plant.output(start), self.slip)
@@ -143,8 +144,9 @@ class SlipModel:
         return system
 
     def with_memory(self, system: StateSpace) -> StateSpace:
-        """Return `system`, whose first state is the slip error, extended by the controller's integral and filter
-        states.
+        """Return a system extended by the controller's states: the integral in front, the filter at the end.
+
+        The first state of `system` is the slip error.
         """
         p, first = len(system.A), int(self.integral)
         n = p + first + isinstance(self.filter, LowPass)

@@ -34,11 +34,13 @@ class Margins(NamedTuple):
 
     Attributes:
         stable: Whether the closed loop is stable.
-        gain: Factors (low, high) by which the loop's gain can fall or rise; 0 and infinity without a limit.
+        gain: Factors (low, high), low < 1 < high, between which the loop's gain may be multiplied; 0 and infinity
+            without
+            a limit.
         gain_at: Frequencies of both [rad/s]; NaN without a limit.
-        phase: Phase margin [rad]; infinity without a crossover.
+        phase: Phase margin [rad]: the smallest angle, lag or lead, that reaches -1; infinity without a crossover.
         phase_at: Its frequency [rad/s].
-        delay: Delay margin [s].
+        delay: Delay margin [s]; infinity without a limit.
         sensitivity: Ms, the largest |S|; 1/Ms is the modulus margin.
         sensitivity_at: Its frequency [rad/s].
         complementary: Mt, the largest |T|.
@@ -83,8 +85,8 @@ class Crossovers(NamedTuple):
 def margins(loop: OpenLoop | Transfer) -> Margins:
     """Return the margins of an open loop.
 
-    The delay margin of an `OpenLoop` with a sampled controller samples the loop again with each added delay. The delay
-    margin of a sampled `Transfer` is that of the phase margin, at the crossover where it is smallest.
+    The delay margin is the smallest (phase lag to -1)/frequency over all crossovers. An `OpenLoop` with a sampled
+    controller is sampled again with each added delay instead, so its delay margin is exact.
 
     Args:
         loop: Open loop with one input and one output.
@@ -131,6 +133,8 @@ def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers
 def is_stable(system: Transfer) -> bool:
     """Return whether the closed loop is stable: all poles in the left half-plane, or in the unit circle if sampled.
 
+    The pure delay is included, without an approximation.
+
     Args:
         system: Open loop with one input and one output.
     """
@@ -150,12 +154,12 @@ def is_stable(system: Transfer) -> bool:
 
 
 def unstable_poles(system: Transfer) -> int:
-    """Return the number of unstable poles of the closed loop, for a system without delay.
+    """Return the number of unstable poles of the closed loop, those on the stability boundary included.
 
-    A loop with 1 + D = 0 is not well-posed; it counts as one pole more than its states.
+    If 1 + D = 0 the closed loop is not well-posed. The result is then the number of states plus 1.
 
     Args:
-        system: Open loop without delay.
+        system: Open loop with one input, one output and no delay.
     """
     if not 1 + system.D[0, 0]:
         return len(system.A) + 1

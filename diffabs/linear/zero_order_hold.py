@@ -10,14 +10,14 @@ TERMS, EXPONENTIAL_SQUARINGS = 14, 16  # terms of the Taylor series and largest 
 
 
 def discretise_held_input(system: StateSpace, period: Scalar, delay: Scalar) -> StateSpace:
-    """Return the discrete system over one period, whose last states are the previous input.
+    """Return the discrete system over one period, for the state (x, u_old): A (n + m, n + m), B (n + m, m).
 
-    The previous input acts until `delay` d, then the new one until the period T ends.
+    The previous input u_old acts until `delay` d, then the new one until the period T ends.
 
         x(T) = e^(A T) x + e^(A (T - d)) G(d) u_old + G(T - d) u,  G(s) = integral of e^(A r) B over r in [0, s]
 
     Args:
-        system: System in continuous time.
+        system: System in continuous time, A (n, n), B (n, m).
         period: Sampling period T [s].
         delay: Computing delay d [s], 0 to T.
     """

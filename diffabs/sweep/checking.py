@@ -21,11 +21,17 @@ MAX_RELATIVE_CHANGE = 0.01  # largest relative change by a half step without a w
 
 
 def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
-    """Return the change of each metric under a half step, for at most `count` runs that did not diverge.
+    """Return how much a half step changes each metric, for at most `count` runs that did not diverge.
 
-    The seed chooses the runs. For each metric the result holds the median and the largest change, and the sample with
-    the largest. A change is relative to the metric's value, or to its median if that is larger. Runs that end
-    differently, or that draw other noise, are counted and left out.
+    The seed chooses the runs. The result has these entries:
+
+    - `samples`: Numbers of the compared samples.
+    - `step`, `solver`: The half step [s], and the description of the sweep's solver.
+    - `ended otherwise`, `not comparable`: Numbers of runs left out, because they end differently or draw other noise.
+    - `metrics`: For each metric the `median` and `largest` relative change, and the `sample` with the largest. Its
+      `difference` is the absolute change of this sample, in the metric's unit.
+
+    A change is relative to the metric's absolute value, or to the median of these if that is larger.
 
     Args:
         study: Study of the sweep.

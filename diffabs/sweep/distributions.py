@@ -222,11 +222,11 @@ def read_distribution(given: PyTree, where: str, kinds: Mapping[str, type] = DIS
 
 
 def convert_distribution_to_si(distribution: Any, scale: float) -> Scalar:
-    """Return the distribution of a parameter in SI units.
+    """Return the distribution of a parameter in SI units: its fields with a unit are divided by `scale`.
 
     Args:
         distribution: Distribution in another unit.
-        scale: Number of these units in one SI unit.
+        scale: Number of these units in one SI unit, for example 3.6 for km/h.
     """
 
     def divide(value: Scalar) -> Any:
@@ -236,7 +236,7 @@ def convert_distribution_to_si(distribution: Any, scale: float) -> Scalar:
 
 
 def support_interval(distribution: Distribution) -> ParameterSpec:
-    """Return the support as an interval, open at an end that only u = 0 or u = 1 reaches.
+    """Return the support as a `ParameterSpec` with unit "1"; infinite ends, and 0 of a `LogNormal`, are open.
 
     Args:
         distribution: Distribution of a parameter.

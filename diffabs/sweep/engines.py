@@ -22,8 +22,8 @@ class ComputedChunk(NamedTuple):
     Attributes:
         chunk: Number of the chunk.
         data: Bytes of its file.
-        lanes: Number of runs.
-        failed: Number of failed runs.
+        lanes: Number of samples, those that were not run included.
+        failed: Number of failed runs, diverged ones included.
         diverged: Number of diverged runs.
         refused: Number of samples that were not run.
     """
@@ -109,6 +109,8 @@ def is_accepted(refused: Bool) -> np.ndarray:
 def has_failed(study: Study, columns: Any) -> np.ndarray:
     """Return which runs diverged, had a wrong end, or exceeded a bound of the study, shape (samples,).
 
+    A sample that was not run has not failed.
+
     Args:
         study: Study of the sweep.
         columns: Columns of the table, by name.
@@ -133,7 +135,7 @@ def has_wrong_end(stopped: Bool, success: bool) -> np.ndarray:
 
 
 def describe_wrong_end(success: bool) -> str:
-    """Return the name of a wrong end.
+    """Return the name of a wrong end: "not stopped" if the stop is a success, else "stopped".
 
     Args:
         success: Whether reaching the stop is a success.

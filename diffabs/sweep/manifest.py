@@ -58,7 +58,9 @@ EARLIER_FORMAT_MESSAGE = "written by an earlier diffabs: read its chunks with pa
 
 
 def describe_owner(study: Study) -> JsonObject:
-    """Return the owner of a study's chunks when this process computes them now: format, study and versions.
+    """Return the identity of a sweep that this process computes now, as {"format", "study", "versions"}.
+
+    A digest of it, the owner, is in every chunk.
 
     Args:
         study: Study of the sweep.

@@ -132,9 +132,11 @@ class Results:
         return seal.tables_digest(self._read_table(chunk, None) for chunk in sorted(self.files))
 
     def failures(self) -> dict[str, np.ndarray]:
-        """Return which samples failed, shape (samples,), for each kind of failure.
+        """Return which samples failed, as {kind: mask}, each of shape (samples,).
 
-        The kinds are: diverged, a wrong end, and a metric beyond its bound. A refused sample has not failed.
+        The kinds are "diverged", a wrong end ("stopped" or "not stopped"), and "METRIC > BOUND". A sample may have
+        several. A
+        refused sample has not failed.
         """
         study, run = self.study, self.accepted
         kinds = {
@@ -192,7 +194,7 @@ class Results:
         return self.table().filter(pa.array(self.column("diverged") & self.accepted))
 
     def worst(self, metric: str, count: int = 10) -> pa.Table:
-        """Return the `count` rows with the largest values of a `metric`, the largest first."""
+        """Return the `count` rows with the largest values of a `metric`, the largest first; NaN comes last."""
         values = self.column(metric)
         order = np.argsort(np.where(np.isnan(values), -np.inf, values), kind="stable")[::-1][:count]
         return self.table().take(order)

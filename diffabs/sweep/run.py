@@ -26,13 +26,13 @@ class SweepProgress(NamedTuple):
     """Progress of a sweep.
 
     Attributes:
-        samples: Number of finished samples.
+        samples: Number of finished samples, those of earlier calls included.
         total: Number of samples of the sweep.
         here: Number of samples that this call has finished.
-        seconds: Time of this call [s], without compiling where `stopwatch.listen` counts it.
+        seconds: Time of this call [s]; the time to compile is left out where `stopwatch.listen` was called.
         failed: Number of failed runs of this call.
         diverged: Number of diverged runs of this call.
-        damaged: Damaged chunks, which are computed again.
+        damaged: Numbers of the damaged chunks, which are computed again.
         refused: Number of samples of this call that were not run.
     """
 
@@ -47,7 +47,7 @@ class SweepProgress(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Runs per second."""
+        """Samples of this call per second."""
         return self.here / self.seconds if self.seconds > 0 else 0.0
 
 

@@ -109,7 +109,11 @@ class Sobol(SamplingDesign):
         return np.concatenate(points)
 
     def count(self, variables: Table, samples: int | None) -> int:
-        """Return `samples` if it is a multiple of the replicates, for any `variables`."""
+        """Return `samples`, for any `variables`.
+
+        Raises:
+            ValueError: `samples` is None, or no multiple of the replicates.
+        """
         del variables
         return _check_multiple(_check_samples(samples), self.replicates, "the number of replicates")
 
@@ -141,7 +145,11 @@ class LatinHypercube(SamplingDesign):
         return _hypercube_points(seed, samples, dimension)[start:stop]
 
     def count(self, variables: Table, samples: int | None) -> int:
-        """Return `samples` if it is at most MAX_HYPERCUBE_SAMPLES, for any `variables`."""
+        """Return `samples`, for any `variables`.
+
+        Raises:
+            ValueError: `samples` is None, or larger than MAX_HYPERCUBE_SAMPLES.
+        """
         del variables
         if (count := _check_samples(samples)) > MAX_HYPERCUBE_SAMPLES:
             raise ValueError(
@@ -277,7 +285,11 @@ class Saltelli(SamplingDesign):
         return np.where(from_b, b, a)
 
     def count(self, variables: Table, samples: int | None) -> int:
-        """Return `samples` if it is a multiple of the number of `variables` plus 2."""
+        """Return `samples`, the number of all runs.
+
+        Raises:
+            ValueError: `samples` is None, or no multiple of the number of `variables` plus 2.
+        """
         return _check_multiple(_check_samples(samples), len(variables) + 2, "the number of variables plus 2")
 
 

@@ -117,7 +117,7 @@ class Study:
         return self.space.draw(self.seed, start, stop, self.samples)
 
     def lane(self, i: int) -> tuple[Loop, jax.Array]:
-        """Return loop and random key of sample i.
+        """Return the loop of sample i with its drawn values and parts in float64, and its random key for noise.
 
         Raises:
             ValueError: The sample is not in the sweep.
@@ -129,7 +129,7 @@ class Study:
             return replace(self.variant(values), numeric_values(values)), noise_key(self.seed, i)
 
     def variant(self, values: Params) -> Loop:
-        """Return the loop with the parts whose names are in `values`."""
+        """Return the loop with the alternative parts that `values` names; the numbers in `values` are not set."""
         return replace(self.loop, {path: self.parts[path][str(values[path])] for path in self.parts})
 
     def table(self) -> JsonObject:

@@ -25,7 +25,7 @@ class PairedComparison(NamedTuple):
     Attributes:
         mean: Mean of a - b.
         median: Median of a - b.
-        less: Share of samples with a < b.
+        less: Probability that a < b; a tie counts as not less.
         ties: Number of samples with a = b.
         correlation: Pearson correlation of a with b.
         reduction: (var a + var b)/var(a - b); infinite for a constant difference, NaN if both are constant.

@@ -70,7 +70,9 @@ class SobolIndices(NamedTuple):
 
 
 def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95, binormal: bool = True) -> Correlations:
-    """Return the correlations of each column of x with y; NaN between -1 and 1 where one of the two is constant.
+    """Return the correlations of each column of x with y, in the order of the columns.
+
+    If one of the two is constant, the value is NaN with the ends -1 and 1.
 
     Args:
         x: Inputs, shape (n, d).
@@ -93,7 +95,9 @@ def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95, binormal: bo
 
 
 def pearson(x: Scalar, y: Scalar, *, confidence: float = 0.95, binormal: bool = True) -> IntervalEstimate:
-    """Return the Pearson correlation of two columns; NaN between -1 and 1 where one of the two is constant.
+    """Return the Pearson correlation of two columns.
+
+    If one of the two is constant, the value is NaN with the ends -1 and 1.
 
     Args:
         x: First column, shape (n,).

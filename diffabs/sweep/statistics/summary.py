@@ -39,8 +39,18 @@ INTERVAL_NOTES = {
 def summarise_sweep(found: Results, confidence: float = 0.95) -> JsonObject:
     """Return the summary of the finished chunks.
 
-    Diverged runs are counted, and enter the failures but no other statistic. Refused samples are counted, and enter
-    none.
+    Its entries are:
+
+    - `samples`, `complete`, `digest`: Number of rows, whether all chunks are finished, and the digest of the table.
+    - `diverged`, `refused`: `count` and first `samples`; `refused` also counts each reason.
+    - `confidence`, `intervals`: Confidence, and the meaning of the intervals as text.
+    - `failures`: Probability of each kind of failure, and of `any`.
+    - `never`: Runs with an infinite value, by metric, where there are some.
+    - `metrics`: Statistics by metric.
+    - `sensitivity`: Correlations, or Sobol' indices, by metric and variable.
+    - `worst`: Samples with the largest values, by metric.
+
+    Diverged runs enter the failures but no other statistic. Refused samples enter none. An infinite end is None.
 
     Args:
         found: Results of the sweep.
