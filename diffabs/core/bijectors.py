@@ -99,12 +99,13 @@ Bijection = Interval | Decades | HalfLine | UnboundedLine
 
 
 def bijection(low: float, high: float, start: float) -> Bijection:
-    """Return the map from z onto the range (low, high).
+    """Return the map from the unbounded z onto the range (low, high).
 
     Args:
         low: Lower end, or -inf.
         high: Upper end, or inf.
-        start: A value inside the range, which sets the scale of unbounded ranges.
+        start: A value inside the range. It has z = 0 in a range with an infinite end and sets the scale there. A finite
+            range does not use it.
     """
     if math.isfinite(low) and math.isfinite(high):
         if low * high > 0:
@@ -131,7 +132,7 @@ class FreeParameter:
 
 @dataclasses.dataclass(frozen=True)
 class FreeSpace:
-    """The free parameters of a part, in order; z has shape (size,)."""
+    """The free parameters of a part, in the order in which they were given; z has shape (size,)."""
 
     entries: tuple[FreeParameter, ...]
 
@@ -176,10 +177,13 @@ class FreeSpace:
         return np.concatenate([self._place_values(entry, value) for entry, value in self._of(part)])
 
     def spread(self, key: jax.Array, count: int) -> np.ndarray:
-        """Return `count` random starts (count, size) from the random `key`.
+        """Return `count` random starts z (count, size) from the random `key`.
 
-        They are uniform over finite ranges (over the logarithm if a range spans decades). On half lines they lie within
-        a factor of three of the present value.
+        On a finite range the values are uniform (over the logarithm if the range spans a decade). On a range with one
+        infinite
+        end, they change the present value's distance from the finite end by at most a factor of about three. On an
+        unbounded
+        range they differ from the present value by at most 1.2 max(|value|, 1).
         """
         u = np.asarray(jax.random.uniform(key, (count, self.size), minval=0.02, maxval=0.98))
         bounded = [isinstance(m, Interval | Decades) for entry in self.entries for m in entry.maps]
@@ -198,7 +202,7 @@ class FreeSpace:
 
 
 def parameter_space(part: Part, free: Sequence[str] | Mapping[str, Range | None]) -> FreeSpace:
-    """Return the space of some parameters of a part.
+    """Return the space of some parameters of a part, as a map from an unbounded vector z.
 
     Args:
         part: Part with the parameters.
@@ -206,8 +210,8 @@ def parameter_space(part: Part, free: Sequence[str] | Mapping[str, Range | None]
             parameter's shape; None is the declared range.
 
     Raises:
-        ValueError: A path is not a parameter, or a run does not depend on it smoothly. A range is empty or leaves the
-            declared range. A present value is at an end of its range or outside.
+        ValueError: No path is given. A path is not a parameter, or a run does not depend on it smoothly. A range is
+            empty or leaves the declared range. A present value is at an end of its range or outside.
     """
     given = free if isinstance(free, Mapping) else dict.fromkeys(free)
     if not given:

@@ -14,13 +14,13 @@ from diffabs.core.types import Int, Part, PyTree
 
 
 class Passage(NamedTuple):
-    """The signal of a block over a step without jumps.
+    """The input signal of a block over a step without jumps.
 
     Attributes:
         start: Time [s] at the start of the step.
-        end: Time [s] at its end.
+        end: Time [s] at the end of the step.
         values: The signal at both ends: after the changes at the start, before the changes at the end.
-        rates: Its rates at both ends [1/s].
+        rates: Time derivatives of the signal at both ends, in the unit of the signal per second.
     """
 
     start: Scalar
@@ -131,11 +131,13 @@ class Series:
 
 
 def offers(block: Part, *hooks: str) -> bool:
-    """Return whether a block has one of the hooks, by default a tick or margins; a composite block decides itself.
+    """Return whether a block has at least one of these optional methods.
+
+    A block with a method `offers(hook)`, such as `Series`, answers for the blocks in it.
 
     Args:
         block: Block.
-        hooks: Names of hooks.
+        hooks: Names of optional methods; without names, `tick` and `margins`.
     """
     asked = getattr(block, "offers", None)
     return any(asked(hook) if asked else hasattr(block, hook) for hook in hooks or ("tick", "margins"))
@@ -144,7 +146,7 @@ def offers(block: Part, *hooks: str) -> bool:
 def next_tick(block: Part, k: Int, h: Scalar) -> Scalar:
     """Return the number of the first grid instant after the k-th at which a block ticks.
 
-    For a composite block, the first tick of any of its blocks counts.
+    A block without a period ticks at every grid instant. For blocks in series, the first tick of any of them counts.
 
     Args:
         block: Block with a tick.
@@ -157,7 +159,8 @@ def next_tick(block: Part, k: Int, h: Scalar) -> Scalar:
 
 
 def record_signal(block: Part, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
-    """Return the signals that a block records: its input, or for blocks in series the input of each recording block.
+    """Return the signal that a block records: its input, or for blocks in series a tuple of the recording blocks'
+    inputs.
 
     Args:
         block: Block that records.
@@ -185,6 +188,6 @@ class NoFeedforward:
     """A feed-forward input of zero."""
 
     def input(self, plant: Part, output: PyTree, target: Scalar) -> Scalar:
-        """Return zero."""
+        """Return zero, with the shape and type of `target`."""
         del plant, output
         return 0.0 * target  # zero with the shape and type of the target

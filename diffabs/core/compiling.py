@@ -31,12 +31,13 @@ QUICK_COMPILE_OPTIONS: dict[str, PyTree] = {
 
 
 def compile_once(static: Iterable[str] | int = (), options: dict[str, PyTree] | None = None) -> Callable[[F], F]:
-    """Return a decorator like `jax.jit`, for a function that is mostly called with numbers, once for each of its
-    shapes.
+    """Return a decorator like `jax.jit`, for a function that usually runs only once for each shape of its arguments.
+
+    A call with numbers compiles with the XLA options. A call under jit, grad or vmap compiles without them.
 
     Args:
-        static: Names of static arguments, which are then passed by name, or the number of leading static arguments.
-        options: Options of XLA (`SAME_RESULT_OPTIONS`, `QUICK_COMPILE_OPTIONS`), used if nothing is traced.
+        static: Names of static arguments, which callers pass by name, or the number of leading static arguments.
+        options: Options of XLA: `SAME_RESULT_OPTIONS`, `QUICK_COMPILE_OPTIONS`, or None.
     """
     leading, names = (static, ()) if isinstance(static, int) else (0, tuple(static))
     fixed: dict[str, PyTree] = {"static_argnums": tuple(range(leading)), "static_argnames": names}
@@ -56,9 +57,7 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, PyTree] | 
 
 
 def is_traced(*trees: PyTree) -> bool:
-    """Return whether a trace is under way (jit), or a leaf is a tracer (also grad, vmap).
-
-    XLA options apply only to a whole program, and a tracer has no value.
+    """Return whether a jit trace is under way, or a leaf of the trees is a tracer, as under grad and vmap.
 
     Args:
         trees: Pytrees of numbers or tracers.

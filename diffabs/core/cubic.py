@@ -20,7 +20,7 @@ NEWTON_ITERATIONS = 4  # from the secant's root, before the last: in a long step
 
 
 class Cubic(NamedTuple):
-    """A cubic, given by its values at both ends and its rates there times the step length."""
+    """The cubic p on [0, 1], given by its values at both ends and dp/dx there: the rate times the step length."""
 
     start: Scalar
     end: Scalar
@@ -46,19 +46,21 @@ class Cubic(NamedTuple):
         return Cubic(*(factor * x for x in self))
 
     def integral(self, x: Scalar) -> Scalar:
-        """Return the integral of p from 0 to `x`, in units of the step."""
+        """Return the integral of p from 0 to `x`; times the step length, it is an integral over time."""
         c1, c2, c3 = self._coefficients()
         return x * (self.start + x * (c1 / 2.0 + x * (c2 / 3.0 + x * c3 / 4.0)))
 
     def moment(self, x: Scalar) -> Scalar:
-        """Return the integral of x p from 0 to `x`, in units of the step."""
+        """Return the integral of x p(x) from 0 to `x`; times the squared step length, it is an integral over time."""
         c1, c2, c3 = self._coefficients()
         return x * x * (self.start / 2.0 + x * (c1 / 3.0 + x * (c2 / 4.0 + x * c3 / 5.0)))
 
     def root(self) -> Scalar:
-        """Return the place x at which p changes sign, or 1 if both ends have the same sign.
+        """Return the x in [0, 1] at which p changes sign.
 
-        The derivative of x follows from the implicit function theorem.
+        It is 0 if p is zero at the start, and 1 if both ends have the same sign. The derivative of x follows from the
+        implicit
+        function theorem.
         """
         # The iterations run without derivatives; `_refine_zero` adds the derivative of the root once at the end.
         still = jax.lax.stop_gradient(self)

@@ -40,11 +40,11 @@ def open_regular(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def read_content(path: str | os.PathLike[str], most: int = sys.maxsize) -> bytes:
-    """Return the first bytes of a regular file.
+    """Return the content of a regular file, or only its first bytes.
 
     Args:
         path: Path of the file.
-        most: Greatest number of bytes.
+        most: Greatest number of bytes; the function does not return the rest of a longer file.
 
     Raises:
         OSError: As in `open_regular`.
@@ -54,7 +54,9 @@ def read_content(path: str | os.PathLike[str], most: int = sys.maxsize) -> bytes
 
 
 def make_room(folder: pathlib.Path, pattern: str, room: int) -> None:
-    """Remove the older half of the matching files of a folder if they have more than `room` bytes together.
+    """Remove half of the matching files, the oldest ones, if all together have more than `room` bytes.
+
+    Half refers to the number of files, so the rest may still exceed `room`.
 
     Args:
         folder: Folder.
@@ -148,7 +150,9 @@ def write_synced(target: pathlib.Path, data: bytes) -> pathlib.Path:
 
 
 def others_may_write(folder: pathlib.Path) -> bool:
-    """Return whether users other than this one and root may write to a folder.
+    """Return whether users other than this one and root may write to a folder; always False on Windows.
+
+    The answer is True for a folder that the group or everybody may write to, or that another user owns.
 
     Args:
         folder: Folder.

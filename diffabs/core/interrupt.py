@@ -26,8 +26,8 @@ _terminated = False
 
 
 def end_early_on_interrupt() -> None:
-    """Let Ctrl-C end the process at once until `begin_hearing`, if the process is the command `diffabs`; not in a
-    library.
+    """Let Ctrl-C end the process at once until `begin_hearing`; does nothing unless the process is the command
+    `diffabs`.
     """
     if _is_command():
         _answer(_leave)
@@ -49,12 +49,12 @@ def stop_hearing() -> None:
 
 
 def was_terminated() -> bool:
-    """Return whether SIGTERM was among the signals."""
+    """Return whether SIGTERM has arrived since the start of the process."""
     return _terminated
 
 
 def take_interrupt() -> bool:
-    """Return whether Ctrl-C or SIGTERM arrived since the last call that returned True."""
+    """Return whether Ctrl-C or SIGTERM has arrived, and reset: the same signal makes only one call return True."""
     global _pending
     if not _pending:
         return False

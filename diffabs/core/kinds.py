@@ -23,7 +23,7 @@ MAX_SHOWN_LENGTH = 60  # characters of a value in a message
 def find_value_objection(value: Scalar) -> str:
     """Return why a value cannot be a number of a run or an array of numbers, such as `is text`; empty if it can.
 
-    The function looks only at types, so the value may be traced.
+    For an array only the type counts, so it may be traced. A Python integer beyond the range of a float is refused.
 
     Args:
         value: Number, array, or nested lists of numbers.
@@ -60,7 +60,9 @@ def _of_type(dtype: DTypeLike) -> str:
 
 
 def value_shape(value: Scalar) -> tuple[int, ...]:
-    """Return the shape of an array, a number, or a list of them, which may be traced.
+    """Return the shape of an array, a number, or a nested list of numbers.
+
+    The first item of a list stands for all its items. Arrays may be traced.
 
     Args:
         value: Array, number, or list.

@@ -38,7 +38,10 @@ class Log:
         return len(self.rows)
 
     def put(self, place: Scalar, row: PyTree) -> "Log":
-        """Return the log with `row` at `place`, a whole number of the row's type."""
+        """Return the log with `row` (n,) as the row at index `place`.
+
+        `place` is a whole number, stored as an array of the row's type.
+        """
         rows = self.rows if self.lent else self.rows.at[place.astype(int)].set(row)
         return dataclasses.replace(self, rows=rows, place=place, row=row)
 
@@ -58,35 +61,35 @@ def log_rows(tree: PyTree) -> list[PyTree]:
 
 
 def borrow(tree: PyTree, rows: list[PyTree] | None) -> PyTree:
-    """Return a tree whose logs are lent and have these rows, or no rows.
+    """Return the tree with its logs lent to a solver, and with these rows in the logs.
 
     Args:
         tree: Pytree with logs.
-        rows: Rows of each log, or None for no rows.
+        rows: Rows of each log, in the order of `log_rows`; None removes the rows.
     """
     each = iter(rows or ())
     return _map_logs(lambda log: Log(next(each) if rows else None, log.place, log.row, lent=True), tree)
 
 
 def commit(tree: PyTree, rows: list[PyTree]) -> PyTree:
-    """Return a tree whose logs have these rows and contain the row that was put while they were lent.
+    """Return the tree with its logs no longer lent: each has its rows, and among them the row written last.
 
     Args:
         tree: Pytree with logs.
-        rows: Rows of each log.
+        rows: Rows of each log, in the order of `log_rows`.
     """
     each = iter(rows)
     return _map_logs(lambda log: Log(next(each), log.place, log.row).put(log.place, log.row), tree)
 
 
 def write_last_rows(tree: PyTree) -> list[PyTree]:
-    """Return the rows of all logs, with the row written last.
+    """Return the rows of all logs after the row written last is put in its place.
 
     A write of the previous step's row followed by a read happens in place. A read before the write needs a copy, unless
     the row depends on the value read.
 
     Args:
-        tree: Pytree with logs.
+        tree: Pytree with lent logs that have their rows.
     """
     return log_rows(commit(tree, log_rows(tree)))
 

@@ -132,8 +132,9 @@ class Loop:
         return any(offers(getattr(self, name), "tick") for name in BLOCKS)
 
     def next_tick(self, k: Int, h: Scalar) -> Scalar:
-        """Return the number of the first grid instant after the `k`-th at which a block ticks; `h` is the grid's step
-        [s].
+        """Return the number of the first grid instant after the `k`-th at which a block ticks.
+
+        `h` is the step of the grid [s]. At least one block must have ticks.
         """
         blocks = (getattr(self, name) for name in BLOCKS)
         return reduce(jnp.minimum, (next_tick(block, k, h) for block in blocks if offers(block, "tick")))
@@ -244,7 +245,9 @@ def _block_inputs(signals: Signals) -> dict[str, PyTree]:
 
 
 def run_signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, PyTree]]:
-    """Return unit and values of the stored signals of a run by name: time, plant outputs, target, command, control.
+    """Return the stored signals of a run by name, each as (unit, values).
+
+    The names are `t`, the outputs of the plant, `target`, `command` and `control`.
 
     Args:
         sample: Samples of the run.

@@ -46,7 +46,7 @@ class ComparisonAnswers(NamedTuple):
 
 
 def single_bit(which: Scalar, words: int) -> ModeBits:
-    """Return the words with one bit set.
+    """Return packed words with one bit set, or without a set bit if `which` is negative.
 
     Args:
         which: Number of the bit.
@@ -132,9 +132,11 @@ class ComparisonTrace:
         return taken
 
     def search(self, ask: tuple[int, bool], says: Callable[[], PyTree], knots: Scalar, x: Scalar) -> Scalar:
-        """Return the number of knots below `x`, with one bit for each knot.
+        """Return the number of knots that are not above `x`, as an integer; each knot has one bit.
 
-        `ask` is the number of the comparison, `says()` the search by the numbers, and `knots` (n,) are the knots.
+        `ask` holds the number of the search and is otherwise not used. `says()` is the search by the numbers, and
+        `knots` (n,)
+        are the knots.
         """
         number, count = ask[0], len(knots)
         first = self.places[number][0]
@@ -202,11 +204,11 @@ def _rounding_error(x: Scalar) -> Scalar:
 
 
 def unpack_answers(words: ModeBits, first: int, shape: tuple[int, ...]) -> Scalar:
-    """Return the answers of a comparison as booleans.
+    """Return the answers of one comparison as booleans of the comparison's shape.
 
     Args:
         words: Packed answers.
-        first: First bit of the comparison.
+        first: Number of the comparison's first bit.
         shape: Shape of the comparison.
     """
     if not shape:
@@ -216,10 +218,12 @@ def unpack_answers(words: ModeBits, first: int, shape: tuple[int, ...]) -> Scala
 
 
 def locate_bits(first: int, shape: tuple[int, ...]) -> list[tuple[int, int, np.ndarray]]:
-    """Return the place of a comparison's bits, as a list of (first element, word, bits in the word).
+    """Return the bits of a comparison word by word, as a list of (first element, word, bits).
+
+    An entry holds the flat index of the first element in the word, the word's index, and the bits' places in it.
 
     Args:
-        first: First bit of the comparison.
+        first: Number of the comparison's first bit.
         shape: Shape of the comparison.
     """
     size, found, start = int(np.prod(shape)), [], 0

@@ -16,9 +16,9 @@ def clamp(x: Scalar, low: Scalar, high: Scalar) -> Scalar:
     """Return x limited to [low, high].
 
     The slope in x is 1 at a limit and 0 beyond it; the slope in a limit is 1 beyond that limit. The function uses
-    selections for two reasons. The tangent of `jnp.clip` divides. `lax.clamp` refuses to batch an upper limit alone
-    (JAX
-    0.10; similar to github.com/jax-ml/jax/issues/5325, whose repair leaves this case out).
+    selections for two reasons. The tangent of `jnp.clip` divides. In JAX 0.10, `lax.clamp` refuses to batch an upper
+    limit
+    alone (similar to github.com/jax-ml/jax/issues/5325, whose repair leaves this case out).
 
     Args:
         x: Number to limit.
@@ -43,8 +43,9 @@ def larger(x: Scalar, y: Scalar) -> Scalar:
 def later_of_larger(x: Scalar, y: Scalar, falls: Scalar = False) -> PyTree:
     """Return max(x, y) of two successive values of a signal, with the slope of y where both are equal to rounding.
 
-    The end y of a step of zero length moves with the event there; its start x does not. If the signal falls after x,
-    the slope is that of x. A peak at an event just before a grid instant then does not move with the grid.
+    If the signal falls after x, the slope is that of x instead. At the end of a step of zero length, y moves with the
+    event
+    there, and x does not. A peak at an event just before a grid instant does not move with the grid.
 
     Args:
         x: Earlier value.
@@ -98,10 +99,11 @@ def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Sc
 
 
 def power(base: Scalar, exponent: Scalar) -> Scalar:
-    """Return base ** exponent for base >= 0 and exponent > 1, with slope 0 at base = 0 in both arguments.
+    """Return base ** exponent for exponent > 1, or 0 with zero slopes for base <= 0.
 
-    The formula is exp(q log x): XLA's own power is three to four times slower on a CPU. It uses the square of the base.
-    A trial step that passes base = 0 with frozen comparisons (`core.comparisons`) then gets a finite number.
+    The formula is exp(q log x), with the logarithm from the square of the base. XLA's own power takes three to four
+    times
+    as long on a CPU. The square keeps the number finite in a trial step that passes base = 0 with frozen comparisons.
 
     Args:
         base: Base.

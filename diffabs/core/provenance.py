@@ -17,10 +17,13 @@ import jax
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Return the versions of diffabs, JAX, these packages, and Python, by name.
+    """Return the versions by name: `diffabs`, `jax`, the given packages, and `python`.
 
     Args:
-        packages: Names of distributions.
+        packages: Names of installed distributions.
+
+    Raises:
+        importlib.metadata.PackageNotFoundError: A distribution is not installed.
     """
     found = {name: importlib.metadata.version(name) for name in ("jax", *packages)}
     own = sys.modules[__name__.partition(".")[0]].__version__  # the distribution's name differs from the package's
@@ -28,17 +31,20 @@ def versions(*packages: str) -> dict[str, str]:
 
 
 def describe_platform(*packages: str) -> dict[str, str]:
-    """Return everything that can change a bit of a result: `versions`, JAX's backend, and the processor.
+    """Return `versions`, JAX's `backend`, and the `machine` (x86_64, arm64), since each can change a bit of a result.
 
     Args:
-        packages: Names of distributions.
+        packages: Names of installed distributions.
+
+    Raises:
+        importlib.metadata.PackageNotFoundError: A distribution is not installed.
     """
     return versions(*packages) | {"backend": jax.default_backend(), "machine": platform.machine()}
 
 
 @functools.cache
 def processor() -> str:
-    """Return a name of this kind of processor.
+    """Return a hash (12 hexadecimal digits) of the model and the features of the processor.
 
     Programs compiled for another kind may not run here, and home folders are shared between machines.
     """
@@ -50,7 +56,9 @@ def processor() -> str:
 
 
 def describe_making(words: Sequence[str]) -> dict[str, str | int]:
-    """Return date (UTC), machine, commit if there is one, and the command that repeats a computation.
+    """Return how a computation was made: `command`, `date`, `machine`, `system`, `processors`, `backend`, and `commit`.
+
+    The command repeats the computation. The date is UTC. `commit` is absent for an installed package.
 
     Args:
         words: Words of the command after `diffabs`.
@@ -62,7 +70,10 @@ def describe_making(words: Sequence[str]) -> dict[str, str | int]:
 
 
 def source_commit() -> dict[str, str]:
-    """Return the commit of a working copy, marked if files differ from it; empty for an installed package."""
+    """Return `{"commit": hash}` of a working copy; empty for an installed package or without git.
+
+    The hash has the suffix `-dirty` if tracked files differ from the commit.
+    """
     root = pathlib.Path(__file__).parents[2]
     if not (root / ".git").exists():
         return {}

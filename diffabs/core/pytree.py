@@ -67,7 +67,9 @@ class ParameterSpec:
         return f"{left}{self.low:g}, {self.high:g}{right}{unit}"
 
     def around(self, units: Units | None) -> "ParameterSpec":
-        """Return the declaration with a relative unit resolved in the `units` of a loop."""
+        """Return the declaration with `control` and `signal` in its unit replaced by the `units` of a loop; None keeps
+        them.
+        """
         unit = resolve_unit(self.unit, units)
         return self if unit == self.unit else dataclasses.replace(self, unit=unit)
 
@@ -212,7 +214,9 @@ def parameters(part: Part, prefix: str = "", units: Units | None = None) -> Iter
 
 
 def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[PyTree] | None, PyTree]]:
-    """Yield the fields of a part as (dotted path, field, value), except static fields; items of a tuple have no field.
+    """Yield (dotted path, field, value) of each field that is not static, without descending into the values.
+
+    For a tuple of parts it yields the items, with None as their field. For any other value it yields nothing.
 
     Args:
         part: Part, or tuple of parts.
@@ -228,7 +232,7 @@ def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[P
 
 
 def parts(part: Part) -> Iterator[PyTree]:
-    """Yield the parts that a part holds.
+    """Yield the parts directly in a part, but not the parts in those; items of a tuple count singly.
 
     Args:
         part: Part.
@@ -241,8 +245,9 @@ def parts(part: Part) -> Iterator[PyTree]:
 
 
 def elements(part: Part) -> dict[str, ParameterSpec]:
-    """Return the declaration of each single number below a part by path; elements of a list have their index at the
-    end.
+    """Return the declaration of every single number below a part by path.
+
+    The path of an element of an array ends in its index: `controller.gain.0`.
 
     Args:
         part: Part.
@@ -255,14 +260,15 @@ def elements(part: Part) -> dict[str, ParameterSpec]:
 
 
 def get(part: Part, path: str) -> PyTree:
-    """Return the value in a part at a dotted path, `plant.road.scale`, or `controller.gain.0` for an element of a list.
+    """Return the value in a part at a dotted path: a parameter, a part, or an element of an array
+    (`controller.gain.0`).
 
     Args:
         part: Part.
         path: Dotted path.
 
     Raises:
-        KeyError: The path does not exist; the message names the existing ones.
+        KeyError: The path does not exist, or leads to a static field; the message names the fields that exist there.
     """
     for name in path.split("."):
         names = _names(part)
@@ -279,8 +285,10 @@ def _names(part: Part) -> list[str]:
 
 
 def replace(part: T, values: Params) -> T:
-    """Return a copy of `part` with the parameters in `values`, by dotted path, replaced. Works under jit, grad and
+    """Return a copy of `part` with new values of parameters or whole parts, by dotted path. Works under jit, grad and
     vmap.
+
+    The function does not check the ranges.
 
     Args:
         part: Part.
@@ -312,7 +320,7 @@ def _replace(part: Part, names: list[str], value: Scalar) -> Any:
 
 
 def as_arrays(part: T) -> T:
-    """Return the part with arrays in place of lists and tuples of numbers.
+    """Return the part with JAX arrays in place of parameters that are lists or tuples; other values stay.
 
     Args:
         part: Part.
@@ -322,9 +330,10 @@ def as_arrays(part: T) -> T:
 
 
 def canonical_dtypes(tree: T) -> T:
-    """Return the tree with float arrays of one dtype: the dtype of its arrays, or JAX's default float if it has none.
+    """Return the tree with every leaf, also an integer, as a float array of one dtype.
 
-    Python numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
+    It is the common dtype of the float JAX arrays among the leaves, or JAX's default float if there are none. Python
+    numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
 
     Args:
         tree: Pytree of numbers and arrays.
@@ -351,10 +360,10 @@ def _first_unfit(tree: PyTree) -> str:
 
 
 def prepare_parts(part: Part) -> PyTree:
-    """Return the parts with all values precomputed that stay constant during a run.
+    """Return the part ready for a run: each part in it with a method `prepared()` is replaced by the method's result.
 
-    A part with a method `prepared()` is replaced by its result. Differentiable; a run does it once, inside its compiled
-    function.
+    The results hold precomputed values that stay constant during a run. Differentiable; a run does it once, inside its
+    compiled function.
 
     Args:
         part: Part.
@@ -363,21 +372,23 @@ def prepare_parts(part: Part) -> PyTree:
 
 
 def refine_parts(part: Part, times: int) -> PyTree:
-    """Return the parts for steps shorter by a factor `times`.
+    """Return the part for shorter steps: each part in it with a method `refined(times)` is replaced by the method's
+    result.
 
-    A part whose memory covers a number of steps has a method `refined(times)`.
+    Such a part has a memory that covers a number of steps.
 
     Args:
         part: Part.
-        times: Factor.
+        times: Factor by which the steps are shorter.
     """
     return _rebuild_parts(part, "refined", times)
 
 
 def prepare_derivatives(part: Part, paths: Iterable[str], prefix: str = "") -> PyTree:
-    """Return the parts for derivatives by the parameters at these paths.
+    """Return the part for derivatives by the parameters at these paths.
 
-    A part with a method `enable_derivatives(names)` is replaced by its result for the names of its own parameters.
+    Each part in it with a method `enable_derivatives(names)` is replaced by the method's result. `names` are the paths
+    below that part, without the path of the part.
 
     Args:
         part: Part.

@@ -21,10 +21,10 @@ class Rule(NamedTuple):
     """A condition on the numbers of a part.
 
     Attributes:
-        holds: Boolean expression of the part's numbers.
+        holds: Boolean or boolean array, True where the condition holds.
         broken: Message for the runs of a batch that break the rule, without numbers.
-        says: Function that returns the message for a single part, with its numbers, which must be concrete. `
-            {control}` in it stands for the unit of the loop's control.
+        says: Function that returns the message for a single part, with its numbers, which must be concrete. The text
+            `{control}` in it stands for the unit of the loop's control.
     """
 
     holds: Any
@@ -37,7 +37,7 @@ class Rule(NamedTuple):
 
 
 def as_rule_array(x: Scalar) -> Scalar:
-    """Return x as an array: traced numbers unchanged, other numbers in float64 for any default type of JAX.
+    """Return x as an array: JAX arrays and tracers in their own type, other numbers as NumPy float64.
 
     Args:
         x: Number, array, or list of numbers.
@@ -48,11 +48,11 @@ def as_rule_array(x: Scalar) -> Scalar:
 
 
 def order_rule(low: tuple[str, PyTree], high: tuple[str, PyTree], unit: str, *, equal: bool = True) -> Rule:
-    """Return the rule that a lower limit does not exceed an upper limit, or lies below it.
+    """Return the rule low <= high, or low < high if the limits may not be equal.
 
     Args:
-        low: Name and value of the lower limit.
-        high: Name and value of the upper limit.
+        low: Lower limit as (name, value).
+        high: Upper limit as (name, value).
         unit: Unit of both.
         equal: Whether the limits may be equal.
     """

@@ -23,7 +23,7 @@ class Stopwatch:
         self._lock = threading.Lock()
 
     def add(self, start: float, end: float) -> None:
-        """Add a span from `start` to `end`, which has just ended."""
+        """Add a span from `start` to `end` [s]. Calls must come in the order of their ends."""
         with self._lock:
             # Spans are added in the order of their ends, so only the last ones can overlap the new span.
             while self._spans and self._spans[-1][1] >= start:
@@ -32,7 +32,7 @@ class Stopwatch:
             self._spans.append((start, end))
 
     def seconds(self, since: float = 0.0) -> float:
-        """Return the length of the union of all spans after the instant `since`."""
+        """Return the length [s] of the union of all spans, without their time before the instant `since` [s]."""
         with self._lock:
             return sum(max(end - max(start, since), 0.0) for start, end in self._spans)
 
@@ -69,7 +69,9 @@ def count_as_compiling() -> Iterator[None]:
 def compile_time_since(since: float = 0.0) -> float:
     """Return the compilation time [s] since an instant, without compilations that have not ended.
 
+    It covers the compilations of JAX only after `count_compilations`.
+
     Args:
-        since: Instant of `time.monotonic`.
+        since: Instant of `time.monotonic` [s].
     """
     return _compiling.seconds(since)

@@ -8,7 +8,9 @@ from diffabs.core.rules import Rule, as_rule_array
 
 
 def steps_in_period(period: Scalar, h: Scalar) -> Scalar:
-    """Return the number of steps of length h in a period: an integer, so without a derivative.
+    """Return the number of steps of length h in a period, rounded to an integer of at least 1.
+
+    The number has no derivative.
 
     Args:
         period: Period [s].
@@ -18,7 +20,7 @@ def steps_in_period(period: Scalar, h: Scalar) -> Scalar:
 
 
 def whole_steps(name: str, period: Scalar, step: float) -> Rule:
-    """Return the rule that a period is a whole multiple of the step.
+    """Return the rule that a period is a whole multiple of the step, to a relative tolerance of 1e-6.
 
     Args:
         name: Name of the period.

@@ -25,16 +25,15 @@ def differentiated_paths(tangents: PyTree) -> frozenset[str]:
 def jvp_nonzero(
     function: Callable[..., PyTree], primals: PyTree, tangents: PyTree, once: str = ""
 ) -> tuple[PyTree, PyTree]:
-    """Return function(*primals) and its derivative along tangents, for a rule with `symbolic_zeros`.
+    """Return function(*primals) and its derivative along the tangents, for a rule with `symbolic_zeros`.
 
-    Only arguments with a tangent are differentiated, since zero tangents cost as much as others.
+    Only leaves with a tangent are differentiated, since zero tangents cost as much as others.
 
     Args:
         function: Function of the primals.
         primals: Arguments.
         tangents: Their tangents, with symbolic zeros.
-        once: Reason why the function has no second derivatives: the message of the ValueError that they raise. Empty if
-            it has second derivatives.
+        once: Message of the ValueError that a second derivative raises. Empty if the function has second derivatives.
     """
     values, tree = jax.tree.flatten(primals)
     moves = tree.flatten_up_to(tangents)
@@ -52,11 +51,12 @@ def jvp_nonzero(
 
 
 def split_batched(make: Callable[[PyTree], PyTree], batch: PyTree) -> tuple[PyTree, Callable[[PyTree], PyTree]]:
-    """Return the batch-dependent leaves of `make` over a batch, and a function from the leaves of one member to its
-    result.
+    """Return (leaves, whole): the result of `make` for each member of a batch, with constants kept apart.
 
-    The leaves that do not depend on the batch are computed once. In a loop over runs constants then stay numbers, which
-    a processor keeps in registers, instead of columns.
+    `leaves` is a list of those leaves of the result that depend on the member, each (n, ...). `whole(leaves of one
+    member)`
+    is the result of that member. The other leaves are computed once. In a loop over runs they stay numbers, which a
+    processor keeps in registers, instead of columns.
 
     Args:
         make: Function of one member.
@@ -93,8 +93,9 @@ def depends_on_signal(function: Callable[[PyTree], PyTree], signal: PyTree) -> b
 
 
 def leaf_dependence(function: Callable[[PyTree], PyTree], signal: PyTree) -> list[bool]:
-    """Return for each leaf of a signal whether the traced result of a function depends on it, as in
-    `depends_on_signal`.
+    """Return for each leaf of a signal, in the order of `jax.tree.leaves`, whether a function depends on it.
+
+    Tracing decides, as in `depends_on_signal`.
 
     Args:
         function: Function of the signal.
@@ -109,13 +110,14 @@ def leaf_dependence(function: Callable[[PyTree], PyTree], signal: PyTree) -> lis
 
 
 def moving_leaves(function: Callable[[PyTree, PyTree], PyTree], fixed: PyTree, batch: PyTree) -> PyTree:
-    """Return for each leaf of `batch` whether function(fixed, batch) of one member has a derivative by it.
+    """Return, with the structure of `batch`, for each leaf whether function(fixed, batch) of one member has a
+    derivative by it.
 
     Leaves that only enter decisions have no derivative.
 
     Args:
-        function: Function of `fixed` and of one member of the batch.
-        fixed: Pytree with leaves (n, ...).
+        function: Function of one member of `fixed` and of `batch`.
+        fixed: Pytree with leaves (n, ...), also batched; its derivatives do not count.
         batch: Pytree with leaves (n, ...).
     """
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (fixed, batch))

@@ -54,7 +54,8 @@ def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> I
 def part_rules(part: Part, prefix: str = "") -> Iterator[Rule]:
     """Yield every rule of a part and of the parts in it, first the ranges of fields.
 
-    These are the conditions of `find_problems` as arrays, for runs with different values. The shapes must be correct.
+    These are the ranges and rules of `find_problems` in array form, for runs with different values. Only `problems` is
+    missing, so the shapes must be correct.
 
     Args:
         part: Part.
@@ -139,15 +140,15 @@ def find_cautions(part: Part, prefix: str = "") -> Iterator[str]:
 
 
 def check_part(part: T, prefix: str = "") -> T:
-    """Return `part` if every parameter is in its range.
+    """Return `part` unchanged if `find_problems` finds nothing.
 
     Args:
         part: Part.
         prefix: Text before every name in a message, `"plant."`.
 
     Raises:
-        ValueError: A field is out of range or NaN, or a rule fails; the message names each field with value, range and
-            unit.
+        ValueError: A field is out of range, NaN or no number, or a condition on shapes or between numbers fails. The
+            message names each field with value, range and unit.
     """
     lines = list(find_problems(part, prefix))
     if lines:

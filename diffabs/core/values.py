@@ -105,7 +105,7 @@ def read_number(value: Scalar, spec: ParameterSpec, path: str) -> float:
 
     Args:
         value: Given value.
-        spec: Range, for messages.
+        spec: Declared range, which the messages show.
         path: Path of the value, for messages.
 
     Raises:
@@ -380,7 +380,7 @@ def _reader(field: dataclasses.Field[Any]) -> Reader:
 
 
 def read_one(kinds: Mapping[str, type], given: PyTree, path: str, **readers: Reader) -> Scalar:
-    """Return the instance of one of several dataclasses, described by a table with a type or by a bare name.
+    """Return an instance of one of several dataclasses, from a table with a key `type` or from the type's name alone.
 
     Args:
         kinds: Dataclasses by name.
@@ -389,7 +389,7 @@ def read_one(kinds: Mapping[str, type], given: PyTree, path: str, **readers: Rea
         readers: Readers of fields that need more than the table, by name.
 
     Raises:
-        ScenarioError: The type is missing or unknown, or as in `read_table`.
+        ScenarioError: The value is neither a table nor a text, the type is missing or unknown, or as in `read_table`.
     """
     table = {"type": given} if isinstance(given, str) else given
     if not isinstance(table, Mapping):
@@ -401,7 +401,7 @@ def read_one(kinds: Mapping[str, type], given: PyTree, path: str, **readers: Rea
 
 
 def check_sound(part: Part, name: str) -> PyTree:
-    """Return the part.
+    """Return the part unchanged if its method `problems(name)` reports no errors.
 
     Args:
         part: Object with a method `problems(name)`.

@@ -74,7 +74,9 @@ def failure_probability(
 
 
 def find_metric_objection(study: Study, metric: str) -> str | None:
-    """Return why a kernel cannot make these runs, or None. The check compiles the kernel but makes no run.
+    """Return why a kernel cannot make the runs of a study that measures only this metric, or None.
+
+    The check compiles the kernel but makes no run.
 
     Args:
         study: Loop, space, solver and objectives.

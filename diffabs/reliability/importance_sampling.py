@@ -46,7 +46,13 @@ class DivergenceError(ValueError):
 
 
 class ProbabilityEstimate(NamedTuple):
-    """A probability, its coefficient of variation, and its 95 % interval."""
+    """An estimate of a probability.
+
+    Attributes:
+        probability: Probability.
+        cov: Coefficient of variation: standard deviation of the estimate over the probability [1].
+        interval: Ends of the 95 % interval.
+    """
 
     probability: float
     cov: float
@@ -70,7 +76,10 @@ class ImportanceEstimate(NamedTuple):
 
 
 class CountedScore:
-    """A score and its gradient that count their evaluations; a NaN score becomes -inf, which fails at no threshold."""
+    """A score z (n, d) -> (n,), and its gradient, that count evaluations, gradients and diverged runs.
+
+    A NaN score counts as diverged and becomes -inf, so it fails at no threshold.
+    """
 
     def __init__(self, score: Score, gradient: Gradient | None, tolerated: float):
         """Set the score, its gradient (None: no gradient) and the share of runs that may diverge."""
@@ -134,7 +143,7 @@ class Mixture(NamedTuple):
 
     @property
     def directions(self) -> np.ndarray:
-        """Directions u of the centres, shape (k, d)."""
+        """Unit vectors u from the origin to the centres, shape (k, d); the first axis for a centre at the origin."""
         size = np.linalg.norm(self.centres, axis=1, keepdims=True)
         return np.where(size > 0, self.centres / np.where(size > 0, size, 1.0), np.eye(1, self.centres.shape[1]))
 
@@ -171,7 +180,12 @@ class Mixture(NamedTuple):
 def fit_proposal(
     failures: np.ndarray, group: np.ndarray, probability: float, centres: np.ndarray | None = None
 ) -> tuple[Mixture, float]:
-    """Return the mixture with the least second moment E_q[w^2 1_F]/P^2, and the logarithm of that moment.
+    """Return the mixture with the least predicted second moment E_q[w^2 1_F]/P^2 of all fits, and the logarithm of that
+    moment.
+
+    The fits have 1, 2, 4, 8 and 16 centres from the failures; one more takes the given `centres`. The logarithm is
+    infinite
+    if all failures are in odd groups, or all in even groups.
 
     Args:
         failures: Points (n, d), distributed as phi on F.
@@ -220,8 +234,7 @@ def _fit_mixture(z: np.ndarray, centres: np.ndarray, *, moving: bool) -> Mixture
 
 
 def choose_spread_points(z: np.ndarray, count: int) -> np.ndarray:
-    """Return up to `count` of the points: first the nearest to the origin, then points in directions far from each
-    other.
+    """Return up to `count` of the points, far apart in direction; the first is the point nearest to the origin.
 
     Each further point has the direction farthest from the directions chosen so far.
 
@@ -296,13 +309,15 @@ def try_importance_sampling(
     draws: int,
     rng: np.random.Generator,
 ) -> tuple[ImportanceEstimate | None, str]:
-    """Run importance sampling if the failures predict a benefit; return the estimate (or None) and a note on the
-    outcome.
+    """Return the estimate of importance sampling, and a note that names the better estimate and the reason.
+
+    The estimate is None, without draws, unless the failures predict at most half the coefficient of variation of subset
+    simulation. With a gradient, design points are further candidates for centres.
 
     Args:
         runs: Score and its gradient.
         failures: Failures of subset simulation, shape (n, d).
-        group: Dependent failures, as in `fit_proposal`, shape (n,).
+        group: Integers (n,) that are equal for dependent failures, as in `fit_proposal`.
         subset: Estimate of subset simulation.
         threshold: Score at the limit surface.
         draws: Number of draws.
@@ -328,9 +343,10 @@ def try_importance_sampling(
 
 
 def is_better_estimate(found: ImportanceEstimate, subset: ProbabilityEstimate) -> bool:
-    """Return whether importance sampling is less uncertain than subset simulation and not far below it.
+    """Return whether importance sampling has at most the coefficient of variation of subset simulation and is not far
+    below it.
 
-    An estimate far below misses failures.
+    Far below means more than four standard deviations in log P: such an estimate misses failures.
 
     Args:
         found: Result of importance sampling.
@@ -373,7 +389,7 @@ def importance_sampling(
 
 
 def lognormal_estimate(probability: float, cov: float, deviation: float, degrees: float) -> ProbabilityEstimate:
-    """Return the estimate with the interval P exp(+- t deviation).
+    """Return the estimate with the 95 % interval P exp(+- t deviation), whose upper end is at most 1.
 
     Args:
         probability: Probability P.

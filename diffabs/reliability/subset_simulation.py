@@ -50,7 +50,7 @@ Rng = np.random.Generator
 
 
 class SubsetReason(enum.Enum):
-    """The reason why no further level was made."""
+    """The reason why the last level is the last: the threshold was reached, no progress, or no levels left."""
 
     REACHED = "the threshold was reached"
     PLATEAU = "no progress: no sample is above the score that they share"
@@ -58,8 +58,13 @@ class SubsetReason(enum.Enum):
 
 
 class SubsetProgress(NamedTuple):
-    """The progress after a level: its number from 1, its threshold, the share that reached it, and all evaluations so
-    far.
+    """The progress after a level.
+
+    Attributes:
+        level: Number of the level, from 1.
+        threshold: Threshold of the level.
+        share: Fraction of the level's samples that reached the threshold [1].
+        evaluations: Number of runs over all levels so far.
     """
 
     level: int
@@ -69,7 +74,16 @@ class SubsetProgress(NamedTuple):
 
 
 class SubsetLevel(NamedTuple):
-    """The samples of F_j-1, with the fraction `share` in F_j."""
+    """Level j of subset simulation: samples of F_(j-1), of which a fraction lies in F_j.
+
+    Attributes:
+        threshold: Threshold b_j of the score.
+        share: Fraction of the samples with a score of at least b_j [1].
+        cov: Coefficient of variation of the share, with the correlation along chains.
+        acceptance: Accepted fraction of the proposals [1]; 1 for the first level, whose samples are independent.
+        spread: Standard deviation s of a proposal, after the last step.
+        diverged: Number of the level's runs that diverged.
+    """
 
     threshold: float  # b_j
     share: float
@@ -87,15 +101,17 @@ class RareEvent:
         probability: Probability of the better estimate; 0 if no sample failed.
         cov: Coefficient of variation of the better estimate; infinite if no sample failed.
         interval: 95 % interval of the better estimate; its upper end is an upper bound if no sample failed.
-        reason: Reason for the last level.
+        reason: Reason why no further level was made.
         levels: The levels of subset simulation.
         subset: Estimate of subset simulation.
         importance: Result of importance sampling, or None if it was not tried.
         note: Name of the better estimate, and the reason for the choice.
-        failing: Failures (k, d) of subset simulation, distributed as phi on F, the most likely first; at most 100.
-        evaluations: Number of runs.
+        failing: Different failures (k, d) of subset simulation, distributed as phi on F, the most likely first; at most
+            100.
+        evaluations: Number of runs of both methods, without the gradients.
         gradients: Number of gradients.
-        diverged: Number of runs with a NaN score. They count as not failing; a score of +inf counts as failing.
+        diverged: Number of runs and gradients with a NaN score. They count as not failing; a score of +inf counts as
+            failing.
         price: Cost of a gradient in runs.
     """
 
@@ -136,25 +152,30 @@ def subset_simulation(
 ) -> RareEvent:
     """Return an estimate of P[score(z) >= threshold] for z ~ N(0, I) in R^dimension.
 
+    The levels may end before a sample fails. The probability is then 0, the coefficient of variation is infinite, and
+    `reason` tells why the levels ended.
+
     Args:
         score: Function (n, dimension) -> (n,); n is `samples` once, then samples * share, and `draws` at the end.
         dimension: Number of coordinates z.
         threshold: Threshold of the score.
         samples: Number of samples of each level.
-        share: Share of the samples that start the next level. P = share^m costs samples (1 + (m - 1)(1 - share)) runs:
-            15400 for 1e-6.
+        share: Share of the samples that start the next level; samples * share is an integer >= 2 that divides samples.
+            P = share^m costs samples (1 + (m - 1)(1 - share)) runs: 15400 for 1e-6.
         seed: Seed of all draws.
         levels: Greatest number of levels.
-        draws: Number of draws of importance sampling; 0 for no importance sampling.
+        draws: Number of draws of importance sampling, >= 2; 0 for no importance sampling.
         gradient: Function (n, dimension) -> score (n,), its derivative (n, dimension), n at most 8; or None. It locates
             design points as centres. In many dimensions (from about 20) the failures alone do not locate them.
         price: Cost of a gradient in runs, for `RareEvent.cost`.
-        tolerated: Share of a level's runs that may diverge.
+        tolerated: Greatest share of diverged runs in a level, and among the draws.
         progress: Called after every level.
 
     Raises:
-        ValueError: The dimension, the threshold or a number of samples, levels or draws is invalid, the score has the
-            wrong shape, or too many runs diverge.
+        ValueError: The dimension, the threshold or a number of samples, levels or draws is invalid, or the score has
+            the
+            wrong shape.
+        importance_sampling.DivergenceError: Too many runs diverge.
     """
     plan = _make_plan(dimension, threshold, samples, share, levels, draws)
     runs = CountedScore(score, gradient, tolerated)

@@ -40,7 +40,9 @@ class AtMost:
     bound: Scalar
 
     def excess(self, loop: Loop, metrics: Params) -> PyTree:
-        """Return (metric - bound)/|bound| from `metrics`, shape (runs,); `loop` is not used."""
+        """Return (metric - bound)/|bound| from `metrics`, shape (runs,), or the metric for a zero bound; `loop` is not
+        used.
+        """
         del loop
         bound = jnp.asarray(self.bound)
         return (metrics[self.metric] - bound) / jnp.where(bound == 0, 1.0, jnp.abs(bound))
@@ -67,7 +69,12 @@ class Poles:
     damping: float = 0.0
 
     def excess(self, loop: Loop, metrics: Params) -> PyTree:
-        """Return (decay + Re s)/decay and damping + Re s/|s| of each vertex and pole of `loop`; `metrics` is unused."""
+        """Return the excesses of each vertex and pole of `loop`, flat; `metrics` is not used.
+
+        First come (decay + Re s)/decay, or Re s without a decay rate. Then come damping + Re s/|s|, absent without a
+        damping
+        ratio.
+        """
         del metrics
         real, ratios = self._modes(loop)
         rates = (self.decay + real) / (self.decay or 1.0)

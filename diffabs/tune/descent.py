@@ -37,12 +37,12 @@ MAX_IDLE_STEPS = 3  # consecutive accepted steps without a significant change of
 
 @dataclasses.dataclass(frozen=True)
 class Stopping:
-    """The conditions that end a descent.
+    """The conditions that end a descent; one of them is enough.
 
     Attributes:
-        gradient: Greatest component of the gradient of L; the gradient is of order one at the start.
-        change: Relative change of L in each of three consecutive steps.
-        iterations: Number of accepted steps.
+        gradient: Tolerance of the greatest |component| of the gradient of L; at the start it is of order one.
+        change: Relative change of L that each of three consecutive steps must not exceed.
+        iterations: Greatest number of accepted steps.
     """
 
     gradient: float = 1e-6
@@ -51,7 +51,16 @@ class Stopping:
 
 
 class DescentPoint(NamedTuple):
-    """One line of the history of a descent."""
+    """One line of the history of a descent: the point after an accepted step.
+
+    Attributes:
+        iteration: Number of accepted steps so far; 0 at the start.
+        objective: Objective J, not scaled.
+        loss: Loss L.
+        gradient: Greatest |component| of the gradient of L.
+        violation: Greatest excess over all constraints, at least 0.
+        evaluations: Number of gradients so far, including rejected trials.
+    """
 
     iteration: int
     objective: float
@@ -122,11 +131,12 @@ class DescentState:
 
 
 class Optimiser(NamedTuple):
-    """An optimiser of optax.
+    """The source of the updates of a descent, in the form of optax.
 
     Attributes:
         transformation: The transformation from gradients to updates.
-        searches: True if the updates are directions for a line search; False if they are complete steps.
+        searches: True if the updates are directions for the line search of this module; False if they are complete
+            steps.
     """
 
     transformation: optax.GradientTransformationExtraArgs
@@ -134,7 +144,7 @@ class Optimiser(NamedTuple):
 
 
 def lbfgs(memory: int = 10) -> Optimiser:
-    """Return optax's L-BFGS direction, for the line search of this module, which rejects runs that diverge.
+    """Return the optimiser that gives L-BFGS directions for the line search of this module.
 
     Args:
         memory: Number of steps that L-BFGS stores.
@@ -341,7 +351,7 @@ def _select_by_start(which: np.ndarray, a: Scalar, b: Scalar) -> PyTree:
 
 
 def slice_start(tree: PyTree, i: int) -> PyTree:
-    """Return the leaves of one start.
+    """Return the tree of one start: entry `i` along the leading axis of each leaf.
 
     Args:
         tree: Tree whose leaves have a leading axis of starts.

@@ -22,7 +22,7 @@ ADVICE = "a search may end there without a minimum: start it from other values, 
 
 
 def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, PyTree, PyTree]]:
-    """Yield the name and the two compared numbers of each condition under which a derivative of `loop` is one-sided.
+    """Yield (name, number, number) for each condition under which a derivative of `loop` may be one-sided.
 
     The derivative is one-sided where the two numbers are equal. The name depends on the parts of the loop alone, so
     both numbers may be traced.
@@ -60,11 +60,11 @@ def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, PyTr
 
 
 def warn(subject: Part, values: Params, batch: Batch, solver: Solver, where: str) -> None:
-    """Warn of parameters whose derivative is one-sided in some run of the batch.
+    """Issue a UserWarning for each condition under which a derivative by these parameters is one-sided in some run.
 
     Args:
         subject: Loop, or a part with a method `closed_loop()`.
-        values: Values of the parameters by path.
+        values: Values of the free parameters by path.
         batch: The runs.
         solver: Solver of the runs.
         where: First words of the warning.

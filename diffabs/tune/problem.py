@@ -81,7 +81,7 @@ def build_subject_loop(subject: Part) -> Loop:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
-    """A tuning problem: a part, its free parameters, and the objective and constraints of a choice of them.
+    """A tuning problem: a part, its free parameters, the runs, the objective, and the constraints.
 
     Attributes:
         subject: Loop, or a part with a method `closed_loop()`. The parameters of such a part may be of any kind that
@@ -138,7 +138,7 @@ class Problem:
         return found
 
     def objection(self) -> str | None:
-        """Return why the engine cannot make the runs and their derivatives, or None.
+        """Return why the engine of the problem cannot make the runs and their derivatives, or None.
 
         The check makes no runs. It compiles the program and keeps it.
         """
@@ -153,7 +153,10 @@ class Problem:
         return None
 
     def evaluate(self, z: AnyArray) -> ObjectiveEvaluation:
-        """Return objective, excesses, number of diverged runs and metrics at `z`."""
+        """Return objective, excesses, number of diverged runs and metrics at `z` (p,).
+
+        A weight of a run in the batch multiplies the run's sum of metrics before the aggregate.
+        """
         runs = self.runs(z)
         each = sum(weight * runs.metrics[name] for name, weight in self.weights.items())
         # Weights of runs multiply before the aggregate; a batch without weights counts each run once.
@@ -210,7 +213,7 @@ class Problem:
         return jax.jit(jax.vmap(self.evaluate))
 
     def find_refusal(self) -> str | None:
-        """Return a one-line reason why the first inadmissible run of the subject cannot start, or None."""
+        """Return a one-line reason why the first inadmissible run cannot start at the subject's own values, or None."""
         return first_refusal(build_subject_loop(self.subject), self.batch.values, self.solver)
 
     def steady(self) -> Callable[[np.ndarray], np.ndarray]:

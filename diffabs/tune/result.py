@@ -52,7 +52,15 @@ class TuningProgress(NamedTuple):
 
 
 class StartResult(NamedTuple):
-    """The result from one start: parameters by path, objective J, greatest excess, reason for the end, and history."""
+    """The result from one start.
+
+    Attributes:
+        values: Free parameters by path.
+        objective: Objective J.
+        violation: Greatest excess over all constraints, at least 0.
+        reason: Reason for the end of the last descent.
+        history: Accepted points over all rounds.
+    """
 
     values: dict[str, PyTree]
     objective: float
@@ -63,20 +71,23 @@ class StartResult(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tuned:
-    """The best part that a search has found.
+    """The best part that a search has found; it may violate a constraint (`met`).
+
+    A pair is (before, after). Before refers to the subject's own values; these numbers are NaN if such a run is
+    inadmissible.
 
     Attributes:
         part: The given part with tuned values of the free parameters; `loop` is its closed loop.
         values: Free parameters by path.
-        objective: J before and after.
-        violation: Greatest excess before and after.
-        metrics: Metrics (runs,) before and after.
+        objective: Pair of objectives J.
+        violation: Pair of greatest excesses, each at least 0.
+        metrics: Pair of dictionaries of metrics, each of shape (runs,).
         met: Whether every constraint holds, without a tolerance.
         reason: Reason why the descent of the best start ended, in its last round.
         history: History of the best start.
         starts: Results and histories of all starts.
         mode: Mode of differentiation.
-        diverged: Number of diverged runs before and after.
+        diverged: Pair of numbers of diverged runs; 0 before if such a run is inadmissible.
         engine: Engine of the runs, with compiler and flags if it is a kernel.
     """
 
@@ -94,7 +105,7 @@ class Tuned:
     engine: dict[str, str]
 
     def table(self) -> Summary:
-        """Return a table of the free parameters and of mean metrics and objective before and after."""
+        """Return a table: free parameters after, means of the finite metrics, and objective before and after."""
         rows: list[tuple[PyTree, ...]] = [(name, "", value) for name, value in self.values.items()]
         rows += [(f"mean {name}", *(_finite_mean(one[name]) for one in self.metrics)) for name in self.metrics[0]]
         rows.append(("objective", *self.objective))
@@ -118,7 +129,7 @@ class Tuned:
 
     @property
     def gradient(self) -> float:
-        """Greatest component of the gradient at the last point."""
+        """Greatest |component| of the gradient of the scaled loss L by z, at the last point."""
         return self.history[-1].gradient
 
     @property

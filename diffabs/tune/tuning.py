@@ -113,11 +113,11 @@ def build_problem(
 
     Args:
         subject, free, objective, over, solver, measured, aggregate, constraints, engine: As in `tune`.
-        mode: Forward or reverse mode of differentiation; None is the cheaper mode.
+        mode: Forward or reverse mode of differentiation; None decides by the number of free parameters and the engine.
 
     Raises:
-        ValueError: As in `tune`.
-        EngineError: As in `tune`.
+        ValueError: A path, range, metric or batch does not fit, or a parameter is out of range.
+        EngineError: The engine is "kernel" and the mode is reverse.
     """
     check_part(subject)
     loop = build_subject_loop(subject)

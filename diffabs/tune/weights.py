@@ -90,17 +90,17 @@ def lq_weights(loop: Loop, Q: AnyArray, R: float, design: GainDesign, path: str 
 
 
 def lqr_gain_design(model: Part) -> GainDesign:
-    """Return the function (Q, R) -> LQ gain of a linear model, in discrete time if the model is discrete.
+    """Return the function (Q, R) -> LQ gain (1, n) of a linear model, in discrete time if the model has a period.
 
     Args:
-        model: Linear model with `matrices()` and `period`.
+        model: Linear model with one input, `matrices()` and `period`.
     """
     solve, (a, b) = (lqr if model.period is None else dlqr), model.matrices()
     return lambda Q, R: solve(a, b, Q, R).gain
 
 
 def robust_gain_design(system: Polytope) -> GainDesign:
-    """Return the function (Q, R) -> gain with the least guaranteed cost over a polytope.
+    """Return the function (Q, R) -> gain (1, n) with the least guaranteed cost over a polytope.
 
     The gain is NaN for weights without a robust gain; a search rejects such weights.
 

@@ -41,18 +41,20 @@ EDGE_SHARE = 0.01  # of a range: least distance of a start from the ends; an asc
 class WorstCase:
     """The greatest value of a metric that a search has found.
 
+    A point with a NaN metric counts as -inf here, and appears in `diverged` instead.
+
     Attributes:
         metric: Name of the metric.
         values: Parameters of the worst case by path.
         value: Metric of the worst case.
         corners: Number of corners that were run.
         corner: Greatest metric among these corners.
-        screened: Greatest metric among all screened points.
+        screened: Greatest metric among all screened points, corners included.
         metrics: All measured metrics of the worst case.
         loop: Loop with the parameters of the worst case.
         rollouts: Cost of the search; a gradient counts as `price` rollouts.
         bound: Bound on the metric, or None.
-        diverged: Parameters of a screened point at which the run diverges or the metric is NaN, or None.
+        diverged: Parameters of the first screened point at which the run diverges or the metric is NaN, or None.
         reasons: Reason for the end of each ascent.
     """
 
@@ -71,7 +73,7 @@ class WorstCase:
 
     @property
     def met(self) -> bool | None:
-        """Whether the bound holds in the worst case; None without a bound."""
+        """Whether the metric stays within the bound and no screened run diverged; None without a bound."""
         return None if self.bound is None else self.diverged is None and self.value <= self.bound
 
     def report(self, proved: bool | None = None) -> str:
@@ -126,8 +128,8 @@ def worst_case(
     """Return the greatest value of a metric found in a box, by a screening of points and then gradient ascent.
 
     Args:
-        loop: A Loop, or a part with a method `closed_loop()`.
-        over: The box {path: (low, high)}.
+        loop: A Loop. The box replaces its values of these parameters.
+        over: The box {path: (low, high)}, with finite ends.
         metric: Name of the metric to maximise.
         solver: Solver of every run.
         measured: Objectives by metric; None takes the default objectives of the plant.
@@ -137,7 +139,8 @@ def worst_case(
         iterations: Greatest number of steps of each ascent.
         seed: Seed of the Sobol sequence.
         seed_of_noise: Seed of noisy sensors, or None.
-        price: Cost of a gradient in rollouts; None is 1 + 1.5 p in forward mode and 6 in reverse mode.
+        price: Cost of a gradient in rollouts. None is 6 in reverse mode and 1 + 1.5 p in forward mode, for p numbers in
+            the box.
         engine: Engine of the runs and their derivatives, as in `run_batch`.
 
     Raises:
