@@ -55,12 +55,13 @@ TRACKING = {"overshoot": Overshoot(), "settling_time": SettlingTime(), "iae": IA
 
 
 def default_objectives(plant: Plant) -> dict[str, Objective]:
-    """Return the default objectives of a run on a plant, by name.
+    """Return the default objectives of a run on a plant, by the names of their metrics.
 
-    A plant without `usual_objectives` gets `TRACKING`: measures of its first signal against the setpoint.
+    A plant may choose them by a method `usual_objectives`, as braked wheels and balances do. Any other plant gets a
+    copy of `TRACKING`, which compares its first signal with the setpoint.
 
     Args:
-        plant: The plant of the run.
+        plant: Plant of the run.
     """
     own = getattr(plant, "usual_objectives", None)
     return own() if own else dict(TRACKING)

@@ -25,8 +25,9 @@ def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Scalar:
 
 @pytree
 class Fell:
-    """1 if the run ended early by a fall, else 0 [1]. A value of 0 does not prove that the run comes to rest;
-    `attraction` gives a proof.
+    """1 if the run reached its stop, such as `Fallen`, else 0 [1].
+
+    A value of 0 does not prove that the run comes to rest; `diffabs.design.attraction` gives a proof.
     """
 
     unit = "1"
@@ -151,10 +152,11 @@ class PeakTorque:
 
 @pytree
 class SoftLoss:
-    """1/(1 + (radius/|x|)^(1/softness)) of the last state [1], |x|^2 = sum of weight x^2 in rad and rad/s.
+    """1/(1 + (radius/|x|)^(1/softness)) of the last state x [1]. The square of |x| is the sum of `weight` times x^2.
 
-    It is near 0 for a run that comes to rest, near 1 for one that diverges, and smooth between. Its mean over starts is
-    one minus a soft share of the region of attraction; see `diffabs.design.attraction`.
+    x is (theta, psi, phi, theta', psi', phi') in rad and rad/s. The loss is near 0 for a run that comes to rest, near 1
+    for one that diverges, and smooth between. Its mean over starts is 1 minus a soft share of the region of attraction;
+    see `diffabs.design.attraction`.
     """
 
     unit = "1"
@@ -175,7 +177,10 @@ class SoftLoss:
 
 @pytree
 class RestTime:
-    """Time after which every angle stays within `band` of upright [s]; infinite for a run that ends outside it."""
+    """Time [s] from t = 0 after which theta, psi and phi all stay within +-`band` of upright.
+
+    The value is 0 for a run that never leaves the band, and infinite for one that ends outside.
+    """
 
     unit = "s"
     physical = (0.0, math.inf)
@@ -208,7 +213,10 @@ class RestTime:
 
 @pytree
 class BalanceCost:
-    """Integral of x'diag(q) x + r u^2 dt [rad^2 s], where u is the voltage at the motor [V]."""
+    """Integral of x'diag(q) x + r u^2 dt [rad^2 s], where u is the voltage at the motor [V].
+
+    x is (theta, psi, phi, theta', psi', phi') in rad and rad/s.
+    """
 
     unit = "rad^2 s"
     physical = (0.0, math.inf)

@@ -22,7 +22,11 @@ from diffabs.objectives.tracking import (
 
 @pytree
 class StopTime:
-    """Time to the stop [s]. A run that does not stop gets t + v/a with its last deceleration."""
+    """Time to the stop [s]: the time of the last sample, plus the time that the loop's stop extrapolates.
+
+    `Standstill` extrapolates to rest, v/a. A run that does not stop is extrapolated, too, with its last deceleration a
+    of at least 0.001 m/s^2. `NoStop` adds nothing.
+    """
 
     unit = "s"
     physical = (0.0, math.inf)
@@ -37,7 +41,11 @@ class StopTime:
 
 @pytree
 class StopDistance:
-    """Distance to the stop [m]. A run that does not stop gets x + v^2/(2 a), so that rolling on is never optimal."""
+    """Distance to the stop [m]: the distance of the last sample, plus the distance that the loop's stop extrapolates.
+
+    `Standstill` extrapolates to rest, v^2/(2 a). A run that does not stop is extrapolated, too, with its last
+    deceleration a of at least 0.001 m/s^2. So rolling on is never optimal. `NoStop` adds nothing.
+    """
 
     unit = "m"
     physical = (0.0, math.inf)
@@ -52,7 +60,10 @@ class StopDistance:
 
 @pytree
 class LockedTime:
-    """Time [s] during which the slip exceeds `threshold`. A root of the step's cubic locates each crossing."""
+    """Time [s] during which the slip exceeds `threshold`; 0 if the wheel never locks.
+
+    A root of the step's cubic locates each crossing.
+    """
 
     unit = "s"
     failure = 0.0  # a wheel that locks
@@ -72,7 +83,9 @@ class LockedTime:
 
 @pytree
 class Effort:
-    """Integral of u^2 dt, where u is the actuator's output; for a torque [N^2 m^2 s]."""
+    """Integral of u^2 dt, where u is the actuator's output, in the square of its unit times s; for a torque [N^2 m^2
+    s].
+    """
 
     unit = "control^2 s"
     physical = (0.0, math.inf)
@@ -86,10 +99,10 @@ class Effort:
 
 
 class Varied(NamedTuple):
-    """Memory of a total variation.
+    """Memory of `Variation` and of `TorqueRate`.
 
     Attributes:
-        total: Value up to the last step.
+        total: Total variation, or greatest rate, up to the end of the last step.
         last: Control at the end of the last step.
         way: Sign of the control's last change.
     """
@@ -139,9 +152,10 @@ class Variation:
 
 @pytree
 class TorqueRate:
-    """Greatest |du/dt| of the actuator's output at the instants of the integration, for a torque [N m/s].
+    """Greatest |du/dt| of the actuator's output u at the instants of the integration, for a torque [N m/s].
 
-    A jump counts as jump/step; behind a lag there are no jumps.
+    A jump counts as its height divided by the grid's step, so it depends on the step. An actuator with a lag has no
+    jumps.
     """
 
     unit = "control/s"

@@ -129,7 +129,10 @@ def start_held(self: Any, sample: Sample) -> Memory:
 
 @pytree
 class IAE:
-    """Integral of |e| dt, e = y - setpoint; for a slip [s]. The cubic of e is integrated on both sides of its zero."""
+    """Integral of |e| dt, e = y - setpoint, in the unit of y times s; for a slip [s].
+
+    The cubic of e is integrated on both sides of its zero.
+    """
 
     unit = "signal s"
     physical = (0.0, math.inf)
@@ -144,7 +147,7 @@ class IAE:
 
 @pytree
 class ITAE:
-    """Integral of t |e| dt, by the method of IAE; for a slip [s^2]."""
+    """Integral of t |e| dt, by the method of `IAE`, in the unit of y times s^2; for a slip [s^2]."""
 
     unit = "signal s^2"
     physical = (0.0, math.inf)
@@ -190,10 +193,10 @@ class MaxSlip:
 
 @pytree
 class Overshoot:
-    """max(0, max y/setpoint - 1), a fraction of the final setpoint [1]. It is a fraction of 0.01 where the setpoint is
-    smaller, because an estimator may end at slip 0.
+    """Overshoot as a fraction of the final setpoint r [1]: max(0, (max y - r)/max(r, 0.01)).
 
-    If the first setpoint is negative, -y takes the place of y. A run without overshoot has derivative 0.
+    The floor 0.01 is in the unit of y. It keeps a division by 0 away where an estimator ends at slip 0. If the first
+    setpoint is negative, -y and -r take the places of y and r. A run without overshoot has derivative 0.
     """
 
     unit = "1"
@@ -238,12 +241,14 @@ class Settling(NamedTuple):
 
 @pytree
 class SettlingTime:
-    """Time [s] after which |y - setpoint| stays within a band; infinite for a run that ends outside the band.
+    """Time [s] from t = 0 after which |y - setpoint| stays within a band.
 
-    The band is `share` of the step from the first value to the setpoint (2 % by default), or `band` if this is wider. A
-    run that starts on its setpoint has no step: it settles only if `band` is given. The entry is the root of the step's
-    cubic. The method misses an excursion that begins and ends within one step. The time jumps where a local extremum
-    just touches the band.
+    The value is 0 for a run that never leaves the band, and infinite for one that ends outside. The band is `share` of
+    the step from the first value to the setpoint (2 % by default), or `band` if this is wider. A run that starts on its
+    setpoint has no step: it settles only if `band` is given.
+
+    The entry is the root of the step's cubic. The method misses an excursion that begins and ends within one step. The
+    time jumps where a local extremum just touches the band.
     """
 
     unit = "s"
@@ -288,7 +293,7 @@ class SettlingTime:
 
 @pytree
 class ShareAtLimit:
-    """Share of the run's time [1] during which the command is at or beyond `low` or `high`.
+    """Fraction of the run's time [1] during which the controller's command is at or beyond `low` or `high`.
 
     A step with one end at a limit counts by half. `at_limits` returns this objective with the limits of a loop.
     """
@@ -317,18 +322,21 @@ class ShareAtLimit:
 
 
 def at_limits(loop: Part) -> ShareAtLimit:
-    """Return the objective that measures the share of a run in which the command of a loop is at its limits.
+    """Return the `ShareAtLimit` whose limits are those of a loop's controller and actuator.
 
-    >>> import diffabs as d
-    >>> from diffabs.objectives import at_limits
-    >>> loop = d.braking()
-    >>> run = d.measure(loop, d.FixedStep(1e-3, 4.0), {"at a limit": at_limits(loop)})
-    >>> print(f"{run.metrics['at a limit']:.2f}")
-    0.00
+    The tightest limits count, also those of controllers inside a controller. Without limits they are infinite. The two
+    torques of a relay are levels and not limits.
 
     Args:
-        loop: A loop; controller and actuator give their limits by a method `limits()`, and the tightest limits count.
-            The two torques of a relay are levels and not limits.
+        loop: Loop. A part gives its limits by a method `limits()`.
+
+    Examples:
+        >>> import diffabs as d
+        >>> from diffabs.objectives import at_limits
+        >>> loop = d.braking()
+        >>> run = d.measure(loop, d.FixedStep(1e-3, 4.0), {"at a limit": at_limits(loop)})
+        >>> print(f"{run.metrics['at a limit']:.2f}")
+        0.00
     """
     low, high = -math.inf, math.inf
     pending = [loop.controller, loop.actuator]
@@ -344,7 +352,7 @@ def at_limits(loop: Part) -> ShareAtLimit:
 
 @pytree
 class FinalError:
-    """|y - setpoint| at the end of the run."""
+    """|y - setpoint| at the end of the run, in the unit of y."""
 
     unit = "signal"
     physical = (0.0, math.inf)
@@ -376,8 +384,9 @@ class Quadratic(NamedTuple):
 
 @pytree
 class QuadraticCost:
-    """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt. Here x1 is the integral of e, x2 = e, and u is the actuator's
-    output.
+    """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt, without a unit of its own.
+
+    Here x1 is the integral of e, and x2 = e. u is the actuator's output, and ff the feedforward.
 
     Source: eq. (24) of Maeda and Sugiura with eps = 0.
     """

@@ -34,15 +34,19 @@ MAX_COMPARED_INSTANTS = 256  # greatest number of instants at which noise is com
 
 
 class ErrorEstimate(NamedTuple):
-    """Error estimate of one metric, in the metric's unit.
+    """Error estimate of one metric, in the metric's unit (`order` and `converges` have none).
+
+    If the runs are not comparable, every field but `value` and `converges` is NaN.
 
     Attributes:
         value: Value m(h) with the step h of the solver.
         difference: Change d1 = m(h/2) - m(h) by the half step.
         finer: Change d2 = m(h/4) - m(h/2) by the quarter step.
         order: Observed order p = -log2(|d2/d1|). NaN if both differences are rounding errors, or if d2 = 0.
-        converges: True if the differences shrink, or if both are rounding errors.
-        error: Estimated error of `value`.
+        converges: True if |d2/d1| is at most `MAX_DIFFERENCE_RATIO`, or if both differences are rounding errors. False
+            if the runs are not comparable.
+        error: Estimate |d1| + |d2|/(1 - q) of the error of `value`, with q = |d2/d1|. A larger q than
+            `MAX_DIFFERENCE_RATIO` is replaced by this limit: the error is then not reliable.
     """
 
     value: Scalar
@@ -54,7 +58,7 @@ class ErrorEstimate(NamedTuple):
 
     @property
     def relative(self) -> Scalar:
-        """Error as a fraction of the value: 0 for a zero error, infinite for a zero value with an error."""
+        """|error/value|: 0 for a zero error, infinite for a nonzero error of a zero value."""
         return relative_difference(self.error, self.value)
 
 
@@ -77,8 +81,8 @@ def estimate_accuracy(
 ) -> Accuracy:
     """Return error estimates for the metrics that `measure` returns for the same arguments.
 
-    The cost is that of seven runs of `measure` (one with the step h, one with h/2, one with h/4). The function is pure:
-    batch it with `jax.vmap`.
+    The function runs the loop with the steps h, h/2 and h/4, so it costs as much as seven runs of `measure`. It is
+    pure: batch it with `jax.vmap`. Runs that are not comparable raise no error: their estimates are NaN.
 
     Args:
         loop: Closed loop to run.
@@ -99,13 +103,16 @@ def estimate_accuracy(
 def measure_finer(
     loop: Loop, solver: Solver, objectives: Mapping[str, Objective], times: int, *, key: Key | None = None
 ) -> Run:
-    """Return the result of `measure` with steps that are `times` shorter, over the same number of original steps.
+    """Return the result of `measure` with a step of `solver.step`/`times`.
+
+    The run lasts as long as with the original step. Delays keep their length in seconds. An `Adaptive` solver also gets
+    a smaller `rtol` (`refine_solver`).
 
     Args:
         loop: Closed loop to run.
         solver: Solver with the original step.
         objectives: Objectives by the names of their metrics.
-        times: Factor by which the step shrinks, a whole number.
+        times: Divisor of the step, a whole number.
         key: Random key of `jax.random`, for noisy sensors.
     """
     return measure(refine_parts(loop, times), refine_solver(solver, times), objectives, key=key)
@@ -133,12 +140,12 @@ def relative_difference(difference: Scalar, value: Scalar) -> Scalar:
 
 
 def is_comparable(loop: Loop, solver: Solver, key: Key | None = None) -> Bool:
-    """Return True if a shorter step changes neither the noise of the loop nor a block's computations.
+    """Return True if a shorter step changes neither the noise of the loop nor the instants at which a block computes.
 
     Args:
         loop: Closed loop.
         solver: Solver with the original step.
-        key: Random key of `jax.random`, for noisy sensors.
+        key: Random key of `jax.random`, for noisy sensors. Without a key (None) the noise is not compared.
     """
     steady = not any(True for _ in per_step_blocks(loop))
     return steady & (has_same_noise(loop, solver, 2, key) & has_same_noise(loop, solver, 4, key))
@@ -161,7 +168,8 @@ def incomparability_reasons(loop: Loop, solver: Solver, key: Key | None = None) 
 
 
 def per_step_blocks(loop: Loop) -> Iterator[str]:
-    """Yield the names of the loop's blocks that work once in every integration step.
+    """Yield the names of the blocks (such as "controller") that compute at every integration step instead of on a
+    clock.
 
     Args:
         loop: Closed loop.

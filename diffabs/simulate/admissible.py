@@ -64,11 +64,14 @@ def check(part: T, solver: Solver | None = None) -> T:
 
     Args:
         part: Part or loop, with concrete parameters.
-        solver: Solver. If it is given and the part is a loop, the start, the periods and the step are checked, too.
+        solver: Solver. If it is given and the part is a loop, the function also checks start, duration, periods and
+            step. Otherwise it has no effect.
 
     Raises:
-        ValueError: A field is out of range, the start is beyond the stop, a period is off the grid, or the step is not
-            stable. The message names every offending field with its value, range and unit.
+        ValueError: A field is out of range or breaks a rule between fields. For a loop with a solver also: the start is
+            beyond the stop, or the step is longer than the duration. A run of more than 1e8 steps, a period off the
+            grid and an unstable step raise it, too. The message gives each value with its range and unit. A later check
+            runs only if the earlier ones have passed.
     """
     check_parts(part)
     if isinstance(part, Loop) and solver is not None:
@@ -108,7 +111,9 @@ def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
 
 
 def find_solver_faults(solver: Solver) -> list[str]:
-    """Return one line for the first fault of the solver that is independent of the loop; an empty list if it has none.
+    """Return one line if the step is longer than the duration or if there are too many steps; otherwise an empty list.
+
+    At most `MAX_SOLVER_STEPS` steps are allowed.
 
     Args:
         solver: Solver to check.
@@ -145,7 +150,9 @@ def find_unstable_step(loop: Loop, solver: Solver) -> Iterator[str]:
 
 
 def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Admissibility:
-    """Return the result of `check` for each run of a batch, with one compiled program for all runs.
+    """Make the checks of `check` for each run of a batch, and return a code for each run instead of an error.
+
+    One compiled program checks all runs. A code stands for the first check that a run fails.
 
     Args:
         loop: Loop that the runs have in common. If it is None, `values` is a batch of loops whose leaves have a leading
@@ -154,7 +161,7 @@ def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Ad
         solver: Solver of all runs.
 
     Raises:
-        ValueError: The solver has a fault that is independent of the loop.
+        ValueError: The step is longer than the duration, or there are too many steps (`find_solver_faults`).
     """
     if lines := find_solver_faults(solver):
         raise ValueError(lines[0])

@@ -37,8 +37,10 @@ class Batch:
         keys: Random keys of `jax.random`, or whole numbers as seeds of keys, shape (runs,), for noisy sensors.
         weights: Positive weights, shape (runs,). `tune` multiplies the objective of each run by its weight, for example
             by 1/the shortest possible distance.
-        durations: Times [s] in which each run is sure to end, shape (runs,). Runs that step together then have similar
-            durations, so that short runs do not wait for long ones. Without them all runs have `solver.duration`.
+        durations: Upper bounds on the end times of the runs [s], shape (runs,). They matter only to runs that step
+            together without trajectories. Runs of similar durations then form a group (`groups`), so that short runs do
+            not wait for long ones. A run that exceeds the duration of its group has `timed_out`. None gives all runs
+            `solver.duration`.
     """
 
     values: Params = dataclasses.field(default_factory=dict)
@@ -90,8 +92,13 @@ class Batch:
         return self
 
     def groups(self, duration: float) -> list[tuple[np.ndarray, float]]:
-        """Return groups of runs with similar `durations`: the numbers of the runs and the group's duration [s], at most
-        `duration` [s].
+        """Return groups of runs whose `durations` differ by less than a factor of 2.
+
+        Each group is a pair: the numbers of its runs, and the longest of their durations [s]. The batch must have
+        `durations`.
+
+        Args:
+            duration: Upper limit of all durations [s].
         """
         wanted = np.minimum(np.asarray(self.durations, float), duration)
         classes = np.floor(np.log(wanted.max() / wanted) / np.log(MAX_LENGTH_RATIO)).astype(int)
@@ -103,12 +110,15 @@ class Batch:
         return replace(loop, {path: np.asarray(column)[i] for path, column in self.values.items()})
 
     def each(self, loop: Part, function: Callable[[PyTree, PyTree], PyTree], lanes: Any = None) -> PyTree:
-        """Return function(loop, key) of every run with a leading axis (runs,), by `jax.vmap`; differentiable.
+        """Return function(loop, key) for every run, stacked along a leading axis (runs,), by `jax.vmap`;
+        differentiable.
+
+        An empty batch calls the function once, with the key None; its result has a leading axis (1,).
 
         Args:
             loop: Loop that the runs have in common.
             function: Function of the loop and the key of one run. The key is None in a batch without keys.
-            lanes: Numbers of the runs to include; None for all runs.
+            lanes: Numbers of the runs to include; None for all runs. It has no effect in an empty batch.
         """
         columns = {path: jnp.asarray(column, float) for path, column in self.values.items()}, self._keys()
         if not jax.tree.leaves(columns):
@@ -295,10 +305,10 @@ def stack_loops(loops: Sequence[PyTree]) -> tuple[PyTree, Batch]:
 
 
 def grid(values: Mapping[str, Sequence[float]]) -> Batch:
-    """Return a batch with one run for every combination of the values.
+    """Return a batch with one run for every combination of the values; the last parameter varies fastest.
 
     Args:
-        values: Values of each parameter, by dotted path.
+        values: Values of each parameter, by dotted path. The numbers of values multiply to the number of runs.
     """
     axes = np.meshgrid(*(np.asarray(v, float) for v in values.values()), indexing="ij")
     return Batch({path: axis.ravel() for path, axis in zip(values, axes, strict=True)})
@@ -308,9 +318,9 @@ def latin(ranges: Mapping[str, tuple[float, float]], count: int, seed: int = 0) 
     """Return a batch of `count` runs spread over a box by SciPy's scrambled Latin hypercube.
 
     Args:
-        ranges: Lowest and highest value of each parameter, by dotted path.
+        ranges: Lowest and highest value of each scalar parameter, by dotted path. Their order is not checked.
         count: Number of runs.
-        seed: Seed of the scrambling.
+        seed: Seed of the random numbers. The same seed gives the same batch.
     """
     from scipy.stats import qmc
 

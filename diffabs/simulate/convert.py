@@ -55,11 +55,13 @@ def _summarise_runs(run: PyTree, count: int) -> Summary:
 
 
 def trajectory_columns(run: PyTree, plant: Part = None) -> dict[str, tuple[str, np.ndarray]]:
-    """Return unit and values (instants,) of each signal up to the end of a run, by name; the time is `t`.
+    """Return a pair (unit, values) for each signal by name, up to the end of a run; values have shape (instants,).
+
+    The names are `t`, the plant's outputs, `target`, `setpoint`, `feedforward`, `command` and `control`.
 
     Args:
         run: One run with a trajectory.
-        plant: Plant that defines the unit of the control. Without a plant the unit is "control".
+        plant: Plant that defines the unit of the last three. Without a plant the unit is "control".
 
     Raises:
         ValueError: The run has no trajectory, or it is a batch of runs.
@@ -81,7 +83,10 @@ def trajectory_columns(run: PyTree, plant: Part = None) -> dict[str, tuple[str, 
 
 
 def to_pandas(run: PyTree, plant: Part = None) -> Scalar:
-    """Return the trajectory as a pandas.DataFrame indexed by time; without a trajectory, a row of metrics for each run.
+    """Return a pandas.DataFrame: the trajectory indexed by `t`, or without a trajectory one row per run.
+
+    A trajectory has units, metrics and end flags in `attrs`. A row per run has the metrics and the end flags as
+    columns.
 
     Args:
         run: One run with a trajectory, or any runs without.
@@ -105,7 +110,7 @@ def to_pandas(run: PyTree, plant: Part = None) -> Scalar:
 
 
 def to_xarray(run: PyTree, plant: Part = None) -> Scalar:
-    """Return the trajectory as an xarray.Dataset over the time, each variable with its `units`.
+    """Return the trajectory as an xarray.Dataset over `t` [s]; each variable has its `units`, and `attrs` the metrics.
 
     Args:
         run: One run with a trajectory.
@@ -122,7 +127,7 @@ def to_xarray(run: PyTree, plant: Part = None) -> Scalar:
 
 
 def to_figure(run: PyTree, plant: Part = None, title: str = "") -> Scalar:
-    """Return a figure of the run; the plant's output type selects the kind of figure.
+    """Return a matplotlib figure of the run. The signals of the plant's output select the kind of figure.
 
     Args:
         run: One run with a trajectory.

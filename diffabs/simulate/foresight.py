@@ -51,10 +51,11 @@ class CrossingForecast(NamedTuple):
 def forecast_crossings(
     margins: Sequence[SwitchingFunction], natural: Scalar, shortest: Scalar, changed: ModeBits, length: Scalar
 ) -> CrossingForecast:
-    """Return the predicted and past crossings from the margins at the end of a step.
+    """Return the time to the next crossing and the time since the first crossing inside the step, for the end of a
+    step.
 
     Args:
-        margins: Margins of the comparisons and their rates.
+        margins: Margins of the comparisons and their rates, at the end of the step.
         natural: Length that the error allows [s].
         shortest: Shortest length of any step [s].
         changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
@@ -77,8 +78,9 @@ def forecast_crossings(
 
 
 def valid_end_rates(margins: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> tuple[PyTree, PyTree]:
-    """Return two flags: the rate at the start, and the rate at the end of a step, is the rate inside. No comparison
-    changes there.
+    """Return two flags, for the start and the end of a step: True if the rate there is also the rate inside the step.
+
+    The start's flag is False if a comparison changes at the start. The end's flag is False if one changes later.
 
     Args:
         margins: Margins of the comparisons at the end of the step, and their rates.

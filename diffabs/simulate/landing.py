@@ -36,7 +36,24 @@ MAX_SLOPE_CHANGE = 0.5
 
 
 class EventSearch(NamedTuple):
-    """State of an event search. A margin is infinite where it is not known."""
+    """State of an event search. All lengths start at the last point of the run. A margin is infinite where it is not
+    known.
+
+    Attributes:
+        which: Number of the sought margin.
+        full: Length of the first attempt [s].
+        at_full: Margin there.
+        near: Shorter length of the bracket [s].
+        at_near: Margin there.
+        far: Longer length of the bracket [s].
+        at_far: Margin there.
+        tries: Number of attempts.
+        place: Length of the attempt that ended near the zero [s].
+        margin: Margin there; 0 if the search found no zero.
+        found: True if the search found a zero.
+        at_once: True if the zero lies at the beginning of the step.
+        fall: Slope of the margin at the end of the final step [1/s]; 0 if the event's time has no derivative.
+    """
 
     which: Int  # number of the sought margin
     full: Any  # length of the first attempt [s]
@@ -125,9 +142,9 @@ def find_event_crossings(which: Scalar, first: int, before: list[PyTree], after:
 def bracket_event(
     search: EventSearch, x: Scalar, new: PyTree, tells: AttemptCrossings, h: Scalar
 ) -> tuple[EventSearch, PyTree, PyTree]:
-    """Return the search for the earliest event after an attempt, the length to try next, and True if that is the probe.
+    """Return three values after an attempt: the search for the earliest event, the next length [s], and a flag.
 
-    The next length is the probe once `x` is near enough to the zero.
+    The flag is True if the next length is the probe: `x` is then near enough to the zero.
 
     Args:
         search: Search before the attempt.

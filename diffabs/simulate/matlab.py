@@ -11,15 +11,16 @@ from diffabs.simulate.solution import Run
 
 
 def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
-    """Write the instants up to the end of a run with a trajectory to a MAT file.
+    """Write the trajectory of one run, up to its end, to a MAT file.
 
-    The file has a column vector for each signal, and structs for their `units` and the run's `metrics`.
+    The file has a column vector for each of `t`, the plant's outputs, `target`, `command` and `control`. The struct
+    `units` has their units, and the struct `metrics` the run's metrics.
 
     Args:
-        path: File to write.
-        run: One run with a trajectory.
+        path: File to write; an existing file is replaced.
+        run: One run, no batch, with a trajectory. An AssertionError refuses a run without.
         plant: Plant that defines the signals and their units.
-        more: Further variables. A mapping becomes a struct, with underscores for dots in its names.
+        more: Further variables by name. A mapping becomes a struct, with underscores for dots in its names.
     """
     from scipy.io import savemat
 

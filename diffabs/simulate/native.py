@@ -161,14 +161,14 @@ def _stop_unaccepted(accepted: Scalar, carry: PyTree) -> PyTree:
 
 
 def kernel_objection(loop: Loop, values: Params, solver: Solver, objectives: Mapping[str, Objective]) -> str | None:
-    """Return the reason why a kernel cannot make these runs, or None.
+    """Return one line with the reason why a kernel cannot make these runs, or None if it can.
 
-    Reasons are an operation of a part without a translation, no compiler on this machine, and traced numbers. No run is
-    executed, but the kernel is compiled and kept.
+    A reason is an operation without a translation, no C++ compiler on this machine, or traced numbers. The function
+    executes no run, but it compiles and keeps the kernel.
 
     Args:
         loop: Loop that the runs have in common.
-        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
+        values: Values of the parameters that differ, shape (runs, ...), by dotted path; at least one path.
         solver: Solver of all runs.
         objectives: Objectives by the names of their metrics.
 

@@ -45,6 +45,9 @@ def rollout(
 ) -> Run:
     """Run a loop and return a `Run` with its trajectory and metrics.
 
+    The trajectory has ceil(steps/`every`) + 1 instants, from t = 0 on. Beyond the end of the run its last sample is
+    repeated.
+
     The function is pure and compiled once per structure of the loop: new values and another duration do not compile
     again. A trajectory or a derivative does compile again if it outgrows its capacity, which is at most an eighth more
     than requested. The stability of the step is not checked here but in `check`. A run with impossible traced
@@ -160,7 +163,9 @@ def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objec
 
 
 def forbid_derivatives(loop: Loop, values: Params) -> dict[str, PyTree]:
-    """Return the values on which a run does not depend smoothly, wrapped so that a derivative raises a ValueError.
+    """Return the values of all parameters that are not tunable, wrapped so that their derivative raises a ValueError.
+
+    A run does not depend smoothly on these parameters. Other values are left out.
 
     Args:
         loop: Closed loop that specifies the parameters.

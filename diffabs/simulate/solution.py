@@ -14,18 +14,18 @@ from diffabs.simulate import convert
 
 @dataclasses.dataclass(frozen=True)
 class FixedStep:
-    """Steps of equal length up to a duration.
+    """Steps of equal length with the classical fourth-order Runge-Kutta method, up to a duration.
 
-    With `kinks` a step ends where a comparison of the flow changes, as it does on events. Examples are a limit, the
-    knot of a measured road, and a wheel that locks. Without, a step across such a kink is exact to h^2, or to h where a
-    rate jumps. A derivative is exact to one order less. `kinks` costs up to twice as much time.
+    A kink is an instant at which a comparison of the flow changes. Examples are a limit, the knot of a measured road,
+    and a wheel that locks. A step that ends on the kink keeps its order. A step across it is exact to h^2, or to h
+    where a rate jumps. Its derivative is exact to one order less.
 
     Attributes:
         step: Length of a step [s].
-        duration: Longest time of the run [s].
+        duration: Longest time of the run [s]. The run ends at the first instant that is not before it.
         every: A trajectory keeps every `every`-th instant.
-        kinks: True if steps end on switching surfaces. None does so for derivatives, and if a rate of a part jumps
-            there (conditional integration).
+        kinks: True if steps end on kinks, which costs up to twice as much time; False if they do not. None means True
+            for derivatives, and for values only if a rate jumps at a kink (conditional integration).
     """
 
     step: float = 1e-3
@@ -35,7 +35,7 @@ class FixedStep:
 
     @property
     def steps(self) -> int:
-        """Number of steps in the duration."""
+        """Number of steps: duration/step, rounded up."""
         # The factor keeps the rounding of the quotient from adding a step.
         return math.ceil(self.duration / self.step * (1 - 1e-12))
 
@@ -48,13 +48,14 @@ class Adaptive:
     Steps end on events, where a clock strikes, and where a comparison of the flow changes. Examples are a limit, the
     knot of a measured road, and a wheel that locks.
 
-    A signal that depends on time alone limits no step unless states follow it. The integral of a setpoint that swings
-    faster than everything else has the error of a cubic over a step. Use fixed steps for it.
+    The error of the states and of the plant's first signal controls the step. A signal that depends on time alone has
+    no influence, unless states follow it. If a setpoint swings faster than every state, use fixed steps for an integral
+    over it.
 
     Attributes:
         rtol: Error of a step, as a fraction of the greatest value so far of each state and of the plant's first signal.
-            The error of a metric is some ten times as much (`accuracy` estimates it).
-        duration: Longest time of the run [s].
+            The error of a metric is some ten times as much (`estimate_accuracy` estimates it).
+        duration: Longest time of the run [s]. The run ends at the first instant of the grid that is not before it.
         step: Step of a grid [s]. Clocks strike and delays remember on this grid. No step of the integration has to end
             there.
         every: A trajectory keeps every `every`-th instant of the grid, by interpolation.
@@ -67,7 +68,7 @@ class Adaptive:
 
     @property
     def steps(self) -> int:
-        """Number of instants of the grid after the first."""
+        """Number of instants of the grid after t = 0: duration/step, rounded up."""
         return math.ceil(self.duration / self.step * (1 - 1e-12))
 
 
@@ -77,11 +78,14 @@ ADAPTIVE_ERROR_ORDER = 4  # order of the error of an adaptive step in its length
 
 
 def refine_solver(solver: Solver, times: int) -> Solver:
-    """Return the solver with steps and grid `times` shorter, over the same number of original steps.
+    """Return the solver with `times` as many steps, or instants of the grid, over the same time.
+
+    The time is the original duration, rounded up to whole steps. An `Adaptive` solver also gets `rtol`/`times`^4, so
+    that its own steps shrink about as much.
 
     Args:
         solver: Solver to refine.
-        times: Factor by which the step shrinks, a whole number.
+        times: Divisor of the step, a whole number.
     """
     step = solver.step / times
     # The duration is a multiple of the original step, so both solvers end at the same time.
@@ -92,7 +96,7 @@ def refine_solver(solver: Solver, times: int) -> Solver:
 
 
 def describe_solver(solver: Solver) -> dict[str, PyTree]:
-    """Return the numbers of a solver that determine a run's results, for a file.
+    """Return step and duration of a solver [s] by name and, for `Adaptive`, its type and `rtol`; for a file.
 
     Args:
         solver: Solver of the run.
@@ -102,7 +106,14 @@ def describe_solver(solver: Solver) -> dict[str, PyTree]:
 
 
 class Trajectory(NamedTuple):
-    """Signals of a run with a leading time axis (instants,). After the end of a run the last sample is repeated."""
+    """Signals of a run with a leading time axis (instants,). After the end of a run the last sample is repeated.
+
+    Attributes:
+        sample: Time, plant outputs, target, setpoint, feedforward, command and control.
+        measured: Output of the sensor.
+        state: State of the plant.
+        running: True before the end of the run, False from its end on; bool, shape (instants,).
+    """
 
     sample: Sample
     measured: PyTree  # output of the sensor
@@ -110,12 +121,23 @@ class Trajectory(NamedTuple):
     running: AnyArray  # bool: False after the end of the run
 
     def finite(self) -> Scalar:
-        """Return True if every number of the run is finite."""
+        """Return True if every number of `sample` is finite; `measured` and `state` are not checked."""
         return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self.sample)]))
 
 
 class Run(NamedTuple):
-    """The result of a run: metrics by name (NaN for a run that diverged), end flags, and a requested trajectory."""
+    """The result of a run: metrics, end flags and, on request, a trajectory. At most one end flag is True.
+
+    In a batch every field has a leading axis (runs,). All flags are False if `EarlyEnd` ended the run.
+
+    Attributes:
+        metrics: Values of the objectives by name. All are NaN if the run diverged.
+        stopped: True if the run reached its stop within the duration.
+        diverged: True if a number is not finite or not physically possible, or if the start is beyond the stop.
+        timed_out: True if the duration ended before the stop. Metrics are valid then.
+        ending: Last sample, whether the run stopped, and the time and distance that remain.
+        trajectory: Signals at the kept instants; None if no trajectory was requested.
+    """
 
     metrics: dict[str, PyTree]
     stopped: Bool  # bool: the run reached its stop in time
@@ -133,10 +155,9 @@ class Run(NamedTuple):
         return convert.summarise_run(self)._repr_html_()
 
     def pandas(self, plant: Part = None) -> Scalar:
-        """Return the trajectory as a pandas.DataFrame indexed by time, with `attrs["units"]`; without one, a row of
-        metrics for each run.
+        """Return a pandas.DataFrame: the trajectory indexed by `t`, or without a trajectory one row per run.
 
-        The `plant` defines the unit of the control. Trajectories of a batch raise a ValueError.
+        See `to_pandas`. The `plant` defines the unit of the control. Trajectories of a batch raise a ValueError.
         """
         return convert.to_pandas(self, plant)
 

@@ -37,8 +37,10 @@ RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 
 
 
 def stable_step(loop: Loop) -> float:
-    """Return the largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its
-    stop.
+    """Return the largest step [s] at which RK4 is stable on every damped mode of the linearised loop.
+
+    The loop is linearised at the points that the plant names, or else at its start and at rest. A linearisation that is
+    not finite has no influence. Without any damped mode the result is infinite.
 
     Args:
         loop: Closed loop with concrete parameters.
@@ -47,7 +49,7 @@ def stable_step(loop: Loop) -> float:
 
 
 def stable_steps(loops: Loop) -> np.ndarray:
-    """Return the largest stable step [s] of each loop of a batch, shape (n,).
+    """Return the result of `stable_step` for each loop of a batch, shape (n,) [s].
 
     Args:
         loops: Batch of loops, whose leaves have a leading axis (n,).

@@ -64,7 +64,18 @@ MAX_RATE_RATIO, MAX_STATE_FRACTION = 4, 1e-3
 
 
 class FixedStepCarry(NamedTuple):
-    """State of a run between two attempts."""
+    """State of a run between two attempts.
+
+    Attributes:
+        point: Point of the run that the last accepted attempt reached.
+        k: Number of the last instant of the grid.
+        length: Length of the next attempt [s].
+        search: Search for an event.
+        extra_attempts: Number of attempts so far that did not end on the grid.
+        here: Number of such attempts since the last instant of the grid.
+        unrestricted: True if steps are unrestricted.
+        status: Status of the run, a `RunStatus`.
+    """
 
     point: FixedStepPoint
     k: Scalar  # number of the last instant of the grid

@@ -60,7 +60,28 @@ class AdaptiveAttempt(NamedTuple):
 
 
 class AdaptiveCarry(NamedTuple):
-    """State of a run between two attempts."""
+    """State of a run between two attempts.
+
+    Attributes:
+        point: Point of the run that the last accepted attempt reached.
+        k: Number of the last instant of the grid at which a clock struck.
+        since: Time since that instant [s]. A difference of two times would lose digits.
+        error_limited: Length that the error allows [s].
+        length: Length of the next attempt [s].
+        ends: True if the attempt ends where a clock strikes, or with the run.
+        limit: Longest stable step [s].
+        scale: Largest values of the states so far.
+        base: Length of the attempt that first contained the sought event [s].
+        search: Search for an event.
+        tries: Number of attempts so far.
+        tries_at_renewal: Number of attempts at the last update of the stability limit.
+        last_step: Last step, a `HermiteStep`; () without a trajectory.
+        turns: Number of consecutive steps that ended on switching surfaces.
+        stability_fraction: Fraction of the longest stable step that a step may have after an event.
+        unrestricted: True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode.
+        triggered: Bit mask of the events at the end of the last attempt.
+        status: Status of the run, a `RunStatus`.
+    """
 
     point: AdaptivePoint
     k: Int  # number of the last instant of the grid at which a clock struck

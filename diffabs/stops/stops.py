@@ -14,8 +14,8 @@ LEAST_DECELERATION = 1e-3  # m/s^2; a car that only rolls gets a finite, very lo
 
 @pytree
 class SpeedReached:
-    """The run ends at `speed`. A run that does not reach it in time continues at its last deceleration, by
-    extrapolation.
+    """The run ends when the vehicle falls to `speed`. A run that does not reach it in time continues, by extrapolation,
+    at its last deceleration.
     """
 
     speed: Scalar = param(default=5 / 3.6, unit="m/s", above=0.0)
@@ -28,14 +28,18 @@ class SpeedReached:
         return output.speed - self.speed
 
     def remainder(self, sample: Sample, stopped: Bool) -> tuple[Scalar, Scalar]:
-        """Return 0 and 0 after a stop, else (v - v_end)/a [s] and (v^2 - v_end^2)/(2 a) [m]."""
+        """Return 0 and 0 after a stop, else (v - v_end)/a [s] and (v^2 - v_end^2)/(2 a) [m].
+
+        a is the last deceleration, at least 0.001 m/s^2.
+        """
         time, distance = _rest_of_braking(sample, self.speed, False)
         return jnp.where(stopped, 0.0, time), jnp.where(stopped, 0.0, distance)
 
 
 @pytree
 class Standstill:
-    """The run ends at a small `speed`; its rest to standstill is extrapolated at the last deceleration: v/a, v^2/(2 a).
+    """The run ends when the vehicle falls to a small `speed`. The rest to standstill is extrapolated: v/a [s] and
+    v^2/(2 a) [m].
 
     Slip is stiff near standstill (its rate is proportional to 1/v), so the last centimetres are not integrated. The
     result does not depend on the speed between 0.01 and 1 m/s.
@@ -48,7 +52,10 @@ class Standstill:
     margin = SpeedReached.margin
 
     def remainder(self, sample: Sample, stopped: Bool) -> tuple[Scalar, Scalar]:
-        """Return v/a [s] and v^2/(2 a) [m]."""
+        """Return v/a [s] and v^2/(2 a) [m], with the last deceleration a, at least 0.001 m/s^2.
+
+        After a stop a is also at least half the mean deceleration of the run, because slip may chatter at the end.
+        """
         return _rest_of_braking(sample, 0.0, stopped)
 
 
@@ -62,7 +69,7 @@ class Fallen:
     otherwise = "FELL: the frame reached the stop's angle"
 
     def margin(self, output: BalanceOutput) -> Scalar:
-        """Return angle^2 - theta^2 [rad^2]."""
+        """Return angle^2 - theta^2 [rad^2]; the run ends when it falls below zero."""
         return self.angle**2 - output.theta**2
 
     def remainder(self, sample: Sample, stopped: Bool) -> tuple[Scalar, Scalar]:
@@ -79,7 +86,7 @@ class NoStop:
     remainder = Fallen.remainder
 
     def margin(self, output: PyTree) -> Scalar:
-        """Return 1, which never crosses zero."""
+        """Return 1 for every output, so the run never stops."""
         return 1.0 + 0.0 * output[0]
 
 
