@@ -140,10 +140,15 @@ def _greatest_deceleration(plant: Plant, box: Box, speed: float) -> float:
 
 
 def certify_gain(task: ProofTask) -> "Certificate":
-    """Return the certificate of the gain, with the fastest provable decay.
+    """Return the certificate of the gain, with the largest decay rate that a common Lyapunov matrix proves.
+
+    A property without a proof raises no error: the certificate leaves it out.
 
     Args:
         task: Linear systems, gain and specification.
+
+    Raises:
+        ModuleNotFoundError: The extra `design` is not installed.
     """
     from diffabs.design import analysis
 
@@ -167,12 +172,13 @@ def _read_gain(text: str, states: Sequence[str]) -> np.ndarray:
 
 
 class FurtherFindings(NamedTuple):
-    """Results on a gain without a common Lyapunov matrix.
+    """Results on a gain that do not rest on a common Lyapunov matrix.
 
     Attributes:
         frozen: Poles of the closed loops at fixed parameters.
-        fall: Greatest fall of the speed [m/s^2] for which a Lyapunov matrix that follows the speed proves stability.
-            None if that proof fails or does not apply.
+        fall: Greatest fall of the speed [m/s^2] that friction allows, if stability is proved for all falls up to it.
+            The
+            proof uses a Lyapunov matrix that depends on the speed. None if it fails or does not apply.
     """
 
     frozen: "FrozenLoops"
@@ -184,7 +190,7 @@ class FurtherFindings(NamedTuple):
 
 
 def find_further(task: ProofTask, proof: "Certificate") -> FurtherFindings | None:
-    """Return results without a common Lyapunov matrix; None if a common one exists, because it proves more.
+    """Return results on a gain without a proved common Lyapunov matrix; None if one is proved, because it implies more.
 
     Args:
         task: Linear systems, gain and specification.
@@ -222,15 +228,15 @@ def proof_document(
     known: FurtherFindings | None = None,
     **numbers: float | None,
 ) -> JsonObject:
-    """Return the JSON document of a proof. Parameters have the names of the linear model, in SI.
+    """Return the JSON document of a proof, whose parameters have the names of the linear model and SI units.
 
     Args:
         task: Linear systems, gain and specification.
-        proof: Certificate; None if there is none.
-        out: File of the certificate.
+        proof: Certificate; None if there is none. Its values are then null.
+        out: File of the certificate, which the document names.
         reason: Sentence on everything unproved; None if all is proved.
         known: Results without a common Lyapunov matrix.
-        **numbers: Numbers of a design: lower bound, gap, residual, trace cost.
+        **numbers: Further values by key: "lower_bound", "gap", "residual" and "trace_cost" of a design.
     """
     summary: JsonObject = proof.summary() if proof else {}
     if proof:
@@ -260,9 +266,11 @@ def proof_document(
 
 
 def slowest_vertex(proof: "Certificate") -> JsonObject:
-    """Return the vertex with the slowest pole, in the form of `worst_vertex`.
+    """Return the vertex with the slowest pole, as a table in the form of `worst_vertex`.
 
-    A proof about all vertices together has no worst vertex of its own.
+    Its keys are "index", "cell", "corner", "claim" and "margin". The margin is the distance [1/s] of that pole from the
+    imaginary axis. For a sampled loop it is 1 - |z|. A proof about all vertices together has no worst vertex of its
+    own.
 
     Args:
         proof: Certificate.

@@ -24,8 +24,14 @@ LOOSE, LEAST = 100, 0.01  # a change above LOOSE * rtol * max(|metric|, LEAST) i
 def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
     """Return the accuracy of each metric as JSON values.
 
-    They hold the changes by a half step (absolute and relative), by a further quarter step, and by single precision.
-    They also hold the order and the error.
+    The key "metrics" has a row by metric. "difference" and "relative" give the change by half steps. "finer difference"
+    gives the further change by quarter steps. "float32 difference" gives the change by single precision, null for a
+    loop
+    with noise. "order", "converges" and "error" are estimates from these runs.
+
+    The keys beside it are "solvers", "comparable", "reasons" and "ended alike". If the runs are not comparable,
+    "reasons"
+    says why.
 
     Args:
         chosen: Scenario of the run.
@@ -68,9 +74,11 @@ def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
 
 
 def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
-    """Return one line on metrics that a smaller `rtol` changes by much more than `rtol`; no line without any.
+    """Return a list of one line that names the metrics which depend on `rtol`; the list is empty without such metrics.
 
-    Such a run chatters, or amplifies its errors.
+    The run is made again with `rtol` / 16. A change is reported if it exceeds 100 `rtol` of the metric's new value.
+    Such a
+    run chatters, or amplifies its errors.
 
     Args:
         metrics: Metrics of the run by name.

@@ -24,9 +24,11 @@ USER_VARIABLES = (
 
 
 def use_compilation_cache() -> pathlib.Path | None:
-    """Return the folder in which JAX keeps compiled programs from now on, or None without one.
+    """Make JAX keep compiled programs in the user's cache folder, and return this folder.
 
-    All commands work without a folder, but compile again. An unwritable folder and a damaged entry give no message.
+    None means that this function changed nothing. The cache is turned off, the user has set JAX's own cache, or the
+    folder
+    cannot be used. Commands then still work. Only a folder that other users may write to gives a warning.
     """
     chosen = jax.config.values.get("jax_compilation_cache_dir")
     if os.environ.get(OFF_VARIABLE) or any(name in os.environ for name in USER_VARIABLES) or chosen:

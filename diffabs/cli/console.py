@@ -117,13 +117,18 @@ def note_command(words: Sequence[str]) -> None:
 
 
 def describe_run() -> dict[str, str | float]:
-    """Return date, place and command of a document, and the time [s] it took so far."""
+    """Return the origin of a document: command, date (UTC), machine, backend, commit, and the time so far.
+
+    "seconds" is the time [s] since `note_command`. "of it compiling" is the part [s] of it that JAX compiled.
+    """
     seconds, compiling = time.monotonic() - _begun, stopwatch.compile_time_since(_begun)
     return {**provenance.describe_making(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
 
 
 def describe_source(chosen: Scenario) -> JsonObject:
-    """Return the first keys of every document on a scenario: name, model, and origin of the document.
+    """Return the first keys of every document on a scenario: "scenario", "model" and "made".
+
+    They hold its name, the values of `describe_model` and those of `describe_run`.
 
     Args:
         chosen: Scenario.
@@ -234,8 +239,8 @@ def end_on_errors() -> Iterator[None]:
 class InterruptibleEnd:
     """The reaction to Ctrl-C of work that can end early with a partial result.
 
-    The first Ctrl-C sets `asked`; the work reads it by calling this object, finishes `what`, and ends. The second
-    Ctrl-C interrupts at once. So does the first while `nothing()` is true: there is no partial result yet.
+    The first Ctrl-C sets `asked`. The work calls this object between its steps, and ends after the current step if the
+    answer is True. The second Ctrl-C interrupts at once. The first one also does while there is no partial result.
     """
 
     def __init__(self, what: str, nothing: Callable[[], bool] = lambda: False):
@@ -243,14 +248,14 @@ class InterruptibleEnd:
         self.what, self.nothing, self.asked = what, nothing, False
 
     def __call__(self) -> bool:
-        """Return True after Ctrl-C."""
+        """Return True once Ctrl-C has requested the end."""
         return self.asked
 
     def ask(self) -> None:
-        """Handle Ctrl-C.
+        """Handle Ctrl-C: request the end of the work, and say so on stderr.
 
         Raises:
-            KeyboardInterrupt: It is the second Ctrl-C, or there is no result yet.
+            KeyboardInterrupt: It is the second Ctrl-C, or there is no partial result yet.
         """
         if self.asked or self.nothing():
             raise KeyboardInterrupt
@@ -261,9 +266,11 @@ class InterruptibleEnd:
 def run_with_progress(
     work: Callable[[], T], message: str, detail: progress.Detail | None = None, ending: InterruptibleEnd | None = None
 ) -> T:
-    """Return the result of `work`, with a spinner on a terminal, or lines on stderr elsewhere.
+    """Return the result of `work`, and show its progress: a spinner on a terminal, else lines on stderr.
 
-    The work runs in its own thread, because Ctrl-C cannot interrupt compiled code in the main thread.
+    The work runs in its own thread, because Ctrl-C cannot interrupt compiled code in the main thread. Its output to
+    stdout
+    goes to stderr.
 
     Args:
         work: Function to run.
@@ -327,11 +334,11 @@ def _wait_for_interrupt(thread: threading.Thread) -> bool:
 
 
 def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: bool = True) -> Scenario:
-    """Return a scenario, and warn of values that are allowed but probably a mistake.
+    """Return a scenario, and write a warning for each value that is allowed but probably a mistake.
 
     Args:
         scenario: Name of a packaged scenario, or path of a TOML file.
-        changes: Overrides.
+        changes: Overrides, as in `load`.
         integrated: Also check that the step is stable for the loop.
 
     Raises:
@@ -344,15 +351,16 @@ def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: b
 
 
 def leave(status: Int) -> NoReturn:
-    """Exit, at once if interrupted work still runs.
+    """End the process with an exit status, without waiting for interrupted work.
 
-    The interpreter would wait for the work's thread. Unfinished files and processes of the work are removed.
+    The interpreter would wait for the thread of such work. This function ends the process at once, after it has removed
+    the work's unfinished files and processes.
 
     Args:
-        status: Exit status.
+        status: Exit status. A process that SIGTERM interrupted gets `TERMINATED` in place of `INTERRUPTED`.
 
     Raises:
-        SystemExit: No work runs.
+        SystemExit: No work runs, so the interpreter can end as usual.
     """
     status = TERMINATED if status == INTERRUPTED and interrupt.was_terminated() else status
     if any(thread.name == WORKER for thread in threading.enumerate()):
@@ -366,7 +374,7 @@ def leave(status: Int) -> NoReturn:
 
 
 def add_option_overrides(changes: Sequence[str] | None, section: str, **fields: Any) -> list[str]:
-    """Return overrides with those of separate options added.
+    """Return the overrides of --set, followed by those of separate options such as --seed.
 
     Args:
         changes: Overrides of --set.

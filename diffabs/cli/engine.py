@@ -28,13 +28,13 @@ def check_engine_name(engine: str) -> None:
 
 
 def choose_engine(engine: str, objection: Callable[[], str | None]) -> str:
-    """Return "xla" or "kernel".
+    """Return "xla" or "kernel", the engine that makes the runs.
 
-    "auto" becomes "kernel" if nothing prevents it; otherwise a line on stderr gives the reason for XLA.
+    "auto" becomes "kernel" unless there is an objection. A line on stderr then gives the reason for XLA.
 
     Args:
-        engine: Value of the option.
-        objection: Function that compiles a kernel and returns the reason against it, or None.
+        engine: Value of the option: "auto", or an engine, which is returned as it is.
+        objection: Function that compiles a kernel, and returns None or the reason why it cannot be used.
     """
     if engine != "auto":
         return engine

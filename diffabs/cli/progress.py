@@ -58,7 +58,7 @@ def format_duration(seconds: float) -> str:
 
 
 class WorkTiming:
-    """The clock of some work: its start, and its start after the first reported amount."""
+    """Clock of some work, which measures the time since its start and estimates the time left."""
 
     def __init__(self) -> None:
         """Start the clock."""
@@ -66,7 +66,9 @@ class WorkTiming:
         self.first: tuple[float, float] | None = None  # time and amount of the first known progress
 
     def describe(self, far: WorkProgress) -> str:
-        """Return the times in words, to follow the words of `far`; empty in the first second."""
+        """Return time so far and time left in words, to follow the words of `far`, the progress; empty in the first
+        second.
+        """
         now = time.monotonic()
         rest = self.remaining_time(far, now)
         if now - self.begun < MIN_SHOWN_S:
@@ -79,9 +81,9 @@ class WorkTiming:
         return f"{'; ' if far.words else ' '}{', '.join(parts)}"
 
     def remaining_time(self, far: WorkProgress, now: float) -> float | None:
-        """Return the time left [s] at `now` by the pace so far, without compiling; None if unknown.
+        """Return the time left [s] at the instant `now` of `time.monotonic`; None if it is unknown.
 
-        `far` is the progress; the pace counts from the first call with a total.
+        `far` is the progress. The pace counts from the first call whose progress has a total, without compile time.
         """
         if far.total is None:
             return None
@@ -107,7 +109,7 @@ class _Picture:
         self.message, self.detail, self.spinner, self.pace = message, detail, Spinner("dots"), WorkTiming()
 
     def far(self) -> tuple[WorkProgress, str]:
-        """Return the progress; and the message with it, without times."""
+        """Return the progress, and one line with message and progress but without times."""
         far = self.detail() if self.detail else ""
         far = WorkProgress(far) if isinstance(far, str) else far
         return far, f"{self.message} ... {far.words}".strip()
@@ -122,9 +124,9 @@ class _Picture:
 
 
 def fit_line(words: str, rest: str, times: str, width: int) -> str:
-    """Return words and times on one line of a terminal.
+    """Return progress and times on one line of a terminal.
 
-    Words that are too long lose the message first. They are then cut at the end.
+    If the line is too long, it loses the message first. The progress is then cut at its end.
 
     Args:
         words: Message and progress.
@@ -142,7 +144,9 @@ def fit_line(words: str, rest: str, times: str, width: int) -> str:
 def show_progress(
     message: str, detail: Detail | None, tell: Callable[[str], None], timing: tuple[float, float]
 ) -> Iterator[Callable[[], None]]:
-    """Show the progress of work until the end of the block; yields a function to call often.
+    """Show the progress of work within a `with` block, as a spinner or as lines.
+
+    It yields a function that the block must call often: without a spinner, each call may write a line that is due.
 
     Args:
         message: Name of the work.

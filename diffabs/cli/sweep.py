@@ -98,11 +98,11 @@ def _check_any(result: JsonObject, chosen: Scenario) -> None:
 
 
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
-    """Return a sample of a sweep as a scenario, and the key of its noise.
+    """Return one sample of a sweep as a scenario with the sample's values, and the random key of its noise.
 
     Args:
         folder: Folder of the sweep.
-        number: Number of the sample.
+        number: Number of the sample, from 0.
 
     Raises:
         SweepError: The folder holds no sweep of a scenario, or its scenario does not match its study.

@@ -206,9 +206,10 @@ def _format_progress(told: "list[TuningProgress]", most: int | None = None) -> p
 
 
 def certify_result(after: Scenario) -> Proved:
-    """Return a certificate over the ranges of [design], if it exists.
+    """Return the outcome of a proof for the tuned loop over the ranges of [design].
 
-    It has the required decay rate of [tune] if that can be proved, else the fastest provable one.
+    The certificate has the fastest provable decay rate, and the required one of [tune] if that can be proved. Without a
+    certificate the outcome gives the reason; no error is raised.
 
     Args:
         after: Scenario with the tuned loop.

@@ -19,9 +19,9 @@ class Canvas:
     def change(self, option: JsonObject, edit: int = 0) -> None:
         """Apply the change `option` to the chart.
 
-        `edit` is the browser's number of the user's edit that this change shows, or 0. A change that arrives before the
-        browser
-        has made the chart waits there.
+        `edit` is the browser's number of the user's edit that this change shows, or 0. If the chart does not exist yet,
+        the
+        browser applies the change later.
         """
         self.send(encode_change(option), edit)
 

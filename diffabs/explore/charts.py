@@ -60,7 +60,8 @@ def change_curves(found: Curves, which: str = "now") -> JsonObject:
 
     Args:
         found: Curves of the run.
-        which: "now" for the current run, "before" for the run to compare with.
+        which: "now" for the current run with all its curves, "before" for the first curve of each panel of a run to
+            compare with.
     """
     source = {"t": round_for_screen(found.t)}
     for i, panel in enumerate(found.panels):

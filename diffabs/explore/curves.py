@@ -94,7 +94,9 @@ class Spread:
 
 
 def drawing_solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
-    """Return the scenario's solver, set to keep as many instants as are drawn.
+    """Return the scenario's solver, with `every` set so that at most about `instants` instants are kept.
+
+    The step of the integration does not change.
 
     Args:
         chosen: Scenario.
@@ -104,9 +106,9 @@ def drawing_solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
 
 
 def draft_solver(chosen: Scenario) -> Solver | None:
-    """Return a quicker solver for the curve during a drag, or None if there is no need or no way.
+    """Return a quicker, adaptive solver for the curve during a drag, or None if the scenario's own is to be used.
 
-    There is no need if the scenario's solver is quick. There is no way if a clock in the loop needs the solver's grid.
+    The own solver stays if it is adaptive or has few steps. It also stays if a clock in the loop needs its grid.
 
     Args:
         chosen: Scenario.
@@ -133,9 +135,11 @@ def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
 def transient_end(found: Curves) -> float:
     """Return the end [s] of a time axis that fits the transient.
 
-    It is 1.5 times the instant after which the first signal stays near its target, or without a target near its last
-    value.
-    A run that does not settle is shown whole.
+    It is 1.5 times the settling time of the first signal, and at most the end of the run. Settled means within 5 % of
+    the
+    largest distance from the target. Without a target the last value takes its place. A run that does not settle is
+    shown
+    whole.
 
     Args:
         found: Curves of the run.
@@ -154,7 +158,9 @@ def transient_end(found: Curves) -> float:
 
 
 def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
-    """Return the quantiles of many runs with different masses and roads in one batch, or None if the loop has neither.
+    """Return the quantiles of `MEMBERS` runs with different masses and roads, or None if the loop has neither.
+
+    Diverged runs do not count. The fan ends where too few runs still go on.
 
     Args:
         chosen: Scenario.
@@ -180,11 +186,11 @@ def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
 
 
 def fan_members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], str]:
-    """Return the values of a fan's members by path, and a description of their spread.
+    """Return the values of a fan's members by path, each of shape (MEMBERS,) in SI, and their spread in words.
 
-    Every call uses the same low-discrepancy points, so the fan does not flicker during a drag. The upper end is limited
-    by
-    the parameter's range.
+    Every call uses the same low-discrepancy points, so the fan does not flicker during a drag. Values stay below the
+    upper
+    end of the parameter's range. The dictionary is empty if the loop has neither mass nor friction factor.
 
     Args:
         chosen: Scenario.

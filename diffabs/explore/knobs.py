@@ -74,7 +74,10 @@ class Knob:
         return f"{value * self.scale:.6g}"
 
     def place_of(self, value: float) -> float:
-        """Return the slider position, 0 to `SLIDER_STEPS`, of a `value` [SI]; values outside are put at an end."""
+        """Return the slider position, 0 to `SLIDER_STEPS`, of a `value` [SI].
+
+        Values outside of the slider are put at its nearer end. A number without a slider has position 0.
+        """
         if self.low is None or self.high is None or not math.isfinite(value):
             return 0.0
         low, high, at = self._line(self.low), self._line(self.high), value * self.scale
@@ -83,7 +86,11 @@ class Knob:
         return float(np.clip(SLIDER_STEPS * (self._line(at) - low) / (high - low), 0, SLIDER_STEPS))
 
     def value_at(self, place: float) -> float:
-        """Return the value [SI] at a slider position `place`, 0 to `SLIDER_STEPS`."""
+        """Return the value [SI] at a slider position `place`, 0 to `SLIDER_STEPS`, rounded to five digits when
+        displayed.
+
+        The number must have a slider: `low` and `high` are not None.
+        """
         assert self.low is not None
         assert self.high is not None
         part = place / SLIDER_STEPS
@@ -135,11 +142,11 @@ def unit_words(unit: str) -> str:
 
 
 def first_knobs(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
-    """Return the keys of the numbers that the page shows at once.
+    """Return the keys of the numbers that the page shows at once, at most `MOST_FIRST`, sorted by group.
 
-    In order of priority they are mass, speed, friction, tuned parameters, filters, gains, and parameters that the
-    scenario
-    varies.
+    In order of priority they are mass, speed, friction, tuned parameters, filters, gains, and parameters that vary in
+    the
+    scenario. Numbers without a slider are left out.
 
     Args:
         chosen: Scenario.
@@ -161,9 +168,9 @@ def first_knobs(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
 def mass_path(chosen: Scenario) -> str | None:
     """Return the path of the mass that differs between vehicles or riders, or None.
 
-    A mass that the scenario varies has priority over the plant's first one. A loop without a mass gives a moment of
-    inertia
-    by the same rule.
+    A mass that the scenario varies has priority over the plant's first one. If the loop has no mass, the same rule
+    selects
+    a moment of inertia.
 
     Args:
         chosen: Scenario.

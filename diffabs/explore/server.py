@@ -106,9 +106,9 @@ def serve(
 def write_redirect_file(url: str, folder: pathlib.Path) -> pathlib.Path:
     """Return the path of a new HTML file, readable by its owner only, that redirects a browser to an address.
 
-    The address has the token, and every user of the machine can see the command line that starts a browser. So the
-    browser
-    gets this file instead.
+    Every user of the machine can see the command line that starts a browser. So the browser gets this file in place of
+    the
+    address, which contains the token.
 
     Args:
         url: Address with the token.

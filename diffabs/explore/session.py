@@ -29,7 +29,7 @@ PERCENT = ParameterSpec("%", low=0.0, high=90.0)
 
 
 class ProofVerdict(NamedTuple):
-    """The verdict of a proof for a loop: one of the four words above, and a sentence."""
+    """The verdict of a proof for a loop: "certified", "refuted", "undecided" or "unknown", and a sentence."""
 
     word: str
     sentence: str
@@ -68,10 +68,9 @@ class Session:
         self._begin(source, {}, load(source))
 
     def choose(self, family: str, part: str) -> None:
-        """Replace the road or the controller (`family`) by the named `part` with default values, or by the scenario's
-        own.
+        """Replace the road or the controller, `family`, by `part`: a name, or `AS_GIVEN` for the scenario's own.
 
-        Edits of all other numbers are kept.
+        The new part has its default values. Edits of all other numbers are kept.
 
         Raises:
             ScenarioError: The part does not fit; the session stays unchanged.
@@ -110,8 +109,7 @@ class Session:
         return value
 
     def put(self, key: str, given: PyTree) -> float:
-        """Set the number `key` to a value `given` in its displayed unit, and return it in SI, without a check of the
-        loop.
+        """Set the number `key` to `given` in its displayed unit, and return it in SI; the loop is not checked.
 
         `judge` checks the loop and takes some milliseconds. `accept` or `withdraw` must follow it.
 
@@ -160,7 +158,7 @@ class Session:
         )
 
     def adopt(self, loop: Loop) -> None:
-        """Take over the numbers of another `loop` with the same parts."""
+        """Set all numbers to those of another `loop` with the same parts, and accept them."""
         self.accept(loop)
         self._values = {knob.path: np.asarray(get(loop, knob.path), float) for knob in self.knobs.values()}
 
@@ -221,7 +219,9 @@ def _value(value: Scalar, knob: Knob) -> float:
 
 
 def objections(chosen: Scenario) -> list[str]:
-    """Return the reasons why a scenario must not be run, one line each, as the command line would give them.
+    """Return the reasons why a scenario must not be run, one line each; empty if it may be run.
+
+    The command line would give the same lines.
 
     Args:
         chosen: Scenario with its current numbers.

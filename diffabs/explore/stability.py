@@ -64,7 +64,9 @@ class CornerLoops(NamedTuple):
 
 
 def corners_of(chosen: Scenario) -> tuple[PyTree, ...]:
-    """Return a key for the corners: their ranges, and the loop with each ranged parameter at its lower end.
+    """Return a key for comparison: it is equal for two scenarios if their corners are equal.
+
+    It holds the ranges, and the loop with each ranged parameter at its lower end.
 
     Args:
         chosen: Scenario.
@@ -77,13 +79,16 @@ def corners_of(chosen: Scenario) -> tuple[PyTree, ...]:
 
 
 def linearise_corners(chosen: Scenario, known: CornerLoops | None = None) -> CornerLoops:
-    """Return poles and worst margins at the corners of a scenario.
+    """Return poles and worst margins of the linearised loops at the corners of the [design.over] ranges.
 
-    A scenario without ranges, or with more than three, has no corners here.
+    A scenario without ranges, or with more than three, gets a result with zero corners.
 
     Args:
         chosen: Scenario.
         known: Earlier result, which is returned if the corners have not changed.
+
+    Raises:
+        ValueError: The loop has no linear model.
     """
     of = corners_of(chosen)
     if known and known.of == of:
@@ -123,7 +128,9 @@ def linear_stability(chosen: Scenario, corners: CornerLoops | None) -> Stability
 
 
 def margin_values(found: Margins) -> dict[str, float]:
-    """Return the margins by name, in SI; NaN for an unstable loop.
+    """Return the margins by the names of `MARGIN_KEYS`, in SI; NaN for an unstable loop.
+
+    Gain and modulus margins are factors [1], the phase margin is in rad, and the delay margin in s.
 
     Args:
         found: Margins of a loop.

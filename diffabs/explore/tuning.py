@@ -53,7 +53,8 @@ def tunable_parameters(chosen: Scenario) -> list[str]:
 def default_tuning(chosen: Scenario) -> tuple[list[str], str]:
     """Return the default free parameters and the default metric.
 
-    The parameters are those of the scenario's [tune], else the first tunable parameter of the controller.
+    The parameters are those of the scenario's [tune], else the first tunable parameter of the controller. The metric is
+    the first one of [tune.objective], else of the scenario; "" without any.
 
     Args:
         chosen: Scenario.
@@ -98,12 +99,16 @@ def scenario_with_goal(
     known: Mapping[str, Knob],
     bounded: Mapping[str, tuple[PyTree, PyTree]] | None = None,
 ) -> Scenario:
-    """Return the scenario with these free parameters and this metric as the objective.
+    """Return the scenario with these free parameters, and an objective that contains this metric.
+
+    If [tune.objective] already weighs the metric, its weights stay, also those of other metrics. Otherwise the metric
+    is
+    the whole objective. The tuning has a single start.
 
     Args:
         chosen: Scenario; its constraints stay.
         paths: Paths of the free parameters.
-        metric: Name of the metric that is minimised.
+        metric: Name of the metric.
         known: Numbers of the loop by key.
         bounded: Typed bounds (low, high) by key of a number. The default is that of `bounds_on_page`.
 
@@ -124,7 +129,7 @@ def scenario_with_goal(
 def tune_scenario(
     chosen: Scenario, posed: TuningTask, told: Callable[[int, float], None], stopping: Callable[[], bool]
 ) -> TuningFound:
-    """Return the result of `diffabs tune` for a scenario's [tune].
+    """Return the result of a tuning by a scenario's [tune], from one start: the current values.
 
     Args:
         chosen: Scenario.

@@ -129,7 +129,12 @@ def loop(plant: Part, gain: Matrix, start: PyTree = PAPER_START, voltage: float 
 
 
 def runs() -> dict[str, Run]:
-    """Return the runs by name: Fig. 3, its start in the correct model, and the hanging arm."""
+    """Return the five runs by name, as NumPy arrays.
+
+    They are Fig. 3 in the printed equations, its start in the correct model with two voltage limits, and two gains of
+    the
+    hanging arm.
+    """
     upright, hanging = lqr_gain(ArmBalance()), lqr_gain(HANGING, WEIGHTS, EFFORT)
     cases = {
         "printed": loop(PrintedArm(), lqr_gain(PrintedArm()), voltage=1e6),
@@ -145,18 +150,20 @@ def runs() -> dict[str, Run]:
 
 
 def recovered_multiples(one: Loop, rows: Table) -> list[Reach]:
-    """Return the largest recovered one of MULTIPLES of the paper's start, for each parameter value.
+    """Return for each row the largest of `MULTIPLES` of the paper's start up to which all of them are recovered.
 
     Args:
         one: Closed loop.
-        rows: Paths of parameters and their values.
+        rows: Values by parameter path, each of shape (rows,); all paths of a row change together.
     """
     direction = {"initial.theta": PAPER_START[0], "initial.phi": PAPER_START[2]}
     return largest_recovered_multiples(one, rows, direction, MULTIPLES, LONG_SOLVER)
 
 
 def largest_possible_multiples(plant: ArmBalance, riders: Any) -> np.ndarray:
-    """Return the largest multiple of the start that any control at 48 V recovers in the linear model, for each rider.
+    """Return an upper bound of the recoverable multiples of the start for each rider, shape (riders,).
+
+    The bound holds in the linear model for any control of at most 48 V.
 
     Args:
         plant: A two-wheeler.
@@ -171,12 +178,12 @@ def largest_possible_multiples(plant: ArmBalance, riders: Any) -> np.ndarray:
 
 
 def heaviest(plant: ArmBalance, gain: np.ndarray, low: float = 50.0, high: float = 200.0) -> float:
-    """Return the mass of the heaviest rider [kg] that a gain stabilises in the linear model, by bisection.
+    """Return the mass of the heaviest rider [kg] that a gain stabilises in the linear model, by bisection to 1 g.
 
     Args:
         plant: A two-wheeler.
         gain: K of u = K x, shape (6,).
-        low: Mass that the gain stabilises [kg].
+        low: Mass [kg] that the gain is known to stabilise.
         high: Upper end of the search [kg].
     """
     while high - low > 1e-3:
@@ -201,8 +208,11 @@ def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
 
 
 def robust_gains(progress: Callable[[str], None]) -> JsonObject:
-    """Return gains for riders of 40 to 100 kg with their recovered multiples: LQR of one rider, LMI of all, and tuned
-    weights.
+    """Return pairs of a gain and its recovered multiples over the riders, by name of the gain.
+
+    The gains are the LQR of one rider, tuned weights, and the LMI for all riders of 40 to 100 kg. The LMI is left out
+    if
+    the extra `design` is not installed.
 
     Args:
         progress: Function that receives a sentence before each long computation.

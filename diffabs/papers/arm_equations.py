@@ -44,7 +44,9 @@ def kinetic(p: ArmBalance, q: AnyArray, v: Scalar) -> Scalar:
 
 
 def potentials(p: ArmBalance, q: AnyArray) -> Scalar:
-    """Return eqs. (2), (4), (6) as printed, shape (3,); the second and third add kg m to J.
+    """Return eqs. (2), (4), (6) as printed, shape (3,) [J].
+
+    In (4) and (6) a term lacks the factor g, so that they add kg m to J.
 
     Args:
         p: Machine.
@@ -58,7 +60,7 @@ def potentials(p: ArmBalance, q: AnyArray) -> Scalar:
 
 
 def lagrangian(p: ArmBalance, q: AnyArray, v: Scalar) -> Scalar:
-    """Return eq. (7) [J]: the kinetic energy of the sums theta1 + theta2, minus a potential of the differences.
+    """Return eq. (7) [J] as printed: its kinetic energy uses theta1 + theta2, but its potential theta1 - theta2.
 
     Args:
         p: Machine.
@@ -112,7 +114,9 @@ def printed_equations(p: ArmBalance, q: AnyArray, v: Scalar, a: Scalar) -> Scala
 
 
 def gravity_stiffness(p: ArmBalance) -> np.ndarray:
-    """Return d(left sides of (8)-(10))/dq at rest, shape (3, 3) [N m/rad]; any potential gives a symmetric matrix.
+    """Return the Jacobian of the left sides of (8)-(10) by the angles, upright and at rest, shape (3, 3) [N m/rad].
+
+    A gravity that comes from a potential has a symmetric Jacobian.
 
     Args:
         p: Machine.

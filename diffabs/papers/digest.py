@@ -161,7 +161,7 @@ def _share(rows: Sequence[Row], agrees: Callable[[Row], bool], words: str) -> st
 
 
 def verdict(rows: Sequence[Row], claim: Refuted) -> tuple[str, str] | None:
-    """Return "refuted" or "holds", and the claim with its numbers; None if the record lacks these numbers.
+    """Return "refuted" or "holds", and a sentence of the claim with its numbers; None if the record lacks one of them.
 
     Args:
         rows: Rows of the record.

@@ -63,7 +63,7 @@ def jerk(run: Run, after: float = LATE_TIME) -> float:
 
 
 def rebounds(run: Run, begin: float = 0.3, end: float = 1.0) -> int:
-    """Return the number of changes of the wheel between deceleration and acceleration.
+    """Return the number of sign changes of the wheel's acceleration within a time window.
 
     Args:
         run: Run with a trajectory.
@@ -76,7 +76,7 @@ def rebounds(run: Run, begin: float = 0.3, end: float = 1.0) -> int:
 
 
 def slow_deceleration(run: Run) -> float:
-    """Return the mean deceleration over the distance from `SLOW_SPEED` to the last sample [m/s^2].
+    """Return the mean deceleration over distance [m/s^2], from 20 km/h (`SLOW_SPEED`) to the last sample.
 
     Args:
         run: Run with a trajectory.
@@ -88,7 +88,7 @@ def slow_deceleration(run: Run) -> float:
 
 
 def braking_gain(slower: Run, faster: Run) -> tuple[float, float]:
-    """Return the difference of two stopping distances, and its part below `SLOW_SPEED` [m].
+    """Return by how much `faster` stops shorter than `slower` [m], and the part of it below 20 km/h [m].
 
     The distance is the integral of v dv/a(v), so its integrand gives the gain at each speed.
 

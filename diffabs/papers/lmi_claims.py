@@ -38,7 +38,7 @@ def rig_masses() -> tuple[float, float]:
 
 
 def corner(system: Polytope, mass: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return A and B at the polytope's vertex with this mass and speed.
+    """Return A, shape (2, 2), and B, shape (2, 1), of the polytope's vertex that is nearest to this mass and speed.
 
     Args:
         system: Polytope over mass and speed.
@@ -51,7 +51,7 @@ def corner(system: Polytope, mass: float, speed: float) -> tuple[np.ndarray, np.
 
 
 def cost(A: np.ndarray, B: np.ndarray, gain: Matrix, weights: tuple[float, float]) -> float:
-    """Return trace P of the cost (24) with R = 1 under a stabilising gain; infinity under any other gain.
+    """Return the trace of the cost matrix P, eq. (24), with R = 1; infinity if the gain does not stabilise.
 
     Args:
         A: State matrix (2, 2).
@@ -67,7 +67,7 @@ def cost(A: np.ndarray, B: np.ndarray, gain: Matrix, weights: tuple[float, float
 
 
 def optimum(A: np.ndarray, B: np.ndarray, weights: tuple[float, float]) -> tuple[np.ndarray, float]:
-    """Return the optimal gain of eq. (27) with R = 1 at one mass and speed, and its cost.
+    """Return the LQ gain K of u = K x with R = 1, eq. (27), shape (2,), and its cost: trace P.
 
     Args:
         A: State matrix (2, 2).
@@ -95,9 +95,9 @@ def holding_mass(system: Polytope, gain: AnyArray) -> float:
 
 
 def nearest_speed(system: Polytope) -> float:
-    """Return the speed [m/s] at which the LQ gain without weight on the slip error is the published gain.
+    """Return the speed [m/s] at which the LQ gain for Q = diag(k1^2, 0) and R = 1 is the published gain.
 
-    alpha/beta does not depend on the speed, and omega_2/beta is proportional to it.
+    It uses that alpha/beta does not depend on the speed, and that omega_2/beta is proportional to it.
 
     Args:
         system: Polytope over mass and speed.

@@ -194,7 +194,9 @@ def stability_threshold(system: Polytope) -> float:
 
 
 def slowest_pole(system: Polytope, gain: tuple[float, float]) -> tuple[float, float, float]:
-    """Return real part, imaginary part and damping of the closed loop's eigenvalue at 50 km/h and 5.3 kg.
+    """Return real part [1/s], imaginary part [rad/s] and damping [1] of a pole at 50 km/h and 5.3 kg.
+
+    Of the closed loop's two eigenvalues it takes the one with the greater imaginary part.
 
     Args:
         system: Polytope over mass and speed.

@@ -34,6 +34,8 @@ def computed_row(
 ) -> JsonObject:
     """Return a row of a table with our number and, if known, the paper's or an independent number.
 
+    "difference" is ours less the published number, else ours less the reference; None without either.
+
     Args:
         name: Name of the row.
         quantity: Quantity of the row.
@@ -49,7 +51,7 @@ def computed_row(
 
 
 def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float, digits: int = 2) -> JsonObject:
-    """Return a row of a table whose published number is rounded; `matches` tells whether ours rounds to it.
+    """Return the row of `computed_row` with "matches": whether ours and the published number round alike.
 
     Args:
         name: Name of the row.
@@ -57,7 +59,7 @@ def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float
         unit: Unit of the quantity.
         ours: Our number.
         published: Number of the paper.
-        digits: Decimals of the paper's number.
+        digits: Decimals of the paper's number, to which both are rounded.
     """
     line = computed_row(name, quantity, unit, ours, published=published)
     return {**line, "matches": round(line["ours"], digits) == round(published, digits)}

@@ -100,7 +100,7 @@ def loop(car: QuarterCar, reference: Reference, controller: Block) -> Loop:
 
 
 def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
-    """Return all nine runs on one car, by row of the tables.
+    """Return all nine runs on one car, as NumPy arrays by row of the tables: "no ABS", "proposed PI" and so on.
 
     Args:
         car: Plant.
@@ -156,10 +156,10 @@ def table(runs: Mapping[str, Run]) -> list[JsonObject]:
 
 
 def worst_difference(rows: list[JsonObject], quantity: str) -> float:
-    """Return the largest absolute difference from a published number.
+    """Return the largest absolute difference from a published number, in the unit of the quantity.
 
     Args:
-        rows: Rows of the tables.
+        rows: Rows of the tables, each with a published number.
         quantity: Quantity of the rows that count.
     """
     return max(abs(row["difference"]) for row in rows if row["quantity"] == quantity)

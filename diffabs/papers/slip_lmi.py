@@ -148,7 +148,8 @@ def run_filtered() -> Run:
 
 
 def convergence_errors(fine: Mapping[str, Run]) -> Errors:
-    """Return the relative errors at each step length against a finer run, by case and quantity.
+    """Return the relative errors against finer runs, as {case: {quantity: errors}} with one error for each of
+    `HALVINGS`.
 
     Args:
         fine: Runs at a finer step, by name.
@@ -166,11 +167,11 @@ def convergence_errors(fine: Mapping[str, Run]) -> Errors:
 
 
 def convergence_order(errors: list[float], points: slice) -> float:
-    """Return the slope of log error over log step length.
+    """Return the order of convergence: the slope of log error over log step length, by least squares.
 
     Args:
-        errors: Relative error for each step length.
-        points: Step lengths that count.
+        errors: Relative error for each step length of `HALVINGS`.
+        points: Slice of the step lengths that count.
     """
     return float(np.polyfit(np.log(HALVINGS[points]), np.log(errors[points]), 1)[0])
 

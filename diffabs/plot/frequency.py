@@ -17,10 +17,10 @@ LEAST_DB = -80.0  # lower end of the magnitude axis; half of it for the sensitiv
 
 
 def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *, title: str = "") -> PyTree:
-    """Return a figure of the open loop L with its sensitivities.
+    """Return a figure of the open loop L, which includes the controller, and its sensitivities S and T.
 
-    The panels are the magnitude and phase of L, its Nyquist plot, and |S| and |T|. The Nyquist plot has the circle of
-    radius 1/Ms about -1, which L does not enter.
+    The panels are magnitude and phase of L, its Nyquist plot, and |S| and |T|. For a stable loop the Nyquist plot has a
+    circle about -1 that L does not enter. Its radius is 1/Ms, the modulus margin.
 
     Args:
         loop: Open loop whose curves are drawn.

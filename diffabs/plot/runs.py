@@ -158,16 +158,16 @@ def draw_angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
 
 
 def shade_region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> list[Patch]:
-    """Shade the cells of a grid by a Boolean value, and return a patch of each shade for a legend.
+    """Shade the cells of a grid by a Boolean value, and return three patches for a legend.
 
-    The patches are in this order: true, unknown, false.
+    The patches stand for true, unknown and false, in this order.
 
     Args:
         ax: Axes to draw into.
         first: Cell centres along the horizontal axis, shape (n,).
         second: Cell centres along the vertical axis, shape (m,).
-        inside: Value of each cell, shape (n, m).
-        unknown: Cells without a value, shape (n, m), or None. `inside` takes precedence.
+        inside: Value of each cell (first, second), shape (n, m).
+        unknown: True for cells without a value, shape (n, m), or None. A cell with true `inside` is never unknown.
     """
     shades = (COLOURS[0], "#9A9A9A", "#F3E3D7")
     value = np.where(inside, 0, 2 if unknown is None else np.where(unknown, 1, 2))
@@ -299,7 +299,7 @@ def draw_convergence(
     Args:
         panels: Relative errors as {case: {quantity: values}}, values of shape (steps,).
         steps: Step lengths [s], shape (steps,).
-        orders: Order of the guide line of each case.
+        orders: Slope of the guide line in each panel, one per case.
         title: Title of the figure.
     """
     figure, axes = sheet(1, len(panels), title=title, size=(5.2, 3.8), sharey=True)

@@ -96,8 +96,7 @@ def label_axes(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True
 def make_logarithmic(ax: Axes, axis: str) -> None:
     """Make an axis logarithmic, with as many labels as have room.
 
-    Over less than two decades the labels are 1, 2 and 5 of each decade, as plain numbers. Over more they are the
-    decades.
+    Over two decades or more the labels are the decades. Over less they are 1, 2 and 5 of each decade, as plain numbers.
 
     Args:
         ax: Axes to change.

@@ -51,14 +51,14 @@ class SweepView:
         self.leading = next((name for name in [*self.bounds, *self.varying] if name in self.varying), "")
 
     def known_rows(self, name: str, rows: np.ndarray) -> np.ndarray:
-        """Return the `rows` in which the metric `name` is finite.
+        """Return those of the `rows` in which the metric `name` is finite; both are Boolean masks, shape (runs,).
 
-        A run that never settles has no finite settling time and is left out.
+        For example, a run that never settles has an infinite settling time and is left out.
         """
         return rows & np.isfinite(self.found.column(name)) if name else rows
 
     def never(self, name: str) -> str:
-        """Return a note on the number of runs that a figure of the metric `name` leaves out, or "" for none."""
+        """Return a note such as " (3 never: left out)" on the runs with an infinite metric `name`; "" for none."""
         count = np.sum(self.rows & ~self.known_rows(name, self.rows))
         return f" ({count} never: left out)" if count else ""
 
@@ -70,9 +70,9 @@ class SweepView:
         return f"{name} [{unit}]" if unit else name
 
     def title(self, what: str, rows: np.ndarray) -> str:
-        """Return a title with the scenario's name, the words `what`, and the number of runs in `rows`.
+        """Return a title: name of the scenario, the words `what`, and the number of runs in the mask `rows`.
 
-        Diverged and refused runs are counted in addition.
+        The numbers of diverged and refused runs follow in brackets.
         """
         name, bad = self.found.manifest.get("source", {}).get("name"), np.sum(self.accepted & ~self.good)
         refused = np.sum(~self.accepted)
@@ -81,7 +81,7 @@ class SweepView:
         return f"{name}: {what} {runs}" if name else f"{what} {runs}"
 
     def variable(self, path: str, rows: np.ndarray) -> AxisVariable:
-        """Return the varied parameter `path` in these `rows`, for an axis."""
+        """Return the varied parameter `path` in the runs of the mask `rows`, for an axis."""
         values = self.found.column(path)[rows]
         if not self.found.is_number(path):
             names, places = np.unique(values.astype(str), return_inverse=True)
@@ -90,13 +90,14 @@ class SweepView:
         return AxisVariable(f"{path} [km/h]" if fast else self.label(path), values * (KMH if fast else 1.0), [])
 
     def influential(self, rows: np.ndarray, result: np.ndarray, *, numbers_first: bool = False) -> list[str]:
-        """Return the paths of the two most influential variables on a `result`, given in these `rows`.
+        """Return the paths of the at most two variables with the most influence on `result`, given in the runs of the
+        mask `rows`.
 
         The first variable explains the largest variance between cells. The second explains the largest variance of the
         rest.
-        With `numbers_first`, numeric variables precede names. In the returned list names come last: the vertical axis
-        has room
-        for them.
+        With `numbers_first`, a variable with names is chosen only if no numeric one varies. Variables with names come
+        last in
+        the list, because the vertical axis has room for them.
         """
         best: list[str] = []
         for _ in range(2 if len(result) else 0):
@@ -113,13 +114,13 @@ class SweepView:
 
 
 def assign_cells(one: AxisVariable, along: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cell index of each run and the edges of the cells.
+    """Return the cell index of each run, shape (runs,), and the edges of the cells, shape (cells + 1,).
 
     A variable with few different values has one cell around each value. Other cells are equally wide.
 
     Args:
         one: Variable to divide into cells.
-        along: Number of variables of the map, 1 or 2.
+        along: Number of variables of the map, 1 or 2; two variables get fewer cells each.
     """
     levels, n = np.unique(one.values), len(one.values)
     if one.names or len(levels) <= min(CELL_COUNTS[1], n / 2):
@@ -133,11 +134,11 @@ def assign_cells(one: AxisVariable, along: int = 2) -> tuple[np.ndarray, np.ndar
 
 
 def cell_means(one: AxisVariable, result: np.ndarray) -> np.ndarray:
-    """Return the mean of the result over the cell of each run, shape (runs,).
+    """Return for each run the mean of the result over its cell, shape (runs,).
 
-    Unlike a correlation, the variance of these means also shows a result that is worst in the middle of a range. It
-    also
-    shows the influence of a variable with names.
+    The variance of these means measures influence. Unlike a correlation, it also shows a result that is worst in the
+    middle
+    of a range, and the influence of a variable with names.
 
     Args:
         one: Variable to divide into cells.

@@ -73,7 +73,7 @@ def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure 
 
 
 def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: float = 0.95) -> Figure | None:
-    """Return the share of runs beyond each value for each metric, or None if no metric varies.
+    """Return the share of runs above each value, for each metric, or None if no metric varies.
 
     Pointwise intervals of Clopper and Pearson are drawn unless the design is a grid or corners, which are not random.
 
@@ -103,11 +103,13 @@ def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: f
 
 
 def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -> Figure | None:
-    """Return a scatter of the runs over the two variables that move a metric most, or None if nothing varies.
+    """Return a scatter of the runs over two variables, coloured by a metric, or None if nothing varies.
 
-    The metric is the first varying one with a bound of failure, or else the first varying one. The worst runs have
-    their
-    sample numbers. Numeric variables are preferred. With one variable, the figure shows the metric over it.
+    The metric is the first varying one with a bound of failure, else the first varying one. The variables are the two
+    that
+    influence it most, numeric ones first. With one variable, the figure shows the metric over it. The worst runs, with
+    the
+    greatest values, are marked with sample number and value.
 
     Args:
         found: Results of the sweep.
@@ -171,14 +173,15 @@ def draw_sensitivity(found: Results, document: Table) -> Figure | None:
 
 
 def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
-    """Return a map of the share of failed runs over its two most influential variables.
+    """Return a map of the share of failed runs over two variables, or None if there is nothing to draw.
 
-    Fewer than ten failed runs, or fewer than ten runs without failure, do not show an influence. The map then uses the
-    two
-    variables that move the metric of `draw_worst` most. If no run failed, the colour is the largest value of that
-    metric in a cell. Cells without a run are grey.
+    The variables are the two that influence failure most. With fewer than ten runs on either side, failed or not, they
+    are
+    the two of `draw_worst`. If no run failed, the colour is the largest value of that metric in a cell. Cells without a
+    run
+    are grey.
 
-    Without a varying variable the function returns None. It also returns None if no run failed and no metric varies.
+    The function returns None if no variable varies, and if no run failed and no metric varies.
 
     Args:
         found: Results of the sweep.

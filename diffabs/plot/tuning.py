@@ -66,10 +66,10 @@ def draw_pareto(
 ) -> Figure:
     """Return a figure of one objective over another, with the Pareto front of each set of points.
 
-    Points on a front are joined; the others are pale.
+    Both objectives are minimised, as in `pareto_front`. Points on a front are joined; the others are pale.
 
     Args:
-        fronts: Points (x, y) by name.
+        fronts: Points (x, y) by name, each coordinate an array of shape (n,).
         marks: Single points (x, y) by name.
         x: Label of the horizontal axis.
         y: Label of the vertical axis.
@@ -88,9 +88,11 @@ def draw_pareto(
 
 
 def pareto_front(x: Scalar, y: Scalar) -> np.ndarray:
-    """Return the indices of the Pareto-optimal points, in the order of x.
+    """Return the indices of the Pareto-optimal points (both objectives are minimised), in ascending order of x.
 
-    A point is Pareto-optimal if no other point is smaller in both objectives. Points with NaN are left out.
+    A point is left out if another point is at least as small in both objectives. Of equal points one is kept. Points
+    that
+    are not finite are left out.
 
     Args:
         x: First objective, shape (n,).

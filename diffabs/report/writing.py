@@ -57,7 +57,7 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
 
 
 def script_checksum(script: str) -> str:
-    """Return the source expression of a content security policy that allows a script.
+    """Return "sha256-" with the checksum of a script, by which a content security policy allows it.
 
     Args:
         script: Text of the script.

@@ -17,9 +17,10 @@ from diffabs.simulate.advance import initial_point
 
 
 def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
-    """Yield one line for the loop if a part reads a missing signal, else one line for each such objective.
+    """Yield one line for each misfit: a part that reads a signal which the loop lacks.
 
-    The loop is only traced: no number is computed.
+    A misfit within the loop gives a single line, and objectives are then not checked. Otherwise each objective with a
+    misfit gives a line. The loop is only traced: no number is computed.
 
     Args:
         loop: Loop to trace once around, and through one instant.

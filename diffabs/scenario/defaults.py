@@ -7,7 +7,7 @@ from diffabs.plants import ArmBalance, QuarterCar
 
 
 def braking(**parts: Any) -> Loop:
-    """Return a quarter car under a PID that holds a fixed slip until standstill.
+    """Return a loop of a quarter car, with PID control of the slip at a fixed target until standstill.
 
     Args:
         **parts: Parts of the loop by field, in place of the usual ones.
@@ -16,7 +16,7 @@ def braking(**parts: Any) -> Loop:
 
 
 def balancing(**parts: Any) -> Loop:
-    """Return the two-wheeler upright under state feedback until it falls.
+    """Return a loop of the two-wheeler, which state feedback keeps upright; the run ends early if it falls.
 
     Args:
         **parts: Parts of the loop by field, in place of the usual ones.

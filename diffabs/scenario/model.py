@@ -14,8 +14,9 @@ from diffabs.simulate.solution import describe_solver
 
 
 def describe_model(chosen: Scenario) -> JsonObject:
-    """Return a scenario as JSON values: title, description, parts, parameters with units, solver, and units of the
-    metrics.
+    """Return a scenario as JSON values.
+
+    They are title, description, parts, parameters with units, solver, and units of the metrics.
 
     Args:
         chosen: Scenario to describe.

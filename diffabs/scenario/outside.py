@@ -24,7 +24,9 @@ _named: dict[str, ModuleType] = {}
 
 
 def register_modules(names: Iterable[str]) -> None:
-    """Import modules from the Python path or the working directory, and keep them as sources of parts.
+    """Import modules with parts, which `registered_modules` then returns for the rest of the process.
+
+    The working directory becomes the last entry of the Python path.
 
     Args:
         names: Dotted names of the modules.
@@ -62,9 +64,9 @@ def registered_modules() -> tuple[ModuleType, ...]:
 
 
 def exported_parts(module: ModuleType) -> Iterator[tuple[str, PyTree]]:
-    """Yield name and part for each class made with `pytree` and each named instance in a module.
+    """Yield name and item for each part in a module: a class made with `pytree`, or an instance of such a class.
 
-    Classes imported from diffabs are left out.
+    Classes imported from diffabs are left out, but their instances are not.
 
     Args:
         module: Module whose `__all__`, or else public names, are searched.

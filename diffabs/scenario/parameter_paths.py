@@ -78,16 +78,17 @@ class ParameterEntry:
         return tuple(read_number_in_range(x, self.spec, f"{self.where}.{i}") / self.scale for i, x in enumerate(given))
 
     def range(self, or_else: str = "") -> Ends:
-        """Return low and high in SI, each a tuple if a list was given for a parameter that is a list.
+        """Return low and high in SI: numbers, or tuples where a list was given for a parameter that is a list.
 
         Args:
-            or_else: Alternative to a range, for messages. If it is not empty, the range is open: its ends may lie on
-                the ends of an open interval, and must differ. A free parameter of a tuning is such a range, because its
-                coordinate never reaches an end.
+            or_else: Alternative to a range, for messages. A text that is not empty also selects the rules of a free
+                parameter
+                of a tuning. Its ends must then differ, and may be ends that the parameter's own range excludes.
 
         Raises:
             ScenarioError: The value is not a pair, an end is outside the parameter's range, or the ends are in the
-                wrong order.
+                wrong
+                order.
         """
         needed = f"a range [low, high] in {self.spec.interval()}"
         if not isinstance(self.given, list):
@@ -167,7 +168,10 @@ def forget_replaced_part(table: JsonObject, replaced: str) -> None:
 
 
 def join_path_keys(keys: list[str]) -> list[str]:
-    """Return the keys of an override, with a path in one of the tables joined to one key.
+    """Return the keys of an override, with a parameter path joined to one key.
+
+    For example `tune.free.plant.mass` becomes ["tune", "free", "plant.mass"]. Keys outside of the tables with parameter
+    keys are returned as they are.
 
     Args:
         keys: Words of the override's path between its dots.
@@ -220,13 +224,13 @@ def read_entries(
 ) -> Iterator[ParameterEntry]:
     """Yield one entry for each parameter in a table.
 
-    A speed also has a key in km/h, and a controller's limit also has its older name.
+    A speed may have the suffix `_kmh`. A controller's limit may have its former name.
 
     Args:
         table: Nested or dotted values by path.
         section: Name of the table, for messages.
         there: Spec and shape of each allowed parameter by path of the loop.
-        otherwise: Predicate for a path that is not allowed, for messages.
+        otherwise: End of the message on a path that is not allowed, such as "not a parameter of this loop".
 
     Raises:
         ScenarioError: A path is not allowed, or a parameter is given twice.

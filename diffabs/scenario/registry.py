@@ -178,7 +178,7 @@ def family_of(field: str, enclosing: str) -> str:
 
 
 def type_name(given: PyTree) -> Scalar:
-    """Return the type that a section of a scenario names, as a bare word or in its table; None without a name.
+    """Return the name of the type in a section: the section itself if it is a bare word, else its `type`, or None.
 
     Args:
         given: Value of the section.
@@ -220,7 +220,8 @@ def unit_of(objective: Any, plant: Part = None) -> str:
 def build_part(family: str, given: PyTree, default: Any, path: str, units: Units | None = None) -> PyTree:
     """Return the part that a table, or the bare name of a type, describes.
 
-    A table without `type` changes fields of `default`. Ranges of numbers are checked later, by `diffabs.check`.
+    A type selects its own default fields; a table without `type` changes fields of `default`. Ranges of numbers are
+    checked later, by `diffabs.check`.
 
     Args:
         family: Family of the part.
@@ -388,9 +389,9 @@ def in_kmh(spec: ParameterSpec) -> ParameterSpec:
 
 
 def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
-    """Return the fields of a part as plain values: default, unit and range of each.
+    """Return the fields of a part as plain values by name: "default", "unit", "range", "low" and "high" of each.
 
-    A default that is a part is given by its name.
+    A default that is a part is given by its name. An infinite end of a range is None.
 
     Args:
         family: Family of the part.
@@ -421,7 +422,9 @@ def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
 
 
 def part_choices(part: Part, path: str = "") -> Iterator[tuple[str, JsonObject]]:
-    """Yield path and choices of this part and every part below it: its type, and its fields that are not parameters.
+    """Yield path and choices of each part: its type, and its fields that are not parameters.
+
+    The given part comes first, then every part inside it.
 
     Args:
         part: Part, or tuple of parts.

@@ -99,7 +99,8 @@ class Scenario:
         return jax.random.key(self.seed)
 
     def with_loop(self, loop: Loop, how: str) -> "Scenario":
-        """Return this scenario with another `loop`, and a title that says `how` the loop was found.
+        """Return this scenario with another `loop`, and the title "NAME, HOW", where `how` tells how the loop was
+        found.
 
         The description is dropped, because it may be wrong for the new loop.
         """

@@ -89,18 +89,19 @@ class DesignTask:
     over: Mapping[str, Range] = dataclasses.field(default_factory=dict)
 
     def box(self, loop: Loop) -> dict[str, Range]:
-        """Return the ranges by path of the linear model of `loop`.
+        """Return the ranges (low, high) in SI by path of the linear model of `loop`, also ranges of a single value.
 
-        A speed without a range gets the range from the loop's stop to its start.
+        A speed without a range gets the range from the loop's stop to its start, even if nothing else has a range.
         """
         known = _rangeable_parameters(loop)
         return {known[path].model: ends for path, ends in self._with_speed(loop).items()}
 
     def ranges(self, loop: Loop) -> dict[str, Range]:
-        """Return the ranges by path of `loop`, without ranges of a single value.
+        """Return the ranges (low, high) in SI by path of `loop`, without ranges of a single value.
 
-        If other parameters have ranges and the speed has none, the speed gets the range from the loop's stop to its
-        start.
+        The dictionary is empty if [design.over] is empty. Otherwise the speed of a brake without a range gets the range
+        from
+        the loop's stop to its start.
         """
         over = self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else self.over
         return {path: ends for path, ends in over.items() if ends[0] < ends[1]}

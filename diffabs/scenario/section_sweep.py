@@ -79,7 +79,14 @@ class SweepSection:
     """The section as read, in SI.
 
     Attributes:
+        samples: Number of runs; 0 for as many as the design has, or 1,000.
+        seed: Seed of the samples.
+        chunk: Number of runs that are computed and stored together.
+        check: Number of runs that are repeated with a half step, to estimate their accuracy.
+        dtype: "float64" or "float32".
+        design: Sampling design.
         over: Distributions, and choices of parts, by path of the loop.
+        correlation: Correlation of the varied parameters by a normal copula; None for independent ones.
         failures: Bounds by metric: a run with a greater value fails.
     """
 
@@ -114,7 +121,7 @@ def read_sweep_section(
 ) -> SweepSection:
     """Return the sweep that a section describes.
 
-    Files of numbers are read at once, so the result does not depend on them.
+    Files of numbers are read now, so later changes of the files have no effect.
 
     Args:
         table: Values of the section.

@@ -107,11 +107,12 @@ class Goal:
         return plain_fields(self) | {"free": free}
 
     def check(self, loop: Loop) -> "Goal":
-        """Return this goal if `loop` can be tuned with it.
+        """Return this goal unchanged if `loop` can be tuned with it.
 
         Raises:
             ScenarioError: No parameter is free, no metric has a weight, or a start is not inside its range. Also raised
-                if a run's initial speed is at or below the stop's.
+                if the
+                initial speed of a run is not above the speed at which runs stop.
         """
         for name, example in (("free", '"controller.gain" = [-20000.0, -80.0]'), ("objective", "iae = 1.0")):
             if not getattr(self, name):
@@ -126,7 +127,10 @@ class Goal:
         return self
 
     def batch(self, seed: int) -> Batch:
-        """Return the batch of runs; all runs have the noise of `seed`."""
+        """Return the runs as a batch: all combinations of [tune.over], or its Latin hypercube.
+
+        It has one run without [tune.over]. All runs have the same noise, from `seed`.
+        """
         if not self.over:
             lanes = grid({})
         elif self.samples:
@@ -136,7 +140,7 @@ class Goal:
         return dataclasses.replace(lanes, keys=(seed,) * max(lanes.size, 1))
 
     def read_aggregate(self) -> risk.Aggregate:
-        """Return the aggregate, which maps one number per run to one number."""
+        """Return the aggregate: it maps the objective of each run to a single number."""
         return read_one(risk.AGGREGATE_TYPES, self.aggregate, "tune.aggregate")
 
 
@@ -196,7 +200,9 @@ def _entries(table: JsonObject, section: str, loop: Loop) -> Iterable[ParameterE
 
 
 def free_ranges(table: JsonObject, loop: Loop, section: str) -> dict[str, Ends | None]:
-    """Return the ranges of the free parameters by path of the loop, in SI; None for a declared range.
+    """Return the ranges (low, high) of the free parameters by path of the loop, in SI; None for a declared range.
+
+    Each end is a number, or a tuple where a list was given for a parameter that is a list.
 
     Args:
         table: Ranges as given, by path.
@@ -219,9 +225,9 @@ def _over(table: JsonObject, loop: Loop) -> dict[str, tuple[float, ...]]:
 
 
 def check_starts(loop: Loop, free: Mapping[str, Ends | None], section: str) -> None:
-    """Check that each free parameter starts inside its range.
+    """Check that each free parameter starts strictly inside its range.
 
-    A start at an end of the range cannot move: the coordinate of the parameter is infinite there.
+    A parameter that starts at an end of its range could not move: its coordinate in the tuning is infinite there.
 
     Args:
         loop: Loop with the values at the start.
