@@ -170,7 +170,7 @@ def forget_replaced_part(table: JsonObject, replaced: str) -> None:
 def join_path_keys(keys: list[str]) -> list[str]:
     """Return the keys of an override, with a parameter path joined to one key.
 
-    For example `tune.free.plant.mass` becomes ["tune", "free", "plant.mass"]. Keys outside of the tables with parameter
+    For example "tune.free.plant.mass" becomes ["tune", "free", "plant.mass"]. Keys outside of the tables with parameter
     keys are returned as they are.
 
     Args:
