@@ -71,7 +71,7 @@ class DelayMemory(NamedTuple):
         known: Number of valid pieces in the window.
         place: Index in the window of the first piece that the present step may read.
         last: Index in the window of the last piece that the present step may read.
-        until: Time up to which the present step may read, minus the delay [s].
+        until: Command time up to which the present step may read [s]; the delay reaches it at `until` + time.
         first: Index in the ring of the window's first piece.
         count: Number of pieces in the ring from `first` on.
         newest: Row of the newest piece.
@@ -90,10 +90,11 @@ class DelayMemory(NamedTuple):
 
 @pytree
 class Delay:
-    """A pure delay, control(t) = command(t - time), between one step and capacity - 2 steps long.
+    """A pure delay, control(t) = command(t - time), and 0 for t < time.
 
+    The delay lies between one step and capacity - 2 steps of the integration.
     The ring has spare rows for events that cut every fourth of these steps. A run with more events within one delay has
-    diverged.
+    diverged: its control becomes NaN.
 
     Attributes:
         time: Delay [s], > 0.
@@ -117,7 +118,7 @@ class Delay:
         )
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """Return the delayed command; beyond the next break, its linear extrapolation."""
+        """Return command(t - time) [control]; past the pieces that the step may read, a linear extrapolation."""
         del signal
         m: DelayMemory = memory.held
         piece = _piece(m.window, self._place(t, m))
@@ -126,7 +127,7 @@ class Delay:
         return piece.command(within) + (x - within) * piece.command.end_slope
 
     def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: PyTree) -> tuple[PyTree]:
-        """Return the time until the next break leaves the delay, or until the step needs pieces beyond the window."""
+        """Return the time [s] until the next break leaves the delay, or until the window runs out of pieces."""
         del signal, rate
         return (memory.held.until + self.time - t,)
 
@@ -138,7 +139,10 @@ class Delay:
         return memory._replace(held=self._aim_at_break(m._replace(place=jnp.where(out, m.last + 1, m.place))))
 
     def record(self, memory: Memory, passage: Passage) -> Memory:
-        """Return the memory with the finished step stored; a step of zero length is not stored."""
+        """Return the memory with the finished step of `passage` stored as a piece.
+
+        A step of zero length is not stored.
+        """
         m: DelayMemory = memory.held
         h, free = passage.end - passage.start, _ring_place(m.first + m.count, m.ring.size)
         before = Piece.of(jax.lax.stop_gradient(m.newest))
@@ -152,8 +156,9 @@ class Delay:
         return memory._replace(held=m._replace(ring=m.ring.put(free, row), newest=newest, count=count))
 
     def tick(self, clock: Clock, memory: Memory, signal: Scalar) -> Memory:
-        """Return the memory with the window moved to time t. If the delay is one step, a break at t itself has left the
-        delay.
+        """Return the memory with the window moved to time t of the clock.
+
+        If the delay is one step, a break at t itself has left the delay.
         """
         del signal
         m: DelayMemory = memory.held
@@ -171,7 +176,10 @@ class Delay:
         return self._aim_at_break(m._replace(place=jnp.where(out, m.last + 1, m.place)))
 
     def enable_derivatives(self, names: set[str]) -> "Delay":
-        """Return the delay to use for derivatives with respect to the parameters in `names`."""
+        """Return the delay for derivatives with respect to the parameters in `names`.
+
+        This is the delay itself unless `names` contains "time".
+        """
         return _InEvents(time=self.time, capacity=self.capacity) if "time" in names else self
 
     def _place(self, t: Scalar, m: DelayMemory) -> PyTree:
@@ -191,11 +199,11 @@ class Delay:
         return m._replace(last=last, until=until + jnp.where(newest, 1.0, -1.0) * _time_tolerance(until + self.time))
 
     def refined(self, times: int) -> "Delay":
-        """Return the delay with capacity for a step that is `times` times shorter."""
+        """Return the same delay with `times` times the capacity, for a step that is `times` times shorter."""
         return dataclasses.replace(self, capacity=times * self.capacity)  # pyright: ignore[reportArgumentType]
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
-        """Yield the rule that the ring holds the delay, up to the rounding of single precision."""
+        """Yield the rule step <= time <= (capacity - 2) * step, up to the rounding of single precision."""
         most, time = (self.capacity - 2) * step, as_rule_array(self.time)
         outside = f"outside [{step:g}, {most:g}] s, one step to capacity - 2 steps"
         yield Rule(

@@ -21,7 +21,7 @@ class Limits:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """Return the control, for a brake its torque [N m]."""
+        """Return the clamped command, for a brake its torque [N m]."""
         del t, memory
         return clamp(signal, self.low, self.high)
 
@@ -61,6 +61,10 @@ class RateLimit:
     """control' = clamp((command - control)/time_constant, -rate, rate), control(0) = 0.
 
     This models a servo whose speed saturates. As time_constant goes to 0, the model becomes the ideal rate limiter.
+
+    Attributes:
+        rate: Greatest |control'| [control/s], > 0.
+        time_constant: Time constant of the servo below this rate [s], > 0.
     """
 
     rate: Scalar = param(default=1000.0, unit="control/s", above=0.0)

@@ -26,7 +26,7 @@ DEFAULT_BALANCE_GAIN = (24208.064, 2293.1921, 7667.1, 8683.2995, 889.36867, 2860
 
 
 def state_of(output: BalanceOutput) -> PyTree:
-    """Return the state x = (theta, psi, phi, theta', psi', phi') of a plant output, shape (6,).
+    """Return the state x = (theta, psi, phi, theta', psi', phi') from a plant output, shape (6,).
 
     Args:
         output: Output of the plant, angles in rad and rates in rad/s.
@@ -46,7 +46,7 @@ class BalanceFeedback:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the voltage [V]."""
+        """Return u = K x [V], without a limit. An actuator such as `VoltageLimit` limits it."""
         del t, memory
         terms = [k * getattr(signal.measured, name) for k, name in zip(self.gain, STATE_NAMES, strict=True)]
         return sum(terms[1:], terms[0])
@@ -70,10 +70,10 @@ class ObserverMemory(NamedTuple):
 
 @pytree
 class ObserverFeedback:
-    """u = K x^, where a steady-state Kalman filter in discrete time estimates x^ from theta and psi. The prediction
-    uses the voltage after its limit.
+    """u = K x^: a steady-state Kalman filter in discrete time estimates the state x^ from theta and psi.
 
-    Without `Sampled`, the observer computes in every step of the integration.
+    The prediction uses the voltage clamped to +-voltage_max. The output itself has no limit.
+    Without `Sampled`, the observer computes in every step of the integration, so A and B must be those of this step.
 
     Attributes:
         gain: K, shape (6,) [V/rad, V s/rad].
@@ -93,18 +93,18 @@ class ObserverFeedback:
     flow = no_flow
 
     def start(self, signal: Tracking) -> Memory:
-        """Return the measured angles as the first estimate; phi and all rates are 0."""
+        """Return the measured angles as the estimate, with phi, all rates and the voltage 0."""
         zero = 0.0 * signal.target
         angles = [getattr(signal.measured, name) if name in MEASURED_NAMES else zero for name in STATE_NAMES]
         return Memory(held=ObserverMemory(jnp.stack(angles), zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the voltage [V]."""
+        """Return u = K x^ [V] for the latest estimate, without a limit; 0 before the first tick."""
         del t, signal
         return memory.held.voltage
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """Return the estimate after one sample; the first sample sets it to the measured angles.
+        """Return the estimate after one sample; the first sample sets it to the measured angles with zero rates.
 
         The memory from `start` cannot serve as the first estimate, because a sensor adds no noise before its first
         sample.

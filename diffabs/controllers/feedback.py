@@ -21,7 +21,14 @@ from diffabs.core.types import Part
 
 @pytree
 class StateFeedback:
-    """u = clamp(ff + k1 x1 + k2 x2, torque_min, torque_max). The default gain is the paper's (section 4)."""
+    """u = clamp(ff + k1 x1 + k2 x2, torque_min, torque_max). The default gain is the paper's (section 4).
+
+    Attributes:
+        gain: (k1, k2), of the integral and of the slip error, shape (2,) [control/signal/s, control/signal].
+        torque_min: Lower limit of the control.
+        torque_max: Upper limit of the control.
+        antiwindup: Anti-windup strategy of the integral.
+    """
 
     gain: Vector = param(default=(-11753.0, -48.0), unit="control/signal/s, control/signal")
     torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
@@ -33,13 +40,13 @@ class StateFeedback:
         return Memory(flow=0.0 * signal.measured[0])
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return x1' = slip - target, as modified by the anti-windup strategy."""
+        """Return x1' = slip - target, in the signal's unit, as modified by the anti-windup strategy."""
         raw, limited = self._torque(memory, signal)
         error = signal.measured[0] - signal.target
         return self.antiwindup.rate(error, self.gain[0], raw, limited)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the control, for a brake its torque [N m]."""
+        """Return the limited control, for a brake its torque [N m]."""
         return self._torque(memory, signal)[1]
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:

@@ -11,17 +11,22 @@ class ConstantInput:
     value: Scalar = param(default=0.0, unit="control")
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Scalar:
-        """Return the constant, in the unit of the plant's control."""
+        """Return `value`, in the unit of the plant's control."""
         del plant, output, target
         return self.value
 
 
 @pytree
 class HoldingInput:
-    """The plant's own equilibrium input at the target: tau* of Maeda and Sugiura. It follows a swept mass or road, as
-    for a controller with exact parameters.
+    """The control that holds the plant in equilibrium at the setpoint: tau* of Maeda and Sugiura.
+
+    It uses the plant's own parameters, so it follows a swept mass or road, as for a controller with exact parameters.
+    The other conditions, such as speed and distance, are the measured ones.
     """
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Scalar:
-        """Return tau*, in the unit of the plant's control."""
+        """Return tau* = plant.holding(output, target), in the unit of the plant's control.
+
+        `output` is the measured output. `target` is the reference's final value (`setpoint`), not its present output.
+        """
         return plant.holding(output, target)

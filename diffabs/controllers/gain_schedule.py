@@ -46,11 +46,19 @@ class ScheduledFeedback:
     start, limits = StateFeedback.start, StateFeedback.limits
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return x1' = slip - target, as modified by the anti-windup strategy."""
+        """Return x1' = slip - target, in the signal's unit, as modified by the anti-windup strategy.
+
+        Raises:
+            ValueError: `speeds`, `integral_gains` and `gains` differ in shape.
+        """
         return self._here(signal).flow(t, memory, signal)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the control, for a brake its torque [N m]."""
+        """Return the limited control with the gains at the measured speed, for a brake its torque [N m].
+
+        Raises:
+            ValueError: `speeds`, `integral_gains` and `gains` differ in shape.
+        """
         return self._here(signal).output(t, memory, signal)
 
     def _here(self, signal: Tracking) -> StateFeedback:
@@ -89,6 +97,9 @@ class ProportionalFeedback:
     Attributes:
         gain: (k1, k2) at v0 [control/signal/s, control/signal].
         reference_speed: v0 [m/s], > 0.
+        torque_min: Lower limit of the control.
+        torque_max: Upper limit of the control.
+        antiwindup: Anti-windup strategy of the integral.
     """
 
     gain: Vector = param(default=(-11753.0, -158.0), unit="control/signal/s, control/signal")

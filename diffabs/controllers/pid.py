@@ -35,7 +35,17 @@ class PIDMemory(NamedTuple):
 
 @pytree
 class PID:
-    """u = clamp(ff + kp e + kI I + kD wc (e - d), low, high); by default both limits are infinite."""
+    """u = clamp(ff + kp e + kI I + kD wc (e - d), low, high); by default both limits are infinite.
+
+    Attributes:
+        kp: Proportional gain [control/signal].
+        ki: Integral gain kI [control/signal/s].
+        kd: Derivative gain kD [control s/signal].
+        cutoff: Corner frequency wc of the derivative filter [rad/s].
+        low: Lower limit of the control.
+        high: Upper limit of the control.
+        antiwindup: Anti-windup strategy of the integral.
+    """
 
     kp: Scalar = param(default=3893.0, unit="control/signal", low=0.0)
     ki: Scalar = param(default=0.0, unit="control/signal/s", low=0.0)
@@ -51,14 +61,14 @@ class PID:
         return Memory(flow=PIDMemory(zero, zero))
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> PIDMemory:
-        """Return I' and d'."""
+        """Return I' [signal], as modified by the anti-windup strategy, and d' [signal/s]."""
         raw, limited = self._torque(memory, signal)
         error = signal.target - signal.measured[0]
         integral = self.antiwindup.rate(error, self.ki, raw, limited)
         return PIDMemory(integral, self.cutoff * (error - memory.flow.filtered))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the control, in the plant's unit."""
+        """Return the limited control, in the plant's unit."""
         return self._torque(memory, signal)[1]
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:

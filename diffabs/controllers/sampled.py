@@ -34,10 +34,10 @@ class SampledMemory(NamedTuple):
 
     Attributes:
         inner: Memory of the inner controller.
-        applied: Output that is applied.
-        next: Output that waits for the end of the delay.
+        applied: Output applied now [control].
+        next: Output of the latest sample [control]; it is applied at the end of the delay.
         until: Time at which `next` is applied [s].
-        waits: 1 while `next` waits, else 0.
+        waits: 1 until `next` is applied, else 0.
     """
 
     inner: Memory
@@ -49,8 +49,9 @@ class SampledMemory(NamedTuple):
 
 @pytree
 class Sampled:
-    """`controller` evaluated every `period`, with its output applied `delay` later. The period is a multiple of the
-    integration step.
+    """`controller` evaluated every `period`, with its output applied `delay` later and held.
+
+    The period must be a whole multiple of the integration step.
 
     Attributes:
         controller: Controller that the computer runs.
@@ -65,18 +66,22 @@ class Sampled:
     flow = no_flow
 
     def start(self, signal: Tracking) -> Memory:
-        """Return the memory with output zero until the first sample has been computed."""
+        """Return the memory with output 0, which applies until the first sample's output replaces it."""
         signal = replace_nan(signal)
         zero = 0.0 * signal.target
         return Memory(held=SampledMemory(self.controller.start(signal), zero, zero, zero, zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the held output."""
+        """Return the held output [control]."""
         del t, signal
         return memory.held.applied
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """Return the memory after a sampling instant: compute a new output, and apply an output that still waits."""
+        """Return the memory after a sampling instant, where the controller computes a new output.
+
+        With delay 0 the new output applies at once. Otherwise it waits for an event, and an output that still waits is
+        applied now. At all other instants the memory stays the same.
+        """
         m: SampledMemory = memory.held
         now, number = clock.ticks(self.period)
         inner, output, _ = self.compute_guarded(clock._replace(h=self.period, k=number), m.inner, m.next, signal)
@@ -86,12 +91,14 @@ class Sampled:
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m))
 
     def compute_sample(self, clock: Clock, memory: Memory, signal: Tracking) -> tuple[Memory, Scalar]:
-        """Return the inner controller's memory after one sample, and its output.
+        """Return the inner controller's memory for the next sample, and its output at this one.
+
+        The output comes before the Euler step of length `clock.h`, but after the inner controller's events and tick.
 
         Args:
-            clock: Clock of the sampling period: its h is the period.
+            clock: Clock of the sampling period: its h is the period [s], its k the number of the sample.
             memory: Inner controller's memory before the sample.
-            signal: The sample.
+            signal: The sample: target, measured output and feed-forward.
         """
         inner = self._update_memory(clock, memory, signal)
         output = self.controller.output(clock.t, inner, signal)
@@ -101,14 +108,15 @@ class Sampled:
     def compute_guarded(
         self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking, lost: Bool = False
     ) -> tuple[Memory, Scalar, PyTree]:
-        """Return the result of `compute_sample` for a usable sample, else the old memory and output, and whether the
-        sample is skipped.
+        """Return inner memory, output, and True if the sample is skipped, where memory and output stay the same.
+
+        A sample is skipped if it is lost, if a number that the controller reads is NaN, or if a result is not finite.
 
         Args:
-            clock: Clock of the sampling period: its h is the period.
+            clock: Clock of the sampling period: its h is the period [s], its k the number of the sample.
             memory: Inner controller's memory before the sample.
-            last: Output of the previous sample.
-            signal: The sample.
+            last: Output of the previous sample [control].
+            signal: The sample: target, measured output and feed-forward.
             lost: True skips the sample in any case.
         """
         # Compute with finite inputs even for a skipped sample. Otherwise NaN would reach the derivatives through the
@@ -130,7 +138,10 @@ class Sampled:
         return jnp.greater(self.delay, 0)
 
     def enable_derivatives(self, names: set[str]) -> "Sampled":
-        """Return the controller to use for derivatives with respect to the parameters in `names`."""
+        """Return the controller for derivatives with respect to the parameters in `names`.
+
+        This is the controller itself unless `names` contains "delay". For this name, an event applies every output.
+        """
         if "delay" not in names:
             return self
         return _AlwaysWaits(controller=self.controller, period=self.period, delay=self.delay)
@@ -146,12 +157,12 @@ class Sampled:
         return t + self.delay - jax.lax.stop_gradient(early)
 
     def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: PyTree) -> tuple[PyTree]:
-        """Return the time until the output changes."""
+        """Return the time until the waiting output applies [s], or 1 if no output waits."""
         del signal, rate
         return (jnp.where(memory.held.waits > 0.5, memory.held.until - t, 1.0),)
 
     def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[PyTree]) -> Memory:
-        """Return the memory after the waiting output is applied."""
+        """Return the memory after the waiting output has become the applied one."""
         del t, signal
         m: SampledMemory = memory.held
         applied, waits = jnp.where(fired[0], m.next, m.applied), jnp.where(fired[0], 0.0, m.waits)
@@ -199,7 +210,7 @@ class _AlwaysWaits(Sampled):
 
 
 def inner_controller(controller: Part) -> PyTree:
-    """Return the controller that a computer runs, or the controller itself if it is not `Sampled`.
+    """Return the controller inside a `Sampled`; any other controller, also `SampledOnGrid`, is returned unchanged.
 
     Args:
         controller: Any controller.
@@ -208,10 +219,10 @@ def inner_controller(controller: Part) -> PyTree:
 
 
 def within_period(controller: Part, delay: Scalar, period: Scalar) -> Iterator[Rule]:
-    """Yield the rules between a sampling period and the controller computed in it.
+    """Yield the rules delay <= period and, for a controller with a `cutoff`, cutoff < 2 / period.
 
     Args:
-        controller: Inner controller; a `cutoff` adds the rule for its filter.
+        controller: Inner controller.
         delay: Computing time [s].
         period: Sampling period [s].
     """

@@ -28,10 +28,10 @@ class GridMemory(NamedTuple):
 
     Attributes:
         inner: Memory of the inner controller.
-        next: Latest output.
-        last: Output before the latest.
+        next: Output of the latest sample [control].
+        last: Output of the sample before it [control].
         until: Time until which `last` is applied [s].
-        applied: Output in the present step.
+        applied: Mean output in the present step [control].
     """
 
     inner: Memory
@@ -45,6 +45,11 @@ class GridMemory(NamedTuple):
 class SampledOnGrid:
     """`controller` evaluated every `sampling_period`, with its output applied `delay` later. In the step of the change
     it applies the mean over the step.
+
+    Attributes:
+        controller: Controller that the computer runs.
+        sampling_period: Sampling period [s], > 0, a whole multiple of the integration step.
+        delay: Computing time [s], 0 <= delay <= sampling_period.
     """
 
     controller: Block = part(default=PID)
@@ -59,19 +64,21 @@ class SampledOnGrid:
     _update_memory = Sampled._update_memory
 
     def start(self, signal: Tracking) -> Memory:
-        """Return the memory with output zero until the first sample has been computed."""
+        """Return the memory with output 0, which applies until the first sample's output replaces it."""
         signal = replace_nan(signal)
         zero = 0.0 * signal.target
         return Memory(held=GridMemory(self.controller.start(signal), zero, zero, zero, zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the mean output over the present step."""
+        """Return the mean output over the present step [control]."""
         del t, signal
         return memory.held.applied
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """Return the memory with a new output at a sampling instant, and with the mean output until the next grid
-        instant.
+        """Return the memory for the step that begins now, with a new output at a sampling instant.
+
+        At every grid instant it sets the mean output over the coming step. Between grid instants the memory stays the
+        same.
         """
         m: GridMemory = memory.held
         now, number = clock.ticks(self.sampling_period)

@@ -14,7 +14,7 @@ from diffabs.core.types import PyTree
 
 @pytree
 class ConstantTorque:
-    """u = torque: a driver who brakes fully, without anti-lock control."""
+    """u = torque, regardless of the target: a driver who brakes fully, without anti-lock control."""
 
     torque: Scalar = param(default=90.0, unit="control")
 
@@ -33,6 +33,11 @@ class Relay:
 
     An event locates each switch where the slip crosses the edge of the band, also between grid instants. The memory is
     1 while the brake is applied, else 0.
+
+    Attributes:
+        band: Half width of the hysteresis [signal], between 0 and 1.
+        torque_min: Control with the brake released.
+        torque_max: Control with the brake applied, > torque_min.
     """
 
     band: Scalar = param(default=0.02, unit="signal", above=0.0, below=1.0)
@@ -52,13 +57,17 @@ class Relay:
         return self.torque_min + memory.held * (self.torque_max - self.torque_min)
 
     def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: PyTree) -> tuple[PyTree]:
-        """Return the distance from the slip to the edge of the band where the relay switches."""
+        """Return the signed distance to the switching edge, in the signal's unit: positive before the edge, negative
+        beyond.
+
+        The edge is target + band while the brake is applied, else target - band.
+        """
         del t, rate
         excess = signal.measured[0] - signal.target
         return (self.band + jnp.where(memory.held > 0.5, -excess, excess),)
 
     def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[PyTree]) -> Memory:
-        """Return the memory after a switch: the brake released or applied."""
+        """Return the memory with the brake toggled if the event has fired."""
         del t, signal
         return Memory(held=jnp.where(fired[0], 1.0 - memory.held, memory.held))
 
@@ -73,6 +82,12 @@ class SlidingMode:
 
     First-order sliding mode with a boundary layer. By default both limits are infinite.
 
+    Attributes:
+        gain: Greatest distance of the control from the feed-forward [control].
+        boundary: Half width of the boundary layer [signal].
+        low: Lower limit of the control.
+        high: Upper limit of the control.
+
     Source: Slotine and Li, Applied Nonlinear Control, sec. 7.2.
     """
 
@@ -85,7 +100,7 @@ class SlidingMode:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the control, for a brake its torque [N m]."""
+        """Return the limited control, for a brake its torque [N m]."""
         del t, memory
         inside = clamp((signal.target - signal.measured[0]) / self.boundary, -1.0, 1.0)
         return clamp(signal.feedforward + self.gain * inside, self.low, self.high)

@@ -55,7 +55,13 @@ class Words:
         self._taken = {*TAKEN, real}
 
     def operations(self, nodes: Sequence[Node], indent: str) -> Iterator[str]:
-        """Yield the declarations that compute `nodes`, operands first, each line after `indent`."""
+        """Yield a C declaration for each of the `nodes`, which come operands first; every line begins with `indent`.
+
+        Constants and inputs need none.
+
+        Raises:
+            Unsupported: An operation has no translation to C.
+        """
         for node in nodes:
             if node.op in ("const", "input"):
                 continue
@@ -134,7 +140,7 @@ class Words:
 
 
 def is_name(name: str) -> bool:
-    """Return whether a name is an identifier in C that may name a function.
+    """Return whether a text can name a function in C: an ASCII letter, then letters, digits and _, and no keyword.
 
     Args:
         name: Text to test.
@@ -154,7 +160,7 @@ def identifier(path: str) -> str:
 
 
 def identifiers(paths: Iterable[str]) -> dict[str, str]:
-    """Return unique identifiers of C, by path.
+    """Return a dictionary from each path to an identifier of C; all identifiers differ.
 
     Args:
         paths: Texts such as paths in a pytree.
@@ -164,7 +170,7 @@ def identifiers(paths: Iterable[str]) -> dict[str, str]:
 
 
 def fresh_name(name: str, taken: set[str]) -> str:
-    """Return a name that is not in `taken`, with a number if necessary, and add it to `taken`.
+    """Return `name`, or `name` with a number such as name_2 if it is in `taken`, and add the result to `taken`.
 
     Args:
         name: Preferred name.
@@ -178,7 +184,7 @@ def fresh_name(name: str, taken: set[str]) -> str:
 
 
 def comment_text(text: str) -> str:
-    """Return a text in a form that is safe in a comment of any language: one line, all unsafe characters as `_`.
+    """Return a text that is safe in a comment of any language: one line, with `_` for each unsafe character.
 
     Args:
         text: Text of a comment.

@@ -3,7 +3,7 @@
     memory, measured --> target, feed-forward, controller --> memory, command
 
 The functions are the loop's own code, traced: reference, feed-forward and the controller within `Sampled`
-(`Sampled.guarded`).
+(`Sampled.compute_guarded`).
 The parameters of these three remain variables. Those of the plant, period and delay become constants.
 A target that moves by itself, such as a filtered one, is advanced by the Runge-Kutta steps of the simulation.
 Sensors and actuators belong to the machine, not to the computer.
@@ -32,15 +32,15 @@ MAX_STEPS_PER_SAMPLE = 64  # simulation steps in a period, for a target that mov
 
 
 class NotExported(ValueError):
-    """An error: a loop cannot be exported. The message says why, in one line."""
+    """An error: a loop cannot be exported. The message gives the reason in one line."""
 
 
 class Input(NamedTuple):
     """The input of one period.
 
     Attributes:
-        measured: Measured outputs.
-        target: Target, if it comes from outside.
+        measured: Measured outputs, a tuple such as `BrakeOutput`.
+        target: Target in the unit of the plant's first output, if it comes from outside; else empty.
     """
 
     measured: PyTree
@@ -52,9 +52,9 @@ class State(NamedTuple):
 
     Attributes:
         controller: Memory of the controller.
-        samples: Number of samples so far.
-        command: Last command.
-        reference: Memory of the reference.
+        samples: Number of samples so far (int64).
+        command: Last command, in the unit of the control.
+        reference: Memory of the reference, empty if the target comes from outside.
     """
 
     controller: Memory
@@ -75,8 +75,8 @@ class DeviceParameter(NamedTuple):
     """A parameter of a part.
 
     Attributes:
-        path: Path in the loop.
-        value: Value, (...).
+        path: Path in the loop, such as controller.controller.kp.
+        value: Value, of the parameter's shape.
         spec: Unit and range.
     """
 
@@ -91,7 +91,7 @@ class DeviceParameter(NamedTuple):
         return f"{self.path} = {values}{'' if self.spec.unit in ('', '1') else f' {self.spec.unit}'}"
 
     def name_entries(self) -> Iterator[tuple[str, str]]:
-        """Yield name and description (unit and range) of each number, as in the exported code."""
+        """Yield, for each number of the value, its name in the exported code and a description (unit and range)."""
         # Twice: the controller stands within `Sampled`, which itself is the loop's controller.
         path = self.path.removeprefix("controller.").removeprefix("controller.")
         units = [unit.strip() for unit in self.spec.unit.split(",")]
@@ -104,15 +104,16 @@ class DeviceParameter(NamedTuple):
 class ComputerProgram:
     """The computer's part of a loop as functions to trace.
 
-    A program calls `start` once before the first sample, `step` at each sample, and then `move` `moves` times.
-    Shapes are those of numbers of `dtype`.
+    A program calls `start` once before the first sample. At each sample it calls `step` once, and then `move` `moves`
+    times.
+    All shapes are `jax.ShapeDtypeStruct`s with the real type `dtype`.
 
     Attributes:
         start: start(parts, input) -> state.
         step: step(parts, state, input) -> (controller's memory, samples, command, held).
-            `held` is true if the sample cannot be used, so that memory and command stay.
-        move: move(parts, state, i) -> reference's memory, for i = 0, 1, ...
-        moves: Number of calls of `move` after each sample.
+            `held` is true if the sample cannot be used. Memory and command then stay the same, but `samples` counts it.
+        move: move(parts, state, i) -> reference's memory after the i-th simulation step, for i = 0, 1, ..., moves - 1.
+        moves: Number of calls of `move` after each sample; 0 for a reference without continuous memory.
         units: Units of the inputs by name.
         input: Shapes of the input.
         state: Shapes of the state.
@@ -142,18 +143,18 @@ class ComputerProgram:
 def computer_program(
     loop: Loop, *, step: float | None = None, dtype: Any = np.float64, given_target: bool = False
 ) -> ComputerProgram:
-    """Return the computer's part of a loop whose controller is `Sampled`.
+    """Return the computer's part of a loop whose controller is `Sampled` or `SampledOnGrid`.
 
     Args:
         loop: Closed loop.
         step: Step of the simulation [s], by which a target that moves by itself is advanced; by default the period.
-        dtype: Type of the real numbers.
-        given_target: Whether the target is an input.
+            The number of steps in a period is rounded to a whole number.
+        dtype: Type of the real numbers, np.float32 or np.float64.
+        given_target: True makes the target an input and leaves the reference out.
 
     Raises:
-        NotExported: The controller runs in continuous time, the reference follows measurements without `given_target`,
-            or
-            a period has more than MAX_STEPS_PER_SAMPLE steps.
+        NotExported: The controller runs in continuous time, or a period has more than MAX_STEPS_PER_SAMPLE steps.
+            Without `given_target`, also a reference that follows measurements, ticks or has events.
     """
     loop = with_sampled_controller(loop)
     controller: Part = loop.controller
@@ -197,13 +198,13 @@ def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Itera
 
 
 def with_sampled_controller(loop: Loop) -> Loop:
-    """Return the loop with its controller as `Sampled`; `SampledOnGrid` is equivalent on a computer.
+    """Return the loop with a `Sampled` controller; a `SampledOnGrid` becomes the `Sampled` with the same times.
 
     Args:
         loop: Closed loop.
 
     Raises:
-        NotExported: The controller runs in continuous time.
+        NotExported: The controller is neither of the two, so it runs in continuous time.
     """
     controller: Part = loop.controller
     if isinstance(controller, SampledOnGrid):

@@ -14,16 +14,19 @@ def difference_equations(loop: Loop, target: Scalar = None) -> JsonObject:
     """Return the coefficients of the controller, linearized at rest on the setpoint.
 
     x(k+1) = F x(k) + G y(k) and u(k) = H x(k) + J y(k), all as differences from rest.
+    The inputs y are not only measurements: "target" and "feedforward" are inputs, too.
+    An input without any nonzero coefficient is left out. The computing delay is not in the equations.
 
     Args:
-        loop: Closed loop whose controller is sampled.
+        loop: Closed loop whose controller is `Sampled` or `SampledOnGrid`.
         target: Setpoint, in the unit of the plant's first output; None for the loop's own.
 
     Returns:
-        A dictionary with F (n, n), G (n, m), H (n,), J (m,), the names of y ("inputs") and the period [s].
+        A dictionary with lists "F" (n, n), "G" (n, m), "H" (n,), "J" (m,), the m names of y as "inputs", and the
+        "period" [s].
 
     Raises:
-        NotExported: The controller runs in continuous time, or the loop has no linear model.
+        NotExported: The controller runs in continuous time, or the loop has no linear model at rest on the setpoint.
     """
     loop = with_sampled_controller(loop)
     try:

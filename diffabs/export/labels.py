@@ -52,7 +52,7 @@ class Labelled(Graph):
 
 
 def source_label(eqn: JaxprEqn) -> str:
-    """Return the name that the source gives to the result of an operation; empty if unknown.
+    """Return the variable's or function's name that the source gives to an operation's result; empty if unknown.
 
     Args:
         eqn: Equation of a jaxpr.

@@ -28,14 +28,16 @@ class Lowered:
     Attributes:
         inputs, numbers, state: Input nodes of measurements, parameters and memory, by name.
         values: Initial values of the parameters, by name.
-        begun: Memory before the first sample, by name.
-        after: Memory after a sample, by name.
-        moving: Memory after one simulation step of the reference, by name; it repeats `moves` times a sample.
-        place: Counter of these steps.
+        begun: Nodes of the memory before the first sample, by name.
+        after: Nodes of the memory after a sample, by name.
+        moving: Nodes of the reference's memory after one simulation step, by name; they repeat `moves` times a sample.
+        place: Node of the counter of these steps.
         command: Node of the command.
-        held: Node of the truth that the sample cannot be used.
-        kept, read, used: Names of memory, inputs and parameters that a command depends on, at once or later.
-        stored: Memory after a sample for the names in `kept`, without `moving`.
+        held: Boolean node: the sample cannot be used.
+        kept: Names of the memory that the command depends on, at once or later.
+        read: Names of the inputs that the kept memory depends on.
+        used: Names of the parameters that the kept memory depends on.
+        stored: Nodes of the memory after a sample for the names in `kept`, without `moving`.
     """
 
     def __init__(self, found: ComputerProgram):
@@ -93,13 +95,13 @@ class Lowered:
 
 
 def number_leaves(shape: PyTree, graph: Graph, where: str, flat: PyTree) -> dict[str, Node]:
-    """Return an input node for each number of a pytree, by name.
+    """Return an input node for each number in a pytree's leaves, by name.
 
     Args:
         shape: Pytree of shapes and types.
         graph: Graph that receives the nodes.
         where: Origin of the inputs, the first entry of a node's `attr`.
-        flat: Function path -> name.
+        flat: Function path -> name; a path such as measured.slip or gain.0.
     """
     found: dict[str, Node] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(shape):
@@ -111,11 +113,11 @@ def number_leaves(shape: PyTree, graph: Graph, where: str, flat: PyTree) -> dict
 
 
 def fill_shapes(shape: PyTree, nodes: dict[str, Node]) -> list[Array]:
-    """Return some nodes as arrays in the shapes of a pytree's leaves.
+    """Return a pytree's leaves as arrays of nodes, filled in order.
 
     Args:
         shape: Pytree of shapes.
-        nodes: Nodes in the order of the leaves' entries.
+        nodes: Nodes in the order of the leaves' entries, one for each number.
     """
     left, arrays = iter(nodes.values()), []
     for leaf in jax.tree.leaves(shape):
@@ -127,13 +129,18 @@ def fill_shapes(shape: PyTree, nodes: dict[str, Node]) -> list[Array]:
 
 
 def trace_outputs(graph: Labelled, function: Any, shape: PyTree, inputs: list[Array]) -> list[Node]:
-    """Return the results of a function, number by number; arrays it closes over become constants.
+    """Return the results of a function as one list of nodes, leaf by leaf and entry by entry.
+
+    Arrays that the function closes over become constants.
 
     Args:
         graph: Graph that receives the nodes.
         function: Function of one pytree.
         shape: Pytree of shapes and types of its argument.
         inputs: Arrays of nodes for the leaves of the argument.
+
+    Raises:
+        Unsupported: An operation has no lowering rule.
     """
     closed = jax.make_jaxpr(function)(shape)
     graph.labels = {id(eqn): source_label(eqn) for eqn in closed.jaxpr.eqns}

@@ -38,20 +38,21 @@ CAUSES = {
 
 
 def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str = "") -> bytes:
-    """Return the plant of a loop as the bytes of an FMU.
+    """Return an FMU of a loop's plant as the bytes of its zip archive; it runs on this kind of machine.
 
-    The control is the input, and the signals that the plant shows are the outputs.
-    Every number of the plant and its start is a parameter that the importing tool may set.
+    The control is the input, and the signals of the plant's output are the outputs.
+    Every number of the plant and of its initial condition is a parameter that the importing tool may set.
 
     Args:
-        loop: Closed loop.
+        loop: Closed loop; controller, sensor and actuator are not part of the FMU.
         name: Name of the model, an identifier of C.
         step: Largest step of the plant's Runge-Kutta method [s].
         duration: Default duration of an experiment [s].
         about: Description, one line.
 
     Raises:
-        NotExported: The name is no identifier, an operation has no translation, or no C compiler works.
+        NotExported: The name is no identifier, an operation has no translation, a state is not a real number, or no C
+            compiler works.
     """
     if not is_name(name):
         raise NotExported(f"{name!r} is no name that C has for a function: letters, digits and _")

@@ -31,10 +31,10 @@ class FmuVariable(NamedTuple):
     """A variable of the FMU.
 
     Attributes:
-        name: Name, with the path of a parameter.
+        name: Name; a parameter has its path, such as plant.mass.
         role: "output", "input" (the control) or "parameter".
-        value: Value before anything is set.
-        unit: Unit.
+        value: Default value.
+        unit: Unit, "1" or empty for a pure number.
         low, high: Least and greatest value that may be set.
     """
 
@@ -47,12 +47,13 @@ class FmuVariable(NamedTuple):
 
 
 class PlantSource(NamedTuple):
-    """A plant as C, without the struct that the functions take.
+    """A plant as C, without the struct `model` that the functions take.
 
     Attributes:
-        text: C functions `plant_start(m)`, `plant_step(m, t, h)` and `plant_show(m)` of a struct `m`, which has the
-            arrays `v` (variables, in their order) and `x` (states).
-        variables: Variables of the FMU.
+        text: C functions `plant_start(m)`, `plant_step(m, t, h)` and `plant_show(m)` of a pointer `m` to a struct with
+            the arrays `v` (variables, in their order) and `x` (states).
+            They set `x` at the start, advance `x` from t by h seconds, and store the outputs in `v`.
+        variables: Variables of the FMU: outputs, control, parameters.
         states: Number of states.
     """
 
@@ -62,7 +63,7 @@ class PlantSource(NamedTuple):
 
 
 def plant_source(loop: Loop) -> PlantSource:
-    """Return the plant of a loop, at the loop's start, as C.
+    """Return the plant of a loop as C, with the loop's initial condition as its default start.
 
     Args:
         loop: Closed loop.

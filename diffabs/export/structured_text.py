@@ -48,9 +48,10 @@ OWN = {"command", "held", "reset", "started", "i"}  # names that the block itsel
 
 
 def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
-    """Return a controller as a FUNCTION_BLOCK.
+    """Return the text of a FUNCTION_BLOCK that runs a controller.
 
-    The inputs are the measurements and `reset`, the outputs `command` and `held`. The parameters are variables.
+    The inputs are the measurements that the controller reads and `reset`, the outputs `command` and `held`.
+    `held` is true if the sample could not be used. The parameters are variables of the block.
     Call the block once a period. It starts at its first call, and again whenever `reset` is true.
 
     Args:
@@ -59,7 +60,7 @@ def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()
         notes: Lines for the comment at the head of the text.
 
     Raises:
-        NotExported: The name is no identifier, or an operation has no translation.
+        NotExported: The name is no identifier, an operation has no translation, or a constant is NaN.
     """
     if not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in ST_KEYWORDS:
         raise NotExported(f"{name!r} is no name that Structured Text has for a block: letters, digits and single _")

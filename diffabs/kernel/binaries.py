@@ -22,7 +22,9 @@ log = logging.getLogger("diffabs")
 
 
 def cache_folder() -> pathlib.Path:
-    """Return the folder of the compiled libraries: $DIFFABS_KERNEL_CACHE, or a subfolder of the user's cache folder.
+    """Return the folder of the compiled libraries, which need not exist.
+
+    This is $DIFFABS_KERNEL_CACHE, or the subfolder diffabs/kernel of the user's cache folder.
 
     Raises:
         OSError: The user has no home folder.
@@ -79,9 +81,10 @@ def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
 
 
 def write_library(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
-    """Write a library and return its file.
+    """Write a library to the cache and return its file.
 
     The write is atomic: a file with a library's name is always complete.
+    A cache above MAX_CACHE_BYTES first loses its least recently used files.
 
     Args:
         made_of: Digest of every input that decides the library.
@@ -89,7 +92,7 @@ def write_library(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
         content: Bytes of the library.
 
     Raises:
-        OSError: The folder or the file cannot be written.
+        OSError: The folder or the file cannot be written, or `make_cache_folder` fails.
     """
     folder = make_cache_folder()
     files.make_room(folder, f"*{suffix}", MAX_CACHE_BYTES)

@@ -34,7 +34,7 @@ class LanePrograms:
     Attributes:
         functions: The traced functions of one lane.
         launch: Function (program, arrays before the carry, carry) -> carry that runs a program.
-        wanted: Numbers of the carry's arrays whose tangents matter at the end, None for all.
+        wanted: Indices of the carry's arrays whose tangents matter at the end, None for all.
     """
 
     def __init__(
@@ -58,12 +58,13 @@ class LanePrograms:
         self.derivative(None)
 
     def derivative(self, begins: tuple[tuple[UpdateLevel, int], ...] | None) -> DerivativeProgram:
-        """Return the program with one tangent for each seeded array.
+        """Return the program with one tangent direction, for tangents that start in the seeded arrays.
 
-        `begins` lists the seeded arrays as (level, number); None means the plain program without tangents.
+        `begins` lists the seeded arrays as (level, index); None means the plain program without tangents.
+        The result is kept for the next call.
 
         Raises:
-            Unsupported: A derivative uses an operation without a lowering rule.
+            Unsupported: A derivative uses an operation without a lowering rule, or there are too many operations.
         """
         if begins not in self._derivatives:
             moving = {level: tuple(i for one, i in begins or () if one == level) for level in INPUT_LEVELS}
@@ -76,9 +77,10 @@ class LanePrograms:
         return self._derivatives[begins]
 
     def program(self, begins: PyTree, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
-        """Return the program with `many` tangents for each seeded array in `begins`.
+        """Return the program with `many` tangent directions, for tangents that start in the arrays in `begins`.
 
-        `as_lanes` holds the numbers of uniform arrays that vmap has made arrays of each lane.
+        `begins` is as in `derivative`. `as_lanes` holds the indices of the uniform arrays that vmap has given a value
+        per lane.
 
         Raises:
             Unsupported: The program has too many operations, or one without a lowering rule.
@@ -94,11 +96,13 @@ class LanePrograms:
         return [ArrayKey(level, i, False) for level in INPUT_LEVELS for i in range(len(self.functions.types[level]))]
 
     def slopes(self, begins: PyTree) -> list[ArrayKey]:
-        """Return the keys of the seed tangents for the arrays in `begins`; these arguments follow the values."""
+        """Return the keys of the seed tangents of the arrays in `begins`; as arguments they follow the values."""
         return [ArrayKey(level, i, True) for level, i in begins or ()]
 
     def ends(self, begins: PyTree) -> list[ArrayKey]:
-        """Return the keys of the results for the seeds in `begins`: the carry's arrays, then the nonzero tangents."""
+        """Return the keys of the results for the seeds in `begins`: all arrays of the carry, then the tangents that may
+        differ from 0.
+        """
         carry = range(len(self.functions.types[UpdateLevel.STEP]))
         do = self.derivative(begins).moved_arrays[UpdateLevel.STEP]
         return [
@@ -112,7 +116,7 @@ run_lanes_primitive.multiple_results = True
 
 
 def bind_lanes(lanes: LanePrograms, arrays: Sequence[PyTree]) -> list[PyTree]:
-    """Return the final carry of all lanes.
+    """Return the carry's arrays after all lanes have ended, in the order of its leaves.
 
     Args:
         lanes: The functions and their programs.

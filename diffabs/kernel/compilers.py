@@ -38,7 +38,7 @@ PROBE_TIMEOUT_S = 30  # for the version output, or for a library of one line
 
 
 class NoCompiler(Exception):
-    """An error: no C++ compiler on this machine makes a library. The message says why."""
+    """An error: no C++ or CUDA compiler on this machine makes a library that loads. The message gives the reason."""
 
 
 class Compiler(NamedTuple):
@@ -79,9 +79,10 @@ def _check_loads(command: tuple[str, ...]) -> None:
 
 
 def find_compiler() -> Compiler:
-    """Return the first compiler that works: c++, clang++, g++, then the one of the package ziglang.
+    """Return the first C++ compiler that makes a library which loads: c++, clang++, g++, then that of the package
+    ziglang.
 
-    $DIFFABS_KERNEL_COMPILER replaces this list by one command; if it is empty, no compiler is used.
+    $DIFFABS_KERNEL_COMPILER replaces this list by one command; if it is set but empty, no compiler is used.
 
     Raises:
         NoCompiler: No command works; the message gives a reason for each.
@@ -102,13 +103,14 @@ def find_compiler() -> Compiler:
 
 
 def build_library(text: str) -> pathlib.Path:
-    """Return the file of the compiled library of a C++ text; a library in the cache is not compiled again.
+    """Compile a C++ text, unless the cache holds its library, and return the library's file.
 
     Args:
         text: C++ source.
 
     Raises:
-        NoCompiler: No compiler works, compilation fails, or the cache folder is not writable or open to other users.
+        NoCompiler: No compiler works, compilation fails, or the cache folder is unusable: not writable, or writable for
+            other users.
     """
     made = find_compiler()
     digest = _digest(text, made)
@@ -127,7 +129,9 @@ def build_library(text: str) -> pathlib.Path:
 
 
 def describe_compiler() -> dict[str, str]:
-    """Return compiler, flags and processor, which together with the text determine a kernel's numbers to the last bit.
+    """Return a dictionary with "compiler", "flags" and "processor" of the C++ back end.
+
+    With a program's text, they determine a kernel's numbers to the last bit.
 
     Raises:
         NoCompiler: No compiler works on this machine.

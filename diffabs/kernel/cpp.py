@@ -34,7 +34,9 @@ class LaunchShape(NamedTuple):
 
 
 def emit_cpp(program: ScalarProgram, shape: LaunchShape) -> str:
-    """Return a program's C++ text with the functions `renew` and `step` (carry to carry) and `running` (to one truth).
+    """Return the C++ text of a program, complete with the loops over lanes and the entry point for XLA.
+
+    It contains the functions `renew` and `step` (carry to carry) and `running` (carry to boolean).
 
     Args:
         program: Operations and results.
@@ -53,7 +55,9 @@ def operands_by_name(node: Node) -> tuple[Node, ...]:
 
 
 class Text:
-    """A writer of the text's parts. A subclass for another back end replaces HEAD and DRIVER and keeps the names
+    """A writer of the text's parts.
+
+    A subclass for another back end replaces HEAD and DRIVER, the includes before and after, and keeps the names
     between.
     """
 
@@ -292,10 +296,10 @@ def _declare_uniform(node: Node, value: str) -> str:
 
 
 def count_operations(source: str) -> int:
-    """Return the number of operations in a text, counted once for all vectors of a block.
+    """Return the number of operations in the C++ text of a program; the vectors of a block count once.
 
     Args:
-        source: C++ text.
+        source: C++ text of `emit_cpp`.
     """
     # Vector 0 stands for all vectors, because every operation has one line for each.
     return len(re.findall(r"^ +(?:const )?\w+ v\d+_0 = ", source, re.MULTILINE))

@@ -23,7 +23,7 @@ CPP_FUNCTIONS = {
 
 
 def is_boolean(dtype: np.dtype) -> bool:
-    """Return whether numbers of this type are truths.
+    """Return whether a type is boolean.
 
     Args:
         dtype: NumPy type.
@@ -32,7 +32,7 @@ def is_boolean(dtype: np.dtype) -> bool:
 
 
 def scalar_type(dtype: np.dtype) -> str:
-    """Return the C++ type of one number; a truth is a byte.
+    """Return the C++ type of one number, such as f64; a boolean is a byte, u8.
 
     Args:
         dtype: NumPy type.
@@ -41,7 +41,7 @@ def scalar_type(dtype: np.dtype) -> str:
 
 
 def vector_type(dtype: np.dtype) -> str:
-    """Return the C++ type of a vector with one number for each lane.
+    """Return the C++ type of a vector with one number for each lane, such as vf64; for booleans, mask.
 
     Args:
         dtype: NumPy type.
@@ -50,7 +50,7 @@ def vector_type(dtype: np.dtype) -> str:
 
 
 def literal(node: Node) -> str:
-    """Return the C++ expression of a constant in every lane.
+    """Return the C++ expression of a vector with a constant in every lane.
 
     Args:
         node: Constant.

@@ -27,7 +27,9 @@ class CudaSource(NamedTuple):
 
 
 def emit_cuda(program: ScalarProgram, shape: LaunchShape) -> CudaSource:
-    """Return a program's CUDA C++ with the functions `renew` and `step` (carry to carry) and `running` (to one truth).
+    """Return the CUDA C++ of a program, with the kernels to launch and their need of memory.
+
+    The text contains the functions `renew` and `step` (carry to carry) and `running` (carry to boolean).
 
     Args:
         program: Operations and results.

@@ -79,7 +79,7 @@ def _threefry(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 def threefry(graph: Graph, k0: Node, k1: Node, x0: Node, x1: Node) -> tuple[Node, Node]:
-    """Return the two words that Threefry-2x32 with 20 rounds makes of (x0, x1) under the key (k0, k1).
+    """Return the two words that Threefry-2x32 with 20 rounds makes from the counter (x0, x1) and the key (k0, k1).
 
     Args:
         graph: Graph of the result.

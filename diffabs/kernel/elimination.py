@@ -15,11 +15,11 @@ from diffabs.kernel.linear import FACTOR_ONE, Algebra, Factor, Sum, Vertex, chan
 
 
 class Elimination:
-    """The linear graph of one tangent of a program, reduced for several tangents.
+    """The linear graph of one tangent direction of a program, reduced for several directions.
 
     Attributes:
         graph: Graph of the factors.
-        many: Number of tangents.
+        many: Number of tangent directions.
         algebra: Operations on sums of tangents.
         vertices: Computed tangents by node id.
         readers: For each tangent, the ids of the vertices that read it.
@@ -49,11 +49,11 @@ class Elimination:
         self.readers[node] = set()
 
     def add(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> None:
-        """Add an operation on tangents.
+        """Add an operation on tangents; its operands must be there already.
 
         Args:
             node: Operation in the graph of one tangent.
-            moves: Function that says if a node is a nonzero tangent.
+            moves: Function that returns True if a node is a nonzero tangent.
             value: Function that returns the factor graph's node for any other number.
         """
         new = self.vertices[node.id] = self.algebra.vertex(node, moves, value)
@@ -133,7 +133,7 @@ class Elimination:
     # elimination ------------------------------------------------------------------------------------------------------
 
     def reduce(self, roots: Iterable[int]) -> None:
-        """Eliminate each vertex that costs more than it saves, except `roots`, the ids of the results."""
+        """Eliminate each vertex whose removal costs no operations, except `roots`, the ids of the results."""
         self.kept.update(roots)
         # An elimination changes the costs of its neighbours, so passes repeat until one removes nothing.
         left = True

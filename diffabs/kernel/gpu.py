@@ -54,10 +54,10 @@ class GpuDevice(Protocol):
 
 
 def find_gpu() -> GpuDevice | None:
-    """Return the GPU that JAX runs on, or None if JAX runs on a processor.
+    """Return the GPU that JAX runs on by default, or None if this default device is a processor.
 
     Raises:
-        NoCompiler: JAX runs on a GPU that is not NVIDIA's.
+        NoCompiler: JAX runs on an accelerator that is not an NVIDIA GPU.
     """
     home = jax.config.jax_default_device or jax.devices()[0]  # pyright: ignore[reportAttributeAccessIssue]
     platform = home if isinstance(home, str) else home.platform
@@ -65,7 +65,7 @@ def find_gpu() -> GpuDevice | None:
 
 
 def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[PyTree], results: list[PyTree]) -> list[PyTree]:
-    """Return the final carry of all lanes, as an operation of XLA on the GPU.
+    """Return the carry's arrays after all lanes have ended, as an operation of XLA on the GPU.
 
     Args:
         program: Operations and results.
@@ -94,8 +94,10 @@ def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[PyTree],
 
 
 def describe_gpu_compiler() -> dict[str, str]:
-    """Return compiler, flags and architecture, which together with the text determine a kernel's numbers to the last
-    bit.
+    """Return a dictionary with "compiler", "flags" and "processor" (the architecture, such as sm_90) of the GPU back
+    end.
+
+    With a program's text, they determine a kernel's numbers to the last bit. JAX must run on a GPU.
 
     Raises:
         NoCompiler: There is no CUDA compiler.
@@ -151,7 +153,7 @@ class CudaDevice:
         self._loaded: dict[tuple[pathlib.Path, int], _LoadedCode] = {}
 
     def compile(self, text: str) -> pathlib.Path:
-        """Return the file with the machine code of a CUDA C++ `text`; see `GpuDevice.compiled`."""
+        """Return the file with the machine code of a CUDA C++ `text`; see `GpuDevice.compile`."""
         return nvrtc.build_cubin(text, self.architecture)
 
     def address(self, buffer: Any) -> int:

@@ -20,7 +20,9 @@ Array = Any  # NumPy array of nodes
 
 
 class UpdateLevel(enum.IntEnum):
-    """The rate at which a value changes: never, with the launch, with the lane, or with the step."""
+    """The rate at which a value changes: KNOWN never, UNIFORM with each launch, LANE with each lane, STEP with each
+    step.
+    """
 
     KNOWN, UNIFORM, LANE, STEP = range(4)
 
@@ -29,13 +31,13 @@ class Node:
     """A number: an operation on other numbers.
 
     Attributes:
-        id: Number of the node in its graph; operands have smaller ones.
-        op: Name of the operation.
+        id: Index of the node in its graph; operands have smaller ones.
+        op: Name of the operation; "const" for a constant, "input" for a number from outside.
         args: Operands.
-        dtype: Type.
+        dtype: NumPy type of the number.
         attr: Data of the operation: a constant's value, an input's place, a conditional's `Gate`.
         level: Rate at which the value changes.
-        label: Variable name in the source, for graphs that record it.
+        label: Variable name in the source, for graphs that record it, else empty.
     """
 
     __slots__ = ("args", "attr", "dtype", "id", "label", "level", "op")
@@ -51,11 +53,11 @@ class Node:
 
 
 class Gate(NamedTuple):
-    """A conditional.
+    """The identity of a conditional, shared by the selections of all its results.
 
     Attributes:
-        number: Number of the conditional in its graph.
-        any: Whether only the truth over all lanes matters, as in `any`.
+        number: Index of the conditional in its graph.
+        any: True if a back end may skip the branch only where the condition is false in all lanes.
     """
 
     number: int
@@ -100,7 +102,10 @@ class Graph:
         return self._make("input", (), dtype, place, level)
 
     def op(self, name: str, *args: Node) -> Node:
-        """Return the operation `name` on numbers `args` of one type: one of `FOLDABLE` or a back end's function."""
+        """Return the node of the operation `name` on numbers `args` of one type, folded and simplified where possible.
+
+        `name` is in `FOLDABLE` or names a back end's function. A comparison gives a boolean.
+        """
         boolean = name in COMPARISONS or name == "is_finite"
         dtype = np.dtype(bool) if boolean else args[0].dtype
         # Folding may overflow or give NaN, as the operation itself does, so NumPy's warnings are off.
@@ -144,9 +149,9 @@ class Graph:
         return self.op("or", self.op("and", which, yes), self.op("and", self.op("not", which), no))
 
     def gate(self, which: Node, no: Iterable[Node], yes: Iterable[Node]) -> list[Node]:
-        """Return selections that a back end may compute as a conditional jump.
+        """Return selections that a back end may compute as a conditional jump, one for each result.
 
-        `no` and `yes` are the results of the two branches; `which` is a truth of a lane, or the node `any` of one.
+        `no` and `yes` are the results of the two branches; `which` is a boolean of a lane, or the node `any` of one.
         """
         pairs = list(zip(no, yes, strict=True))
         asked = which.args[0] if which.op == "any" else which
@@ -162,11 +167,11 @@ class Graph:
         return self._make("gate", (which, no, yes), yes.dtype, gate)
 
     def any(self, which: Node) -> Node:
-        """Return a marker for the truth over all lanes of the truth `which`; its value in a lane is `which` itself."""
+        """Return a marker of the condition "`which` is true in some lane"; its value in a lane is `which` itself."""
         return which if which.op in ("const", "any") else self._make("any", (which,), bool)
 
     def convert(self, x: Node, dtype: DTypeLike) -> Node:
-        """Return the number `x` converted to `dtype`; to a truth, whether `x` differs from 0."""
+        """Return the number `x` converted to `dtype`; as a boolean, x != 0."""
         dtype = np.dtype(dtype)
         if x.dtype == dtype:
             return x
@@ -178,7 +183,7 @@ class Graph:
         return self._make("convert", (x,), dtype)
 
     def bits(self, x: Node, dtype: DTypeLike) -> Node:
-        """Return the bits of `x` as a number of the type `dtype`."""
+        """Return the bits of `x`, read as a number of the type `dtype` of the same size."""
         if x.dtype == np.dtype(dtype):
             return x
         return self.const(x.attr.view(dtype)) if x.op == "const" else self._make("bits", (x,), dtype)
@@ -188,7 +193,7 @@ class Graph:
         return self._make("table", (index, *column), column[0].dtype)
 
     def again(self, node: Node, args: list[Node]) -> Node:
-        """Return the operation of `node`, which may belong to another graph, on the operands `args`."""
+        """Return the operation of `node`, which may belong to another graph, on the operands `args` of this graph."""
         match node.op:
             case "const":
                 return self.const(node.attr)

@@ -33,8 +33,12 @@ def run_lanes(
     rounds: int,
     wanted: PyTree = None,
 ) -> PyTree:
-    """Return the final carry (pytree, leading axis of n lanes) of lanes that all run to their ends.
+    """Return the carry of n lanes after all have ended (pytree, leading axis n), with the structure of `carry`.
 
+    A lane calls `renew` once and `step` `steps` times, and repeats this `rounds` times. Then `running` decides if it
+    goes on.
+    So every lane computes at least `rounds` * `steps` steps, also if `running` is false for its initial carry.
+    A lane that never ends keeps the call from returning.
     The function works under jit and vmap, with forward-mode derivatives.
     Arrays that the functions close over are the same for all lanes.
 
@@ -42,16 +46,17 @@ def run_lanes(
         renew: Function of one lane, (lane, carry) -> carry, called before every `steps` steps.
         step: Function of one lane, (lane, carry) -> carry. In a lane that has ended, it must change nothing that
             matters.
-        running: Function of one lane, (lane, carry) -> truth: whether the lane continues.
+        running: Function of one lane, (lane, carry) -> boolean: True if the lane continues.
         lane: Pytree of each lane's constants, (n, ...) each.
-        carry: Pytree of each lane's initial values, (n, ...) each.
+        carry: Pytree of each lane's initial values, (n, ...) each. Its real numbers share one type, float32 or float64.
         steps: Calls of `step` after each call of `renew`.
         rounds: Rounds of `renew` and `steps` between two calls of `running`.
-        wanted: Pytree of truths like `carry`: arrays whose derivatives matter afterwards, None for all.
-            The derivatives of the other arrays are returned as zero.
+        wanted: Pytree of booleans like `carry`: arrays whose derivatives matter afterwards, None for all.
+            The derivatives of an array that influences none of these may be returned as zero.
 
     Raises:
-        Unsupported: A function uses an operation without a lowering rule.
+        Unsupported: A function uses an operation without a lowering rule, has too many operations, or the carry mixes
+            real types.
         NoCompiler: There is no compiler for the processor or GPU.
         ValueError: Reverse mode or a second derivative is requested.
     """
@@ -89,11 +94,11 @@ def _launch_lanes(
 
 
 def build_target(made: program.ScalarProgram, shape: cpp.LaunchShape) -> str:
-    """Return the name under which XLA has a program's library, after compiling it if necessary.
+    """Compile a program for the processor, if necessary, and return its name as an FFI target of XLA.
 
     Args:
         made: Operations and results.
-        shape: Loop structure of the launch.
+        shape: Loop structure of the launch; a large program or one with tangents gets fewer `vectors`.
 
     Raises:
         NoCompiler: No compiler works, or the library does not load.
@@ -108,7 +113,9 @@ def build_target(made: program.ScalarProgram, shape: cpp.LaunchShape) -> str:
 
 
 def describe_kernel_build() -> dict[str, str]:
-    """Return compiler, flags and processor, which together with the text determine a kernel's numbers to the last bit.
+    """Return a dictionary with "compiler", "flags" and "processor" of the present back end.
+
+    With a program's text, they determine a kernel's numbers to the last bit.
 
     Raises:
         NoCompiler: There is no compiler for the processor or GPU.
@@ -136,7 +143,7 @@ def register_library(path: pathlib.Path) -> str:
 
 
 def library_names() -> list[str]:
-    """Return the names of all registered libraries."""
+    """Return the XLA names of all libraries that this process has registered."""
     return list(_loaded)
 
 
@@ -176,7 +183,7 @@ def _lane_type(x: Scalar) -> Scalar:
 
 
 def unwrap_key(x: Scalar) -> Scalar:
-    """Return an array, or the words (uint32) of random keys.
+    """Return random keys as their words (uint32, one more axis), and anything else as a JAX array.
 
     Args:
         x: Array or random keys.

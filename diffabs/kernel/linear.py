@@ -17,7 +17,7 @@ class Factor(NamedTuple):
     """A signed factor of a tangent.
 
     Attributes:
-        negative: Whether the factor is -`number`.
+        negative: True if the factor is -`number`.
         number: Node of the factor, None for 1.
     """
 
@@ -33,10 +33,10 @@ class Vertex:
     """A tangent: a sum of other tangents, a selection between two sums, or a nonlinear operation.
 
     Attributes:
-        sum: Factors by the id of their tangents.
-        which: Truth of a selection, None without one.
+        sum: Factors by the id of their tangents; in a selection, the sum where `which` is false.
+        which: Boolean node that selects; None without a selection.
         others: The sum where `which` is true.
-        reads: Ids of the tangents that a nonlinear operation reads.
+        reads: Ids of the tangents that a nonlinear operation reads; empty for a sum or a selection.
     """
 
     __slots__ = ("others", "reads", "sum", "which")
@@ -75,11 +75,11 @@ class Algebra:
         self.graph, self.dtype = graph, dtype
 
     def vertex(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> Vertex:
-        """Return the vertex of an operation on tangents.
+        """Return an operation on tangents as a sum or selection of its operands, or as a nonlinear operation.
 
         Args:
             node: Operation in the graph of one tangent.
-            moves: Function that says if a node is a nonzero tangent.
+            moves: Function that returns True if a node is a nonzero tangent.
             value: Function that returns the factor graph's node for any other number.
         """
         on, args = [moves(x) for x in node.args], node.args
@@ -135,7 +135,7 @@ class Algebra:
         return found
 
     def within(self, sum: Sum, key: int, inner: Sum) -> Sum:
-        """Return `sum` with the sum `inner` in place of the tangent `key`."""
+        """Return `sum` with the tangent `key` replaced by the sum `inner`, times its factor."""
         factor = sum[key]
         more = {x: self._times(factor, one) for x, one in inner.items()}
         return self._plus({x: one for x, one in sum.items() if x != key}, more)
@@ -183,7 +183,9 @@ def changes_in_step(factor: Factor) -> bool:
 
 
 def count_terms(sum: Sum) -> int:
-    """Return the operations of a sum for each tangent; a product with the following addition counts as one (FMA).
+    """Return the operations that a sum needs in each tangent direction.
+
+    A product with the following addition counts as one (FMA). A copy or an empty sum counts as 0.
 
     Args:
         sum: Sum of tangents.

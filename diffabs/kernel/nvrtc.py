@@ -26,7 +26,7 @@ NVRTC_FLAGS = (
 
 
 def build_cubin(text: str, architecture: str) -> pathlib.Path:
-    """Return the file with the machine code of a CUDA C++ text; code in the cache is not compiled again.
+    """Compile a CUDA C++ text, unless the cache holds its machine code, and return the file.
 
     A file `.log` beside it holds the assembler's messages on register usage.
 
@@ -52,7 +52,7 @@ def build_cubin(text: str, architecture: str) -> pathlib.Path:
 
 
 def parse_register_usage(log: str) -> dict[str, dict[str, int]]:
-    """Return the registers of a thread ("registers") and the bytes it spills ("spilled") by kernel name.
+    """Return, by kernel name, the registers of a thread ("registers") and its spilled bytes ("spilled").
 
     Args:
         log: Messages of the assembler.

@@ -28,7 +28,7 @@ class Unsupported(Exception):
 
     Attributes:
         primitive: Name of the primitive.
-        reason: The reason, to be read after the primitive's name.
+        reason: The reason, as it continues after the primitive's name.
         method: Method of the part that uses the primitive, empty if unknown.
     """
 
@@ -73,7 +73,7 @@ def lowering_rule(names: str, known: str = "") -> Callable[[PyTree], PyTree]:
 
 
 def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Sequence[Array]) -> list[Array]:
-    """Return the outputs of a jaxpr as arrays of nodes.
+    """Lower a jaxpr to a graph and return its outputs as arrays of nodes.
 
     Args:
         graph: Graph that receives the nodes.
@@ -149,7 +149,7 @@ def scalar_array(node: Node) -> Array:
 
 
 def map_entries(function: Callable[..., Node], *arrays: PyTree) -> Array:
-    """Return a function of numbers, applied entry by entry with broadcasting.
+    """Apply a function entry by entry, with broadcasting, and return the array of its results.
 
     Args:
         function: Function of nodes.
@@ -178,9 +178,9 @@ def inline_program(graph: Graph, program: Any, inputs: Sequence[Array]) -> list[
 
 
 def as_node_array(x: Scalar) -> Array:
-    """Return the result of indexing an array of nodes as an array, also if it is a single node.
+    """Return `x` itself if it is an array, or a single node as an array of shape ().
 
     Args:
-        x: Array of nodes, or a node.
+        x: Array of nodes, or a node, as indexing an array gives it.
     """
     return x if isinstance(x, np.ndarray) else scalar_array(x)

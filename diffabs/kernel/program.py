@@ -24,7 +24,7 @@ class InputPlace(NamedTuple):
 
     Attributes:
         level: Rate of change of the array.
-        array: Number of the array among those of its level.
+        array: Index of the array among those of its level.
         entry: Index of the number within one lane's flat array.
     """
 
@@ -41,9 +41,9 @@ class ScalarProgram:
         inputs: Nodes of the carry, the lanes and the uniform arrays, by place.
         results: For each function, by name, its outputs as single numbers.
         uniform: Arrays that all lanes share.
-        sizes: Numbers of one lane in each array, by level.
+        sizes: For each level, the sizes of its arrays in one lane.
         dtype: Type of the real numbers.
-        tangents: Number of tangents of each number that has any.
+        tangents: Number of tangent directions in a program of `replicate_tangents`, else 0.
     """
 
     inputs: dict[InputPlace, Node]
@@ -54,7 +54,7 @@ class ScalarProgram:
     tangents: int = 0
 
     def carry_inputs(self) -> list[Node]:
-        """Return the nodes of the carry in their order."""
+        """Return the input nodes of the carry, array by array and entry by entry."""
         return [node for place, node in self.inputs.items() if place.level == UpdateLevel.STEP]
 
 
@@ -63,7 +63,7 @@ class TracedFunction(NamedTuple):
 
     Attributes:
         jaxpr: Jaxpr; its constvars are first the uniform arrays, then constants.
-        closed: Numbers of the arrays in `TracedFunctions.uniform` that the function closes over.
+        closed: Indices of the arrays in `TracedFunctions.uniform` that the function closes over.
         constants: Further constants that it closes over.
     """
 
@@ -89,12 +89,12 @@ class TracedFunctions(NamedTuple):
 def trace_functions(
     functions: dict[str, Callable[[PyTree, PyTree], PyTree]], lane: PyTree, carry: PyTree
 ) -> TracedFunctions:
-    """Return functions of (lane, carry) as jaxprs.
+    """Return functions of (lane, carry) as jaxprs, with the arrays that they close over.
 
     Args:
         functions: Functions by name.
-        lane: Pytree with shapes and types of a lane's constants.
-        carry: Pytree with shapes and types of a lane's carry.
+        lane: Pytree with shapes and types of a lane's constants, without the axis of lanes.
+        carry: Pytree with shapes and types of a lane's carry, without the axis of lanes.
     """
     uniform: list[PyTree] = []
     numbers: dict[int, int] = {}
@@ -118,27 +118,29 @@ def trace_functions(
 def build_program(
     functions: dict[str, Callable[[PyTree, PyTree], PyTree]], lane: PyTree, carry: PyTree
 ) -> ScalarProgram:
-    """Return the program of functions of (lane, carry).
+    """Trace functions of (lane, carry) and return their program of single numbers.
 
     Args:
         functions: Functions by name.
-        lane: Pytree with shapes and types of a lane's constants.
-        carry: Pytree with shapes and types of a lane's carry.
+        lane: Pytree with shapes and types of a lane's constants, without the axis of lanes.
+        carry: Pytree with shapes and types of a lane's carry, without the axis of lanes.
 
     Raises:
-        Unsupported: A function uses an operation without a lowering rule, or there are too many operations.
+        Unsupported: A function uses an operation without a lowering rule, there are too many operations, or the carry's
+            real numbers do not share one type, float32 or float64.
     """
     return lower_functions(trace_functions(functions, lane, carry))
 
 
 def lower_functions(functions: TracedFunctions) -> ScalarProgram:
-    """Return the program of traced functions.
+    """Return the program of single numbers of traced functions.
 
     Args:
         functions: Traced functions.
 
     Raises:
-        Unsupported: A function uses an operation without a lowering rule, or there are too many operations.
+        Unsupported: A function uses an operation without a lowering rule, there are too many operations, or the carry's
+            real numbers do not share one type, float32 or float64.
     """
     graph, inputs = Graph(), {}
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in functions.types}
@@ -163,14 +165,14 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
 
 
 def check_size(program: ScalarProgram, operations: int) -> ScalarProgram:
-    """Return the program if its size is within MAX_OPERATIONS.
+    """Return the program unchanged, or raise if it is too large.
 
     Args:
         program: Program to return.
         operations: Number of its operations.
 
     Raises:
-        Unsupported: There are too many operations.
+        Unsupported: There are more than MAX_OPERATIONS operations.
     """
     if operations > MAX_OPERATIONS:
         raise Unsupported("step", f"of {operations} operations; {MAX_OPERATIONS} are the most")
@@ -196,7 +198,7 @@ def _type(x: Scalar) -> Scalar:
 
 
 def live_nodes(roots: Sequence[Node]) -> list[Node]:
-    """Return the nodes that the roots depend on, the roots included, operands first.
+    """Return the roots and all nodes that they depend on, without duplicates, operands first.
 
     Args:
         roots: Nodes.
@@ -219,7 +221,7 @@ class Branch:
         gates: Selections of the conditional's results.
         yes: Operations that only the true branch needs.
         no: Operations that only the false branch needs.
-        which: Truth that decides.
+        which: Boolean node of the condition.
     """
 
     def __init__(self, gates: list[Node], yes: "ScheduleBlock", no: "ScheduleBlock"):
@@ -252,7 +254,9 @@ class ScheduleBlock:
 
 
 def schedule_nodes(roots: Sequence[Node], level: UpdateLevel) -> ScheduleBlock:
-    """Return the operations of a level that the roots need, each in the innermost branch that contains all its readers.
+    """Return a level's operations that the roots need, nested in the branches of conditionals.
+
+    Each operation lies in the innermost branch that contains all its readers.
 
     Args:
         roots: Nodes to compute.

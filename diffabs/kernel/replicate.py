@@ -11,7 +11,7 @@ from diffabs.kernel.program import live_nodes
 
 
 def dependents(nodes: Iterable[Node], first: set[int]) -> set[int]:
-    """Return the ids of some nodes and of all nodes that depend on them.
+    """Return the ids in `first`, and of all nodes that depend on them.
 
     Args:
         nodes: Nodes, operands first.
@@ -23,11 +23,11 @@ def dependents(nodes: Iterable[Node], first: set[int]) -> set[int]:
 
 
 def tangent_copy(nodes: list[Node], k: int) -> Node:
-    """Return the k-th tangent of a number, or its only node if it is the same for all tangents.
+    """Return the node of a number in tangent direction k, or its only node if it is the same in all directions.
 
     Args:
-        nodes: One node, or one for each tangent.
-        k: Number of the tangent.
+        nodes: One node, or one for each tangent direction.
+        k: Index of the direction.
     """
     return nodes[k if len(nodes) > 1 else 0]
 
@@ -39,16 +39,17 @@ def replicate_nodes(
     slopes: set[int],
     size: tuple[int, np.dtype],
 ) -> dict[int, list[Node]]:
-    """Return, for each node id that the roots need, its nodes in a program of several tangents.
+    """Return, for each node id that the roots need, its nodes in a program of several tangent directions.
 
-    A value has one node, a nonzero tangent has several, a zero tangent the constant 0.
+    A value has one node, a nonzero tangent one for each direction, a zero tangent the constant 0.
+    A node that the elimination has removed has no entry.
 
     Args:
         graph: Graph that receives the nodes.
         roots: Results of the program of one tangent.
         given: Inputs of the new program by node id of the old one.
         slopes: Ids of the inputs that are tangents; a tangent without an entry in `given` is zero.
-        size: Number and type of the tangents.
+        size: Number of the tangent directions, and the type of the tangents.
     """
     nodes = live_nodes(roots)
     moving = dependents(nodes, {i for i in slopes if i in given})

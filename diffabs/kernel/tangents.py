@@ -35,8 +35,8 @@ class ArrayKey(NamedTuple):
 
     Attributes:
         level: Level of the array when the functions were traced.
-        number: Number of the array in that level.
-        tangent: Whether the key means the array's tangents.
+        number: Index of the array in that level.
+        tangent: True if the key means the array's tangents.
     """
 
     level: UpdateLevel
@@ -61,12 +61,12 @@ class DerivativeProgram(NamedTuple):
 def differentiate_functions(
     functions: TracedFunctions, seeded: TangentArrays, outputs_needed: Iterable[int] | None = None
 ) -> DerivativeProgram:
-    """Return the derivative program of functions, with one tangent.
+    """Return the program of the functions' values and one tangent direction.
 
     Args:
         functions: Traced functions.
-        seeded: Arrays that have nonzero tangents at the start.
-        outputs_needed: Arrays of the carry whose tangents matter at the end, None for all.
+        seeded: Indices of the arrays that have nonzero tangents at the start, by level.
+        outputs_needed: Indices of the carry's arrays whose tangents matter at the end, None for all.
 
     Raises:
         Unsupported: A derivative uses an operation without a lowering rule, or there are too many operations.
@@ -84,7 +84,7 @@ def differentiate_functions(
 
 
 def lower_without_tangents(functions: TracedFunctions) -> DerivativeProgram:
-    """Return the program of functions without tangents.
+    """Return the plain program of the functions, as a derivative program without tangents.
 
     Args:
         functions: Traced functions.
@@ -101,10 +101,12 @@ def arrange_arrays(
 ) -> dict[UpdateLevel, list[ArrayKey]]:
     """Return the keys of a program's arrays by level, in the order of its arguments: values, then tangents.
 
+    A uniform array with a value per lane stands in the level of the lanes.
+
     Args:
         functions: Traced functions.
-        moved_arrays: Arrays that have tangents.
-        per_lane_uniforms: Arrays that were uniform in the trace and that vmap has made arrays of each lane.
+        moved_arrays: Indices of the arrays that have tangents, by level.
+        per_lane_uniforms: Indices of the uniform arrays that vmap has given a value per lane.
     """
     found: dict[UpdateLevel, list[ArrayKey]] = {level: [] for level in INPUT_LEVELS}
     for tangent in (False, True):
@@ -118,13 +120,13 @@ def arrange_arrays(
 def replicate_tangents(
     functions: TracedFunctions, one: DerivativeProgram, many: int, per_lane_uniforms: frozenset[int] = frozenset()
 ) -> ScalarProgram:
-    """Return the program with several tangents; a tangent array has the shape (many, ...).
+    """Return the program with several tangent directions; an array's tangents have the shape (many, ...).
 
     Args:
         functions: Traced functions.
-        one: Program with one tangent.
-        many: Number of tangents.
-        per_lane_uniforms: Arrays that were uniform in the trace and that vmap has made arrays of each lane.
+        one: Program with one tangent direction.
+        many: Number of tangent directions.
+        per_lane_uniforms: Indices of the uniform arrays that vmap has given a value per lane.
 
     Raises:
         Unsupported: There are too many operations.

@@ -35,21 +35,25 @@ class SlipByDeceleration:
     time_constant: Scalar = param(default=0.05, unit="s", above=0.0)
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Return the memory with the filter at the first sample."""
+        """Return the memory with a_f at the measured deceleration."""
         return Memory(flow=signal.deceleration)
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Return a_f'."""
+        """Return a_f' [m/s^3]."""
         del t
         return (signal.deceleration - memory.flow) / self.time_constant
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Return the target slip [1]."""
+        """Return the present target slip [1].
+
+        Raises:
+            ValueError: `decelerations` and `slips` differ in shape.
+        """
         del t, signal
         return self.setpoint(memory)
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """Return the present target slip [1].
+        """Return the present target slip [1], the same as `output`.
 
         Raises:
             ValueError: `decelerations` and `slips` differ in shape.

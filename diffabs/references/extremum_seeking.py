@@ -29,14 +29,14 @@ from diffabs.core.types import PyTree
 
 
 class SeekingMemory(NamedTuple):
-    """Continuous memory of the extremum seeking.
+    """Continuous memory of the extremum seeking; all means are exponential means over the time constant.
 
     Attributes:
         logarithm: ln s, with the estimate s of the best slip.
-        slip: Mean of the slip [1].
-        deceleration: Mean of the deceleration [m/s^2].
-        covariance: Covariance of slip and deceleration [m/s^2].
-        variance: Variance of the slip [1].
+        slip: Mean of the slip, m [1].
+        deceleration: Mean of the deceleration, b [m/s^2].
+        covariance: Covariance of slip and deceleration, c [m/s^2].
+        variance: Variance of the slip, q [1].
     """
 
     logarithm: Scalar
@@ -48,7 +48,20 @@ class SeekingMemory(NamedTuple):
 
 @pytree
 class ExtremumSeeking:
-    """target = s (1 + dither sin(frequency t)), where s climbs the slope of the deceleration between two limits."""
+    """target = s (1 + dither sin(frequency t)), where s climbs the slope of the deceleration between two limits.
+
+    Attributes:
+        slip: Estimate s at the start [1].
+        gain: Rate of ln s for an elasticity of 1, k [1/s].
+        dither: Relative amplitude of the dither, d [1].
+        frequency: Frequency of the dither, w [rad/s].
+        time_constant: Time constant of the means, T [s].
+        resolution: Slip deviation r below which the estimated slope fades to 0 [1].
+        least_deceleration: Least deceleration in the denominator of the elasticity, b0 [m/s^2].
+        least_slip: Lower limit of s [1].
+        greatest_slip: Upper limit of s [1].
+        band: Relative distance from a limit within which the gain fades to 0 [1].
+    """
 
     slip: Scalar = param(default=0.12, unit="1", above=0.0, high=1.0)
     gain: Scalar = param(default=3.0, unit="1/s", low=0.0)
@@ -62,12 +75,12 @@ class ExtremumSeeking:
     band: Scalar = param(default=0.1, unit="1", above=0.0, tunable=False)
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Return the memory at the first slip, with means at the first sample and covariance 0."""
+        """Return the memory with s = slip, means at the measured signals, and covariance and variance 0."""
         zero = 0.0 * signal.slip
         return Memory(flow=SeekingMemory(jnp.log(self.slip) + zero, signal.slip, signal.deceleration, zero, zero))
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> SeekingMemory:
-        """Return the rates of all five memories."""
+        """Return the time derivatives of the five numbers in the memory, per second."""
         del t
         m: SeekingMemory = memory.flow
         slip, deceleration = signal.slip - m.slip, signal.deceleration - m.deceleration
@@ -76,17 +89,18 @@ class ExtremumSeeking:
         return SeekingMemory(self._climb(m), *means, *moments)
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Return the target slip [1]."""
+        """Return the target slip with the dither [1]."""
         del signal
         return self.setpoint(memory) * (1 + self.dither * jnp.sin(self.frequency * t))
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """Return the estimate of the best slip [1]."""
+        """Return s, the present estimate of the best slip without the dither [1]."""
         return jnp.exp(memory.flow.logarithm)
 
     def elasticity(self, memory: Memory) -> PyTree:
-        """Return the estimate of d ln(deceleration)/d ln(slip) from `memory` [1]: positive below the peak, negative
-        beyond it.
+        """Return the estimate e of d ln(deceleration)/d ln(slip) from `memory` [1].
+
+        It is positive below the peak and negative beyond it.
         """
         m: SeekingMemory = memory.flow
         return (

@@ -4,8 +4,8 @@
 
 The slip rate of a braked wheel under torque is proportional to 1/v: r tau/(J v). A target with a rate proportional to
 1/v therefore needs the same torque at every speed. `rate`, the greatest rate at the speed v0, keeps this torque within
-the limits. Near its final value the target settles with the time constant T v/v0. The target starts at the measured
-slip. At t = 0 it has already made its first step.
+the limits. It limits a rising target, not a falling one. Near its final value the target settles with the time
+constant T v/v0. The target starts at the measured slip. At t = 0 it has already made its first step.
 """
 
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ class LimitedSlip:
         return Memory(held=signal.slip)
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Return the target slip [1]."""
+        """Return the present target slip [1]."""
         del t, signal
         return memory.held
 
@@ -56,7 +56,7 @@ class LimitedSlip:
         return self.slip
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """Return the memory after one step of the target at an instant of the period."""
+        """Return the memory after one step of the target if a period begins, else the old memory."""
         now, _ = clock.ticks(self.period)
         # h is the period scaled by v0/v: in this time the target behaves equally at every speed.
         h = self.period * self.reference_speed / jnp.maximum(signal.speed, self.floor)

@@ -33,8 +33,8 @@ class PeakMemory(NamedTuple):
 
     Attributes:
         latched: 1 once latched, else 0.
-        greatest: Greatest |a| [m/s^2].
-        slip: Slip at the greatest |a| [1].
+        greatest: Greatest |a| so far; in `PeakRobust`, of the signed filtered deceleration [m/s^2].
+        slip: Slip at this maximum [1].
         target: Target slip [1].
     """
 
@@ -60,8 +60,12 @@ def _fresh_memory(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMem
 
 @pytree
 class PeakLiteral:
-    """The paper's estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake and serves
-    as evidence.
+    """The paper's estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake.
+
+    It shows that the printed rule, read literally, cannot brake.
+
+    Attributes:
+        slip: Target until |a| exceeds its first sample [1].
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
@@ -70,12 +74,12 @@ class PeakLiteral:
     flow = no_flow
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Return the memory with the first sample as the maximum."""
+        """Return the memory with `slip` as the target and the first |a| as the maximum."""
         size = _size(signal)
         return Memory(held=_fresh_memory(self.slip, size, signal.slip)._replace(greatest=size))
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Return the target slip [1]."""
+        """Return the present target slip [1]."""
         del t, signal
         return memory.held.target
 
@@ -100,6 +104,9 @@ class PeakLatch:
 
     It needs an exact accelerometer. Noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip. A forward bias
     does the same, because |a| falls through zero before it rises.
+
+    Attributes:
+        slip: Target before the first maximum [1].
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
@@ -109,17 +116,20 @@ class PeakLatch:
     setpoint = PeakLiteral.setpoint
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Return the memory without a maximum."""
+        """Return the memory with `slip` as the target and no maximum yet."""
         return Memory(held=_fresh_memory(self.slip, _size(signal), signal.slip))
 
     def margins(self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]) -> tuple[PyTree]:
-        """Return d|a|/dt where |a| exceeds its maximum, else the absolute value of d|a|/dt."""
+        """Return d|a|/dt [m/s^3] where |a| exceeds its maximum so far, else |d|a|/dt|.
+
+        So the margin falls through zero only at a new maximum.
+        """
         del t
         m: PeakMemory = memory.held
         return (_falling_rate(_rate(_size, signal, rate()), _size(signal), m),)
 
     def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[PyTree]) -> Memory:
-        """Return the memory latched at a new maximum."""
+        """Return the memory after the event: if it has fired, target and maximum are the present slip and |a|."""
         del t
         m: PeakMemory = _record_peak(memory.held, fired[0], _size(signal), signal.slip)
         latched = jnp.where(fired[0], 1.0, m.latched)
@@ -170,10 +180,11 @@ class PeakRobust:
     def margins(
         self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]
     ) -> tuple[PyTree, PyTree]:
-        """Return the margin of a new maximum, and the filtered deceleration's distance to the threshold.
+        """Return two margins: of a new maximum [m/s^3], and of the fall that latches [m/s^2].
 
-        Before the latch, the second margin is the filtered deceleration minus the threshold. Afterwards it is an
-        absolute value, so it causes no event.
+        The first is the filtered deceleration's rate where it exceeds its maximum, else the absolute value of the rate.
+        The second is the filtered deceleration minus (1 - threshold) times its maximum.
+        After the latch, or while the maximum is at most `arming`, it is the absolute value, so it causes no event.
         """
         del rate
         m: PeakMemory = memory.held
@@ -184,7 +195,10 @@ class PeakRobust:
         return _falling_rate(moving, a, m), jnp.where(waits, level, jnp.abs(level))
 
     def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[PyTree, PyTree]) -> Memory:
-        """Return the memory after a new maximum or the latch; once latched, a new maximum moves the target."""
+        """Return the memory after the events in `fired`: a new maximum, a latch, or both.
+
+        A latch sets the target to the slip at the maximum. Once latched, a new maximum moves the target.
+        """
         del t, signal
         a, s = memory.flow
         m: PeakMemory = _record_peak(memory.held, fired[0], a, s)

@@ -7,7 +7,7 @@ from diffabs.core.types import PyTree
 
 @pytree
 class Setpoint:
-    """target = value, for the first signal that the plant shows."""
+    """target = value, for the first signal of the plant's output."""
 
     value: Scalar = param(default=1.0, unit="signal")
 
@@ -15,12 +15,12 @@ class Setpoint:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
-        """Return the target."""
+        """Return the target, in the unit of that signal."""
         del t, memory, signal
         return self.value
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """Return the target."""
+        """Return the target, in the unit of that signal."""
         del memory
         return self.value
 
@@ -50,6 +50,10 @@ class FilteredSlip:
     """time_constant target' = slip - target, from the measured slip at the start.
 
     From slip 0 this is slip (1 - exp(-t/T)), which the loop can follow without overshoot.
+
+    Attributes:
+        slip: Final value of the target [1].
+        time_constant: T [s], > 0.
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
@@ -65,11 +69,11 @@ class FilteredSlip:
         return (self.slip - memory.flow) / self.time_constant
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Return the target slip [1]."""
+        """Return the present target slip [1]."""
         del t, signal
         return memory.flow
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """Return the final value of the filter [1]."""
+        """Return the final target slip, `slip` [1]."""
         del memory
         return self.slip

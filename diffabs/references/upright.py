@@ -6,19 +6,19 @@ from diffabs.core.pytree import Scalar, pytree
 
 @pytree
 class Upright:
-    """target = 0 for every angle and every rate."""
+    """target = 0: the angle theta in the upright position."""
 
     flow = no_flow
 
     def start(self, signal: BalanceOutput) -> Memory:
-        """Return 0 in the signal's type."""
+        """Return the memory with the target 0, in the type of the signal."""
         return Memory(held=0.0 * signal.theta)
 
     def output(self, t: Scalar, memory: Memory, signal: BalanceOutput) -> Scalar:
-        """Return the target angle [rad]."""
+        """Return the target angle 0 [rad]."""
         del t, signal
         return memory.held
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """Return the target angle [rad]."""
+        """Return the target angle 0 [rad]."""
         return memory.held

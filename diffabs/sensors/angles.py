@@ -1,4 +1,4 @@
-"""The balance sensor of a real vehicle: it measures the angles of frame and arm, but not the rider's."""
+"""The balance sensor of a real vehicle: it measures theta (frame) and psi (arm), but not phi (rider)."""
 
 from collections.abc import Iterator
 
@@ -14,10 +14,14 @@ from diffabs.sensors.noise import draw_noise
 
 @pytree
 class AngleSensor:
-    """theta and psi with Gaussian noise of the given standard deviations, drawn every `period` and held; all other
-    channels read 0.
+    """theta and psi with Gaussian noise, drawn every `period` and held; all other channels read 0.
 
-    It needs a random key unless both deviations are 0: `rollout(..., key=)`.
+    A run needs a random key (`rollout(..., key=)`), also with both deviations 0.
+
+    Attributes:
+        theta: Standard deviation of theta [rad].
+        psi: Standard deviation of psi [rad].
+        period: Time between two draws [s], a whole multiple of the integration step.
     """
 
     theta: Scalar = param(default=0.0, unit="rad", low=0.0)
@@ -27,7 +31,7 @@ class AngleSensor:
     flow = no_flow
 
     def start(self, signal: BalanceOutput) -> Memory:
-        """Return the memory without noise."""
+        """Return the memory with zero noise for both angles."""
         zero = 0.0 * signal.theta
         return Memory(held=(zero, zero))
 
@@ -38,7 +42,7 @@ class AngleSensor:
         return nothing._replace(theta=signal.theta + memory.held[0], psi=signal.psi + memory.held[1])
 
     def tick(self, clock: Clock, memory: Memory, signal: BalanceOutput) -> Memory:
-        """Return the memory with new noise at an instant of the period.
+        """Return the memory with new noise if a period begins, else the old memory.
 
         Raises:
             ValueError: The run has no random key.

@@ -18,11 +18,19 @@ from diffabs.core.types import Key, PyTree
 
 @pytree
 class Noise:
-    """Gaussian noise of these standard deviations, drawn every `period` and held. It needs a random key: `rollout(...,
-    key=)`.
+    """Independent Gaussian noise of each channel, drawn every `period` and held; the distance has none.
 
+    The slip has noise of its own: it is not computed again from the noisy speeds.
+    A run needs a random key (`rollout(..., key=)`), also with all deviations 0.
     The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations. A channel
     with deviation 0 draws nothing, because drawing would take most of the run's time.
+
+    Attributes:
+        slip: Standard deviation of the slip [1].
+        speed: Standard deviation of the vehicle speed [m/s].
+        wheel_speed: Standard deviation of the wheel speed [m/s].
+        deceleration: Standard deviation of the deceleration [m/s^2].
+        period: Time between two draws [s], a whole multiple of the integration step.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0)
@@ -34,16 +42,16 @@ class Noise:
     flow = no_flow
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Return the memory without noise."""
+        """Return the memory with zero noise in every channel."""
         return Memory(held=jax.tree.map(lambda x: 0.0 * x, signal))
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Return the signal plus noise."""
+        """Return the signal plus the held noise."""
         del t
         return axpy(1.0, memory.held, signal)
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """Return the memory with new noise at an instant of the period.
+        """Return the memory with new noise if a period begins, else the old memory.
 
         Raises:
             ValueError: The run has no random key.
@@ -67,8 +75,12 @@ class WheelNoise:
     """Gaussian noise of the wheel speed, proportional to the vehicle speed: w_seen = w - v n, with n drawn every
     `period` and held.
 
-    The measured slip thus has the noise n, of standard deviation `slip`, at any speed. The sensor needs a random key.
+    The slip shown is slip + n at any speed. A run needs a random key, also with deviation 0.
     Teeth of unequal width cause such noise. It also enters an estimate of the vehicle speed from the wheel speed.
+
+    Attributes:
+        slip: Standard deviation of n [1].
+        period: Time between two draws [s], a whole multiple of the integration step.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0)
@@ -78,7 +90,7 @@ class WheelNoise:
     grid_rules = Noise.grid_rules
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Return the memory without noise."""
+        """Return the memory with zero noise."""
         return Memory(held=0.0 * signal.slip)
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
@@ -88,7 +100,7 @@ class WheelNoise:
         return signal._replace(slip=signal.slip + noise, wheel_speed=signal.wheel_speed - signal.speed * noise)
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """Return the memory with new noise at an instant of the period.
+        """Return the memory with new noise if a period begins, else the old memory.
 
         Raises:
             ValueError: The run has no random key.
@@ -102,11 +114,16 @@ class WheelNoise:
 
 @pytree
 class PlayedWheelNoise:
-    """A given error of the wheel speed, proportional to the vehicle speed: w_seen = w - v n. Each period holds one
-    entry of `noise` (n,), cyclically.
+    """A given error of the wheel speed, proportional to the vehicle speed: w_seen = w - v n.
 
+    Each period holds one entry of `noise` (length,), cyclically. The slip shown is slip + n. No random key is
+    necessary.
     The entries of `noise` are parameters in place of the draws of `WheelNoise`: a recorded sequence, or the result of a
     search. A repeating sequence models the teeth of a wheel.
+
+    Attributes:
+        noise: Values of n, shape (length,) [1].
+        period: Time for which an entry is held [s], a whole multiple of the integration step.
     """
 
     noise: Vector = param(default=(0.0,), unit="1", free=True)
@@ -116,7 +133,7 @@ class PlayedWheelNoise:
     grid_rules, start, output = Noise.grid_rules, WheelNoise.start, WheelNoise.output
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """Return the memory with the next entry at an instant of the period."""
+        """Return the memory with the next entry if a period begins, else the old memory."""
         del signal
         now, played = clock.ticks(self.period)
         noise = jnp.asarray(self.noise)
@@ -131,14 +148,15 @@ class PlayedWheelNoise:
 
 @jax.custom_jvp
 def draw_noise(deviation: Scalar, key: Key, number: Scalar) -> PyTree:
-    """Return deviation * z with a standard normal z, drawn only if the deviation is nonzero or has a tangent.
+    """Return deviation * z as a scalar, with z standard normal; a draw happens only if necessary.
 
+    A deviation of 0 without a tangent draws nothing and returns 0.
     The tangent is z times the deviation's tangent, also at deviation 0.
 
     Args:
-        deviation: Standard deviation.
+        deviation: Standard deviation, shape ().
         key: Random key of the run.
-        number: Number of the draw, folded into the key.
+        number: Number of the draw, folded into the key: equal key and number give equal z.
     """
     return jax.lax.cond(deviation != 0, lambda: deviation * _normal(deviation, key, number), lambda: 0.0 * deviation)
 
@@ -158,7 +176,10 @@ def _normal(like: PyTree, key: Key, number: Scalar) -> Any:
 
 @pytree
 class Bias:
-    """measured = true + bias, for each channel."""
+    """measured = true + bias, for each channel; the distance has no bias.
+
+    The slip has a bias of its own: it is not computed again from the biased speeds.
+    """
 
     slip: Scalar = param(default=0.0, unit="1")
     speed: Scalar = param(default=0.0, unit="m/s")
@@ -184,6 +205,7 @@ class Bias:
 class Quantisation:
     """measured = q round(true/q) for each channel; q = 0 leaves the channel unchanged.
 
+    Every field is the q of its channel. The distance has none.
     The derivative with respect to the signal is 0, as on the treads of a staircase; it does not contain the jumps. A
     run does not depend smoothly on q: a derivative with respect to q raises a ValueError.
     """
@@ -197,7 +219,7 @@ class Quantisation:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Return the nearest multiples of q."""
+        """Return each channel rounded to the nearest multiple of its q."""
         del t, memory
         return BrakeOutput(
             _round_to(signal.slip, self.slip),

@@ -8,13 +8,18 @@ from diffabs.core.pytree import Scalar, param, pytree
 
 @pytree
 class WheelSpeed:
-    """A wheel-speed sensor with a first-order filter, w' = (true - w)/T; the slip is computed from it as (v - w)/v."""
+    """A wheel-speed sensor with a first-order filter, w' = (true - w)/T, and the slip (v - w)/max(v, floor).
+
+    Attributes:
+        time_constant: T [s], > 0.
+        floor: Least speed in the slip's denominator [m/s], > 0.
+    """
 
     time_constant: Scalar = param(default=0.002, unit="s", above=0.0)
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Return the memory with the filter at the true speed."""
+        """Return the memory with the filter at the true wheel speed."""
         return Memory(flow=signal.wheel_speed)
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
@@ -23,7 +28,7 @@ class WheelSpeed:
         return (signal.wheel_speed - memory.flow) / self.time_constant
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Return the signal with the filtered wheel speed and the slip computed from it."""
+        """Return the signal with the filtered wheel speed, and the slip computed from it."""
         del t
         slip = (signal.speed - memory.flow) / jnp.maximum(signal.speed, self.floor)
         return signal._replace(slip=slip, wheel_speed=memory.flow)
@@ -34,8 +39,11 @@ class IntegratedAccelerometer:
     """Vehicle speed as the integral of an accelerometer, v' = -deceleration + bias, and the slip computed with it.
 
     The bias is that of the signed forward acceleration. A positive bias makes the estimated speed too high and the slip
-    too large, which releases the brake. The `floor` on the speed in the slip's denominator limits this effect near
-    standstill.
+    too large, which releases the brake. The `floor` limits this effect near standstill.
+
+    Attributes:
+        bias: Bias of the forward acceleration [m/s^2].
+        floor: Least speed in the slip's denominator [m/s], > 0.
 
     Source: Aoki and Nakamura, sec. 4: "obtained by integrating the acceleration sensors".
     """
@@ -48,12 +56,12 @@ class IntegratedAccelerometer:
         return Memory(flow=signal.speed)
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Return v' [m/s^2]."""
+        """Return v' = bias - deceleration [m/s^2]."""
         del t, memory
         return self.bias - signal.deceleration
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Return the signal with estimated speed, biased deceleration, and the slip computed with this speed."""
+        """Return the signal with estimated speed v, deceleration - bias, and slip (v - w)/max(v, floor)."""
         del t
         v = memory.flow
         slip = (v - signal.wheel_speed) / jnp.maximum(v, self.floor)
@@ -62,10 +70,14 @@ class IntegratedAccelerometer:
 
 @pytree
 class SpeedScale:
-    """A vehicle speed with a relative error, v = factor * true, and the slip computed with it, (v - w)/v.
+    """A vehicle speed with a relative error, v = factor * true, and the slip (v - w)/max(v, floor).
 
     A wrong rolling radius has this effect on a speed that is estimated from another wheel. A factor below 1 hides slip:
     at a measured slip s, the wheel slips by 1 - factor (1 - s).
+
+    Attributes:
+        factor: Ratio of the shown speed to the true one [1], > 0.
+        floor: Least speed in the slip's denominator [m/s], > 0.
     """
 
     factor: Scalar = param(default=1.0, unit="1", above=0.0)
@@ -83,11 +95,17 @@ class SpeedScale:
 
 @pytree
 class DriftingSpeed:
-    """A vehicle speed whose relative error drifts, and the slip computed with it and the measured wheel speed w.
+    """A vehicle speed with a relative error e that drifts, and the slip computed with it and the given wheel speed w.
 
-        v_seen = (1 + e) v,   e = last + (first - last) exp(-t/T),   slip = (v_seen - w)/v_seen
+        v_seen = (1 + e) v,   e = last + (first - last) exp(-t/T),   slip = (v_seen - w)/max(v_seen, floor)
 
     At a measured slip s, the wheel slips by s - e (1 - s): an error e < 0 hides slip.
+
+    Attributes:
+        first: Relative error at t = 0 [1], > -1.
+        last: Relative error for large t [1], > -1.
+        time_constant: T [s], > 0.
+        floor: Least speed in the slip's denominator [m/s], > 0.
     """
 
     first: Scalar = param(default=0.0, unit="1", above=-1.0)
@@ -99,7 +117,7 @@ class DriftingSpeed:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Return the signal with the erroneous speed and the slip computed with it."""
+        """Return the signal with v_seen as speed, and the slip computed with it."""
         del memory
         error = self.last + (self.first - self.last) * jnp.exp(-t / self.time_constant)
         v = (1 + error) * signal.speed

@@ -55,7 +55,7 @@ class EstimatorMemory(NamedTuple):
         speed: Estimate v [m/s].
         variance: Its variance P [m^2/s^2].
         braked: Recent deceleration f [m/s^2].
-        begun: 1 after the first sample, else 0.
+        begun: 1 once the filter has taken its first sample, else 0.
     """
 
     speed: Scalar
@@ -90,18 +90,21 @@ class SpeedEstimator:
     grid_rules = Noise.grid_rules
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Return the memory with the wheel speed as the estimate."""
+        """Return the memory with v = w, at least `floor`, P = (noise v)^2 and f = 9.81 m/s^2."""
         w = jnp.maximum(signal.wheel_speed, self.floor)
         return Memory(held=EstimatorMemory(w, (self.noise * w) ** 2, BRAKED + 0.0 * w, 0.0 * w))
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Return the signal with the estimated speed and the slip computed with it."""
+        """Return the signal with the estimated speed v, and the slip (v - w)/v computed with it."""
         del t
         v = memory.held.speed
         return signal._replace(slip=(v - signal.wheel_speed) / v, speed=v)
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """Return the memory after a step of the filter, or after its start, at an instant of the period."""
+        """Return the memory after one filter step if a period begins, else the old memory.
+
+        At the first sample, and where slip >= gate with f < rest, the filter starts anew from the wheel speed.
+        """
         now, _ = clock.ticks(self.period)
         m: EstimatorMemory = memory.held
         first = self.start(signal).held
