@@ -16,7 +16,7 @@ ROTOR = 2e-4  # kg m^2
 
 @pytree
 class Machine:
-    """A machine and its LQR weights; `closed()` is the loop."""
+    """A machine and its LQR weights; `closed_loop()` is the loop."""
 
     loop: Loop = part(default=Loop)
     mount: Scalar = param(default=0.7, unit="m")
@@ -49,7 +49,7 @@ class Machine:
             current_max=self.current + 0.0 * self.gear,
         )
 
-    def closed(self) -> Loop:
+    def closed_loop(self) -> Loop:
         """The loop with the LQR for one rider."""
         plant = self.plant()
         a, b = BalanceModel(plant=dataclasses.replace(plant, rider_mass=self.rider)).matrices()

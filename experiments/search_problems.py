@@ -148,7 +148,7 @@ class Weights:
     loop: Loop = part(default=Loop)
     log_diagonal: Vector = param(default=(0.0, 0.0), unit="1")
 
-    def closed(self) -> Loop:
+    def closed_loop(self) -> Loop:
         """The loop with the gains of these weights."""
 
         def gain(speed: Any, d: Any) -> Any:
