@@ -136,7 +136,7 @@ def gradients(problem: Problem, mode: DerivativeMode, most: int) -> Trace:
         spent += 1
         found = jax.device_get(evaluate(jnp.asarray(z)[None], none))
         value, gradient = float(found.loss[0]), np.asarray(found.gradient[0])
-        fine = np.isfinite(value) and np.isfinite(gradient).all() and not found.seen.diverged[0]
+        fine = np.isfinite(value) and np.isfinite(gradient).all() and not found.evaluation.diverged[0]
         if not fine or not steady(z[None])[0]:
             return REJECTED, np.zeros_like(z)
         if not trace or value < trace[-1][1]:
