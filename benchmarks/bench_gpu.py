@@ -35,7 +35,7 @@ from diffabs.core.pytree import get
 from diffabs.kernel import cuda, gpu, launch, nvrtc
 from diffabs.kernel.graph import UpdateLevel, is_real
 from diffabs.kernel.program import ScalarProgram, live_nodes
-from diffabs.simulate import native
+from diffabs.simulate.drive import kernel as native
 
 ACCURACY = 1e-4
 STEPS, TOLERANCES = (1e-3, 5e-4, 2e-4, 1e-4), (1e-5, 5e-6, 1e-6)

@@ -14,8 +14,8 @@ from diffabs.simulate.batch import Batch as Batch
 from diffabs.simulate.batch import run_batch as run_batch
 from diffabs.simulate.run import measure as measure
 from diffabs.simulate.run import rollout as rollout
-from diffabs.simulate.solution import Adaptive as Adaptive
-from diffabs.simulate.solution import FixedStep as FixedStep
-from diffabs.simulate.solution import Run as Run
+from diffabs.simulate.types import Adaptive as Adaptive
+from diffabs.simulate.types import FixedStep as FixedStep
+from diffabs.simulate.types import Run as Run
 
 __version__ = "0.1.0"

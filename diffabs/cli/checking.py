@@ -13,7 +13,7 @@ from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, needs_key
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import Adaptive, Run, Solver, describe_solver, refine_solver
+from diffabs.simulate.types import Adaptive, Run, Solver, describe_solver, refine_solver
 
 MIN_CHANGE = 1e-6  # of a value; the order of a smaller error does not matter
 FINEST = 4  # the shortest step of the check is the scenario's divided by this

@@ -7,7 +7,7 @@ import typer
 
 from diffabs.cli import console
 from diffabs.core.values import unknown_name_error
-from diffabs.simulate.engine import REQUESTABLE_ENGINES
+from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES
 
 Engine = Annotated[
     str, typer.Option(help="Engine of the runs: xla, kernel (compiled by this machine's C++ compiler) or auto.")

@@ -18,7 +18,7 @@ from diffabs.core.units import units_of
 from diffabs.core.validity import find_problems
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.types import FixedStep
 
 
 class Form(enum.StrEnum):

@@ -21,7 +21,7 @@ from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read_measurements
 from diffabs.scenario.parameter_paths import flatten_table
 from diffabs.scenario.scenario import Scenario, dump
-from diffabs.simulate.solution import Solver
+from diffabs.simulate.types import Solver
 
 if TYPE_CHECKING:
     from diffabs.identify.fit import Identified

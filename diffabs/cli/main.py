@@ -50,7 +50,7 @@ from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.matlab import write_mat
 from diffabs.simulate.run import measure, rollout
-from diffabs.simulate.solution import Adaptive, Run, describe_solver
+from diffabs.simulate.types import Adaptive, Run, describe_solver
 
 if COLLECTS:
     gc.enable()

@@ -19,7 +19,7 @@ from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.toml import parse_value
-from diffabs.simulate.engine import describe_engine
+from diffabs.simulate.drive.engine import describe_engine
 
 if TYPE_CHECKING:
     from diffabs.reliability.subset_simulation import RareEvent, SubsetProgress

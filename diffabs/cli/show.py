@@ -19,7 +19,7 @@ from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.papers.digest import Digest
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.solution import Trajectory
+from diffabs.simulate.types import Trajectory
 
 BOUND_SHARE = 1e-3  # of its range: a tuned number this close to a bound counts as on it
 PIPE_WIDTH = 140  # columns of a table on a pipe or in a file

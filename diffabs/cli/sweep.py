@@ -28,7 +28,7 @@ from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
 from diffabs.simulate.admissible import first_refusal
-from diffabs.simulate.engine import EngineError
+from diffabs.simulate.drive.engine import EngineError
 
 if TYPE_CHECKING:
     from diffabs.sweep import Results, Study

@@ -21,9 +21,9 @@ from diffabs.core.types import JsonObject, Part
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.admissible import first_refusal
-from diffabs.simulate.engine import EngineError
+from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import Trajectory
+from diffabs.simulate.types import Trajectory
 
 if TYPE_CHECKING:
     from diffabs.tune import Tuned, TuningProgress

@@ -119,8 +119,8 @@ def power(base: Scalar, exponent: Scalar) -> Scalar:
 def searchsorted(knots: Scalar, x: Scalar) -> Scalar:
     """Return the number of knots that are not above x, for a few knots.
 
-    `core.comparisons` recognises the search by this name, which JAX uses, too. JAX's own search looks for NaN among the
-    knots in each call.
+    `simulate.step.comparisons` recognises the search by this name, which JAX uses, too. JAX's own search looks for
+    NaN among the knots in each call.
 
     Args:
         knots: Increasing knots, shape (n,).

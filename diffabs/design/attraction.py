@@ -26,7 +26,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.types import Matrix, Params, Part, PyTree, Scalar
 from diffabs.design.capture import capture_ellipsoids
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.solution import Solver
+from diffabs.simulate.types import Solver
 
 MIN_RUNS_PER_CORE = 256  # a core gets at least so many runs
 # Search for the largest multiple: relative width of the last interval; runs of one batch.

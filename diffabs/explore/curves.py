@@ -17,7 +17,7 @@ from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.convert import trajectory_columns
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import Adaptive, FixedStep, Run, Solver
+from diffabs.simulate.types import Adaptive, FixedStep, Run, Solver
 
 INSTANTS = 400  # number of instants of a curve
 DRAFT_INSTANTS = 200  # number of instants of a fan, few because the browser lays all of them out with every redraw

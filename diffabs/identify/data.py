@@ -8,7 +8,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.types import PyTree, Scalar
 from diffabs.identify.residuals import Residuals
-from diffabs.simulate.solution import Solver
+from diffabs.simulate.types import Solver
 
 
 class Comparison(NamedTuple):

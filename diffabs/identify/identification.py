@@ -20,8 +20,8 @@ from diffabs.identify.data import Comparison, Data
 from diffabs.identify.fit import Identified, Tolerances, fit
 from diffabs.identify.residuals import Prior
 from diffabs.simulate.admissible import batch_admissibility
-from diffabs.simulate.solution import Solver
-from diffabs.simulate.stable_step import stable_steps
+from diffabs.simulate.stability import stable_steps
+from diffabs.simulate.types import Solver
 
 
 def identify(

@@ -17,7 +17,7 @@ from diffabs.identify.data import Comparison, check_positive
 from diffabs.objectives import BRAKING
 from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import Solver
+from diffabs.simulate.types import Solver
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from diffabs.identify.data import Comparison, check_positive
 from diffabs.identify.fit import Identified
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import Solver
+from diffabs.simulate.types import Solver
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

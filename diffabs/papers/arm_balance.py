@@ -31,7 +31,7 @@ from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
 from diffabs.scenario.defaults import balancing
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import Adaptive, FixedStep, Run, describe_solver
+from diffabs.simulate.types import Adaptive, FixedStep, Run, describe_solver
 
 TITLE = "Fumita: a two-wheeler balanced by an arm"
 SOLVER = FixedStep(step=1e-3, duration=10.0)

@@ -9,7 +9,7 @@ from diffabs import plot
 from diffabs.core.types import JsonObject, PyTree
 from diffabs.design.attraction import Basin, Reach
 from diffabs.linear.recoverable import mode_bounds
-from diffabs.simulate.solution import Run
+from diffabs.simulate.types import Run
 
 
 def figures(

@@ -13,7 +13,7 @@ import numpy as np
 from diffabs.core.types import JsonObject, Table
 from diffabs.papers import record
 from diffabs.roads import peak
-from diffabs.simulate.solution import Run
+from diffabs.simulate.types import Run
 
 KMH = 3.6
 LATE_TIME = 0.45  # s; later the torque is built up in every run

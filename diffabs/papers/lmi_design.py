@@ -18,7 +18,7 @@ from diffabs.linear.slip_model import SlipModel
 from diffabs.papers import record
 from diffabs.papers.digest import Refuted
 from diffabs.plants import MirroredRig
-from diffabs.simulate.solution import Run
+from diffabs.simulate.types import Run
 
 K1 = 11753.0
 PUBLISHED_GAIN = (-K1, -48.0)

@@ -16,7 +16,7 @@ from rich.table import Table
 from diffabs import plot
 from diffabs.core import files, provenance
 from diffabs.core.types import JsonObject, Params, Scalar
-from diffabs.simulate.solution import FixedStep, Run
+from diffabs.simulate.types import FixedStep, Run
 
 
 def lane(run: Run, i: int) -> Run:

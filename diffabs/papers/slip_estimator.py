@@ -28,7 +28,7 @@ from diffabs.roads import MagicFormula, peak
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.batch import run_batch, stack_loops
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import FixedStep, Run
+from diffabs.simulate.types import FixedStep, Run
 
 TITLE = "Aoki and Nakamura: anti-lock braking at the estimated best slip (quarter car, from 100 km/h)"
 SOLVER = FixedStep(step=5e-5, duration=3.6, every=20)

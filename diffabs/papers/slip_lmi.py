@@ -28,7 +28,7 @@ from diffabs.roads import RIG, peak
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.batch import run_batch, stack_loops
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import FixedStep, Run, Trajectory
+from diffabs.simulate.types import FixedStep, Run, Trajectory
 from diffabs.stops import SpeedReached
 
 TITLE = "Maeda and Sugiura: robust LQ control of an anti-lock brake (mirrored rig, 50 to 5 km/h)"

@@ -24,7 +24,7 @@ from diffabs.plot.style import (
     sheet,
     spaced_name,
 )
-from diffabs.simulate.solution import Run, Trajectory
+from diffabs.simulate.types import Run, Trajectory
 
 
 def draw_braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:

@@ -17,7 +17,7 @@ from diffabs.plot.style import (
     sheet,
     signal_label,
 )
-from diffabs.simulate.solution import Trajectory
+from diffabs.simulate.types import Trajectory
 
 MARKS = "osD^v"
 MAX_DECADES = 5.0  # an objective that falls by less is easier to read on a linear axis

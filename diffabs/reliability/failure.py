@@ -85,7 +85,7 @@ def find_metric_objection(study: Study, metric: str) -> str | None:
     Raises:
         ValueError: The loop cannot be run at all.
     """
-    from diffabs.simulate import native
+    from diffabs.simulate.drive import kernel as native
 
     values = study.space.normal(np.zeros((1, study.space.dimension)))
     with precision(study.dtype):

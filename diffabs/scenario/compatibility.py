@@ -13,7 +13,7 @@ from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import PyTree
 from diffabs.core.values import kebab_case
 from diffabs.scenario.registry import join_path
-from diffabs.simulate.advance import initial_point
+from diffabs.simulate.step.attempt import initial_point
 
 
 def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:

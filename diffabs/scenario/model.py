@@ -10,7 +10,7 @@ from diffabs.core.types import JsonObject, Scalar
 from diffabs.core.units import units_of
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.solution import describe_solver
+from diffabs.simulate.types import describe_solver
 
 
 def describe_model(chosen: Scenario) -> JsonObject:

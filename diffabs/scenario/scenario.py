@@ -55,7 +55,7 @@ from diffabs.scenario.registry import (
     type_name,
 )
 from diffabs.simulate.admissible import find_mismatches, find_unstable_step
-from diffabs.simulate.solution import Adaptive, Solver
+from diffabs.simulate.types import Adaptive, Solver
 
 MAX_SCENARIO_BYTES = 1_000_000  # bytes
 MAX_PATH_LENGTH = 4096  # characters of a path in a message

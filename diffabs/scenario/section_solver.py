@@ -10,7 +10,7 @@ from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject, PyTree, Table
 from diffabs.core.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
-from diffabs.simulate.solution import SOLVER_TYPES, Adaptive, FixedStep, Solver
+from diffabs.simulate.types import SOLVER_TYPES, Adaptive, FixedStep, Solver
 
 TIME_SPEC = ParameterSpec("s", low=0.0, open_low=True)
 TOLERANCE_SPEC = ParameterSpec("1", low=1e-12, high=0.01)

@@ -26,7 +26,7 @@ from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import refine_parts
 from diffabs.core.types import Bool, Int, Key, Part, PyTree, Scalar
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import Run, Solver, refine_solver
+from diffabs.simulate.types import Run, Solver, refine_solver
 
 MAX_DIFFERENCE_RATIO = 0.75  # greatest |d2/d1| of a convergent metric: an order of 0.4
 ROUNDING_EPS = 1e3  # multiples of machine epsilon: smaller differences count as rounding errors

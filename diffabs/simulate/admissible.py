@@ -25,8 +25,8 @@ from diffabs.core.rules import Rule
 from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.core.validity import check_part as check_parts
 from diffabs.core.validity import find_broken, grid_rules, part_rules
-from diffabs.simulate.solution import Adaptive, Solver
-from diffabs.simulate.stable_step import is_step_stable, stable_step
+from diffabs.simulate.stability import is_step_stable, stable_step
+from diffabs.simulate.types import Adaptive, Solver
 
 MAX_SOLVER_STEPS = 1e8
 T = TypeVar("T")

@@ -16,11 +16,11 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import as_arrays, get, parameters, replace
 from diffabs.core.types import Bool, Key, Params, Part, PyTree
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
-from diffabs.simulate.engine import check_process, run_with_engine
-from diffabs.simulate.packed import EarlyEnd, run_packed
+from diffabs.simulate.drive.engine import check_process, run_with_engine
+from diffabs.simulate.drive.packed import EarlyEnd, run_packed
+from diffabs.simulate.drive.sharding import run_on_auto_mesh
 from diffabs.simulate.run import refuse, run_unchecked
-from diffabs.simulate.sharding import run_on_auto_mesh
-from diffabs.simulate.solution import Run, Solver
+from diffabs.simulate.types import Run, Solver
 
 # Part of a message: why a batch cannot run in a kernel.
 TOGETHER_REASON = "lanes run together, for trajectories or for derivatives in either mode"
@@ -180,8 +180,8 @@ def run_batch(
 
     Raises:
         ValueError: Columns have different lengths, `measure` rejects the arguments, or `enough` is given for runs that
-            step together. Also if engine "kernel" is impossible; `simulate.native.kernel_objection` returns the reason
-            without a run.
+            step together. Also if engine "kernel" is impossible; `simulate.drive.kernel.kernel_objection` returns
+            the reason without a run.
         KeyError: A path does not exist.
         RuntimeError: A kernel is requested in a process that was forked after JAX had started.
     """
@@ -233,7 +233,7 @@ def _dispatch_batch(
         raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
 
     def by_kernel() -> Run:
-        from diffabs.simulate.native import run_native
+        from diffabs.simulate.drive.kernel import run_native
 
         return run_native(*given, enough)
 

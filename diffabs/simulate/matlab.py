@@ -7,7 +7,7 @@ from typing import Any
 from diffabs.core.loop import run_signals
 from diffabs.core.protocols import Plant
 from diffabs.core.types import Params, PyTree
-from diffabs.simulate.solution import Run
+from diffabs.simulate.types import Run
 
 
 def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:

@@ -12,8 +12,8 @@ from diffabs.core.loop import Loop, LoopState
 from diffabs.core.protocols import Ending, Objective
 from diffabs.core.pytree import prepare_parts
 from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
-from diffabs.simulate.condition import RunStatus
-from diffabs.simulate.solution import Run, Trajectory
+from diffabs.simulate.step.status import RunStatus
+from diffabs.simulate.types import Run, Trajectory
 
 PHYSICAL_RANGE_TOLERANCE = 1e-9  # a metric may exceed its physical range by this much
 AUDIT_METRIC = ""  # name of a plant's audit among the objectives; no metric has an empty name

@@ -24,17 +24,17 @@ from diffabs.core.types import Key, Params, PyTree, Scalar
 from diffabs.core.validity import find_broken, find_misshapen, part_rules
 from diffabs.objectives import Variation
 from diffabs.simulate.admissible import find_impossible_values
-from diffabs.simulate.drivers import (
+from diffabs.simulate.drive.loops import (
     round_up_capacity,
     run_to_end,
     run_with_trajectory,
     scan_to_end,
     scan_with_trajectory,
 )
-from diffabs.simulate.methods import AdaptiveStepping, build_stepping
-from diffabs.simulate.replay import log_capacity, log_steps, replay_run, replay_with_trajectory
 from diffabs.simulate.result import finish_run, prepare
-from diffabs.simulate.solution import Adaptive, Run, Solver, Trajectory
+from diffabs.simulate.step.methods import AdaptiveStepping, build_stepping
+from diffabs.simulate.step.replay import log_capacity, log_steps, replay_run, replay_with_trajectory
+from diffabs.simulate.types import Adaptive, Run, Solver, Trajectory
 
 OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
 MAX_COUNTED_STEPS = 2**31 - 8  # greatest number of steps that a 32-bit counter holds, including the landing

@@ -10,7 +10,7 @@ import numpy as np
 from diffabs.core.types import JsonObject, Key, Part, PyTree
 from diffabs.simulate.accuracy import is_comparable, measure_finer, relative_difference
 from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
-from diffabs.simulate.solution import Run, describe_solver
+from diffabs.simulate.types import Run, describe_solver
 from diffabs.sweep.results import Results
 from diffabs.sweep.study import Study, precision
 

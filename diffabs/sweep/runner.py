@@ -24,7 +24,7 @@ from diffabs.core.types import Bool, JsonObject, Params, Part, PyTree
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.engine import EngineError
+from diffabs.simulate.drive.engine import EngineError
 from diffabs.sweep.study import FLAG_COLUMNS, Study, noise_key, numeric_values, precision
 
 BLOCKS_PER_CHUNK = 8

@@ -23,7 +23,7 @@ from diffabs.core.values import as_plain, unknown_name_error
 from diffabs.kernel import launch
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import find_solver_faults
-from diffabs.simulate.solution import Solver, describe_solver
+from diffabs.simulate.types import Solver, describe_solver
 from diffabs.sweep.discrete import Categorical
 from diffabs.sweep.variables import Space
 

@@ -15,7 +15,7 @@ import zarr
 from diffabs.core import files
 from diffabs.core.loop import run_signals
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import Trajectory
+from diffabs.simulate.types import Trajectory
 from diffabs.sweep.study import Study, precision
 
 TRAJECTORIES_NAME = "trajectories.zarr"

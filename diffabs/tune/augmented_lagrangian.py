@@ -20,7 +20,7 @@ import optax
 
 from diffabs.core.reason import Reason
 from diffabs.core.types import PyTree
-from diffabs.simulate.engine import describe_engine
+from diffabs.simulate.drive.engine import describe_engine
 from diffabs.tune.descent import Descent, DescentPoint, DescentState, Optimiser, lbfgs, slice_start
 from diffabs.tune.problem import Multipliers, ObjectiveEvaluation, Problem
 from diffabs.tune.result import Method, StartError, StartResult, Tuned, TuningProgress

@@ -14,7 +14,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.pytree import as_arrays, replace
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.simulate.batch import Batch
-from diffabs.simulate.solution import FixedStep, Solver
+from diffabs.simulate.types import FixedStep, Solver
 from diffabs.tune.problem import build_subject_loop
 
 EQUAL_ROUNDING_STEPS = 64.0  # tolerance of equality, in units of the relative precision

@@ -28,8 +28,8 @@ from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar, Vector
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.engine import REQUESTABLE_ENGINES, EngineError, log_xla_reason
-from diffabs.simulate.solution import Run, Solver
+from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES, EngineError, log_xla_reason
+from diffabs.simulate.types import Run, Solver
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.risk import Aggregate
 

@@ -13,8 +13,8 @@ from diffabs.core.validity import check_part
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.objectives import default_objectives
 from diffabs.simulate.batch import Batch
-from diffabs.simulate.engine import EngineError
-from diffabs.simulate.solution import Solver
+from diffabs.simulate.drive.engine import EngineError
+from diffabs.simulate.types import Solver
 from diffabs.tune import one_sided
 from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch
 from diffabs.tune.constraints import Constraint

@@ -27,7 +27,7 @@ from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.solution import Run, Solver
+from diffabs.simulate.types import Run, Solver
 from diffabs.tune.descent import Descent, DescentState, Stopping, lbfgs
 from diffabs.tune.problem import DerivativeMode, Multipliers, Problem, choose_gradient_mode
 from diffabs.tune.risk import Mean

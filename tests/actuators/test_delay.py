@@ -23,8 +23,8 @@ from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import canonical_dtypes, param, pytree
 from diffabs.objectives import TorqueRate
 from diffabs.references import Setpoint
-from diffabs.simulate.dynamics import build_dynamics
-from diffabs.simulate.stepper import init_carry
+from diffabs.simulate.step.fixed import init_carry
+from diffabs.simulate.step.system import build_dynamics
 
 
 @pytree
@@ -196,7 +196,7 @@ def test_what_a_computer_says_comes_out_later(late):
 
 
 @killed_by("actuators/delay.py", "return jnp.any(jnp.stack(jumps))", "return jumps[0]", case="True")
-@killed_by("simulate/dynamics.py", "(seen[:2], seen.signals.recorded)", "seen[:2]", case="True")
+@killed_by("simulate/step/system.py", "(seen[:2], seen.signals.recorded)", "seen[:2]", case="True")
 @killed_by(
     "core/blocks.py",
     "            signal = block.output(t, m, signal)\n        return found\n\n    def record",

@@ -24,7 +24,7 @@ from diffabs.cli import main
 from diffabs.core.pytree import parameters
 from diffabs.objectives import BRAKING
 from diffabs.scenario import model, registry, scenario
-from diffabs.simulate.stable_step import stable_step
+from diffabs.simulate.stability import stable_step
 
 SHORT = ("--set", "solver.duration=0.02", "--set", "solver.step=1e-3", "--set", "solver.every=1")
 

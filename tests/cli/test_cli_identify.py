@@ -18,7 +18,7 @@ from diffabs.identify.fit import Identified
 from diffabs.identify.uncertainty import uncertainty
 from diffabs.scenario.measurements import read_measurements
 from diffabs.scenario.scenario import ScenarioError, load
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.types import FixedStep
 from diffabs.tune import Reason
 
 KEYS = [

@@ -33,7 +33,7 @@ from diffabs.objectives import IAE, ITAE, MaxSlip, SettlingTime
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip, PeakLatch, PeakLiteral, PeakRobust, SlipByDeceleration
 from diffabs.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, SpeedScale, WheelSpeed
-from diffabs.simulate.rk4 import rk4_step
+from diffabs.simulate.step.rk4 import rk4_step
 from diffabs.stops import NoStop, SpeedReached, Standstill
 
 
@@ -177,7 +177,9 @@ def test_scheduled_feedback_refuses(change, message):
 
 @killed_by("controllers/switching.py", "return (self.band + jnp.where", "return (0.0 * self.band + jnp.where")
 @killed_by(
-    "simulate/landing.py", "length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)", "length = place"
+    "simulate/step/event_location.py",
+    "length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)",
+    "length = place",
 )
 def test_relay_switches_on_the_far_side_of_its_band():
     """Slip 0.2 + 0.03 sin(w t), band 0.02: released where the sine is 2/3 and rises, applied where it is -2/3 and
@@ -194,7 +196,7 @@ def test_relay_switches_on_the_far_side_of_its_band():
     close(mean, 1.0 + 8.0 * on / (20 * np.pi), rtol=1e-9)
 
 
-@killed_by("simulate/landing.py", "enough & ~at_once & tells.another", "enough & ~at_once & False")
+@killed_by("simulate/step/event_location.py", "enough & ~at_once & tells.another", "enough & ~at_once & False")
 def test_two_events_in_one_step():
     """The deceleration has its maximum 0.3 into step 5, at a slip of 0.15; the relay, whose target is that from then
     on, releases at 0.16; with the target before it, it would at 0.21, 0.8 into the step. The slip bends so that a
@@ -215,7 +217,7 @@ def test_two_events_in_one_step():
 
 
 @killed_by(
-    "simulate/stepper.py",
+    "simulate/step/fixed.py",
     "jnp.where(lost, RunStatus.DIVERGED, status)",
     "jnp.where(lost, RunStatus.TIMED_OUT, status)",
 )
@@ -339,7 +341,9 @@ def parabola(t, top=5.3e-3, a=9.0, bend=4e4):
 
 
 @killed_by(
-    "simulate/landing.py", "jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier", "x, True"
+    "simulate/step/event_location.py",
+    "jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier",
+    "x, True",
 )
 @pytest.mark.parametrize("top", [5.3e-3, 5.7e-3, 6e-3])
 def test_latch_finds_the_vertex(top):

@@ -22,9 +22,7 @@ from diffabs.controllers import (
     ScheduledFeedback,
     StateFeedback,
 )
-from diffabs.core.comparisons import SwitchedProgram
 from diffabs.core.loop import Loop
-from diffabs.core.modes import Mode, find_contradicted
 from diffabs.core.numerics import quotient, searchsorted
 from diffabs.core.pytree import param, pytree, static
 from diffabs.objectives import IAE, Effort, FinalError
@@ -32,6 +30,8 @@ from diffabs.plants import LabRig, MirroredRig
 from diffabs.references import FixedSlip, Setpoint
 from diffabs.roads import DRY_ASPHALT
 from diffabs.scenario.defaults import braking
+from diffabs.simulate.step.comparisons import SwitchedProgram
+from diffabs.simulate.step.modes import Mode, find_contradicted
 from diffabs.stops import SpeedReached
 
 KNOTS = np.array([-1.0, 0.0, 0.5, 2.0, 3.0])
@@ -78,12 +78,14 @@ def same(out: Any) -> Any:
 
 
 @killed_by(
-    "core/comparisons.py",
+    "simulate/step/comparisons.py",
     "key = (y, x, not strict) if turned else (x, y, strict)",
     "key = (x, y, strict)",
     case="a contrary",
 )
-@killed_by("core/comparisons.py", "asks = name if moves and real", "asks = name if real", case="of what is fixed")
+@killed_by(
+    "simulate/step/comparisons.py", "asks = name if moves and real", "asks = name if real", case="of what is fixed"
+)
 @pytest.mark.parametrize("name", KINKED)
 def test_a_program_is_the_function(name):
     f, count = KINKED[name]
@@ -107,7 +109,7 @@ def test_a_regime_goes_on_beyond_its_kinks(name, at, beyond, value, slope):
     np.testing.assert_allclose([found, move], [value, slope], rtol=1e-15)
 
 
-@killed_by("core/modes.py", "against = margin < -_rounding_error(x)", "against = margin < -jnp.inf", case="gt")
+@killed_by("simulate/step/modes.py", "against = margin < -_rounding_error(x)", "against = margin < -jnp.inf", case="gt")
 @pytest.mark.parametrize("name", [name for name, (_, count) in KINKED.items() if count])
 def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
     f, _ = KINKED[name]
@@ -132,7 +134,7 @@ def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
         assert answers.words == held(one, 2.2).words
 
 
-@killed_by("core/modes.py", "most.eps**ROUNDING_POWER *", "0.0 *")
+@killed_by("simulate/step/modes.py", "most.eps**ROUNDING_POWER *", "0.0 *")
 def test_numbers_that_are_equal_to_rounding_say_nothing():
     one = program(lambda x, p: jnp.where(x > p, 1.0, 0.0))
     regime = held(one, 0.1)
@@ -140,7 +142,7 @@ def test_numbers_that_are_equal_to_rounding_say_nothing():
         assert any(one.look(same, 0.6 + excess, 0.6, regime)[1].contradicted) == sees
 
 
-@killed_by("core/modes.py", "against |= gives & (margin == 0) & (says() != taken)", "pass")
+@killed_by("simulate/step/modes.py", "against |= gives & (margin == 0) & (says() != taken)", "pass")
 def test_a_product_that_has_become_0_is_held_by_nobody():
     """(x - min(x, p)) x > 0 above p, and 0 > 0 below, which contradicts nobody: it gives way all the same."""
     one = program(lambda x, p: jnp.where((x - jnp.minimum(x, p)) * x > 0, 1.0, 0.0))
@@ -231,13 +233,13 @@ def clockwork(rate: Any, place: Any) -> Loop:
 
 
 @killed_by(
-    "core/modes.py",
+    "simulate/step/modes.py",
     "next = below + jnp.where(high < -_rounding_error(x), 1, 0) - jnp.where(low < -_rounding_error(x), 1, 0)",
     "next = below",
     case="a table",
 )
 @killed_by(
-    "simulate/methods.py",
+    "simulate/step/methods.py",
     "dataclasses.replace(self, kinks=self.kinks is not False,",
     "dataclasses.replace(self, kinks=False,",
     case="a jump",
@@ -287,7 +289,7 @@ def test_a_step_ends_on_a_comparison_near_the_start():
     np.testing.assert_allclose(found, jax.jit(jax.jacfwd(iae))(gains), rtol=1e-12)
 
 
-@killed_by("simulate/stepper.py", "tired & (search.which < kinks)", "tired & False")
+@killed_by("simulate/step/fixed.py", "tired & (search.which < kinks)", "tired & False")
 def test_a_run_that_slides_along_a_kink_is_a_run():
     """x' = -sign(x - a) + 0.3: nobody can follow each switch; it stays within a step of the place, and says so."""
 
@@ -303,7 +305,9 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
     np.testing.assert_allclose(run.metrics["y"], [0.2, 0.4], atol=0.02)
 
 
-@killed_by("simulate/stepper.py", "fine &= carry.unrestricted | _is_plausible(carry, here) if kinks else True", "pass")
+@killed_by(
+    "simulate/step/fixed.py", "fine &= carry.unrestricted | _is_plausible(carry, here) if kinks else True", "pass"
+)
 def test_where_a_step_is_too_long_a_regime_is_not_believed():
     """Below its crawl speed a wheel is stiffer than any step, and a curve of friction beyond its kinks has no bound."""
     loop = braking(
@@ -365,7 +369,7 @@ def integrating(late: float) -> tuple[Loop, float]:
     "(raw - limited) * gain * error > 0",
     "jnp.not_equal(raw, limited) & ((raw - limited) * gain * error > 0)",
 )
-@killed_by("simulate/methods.py", "loop.jumps if self.kinks is None", "False if self.kinks is None")
+@killed_by("simulate/step/methods.py", "loop.jumps if self.kinks is None", "False if self.kinks is None")
 @pytest.mark.parametrize("late", [0.0, 0.0337])
 def test_where_a_rate_jumps_a_value_is_right_too(late):
     """An integral that waits for a limit starts at once when the limit is left: in the middle of a step of 10 ms, which

@@ -30,7 +30,7 @@ from diffabs.papers.arm_balance import TUNED, heaviest
 from diffabs.plants import ArmBalance, PrintedArm
 from diffabs.plants.arm_balance import ArmState
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.types import FixedStep
 
 OVER = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "plant.damping": (70.0, 130.0)}
 

@@ -26,8 +26,8 @@ from diffabs.kernel.primitives import Unsupported, constant_array, lower_jaxpr
 from diffabs.objectives import BRAKING
 from diffabs.scenario import section_sweep
 from diffabs.scenario.defaults import braking
-from diffabs.simulate import native
-from diffabs.simulate.engine import log_xla_reason
+from diffabs.simulate.drive import kernel as native
+from diffabs.simulate.drive.engine import log_xla_reason
 from diffabs.stops import SpeedReached
 from diffabs.sweep import SweepError, sweep
 
@@ -143,7 +143,7 @@ class TestObjections:
         assert native.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) is None
 
     @killed_by("kernel/compilers.py", "if said is not None and not said.strip():", "if False:")
-    @killed_by("simulate/engine.py", "    log_xla_reason(why_not)\n", "")
+    @killed_by("simulate/drive/engine.py", "    log_xla_reason(why_not)\n", "")
     def test_without_a_compiler(self, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
         log_xla_reason.cache_clear()
@@ -165,7 +165,7 @@ class TestObjections:
         with pytest.raises(compilers.NoCompiler, match=command):
             compilers.find_compiler()
 
-    @killed_by("simulate/engine.py", "if engine not in REQUESTABLE_ENGINES:", "if False:")
+    @killed_by("simulate/drive/engine.py", "if engine not in REQUESTABLE_ENGINES:", "if False:")
     def test_of_another_name(self):
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
             d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="gpu")

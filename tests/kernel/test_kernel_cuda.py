@@ -26,7 +26,7 @@ from diffabs import scenario
 from diffabs.kernel import binaries, cuda, gpu, nvrtc
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.scenario.defaults import braking
-from diffabs.simulate import native
+from diffabs.simulate.drive import kernel as native
 
 pytestmark = pytest.mark.xdist_group("kernel cuda")
 ON_GPU = jax.default_backend() == "gpu"

@@ -19,8 +19,8 @@ from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.kernel import binaries, compilers, launch
 from diffabs.objectives import IAE, StopTime
 from diffabs.scenario.defaults import braking
-from diffabs.simulate import native
-from diffabs.simulate.engine import EngineError, log_xla_reason
+from diffabs.simulate.drive import kernel as native
+from diffabs.simulate.drive.engine import EngineError, log_xla_reason
 from diffabs.tune.problem import DerivativeMode
 
 pytestmark = pytest.mark.xdist_group("kernel engines")
@@ -158,7 +158,7 @@ def test_the_worst_case_is_that_of_xla(monkeypatch):
     assert {bool(made.tangents) for made in launches} == {False, True}
 
 
-@killed_by("simulate/native.py", "STEPS_PER_EXCHANGE // STEPS_PER_BLOCK", "1")
+@killed_by("simulate/drive/kernel.py", "STEPS_PER_EXCHANGE // STEPS_PER_BLOCK", "1")
 @pytest.mark.slow
 def test_a_map_of_starts_is_that_of_xla():
     """Runs that end inside of an ellipsoid, that fall, and that do neither; known at the same instant."""

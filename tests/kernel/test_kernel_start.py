@@ -93,7 +93,8 @@ FORKED = """
 import os
 import diffabs as d
 from diffabs import scenario
-from diffabs.simulate import engine, native
+from diffabs.simulate.drive import engine
+from diffabs.simulate.drive import kernel as native
 
 def in_a_child(task):
     if child := os.fork():

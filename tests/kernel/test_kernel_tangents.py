@@ -305,7 +305,7 @@ def test_a_part(family, name):
     )
 
 
-@killed_by("simulate/native.py", "else method.for_derivatives()", "else method")
+@killed_by("simulate/drive/kernel.py", "else method.for_derivatives()", "else method")
 @pytest.mark.slow
 def test_steps_end_on_kinks_where_those_of_xla_do():
     """Of a torque that comes to its limits: without, the derivatives would be others."""
@@ -323,7 +323,7 @@ def test_steps_end_on_kinks_where_those_of_xla_do():
     assert np.abs(blunt - known).max() > 1e-5 * np.abs(known).max()
 
 
-@killed_by("simulate/pursuit.py", "any_lane(note.moved)", "any_lane(note.fired != 0)", case="slip-lmi-adaptive")
+@killed_by("simulate/step/pursuit.py", "any_lane(note.moved)", "any_lane(note.fired != 0)", case="slip-lmi-adaptive")
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grid", "kinks", "adaptive"])
 @pytest.mark.parametrize("name", scenario.names())

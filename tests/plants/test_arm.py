@@ -20,9 +20,9 @@ from diffabs.objectives import PeakArmAngle, PeakVoltage
 from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
 from diffabs.plants.arm_balance import ArmState
 from diffabs.scenario.defaults import balancing
-from diffabs.simulate.rk4 import rk4_step
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.step.rk4 import rk4_step
+from diffabs.simulate.types import FixedStep
 
 ARM, HANGING = ArmBalance(), ArmBalance(arm_length=-0.5)
 POINT = ArmState(0.5, 0.3, 0.2, 0.1, -0.4, 0.7)

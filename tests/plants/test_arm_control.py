@@ -22,7 +22,7 @@ from diffabs.objectives import FinalNorm
 from diffabs.plants import ArmBalance
 from diffabs.sensors import AngleSensor
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.types import FixedStep
 
 SOLVER, MEASURED = FixedStep(step=1e-3, duration=10.0), {"final_norm": FinalNorm()}
 

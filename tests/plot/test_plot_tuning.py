@@ -6,7 +6,7 @@ from mutants import killed_by
 
 from diffabs.core.protocols import BrakeOutput, Sample
 from diffabs.plot import tuning as plots
-from diffabs.simulate.solution import Trajectory
+from diffabs.simulate.types import Trajectory
 from diffabs.tune import DescentPoint
 
 HISTORY = [DescentPoint(i, 10.0 ** (1 - i), 1.0, 10.0**-i, max(0.0, 0.2 - 0.1 * i), 2 * i + 1) for i in range(5)]

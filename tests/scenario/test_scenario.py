@@ -15,7 +15,7 @@ from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import dump, load, names
 from diffabs.scenario.section_design import DesignTask
 from diffabs.scenario.section_tune import Goal
-from diffabs.simulate.solution import Adaptive, FixedStep
+from diffabs.simulate.types import Adaptive, FixedStep
 from diffabs.tune import risk
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")

@@ -277,7 +277,7 @@ def test_nothing_is_evaluated(file):
 
 @pytest.fixture
 def checked_step(monkeypatch):
-    from diffabs.simulate.stable_step import stable_step
+    from diffabs.simulate.stability import stable_step
 
     replace_seam(monkeypatch, "stable_step", stable_step)
 

@@ -18,10 +18,10 @@ from diffabs.core.pytree import as_arrays, canonical_dtypes, get, prepare_parts,
 from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
-from diffabs.simulate import lengths
-from diffabs.simulate.foresight import SwitchingFunction, forecast_crossings, read_bits
-from diffabs.simulate.replay import BASE_LOG_CAPACITY, log_capacity
 from diffabs.simulate.run import prepare_arguments
+from diffabs.simulate.step import step_size as lengths
+from diffabs.simulate.step.foresight import SwitchingFunction, forecast_crossings, read_bits
+from diffabs.simulate.step.replay import BASE_LOG_CAPACITY, log_capacity
 from diffabs.tune import worst_case
 
 LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
@@ -92,7 +92,7 @@ def test_random_loops_of_any_parts_are_right_to_1e_4(name):
 
 
 @killed_by(
-    "simulate/lengths.py", "jnp.minimum(loop.next_tick(k, self.h), self.steps)", "jnp.minimum(k + 1, self.steps)"
+    "simulate/step/step_size.py", "jnp.minimum(loop.next_tick(k, self.h), self.steps)", "jnp.minimum(k + 1, self.steps)"
 )
 @pytest.mark.slow
 def test_a_computer_ticks_on_its_own_clock():
@@ -107,7 +107,7 @@ def test_a_computer_ticks_on_its_own_clock():
 
 
 @killed_by(
-    "simulate/methods.py",
+    "simulate/step/methods.py",
     "        inside = (t < now.t) & (carry.last_step.until > carry.last_step.t)",
     "        inside = (t < now.t) & (carry.last_step.until < carry.last_step.t)",
 )
@@ -158,7 +158,7 @@ def test_a_computer_in_single_precision_keeps_its_time():
     close(run, exact, 2e-4)
 
 
-@killed_by("simulate/methods.py", "MIN_RTOL_EPS = 32 ", "MIN_RTOL_EPS = 0 ")
+@killed_by("simulate/step/methods.py", "MIN_RTOL_EPS = 32 ", "MIN_RTOL_EPS = 0 ")
 @pytest.mark.slow
 def test_single_precision_asks_for_no_smaller_error_than_it_has():
     chosen = rig()
@@ -183,11 +183,11 @@ def on_limits(solver):
 
 
 @killed_by(
-    "simulate/adaptive.py",
+    "simulate/step/adaptive.py",
     "exact = fine & (((here.error <= 1) & (here.late <= 0)) | short)",
     "exact = fine & ((here.error_norm <= 1) | short)",
 )
-@killed_by("simulate/adaptive.py", "system.kinks if control.notes else 0", "0")
+@killed_by("simulate/step/adaptive.py", "system.kinks if control.notes else 0", "0")
 @pytest.mark.slow
 def test_derivatives_on_limits_agree_with_differences():
     slopes = jax.jit(jax.jacfwd(on_limits(d.Adaptive(1e-5, 2.5))))(jnp.zeros(2))
@@ -277,7 +277,7 @@ def test_reverse_mode_is_forward_mode(name):
     np.testing.assert_allclose(reverse(5.7), forward(5.7), rtol=1e-6)
 
 
-@killed_by("simulate/replay.py", "    t = one.t + shift\n", "    shift *= 0.0\n    t = one.t + shift\n")
+@killed_by("simulate/step/replay.py", "    t = one.t + shift\n", "    shift *= 0.0\n    t = one.t + shift\n")
 @pytest.mark.slow
 def test_a_derivative_through_relay_and_latch_is_that_of_rk4():
     structure, loop = random_loops.STRUCTURES["relay, latch, lag"], random_loops.drawn("relay, latch, lag", 3, 0)
@@ -294,7 +294,7 @@ def test_a_derivative_through_relay_and_latch_is_that_of_rk4():
 
 
 @killed_by(
-    "simulate/adaptive.py",
+    "simulate/step/adaptive.py",
     "    return point.t, point.state.flow(), point.rate[0]",
     "    return point.t, point.state.flow(), jax.tree.map(lambda x: 0.0 * x, point.rate[0])",
 )
@@ -307,7 +307,7 @@ def test_a_trajectory_between_ticks_is_that_of_fixed_steps():
 
 
 @killed_by(
-    "simulate/replay.py",
+    "simulate/step/replay.py",
     "(t, state.flow(), end.seen.rate) if stepping.keeps",
     "(t, state.flow(), begin.seen.rate) if stepping.keeps",
     case="limits",
@@ -388,7 +388,9 @@ def test_steps_that_find_themselves_are_never_unstable():
     d.check(loop, d.Adaptive(1e-5, 4.0, 1e-2))
 
 
-@killed_by("simulate/foresight.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least")
+@killed_by(
+    "simulate/step/foresight.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least"
+)
 def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = [0, 1, 33, np.array([2, 3])]
     values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]
@@ -404,12 +406,12 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
 
 
 @killed_by(
-    "simulate/lengths.py",
+    "simulate/step/step_size.py",
     "sample.output[0], *jax.tree.leaves(off))",
     "sample.output[0], *(0.0 * x for x in jax.tree.leaves(off)))",
 )
 @killed_by(
-    "simulate/lengths.py",
+    "simulate/step/step_size.py",
     "moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), off))",
     "moved = state",
 )
@@ -437,7 +439,7 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
     assert slip > 0.01 * float(scale[0])
 
 
-@killed_by("simulate/lengths.py", "(moves) / size", "(moves * 0.0 + size[0]) / size", case="arm-hanging")
+@killed_by("simulate/step/step_size.py", "(moves) / size", "(moves * 0.0 + size[0]) / size", case="arm-hanging")
 @pytest.mark.parametrize("name", ["slip-lmi", "arm-hanging"])
 def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
     loop = prepare_parts(canonical_dtypes(as_arrays(load(name).loop)))

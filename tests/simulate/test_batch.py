@@ -22,10 +22,10 @@ from diffabs.core.pytree import replace
 from diffabs.objectives import BRAKING
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import Noise
-from diffabs.simulate import packed
 from diffabs.simulate.batch import Batch, grid, group_by_structure, latin, stack_loops
-from diffabs.simulate.packed import STEPS_PER_EXCHANGE
-from diffabs.simulate.sharding import run_on_auto_mesh
+from diffabs.simulate.drive import packed
+from diffabs.simulate.drive.packed import STEPS_PER_EXCHANGE
+from diffabs.simulate.drive.sharding import run_on_auto_mesh
 from diffabs.stops import SpeedReached, Standstill
 
 LOOP = braking(
@@ -146,7 +146,7 @@ class TestLanes:
 
     @killed_by("simulate/batch.py", "    if accepted is True:\n        return run", "    return run", case="together")
     @killed_by(
-        "simulate/packed.py",
+        "simulate/drive/packed.py",
         "jnp.where(run & (number < count), carry.status",
         "jnp.where(number < count, carry.status",
         case="refilled",
@@ -189,7 +189,7 @@ class TestLanes:
 
 
 @killed_by(
-    "simulate/packed.py",
+    "simulate/drive/packed.py",
     "free = ~slots.carry.running | _lanes_ended_early(enough, built, slots)",
     "free = ~slots.carry.running",
 )
@@ -336,7 +336,7 @@ def placed(values, keys, kind):
     return {path: jax.device_put(x, place) for path, x in values.items()}, jax.device_put(keys, place)
 
 
-@killed_by("simulate/sharding.py", "    if not meshes:", "    if True:")
+@killed_by("simulate/drive/sharding.py", "    if not meshes:", "    if True:")
 def test_lanes_on_an_explicit_mesh_are_run_on_an_auto_one():
     """Gathers say nothing of where they lie there; results come back."""
     (speeds,), numbers = (given := placed({"speed": SPEEDS[:4]}, np.arange(4), AxisType.Explicit))[0].values(), given[1]

@@ -14,8 +14,8 @@ from diffabs import controllers, plants
 from diffabs.core.pytree import get
 from diffabs.objectives import IAE, StopDistance
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.checkpoint import MAX_SAVED_CARRIES, SCAN_GROUP_STEPS, nested_scan_lengths, repeat_step
-from diffabs.simulate.drivers import round_up_capacity
+from diffabs.simulate.drive.checkpoint import MAX_SAVED_CARRIES, SCAN_GROUP_STEPS, nested_scan_lengths, repeat_step
+from diffabs.simulate.drive.loops import round_up_capacity
 from diffabs.stops import SpeedReached
 
 LOOP = braking(
@@ -55,7 +55,7 @@ def memory(steps):
     return analysis.temp_size_in_bytes
 
 
-@killed_by("simulate/checkpoint.py", "MAX_SAVED_CARRIES = 1800", "MAX_SAVED_CARRIES = 10**9")
+@killed_by("simulate/drive/checkpoint.py", "MAX_SAVED_CARRIES = 1800", "MAX_SAVED_CARRIES = 10**9")
 @pytest.mark.slow
 def test_reverse_mode_memory_hardly_grows_with_steps():
     sizes = [memory(steps) for steps in (1000, 4000, 16000)]
@@ -63,7 +63,10 @@ def test_reverse_mode_memory_hardly_grows_with_steps():
 
 
 @killed_by(
-    "simulate/checkpoint.py", "return math.ceil(count / inner), inner", "return count // inner, inner", case="1801"
+    "simulate/drive/checkpoint.py",
+    "return math.ceil(count / inner), inner",
+    "return count // inner, inner",
+    case="1801",
 )
 @pytest.mark.parametrize("count", [1, 2, 7, 900, 1800, 1801, 1804, 4004, 16004, 10**6])
 def test_nested_scans_make_enough_steps_and_keep_few_carries(count):
@@ -97,7 +100,7 @@ def test_groups_after_the_end_have_no_derivative():
 
 
 @killed_by(
-    "simulate/rk4.py",
+    "simulate/step/rk4.py",
     "jvp_nonzero(lambda *step: _scan(f, *step), primals",
     "jvp_nonzero(lambda *step: _scan(f, *step[:4], jax.lax.stop_gradient(step[4])), primals",
 )

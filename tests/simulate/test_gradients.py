@@ -233,7 +233,7 @@ def differences(measured, x, step):
     return np.asarray((many(x + moves) - many(x - moves)) / (2 * step)).T, scale
 
 
-@killed_by("simulate/landing.py", "return -rises / jnp", "return 0.0 * rises / jnp", case="feedback")
+@killed_by("simulate/step/event_location.py", "return -rises / jnp", "return 0.0 * rises / jnp", case="feedback")
 @pytest.mark.parametrize("name", cases(LOOPS, *SLOW))
 def test_gradient_of_every_objective_in_every_parameter(name):
     names, x, measured, jacobian_at, measures = flat(name)
@@ -301,7 +301,7 @@ def test_sensitivity_of_the_conventional_brake():
     np.testing.assert_allclose(_sensitivity(FULL, list(expected)), list(expected.values()), rtol=5e-4, atol=0)
 
 
-@killed_by("simulate/landing.py", "found = near | at_once", "found = at_once", case="0.0-published0")
+@killed_by("simulate/step/event_location.py", "found = near | at_once", "found = at_once", case="0.0-published0")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("ki", "published"),

@@ -8,7 +8,7 @@ import pytest
 from mutants import killed_by
 
 from diffabs.core.numerics import axpy
-from diffabs.simulate.rk4 import rk4_step
+from diffabs.simulate.step.rk4 import rk4_step
 
 
 def integrate(derivative, x, end, steps):
@@ -26,8 +26,8 @@ def forced(t, x):
     return -2 * t * x
 
 
-@killed_by("simulate/rk4.py", "(0.5, 2.0), (0.5, 2.0)", "(0.5, 1.0), (0.5, 3.0)")
-@killed_by("simulate/rk4.py", "rate = f(t + place * h,", "rate = f(t,")
+@killed_by("simulate/step/rk4.py", "(0.5, 2.0), (0.5, 2.0)", "(0.5, 1.0), (0.5, 3.0)")
+@killed_by("simulate/step/rk4.py", "rate = f(t + place * h,", "rate = f(t,")
 @pytest.mark.parametrize(
     ("derivative", "x0", "end", "error"),
     [

@@ -51,10 +51,16 @@ class Slips:
 
 
 @killed_by(
-    "simulate/adaptive.py", "jnp.where(again, RunStatus.SEEKING, RunStatus.LANDING)", "jnp.asarray(RunStatus.LANDING)"
+    "simulate/step/adaptive.py",
+    "jnp.where(again, RunStatus.SEEKING, RunStatus.LANDING)",
+    "jnp.asarray(RunStatus.LANDING)",
 )
-@killed_by("simulate/landing.py", "((off > probe) | ((off == 0) & (search.margin != 0)))", "(off > probe)")
-@killed_by("simulate/landing.py", "missed & ~search.at_once & (search.tries < MAX_LOCATION_ATTEMPTS)", "missed & False")
+@killed_by("simulate/step/event_location.py", "((off > probe) | ((off == 0) & (search.margin != 0)))", "(off > probe)")
+@killed_by(
+    "simulate/step/event_location.py",
+    "missed & ~search.at_once & (search.tries < MAX_LOCATION_ATTEMPTS)",
+    "missed & False",
+)
 @pytest.mark.parametrize("solver", [d.FixedStep(H, 0.01, kinks=False), d.Adaptive(1e-5, 0.01, H)])
 def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
     """Where it is still flat, a parabola through three tries may take it for near its zero, and its fall there leads
@@ -71,7 +77,12 @@ def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
 
 
 @killed_by("controllers/sampled.py", "output, self._until(clock.t), jnp", "output, clock.t + self.delay, jnp")
-@killed_by("simulate/landing.py", "jnp.where(steep, moved -", "jnp.where(steep & False, moved -", case="fixed-0.002")
+@killed_by(
+    "simulate/step/event_location.py",
+    "jnp.where(steep, moved -",
+    "jnp.where(steep & False, moved -",
+    case="fixed-0.002",
+)
 @pytest.mark.parametrize("late", cases([2e-3, 4e-3, 2.3e-3, 5e-3], 2e-3, 4e-3, 5e-3))
 @pytest.mark.parametrize(
     "solver", [pytest.param(d.FixedStep(H, 0.03), id="fixed"), pytest.param(d.Adaptive(1e-5, 0.03, H), id="adaptive")]
@@ -94,7 +105,10 @@ def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
 
 
 @killed_by(
-    "simulate/landing.py", "share = ratio(zero - search.place, x - search.place)", "share = 0.0 * zero", case="jacfwd"
+    "simulate/step/event_location.py",
+    "share = ratio(zero - search.place, x - search.place)",
+    "share = 0.0 * zero",
+    case="jacfwd",
 )
 @pytest.mark.parametrize("derivative", cases([jax.jacfwd, jax.jacrev], jax.jacrev))
 def test_derivatives_of_a_moment_are_those_at_the_zero(derivative):

@@ -24,7 +24,8 @@ from diffabs.objectives import BALANCE, BRAKING
 from diffabs.plants.audit import BrakeAudit
 from diffabs.reliability.failure import failure_probability
 from diffabs.scenario.defaults import braking
-from diffabs.simulate import admissible, stable_step
+from diffabs.simulate import admissible
+from diffabs.simulate import stability as stable_step
 from diffabs.simulate.result import _is_impossible
 from diffabs.stops import Fallen, SpeedReached
 from diffabs.sweep import Results, sweep
@@ -154,7 +155,7 @@ class TestBeforeARun:
                 d.check(RIG, solver)
 
     @pytest.mark.slow
-    @killed_by("simulate/stable_step.py", "bound = jnp.max(jnp.exp(log)", "bound = 0.5 * jnp.max(jnp.exp(log)")
+    @killed_by("simulate/stability.py", "bound = jnp.max(jnp.exp(log)", "bound = 0.5 * jnp.max(jnp.exp(log)")
     def test_the_step_is_judged_as_by_the_eigenvalues(self):
         """Whatever a lane is decided by: the first bound, the squared one, or its eigenvalues; the last are NumPy's."""
         rng = np.random.default_rng(0)
@@ -177,7 +178,7 @@ class TestBeforeARun:
         assert not stable_step.is_step_stable(RIG, alike, 2e-2).any()
 
     @killed_by(
-        "simulate/stable_step.py",
+        "simulate/stability.py",
         "bound = jnp.max(jnp.minimum(rows, columns))",
         "bound = 0.5 * jnp.max(jnp.minimum(rows, columns))",
     )
@@ -222,7 +223,7 @@ class TestAfterARun:
         assert all(np.isnan(x).all() for x in many.metrics.values())
 
     @killed_by(
-        "simulate/stepper.py",
+        "simulate/step/fixed.py",
         "zero + RunStatus.RUNNING, zero + RunStatus.DIVERGED",
         "zero + RunStatus.RUNNING, zero + RunStatus.STOPPED",
     )
@@ -345,7 +346,7 @@ class TestWhoeverRuns:
         assert found["failures"]["not stopped"]["value"] < 0.5
         assert found["failures"]["any"]["high"] < 1 / 2
 
-    @killed_by("simulate/packed.py", "carry.status, RunStatus.DIVERGED)", "carry.status, RunStatus.TIMED_OUT)")
+    @killed_by("simulate/drive/packed.py", "carry.status, RunStatus.DIVERGED)", "carry.status, RunStatus.TIMED_OUT)")
     @pytest.mark.slow
     def test_a_batch_does_not_run_them(self, any_step):
         values = {"initial.speed": np.array([8.0, 1.0, 9.0])}

@@ -16,8 +16,8 @@ from diffabs.objectives import BRAKING, Effort, MaxSlip, TorqueRate, Variation
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.result import finish_run, prepare
 from diffabs.simulate.run import _run, prepare_arguments
-from diffabs.simulate.stable_step import stable_step
-from diffabs.simulate.stepper import attempt_capacity
+from diffabs.simulate.stability import stable_step
+from diffabs.simulate.step.fixed import attempt_capacity
 from diffabs.stops import SpeedReached, Standstill
 
 RIG = braking(
@@ -55,7 +55,7 @@ def test_standstill_of_a_locked_wheel_in_closed_form(step):
     np.testing.assert_allclose(run.metrics["locked_time"], (10 - 0.05) / DECELERATION, rtol=1e-12)
 
 
-@killed_by("simulate/stepper.py", "| (to_grid & ~changes))", "| to_grid)")
+@killed_by("simulate/step/fixed.py", "| (to_grid & ~changes))", "| to_grid)")
 def test_speed_reached_lands_between_samples():
     loop = dataclasses.replace(SLIDING, stop=SpeedReached(speed=3.0))
     run = d.rollout(loop, d.FixedStep(0.01, 2.0), {"effort": Effort(), "variation": Variation()})
@@ -91,7 +91,7 @@ def test_the_peak_of_a_falling_slip_is_its_first_value():
     "(carry.status == RunStatus.TIMED_OUT) & ~diverged",
     "(carry.status == RunStatus.LANDING) & ~diverged",
 )
-@killed_by("simulate/stepper.py", "(on_grid & (carry.k + 1 >= steps))", "(on_grid & False)")
+@killed_by("simulate/step/fixed.py", "(on_grid & (carry.k + 1 >= steps))", "(on_grid & False)")
 def test_a_run_that_does_not_stop_is_charged_the_rest():
     run = d.measure(SLIDING, d.FixedStep(1e-3, 0.5), BRAKING)
     assert run.timed_out
@@ -202,11 +202,11 @@ def test_trajectories_of_all_durations_share_a_program():
 
 
 @killed_by(
-    "simulate/drivers.py",
+    "simulate/drive/loops.py",
     "jax.lax.while_loop(lambda carry: any_lane(carry.running), block",
     "jax.lax.while_loop(lambda carry: ~any_lane(~carry.running), block",
 )
-@killed_by("simulate/checkpoint.py", "jnp.any(running, axis=0)", "jnp.all(running, axis=0)")
+@killed_by("simulate/drive/checkpoint.py", "jnp.any(running, axis=0)", "jnp.all(running, axis=0)")
 @pytest.mark.slow
 def test_a_batch_ends_with_its_last_lane():
     """Behind `vmap` the condition of the loop is one for all lanes; each lane ends as it would alone, also if another

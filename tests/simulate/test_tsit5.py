@@ -11,8 +11,8 @@ from mutants import killed_by
 from scipy.integrate import solve_ivp
 
 from diffabs.core.cubic import Cubic
-from diffabs.simulate import tsit5
-from diffabs.simulate.tsit5 import midpoint_error, tsit5_step_from, tsit5_step_with_error
+from diffabs.simulate.step import tsit5
+from diffabs.simulate.step.tsit5 import midpoint_error, tsit5_step_from, tsit5_step_with_error
 
 A = np.zeros((6, 6))
 for i, row in enumerate(tsit5.STAGE_COEFFICIENTS, 1):
@@ -52,7 +52,7 @@ def weight(tree):
     return np.prod([A @ weight(branch) for branch in tree], axis=0) if tree else np.ones(6)
 
 
-@killed_by("simulate/tsit5.py", "4.3622954328695815", "4.3622954328795815", case="5")
+@killed_by("simulate/step/tsit5.py", "4.3622954328695815", "4.3622954328795815", case="5")
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
 def test_all_conditions_of_order_hold(order):
     """Butcher: sum_i b_i Phi_i(t) = 1/gamma(t) for each rooted tree of up to five nodes; there are 1, 1, 2, 4, 9. The
@@ -107,7 +107,9 @@ def test_the_middle_of_a_power_is_that_of_its_cubic_or_known(power):
 
 
 @killed_by(
-    "simulate/tsit5.py", "h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b)", "0.5 * h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b)"
+    "simulate/step/tsit5.py",
+    "h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b)",
+    "0.5 * h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b)",
 )
 def test_the_error_at_the_middle_is_that_of_the_cubic():
     """x' = -x + sin 2t: against the closed form."""
@@ -144,7 +146,7 @@ def written_out(f, t, x, rate, h, given):
 
 @pytest.mark.slow
 @killed_by(
-    "simulate/tsit5.py",
+    "simulate/step/tsit5.py",
     "rounds = (jnp.arange(1, count), jnp.asarray(STAGE_NODES, dtype), jnp.asarray(rows, dtype))",
     "rounds = (jnp.arange(1, count - 1), jnp.asarray(STAGE_NODES[:-1], dtype), jnp.asarray(rows[:-1], dtype))",
 )

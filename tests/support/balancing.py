@@ -9,7 +9,7 @@ from diffabs.core.pytree import replace
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.plants import ArmBalance
 from diffabs.scenario.defaults import balancing
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.types import FixedStep
 
 HANGING = ArmBalance(arm_length=-0.5)
 START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # of the paper's Fig. 3

@@ -28,8 +28,8 @@ from diffabs.core.pytree import elements, get
 from diffabs.scenario import registry, toml
 from diffabs.scenario.scenario import Scenario, ScenarioError, dump, loads
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import FixedStep, Run
-from diffabs.simulate.stable_step import stable_step
+from diffabs.simulate.stability import stable_step
+from diffabs.simulate.types import FixedStep, Run
 
 PER_STRUCTURE = 200
 STEPS = 300

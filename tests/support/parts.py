@@ -30,7 +30,7 @@ from diffabs.core.protocols import (
     Tracking,
 )
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.simulate.rk4 import rk4_step
+from diffabs.simulate.step.rk4 import rk4_step
 
 FAMILIES = (roads, plants, controllers, references, actuators, sensors, objectives, stops, blocks)
 

@@ -22,7 +22,7 @@ from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
 from diffabs.objectives.tracking import keep_memory, no_integral
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.stable_step import stable_step, stable_steps
+from diffabs.simulate.stability import stable_step, stable_steps
 from diffabs.stops import SpeedReached
 from diffabs.tune import (
     AtMost,
@@ -161,12 +161,12 @@ class TestStability:
         np.testing.assert_allclose(stable_steps(batch), each, rtol=1e-12)
 
     @killed_by(
-        "simulate/stable_step.py",
+        "simulate/stability.py",
         "angles = np.abs(np.angle(direction))",
         "angles = np.full(np.shape(direction), np.pi)",
     )
     def test_the_limit_of_a_real_and_of_an_imaginary_mode(self):
-        from diffabs.simulate.stable_step import _radius
+        from diffabs.simulate.stability import _radius
 
         np.testing.assert_allclose(_radius(np.array([-1.0 + 0j])), 2.785, atol=1.5e-3)  # the roots of |R(z)| = 1
         np.testing.assert_allclose(_radius(np.array([1j])), np.sqrt(8.0), atol=1.5e-3)

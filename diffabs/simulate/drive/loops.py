@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.types import Bool, Int, PyTree
-from diffabs.simulate.checkpoint import any_lane, rematerialise, repeat_step
+from diffabs.simulate.drive.checkpoint import any_lane, rematerialise, repeat_step
 
 Carry = Any  # pytree of the stepping method, with an attribute `running`
 Step = Callable[..., Carry]  # function of a carry and, for trajectories, of `until`, the instant at which to pause

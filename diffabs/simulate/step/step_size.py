@@ -13,7 +13,7 @@ from diffabs.core.loop import Loop, LoopState
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Sample
 from diffabs.core.types import Int, PyTree, Scalar
-from diffabs.simulate.foresight import MIN_CROSSING_STEP_FRACTION
+from diffabs.simulate.step.foresight import MIN_CROSSING_STEP_FRACTION
 
 INITIAL_STEP_S = 1e-4  # s, the first step
 SAFETY, MIN_ERROR = 0.85, 1e-6  # fraction of the optimal length; offset that keeps the length finite for an error of 0

@@ -8,7 +8,7 @@ from typing import Any
 
 from jax._src.xla_bridge import backends_are_initialized  # JAX has no public function that does not start the backends
 
-from diffabs.simulate.solution import Run
+from diffabs.simulate.types import Run
 
 REQUESTABLE_ENGINES = ("auto", "xla", "kernel")
 log = logging.getLogger("diffabs")

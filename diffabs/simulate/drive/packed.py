@@ -16,11 +16,11 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.tracing import split_batched
 from diffabs.core.types import Params, PyTree, Scalar
-from diffabs.simulate.condition import RunStatus
-from diffabs.simulate.drivers import STEPS_PER_BLOCK, Carry
+from diffabs.simulate.drive.loops import STEPS_PER_BLOCK, Carry
 from diffabs.simulate.result import finish_run, prepare
 from diffabs.simulate.run import forbid_derivatives, prepare_arguments
-from diffabs.simulate.solution import Run, Solver
+from diffabs.simulate.step.status import RunStatus
+from diffabs.simulate.types import Run, Solver
 
 LANES_AT_ONCE = 1024  # runs that step at a time: their state stays in a processor's cache
 STEPS_PER_EXCHANGE = 64  # steps between two exchanges of runs

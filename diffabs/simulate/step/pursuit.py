@@ -13,11 +13,11 @@ import jax
 
 from diffabs.core.loop import Loop
 from diffabs.core.types import Key, PyTree, Scalar
-from diffabs.simulate.checkpoint import any_lane
-from diffabs.simulate.dynamics import Objectives
-from diffabs.simulate.methods import AdaptiveStepping
-from diffabs.simulate.replay import ReplayState, log_attempt, replay_attempt, start_replay
-from diffabs.simulate.tries import AdaptiveCarry
+from diffabs.simulate.drive.checkpoint import any_lane
+from diffabs.simulate.step.methods import AdaptiveStepping
+from diffabs.simulate.step.replay import ReplayState, log_attempt, replay_attempt, start_replay
+from diffabs.simulate.step.system import Objectives
+from diffabs.simulate.step.tries import AdaptiveCarry
 
 
 class LaggedReplay(NamedTuple):

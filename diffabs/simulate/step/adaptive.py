@@ -20,23 +20,11 @@ import jax.numpy as jnp
 from diffabs.core.blocks import Passage
 from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.loop import Loop, LoopState, Margins
-from diffabs.core.modes import ComparisonAnswers, Mode, find_contradicted
 from diffabs.core.protocols import Clock, Memory, Segment, Shown
 from diffabs.core.types import Matrix, PyTree, Scalar
-from diffabs.simulate.advance import SurfaceCrossing, mode_after_changes, mode_at_end, start_state
-from diffabs.simulate.checkpoint import any_lane, jit_barrier
-from diffabs.simulate.condition import RunStatus, status_after_step
-from diffabs.simulate.dynamics import (
-    UNCONSTRAINED,
-    Accumulators,
-    Dynamics,
-    LoopEvaluationWithRates,
-    Objectives,
-    build_dynamics,
-    split_flow_and_held,
-)
-from diffabs.simulate.foresight import forecast_crossings, valid_end_rates
-from diffabs.simulate.landing import (
+from diffabs.simulate.drive.checkpoint import any_lane, jit_barrier
+from diffabs.simulate.step.attempt import SurfaceCrossing, mode_after_changes, mode_at_end, start_state
+from diffabs.simulate.step.event_location import (
     MAX_LOCATION_ATTEMPTS,
     OVERSHOOT_EXPONENT,
     EventSearch,
@@ -48,7 +36,12 @@ from diffabs.simulate.landing import (
     locate_event,
     select,
 )
-from diffabs.simulate.lengths import (
+from diffabs.simulate.step.fixed import cast_floats, find_crossings
+from diffabs.simulate.step.foresight import forecast_crossings, valid_end_rates
+from diffabs.simulate.step.modes import ComparisonAnswers, Mode, find_contradicted
+from diffabs.simulate.step.span import HermiteStep
+from diffabs.simulate.step.status import RunStatus, status_after_step
+from diffabs.simulate.step.step_size import (
     INITIAL_STEP_S,
     MIN_STEP_RATIO,
     StepSizeControl,
@@ -58,10 +51,17 @@ from diffabs.simulate.lengths import (
     propose_length,
     spectral_step_limit,
 )
-from diffabs.simulate.span import HermiteStep
-from diffabs.simulate.stepper import cast_floats, find_crossings
-from diffabs.simulate.tries import AdaptiveAttempt, AdaptiveCarry, AdaptiveDecision, AdaptivePoint
-from diffabs.simulate.tsit5 import midpoint_error, tsit5_step_with_error
+from diffabs.simulate.step.system import (
+    UNCONSTRAINED,
+    Accumulators,
+    Dynamics,
+    LoopEvaluationWithRates,
+    Objectives,
+    build_dynamics,
+    split_flow_and_held,
+)
+from diffabs.simulate.step.tries import AdaptiveAttempt, AdaptiveCarry, AdaptiveDecision, AdaptivePoint
+from diffabs.simulate.step.tsit5 import midpoint_error, tsit5_step_with_error
 
 # A run with more attempts in all, or per instant of its grid, makes no progress and has diverged.
 MAX_ATTEMPTS, ATTEMPTS_PER_INSTANT = 100_000, 16

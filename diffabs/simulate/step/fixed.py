@@ -28,7 +28,8 @@ from diffabs.core.log import borrow, commit, log_rows
 from diffabs.core.loop import Loop, Margins
 from diffabs.core.protocols import Clock
 from diffabs.core.types import PyTree, Scalar
-from diffabs.simulate.advance import (
+from diffabs.simulate.drive.checkpoint import any_lane, jit_barrier
+from diffabs.simulate.step.attempt import (
     FixedStepAttempt,
     FixedStepPoint,
     StepRequest,
@@ -37,10 +38,7 @@ from diffabs.simulate.advance import (
     commit_step,
     initial_point,
 )
-from diffabs.simulate.checkpoint import any_lane, jit_barrier
-from diffabs.simulate.condition import RunStatus, is_running, status_after_step
-from diffabs.simulate.dynamics import Objectives, build_dynamics
-from diffabs.simulate.landing import (
+from diffabs.simulate.step.event_location import (
     MAX_LOCATION_ATTEMPTS,
     OVERSHOOT_EXPONENT,
     AttemptCrossings,
@@ -55,6 +53,8 @@ from diffabs.simulate.landing import (
     refine,
     select,
 )
+from diffabs.simulate.step.status import RunStatus, is_running, status_after_step
+from diffabs.simulate.step.system import Objectives, build_dynamics
 
 EVENT_ATTEMPTS_PER_STEP, SPARE_ATTEMPTS = 4, 64  # attempts to locate events: for each step of the grid, and in addition
 CROSSING_ATTEMPTS_PER_STEP = 1  # attempts on switching surfaces per step of the grid; beyond, steps are unrestricted

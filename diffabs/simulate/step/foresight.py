@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.core.modes import WORD_BITS, ModeBits
 from diffabs.core.types import PyTree, Scalar
+from diffabs.simulate.step.modes import WORD_BITS, ModeBits
 
 NEVER_S = 1e9  # s; time to the next crossing if no crossing is predicted
 

@@ -3,12 +3,12 @@
 from typing import Any, NamedTuple
 
 from diffabs.core.loop import LoopState, Margins, Signals
-from diffabs.core.modes import ModeBits
 from diffabs.core.protocols import Sample
 from diffabs.core.types import Bool, Int, PyTree, Scalar
-from diffabs.simulate.condition import is_running
-from diffabs.simulate.dynamics import Accumulators
-from diffabs.simulate.landing import EventSearch
+from diffabs.simulate.step.event_location import EventSearch
+from diffabs.simulate.step.modes import ModeBits
+from diffabs.simulate.step.status import is_running
+from diffabs.simulate.step.system import Accumulators
 
 
 class AdaptivePoint(NamedTuple):

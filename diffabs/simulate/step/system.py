@@ -1,8 +1,8 @@
 """The dynamics of the loop and its objectives, as one function of time and state.
 
 For values, the parts are evaluated directly. For derivatives, the function is a program whose comparisons are visible
-(`core.comparisons`), so that a step has one mode. Without a mode, the derivative of a step with a kink inside is wrong
-by up to one step in the kink's time. The value may still be exact.
+(`comparisons`), so that a step has one mode. Without a mode, the derivative of a step with a kink inside is wrong by up
+to one step in the kink's time. The value may still be exact.
 """
 
 from collections.abc import Callable
@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.comparisons import SwitchedProgram
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.modes import ComparisonAnswers, Mode, ModeBits
 from diffabs.core.protocols import Memory, Objective, Sample
 from diffabs.core.types import AnyArray, PyTree, Scalar
-from diffabs.simulate.foresight import SwitchingFunction
+from diffabs.simulate.step.comparisons import SwitchedProgram
+from diffabs.simulate.step.foresight import SwitchingFunction
+from diffabs.simulate.step.modes import ComparisonAnswers, Mode, ModeBits
 
 Objectives = dict[str, Objective]
 Accumulators = dict[str, Memory]

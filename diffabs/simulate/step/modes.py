@@ -1,4 +1,4 @@
-"""Modes: frozen answers to the comparisons of a program (`core.comparisons`), packed in words, one bit for each."""
+"""Modes: frozen answers to the comparisons of a program (`comparisons`), packed in words, one bit for each."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

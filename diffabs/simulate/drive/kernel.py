@@ -22,15 +22,15 @@ from diffabs.core.types import Params, PyTree, Scalar
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
-from diffabs.simulate.condition import RunStatus
-from diffabs.simulate.drivers import STEPS_PER_BLOCK
-from diffabs.simulate.engine import check_process
-from diffabs.simulate.methods import AdaptiveStepping
-from diffabs.simulate.packed import STEPS_PER_EXCHANGE, EarlyEnd, split_by_lane
-from diffabs.simulate.pursuit import LaggedReplay, LaggedReplayStepping
+from diffabs.simulate.drive.engine import check_process
+from diffabs.simulate.drive.loops import STEPS_PER_BLOCK
+from diffabs.simulate.drive.packed import STEPS_PER_EXCHANGE, EarlyEnd, split_by_lane
 from diffabs.simulate.result import finish_run
 from diffabs.simulate.run import forbid_derivatives, prepare_arguments, refuse_derivative
-from diffabs.simulate.solution import Run, Solver
+from diffabs.simulate.step.methods import AdaptiveStepping
+from diffabs.simulate.step.pursuit import LaggedReplay, LaggedReplayStepping
+from diffabs.simulate.step.status import RunStatus
+from diffabs.simulate.types import Run, Solver
 
 MAX_LANES_PER_LAUNCH = 1 << 17  # runs that are started together: the carries of more runs would fill the memory
 

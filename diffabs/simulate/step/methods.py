@@ -13,14 +13,15 @@ from diffabs.core.compiling import is_traced
 from diffabs.core.log import borrow
 from diffabs.core.loop import Loop
 from diffabs.core.types import Int, Key, PyTree, Scalar
-from diffabs.simulate import adaptive, stepper
-from diffabs.simulate.checkpoint import any_lane
-from diffabs.simulate.dynamics import Objectives
-from diffabs.simulate.landing import select
-from diffabs.simulate.lengths import StepSizeControl, spectral_step_limit
+from diffabs.simulate.drive.checkpoint import any_lane
 from diffabs.simulate.result import observe
-from diffabs.simulate.solution import Adaptive, Solver, Trajectory
-from diffabs.simulate.tries import AdaptiveCarry
+from diffabs.simulate.step import adaptive
+from diffabs.simulate.step import fixed as stepper
+from diffabs.simulate.step.event_location import select
+from diffabs.simulate.step.step_size import StepSizeControl, spectral_step_limit
+from diffabs.simulate.step.system import Objectives
+from diffabs.simulate.step.tries import AdaptiveCarry
+from diffabs.simulate.types import Adaptive, Solver, Trajectory
 
 MIN_RTOL_EPS = 32  # multiples of machine epsilon: the smallest error that a step can reach
 DERIVATIVE_RTOL_FRACTION = 0.03  # fraction of the allowed error of a step, for derivatives

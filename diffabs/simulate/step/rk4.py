@@ -13,7 +13,7 @@ from diffabs.core.numerics import axpy
 from diffabs.core.pytree import Scalar
 from diffabs.core.tracing import jvp_nonzero
 from diffabs.core.types import PyTree
-from diffabs.simulate.checkpoint import rematerialise
+from diffabs.simulate.drive.checkpoint import rematerialise
 
 X = TypeVar("X")
 

@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from diffabs.core.modes import WORD_BITS, BitRange, ComparisonAnswers, ComparisonTrace, Mode
 from diffabs.core.types import PyTree, Scalar
+from diffabs.simulate.step.modes import WORD_BITS, BitRange, ComparisonAnswers, ComparisonTrace, Mode
 
 INLINED_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint")
 SEARCHSORTED = "searchsorted"  # of `jax.numpy` or `core.numerics`, in at most WORD_BITS knots

@@ -20,16 +20,21 @@ import jax.numpy as jnp
 from diffabs.core.blocks import Passage
 from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.loop import Loop, LoopState, Margins
-from diffabs.core.modes import Mode, ModeBits
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment, Shown
 from diffabs.core.types import Matrix, PyTree, Scalar
-from diffabs.simulate.adaptive import build_passages
-from diffabs.simulate.advance import start_state
-from diffabs.simulate.checkpoint import any_lane, rematerialise
-from diffabs.simulate.condition import RunStatus, is_running
-from diffabs.simulate.drivers import STEPS_PER_BLOCK
-from diffabs.simulate.dynamics import (
+from diffabs.simulate.drive.checkpoint import any_lane, rematerialise
+from diffabs.simulate.drive.loops import STEPS_PER_BLOCK
+from diffabs.simulate.result import observe
+from diffabs.simulate.step.adaptive import build_passages
+from diffabs.simulate.step.attempt import start_state
+from diffabs.simulate.step.event_location import select
+from diffabs.simulate.step.fixed import cast_floats
+from diffabs.simulate.step.methods import AdaptiveStepping
+from diffabs.simulate.step.modes import Mode, ModeBits
+from diffabs.simulate.step.span import HermiteStep
+from diffabs.simulate.step.status import RunStatus, is_running
+from diffabs.simulate.step.system import (
     Accumulators,
     Dynamics,
     LoopEvaluationWithRates,
@@ -37,14 +42,9 @@ from diffabs.simulate.dynamics import (
     build_dynamics,
     split_flow_and_held,
 )
-from diffabs.simulate.landing import select
-from diffabs.simulate.methods import AdaptiveStepping
-from diffabs.simulate.result import observe
-from diffabs.simulate.solution import ADAPTIVE_ERROR_ORDER, Adaptive, Trajectory
-from diffabs.simulate.span import HermiteStep
-from diffabs.simulate.stepper import cast_floats
-from diffabs.simulate.tries import AdaptiveCarry
-from diffabs.simulate.tsit5 import tsit5_step_from
+from diffabs.simulate.step.tries import AdaptiveCarry
+from diffabs.simulate.step.tsit5 import tsit5_step_from
+from diffabs.simulate.types import ADAPTIVE_ERROR_ORDER, Adaptive, Trajectory
 
 # Capacity of the log: attempts at an rtol of 1e-5, and attempts for each instant of a grid with clocks.
 BASE_LOG_CAPACITY, LOG_CAPACITY_PER_TICK = 4096, 3

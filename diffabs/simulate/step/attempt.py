@@ -14,12 +14,12 @@ import jax.numpy as jnp
 from diffabs.core.blocks import Passage
 from diffabs.core.log import borrow
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.modes import Mode, ModeBits, find_contradicted, single_bit
 from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
 from diffabs.core.types import Matrix, PyTree, Scalar
-from diffabs.simulate.checkpoint import jit_barrier
-from diffabs.simulate.dynamics import Accumulators, Dynamics, Objectives, build_dynamics, split_flow_and_held
-from diffabs.simulate.rk4 import rk4_step_from
+from diffabs.simulate.drive.checkpoint import jit_barrier
+from diffabs.simulate.step.modes import Mode, ModeBits, find_contradicted, single_bit
+from diffabs.simulate.step.rk4 import rk4_step_from
+from diffabs.simulate.step.system import Accumulators, Dynamics, Objectives, build_dynamics, split_flow_and_held
 
 
 class FixedStepPoint(NamedTuple):

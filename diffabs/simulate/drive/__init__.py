@@ -1,0 +1,1 @@
+"""Repetition of steps: loops, batches, the kernel and devices."""

@@ -1,0 +1,1 @@
+"""One step of a run: what it computes, and which step is taken."""
