@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.blocks import Passage
-from diffabs.core.cubic import Cubic
+from diffabs.core.cubic import Cubic, HermiteStep
 from diffabs.core.log import Log
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree, static
@@ -138,19 +137,19 @@ class Delay:
         out = fired[0] & (m.last + 1 < m.known)
         return memory._replace(held=self._aim_at_break(m._replace(place=jnp.where(out, m.last + 1, m.place))))
 
-    def record(self, memory: Memory, passage: Passage) -> Memory:
-        """Return the memory with the finished step of `passage` stored as a piece.
+    def record(self, memory: Memory, step: HermiteStep) -> Memory:
+        """Return the memory with the finished `step` stored as a piece.
 
         A step of zero length is not stored.
         """
         m: DelayMemory = memory.held
-        h, free = passage.end - passage.start, _ring_place(m.first + m.count, m.ring.size)
+        h, free = step.end - step.start, _ring_place(m.first + m.count, m.ring.size)
         before = Piece.of(jax.lax.stop_gradient(m.newest))
-        cubic = Cubic(*passage.values, *(h * rate for rate in passage.rates))
-        after = passage.values[0], self.time * passage.rates[0]
+        cubic = Cubic(*step.values, *(h * rate for rate in step.rates))
+        after = step.values[0], self.time * step.rates[0]
         breaks = jnp.where(_differ((before.command.end, before.rate * self.time), after), 1.0, 0.0).astype(h.dtype)
-        row = _row(Piece(passage.start, passage.end, cubic, breaks))
-        some = h > _time_tolerance(passage.end)
+        row = _row(Piece(step.start, step.end, cubic, breaks))
+        some = h > _time_tolerance(step.end)
         count = m.count + jnp.where(some, 1.0, 0.0)
         newest = jnp.where(some, row, m.newest)
         return memory._replace(held=m._replace(ring=m.ring.put(free, row), newest=newest, count=count))

@@ -2,31 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.cubic import HermiteStep
 from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, part, pytree
 from diffabs.core.timing import steps_in_period
 from diffabs.core.types import Int, Part, PyTree
-
-
-class Passage(NamedTuple):
-    """The input signal of a block over a step without jumps.
-
-    Attributes:
-        start: Time [s] at the start of the step.
-        end: Time [s] at the end of the step.
-        values: The signal at both ends: after the changes at the start, before the changes at the end.
-        rates: Time derivatives of the signal at both ends, in the unit of the signal per second.
-    """
-
-    start: Scalar
-    end: Scalar
-    values: tuple[PyTree, PyTree]
-    rates: tuple[PyTree, PyTree]
 
 
 @pytree
@@ -114,15 +99,15 @@ class Series:
             signal = block.output(t, m, signal)
         return found
 
-    def record(self, memory: Memory, passage: Passage) -> Memory:
+    def record(self, memory: Memory, step: HermiteStep) -> Memory:
         """Return the memories after each recording block has recorded its input."""
-        (starts, ends), (rates, last) = passage.values, passage.rates
+        (starts, ends), (rates, last) = step.values, step.rates
         each = zip(starts, ends, rates, last, strict=True)
         memories = []
         for block, m in self._pairs(memory):
             if offers(block, "record"):
                 a, b, da, db = next(each)
-                m = block.record(m, passage._replace(values=(a, b), rates=(da, db)))
+                m = block.record(m, step._replace(values=(a, b), rates=(da, db)))
             memories.append(m)
         return _join_memories(memories)
 

@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp, later_of_larger
-from diffabs.core.pytree import Scalar
-from diffabs.core.types import PyTree
+from diffabs.core.types import PyTree, Scalar
 
 NEWTON_ITERATIONS = 4  # from the secant's root, before the last: in a long step the cubic is far from a line
 
@@ -110,6 +109,28 @@ class Cubic(NamedTuple):
         rise = self.end - self.start
         c2 = 3.0 * rise - 2.0 * self.start_slope - self.end_slope
         return self.start_slope, c2, self.start_slope + self.end_slope - 2.0 * rise
+
+
+class HermiteStep(NamedTuple):
+    """A quantity over a step without jumps: the cubic through its values and rates at both ends.
+
+    Attributes:
+        start: Time [s] at the start of the step.
+        end: Time [s] at the end of the step.
+        values: The quantity, a pytree, at both ends: after the changes at the start, before the changes at the end.
+        rates: Time derivatives of the quantity at both ends, per second.
+    """
+
+    start: Scalar
+    end: Scalar
+    values: tuple[PyTree, PyTree]
+    rates: tuple[PyTree, PyTree]
+
+    def at(self, t: Scalar) -> PyTree:
+        """Return the quantity at a time `t` [s] within the step."""
+        h = self.end - self.start
+        x = clamp((t - self.start) / jnp.where(h > 0, h, 1.0), 0.0, 1.0)
+        return jax.tree.map(lambda a, b, p, q: Cubic(a, b, h * p, h * q)(x), *self.values, *self.rates)
 
 
 def _refine_zero(x: Scalar, function: Callable[[PyTree], PyTree], slope: Scalar) -> PyTree:

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.blocks import Direct, NoFeedforward, Passage, next_tick, offers, record_signal
+from diffabs.core.blocks import Direct, NoFeedforward, next_tick, offers, record_signal
+from diffabs.core.cubic import HermiteStep
 from diffabs.core.protocols import (
     Block,
     Clock,
@@ -175,7 +176,7 @@ class Loop:
         before: Signals,
         margins: Margins,
         fired: Margins,
-        passed: dict[str, Passage] | None = None,
+        passed: dict[str, HermiteStep] | None = None,
     ) -> LoopState:
         """Return the state after an instant.
 

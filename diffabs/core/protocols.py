@@ -33,7 +33,7 @@ Optional methods or attributes of a part's class, beyond its contract:
                    margins(), event()                   change where a margin falls through zero: see Switching
                    period                               period of its clock [s]; default: the step of the grid
                    every_step = True                    it ticks in every step of the integration
-                   record(memory, passage)              called after every step: `core.blocks.Passage`
+                   record(memory, step)                 called after every step: `core.cubic.HermiteStep`
                    limits()                             limits of the control, for a controller or actuator
                    offers(hook)                         for a composite block: whether one of its blocks has the hook
     plant          usual_parts(), usual_objectives()    defaults of a scenario: the other parts of the loop, the metrics

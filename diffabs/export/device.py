@@ -26,7 +26,7 @@ from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import ParameterSpec, as_arrays, canonical_dtypes, parameters, prepare_parts
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
 from diffabs.core.types import Part, PyTree, Scalar
-from diffabs.simulate.step.rk4 import rk4_step
+from diffabs.simulate.step.runge_kutta import rk4_step
 
 MAX_STEPS_PER_SAMPLE = 64  # simulation steps in a period, for a target that moves by itself
 

@@ -22,7 +22,7 @@ from diffabs.export.lowered import fill_shapes, number_leaves, trace_outputs
 from diffabs.kernel.graph import Node, UpdateLevel, is_real
 from diffabs.kernel.primitives import Unsupported
 from diffabs.kernel.program import live_nodes
-from diffabs.simulate.step.rk4 import rk4_step
+from diffabs.simulate.step.runge_kutta import rk4_step
 
 CONTROL = "control"
 

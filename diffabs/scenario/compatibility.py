@@ -13,7 +13,7 @@ from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import PyTree
 from diffabs.core.values import kebab_case
 from diffabs.scenario.registry import join_path
-from diffabs.simulate.step.attempt import initial_point
+from diffabs.simulate.step.attempt import start_state
 
 
 def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
@@ -46,7 +46,11 @@ def _trials(loop: Loop, objectives: Mapping[str, Objective]) -> Any:
 
 def _trace_loop(loop: Loop) -> PyTree:
     """Trace the loop once around, and through an instant."""
-    return initial_point(loop, {}, Clock(0.0, 1e-3, 0, jax.random.key(0)))
+    clock = Clock(0.0, 1e-3, 0, jax.random.key(0))
+    state, _ = start_state(loop, {}, clock)
+    signals = loop.signals(clock.t, state)
+    rate = loop.flow(clock.t, state, signals)
+    return rate, loop.margins(clock.t, state, signals, lambda: rate)
 
 
 def _trace_objective(loop: Loop, objective: Objective) -> Any:

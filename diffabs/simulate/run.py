@@ -12,28 +12,35 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
 
 from diffabs.core import kinds
+from diffabs.core.arrays import as_array
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once, is_traced
 from diffabs.core.first_order import without_derivative
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import as_arrays, canonical_dtypes, parameters, prepare_derivatives, replace
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero
-from diffabs.core.types import Key, Params, PyTree, Scalar
+from diffabs.core.types import Int, Key, Params, PyTree, Scalar
 from diffabs.core.validity import find_broken, find_misshapen, part_rules
 from diffabs.objectives import Variation
 from diffabs.simulate.admissible import find_impossible_values
 from diffabs.simulate.drive.loops import (
+    log_run,
+    replay_log,
     round_up_capacity,
     run_to_end,
     run_with_trajectory,
     scan_to_end,
     scan_with_trajectory,
 )
-from diffabs.simulate.result import finish_run, prepare
-from diffabs.simulate.step.methods import AdaptiveStepping, build_stepping
-from diffabs.simulate.step.replay import log_capacity, log_steps, replay_run, replay_with_trajectory
+from diffabs.simulate.result import finish_run, observe, prepare
+from diffabs.simulate.step.adaptive import AdaptiveStepping, clip_rtol
+from diffabs.simulate.step.fixed import FixedStepping
+from diffabs.simulate.step.replay import ReplayedRun, ReplayStepping, log_attempt, log_capacity
+from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.types import Adaptive, Run, Solver, Trajectory
 
 OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
@@ -116,7 +123,7 @@ def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
     between = min(every, steps) if every else round_up_capacity(steps)
-    tries = log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.room(loop, between)
+    tries = log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.capacity(loop, between)
     method = method.with_trajectory() if every else method
     places = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
@@ -160,6 +167,21 @@ def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objec
         # Only traced values can be differentiated.
         loop = replace(loop, forbid_derivatives(loop, {path: value for path, _, value in parameters(loop)}))
     return loop, objectives, build_stepping(solver, jax.tree.leaves(loop)[0].dtype)
+
+
+def build_stepping(solver: Solver, dtype: DTypeLike) -> FixedStepping | AdaptiveStepping:
+    """Return the stepping method of a solver, with numbers of one data type: a pytree, for compiled programs.
+
+    Args:
+        solver: Solver of the run.
+        dtype: Floating-point type.
+    """
+    number = jnp.asarray if is_traced() else as_array
+    # `device_put` instead of `jnp.asarray`, which would compile a program.
+    h, steps = number(float(solver.step), dtype), jax.device_put(solver.steps)
+    if isinstance(solver, Adaptive):
+        return AdaptiveStepping(h, steps, number(float(clip_rtol(np.asarray(solver.rtol, dtype))), dtype))
+    return FixedStepping(h, steps, solver.kinks)
 
 
 def forbid_derivatives(loop: Loop, values: Params) -> dict[str, PyTree]:
@@ -303,7 +325,7 @@ def _run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key,
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     seen = partial(method.observe_at, loop)
     carry, seen = run_with_trajectory(
-        stepped, partial(method.renew, loop), method.before, seen, carry, every, count, places
+        stepped, partial(method.renew, loop), method.is_active, seen, carry, every, count, places
     )
     return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
 
@@ -322,23 +344,54 @@ def _run_reversible(
         return finish_run(loop, objectives, scan_to_end(stepped, carry, tries))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     carry, seen = scan_with_trajectory(
-        stepped, method.before, partial(method.observe_at, loop), carry, every, count, instants, tries
+        stepped, method.is_active, partial(method.observe_at, loop), carry, every, count, instants, tries
     )
     return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
 
 
 def _run_by_replay(
-    loop: Loop, objectives: dict[str, Objective], method: AdaptiveStepping, key: Key, places: RunCapacity
+    loop: Loop, objectives: dict[str, Objective], live: AdaptiveStepping, key: Key, places: RunCapacity
 ) -> Run:
+    """Return a run with adaptive steps for derivatives in both modes: logged for its values, then replayed."""
     loop, audit = prepare(loop)
     objectives, (tries, instants, every) = objectives | audit, places
     # The log holds values only: derivatives come from the replay.
     still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
-    run = (loop, objectives, method, key, *log_steps(still, measures, method.without_trajectory(), key, tries))
+    logged = live.without_trajectory()
+    carry, log = log_run(
+        partial(logged.step, still, measures, key),
+        partial(logged.renew, still),
+        log_attempt,
+        logged.start(still, measures, key),
+        tries,
+    )
+    log = jax.lax.stop_gradient(log)
+    status = jnp.where(carry.running, RunStatus.DIVERGED, carry.status)  # a run beyond the capacity of the log
+    replay = ReplayStepping(live)
+    start = replay.start(loop, objectives, key)
+    again, spans = replay_log(
+        partial(replay.step, loop, objectives, key),
+        lambda carry: carry.control.last_step,
+        lambda log: log.taken,
+        start,
+        log,
+    )
+    judged = finish_run(loop, objectives, ReplayedRun(again.point, status))
     if not every:
-        return finish_run(loop, objectives, replay_run(*run))[0]
-    carry, first, seen = replay_with_trajectory(*run, jnp.arange(1, instants + 1) * every)
-    return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
+        return judged[0]
+
+    # Skipped blocks are zero and come after the end: infinity keeps the start times sorted for the search.
+    starts = jnp.where(jnp.any(log.taken, axis=1)[:, None], jax.lax.stop_gradient(spans.flow.start), jnp.inf)
+    spans = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), spans)
+
+    def observe_at(instant: Int) -> Trajectory:
+        t = instant * live.h
+        place = jnp.searchsorted(starts.ravel(), t, side="right") - 1
+        span = jax.tree.map(lambda x: x[place], spans)
+        return observe(loop, t, span.at(t), t < jax.lax.stop_gradient(again.point.t))
+
+    first = observe(loop, start.point.t, start.point.state, jnp.asarray(True))
+    return _attach_trajectory(judged, first, jax.vmap(observe_at)(jnp.arange(1, instants + 1) * every))
 
 
 def _prepare_run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key) -> tuple[Loop, PyTree, PyTree]:

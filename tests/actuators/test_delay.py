@@ -18,13 +18,14 @@ from signals import Mean, close
 import diffabs as d
 from diffabs.actuators import Delay, Lag, Limits
 from diffabs.controllers import ConstantTorque, Relay, Sampled
-from diffabs.core.blocks import Passage, Series
+from diffabs.core.blocks import Series
+from diffabs.core.cubic import HermiteStep
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import canonical_dtypes, param, pytree
 from diffabs.objectives import TorqueRate
 from diffabs.references import Setpoint
-from diffabs.simulate.step.fixed import init_carry
-from diffabs.simulate.step.system import build_dynamics
+from diffabs.simulate.step.attempt import start_state
+from diffabs.simulate.step.system import build_system
 
 
 @pytree
@@ -273,7 +274,7 @@ def stepped(delay, command, slope, lengths, jumps=()):
             middle = float(output(t + 0.5 * h, memory, 0.0))
             before = float(output(t + h, memory, 0.0))
             memory = event(t + h, memory, jnp.asarray(cut))
-            memory = record(memory, Passage(jnp.asarray(t), jnp.asarray(t + h), values, rates))
+            memory = record(memory, HermiteStep(jnp.asarray(t), jnp.asarray(t + h), values, rates))
             found.append((t + 0.5 * h, middle, t + h, before))
             t = t + h
             memory = tick(t, h, not cut, memory)
@@ -348,13 +349,12 @@ def test_a_lag_behind_a_delay():
 def test_nobody_looks_for_the_ends_of_smooth_pieces():
     """A step spans two of them, and compares, but what it compares does not count as a kink."""
     there = canonical_dtypes(loop(Says(read=lambda t: jnp.sin(40.0 * t)), Delay(time=3.3e-3, capacity=16)))
-    kinks = []
+    comparisons = []
 
     def traced():
-        carry = init_carry(there, {}, jnp.asarray(H), None, kinks=True)
-        kinks.append(
-            build_dynamics(there, {}, carry.point.t, carry.point.state, carry.point.accumulators, kinks=True).kinks
-        )
+        zero = jnp.asarray(0.0)
+        state, accumulators = start_state(there, {}, Clock(zero, jnp.asarray(H), 0, None))
+        comparisons.append(build_system(there, {}, zero, state, accumulators, switched=True).comparisons)
 
     jax.eval_shape(traced)
-    assert kinks == [0]
+    assert comparisons == [0]

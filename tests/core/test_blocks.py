@@ -33,7 +33,7 @@ from diffabs.objectives import IAE, ITAE, MaxSlip, SettlingTime
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip, PeakLatch, PeakLiteral, PeakRobust, SlipByDeceleration
 from diffabs.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, SpeedScale, WheelSpeed
-from diffabs.simulate.step.rk4 import rk4_step
+from diffabs.simulate.step.runge_kutta import rk4_step
 from diffabs.stops import NoStop, SpeedReached, Standstill
 
 

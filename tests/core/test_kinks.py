@@ -239,7 +239,7 @@ def clockwork(rate: Any, place: Any) -> Loop:
     case="a table",
 )
 @killed_by(
-    "simulate/step/methods.py",
+    "simulate/step/fixed.py",
     "dataclasses.replace(self, kinks=self.kinks is not False,",
     "dataclasses.replace(self, kinks=False,",
     case="a jump",
@@ -369,7 +369,7 @@ def integrating(late: float) -> tuple[Loop, float]:
     "(raw - limited) * gain * error > 0",
     "jnp.not_equal(raw, limited) & ((raw - limited) * gain * error > 0)",
 )
-@killed_by("simulate/step/methods.py", "loop.jumps if self.kinks is None", "False if self.kinks is None")
+@killed_by("simulate/step/fixed.py", "loop.jumps if self.kinks is None", "False if self.kinks is None")
 @pytest.mark.parametrize("late", [0.0, 0.0337])
 def test_where_a_rate_jumps_a_value_is_right_too(late):
     """An integral that waits for a limit starts at once when the limit is left: in the middle of a step of 10 ms, which

@@ -100,7 +100,7 @@ def commands_of_parts(loop, seen, dtype, step=None):
             return d.core.protocols.Tracking(target, y, loop.feedforward.input(loop.plant, y, setpoint))
 
         def moved(reference, y):
-            return d.simulate.step.rk4.rk4_step(
+            return d.simulate.step.runge_kutta.rk4_step(
                 lambda t, x: loop.reference.flow(t, reference._replace(flow=x), y), 0.0, reference.flow, h
             )
 

@@ -323,7 +323,9 @@ def test_steps_end_on_kinks_where_those_of_xla_do():
     assert np.abs(blunt - known).max() > 1e-5 * np.abs(known).max()
 
 
-@killed_by("simulate/step/pursuit.py", "any_lane(note.moved)", "any_lane(note.fired != 0)", case="slip-lmi-adaptive")
+@killed_by(
+    "simulate/step/replay.py", "any_lane(entry.taken)", "any_lane(entry.triggered != 0)", case="slip-lmi-adaptive"
+)
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grid", "kinks", "adaptive"])
 @pytest.mark.parametrize("name", scenario.names())

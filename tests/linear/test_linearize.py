@@ -33,7 +33,7 @@ from diffabs.references import FilteredSlip, FixedSlip
 from diffabs.roads import WET_ASPHALT, Burckhardt
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import Bias, WheelSpeed
-from diffabs.simulate.step.rk4 import rk4_step
+from diffabs.simulate.step.runge_kutta import rk4_step
 
 K = 1 / 3.6
 R1, R2, J1, G = 0.0995, 0.099, 7.53e-3, 9.81

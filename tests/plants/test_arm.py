@@ -21,7 +21,7 @@ from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
 from diffabs.plants.arm_balance import ArmState
 from diffabs.scenario.defaults import balancing
 from diffabs.simulate.run import measure
-from diffabs.simulate.step.rk4 import rk4_step
+from diffabs.simulate.step.runge_kutta import rk4_step
 from diffabs.simulate.types import FixedStep
 
 ARM, HANGING = ArmBalance(), ArmBalance(arm_length=-0.5)

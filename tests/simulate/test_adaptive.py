@@ -19,8 +19,7 @@ from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
 from diffabs.simulate.run import prepare_arguments
-from diffabs.simulate.step import step_size as lengths
-from diffabs.simulate.step.foresight import SwitchingFunction, forecast_crossings, read_bits
+from diffabs.simulate.step import step_size, system
 from diffabs.simulate.step.replay import BASE_LOG_CAPACITY, log_capacity
 from diffabs.tune import worst_case
 
@@ -107,9 +106,9 @@ def test_a_computer_ticks_on_its_own_clock():
 
 
 @killed_by(
-    "simulate/step/methods.py",
-    "        inside = (t < now.t) & (carry.last_step.until > carry.last_step.t)",
-    "        inside = (t < now.t) & (carry.last_step.until < carry.last_step.t)",
+    "simulate/step/adaptive.py",
+    "inside = (t < now.t) & (last.flow.end > last.flow.start)",
+    "inside = (t < now.t) & (last.flow.end < last.flow.start)",
 )
 @pytest.mark.slow
 def test_a_trajectory_is_kept_on_the_grid_and_changes_nothing():
@@ -158,7 +157,7 @@ def test_a_computer_in_single_precision_keeps_its_time():
     close(run, exact, 2e-4)
 
 
-@killed_by("simulate/step/methods.py", "MIN_RTOL_EPS = 32 ", "MIN_RTOL_EPS = 0 ")
+@killed_by("simulate/step/adaptive.py", "MIN_RTOL_EPS = 32 ", "MIN_RTOL_EPS = 0 ")
 @pytest.mark.slow
 def test_single_precision_asks_for_no_smaller_error_than_it_has():
     chosen = rig()
@@ -389,20 +388,20 @@ def test_steps_that_find_themselves_are_never_unstable():
 
 
 @killed_by(
-    "simulate/step/foresight.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least"
+    "simulate/step/step_size.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least"
 )
 def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = [0, 1, 33, np.array([2, 3])]
     values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]
     rates = [jnp.asarray(-1.0), jnp.asarray(1.0), jnp.asarray(4.0), jnp.array([1.0, -40.0])]
-    margins = [SwitchingFunction(*one) for one in zip(numbers, values, rates, strict=True)]
+    margins = [system.SwitchingFunction(*one) for one in zip(numbers, values, rates, strict=True)]
     words = (jnp.uint32(0b1100), jnp.uint32(0b10))
-    np.testing.assert_array_equal(read_bits(words, np.array([2, 3, 33, 1])), [True, True, True, False])
-    found = forecast_crossings(margins, jnp.asarray(1.0), 0.0, words, jnp.asarray(1.0))
-    assert found.ahead == pytest.approx(0.1)  # 4 falls by 40/s
-    assert found.late == pytest.approx(0.5)  # of bits 2 and 33, 0.5 s and 0.25 s ago
-    none = forecast_crossings(margins, jnp.asarray(1.0), 0.0, (jnp.uint32(0),) * 2, jnp.asarray(1.0))
-    assert none.late == 0
+    np.testing.assert_array_equal(step_size.read_bits(words, np.array([2, 3, 33, 1])), [True, True, True, False])
+    length = jnp.asarray(1.0)
+    assert step_size.forecast_crossing(margins, length, 0.0) == pytest.approx(0.1)  # 4 falls by 40/s
+    # Bits 2 and 33 changed 0.5 s and 0.25 s ago.
+    assert step_size.time_since_crossing(margins, words, length) == pytest.approx(0.5)
+    assert step_size.time_since_crossing(margins, (jnp.uint32(0),) * 2, length) == 0
 
 
 @killed_by(
@@ -422,11 +421,11 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
     state = loop.start()
     state = state.with_flow(jax.tree.map(lambda x: x + 2.0, state.flow()))
     sample = loop.signals(0.0, state).sample
-    scale = lengths.error_scales(state, sample)
+    scale = step_size.error_scales(state, sample)
     none = jax.tree.map(lambda x: 0.0 * x, state)
-    assert lengths.error_norm(loop, state, none.flow(), scale, sample) == 0
+    assert step_size.error_norm(loop, state, none.flow(), scale, sample) == 0
     off = none._replace(actuator=none.actuator._replace(flow=0.01 * state.actuator.flow))
-    assert lengths.error_norm(loop, state, off.flow(), scale, sample) == pytest.approx(0.01)
+    assert step_size.error_norm(loop, state, off.flow(), scale, sample) == pytest.approx(0.01)
     slower = none._replace(plant=none.plant._replace(wheel=0.01 * state.plant.wheel))
     slip = abs(
         float(
@@ -434,7 +433,7 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
             - sample.output[0]
         )
     )
-    first = lengths.error_norm(loop, state, slower.flow(), scale, sample)
+    first = step_size.error_norm(loop, state, slower.flow(), scale, sample)
     assert first == pytest.approx(max(0.01, slip / float(scale[0])), rel=1e-9)
     assert slip > 0.01 * float(scale[0])
 
@@ -452,9 +451,9 @@ def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
             at = state.with_flow(tree(z))
             return jax.flatten_util.ravel_pytree(loop.flow(0.0, at, loop.signals(0.0, at)))[0]
 
-        sizes = lengths.error_scales(state, loop.signals(0.0, state).sample)
-        return jax.jacfwd(flow)(z), lengths.spectral_step_limit(loop, jnp.asarray(0.0), state, sizes)
+        sizes = step_size.error_scales(state, loop.signals(0.0, state).sample)
+        return jax.jacfwd(flow)(z), step_size.spectral_step_limit(loop, jnp.asarray(0.0), state, sizes)
 
     jacobian, longest = both()
     radius = np.max(np.abs(np.linalg.eigvals(jacobian)))
-    assert 0.7 < float(longest) * radius / lengths.STABILITY_RADIUS < 1.4
+    assert 0.7 < float(longest) * radius / step_size.STABILITY_RADIUS < 1.4

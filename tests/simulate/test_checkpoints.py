@@ -14,8 +14,13 @@ from diffabs import controllers, plants
 from diffabs.core.pytree import get
 from diffabs.objectives import IAE, StopDistance
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.drive.checkpoint import MAX_SAVED_CARRIES, SCAN_GROUP_STEPS, nested_scan_lengths, repeat_step
-from diffabs.simulate.drive.loops import round_up_capacity
+from diffabs.simulate.drive.loops import (
+    MAX_SAVED_CARRIES,
+    SCAN_GROUP_STEPS,
+    nested_scan_lengths,
+    repeat_step,
+    round_up_capacity,
+)
 from diffabs.stops import SpeedReached
 
 LOOP = braking(
@@ -55,7 +60,7 @@ def memory(steps):
     return analysis.temp_size_in_bytes
 
 
-@killed_by("simulate/drive/checkpoint.py", "MAX_SAVED_CARRIES = 1800", "MAX_SAVED_CARRIES = 10**9")
+@killed_by("simulate/drive/loops.py", "MAX_SAVED_CARRIES = 1800", "MAX_SAVED_CARRIES = 10**9")
 @pytest.mark.slow
 def test_reverse_mode_memory_hardly_grows_with_steps():
     sizes = [memory(steps) for steps in (1000, 4000, 16000)]
@@ -63,7 +68,7 @@ def test_reverse_mode_memory_hardly_grows_with_steps():
 
 
 @killed_by(
-    "simulate/drive/checkpoint.py",
+    "simulate/drive/loops.py",
     "return math.ceil(count / inner), inner",
     "return count // inner, inner",
     case="1801",
@@ -100,9 +105,9 @@ def test_groups_after_the_end_have_no_derivative():
 
 
 @killed_by(
-    "simulate/step/rk4.py",
-    "jvp_nonzero(lambda *step: _scan(f, *step), primals",
-    "jvp_nonzero(lambda *step: _scan(f, *step[:4], jax.lax.stop_gradient(step[4])), primals",
+    "simulate/step/runge_kutta.py",
+    "jvp_nonzero(lambda *step: _scanned_step(tableau, f, *step), primals",
+    "jvp_nonzero(lambda *step: _scanned_step(tableau, f, *step[:4], jax.lax.stop_gradient(step[4])), primals",
 )
 @pytest.mark.slow
 def test_reverse_forward_and_differences_agree_in_nested_scans(monkeypatch):

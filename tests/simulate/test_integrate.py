@@ -8,7 +8,7 @@ import pytest
 from mutants import killed_by
 
 from diffabs.core.numerics import axpy
-from diffabs.simulate.step.rk4 import rk4_step
+from diffabs.simulate.step.runge_kutta import rk4_step
 
 
 def integrate(derivative, x, end, steps):
@@ -26,8 +26,8 @@ def forced(t, x):
     return -2 * t * x
 
 
-@killed_by("simulate/step/rk4.py", "(0.5, 2.0), (0.5, 2.0)", "(0.5, 1.0), (0.5, 3.0)")
-@killed_by("simulate/step/rk4.py", "rate = f(t + place * h,", "rate = f(t,")
+@killed_by("simulate/step/runge_kutta.py", "(1 / 6, 1 / 3, 1 / 3, 1 / 6)", "(1 / 6, 1 / 4, 5 / 12, 1 / 6)")
+@killed_by("simulate/step/runge_kutta.py", "rates.append(f(t + place * h,", "rates.append(f(t,", case="time-dependent")
 @pytest.mark.parametrize(
     ("derivative", "x0", "end", "error"),
     [

@@ -17,7 +17,6 @@ from diffabs.scenario.defaults import braking
 from diffabs.simulate.result import finish_run, prepare
 from diffabs.simulate.run import _run, prepare_arguments
 from diffabs.simulate.stability import stable_step
-from diffabs.simulate.step.fixed import attempt_capacity
 from diffabs.stops import SpeedReached, Standstill
 
 RIG = braking(
@@ -181,7 +180,7 @@ def test_another_duration_compiles_nothing_new(duration, like):
     run = d.measure(RIG, solver, BRAKING)
     assert _run._cache_size() == before
     loop, objectives, method = prepare_arguments(RIG, solver, BRAKING)
-    alone = plainly(loop, objectives, method, attempt_capacity(loop, solver.steps))
+    alone = plainly(loop, objectives, method, method.capacity(loop, solver.steps))
     assert bool(run.stopped) == (duration == 3.0)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-13), run, alone)
 
@@ -206,7 +205,7 @@ def test_trajectories_of_all_durations_share_a_program():
     "jax.lax.while_loop(lambda carry: any_lane(carry.running), block",
     "jax.lax.while_loop(lambda carry: ~any_lane(~carry.running), block",
 )
-@killed_by("simulate/drive/checkpoint.py", "jnp.any(running, axis=0)", "jnp.all(running, axis=0)")
+@killed_by("core/lanes.py", "jnp.any(running, axis=0)", "jnp.all(running, axis=0)")
 @pytest.mark.slow
 def test_a_batch_ends_with_its_last_lane():
     """Behind `vmap` the condition of the loop is one for all lanes; each lane ends as it would alone, also if another

@@ -16,7 +16,8 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors, stops
 from diffabs.core import blocks
-from diffabs.core.blocks import Passage, offers, record_signal
+from diffabs.core.blocks import offers, record_signal
+from diffabs.core.cubic import HermiteStep
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import (
     BalanceOutput,
@@ -30,7 +31,7 @@ from diffabs.core.protocols import (
     Tracking,
 )
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.simulate.step.rk4 import rk4_step
+from diffabs.simulate.step.runge_kutta import rk4_step
 
 FAMILIES = (roads, plants, controllers, references, actuators, sensors, objectives, stops, blocks)
 
@@ -263,7 +264,7 @@ def braking_at(t: Any) -> Sample:
 
 
 def at_instant(
-    block: Any, clock: Clock, memory: Memory, signal: Any, rate: Any, before: Any, passage: Passage | None = None
+    block: Any, clock: Clock, memory: Memory, signal: Any, rate: Any, before: Any, passage: HermiteStep | None = None
 ) -> tuple[Memory, Any]:
     """A block's memory after an instant, and its margins there: an event where one has become negative since `before`,
     which are None at first; the step that ends there; then its tick."""
@@ -281,7 +282,7 @@ def at_instant(
     return memory, margins(memory)
 
 
-def passed(family: str, block: Any, memory: Memory, t: Any) -> Passage:
+def passed(family: str, block: Any, memory: Memory, t: Any) -> HermiteStep:
     """The step that ends at t; before the first there is none."""
 
     def seen(t: Any) -> Any:
@@ -289,7 +290,7 @@ def passed(family: str, block: Any, memory: Memory, t: Any) -> Passage:
 
     start = jnp.maximum(t - H, 0.0)
     (first, rate), (last, final) = (jax.jvp(seen, (at,), (jnp.ones_like(at),)) for at in (start, t))
-    return Passage(start, t, (first, last), (rate, final))
+    return HermiteStep(start, t, (first, last), (rate, final))
 
 
 def block_run(family: str, block: Any, steps: int = 8) -> Any:

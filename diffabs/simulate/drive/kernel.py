@@ -27,8 +27,8 @@ from diffabs.simulate.drive.loops import STEPS_PER_BLOCK
 from diffabs.simulate.drive.packed import STEPS_PER_EXCHANGE, EarlyEnd, split_by_lane
 from diffabs.simulate.result import finish_run
 from diffabs.simulate.run import forbid_derivatives, prepare_arguments, refuse_derivative
-from diffabs.simulate.step.methods import AdaptiveStepping
-from diffabs.simulate.step.pursuit import LaggedReplay, LaggedReplayStepping
+from diffabs.simulate.step.adaptive import AdaptiveStepping
+from diffabs.simulate.step.replay import LaggedReplay, LaggedReplayStepping
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.types import Run, Solver
 

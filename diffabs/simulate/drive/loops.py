@@ -9,17 +9,21 @@ run do nothing. So a new duration compiles no new program for values, and a new 
 capacity.
 """
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.lanes import any_lane, rematerialise
 from diffabs.core.types import Bool, Int, PyTree
-from diffabs.simulate.drive.checkpoint import any_lane, rematerialise, repeat_step
 
+X = TypeVar("X")
 Carry = Any  # pytree of the stepping method, with an attribute `running`
 Step = Callable[..., Carry]  # function of a carry and, for trajectories, of `until`, the instant at which to pause
+SCAN_GROUP_STEPS = 32  # steps that are skipped together, in scans of at most MAX_SAVED_CARRIES steps
+MAX_SAVED_CARRIES = 1800  # carries that reverse mode keeps in one scan: some 0.2 MB for each run of a batch
 STEPS_PER_BLOCK = 16  # steps between two checks of `running`, which is a reduction over the whole batch
 
 
@@ -139,3 +143,114 @@ def scan_with_trajectory(
 def _any_running(running: Bool) -> Bool:
     """Return `any_lane(running)` without a derivative."""
     return any_lane(jax.lax.stop_gradient(running))
+
+
+def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X], PyTree]) -> X:
+    """Return the carry after `capacity` applications of `step`, in nested scans.
+
+    Groups of steps are skipped while `on(carry)` is False; there, `step` must return its argument. In a batch under
+    `jax.vmap` groups are skipped only if `on` returns one value for all runs (`any_lane`). Reverse mode keeps the carry
+    of each step. Beyond `MAX_SAVED_CARRIES` steps it keeps the carry of each group and computes the steps of a group
+    again.
+
+    Args:
+        step: Function from carry to carry.
+        carry: Carry before the first step.
+        capacity: Number of steps for which there is room.
+        on: Function of the carry: True if the run goes on.
+    """
+    outer, inner = nested_scan_lengths(capacity)
+
+    def group(carry: X) -> X:
+        return jax.lax.scan(rematerialise(lambda carry, _: (step(carry), None)), carry, length=inner)[0]
+
+    def body(carry: X, _: Any) -> tuple[X, None]:
+        return jax.lax.cond(on(carry), group, lambda carry: carry, carry), None
+
+    # Checkpoints on both levels: memory for the carries of the groups plus those of one group at a time.
+    return jax.lax.scan(rematerialise(body) if capacity > MAX_SAVED_CARRIES else body, carry, length=outer)[0]
+
+
+def nested_scan_lengths(count: int) -> tuple[int, int]:
+    """Return the number of groups and the number of steps in a group for at least `count` steps.
+
+    Up to `MAX_SAVED_CARRIES` steps a group has `SCAN_GROUP_STEPS` steps. Beyond, both numbers together are at most 3/2
+    `MAX_SAVED_CARRIES`, up to a count of MAX_SAVED_CARRIES^2/2.
+
+    Args:
+        count: Number of steps.
+    """
+    inner = math.ceil(count / MAX_SAVED_CARRIES) if count > MAX_SAVED_CARRIES else min(SCAN_GROUP_STEPS, count)
+    return math.ceil(count / inner), inner
+
+
+def log_run(
+    step: Step, renew: Step, log: Callable[[Carry, Carry], PyTree], carry: Carry, room: int
+) -> tuple[Carry, PyTree]:
+    """Return the carry at the end of a run after at most `room` attempts, and the log of the attempts.
+
+    The log is in blocks of shape (blocks, `STEPS_PER_BLOCK`, ...). Blocks after the end of the run are zero.
+
+    Args:
+        step: Function from carry to carry: one attempt of a step.
+        renew: Function from carry to carry, called once before each block.
+        log: Function of the carries before and after an attempt that returns its log entry.
+        carry: Carry at t = 0.
+        room: Capacity for attempts.
+    """
+
+    def one(carry: Carry, _: None) -> tuple[Carry, PyTree]:
+        new = step(carry)
+        return new, log(carry, new)
+
+    def block(carry: Carry, _: None) -> tuple[Carry, PyTree]:
+        return jax.lax.scan(one, renew(carry), length=STEPS_PER_BLOCK)
+
+    return _scan_active(block, lambda carry, _: carry.running, carry, None, -(-room // STEPS_PER_BLOCK))
+
+
+def replay_log(
+    step: Callable[[Carry, PyTree], Carry],
+    keep: Callable[[Carry], PyTree],
+    taken: Callable[[PyTree], Bool],
+    carry: Carry,
+    log: PyTree,
+) -> tuple[Carry, PyTree]:
+    """Return the carry after all logged attempts, and what is kept of each, in the blocks of the log.
+
+    Args:
+        step: Function of the carry and a log entry: one attempt.
+        keep: Function of the carry after an attempt that returns what is kept.
+        taken: Function of a block of the log: True for each attempt that was accepted.
+        carry: Carry at t = 0.
+        log: Log of a run, as `log_run` returns it.
+    """
+
+    def one(carry: Carry, entry: PyTree) -> tuple[Carry, PyTree]:
+        carry = step(carry, entry)
+        return carry, keep(carry)
+
+    # Checkpoints on both levels: memory for the states of the blocks plus those of one block.
+    @rematerialise
+    def block(carry: Carry, some: PyTree) -> tuple[Carry, PyTree]:
+        return jax.lax.scan(rematerialise(one), carry, some)
+
+    return _scan_active(block, lambda _, some: jnp.any(taken(some)), carry, log)
+
+
+def _scan_active(
+    work: Callable[[Carry, PyTree], tuple[Carry, PyTree]],
+    on: Callable[[Carry, PyTree], Bool],
+    carry: Carry,
+    xs: PyTree,
+    length: int | None = None,
+) -> tuple[Carry, PyTree]:
+    """Return the result of a scan of `work` in which steps are skipped, with zeros, if no run is `on`."""
+
+    def body(carry: Carry, x: PyTree) -> tuple[Carry, PyTree]:
+        def skip() -> tuple[Carry, PyTree]:
+            return carry, jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(work, carry, x)[1])
+
+        return jax.lax.cond(any_lane(on(carry, x)), lambda: work(carry, x), skip)
+
+    return jax.lax.scan(body, carry, xs, length=length)

@@ -1,89 +1,66 @@
-"""One fixed step, or a part of one: integration, objectives, events and ticks. `adaptive` has the same for adaptive
-steps.
+"""One step of a run: `attempt_step` integrates, `commit_step` changes the blocks at the end.
 
-A step integrates to t + h within one mode. Then the plant projects its state, and the objectives are updated over the
-step. At t + h the events and ticks of the blocks happen. The rates after these changes begin the next step.
+    attempt_step   integrates over the step within one mode, lets the plant project its state, evaluates the dynamics at
+                   the end, and updates the objectives over the step
+    commit_step    lets the events and ticks of the blocks happen at the end of an accepted step
+
+Nothing else integrates, projects or accumulates, and nothing else changes a block. What chooses the steps is a
+`Stepping` (`advance`).
 """
 
-from functools import cache, partial
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.blocks import Passage
+from diffabs.core.cubic import HermiteStep
 from diffabs.core.log import borrow
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
+from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
-from diffabs.core.types import Matrix, PyTree, Scalar
-from diffabs.simulate.drive.checkpoint import jit_barrier
-from diffabs.simulate.step.modes import Mode, ModeBits, find_contradicted, single_bit
-from diffabs.simulate.step.rk4 import rk4_step_from
-from diffabs.simulate.step.system import Accumulators, Dynamics, Objectives, build_dynamics, split_flow_and_held
+from diffabs.core.types import Bool, Int, PyTree, Scalar
+from diffabs.simulate.step.event_location import select
+from diffabs.simulate.step.modes import Mode, ModeBits, single_bit
+from diffabs.simulate.step.runge_kutta import Tableau, runge_kutta_step
+from diffabs.simulate.step.step_size import valid_end_rates
+from diffabs.simulate.step.system import (
+    Accumulators,
+    Evaluation,
+    Objectives,
+    System,
+    split_flow_and_held,
+    with_flow,
+)
 
 
-class FixedStepPoint(NamedTuple):
-    """A run at an instant, after the changes there.
+class Point(NamedTuple):
+    """A run at an instant.
 
     Attributes:
         t: Time [s].
         state: State of the loop.
         accumulators: Accumulators of the objectives.
         sample: Sample of the signals.
-        rate: Rates of the loop's flow and of the objectives' integrals.
+        signal_rates: Rates of the signals, as `System.signal_rates` says.
+        recorded: Signals that blocks record, and their rates, each by block.
+        rates: Rates of the loop's flow and of the objectives' integrals.
         margins: Margins of the stop and of the blocks' events.
-        mode: Answers to the comparisons in these rates.
+        words: Answers to the comparisons: the mode of the next step.
+        forecast: What the stepping method foresees from here.
     """
 
     t: Scalar
     state: LoopState
     accumulators: Accumulators
     sample: Sample
-    rate: tuple[PyTree, PyTree]
+    signal_rates: PyTree
+    recorded: tuple[dict[str, PyTree], dict[str, PyTree]]
+    rates: tuple[PyTree, PyTree]
     margins: Margins
-    mode: ModeBits
-
-
-class SurfaceCrossing(NamedTuple):
-    """Contradicted comparisons at the end of a step: their answers differ from the mode of the step.
-
-    Attributes:
-        other: A contradicted comparison other than the sought one, or -1.
-        contradicted: True if the sought comparison is contradicted.
-        chosen: Number of the comparison to search for: the sought one if it is contradicted, else `other`.
-        margin: Margin of the chosen comparison.
-    """
-
-    other: Any
-    contradicted: Any
-    chosen: Any
-    margin: Scalar
-
-
-class FixedStepAttempt(NamedTuple):
-    """The end of an attempted step, before the changes there.
-
-    Attributes:
-        t: Time [s].
-        state: State of the loop, projected.
-        accumulators: Accumulators of the objectives.
-        signals: Signals of the loop.
-        rate: Rates of the loop's flow and of the objectives' integrals.
-        margins: Margins of the stop and of the blocks' events.
-        kink: Contradicted comparisons.
-        mode: Mode after the step.
-        passed: The step as a `Passage` for each block that records its signal.
-    """
-
-    t: Scalar
-    state: LoopState
-    accumulators: Accumulators
-    signals: Signals
-    rate: tuple[PyTree, PyTree]
-    margins: Margins
-    kink: SurfaceCrossing
-    mode: ModeBits
-    passed: dict[str, Passage]
+    words: ModeBits
+    forecast: PyTree
 
 
 class StepRequest(NamedTuple):
@@ -92,20 +69,39 @@ class StepRequest(NamedTuple):
     Attributes:
         h: Length [s].
         end: Time at the end [s].
-        step: Step of the grid [s].
-        unrestricted: True for a step without a mode: each stage evaluates its comparisons, across switching surfaces.
-        refresh: True for a step of length 0 that evaluates the rates after an event.
-        which: Number of the sought comparison.
-        lands: True if the step ends on the switching surface of that comparison.
+        grid: Step of the grid [s].
+        mode: Mode of the step.
+        refresh: True for a step of length 0 that evaluates the rates after an event or a switching surface.
+        strikes: True if the step ends where a clock strikes, or with the run.
+        strike: Number of that instant of the grid.
     """
 
     h: Scalar
-    end: PyTree
-    step: Scalar
-    unrestricted: Scalar
-    refresh: Any
-    which: Scalar
-    lands: Scalar
+    end: Scalar
+    grid: Scalar
+    mode: Mode
+    refresh: Bool
+    strikes: Bool
+    strike: Int
+
+
+class Attempt(NamedTuple):
+    """The end of an attempted step.
+
+    Attributes:
+        point: The end, before the changes there.
+        signals: Signals of the loop.
+        shift: Time [s] by which the end lies later than requested.
+        report: What the stepping method needs for its decision.
+    """
+
+    point: Point
+    signals: Signals
+    shift: Scalar
+    report: PyTree
+
+
+Forecast = Callable[[Evaluation], PyTree]  # of a stepping method, from an instant
 
 
 def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopState, Accumulators]:
@@ -125,167 +121,170 @@ def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopS
     return state, accumulators
 
 
-def initial_point(loop: Loop, objectives: Objectives, clock: Clock, *, kinks: bool = False) -> FixedStepPoint:
-    """Return the point at t = 0.
+def evaluate_point(
+    system: System, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode, forecast: Forecast
+) -> Point:
+    """Return the point at an instant.
 
     Args:
-        loop: Closed loop, prepared.
-        objectives: Objectives by the names of their metrics.
-        clock: Instant t = 0.
-        kinks: True if switching surfaces are located.
+        system: Dynamics of the loop and its objectives.
+        t: Time [s].
+        state: State of the loop, after the changes at this instant.
+        accumulators: Accumulators of the objectives.
+        mode: Mode in which the dynamics are evaluated.
+        forecast: What the stepping method foresees.
     """
-    state, accumulators = start_state(loop, objectives, clock)
-    system = build_dynamics(loop, objectives, clock.t, state, accumulators, kinks=kinks)
-    return _evaluate_point(system, clock.t, state, accumulators, Mode(None))
+    return _build_point(system.evaluate(t, state, accumulators, mode), t, state, accumulators, forecast)
 
 
-def attempt_step(system: Dynamics, point: FixedStepPoint, one: StepRequest, active: Scalar) -> FixedStepAttempt:
+def attempt_step(
+    system: System,
+    point: Point,
+    request: StepRequest,
+    tableau: Tableau,
+    forecast: Forecast,
+    report: Callable[[Evaluation, LoopState, PyTree], PyTree],
+    shift_end: Callable[[Evaluation], Scalar] | None = None,
+) -> Attempt:
     """Return the end of one Runge-Kutta step from a point.
 
     Args:
         system: Dynamics of the loop and its objectives.
         point: Point at the beginning.
-        one: Step to attempt.
-        active: False for a run that is over. Its result has no meaning.
+        request: Step to attempt.
+        tableau: Coefficients of the Runge-Kutta method.
+        forecast: What the stepping method foresees from the end.
+        report: What the stepping method needs for its decision, from the dynamics at the end, the state there, and the
+            shares of the rates in the error.
+        shift_end: Time [s] to add to the step, from the dynamics at its requested end; None for none. It is zero to
+            rounding, but has the derivative of the event's time there.
     """
-    loop, (z, held) = system.loop, split_flow_and_held(point.state, point.accumulators)
+    loop, (t, h), mode = system.loop, (request.end, request.h), request.mode
+    z, held = split_flow_and_held(point.state, point.accumulators)
 
-    def flow(t: Scalar, z: Matrix, given: tuple[PyTree, Mode]) -> Any:
+    def flow(t: Scalar, z: PyTree, given: tuple[PyTree, Mode]) -> PyTree:
         return system.rates(t, z, *given)
 
-    z = rk4_step_from(flow, point.t, z, point.rate, one.h, (held, Mode(point.mode, one.unrestricted)))
-    state = point.state.with_flow(z[0])
-    accumulated = {name: memory._replace(flow=z[1][name]) for name, memory in point.accumulators.items()}
-    rests = state._replace(plant=loop.plant.project(state.plant))
+    z, error = runge_kutta_step(tableau, flow, point.t, z, point.rates, h, (held, mode))
+    shift = jnp.zeros_like(h)
+    if shift_end:
+        seen = system.evaluate(t, *with_flow(point.state, point.accumulators, z), mode)
+        shift = shift_end(seen)
+        t, h, z = t + shift, h + shift, axpy(shift, seen.rates, z)
+    state, accumulators = with_flow(point.state, point.accumulators, z)
+    projected = state._replace(plant=loop.plant.project(state.plant))
     # A projection may move the state onto a switching surface, so the end of a frozen mode is evaluated without it.
-    state = jax.tree.map(partial(jnp.where, one.unrestricted), rests, state) if system.kinks else rests
+    frozen = mode.words is not None and system.program is not None
+    state = select(mode.free, projected, state) if frozen else projected
+    seen = system.evaluate(t, state, accumulators, mode)
 
-    def look() -> Any:
-        seen, answers = system.look(
-            one.end,
-            state,
-            accumulated,
-            mode_at_end(system, point.mode, one.which, one.lands, one.unrestricted | one.refresh),
-        )
-        return seen, SurfaceCrossing(*find_contradicted(answers, one.which, one.h)), answers.words
-
-    # The evaluation has many consumers (objectives, margins, rates). XLA would fuse a copy of it into each of them.
-    seen, kink, words = jit_barrier(active, look) if system.kinks else look()
-    end = (one.end, state, accumulated, seen.rate)
-    segment = _build_segment(system, point, end, seen.signals.sample, one)
-    new = {name: Memory(z[1][name], o.update(accumulated[name], segment)) for name, o in system.objectives.items()}
-    # A step of length 0 must not count twice in the objectives.
-    accumulated = (
-        jax.tree.map(partial(jnp.where, one.refresh), point.accumulators, new)
-        if loop.changes and not loop.ticks
-        else new
+    smooth, within = system.program is not None, (True, True)
+    if frozen:
+        smooth, within = ~mode.free, (True, ~mode.free)
+    elif system.forecasts:
+        changed = tuple(a ^ b for a, b in zip(seen.words, point.words, strict=True))
+        within = valid_end_rates(seen.surfaces, changed, h)
+    rates = (point.signal_rates, seen.signal_rates)
+    segment = Segment(
+        *(point.sample, seen.signals.sample, h, request.grid),
+        shown_rates=lambda: tuple(Shown(*map(partial(getattr, one), Shown._fields)) for one in rates),
+        sample_rates=lambda: rates,
+        smooth=smooth,
+        within=within,
     )
-    passed = _build_passages(system, point, end, one)
-    return FixedStepAttempt(one.end, rests, accumulated, seen.signals, seen[:2], seen.margins, kink, words, passed)
+    updated = {name: Memory(z[1][name], o.update(accumulators[name], segment)) for name, o in system.objectives.items()}
+    if not loop.ticks and (loop.eventful or frozen):
+        # A step of length 0 must not count twice in the objectives.
+        updated = select(request.refresh, point.accumulators, updated)
+    end = _build_point(seen, t, projected, updated, forecast)
+    return Attempt(end, seen.signals, shift, report(seen, state, error))
 
 
 def commit_step(
-    system: Dynamics, clock: Clock, here: FixedStepAttempt, fired: Margins, one: StepRequest, logs: list[PyTree]
-) -> FixedStepPoint:
-    """Return the point at which the run continues, after the triggered events and the ticks of the clock.
+    system: System,
+    point: Point,
+    attempt: Attempt,
+    clock: Clock,
+    triggered: Margins,
+    mode: Mode,
+    logs: list[PyTree],
+    forecast: Forecast,
+) -> Point:
+    """Return the point at which the run continues, after the events and the ticks at the end of a step.
 
     In a loop without ticks a later step of length 0 (`StepRequest.refresh`) evaluates the rates after an event. Events
     are rare, so this is cheaper than an evaluation after every step.
 
     Args:
         system: Dynamics of the loop and its objectives.
+        point: Point at the beginning of the step.
+        attempt: The step.
         clock: Instant at the end of the step.
-        here: Result of the attempt.
-        fired: True for each event that happens at the end of the step.
-        one: Step that led there.
+        triggered: True for each event that happens there.
+        mode: Mode after the changes.
         logs: Rows of the blocks' logs, which the state is without (`core.log`).
+        forecast: What the stepping method foresees.
     """
-    t, state, accumulators, signals, rate, margins, _, mode, passed = here
-    if system.loop.changes:
-        state = borrow(system.loop.change(clock, borrow(state, logs), signals, margins, fired, passed), None)
-    if not system.loop.ticks:
-        return FixedStepPoint(t, state, accumulators, signals.sample, rate, margins, mode)
-    return _evaluate_point(system, t, state, accumulators, mode_after_changes(system, mode, one.which, one.lands))
+    loop, end = system.loop, attempt.point
+    state = end.state
+    if loop.changes:
+        (values, rates), (last, last_rates) = point.recorded, end.recorded
+        passed = {
+            name: HermiteStep(point.t, end.t, (values[name], last[name]), (rates[name], last_rates[name]))
+            for name in values
+        }
+        lent = borrow(state, logs)
+        state = borrow(loop.change(clock, lent, attempt.signals, end.margins, triggered, passed), None)
+    if loop.ticks:
+        return evaluate_point(system, end.t, state, end.accumulators, mode, forecast)
+    return end._replace(state=state, words=end.words if mode.words is None else mode.words)
 
 
-def _evaluate_point(
-    system: Dynamics, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode
-) -> FixedStepPoint:
-    seen, answers = system.look(t, state, accumulators, mode)
-    return FixedStepPoint(t, state, accumulators, seen.signals.sample, seen[:2], seen.margins, answers.words)
-
-
-def mode_at_end(system: Dynamics, words: ModeBits, which: Scalar, lands: Scalar, free: PyTree) -> Mode:
-    """Return the mode for the end of a step made in the mode `words`.
-
-    It is the same mode, or the comparisons are evaluated where it is `free`. A step that lands on a switching surface
-    flips the answer of that comparison, and the other comparisons may give way.
+def mode_in_step(system: System, words: ModeBits, free: Bool) -> Mode:
+    """Return the mode of a step in which the comparisons keep the answers `words`, or are evaluated where it is `free`.
 
     Args:
         system: Dynamics of the loop and its objectives.
-        words: Answers to the comparisons in the step.
-        which: Number of the sought comparison.
-        lands: True if the step ends on its switching surface.
-        free: True if all comparisons are evaluated.
+        words: Answers to the comparisons.
+        free: True for a step without a mode: each stage evaluates its comparisons, across switching surfaces.
     """
-    one_bit = single_bit(which, system.words)
-    none, all = jnp.uint32(0), ~jnp.uint32(0)
-    # `loose` are the answers that the numbers may override. The landed comparison is not among them: at its zero,
-    # rounding could turn it back.
-    flipped = tuple(word ^ jnp.where(lands, bit, none) for word, bit in zip(words, one_bit, strict=True))
-    loose = tuple(jnp.where(free, all, jnp.where(lands, ~bit, none)) for bit in one_bit)
-    return Mode(flipped, free, loose)
+    all, none = jnp.uint32(0xFFFFFFFF), jnp.uint32(0)
+    return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.words)))
 
 
-def mode_after_changes(system: Dynamics, words: ModeBits, which: Scalar, lands: Scalar) -> Mode:
-    """Return the mode after the ticks and events at the end of a step.
+def mode_after_changes(system: System, words: ModeBits, which: Scalar, lands: Bool) -> Mode:
+    """Return the mode after the changes at the end of a step, which ended in the mode `words`.
 
-    All comparisons are evaluated, except for the comparison on whose switching surface the step lands: it keeps its
-    answer.
+    All comparisons are evaluated, but for that on whose switching surface the step ended: its answer stays. At the zero
+    of its margin, rounding could turn it back.
 
     Args:
         system: Dynamics of the loop and its objectives.
-        words: Answers to the comparisons at the end of the step.
-        which: Number of the sought comparison.
-        lands: True if the step ends on its switching surface.
+        words: Answers to the comparisons.
+        which: Number of a comparison.
+        lands: True if the step ended on its switching surface.
     """
     kept = (jnp.where(lands, bit, jnp.uint32(0)) for bit in single_bit(which, system.words))
     return Mode(words, ~lands, tuple(~bit for bit in kept))
 
 
-def _build_segment(system: Dynamics, point: FixedStepPoint, end: PyTree, sample: Sample, one: StepRequest) -> Segment:
-    within = Mode(point.mode, one.unrestricted)
-    ends = ((point.t, point.state, point.accumulators, point.rate[0]), end)
+def flip_answer(system: System, words: ModeBits, which: Scalar, lands: Bool) -> ModeBits:
+    """Return the answers with that of one comparison reversed where a step ends on its switching surface.
 
-    # Rates are computed on demand, once for all objectives that ask for them.
-    def each(of: Any) -> Any:
-        return cache(lambda: tuple(system.rate_of(of, end, within) for end in ends))
+    Args:
+        system: Dynamics of the loop and its objectives.
+        words: Answers to the comparisons.
+        which: Number of the comparison.
+        lands: True if the step ends on its switching surface.
+    """
+    bits = single_bit(which, system.words)
+    return tuple(word ^ jnp.where(lands, bit, jnp.uint32(0)) for word, bit in zip(words, bits, strict=True))
 
-    # A step that ends on every switching surface reaches no limit inside.
-    smooth = ~one.unrestricted if system.kinks else False
-    rates = each(Shown.of), each(lambda sample: sample)
-    return Segment(point.sample, sample, one.h, one.step, *rates, smooth, (True, True))
 
-
-def _build_passages(system: Dynamics, point: FixedStepPoint, end: PyTree, one: StepRequest) -> dict[str, Passage]:
-    """Return the recorded signals of each block at both ends of a step, and their rates within its mode."""
-    loop, within = system.loop, Mode(point.mode, one.unrestricted)
-
-    def recorded_rates(t: Scalar, state: LoopState, accumulators: Accumulators, rate: PyTree) -> Any:
-        (flow, still), held = split_flow_and_held(state, accumulators)
-
-        def read_recorded(t: Scalar, flow: PyTree) -> Any:
-            if system.program is None:
-                return loop.signals(t, state.with_flow(flow)).recorded
-            fixed = (held, loop, system.objectives)
-            return system.program(lambda recorded: recorded.signals.recorded, (t, flow, still), fixed, within)
-
-        return jax.jvp(read_recorded, (t, flow), (jnp.ones_like(t), rate))
-
-    if not loop.recorders:
-        return {}
-    (starts, rates), (ends, last) = (
-        recorded_rates(point.t, point.state, point.accumulators, point.rate[0]),
-        recorded_rates(*end),
+def _build_point(
+    seen: Evaluation, t: Scalar, state: LoopState, accumulators: Accumulators, forecast: Forecast
+) -> Point:
+    return Point(
+        *(t, state, accumulators, seen.signals.sample, seen.signal_rates),
+        *((seen.signals.recorded, seen.recorded_rates), seen.rates, seen.margins, seen.words, forecast(seen)),
     )
-    return {name: Passage(point.t, one.end, (starts[name], ends[name]), (rates[name], last[name])) for name in starts}

@@ -1,5 +1,15 @@
 """Event location: find the zero of a margin within a step, and the length of the step that ends on it.
 
+A margin of the stop, of a block, or of a comparison in the flow may fall through zero within a step. Then shorter steps
+are attempted until one ends on the zero. So the run discretises the exact solution on both sides of the event, without
+a later correction.
+
+    RUNNING --a margin falls--> SEEKING --near its zero--> PROBING --> (REFINING) --> LANDING --> RUNNING, or STOPPED
+       ^                          |  ^                        |                          |
+       |                          |  +----missed the zero-----+                          | something has changed
+       +--gave up: no mode--------+                                                      v
+       +-------------------------------------------------------------------------- REFRESHING
+
     seek    attempts shrink a bracket, by secant, by Newton's step on a parabola, or by bisection, until one ends near
             the zero
     probe   an attempt beside it, on the same side of the zero, measures how the margin falls there
@@ -7,6 +17,8 @@
             implicit function theorem: the margin at the end of an attempt carries the derivative
     refine  for derivatives: one more attempt of this length. A Newton step from there is right to the second
             derivative, as the step before is right to the first: each step doubles the order
+    refresh a step of length 0 evaluates the rates after an event, or within the mode beyond a switching surface. In a
+            loop with a clock the rates are evaluated after every step, and no step of length 0 is needed
 
 The margins of comparisons have the first numbers; the margins of the stop and of the blocks' events follow. The margin
 of a comparison is known only at the end of an attempt.
@@ -21,6 +33,9 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import ratio
 from diffabs.core.types import AnyArray, Bool, Int, PyTree, Scalar
+from diffabs.simulate.step.modes import ComparisonAnswers, find_contradicted
+from diffabs.simulate.step.status import RunStatus
+from diffabs.simulate.step.system import Evaluation
 
 NEWTON_RADIUS_STEPS = 1e-4  # steps: a Newton step from here misses the zero by some 1e-8 steps
 PROBE_EXPONENT = 0.2  # the probe is eps**PROBE_EXPONENT steps away
@@ -55,19 +70,19 @@ class EventSearch(NamedTuple):
         fall: Slope of the margin at the end of the final step [1/s]; 0 if the event's time has no derivative.
     """
 
-    which: Int  # number of the sought margin
-    full: Any  # length of the first attempt [s]
-    at_full: Any  # margin there
-    near: Scalar  # shorter length of the bracket [s]
+    which: Int
+    full: Any
+    at_full: Any
+    near: Scalar
     at_near: Any
-    far: Any  # longer length of the bracket [s]
+    far: Any
     at_far: Any
-    tries: Int  # number of attempts
-    place: Scalar  # length of the attempt that ended near the zero [s]
-    margin: Scalar  # margin there; 0 if the search found no zero
-    found: Any  # True if the search found a zero
-    at_once: Bool  # True if the zero lies at the beginning of the step
-    fall: Scalar  # slope of the margin at the end of the final step [1/s]; 0 if the event's time has no derivative
+    tries: Int
+    place: Scalar
+    margin: Scalar
+    found: Any
+    at_once: Bool
+    fall: Scalar
 
 
 class EventCrossing(NamedTuple):
@@ -98,6 +113,36 @@ class AttemptCrossings(NamedTuple):
     falls: Scalar
     other: EventCrossing
     another: Any
+
+
+class SurfaceCrossing(NamedTuple):
+    """Contradicted comparisons at the end of a step: the numbers there give other answers than the mode of the step.
+
+    Attributes:
+        other: A contradicted comparison other than the sought one, or -1.
+        contradicted: True if the sought comparison is contradicted.
+        chosen: Number of the comparison to search for: the sought one if it is contradicted, else `other`.
+        margin: Margin of the chosen comparison.
+    """
+
+    other: Int
+    contradicted: Bool
+    chosen: Int
+    margin: Scalar
+
+
+class SearchPlan(NamedTuple):
+    """A search, and the next attempt that it asks for.
+
+    Attributes:
+        search: The search.
+        length: Length of the next attempt [s].
+        status: Status of the run, a `RunStatus`.
+    """
+
+    search: EventSearch
+    length: Scalar
+    status: Scalar
 
 
 def init_search(h: Scalar) -> EventSearch:
@@ -137,6 +182,67 @@ def find_event_crossings(which: Scalar, first: int, before: list[PyTree], after:
     picked = [EventCrossing(i, _pick(i - first, after), _pick(i - first, before)) for i in (which, other)]
     falls = _pick(which - first, crossed) & (which >= first)
     return AttemptCrossings(picked[0], falls, picked[1], jnp.any(jnp.stack(others)))
+
+
+def find_surface_crossing(seen: Evaluation, which: Scalar, like: Scalar) -> SurfaceCrossing:
+    """Return the comparisons whose answers at the end of a step contradict the mode of the step.
+
+    Args:
+        seen: Dynamics at the end of the step, within its mode.
+        which: Number of the sought comparison.
+        like: A number with the type of the margin.
+    """
+    margins = [(one.numbers, one.value) for one in seen.surfaces]
+    return SurfaceCrossing(*find_contradicted(ComparisonAnswers(seen.words, seen.contradicted, margins), which, like))
+
+
+def find_crossings(
+    which: Scalar, comparisons: int, surface: SurfaceCrossing | None, before: list[PyTree], after: list[PyTree]
+) -> AttemptCrossings:
+    """Return the crossings of switching surfaces and events within an attempt; comparisons have the first numbers.
+
+    Args:
+        which: Number of the sought margin.
+        comparisons: Number of comparisons.
+        surface: Contradicted comparisons at the end of the attempt; None if switching surfaces are not located.
+        before: Margins of events at the beginning.
+        after: Margins of events at the end.
+    """
+    events = find_event_crossings(which, comparisons, before, after)
+    if surface is None:
+        return events
+    unknown, bends = jnp.full_like(surface.margin, jnp.inf), surface.other >= 0
+    at = [jnp.where(surface.chosen == one, surface.margin, jnp.inf) for one in (which, surface.other)]
+    sought = select(which < comparisons, EventCrossing(which, at[0], unknown), events.sought)
+    other = select(bends, EventCrossing(surface.other, at[1], unknown), events.other)
+    return AttemptCrossings(sought, surface.contradicted | events.falls, other, bends | events.another)
+
+
+def continue_search(
+    plan: SearchPlan, crossings: AttemptCrossings, base: Scalar, comparisons: int, *, refines: bool
+) -> SearchPlan:
+    """Return the search after an attempt that contains an event or a switching surface.
+
+    Args:
+        plan: The search before the attempt, the length of the attempt, and the status of the run.
+        crossings: Crossings within the attempt.
+        base: Length of a regular step [s], the scale of the tolerances.
+        comparisons: Number of comparisons whose switching surfaces are located.
+        refines: True if the event's time has second derivatives.
+    """
+    old, length, status = plan
+    search, next, near = bracket_event(old, length, status == RunStatus.RUNNING, crossings, base)
+    seeking = SearchPlan(search, next, jnp.where(near, RunStatus.PROBING, RunStatus.SEEKING))
+    # A step ends sqrt(eps) steps beyond a switching surface, so that the comparison has surely changed there.
+    beyond = jnp.where(old.which < comparisons, base * jnp.finfo(base.dtype).eps ** OVERSHOOT_EXPONENT, 0.0)
+    search, next = locate_event(old, length, crossings, beyond)
+    next, missed = accept_location(search, length, next)
+    located = jnp.where(missed, RunStatus.SEEKING, RunStatus.REFINING if refines else RunStatus.LANDING)
+    found = select(status == RunStatus.PROBING, SearchPlan(search, next, located), seeking)
+    if refines:
+        refined = SearchPlan(old, refine(old, length, crossings), status * 0 + RunStatus.LANDING)
+        found = select(status == RunStatus.REFINING, refined, found)
+    return found._replace(status=found.status.astype(status.dtype))
 
 
 def bracket_event(

@@ -5,7 +5,7 @@ import enum
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.loop import Loop, Margins
+from diffabs.core.loop import Loop
 from diffabs.core.types import Bool, PyTree, Scalar
 
 # A landing on the stop may leave at most this fraction of the margin's change in the step.
@@ -21,7 +21,7 @@ class RunStatus(enum.IntEnum):
         PROBING: The attempt measures how the margin falls near the event.
         REFINING: The attempt provides second derivatives of the event's time.
         LANDING: The attempt ends on the event.
-        REFRESHING: A step of length 0 evaluates the rates after the event.
+        REFRESHING: A step of length 0 evaluates the rates after the event, or beyond the switching surface.
         STOPPED: The run is over and has reached its stop.
         TIMED_OUT: The run is over because its duration has passed.
         DIVERGED: The run is over because its numbers are invalid.
@@ -39,21 +39,22 @@ def is_running(carry: PyTree) -> Bool:
     return carry.status <= RunStatus.REFRESHING
 
 
-def status_after_step(loop: Loop, carry: PyTree, margins: Margins, verdict: PyTree) -> Scalar:
-    """Return the status after an accepted step.
+def status_after_step(loop: Loop, carry: PyTree, attempt: PyTree, decision: PyTree) -> Scalar:
+    """Return the status after an accepted attempt.
 
     A landing whose margin is too far from zero (`MAX_MISSED_FRACTION`) makes the run diverge.
 
     Args:
         loop: Closed loop.
-        carry: Carry before the step.
-        margins: Margins at the end of the step.
-        verdict: Decision on the attempt: the triggered events, and True in `over` if the run ends there.
+        carry: Carry before the attempt.
+        attempt: The attempt.
+        decision: Decision on it.
     """
-    left, scale = jnp.abs(margins["stop"][0]), carry.point.margins["stop"][0] + jnp.abs(carry.search.at_full)
-    landed = jnp.where(left <= MAX_MISSED_FRACTION * scale, RunStatus.STOPPED, RunStatus.DIVERGED)
+    left, start = jnp.abs(attempt.point.margins["stop"][0]), carry.point.margins["stop"][0]
+    near = left <= MAX_MISSED_FRACTION * (start + jnp.abs(carry.search.at_full))
+    landed = jnp.where(near, RunStatus.STOPPED, RunStatus.DIVERGED)
     further = jnp.asarray(RunStatus.RUNNING)
-    if loop.eventful and not loop.ticks:
-        happened = jnp.any(jnp.stack(jax.tree.leaves(verdict.triggered)))
-        further = jnp.where(happened, RunStatus.REFRESHING, RunStatus.RUNNING)
-    return jnp.where(verdict.triggered["stop"][0], landed, jnp.where(verdict.over, RunStatus.TIMED_OUT, further))
+    if not loop.ticks:
+        changed = jnp.any(jnp.stack([decision.crosses_surface, *jax.tree.leaves(decision.triggered)]))
+        further = jnp.where(changed, RunStatus.REFRESHING, RunStatus.RUNNING)
+    return jnp.where(decision.triggered["stop"][0], landed, jnp.where(decision.over, RunStatus.TIMED_OUT, further))

@@ -1,7 +1,11 @@
-"""Length of an adaptive step: limits by its error, by stability, by switching surfaces and by clocks."""
+"""Length of an adaptive step: limits by its error, by stability, by switching surfaces and by clocks.
 
-import dataclasses
-from functools import partial, reduce
+Near a point of the run the margin x - y of a comparison moves along a line. It is zero at a time |x - y|/|d(x - y)/dt|
+ahead or in the past. A step that ends there has its kink at its end, where the kink costs no accuracy.
+"""
+
+from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import jax
@@ -12,8 +16,9 @@ from jax.flatten_util import ravel_pytree
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Sample
-from diffabs.core.types import Int, PyTree, Scalar
-from diffabs.simulate.step.foresight import MIN_CROSSING_STEP_FRACTION
+from diffabs.core.types import Array, Int, PyTree, Scalar
+from diffabs.simulate.step.modes import WORD_BITS, ModeBits
+from diffabs.simulate.step.system import SwitchingFunction
 
 INITIAL_STEP_S = 1e-4  # s, the first step
 SAFETY, MIN_ERROR = 0.85, 1e-6  # fraction of the optimal length; offset that keeps the length finite for an error of 0
@@ -23,38 +28,13 @@ TWO_STEP_RATIO = 1.2  # ratio to the present length: a nearer switching surface 
 CLOCK_REACH_FRACTION = 0.99  # fraction of the time to a clock's instant: a longer step ends on the instant
 STABILITY_RADIUS = 3.0  # the longest step is this number divided by the spectral radius
 POWER_ITERATIONS, MIN_NORM = 12, 1e-20
+NEVER_S = 1e9  # s; time to the next crossing if no crossing is predicted
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps", "notes"])
-@dataclasses.dataclass(frozen=True)
-class StepSizeControl:
-    """Numbers that control the steps of an `Adaptive` solver.
-
-    Attributes:
-        h: Step of the grid [s].
-        steps: Number of the last instant of the grid.
-        rtol: Allowed relative error of a step.
-        keeps: True if the carry keeps the last step, for samples between its ends.
-        notes: True if the run is logged for a replay with derivatives.
-    """
-
-    h: Scalar
-    steps: Int
-    rtol: Scalar
-    keeps: bool = False
-    notes: bool = False
-
-    @property
-    def least(self) -> Scalar:
-        """Shortest step [s]."""
-        return self.h * self.steps * jnp.maximum(MIN_STEP_FRACTION, 4 * jnp.finfo(self.h.dtype).eps)
-
-    def next_strike(self, loop: Loop, k: Int) -> PyTree:
-        """Return the number of the first instant after the k-th at which a clock of the `loop` strikes or the run ends.
-
-        `k` is the number of an instant on the grid.
-        """
-        return jnp.minimum(loop.next_tick(k, self.h), self.steps) if loop.ticks else self.steps
+# Tolerances of steps that end on switching surfaces. The first two are fractions of the length that the error allows: a
+# crossing nearer than the first has happened, and the second is the shortest step that ends on a crossing. The last two
+# are fractions of a step: a crossing outside of this range lies at one end of the step.
+IMMEDIATE_FRACTION, MIN_CROSSING_STEP_FRACTION, STEP_START_FRACTION, STEP_END_FRACTION = 2e-4, 4e-3, 0.02, 0.95
 
 
 def error_scales(state: LoopState, sample: Sample) -> PyTree:
@@ -97,19 +77,19 @@ def propose_length(length: Scalar, error: Scalar) -> Scalar:
     return length * clamp(SAFETY / jnp.sqrt(jnp.sqrt(error + MIN_ERROR)), MIN_STEP_RATIO, MAX_STEP_RATIO)
 
 
-def plan_step(length: Scalar, ahead: Scalar, left: Scalar, control: StepSizeControl) -> tuple[PyTree, PyTree]:
+def plan_step(length: Scalar, ahead: Scalar, left: Scalar, least: Scalar) -> tuple[PyTree, PyTree]:
     """Return the length of the next step [s], and True if the step ends where a clock strikes.
 
     Args:
         length: Length that the error and stability allow [s].
         ahead: Time to the next switching surface [s].
         left: Time to the next instant of a clock [s].
-        control: Step-size control.
+        least: Shortest length of any step [s].
     """
     # Two steps of 0.6 lengths instead of one full step and a very short one.
     near = jnp.where(ahead < TWO_STEP_RATIO * length, 0.5 * TWO_STEP_RATIO * length, length)
     length = jnp.where(
-        ahead < length, jnp.maximum(ahead, jnp.maximum(MIN_CROSSING_STEP_FRACTION * length, control.least)), near
+        ahead < length, jnp.maximum(ahead, jnp.maximum(MIN_CROSSING_STEP_FRACTION * length, least)), near
     )
     # A step just short of the clock's instant would leave a remainder near rounding. Else, two halves share the rest.
     ends = length > CLOCK_REACH_FRACTION * left
@@ -159,3 +139,74 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
     # Logarithms: a product of the norms of a stiff loop would overflow single precision.
     vector, log = jax.lax.scan(multiply, (list(jnp.ones_like(size)), 0.0 * t), later)[0]
     return STABILITY_RADIUS * jnp.exp(-(log + jnp.log(longest(vector))) / half)
+
+
+def forecast_crossing(surfaces: Sequence[SwitchingFunction], natural: Scalar, shortest: Scalar) -> Scalar:
+    """Return the time [s] to the first predicted crossing of a switching surface; `NEVER_S` without one.
+
+    Args:
+        surfaces: Margins of the comparisons and their rates, at an instant.
+        natural: Length that the error allows [s].
+        shortest: Shortest length of any step [s].
+    """
+    # A crossing nearer than this has happened.
+    least, next = jnp.maximum(IMMEDIATE_FRACTION * natural, shortest), jnp.full_like(natural, -NEVER_S)
+    for one in surfaces:
+        for since in _times_since_crossing(one):
+            next = jnp.where((since < -least) & (since > next), since, next)
+    return -next
+
+
+def time_since_crossing(surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> Scalar:
+    """Return the time [s] between the first crossing inside a step and the end of the step; 0 without one.
+
+    Args:
+        surfaces: Margins of the comparisons and their rates, at the end of the step.
+        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
+        length: Length of the step [s].
+    """
+    # Crossings outside of these fractions of the step lie at its ends.
+    low, high = (1 - STEP_END_FRACTION) * length, (1 - STEP_START_FRACTION) * length
+    first = low
+    for one in surfaces:
+        for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
+            first = jnp.where(on & (since < high) & (since > first), since, first)
+    return jnp.where(first > low, first, 0.0)
+
+
+def _times_since_crossing(surface: SwitchingFunction) -> Array:
+    """Return the times since the crossings of these surfaces, shape (n,) [s]; negative for a crossing ahead.
+
+    A rate of 0 gives an infinite time or NaN: no comparison with such a time is true.
+    """
+    return jnp.ravel(jnp.asarray(surface.value / surface.rate))
+
+
+def valid_end_rates(surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> tuple[PyTree, PyTree]:
+    """Return two flags, for the start and the end of a step: True if the rate there is also the rate inside the step.
+
+    The start's flag is False if a comparison changes at the start. The end's flag is False if one changes later.
+
+    Args:
+        surfaces: Margins of the comparisons at the end of the step, and their rates.
+        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
+        length: Length of the step [s].
+    """
+    start = end = jnp.asarray(True)
+    for one in surfaces:
+        for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
+            early = since >= (1 - STEP_START_FRACTION) * length
+            start, end = start & ~(on & early), end & ~(on & ~early)
+    return start, end
+
+
+def read_bits(words: ModeBits, numbers: PyTree) -> Scalar:
+    """Return the bits with these numbers, bool.
+
+    Args:
+        words: Packed bits.
+        numbers: Numbers of the bits.
+    """
+    numbers = jnp.asarray(numbers)
+    word = sum(jnp.where(numbers // WORD_BITS == i, one, jnp.uint32(0)) for i, one in enumerate(words))
+    return word & (jnp.uint32(1) << (numbers % WORD_BITS).astype(jnp.uint32)) != 0

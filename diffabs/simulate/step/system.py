@@ -1,29 +1,27 @@
 """The dynamics of the loop and its objectives, as one function of time and state.
 
-For values, the parts are evaluated directly. For derivatives, the function is a program whose comparisons are visible
-(`comparisons`), so that a step has one mode. Without a mode, the derivative of a step with a kink inside is wrong by up
-to one step in the kink's time. The value may still be exact.
+For values by fixed steps, the parts are evaluated directly. Otherwise the function is a program whose comparisons are
+visible (`comparisons`), so that a step has one mode. Without a mode, the derivative of a step with a kink inside is
+wrong by up to one step in the kink's time. The value may still be exact.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.protocols import Memory, Objective, Sample
-from diffabs.core.types import AnyArray, PyTree, Scalar
+from diffabs.core.protocols import Memory, Objective, Sample, Segment, Shown
+from diffabs.core.types import PyTree, Scalar
 from diffabs.simulate.step.comparisons import SwitchedProgram
-from diffabs.simulate.step.foresight import SwitchingFunction
 from diffabs.simulate.step.modes import ComparisonAnswers, Mode, ModeBits
 
 Objectives = dict[str, Objective]
 Accumulators = dict[str, Memory]
 
 UNCONSTRAINED = Mode(None)  # no frozen answers: every comparison is evaluated
-MAX_CACHED_PROGRAMS = 256  # greatest number of programs that are kept
-_programs: dict[PyTree, SwitchedProgram] = {}
+MAX_CACHED_SYSTEMS = 256  # greatest number of traced programs that are kept
+_traced: dict[PyTree, tuple[SwitchedProgram | None, str]] = {}
 
 
 class LoopEvaluation(NamedTuple):
@@ -37,45 +35,67 @@ class LoopEvaluation(NamedTuple):
     """
 
     rate: PyTree
-    accumulator_rates: Any
+    accumulator_rates: dict[str, PyTree]
     signals: Signals
     margins: Margins
 
 
-class LoopEvaluationWithRates(NamedTuple):
-    """The dynamics at an instant, with the time derivatives of the signals and margins.
+class SwitchingFunction(NamedTuple):
+    """Margins of comparisons, and their rates.
 
     Attributes:
-        seen: The dynamics.
-        moving: Rates of the sample.
-        recorded: Rates of the signals that blocks record, by block.
-        falls: Rates of the margins of events.
-        words: Answers to the comparisons.
-        contradicted: Answers of the mode that the numbers contradict.
-        comparisons: Margins of the comparisons and their rates.
+        numbers: Numbers of the comparisons' bits.
+        value: Margins x - y.
+        rate: Rates of the margins [1/s]; None if they were not evaluated.
     """
 
-    seen: LoopEvaluation
-    moving: Sample
-    recorded: dict[str, PyTree]
-    falls: Margins
+    numbers: PyTree
+    value: Scalar
+    rate: Scalar = None
+
+
+class Evaluation(NamedTuple):
+    """The dynamics at an instant within a mode, with the time derivatives that a step needs.
+
+    Attributes:
+        rates: Rates of the loop's flow and of the objectives' integrals.
+        signals: Signals of the loop.
+        margins: Margins of the stop and of the blocks' events.
+        words: Answers to the comparisons.
+        contradicted: Answers of the mode that the numbers contradict.
+        surfaces: Margins of the comparisons.
+        signal_rates: Rates of the sample, or of plant outputs and setpoint, or (), as the objectives need them.
+        recorded_rates: Rates of the signals that blocks record, by block.
+        margin_rates: Rates of the margins of stop and events; () if they were not evaluated.
+    """
+
+    rates: tuple[PyTree, PyTree]
+    signals: Signals
+    margins: Margins
     words: ModeBits
     contradicted: ModeBits
-    comparisons: list[SwitchingFunction]
+    surfaces: list[SwitchingFunction]
+    signal_rates: PyTree
+    recorded_rates: dict[str, PyTree]
+    margin_rates: PyTree
 
 
-class Dynamics(NamedTuple):
+class System(NamedTuple):
     """A loop and its objectives, with the program of their dynamics.
 
     Attributes:
         program: The program with visible comparisons; None if the parts are evaluated directly.
         loop: Loop with the parameters of the run.
         objectives: Objectives by name.
+        signal_rates: Signals whose rates an evaluation has: "sample", "shown" (plant outputs and setpoint), or "".
+        forecasts: True if an evaluation has the rates of all margins.
     """
 
     program: SwitchedProgram | None
     loop: Loop
     objectives: Objectives
+    signal_rates: str
+    forecasts: bool
 
     @property
     def words(self) -> int:
@@ -83,74 +103,62 @@ class Dynamics(NamedTuple):
         return self.program.words if self.program else 0
 
     @property
-    def kinks(self) -> int:
+    def comparisons(self) -> int:
         """Number of comparisons whose switching surfaces are located."""
         return self.program.answers if self.program else 0
 
-    def rates(self, t: Scalar, z: AnyArray, held: PyTree, mode: Mode) -> Scalar:
+    def rates(self, t: Scalar, z: PyTree, held: PyTree, mode: Mode) -> PyTree:
         """Return dz/dt at time `t` within a `mode`, with z and `held` as `split_flow_and_held` returns them."""
-        return self._at(lambda seen: seen[:2], (t, *z), held, mode)
-
-    def look(
-        self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode
-    ) -> tuple[LoopEvaluation, ComparisonAnswers]:
-        """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`, and the answers to the
-        comparisons.
-        """
-        z, held = split_flow_and_held(state, accumulators)
         moving, fixed = (t, *z), (held, self.loop, self.objectives)
         if self.program is None:
-            return _evaluate_loop(moving, fixed), ComparisonAnswers((), (), [])
-        return self.program.look(lambda seen: seen, moving, fixed, mode)
+            return _evaluate_loop(moving, fixed)[:2]
+        return self.program(lambda seen: seen[:2], moving, fixed, mode)
 
-    def ahead(
-        self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode = UNCONSTRAINED
-    ) -> "LoopEvaluationWithRates":
-        """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`, with the rates along the flow.
-
-        By default the comparisons are evaluated.
-        """
-        assert self.program is not None
-        program, (z, held) = self.program, split_flow_and_held(state, accumulators)
+    def evaluate(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> Evaluation:
+        """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`."""
+        z, held = split_flow_and_held(state, accumulators)
         fixed = (held, self.loop, self.objectives)
-        now = program.look(lambda seen: seen, (t, *z), fixed, mode)[0]
 
-        def moves(t: Scalar, z: AnyArray) -> Any:
-            one, answers = program.look(lambda seen: seen, (t, *z), fixed, mode)
-            values = [value for _, value in answers.margins]
-            return (one.signals.sample, one.signals.recorded, one.margins, values), answers
+        def look(t: Scalar, z: PyTree) -> tuple[LoopEvaluation, ComparisonAnswers]:
+            if self.program is None:
+                return _evaluate_loop((t, *z), fixed), ComparisonAnswers((), (), [])
+            return self.program.look(lambda seen: seen, (t, *z), fixed, mode)
 
-        # The derivative along (1, dz/dt) is the total time derivative on the trajectory.
-        moving = (jnp.ones_like(t), now[:2])
-        (*_, values), (sample, recorded, falls, rates), answers = jax.jvp(moves, (t, z), moving, has_aux=True)
-        numbers = [number for number, _ in answers.margins]
-        comparisons = [SwitchingFunction(*one) for one in zip(numbers, values, rates, strict=True)]
-        return LoopEvaluationWithRates(now, sample, recorded, falls, answers.words, answers.contradicted, comparisons)
+        def moving_signals(t: Scalar, z: PyTree) -> tuple[PyTree, ComparisonAnswers]:
+            seen, answers = look(t, z)
+            sample = seen.signals.sample
+            shown = {"sample": sample, "shown": Shown.of(sample), "": ()}[self.signal_rates]
+            margins = (seen.margins, [margin for _, margin in answers.margins]) if self.forecasts else ((), [])
+            return (shown, seen.signals.recorded, *margins), answers
 
-    def rate_of(
-        self, of: Callable[[Sample], PyTree], end: tuple[PyTree, LoopState, Accumulators, PyTree], mode: Mode
-    ) -> PyTree:
-        """Return d(of(sample))/dt within a `mode`.
-
-        `end` holds time, state, accumulators and d(state.flow())/dt; `of` is a function of the sample.
-        """
-        t, state, accumulators, rate = end
-        (flow, still), held = split_flow_and_held(state, accumulators)
-
-        def evaluate(t: Scalar, flow: PyTree) -> Any:
-            return self._at(lambda evaluate: of(evaluate.signals.sample), (t, flow, still), held, mode)
-
-        return jax.jvp(evaluate, (t, flow), (jnp.ones_like(t), rate))[1]
-
-    def _at(self, pick: Callable[[LoopEvaluation], PyTree], moving: PyTree, held: PyTree, mode: Mode) -> Any:
-        fixed = (held, self.loop, self.objectives)
-        return self.program(pick, moving, fixed, mode) if self.program else pick(_evaluate_loop(moving, fixed))
+        seen, answers = look(t, z)
+        surfaces = [SwitchingFunction(*one) for one in answers.margins]
+        signal_rates, recorded_rates, margin_rates = (), seen.signals.recorded, ()
+        if self.signal_rates or self.forecasts or self.loop.recorders:
+            # The derivative along (1, dz/dt) is the total time derivative on the trajectory.
+            along = (jnp.ones_like(t), seen[:2])
+            (_, _, _, values), moves, answers = jax.jvp(moving_signals, (t, z), along, has_aux=True)
+            signal_rates, recorded_rates, margin_rates, rates = moves
+            if self.forecasts:
+                each = zip(answers.margins, values, rates, strict=True)
+                surfaces = [SwitchingFunction(numbers, value, rate) for (numbers, _), value, rate in each]
+        return Evaluation(
+            *(seen[:2], seen.signals, seen.margins, answers.words, answers.contradicted, surfaces),
+            *(signal_rates, recorded_rates, margin_rates),
+        )
 
 
-def build_dynamics(
-    loop: Loop, objectives: Objectives, t: Scalar, state: LoopState, accumulators: Accumulators, *, kinks: bool
-) -> Dynamics:
-    """Return the dynamics of a loop. A program is traced once for each structure and for arguments of these shapes.
+def build_system(
+    loop: Loop,
+    objectives: Objectives,
+    t: Scalar,
+    state: LoopState,
+    accumulators: Accumulators,
+    *,
+    switched: bool,
+    forecasts: bool = False,
+) -> System:
+    """Return the system of a loop. Its program is traced once for each structure and for arguments of these shapes.
 
     Args:
         loop: Closed loop, prepared.
@@ -158,21 +166,49 @@ def build_dynamics(
         t: Time [s].
         state: State of the loop.
         accumulators: Accumulators of the objectives.
-        kinks: True for a program with visible comparisons; False for direct evaluation.
+        switched: True for a program with visible comparisons; False for direct evaluation.
+        forecasts: True if an evaluation has the rates of all margins.
     """
-    if not kinks:
-        return Dynamics(None, loop, objectives)
     z, held = split_flow_and_held(state, accumulators)
     args = ((t, *z), (held, loop, objectives))
     leaves, tree = jax.tree.flatten(args)
     # `result_type(float)` is part of the key: with another precision the same shapes give another program.
-    key = (tree, tuple(map(jax.typeof, leaves)), jnp.result_type(float))
-    if key not in _programs:
-        while len(_programs) >= MAX_CACHED_PROGRAMS:
-            _programs.pop(next(iter(_programs)))  # a dict keeps the order of insertion: the oldest program goes first
+    key = (tree, tuple(map(jax.typeof, leaves)), jnp.result_type(float), switched)
+    if key not in _traced:
+        while len(_traced) >= MAX_CACHED_SYSTEMS:
+            _traced.pop(next(iter(_traced)))  # a dict keeps the order of insertion: the oldest goes first
         # `counts`: only comparisons that influence rates or recorded signals produce a kink in the run.
-        _programs[key] = SwitchedProgram(_evaluate_loop, *args, counts=lambda seen: (seen[:2], seen.signals.recorded))
-    return Dynamics(_programs[key], loop, objectives)
+        program = (
+            SwitchedProgram(_evaluate_loop, *args, counts=lambda seen: (seen[:2], seen.signals.recorded))
+            if switched
+            else None
+        )
+        _traced[key] = program, _find_asked_rates(loop, objectives, t, state, accumulators, smooth=switched)
+    return System(_traced[key][0], loop, objectives, _traced[key][1], forecasts)
+
+
+def _find_asked_rates(
+    loop: Loop, objectives: Objectives, t: Scalar, state: LoopState, accumulators: Accumulators, *, smooth: bool
+) -> str:
+    """Return the signals of a segment whose rates the objectives ask for, as `System.signal_rates`."""
+    asked = set()
+
+    def note(what: str, rates: PyTree) -> tuple[PyTree, PyTree]:
+        asked.add(what)
+        return rates, rates
+
+    def update(loop: Loop, objectives: Objectives, state: LoopState, accumulators: Accumulators, t: Scalar) -> PyTree:
+        sample = loop.signals(t, state).sample
+        segment = Segment(
+            *(sample, sample, t, t),
+            lambda: note("shown", Shown.of(sample)),
+            lambda: note("sample", sample),
+            smooth=t > 0 if smooth else False,
+        )
+        return {name: one.update(accumulators[name], segment) for name, one in objectives.items()}
+
+    jax.eval_shape(update, loop, objectives, state, accumulators, t)
+    return "sample" if "sample" in asked else "shown" if asked else ""
 
 
 def accumulator_rates(objectives: Objectives, accumulators: Accumulators, sample: Sample) -> dict[str, PyTree]:
@@ -195,6 +231,19 @@ def split_flow_and_held(state: LoopState, accumulators: Accumulators) -> tuple[P
     """
     flow = (state.flow(), {name: memory.flow for name, memory in accumulators.items()})
     return flow, ([memory.held for memory in state[1:]], {name: memory.held for name, memory in accumulators.items()})
+
+
+def with_flow(state: LoopState, accumulators: Accumulators, flow: PyTree) -> tuple[LoopState, Accumulators]:
+    """Return state and accumulators with another integrated part.
+
+    Args:
+        state: State of the loop.
+        accumulators: Accumulators of the objectives.
+        flow: Integrated part, as `split_flow_and_held` returns it.
+    """
+    return state.with_flow(flow[0]), {
+        name: memory._replace(flow=flow[1][name]) for name, memory in accumulators.items()
+    }
 
 
 def _evaluate_loop(moving: PyTree, fixed: PyTree) -> LoopEvaluation:

@@ -1,0 +1,55 @@
+"""JAX helpers for the body of a step: conditions of a whole batch, units of compilation, and checkpoints."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.custom_batching
+import jax.numpy as jnp
+
+from diffabs.core.types import Bool, PyTree
+
+X = TypeVar("X")
+
+
+@jax.custom_batching.custom_vmap
+def any_lane(running: Bool) -> Bool:
+    """Return True if any run of a batch under `jax.vmap` is still running, the same value for all runs.
+
+    With one condition for all runs `jax.lax.cond` skips the work. With one condition for each run JAX would execute
+    both branches and select between all carries in every step. A step must therefore do nothing in a run that is over.
+
+    Args:
+        running: True if this run goes on.
+    """
+    return running
+
+
+@any_lane.def_vmap
+def _(size: int, batched: Any, running: Bool) -> tuple[PyTree, bool]:
+    del size
+    # The result is unbatched, and `any_lane` again covers a further `vmap` around this one.
+    return (any_lane(jnp.any(running, axis=0)), False) if batched[0] else (any_lane(running), False)
+
+
+def jit_barrier(active: Bool, work: Callable[[], X]) -> X:
+    """Return work(), compiled as one unit; zeros if no run of a batch is active.
+
+    XLA would otherwise compile a copy of `work` into each expression that uses the result.
+
+    Args:
+        active: True if this run is active.
+        work: Function without arguments that returns a pytree of arrays.
+    """
+    work = jax.jit(work)  # traced once for its shape and for its program
+    shape = jax.eval_shape(work)
+    return jax.lax.cond(any_lane(active), work, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape))
+
+
+def rematerialise(body: Any) -> PyTree:
+    """Return `body` with checkpointing: reverse mode keeps only its arguments and computes everything else again.
+
+    Args:
+        body: Function to wrap, usually the body of a scan.
+    """
+    return jax.checkpoint(body, policy=jax.checkpoint_policies.nothing_saveable, prevent_cse=False)

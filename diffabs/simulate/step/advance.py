@@ -1,0 +1,361 @@
+"""One attempt of a run, and everything that follows from it: the carry of a run, and the interface of stepping methods.
+
+    propose    which step to attempt, in which mode
+    attempt    `attempt.attempt_step`: the same for every method
+    decide     accept the step, search within it, or end the run
+    commit     `attempt.commit_step`: the same for every method
+    refine     the length of the next attempt
+
+`FixedStepping`, `AdaptiveStepping` and `ReplayStepping` differ in these and in the coefficients of their step.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jax.typing import DTypeLike
+
+from diffabs.core.lanes import any_lane, jit_barrier
+from diffabs.core.log import borrow, log_rows, write_last_rows
+from diffabs.core.loop import Loop, LoopState, Margins
+from diffabs.core.protocols import Clock
+from diffabs.core.types import Array, Bool, Int, PyTree, Scalar
+from diffabs.simulate.step.attempt import (
+    Attempt,
+    Point,
+    StepRequest,
+    attempt_step,
+    commit_step,
+    evaluate_point,
+    flip_answer,
+    mode_after_changes,
+    mode_in_step,
+    start_state,
+)
+from diffabs.simulate.step.event_location import (
+    EventSearch,
+    SearchPlan,
+    continue_search,
+    falls_through,
+    find_crossings,
+    init_search,
+    select,
+)
+from diffabs.simulate.step.modes import Mode
+from diffabs.simulate.step.runge_kutta import Tableau
+from diffabs.simulate.step.status import RunStatus, is_running, status_after_step
+from diffabs.simulate.step.system import UNCONSTRAINED, Evaluation, Objectives, System, build_system
+
+
+class Carry(NamedTuple):
+    """State of a run between two attempts.
+
+    Attributes:
+        point: Point of the run that the last accepted attempt reached.
+        k: Number of the last instant of the grid at which a clock struck.
+        since: Time since that instant [s]. A difference of two times would lose digits.
+        length: Length of the next attempt [s].
+        strikes: True if the next attempt ends where a clock strikes next, or with the run.
+        base: Length of a regular step [s], the scale of a search.
+        search: Search for an event.
+        unrestricted: True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode.
+        control: Numbers of the stepping method.
+        status: Status of the run, a `RunStatus`.
+    """
+
+    point: Point
+    k: Int
+    since: Scalar
+    length: Scalar
+    strikes: Bool
+    base: Scalar
+    search: EventSearch
+    unrestricted: Bool
+    control: PyTree
+    status: Scalar
+
+    running = property(is_running)
+
+
+class Decision(NamedTuple):
+    """Decision on an attempt.
+
+    Attributes:
+        fine: True if its numbers are finite and plausible.
+        taken: True if the attempt is accepted.
+        searches: True if an event or a switching surface lies inside and is to be located.
+        crosses_surface: True if an accepted attempt ends on a switching surface.
+        triggered: True for each event at its end.
+        over: True if the run ends there.
+    """
+
+    fine: Bool
+    taken: Bool
+    searches: Bool
+    crosses_surface: Bool
+    triggered: Margins
+    over: Bool
+
+
+class Stepping(Protocol):
+    """A stepping method: what `advance` needs of it.
+
+    Attributes:
+        h: Step of the grid [s].
+        steps: Number of the last instant of the grid.
+        tableau: Coefficients of its Runge-Kutta step.
+        forecasts: True if the rates of all margins are evaluated.
+        searches: True if attempts may search for an event.
+        refines: True if the times of events have second derivatives.
+    """
+
+    h: Scalar
+    steps: Int
+    tableau: Tableau
+    forecasts: bool
+    searches: bool
+    refines: bool
+
+    def is_active(self, carry: Carry, until: Int | None) -> Bool:
+        """Return True if the run goes on and has not reached the instant `until` of the grid."""
+        ...
+
+    def is_switched(self, loop: Loop) -> bool:
+        """Return True if the comparisons of the flow are visible."""
+        ...
+
+    def propose(self, system: System, carry: Carry) -> StepRequest:
+        """Return the next step to attempt."""
+        ...
+
+    def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
+        """Return what the method foresees from the end of a step."""
+        ...
+
+    def report(self, system: System, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree) -> Any:
+        """Return what the method needs to know of an attempt, from the dynamics and the state at its end."""
+        ...
+
+    def regular_length(self, carry: Carry) -> Scalar:
+        """Return the length of a regular step [s], the scale of a search."""
+        ...
+
+    def shift_end(self, carry: Carry, request: StepRequest) -> Callable[[Evaluation], Scalar] | None:
+        """Return a function for the time [s] to add to the step, or None."""
+        ...
+
+    def decide(self, system: System, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool) -> Decision:
+        """Return the decision on an attempt."""
+        ...
+
+    def mode_after(self, system: System, carry: Carry, attempt: Attempt, decision: Decision) -> Mode:
+        """Return the mode after the changes at the end of an accepted step."""
+        ...
+
+    def refine(self, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+        """Return the carry `after` an attempt, with the next attempt."""
+        ...
+
+
+def advance(
+    stepping: Stepping, loop: Loop, objectives: Objectives, key: PyTree, carry: Carry, until: Int | None = None
+) -> Carry:
+    """Return the carry after one attempt of a step, unchanged if the run is over or has reached the instant `until`.
+
+    Args:
+        stepping: Stepping method.
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        key: Random key, or None.
+        carry: Carry before the attempt.
+        until: Number of the grid instant at which to pause; None to go on to the end of the run.
+    """
+    active = stepping.is_active(carry, until)
+    # The blocks' logs leave the carry: `select` below would otherwise copy whole tables in every step.
+    logs = write_last_rows(carry.point.state)
+    start = carry.point._replace(state=borrow(carry.point.state, None))
+    carry = carry._replace(point=start)
+    system = build_system(
+        *(loop, objectives, start.t, start.state, start.accumulators),
+        switched=stepping.is_switched(loop),
+        forecasts=stepping.forecasts,
+    )
+    request, forecast = stepping.propose(system, carry), partial(stepping.forecast, carry)
+
+    def attempt_request() -> Attempt:
+        report = partial(stepping.report, system, carry, request.h)
+        shift = stepping.shift_end(carry, request)
+        return attempt_step(system, start, request, stepping.tableau, forecast, report, shift)
+
+    # Without the barriers, XLA would compile the attempt again into each expression that uses it.
+    attempt = jit_barrier(active, attempt_request)
+    decision = jit_barrier(active, lambda: stepping.decide(system, carry, request, attempt, active))
+
+    strikes = decision.taken & request.strikes
+    k = jnp.where(strikes, request.strike, carry.k)
+    clock = Clock(attempt.point.t, stepping.h, k, key, strikes)
+    mode = stepping.mode_after(system, carry, attempt, decision)
+
+    def commit() -> Point:
+        return commit_step(system, start, attempt, clock, decision.triggered, mode, logs, forecast)
+
+    # Where a run ends, no block changes any more.
+    point = select(decision.over, attempt.point, jit_barrier(active, commit) if loop.changes else commit())
+    point = select(decision.taken, point, start)
+    since = jnp.where(strikes, 0.0, jnp.where(decision.taken, carry.since + request.h, carry.since))
+    after = carry._replace(point=point, k=k, since=since)
+    if stepping.searches:
+        after = _search(stepping, system, carry, attempt, decision, after)
+    after = stepping.refine(system, carry, attempt, decision, after)
+    after = after._replace(status=jnp.where(active, after.status, carry.status).astype(carry.status.dtype))
+    if until is not None:  # without a pause, the other fields of a run that is over have no effect
+        after = select(active, after, carry)
+    return after._replace(point=after.point._replace(state=borrow(after.point.state, logs)))
+
+
+def _search(
+    stepping: Stepping, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
+) -> Carry:
+    """Return the carry `after` an attempt with the search for an event continued, and with the next status."""
+    plan, base = SearchPlan(carry.search, carry.length, carry.status), stepping.regular_length(carry)
+
+    def look() -> SearchPlan:
+        margins = (jax.tree.leaves(point.margins) for point in (carry.point, attempt.point))
+        crossings = find_crossings(carry.search.which, system.comparisons, attempt.report.surface, *margins)
+        found = continue_search(plan, crossings, base, system.comparisons, refines=stepping.refines)
+        return select(decision.searches, found, plan)
+
+    # Few attempts search, so a batch skips the search unless one of its runs needs it.
+    search, length, status = jax.lax.cond(any_lane(decision.searches), look, lambda: plan)
+    status = jnp.where(decision.taken, status_after_step(system.loop, carry, attempt, decision), status)
+    base = jnp.where(decision.searches, base, carry.base)
+    return after._replace(base=base, search=search, length=length, status=status)
+
+
+def start_carry(
+    stepping: Stepping,
+    loop: Loop,
+    objectives: Objectives,
+    key: PyTree,
+    forecast: Callable[[Evaluation], PyTree] = lambda seen: (),
+) -> Carry:
+    """Return the carry of a run at t = 0, without the numbers of the stepping method.
+
+    Args:
+        stepping: Stepping method.
+        loop: Closed loop, prepared.
+        objectives: Objectives by the names of their metrics.
+        key: Random key, or None.
+        forecast: What the stepping method foresees.
+    """
+    none, zero = 0.0 * stepping.h, jnp.asarray(0)
+    state, accumulators = start_state(loop, objectives, Clock(none, stepping.h, zero, key))
+    logs, state = log_rows(state), borrow(state, None)
+    switched = stepping.is_switched(loop)
+    system = build_system(loop, objectives, none, state, accumulators, switched=switched, forecasts=stepping.forecasts)
+    point = evaluate_point(system, none, state, accumulators, UNCONSTRAINED, forecast)
+    status = jnp.where(point.margins["stop"][0] > 0, zero + RunStatus.RUNNING, zero + RunStatus.DIVERGED)
+    point = point._replace(state=borrow(state, logs))
+    search, yes, no = init_search(stepping.h), jnp.asarray(True), jnp.asarray(False)
+    return Carry(point, zero, none, stepping.h, yes, stepping.h, search, no, (), status)
+
+
+def propose_step(stepping: Stepping, system: System, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:
+    """Return the attempt that a carry asks for.
+
+    Args:
+        stepping: Stepping method.
+        system: Dynamics of the loop and its objectives.
+        carry: Carry before the attempt.
+        strike: Number of the next instant at which a clock strikes, or the run ends.
+        frozen: True if a step keeps to a mode.
+    """
+    refresh, mode = carry.status == RunStatus.REFRESHING, UNCONSTRAINED
+    if frozen:
+        which, words = carry.search.which, carry.point.words
+        beyond = mode_after_changes(system, words, which, which < system.comparisons)
+        mode = select(refresh, beyond, mode_in_step(system, words, carry.unrestricted))
+    end = jnp.where(carry.strikes, strike * stepping.h, carry.point.t + carry.length)
+    return StepRequest(carry.length, end, stepping.h, mode, refresh, carry.strikes, strike)
+
+
+def decide_attempt(
+    system: System,
+    carry: Carry,
+    attempt: Attempt,
+    active: Bool,
+    fine: Bool,
+    exact: Bool,
+    *,
+    last: Bool,
+) -> Decision:
+    """Return the decision on an attempt: accept it, search within it, or end the run.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        carry: Carry before the attempt.
+        attempt: The attempt.
+        active: True if the run needs an attempt.
+        fine: True if the numbers of the attempt are finite and plausible.
+        exact: True if it is also accurate enough.
+        last: True if the run ends at the end of the attempt.
+    """
+    running, landing, refreshing = (
+        carry.status == one for one in (RunStatus.RUNNING, RunStatus.LANDING, RunStatus.REFRESHING)
+    )
+    surface, count, which = attempt.report.surface, system.comparisons, carry.search.which
+    crossed = falls_through(jax.tree.leaves(carry.point.margins), jax.tree.leaves(attempt.point.margins))
+    crosses = [*crossed, *([] if surface is None else [surface.contradicted, surface.other >= 0])]
+    crosses = jnp.any(jnp.stack(crosses))
+    taken = active & fine & (landing | refreshing | (running & exact & ~crosses))
+    searches = active & ~landing & ~refreshing & (~running | (exact & crosses))
+    triggered = [taken & landing & ((which == count + i) | one) for i, one in enumerate(crossed)]
+    triggered = jax.tree.unflatten(jax.tree.structure(attempt.point.margins), triggered)
+    over = triggered["stop"][0] | (taken & last)
+    on_surface = jnp.asarray(False) if surface is None else taken & landing & (which < count)
+    return Decision(fine, taken, searches, on_surface, triggered, over)
+
+
+def mode_beyond(system: System, carry: Carry, attempt: Attempt, decision: Decision, *, frozen: bool) -> Mode:
+    """Return the mode after the changes at the end of an accepted step.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        carry: Carry before the step.
+        attempt: The step.
+        decision: Decision on it.
+        frozen: True if a step keeps to a mode.
+    """
+    if not frozen:
+        return UNCONSTRAINED
+    which, lands = carry.search.which, decision.crosses_surface
+    return mode_after_changes(system, flip_answer(system, attempt.point.words, which, lands), which, lands)
+
+
+def have_same_answers(carry: Carry, attempt: Attempt) -> Bool:
+    """Return True if the comparisons have the same answers at both ends of an attempt.
+
+    Args:
+        carry: Carry before the attempt.
+        attempt: The attempt.
+    """
+    pairs = zip(attempt.point.words, carry.point.words, strict=True)
+    return jnp.all(jnp.array([a == b for a, b in pairs], bool))
+
+
+def cast_floats(tree: PyTree, dtype: DTypeLike) -> PyTree:
+    """Return the tree with strong types throughout, and its floating-point leaves cast to one type.
+
+    Args:
+        tree: Pytree to cast.
+        dtype: Floating-point type.
+    """
+
+    # A scan rejects a carry whose type weakens or strengthens.
+    def cast(x: Scalar) -> Array:
+        x = jnp.asarray(x)
+        return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(x.dtype)
+
+    return jax.tree.map(cast, tree)
