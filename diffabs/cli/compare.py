@@ -30,33 +30,23 @@ def compare(
     with console.end_on_errors():
         console.need_extra("sweep")
         from diffabs.sweep import Results
+        from diffabs.sweep.store import describe_differences
 
         a, b = Results(first), Results(second)
-        _check_same(a, b)
-        result = {"first": str(first), "second": str(second), **_compare_metrics(a, b, _common_metrics(a, b, metric))}
+        for found in (a, b):
+            warn_of_strays(found)
+            if not found.complete:
+                raise ScenarioError(f"{found.folder} is not complete; diffabs sweep ... --resume completes it")
+        one, other = ({name: found.study[name] for name in SHARED_FIELDS} for found in (a, b))
+        for line in describe_differences(one, other):
+            difference = line.replace(" there, ", " in the first, ")
+            raise ScenarioError(f"the samples are not the same: {difference} in the second")
+        both = [name for name in a.metrics if name in b.metrics]
+        for name in metric or ():
+            if name not in both:
+                raise unknown_name_error(f"--metric {name} is not in both sweeps", name, both)
+        result = {"first": str(first), "second": str(second), **_compare_metrics(a, b, metric or both)}
         show.as_json(result) if as_json else show_samples.show_comparison(result)
-
-
-def _check_same(a: "Results", b: "Results") -> None:
-    """Raise ScenarioError for sweeps over different samples, and for incomplete sweeps."""
-    from diffabs.sweep.store import describe_differences
-
-    for found in (a, b):
-        warn_of_strays(found)
-        if not found.complete:
-            raise ScenarioError(f"{found.folder} is not complete; diffabs sweep ... --resume completes it")
-    for line in describe_differences({k: a.study[k] for k in SHARED_FIELDS}, {k: b.study[k] for k in SHARED_FIELDS}):
-        raise ScenarioError(
-            f"the samples are not the same: {line.replace(' there, ', ' in the first, ')} in the second"
-        )
-
-
-def _common_metrics(a: "Results", b: "Results", wanted: list[str] | None) -> list[str]:
-    both = [name for name in a.metrics if name in b.metrics]
-    for name in wanted or ():
-        if name not in both:
-            raise unknown_name_error(f"--metric {name} is not in both sweeps", name, both)
-    return wanted or both
 
 
 def _compare_metrics(a: "Results", b: "Results", metrics: list[str]) -> JsonObject:

@@ -142,8 +142,12 @@ def say(line: str) -> None:
     Args:
         line: Line without a line break.
     """
-    if not _quiet or line.startswith(LOUD):
-        _write("\n".join(_fold_line(line)))
+    if _quiet and not line.startswith(LOUD):
+        return
+    width = _terminal_width()
+    if width is not None and len(line) > width:
+        line = "\n".join(textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False))
+    _write(line)
 
 
 def say_command(line: str, words: Sequence[str]) -> None:
@@ -174,13 +178,6 @@ def _write(text: str) -> None:
     past it.
     """
     print(text, file=sys.stderr, flush=True)
-
-
-def _fold_line(line: str) -> list[str]:
-    width = _terminal_width()
-    if width is None or len(line) <= width:
-        return [line]
-    return textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False)
 
 
 def _terminal_width() -> int | None:

@@ -13,7 +13,7 @@ from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
-    from diffabs.explore.session import ProofVerdict, Tools
+    from diffabs.explore.session import ProofVerdict
     from diffabs.explore.tuning import TuningTask
 
 PORT = 8342
@@ -39,12 +39,14 @@ def explore(
         console.need_extra("explore")
         console.load_scenario(scenario, None)  # reports a wrong scenario here, before a page opens
         from diffabs.explore import server
+        from diffabs.explore.session import Tools
 
         there = _open_socket(port)
         told = {"ready": lambda url: console.say(f"{url} (on this machine only; Ctrl-C ends it)"), "browser": browser}
         if not interrupt.take_interrupt():  # Ctrl-C may have come during the import of the framework
             with console.warnings_in_lines():
-                server.serve(scenario, _page_tools(), pathlib.Path.cwd(), there, thread=console.WORKER, **told)
+                tools = Tools(prove_scenario, pose_tuning)
+                server.serve(scenario, tools, pathlib.Path.cwd(), there, thread=console.WORKER, **told)
             interrupt.take_interrupt()
         raise KeyboardInterrupt  # only Ctrl-C ends the server
 
@@ -60,13 +62,6 @@ def _open_socket(port: int | None) -> socket.socket:
             return listen_on_loopback(0)
         why = "another program uses this port" if error.errno == errno.EADDRINUSE else error.strerror
         console.fail(f"--port {port}: {why}")
-
-
-def _page_tools() -> "Tools":
-    """Return the functions of other commands that the page uses."""
-    from diffabs.explore.session import Tools
-
-    return Tools(prove_scenario, pose_tuning)
 
 
 def prove_scenario(chosen: Scenario) -> "ProofVerdict":

@@ -86,18 +86,15 @@ def export(
                     lambda: _write_source(chosen, out, to, single, given), f"tracing {chosen.name}"
                 )
             except NotExported as error:
-                console.fail(f"{chosen.name}: {_add_hint(str(error))}")
+                # The message names arguments of Python; here they are options of the command.
+                line = str(error).replace("give the target from outside", "say --given target")
+                line = line.replace("give the period at which", "say --period SECONDS, at which")
+                console.fail(f"{chosen.name}: {line}")
             file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
         if out and to is Form.ST:
             console.say(f"st: {out}; call FUNCTION_BLOCK {_function_prefix(chosen, out)} once a period")
         elif out:
             console.say(f"c: {out}; try it with: cc -std=c99 -D{_function_prefix(chosen, out).upper()}_MAIN {out} -lm")
-
-
-def _add_hint(line: str) -> str:
-    """Return a message with Python's arguments replaced by options of the command line."""
-    line = line.replace("give the target from outside", "say --given target")
-    return line.replace("give the period at which", "say --period SECONDS, at which")
 
 
 def _sample_controller(chosen: Scenario, period: float) -> Scenario:
@@ -161,15 +158,11 @@ def _show_table(chosen: Scenario, file: pathlib.Path | None, as_json: bool) -> N
     elif as_json:
         show.as_json({"scenario": chosen.name, **found, "versions": versions()})
     else:
-        _show_columns(chosen, found["period"], columns, rows)
-
-
-def _show_columns(chosen: Scenario, period: float, columns: list[str], rows: dict[str, list[float]]) -> None:
-    table = Table("next", *columns)
-    for name, row in rows.items():
-        table.add_row(name, *(f"{value:.8g}" for value in row))
-    show.show_titled_table(f"{chosen.title or chosen.name}: every {1e3 * period:g} ms, at k", table)
-    console.say(
-        "note: d is the deviation from rest at the setpoint, x the deviation of the controller's state; limits are not"
-        " included"
-    )
+        table = Table("next", *columns)
+        for name, row in rows.items():
+            table.add_row(name, *(f"{value:.8g}" for value in row))
+        show.show_titled_table(f"{chosen.title or chosen.name}: every {1e3 * found['period']:g} ms, at k", table)
+        console.say(
+            "note: d is the deviation from rest at the setpoint, x the deviation of the controller's state; limits are"
+            " not included"
+        )

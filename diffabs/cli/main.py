@@ -16,7 +16,7 @@ import itertools
 import math
 import pathlib
 from collections.abc import Iterator
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 import jax
 import typer
@@ -44,7 +44,7 @@ from diffabs.cli import (
 from diffabs.cli.checking import check_run_accuracy, describe_check, describe_loose_metrics
 from diffabs.core import interrupt, provenance
 from diffabs.core.pytree import parameters
-from diffabs.core.types import JsonObject, Key, PyTree, Scalar
+from diffabs.core.types import JsonObject, Key, Scalar
 from diffabs.objectives import at_limits
 from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
@@ -129,14 +129,24 @@ def simulate(
 ) -> None:
     """Run a scenario once and show its metrics."""
     with console.end_on_errors():
-        _check_source(scenario, from_sweep, sample, changes, seed)
+        if (scenario is None) == (from_sweep is None):
+            console.fail("either SCENARIO or --from-sweep DIR --sample N is needed")
+        if (from_sweep is None) != (sample is None):
+            console.fail("--from-sweep DIR and --sample N need each other")
+        if from_sweep and (changes or seed is not None):
+            console.fail("--from-sweep runs a sample unchanged: --set and --seed do not apply")
         _check_targets({"csv": csv, "mat": mat, "plot": plot})
         kept = bool(csv or mat or plot)
         with contextlib.ExitStack() as files:
             csv_file = files.enter_context(targets.new_target_file(csv, "--csv"))
             mat_file = files.enter_context(targets.new_target_file(mat, "--mat"))
             picture = files.enter_context(targets.new_target_file(plot, "--plot"))
-            chosen, key = _load_source(scenario, from_sweep, sample, changes, seed)
+            if from_sweep and sample is not None:
+                chosen, key = console.run_with_progress(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
+            else:
+                overrides = console.add_option_overrides(changes, "solver", seed=seed)
+                chosen = console.load_scenario(scenario or "", overrides)
+                key = chosen.key()
             run, limited = console.run_with_progress(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
                 show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
@@ -160,16 +170,6 @@ def simulate(
         for line in lines:
             console.say(f"warning: {line}")
         _judge(chosen, result)
-
-
-def _load_source(
-    scenario: str | None, from_sweep: pathlib.Path | None, sample: int | None, changes: Any, seed: int | None
-) -> tuple[Scenario, PyTree]:
-    """Return the scenario to run, and the key of its noise."""
-    if from_sweep and sample is not None:
-        return console.run_with_progress(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
-    chosen = console.load_scenario(scenario or "", console.add_option_overrides(changes, "solver", seed=seed))
-    return chosen, chosen.key()
 
 
 def _judge(chosen: Scenario, result: JsonObject) -> None:
@@ -199,16 +199,6 @@ def _warnings(chosen: Scenario, run: Run, limited: float) -> Iterator[str]:
         yield f"the control is at a limit ({ends}) for {100 * limited:.0f} % of the run: gains hardly matter there"
 
 
-def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: Any, seed: int | None) -> None:
-    """Raise typer.Exit unless there is either a scenario, or a sweep with a sample and no overrides."""
-    if (scenario is None) == (from_sweep is None):
-        console.fail("either SCENARIO or --from-sweep DIR --sample N is needed")
-    if (from_sweep is None) != (sample is None):
-        console.fail("--from-sweep DIR and --sample N need each other")
-    if from_sweep and (changes or seed is not None):
-        console.fail("--from-sweep runs a sample unchanged: --set and --seed do not apply")
-
-
 def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
     """Raise typer.Exit for files that cannot be written, or that are the same file."""
     targets.check_picture(wanted["plot"])
@@ -222,18 +212,15 @@ def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
 def _run(chosen: Scenario, key: Key, keep: bool) -> tuple[Run, float]:
     """Return the run, on the host, and the share of its time with the control at a limit."""
     measured = {**chosen.objectives, AT_LIMIT: at_limits(chosen.loop)}
-    run = jax.device_get(_describe_run(chosen, measured, key, keep=keep))
+    if keep:
+        # A file needs few rows: thin the trajectory on the device, before it takes memory.
+        steps = chosen.solver.steps
+        every = min(max(chosen.solver.every, math.ceil(steps / MAX_CSV_ROWS)), steps)
+        run = rollout(chosen.loop, dataclasses.replace(chosen.solver, every=every), measured, key=key)
+    else:
+        run = measure(chosen.loop, chosen.solver, measured, key=key)
+    run = jax.device_get(run)
     return run._replace(metrics={name: run.metrics[name] for name in chosen.objectives}), float(run.metrics[AT_LIMIT])
-
-
-def _describe_run(chosen: Scenario, measured: JsonObject, key: Key, *, keep: bool) -> Run:
-    if not keep:
-        return measure(chosen.loop, chosen.solver, measured, key=key)
-    steps = chosen.solver.steps
-    # A file needs few rows: thin the trajectory on the device, before it takes memory.
-    every = min(max(chosen.solver.every, math.ceil(steps / MAX_CSV_ROWS)), steps)
-    solver = dataclasses.replace(chosen.solver, every=every)
-    return rollout(chosen.loop, solver, measured, key=key)
 
 
 def _find_loose_metrics(chosen: Scenario, run: Run, key: Key, keep: bool) -> list[str]:

@@ -47,27 +47,22 @@ def rare(
     Parameters vary as [sweep.over] says. Probabilities below 1e-7 are feasible."""
     with console.end_on_errors():
         console.need_extra("sweep")
+        from diffabs.reliability.failure import find_metric_objection
+
         engines.check_engine_name(engine)
         chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
         metric, bound = _read_failure(failure, chosen)
         if samples < 20 or samples % 10:
             console.fail(f"--samples {samples} is not a multiple of 10 in [20, inf)")
-        study = _build_runner(section_sweep.build_study(chosen), metric, engine)
+        study = section_sweep.build_study(chosen)
+        try:
+            usable = engines.choose_engine(engine, lambda: find_metric_objection(study, metric))
+            study = dataclasses.replace(study, engine=usable)
+        except ValueError as error:
+            raise ScenarioError(str(error)) from None
         found = _estimate(study, metric, bound, samples, gradients)
         result = _document(found, study, chosen, metric, bound)
         show.as_json(result) if as_json else show_samples.show_rare_event(result, chosen)
-
-
-def _build_runner(study: "Study", metric: str, engine: str) -> "Study":
-    """Return the study with its engine. Raises ScenarioError for a study that cannot be run."""
-    from diffabs.reliability.failure import find_metric_objection
-
-    try:
-        return dataclasses.replace(
-            study, engine=engines.choose_engine(engine, lambda: find_metric_objection(study, metric))
-        )
-    except ValueError as error:
-        raise ScenarioError(str(error)) from None
 
 
 def _read_failure(text: str, chosen: Scenario) -> tuple[str, float]:
@@ -107,18 +102,14 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
     except KeyboardInterrupt:
         if not levels:
             raise
-        console.say(f"interrupted: {_describe_levels(levels, metric)}, by {levels[-1].evaluations:,} runs")
+        probability, last = math.prod(level.share for level in levels), levels[-1]
+        reached = f"{metric} >= {last.threshold:.4g} has a probability of about {probability:.2g}"
+        console.say(f"interrupted: {reached}, by {last.evaluations:,} runs")
         raise typer.Exit(console.INTERRUPTED) from None
     except DivergenceError as error:
         console.fail(str(error), console.FAILED)
     except ValueError as error:
         raise ScenarioError(str(error)) from None
-
-
-def _describe_levels(levels: "list[SubsetProgress]", metric: str) -> str:
-    """Return a sentence on the probability that the finished levels give."""
-    probability = math.prod(level.share for level in levels)
-    return f"{metric} >= {levels[-1].threshold:.4g} has a probability of about {probability:.2g}"
 
 
 def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str, bound: float) -> JsonObject:

@@ -38,7 +38,11 @@ def reproduce(
                     report.write_report_file([folder], folder / report.DEFAULT_NAME)
                 if not as_json:
                     show.show_paper(compact(results[paper]), out / paper)
-            whole = _write_joint_report(out, results) if name == "all" else None
+            whole = out / report.DEFAULT_NAME if name == "all" else None
+            if whole:
+                report.check_target(whole)
+                folders = [out / paper for paper in results]
+                report.write_report_file(folders, whole, f"{len(results)} papers, reproduced")
         except KeyboardInterrupt:
             if not results:
                 raise
@@ -48,14 +52,6 @@ def reproduce(
             console.say(f"report of all papers: {whole}")
         if as_json:
             show.as_json({"out": str(out), "papers": results, "versions": provenance.versions()})
-
-
-def _write_joint_report(out: pathlib.Path, results: JsonObject) -> pathlib.Path:
-    """Write the report of several papers in one file, and return its path."""
-    path = out / report.DEFAULT_NAME
-    report.check_target(path)
-    report.write_report_file([out / paper for paper in results], path, f"{len(results)} papers, reproduced")
-    return path
 
 
 def _reproduce_with_progress(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> JsonObject:

@@ -65,7 +65,8 @@ def sweep(
     Parameters vary as [sweep.over] says. Statistics have confidence intervals."""
     with console.end_on_errors():
         _check_options(engine, on, scheduler, workers, devices, figures)
-        _check_samples(samples)
+        if samples is not None and samples < 1:
+            console.fail(f"--samples {samples} is not positive")
         if devices:
             jax.config.update("jax_num_cpu_devices", devices)
         chosen = console.load_scenario(
@@ -86,15 +87,13 @@ def sweep(
                 lambda: _result(found, study, out, kept, figures, check), "computing statistics"
             )
         show.as_json(result) if as_json else show_samples.show_sweep(result, chosen)
-        _warn(result["accuracy"])
-        _check_any(result, chosen)
+        from diffabs.sweep.checking import accuracy_warnings
 
-
-def _check_any(result: JsonObject, chosen: Scenario) -> None:
-    """Raise typer.Exit if every sample was refused."""
-    if result["refused"]["count"] == result["samples"]:
-        why = next(iter(result["refused"]["reasons"]))
-        console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
+        for line in accuracy_warnings(result["accuracy"]) if result["accuracy"] else ():
+            console.say(f"warning: {line}")
+        if result["refused"]["count"] == result["samples"]:
+            why = next(iter(result["refused"]["reasons"]))
+            console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
 
 
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
@@ -192,11 +191,6 @@ def _check_options(
         console.need_extra("report")
 
 
-def _check_samples(samples: int | None) -> None:
-    if samples is not None and samples < 1:
-        console.fail(f"--samples {samples} is not positive")
-
-
 def _numbers(keep: str | None, samples: int) -> list[int]:
     """Return the sample numbers of --keep. Raises typer.Exit."""
     try:
@@ -240,11 +234,16 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: 
     ending = console.InterruptibleEnd("the chunks in hand")
 
     def report_progress(at: "Told") -> None:
-        if at.damaged and not at.here:
-            console.say(
-                f"damaged, computed again: chunk{'s' if len(at.damaged) > 1 else ''} {_list_numbers(at.damaged)}"
-            )
-        far[0] = _far(at)
+        words, count = f"{at.samples:,} of {at.total:,}", len(at.damaged)
+        if at.here:
+            words += f": {at.rate:,.0f}/s, {at.failed:,} failed, {at.diverged:,} diverged"
+            words += f", {at.refused:,} refused" if at.refused else ""
+        else:
+            words += f", {progress.COMPILING}"
+            if count:
+                first = ", ".join(map(str, at.damaged[:8])) + (f" and {count - 8} more" if count > 8 else "")
+                console.say(f"damaged, computed again: chunk{'s' if count > 1 else ''} {first}")
+        far[0] = progress.WorkProgress(words, at.samples, at.total)
 
     def run() -> "Results":
         from diffabs.sweep import sweep as run
@@ -253,26 +252,6 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: 
         return run(study, out, resume=resume, on=on(), progress=report_progress, stopping=ending, source=source)
 
     return console.run_with_progress(run, f"sweeping {chosen.name}", lambda: far[0], ending)
-
-
-def _far(at: "Told") -> progress.WorkProgress:
-    """Return the progress of a sweep."""
-    if not at.here:
-        return progress.WorkProgress(f"{at.samples:,} of {at.total:,}, {progress.COMPILING}", at.samples, at.total)
-    bad = f"{at.failed:,} failed, {at.diverged:,} diverged" + (f", {at.refused:,} refused" if at.refused else "")
-    words = f"{at.samples:,} of {at.total:,}: {at.rate:,.0f}/s, {bad}"
-    return progress.WorkProgress(words, at.samples, at.total)
-
-
-def _list_numbers(numbers: tuple[int, ...]) -> str:
-    return ", ".join(map(str, numbers[:8])) + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")
-
-
-def _warn(accuracy: JsonObject | None) -> None:
-    from diffabs.sweep.checking import accuracy_warnings
-
-    for line in accuracy_warnings(accuracy) if accuracy else ():
-        console.say(f"warning: {line}")
 
 
 def _result(

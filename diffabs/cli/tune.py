@@ -7,7 +7,6 @@ runs.
 import contextlib
 import dataclasses
 import pathlib
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
 import jax
@@ -106,18 +105,12 @@ def _tune_and_document(
     if out and result["met"]:
         out.write_text(dump(after), encoding="utf-8")
     if picture and result["met"]:
-        interrupted |= not _draw_until_interrupt(lambda: _draw(work, found, picture), picture)
+        try:
+            console.run_with_progress(lambda: _draw(work, found, picture), "drawing")
+        except KeyboardInterrupt:
+            picture.unlink()
+            interrupted = True
     return {**result, "interrupted": interrupted}, proved.sentence
-
-
-def _draw_until_interrupt(draw: Callable[[], None], picture: pathlib.Path) -> bool:
-    """Return True if the picture was drawn before Ctrl-C; otherwise its file is removed."""
-    try:
-        console.run_with_progress(draw, "drawing")
-    except KeyboardInterrupt:
-        picture.unlink()
-        return False
-    return True
 
 
 def _without_proof(work: Work, result: JsonObject) -> JsonObject:

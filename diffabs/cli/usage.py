@@ -37,21 +37,17 @@ class Group(typer.core.TyperGroup):
         try:
             status = super().main(*args, standalone_mode=False, **more)
         except UsageError as error:
-            status = _format_error(error)
+            if type(error).__name__ == "NoArgsIsHelpError":
+                error.show()
+            else:
+                text = " ".join(error.format_message().split()).removesuffix(".")
+                text = re.sub(r"^Invalid value for '(.*?)': ", r"\1: ", text)
+                where = error.ctx.command_path if error.ctx else "diffabs"
+                console.say(f"error: {text[:1].lower()}{text[1:]} ({where} --help)")
+            status = error.exit_code
         if standalone_mode:
             sys.exit(status)
         return status
-
-
-def _format_error(error: Scalar) -> int:
-    if type(error).__name__ == "NoArgsIsHelpError":
-        error.show()
-    else:
-        text = " ".join(error.format_message().split()).removesuffix(".")
-        text = re.sub(r"^Invalid value for '(.*?)': ", r"\1: ", text)
-        where = error.ctx.command_path if error.ctx else "diffabs"
-        console.say(f"error: {text[:1].lower()}{text[1:]} ({where} --help)")
-    return error.exit_code
 
 
 def add_command(app: typer.Typer, function: Callable[..., PyTree], example: str, name: str | None = None) -> None:

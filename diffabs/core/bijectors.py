@@ -174,7 +174,14 @@ class FreeSpace:
         Raises:
             ValueError: A value is not inside its range.
         """
-        return np.concatenate([self._place_values(entry, value) for entry, value in self._of(part)])
+        there = {path: value for path, _, value in parameters(part)}
+        values = [np.asarray(there[entry.path], float).ravel() for entry in self.entries]
+        found = []
+        for entry, numbers in zip(self.entries, values, strict=True):
+            for x, (low, high) in zip(numbers, entry.ranges, strict=True):
+                _check_inside(entry.path, float(x), low, high)
+            found.append(np.array([m.place(float(x)) for m, x in zip(entry.maps, numbers, strict=True)]))
+        return np.concatenate(found)
 
     def spread(self, key: jax.Array, count: int) -> np.ndarray:
         """Return `count` random starts z (count, size) from the random `key`.
@@ -189,16 +196,6 @@ class FreeSpace:
         bounded = [isinstance(m, Interval | Decades) for entry in self.entries for m in entry.maps]
         # The logit of a uniform number is uniform over the range once s(z) maps it back.
         return (np.log(u) - np.log1p(-u)) * np.where(bounded, 1.0, RANGE_END_SHARE)
-
-    def _of(self, part: Part) -> list[tuple[FreeParameter, np.ndarray]]:
-        there = {path: value for path, _, value in parameters(part)}
-        return [(entry, np.asarray(there[entry.path], float)) for entry in self.entries]
-
-    @staticmethod
-    def _place_values(entry: FreeParameter, value: np.ndarray) -> np.ndarray:
-        for x, (low, high) in zip(value.ravel(), entry.ranges, strict=True):
-            _check_inside(entry.path, float(x), low, high)
-        return np.array([m.place(float(x)) for m, x in zip(entry.maps, value.ravel(), strict=True)])
 
 
 def parameter_space(part: Part, free: Sequence[str] | Mapping[str, Range | None]) -> FreeSpace:

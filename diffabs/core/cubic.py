@@ -7,7 +7,7 @@ It differs from a smooth function by O(h^4).
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -93,7 +93,7 @@ class Cubic(NamedTuple):
         bend = jnp.sqrt(jnp.where(inside & (square > 0), square, 1.0)) - c2
         x = clamp(_quotient(c1, bend), 0.0, 1.0)
         x = _refine_zero(x, self.slope, jnp.where(inside, 2.0 * c2 + 6.0 * c3 * x, 0.0))
-        ends = self._greater_end()
+        ends = later_of_larger(self.start, self.end, self.falls)
         top = self(x)
         return jnp.where(inside & (top > ends), top, ends)
 
@@ -101,9 +101,6 @@ class Cubic(NamedTuple):
     def falls(self) -> Scalar:
         """Whether p falls at the start."""
         return jax.lax.stop_gradient(self.start_slope) < 0
-
-    def _greater_end(self) -> Any:
-        return later_of_larger(self.start, self.end, self.falls)
 
     def _coefficients(self) -> tuple[PyTree, PyTree, PyTree]:
         rise = self.end - self.start

@@ -343,20 +343,16 @@ def canonical_dtypes(tree: T) -> T:
     """
     leaves, structure = jax.tree.flatten(tree)
     if any(map(kinds.find_value_objection, leaves)):
-        raise ValueError(_first_unfit(tree))
+        paths = jax.tree_util.tree_leaves_with_path(tree)
+        path, leaf = next((path, leaf) for path, leaf in paths if kinds.find_value_objection(leaf))
+        name, objection = jax.tree_util.keystr(path).lstrip("."), kinds.find_value_objection(leaf)
+        raise ValueError(f"{name} = {kinds.format_value(leaf)} {objection}")
     arrays = {x.dtype for x in leaves if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)}
     dtype = jnp.result_type(*arrays) if arrays else jnp.result_type(float)
     if is_traced(leaves):
         return structure.unflatten([jnp.asarray(x, dtype) for x in leaves])
     with np.errstate(over="ignore"):  # a number too large for single precision becomes infinite
         return structure.unflatten([as_array(x, dtype) for x in leaves])
-
-
-def _first_unfit(tree: PyTree) -> str:
-    """Return a line on the first leaf that cannot be a number of a run."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    path, leaf = next((path, leaf) for path, leaf in leaves if kinds.find_value_objection(leaf))
-    return f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.format_value(leaf)} {kinds.find_value_objection(leaf)}"
 
 
 def prepare_parts(part: Part) -> PyTree:

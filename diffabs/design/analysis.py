@@ -24,7 +24,7 @@ from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
 from diffabs.design.sdp import solver
 from diffabs.design.sdp.scaling import analysis_frame, lyapunov_frame
-from diffabs.design.sdp.solver import Answer, Unknowns, he
+from diffabs.design.sdp.solver import Unknowns, he
 from diffabs.design.spec import Spec
 
 MAX_FRAMES = 4  # attempts, each in the frame of the last P
@@ -161,20 +161,14 @@ class _Analysis:
         if not np.isfinite(answer.y).all():
             return None, math.nan, np.zeros((0, n, n))
         values = unknowns.values(answer.y)
-        return self.frame.form(values["P"]), float(values["t"][0, 0]), self._witness(answer, sizes)
-
-    def _witness(self, answer: Answer, sizes: np.ndarray) -> np.ndarray:
-        """Return the multipliers W_i in the original coordinates, moved off the boundary of the cone.
-
-        Without that move, rounding could make them indefinite.
-        """
         # The last multiplier of the group belongs to P >= t I, not to a vertex.
         w = answer.multipliers[0][:-1]
         w = (w + np.swapaxes(w, 1, 2)) / 2
-        w = w / np.trace(w.sum(axis=0)) + 1e-9 * np.eye(self.system.order)
+        # Moved off the boundary of the cone: rounding could make them indefinite there.
+        w = w / np.trace(w.sum(axis=0)) + 1e-9 * one
         t = self.frame.T
         w = t @ w @ t.T / sizes[:, None, None]
-        return he(w) / np.abs(w).max()
+        return self.frame.form(values["P"]), float(values["t"][0, 0]), he(w) / np.abs(w).max()
 
     def _decay_claim(self, p: np.ndarray, asked: float) -> Claim | None:
         """Return the proved claim with the largest rate of this P, or None if that rate is below the specified one."""

@@ -88,35 +88,28 @@ class Spec:
             raise ValueError(f"damping = {self.damping:g} is outside [0, 1)")
         if self.rates is not None and not (np.isfinite(self.rates).all() and self.rates[0] <= self.rates[1]):
             raise ValueError(f"rates = {self.rates} are not a lower and an upper bound")
-        limit, gain = (
-            self.input and _check_input_limit(self.input, order, inputs),
-            self.l2 and _check_l2_gain(self.l2, order, inputs),
-        )
+        limit, gain = self.input, self.l2
+        if limit:
+            values, points = np.atleast_1d(np.array(limit.limit, float)), np.atleast_2d(np.array(limit.points, float))
+            if values.shape != (inputs,) or not (np.isfinite(values) & (values > 0)).all():
+                raise ValueError(f"input limit = {values.tolist()}: {inputs} numbers in (0, inf) are needed")
+            if points.shape[1:] != (order,) or not np.isfinite(points).all() or not points.any():
+                needed = f"finite ones of shape (k, {order}), not all zero"
+                raise ValueError(f"input points have shape {points.shape}; {needed}")
+            limit = InputLimit(values, points)
+        if gain:
+            c = np.atleast_2d(np.array(gain.output, float))
+            d = np.zeros((len(c), inputs))
+            if gain.feedthrough is not None:
+                d = np.array(gain.feedthrough, float).reshape(len(c), -1)
+            e = None if gain.disturbance is None else np.array(gain.disturbance, float).reshape(order, -1)
+            fits = c.shape[1:] == (order,) and d.shape == (len(c), inputs)
+            if not (fits and np.isfinite(c).all() and np.isfinite(d).all()):
+                needed = f"finite ones of ({len(c)}, {order}) and ({len(c)}, {inputs}) are needed"
+                raise ValueError(f"L2 output C {c.shape} and feedthrough D {d.shape}: {needed}")
+            if e is not None and not np.isfinite(e).all():
+                raise ValueError("the L2 disturbance matrix has an entry that is not finite")
+            if gain.bound is not None and not (math.isfinite(gain.bound) and gain.bound > 0):
+                raise ValueError(f"L2 bound = {gain.bound:g} is outside (0, inf)")
+            gain = L2Gain(c, d, e, gain.bound)
         return dataclasses.replace(self, **weights, input=limit, l2=gain)
-
-
-def _check_input_limit(limit: InputLimit, order: int, inputs: int) -> InputLimit:
-    values, points = np.atleast_1d(np.array(limit.limit, float)), np.atleast_2d(np.array(limit.points, float))
-    if values.shape != (inputs,) or not (np.isfinite(values) & (values > 0)).all():
-        raise ValueError(f"input limit = {values.tolist()}: {inputs} numbers in (0, inf) are needed")
-    if points.shape[1:] != (order,) or not np.isfinite(points).all() or not points.any():
-        raise ValueError(f"input points have shape {points.shape}; finite ones of shape (k, {order}), not all zero")
-    return InputLimit(values, points)
-
-
-def _check_l2_gain(gain: L2Gain, order: int, inputs: int) -> L2Gain:
-    c = np.atleast_2d(np.array(gain.output, float))
-    d = (
-        np.zeros((len(c), inputs))
-        if gain.feedthrough is None
-        else np.array(gain.feedthrough, float).reshape(len(c), -1)
-    )
-    e = None if gain.disturbance is None else np.array(gain.disturbance, float).reshape(order, -1)
-    if c.shape[1:] != (order,) or d.shape != (len(c), inputs) or not (np.isfinite(c).all() and np.isfinite(d).all()):
-        fitting = f"({len(c)}, {order}) and ({len(c)}, {inputs})"
-        raise ValueError(f"L2 output C {c.shape} and feedthrough D {d.shape}: finite ones of {fitting} are needed")
-    if e is not None and not np.isfinite(e).all():
-        raise ValueError("the L2 disturbance matrix has an entry that is not finite")
-    if gain.bound is not None and not (math.isfinite(gain.bound) and gain.bound > 0):
-        raise ValueError(f"L2 bound = {gain.bound:g} is outside (0, inf)")
-    return L2Gain(c, d, e, gain.bound)

@@ -1,7 +1,5 @@
 """A balance's controller as static state feedback u = K x on its linear model about upright."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from diffabs.actuators import VoltageLimit
@@ -9,7 +7,6 @@ from diffabs.controllers import BalanceFeedback
 from diffabs.controllers.sampled import Sampled, inner_controller
 from diffabs.core.blocks import Direct
 from diffabs.core.loop import Loop
-from diffabs.core.types import PyTree
 from diffabs.core.validity import check_part
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import Continuous, Sampling
@@ -38,13 +35,12 @@ def reduce_balance_loop(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tup
     sampling = Sampling(period=float(sampled.period), delay=float(sampled.delay)) if sampled else Continuous()
     model = check_part(BalanceModel(plant=loop.plant, sampling=sampling))
     exact = isinstance(loop.sensor, Direct)
-    return model, np.asarray(controller.gain, float), exact, tuple(_balance_omissions(loop))
-
-
-def _balance_omissions(loop: Loop) -> Iterator[PyTree]:
-    yield "Everything that is not linear: the proof is about small angles."
-    yield "What lies between the points of the grid: a balance is rational in its masses, its hull covers no box."
+    neglected = [
+        "Everything that is not linear: the proof is about small angles.",
+        "What lies between the points of the grid: a balance is rational in its masses, its hull covers no box.",
+    ]
     if isinstance(loop.actuator, VoltageLimit):
-        yield f"The voltage limit of {float(loop.actuator.voltage_max):g} V."
-    if not isinstance(loop.sensor, Direct):
-        yield f"The sensor ({type(loop.sensor).__name__})."
+        neglected.append(f"The voltage limit of {float(loop.actuator.voltage_max):g} V.")
+    if not exact:
+        neglected.append(f"The sensor ({type(loop.sensor).__name__}).")
+    return model, np.asarray(controller.gain, float), exact, tuple(neglected)

@@ -175,7 +175,15 @@ def _certificate_from_json(value: Any) -> StoredCertificate:
         raise ValueError("format and version are not those of a diffabs certificate, 1")
     sizes: dict[str, int] = {"2": 2}
     scheduled = isinstance(file["system"], dict) and "cells" in file["system"]
-    nodes, parts = _read_schedule(file["system"], sizes) if scheduled else ([], {"system": file["system"]})
+    nodes, parts = [], {"system": file["system"]}
+    if scheduled:
+        system = _read_members(file["system"], "system", "parameter", "nodes", "cells")
+        nodes, listed = _read_tensor(system["nodes"], "N", sizes, "system.nodes"), system["cells"]
+        if not isinstance(listed, list) or not 0 < len(listed) == len(nodes) - 1:
+            raise ValueError("system.cells must be a list of one cell between two nodes")
+        if not all(a < b for a, b in itertools.pairwise(nodes)):
+            raise ValueError("system.nodes must increase")
+        parts = {f"system.cells[{i}]": cell for i, cell in enumerate(listed)}
     cells, periods = zip(*(_read_cell(part, where, sizes) for where, part in parts.items()), strict=True)
     if len(set(periods)) != 1:
         raise ValueError("system.cells must have one period")
@@ -187,17 +195,6 @@ def _certificate_from_json(value: Any) -> StoredCertificate:
     discrete = periods[0] is not None
     read = [_read_claim(claim, f"claims[{i}]", sizes, discrete, scheduled) for i, claim in enumerate(claims)]
     return StoredCertificate(list(cells), nodes, gains if tables else [gains] * max(len(nodes), 1), discrete, read)
-
-
-def _read_schedule(value: Any, sizes: dict[str, int]) -> tuple[list[Fraction], dict[str, Any]]:
-    """Return the nodes of a schedule and its cells by name."""
-    system = _read_members(value, "system", "parameter", "nodes", "cells")
-    nodes, cells = _read_tensor(system["nodes"], "N", sizes, "system.nodes"), system["cells"]
-    if not isinstance(cells, list) or not 0 < len(cells) == len(nodes) - 1:
-        raise ValueError("system.cells must be a list of one cell between two nodes")
-    if not all(a < b for a, b in itertools.pairwise(nodes)):
-        raise ValueError("system.nodes must increase")
-    return nodes, {f"system.cells[{i}]": cell for i, cell in enumerate(cells)}
 
 
 def _read_cell(value: Any, where: str, sizes: dict[str, int]) -> tuple[Cell, float | None]:
@@ -361,14 +358,11 @@ def is_positive_definite(m: Matrix, semi: bool = False) -> bool:
         if pivot < 0 or (pivot == 0 and (any(row) or not semi)):
             return False
         if pivot:
-            rows = [_eliminate_row(pivot, a, row[i:], r, last) for i, (a, r) in enumerate(zip(row, rows, strict=True))]
+            for i, first in enumerate(row):
+                _check_time()
+                rows[i] = [(pivot * x - first * y) // last for x, y in zip(rows[i], row[i:], strict=True)]
             last = pivot
     return True
-
-
-def _eliminate_row(pivot: int, first: int, above: list[int], row: list[int], last: int) -> list[int]:
-    _check_time()
-    return [(pivot * x - first * y) // last for x, y in zip(row, above, strict=True)]
 
 
 def _failed_inequality(kind: str, d: Mapping[str, Any], stored: StoredCertificate) -> str:
@@ -433,11 +427,17 @@ def _quadratic_conditions(
             skew = weighted_sum((-d["cot"], m), (d["cot"], transpose_matrix(m)))
             yield f"vertex {i}: the cone of the damping", is_positive_definite(bordered_matrix(falls, skew, falls))
         if kind == "l2":
-            w = d["Bw"] if isinstance(d["Bw"][0][0], Fraction) else d["Bw"][i]
-            yield (
-                f"vertex {i}: what is left of the gain",
-                is_positive_definite(_l2_matrix(p, c, w, falls, d, k, discrete)),
-            )
+            # -V' - |z|^2 + gamma^2 |w|^2 as a matrix of (x, w).
+            bw = d["Bw"] if isinstance(d["Bw"][0][0], Fraction) else d["Bw"][i]
+            z = weighted_sum((1, d["C"]), (1, multiply_matrices(d["D"], k)))
+            rest = weighted_sum((1, falls), (-1, multiply_matrices(transpose_matrix(z), z)))
+            supply = weighted_sum((d["gamma"] ** 2, identity_matrix(len(bw[0]))))
+            cross = multiply_matrices(p, bw)
+            if discrete:
+                cross = multiply_matrices(transpose_matrix(c), cross)
+                supply = weighted_sum((1, supply), (-1, multiply_matrices(transpose_matrix(bw), p, bw)))
+            left = bordered_matrix(rest, weighted_sum((-1, cross)), supply)
+            yield f"vertex {i}: what is left of the gain", is_positive_definite(left)
     if kind == "damping":
         yield "cot^2 (1 - zeta^2) - zeta^2", d["cot"] ** 2 * (1 - d["zeta"] ** 2) >= d["zeta"] ** 2
     if kind == "input":
@@ -450,21 +450,6 @@ def _quadratic_conditions(
                 "what is left of the input's limit",
                 is_positive_definite(bordered_matrix(p, transpose_matrix([row]), [[limit**2]])),
             )
-
-
-def _l2_matrix(
-    p: Matrix, c: Matrix, w: Matrix, falls: Matrix, d: Mapping[str, Any], k: Matrix, discrete: bool
-) -> Matrix:
-    """Return -V' - |z|^2 + gamma^2 |w|^2 as a matrix of (x, w)."""
-    z = weighted_sum((1, d["C"]), (1, multiply_matrices(d["D"], k)))
-    supply = weighted_sum(
-        (d["gamma"] ** 2, identity_matrix(len(w[0]))),
-        *([(-1, multiply_matrices(transpose_matrix(w), p, w))] if discrete else []),
-    )
-    cross = multiply_matrices(transpose_matrix(c), p, w) if discrete else multiply_matrices(p, w)
-    return bordered_matrix(
-        weighted_sum((1, falls), (-1, multiply_matrices(transpose_matrix(z), z))), weighted_sum((-1, cross)), supply
-    )
 
 
 def _schedule_conditions(d: Mapping[str, Any], stored: StoredCertificate) -> Iterator[tuple[str, bool]]:

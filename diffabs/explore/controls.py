@@ -81,49 +81,45 @@ class Controls:
     def _fill(self) -> None:
         self.fields, self.sliders = {}, {}
         with self.inside:
-            self._choosers()
-            self._spread()
+            # A choice of scenario, road or controller replaces all numbers.
+            labels = {source: pathlib.Path(source).name for source in self.sources}
+            look = "dense outlined options-dense"
+            source = ui.select(labels, value=self.session.source, label="scenario").classes("w-full chooser")
+            source.props(f"{look} data-id=scenario").on_value_change(
+                lambda event: self._replaced(partial(self.session.open, event.value))
+            )
+            for family in EXCHANGEABLE_FAMILIES:
+                if there := self.session.choices(family):
+                    part = ui.select(there, value=self.session.parts[family], label=family).classes("w-full chooser")
+                    part.props(f"{look} data-id={family}").on_value_change(
+                        lambda event, family=family: self._replaced(partial(self.session.choose, family, event.value))
+                    )
+            # How far the members of the fan spread around the current values.
+            ui.label("fan of 200 runs").classes("group")
+            words = {MASS: "masses differ by ±", ROAD: "friction differs by ±"}
+            wanted = [MASS, ROAD] if AS_GIVEN in self.session.choices("road") else [MASS]
+            for name in wanted:
+                with ui.element("div").classes("spread"):
+                    ui.label(words[name])
+                    field = ui.input(value=f"{100 * getattr(self.session.spread, name):g}").props("dense outlined")
+                    field.props(f"data-id=fan-{name}")
+                    field.on("change", lambda _, name=name, field=field: self._widened(name, field.value))
+                    ui.label("%").classes("unit")
+            self.made = ui.label().classes("note").props("data-id=fan")
+            # Few numbers at first, to keep the page light: rows of the others are built when they are first opened.
             self._rows(self.session.first)
             rest = [key for key in self.session.knobs if key not in self.session.first]
-            # Rows of the other numbers are built on demand, to keep the page light.
             with (
                 ui.expansion(f"all other numbers ({len(rest)})").classes("w-full").props("dense data-id=others") as more
             ):
                 pass
-            more.on_value_change(lambda event: self._more(more, rest) if event.value else None)
 
-    def _more(self, place: Scalar, keys: list[str]) -> None:
-        """Build the rows of the other numbers when they are opened for the first time."""
-        if not any(key in self.fields for key in keys):
-            with place:
-                self._rows(keys)
+            def open_rest(event: Any) -> None:
+                if event.value and not any(key in self.fields for key in rest):
+                    with more:
+                        self._rows(rest)
 
-    def _choosers(self) -> None:
-        labels = {source: pathlib.Path(source).name for source in self.sources}
-        look = "dense outlined options-dense"
-        source = ui.select(labels, value=self.session.source, label="scenario").classes("w-full chooser")
-        source.props(f"{look} data-id=scenario").on_value_change(
-            lambda event: self._replaced(partial(self.session.open, event.value))
-        )
-        for family in EXCHANGEABLE_FAMILIES:
-            if there := self.session.choices(family):
-                part = ui.select(there, value=self.session.parts[family], label=family).classes("w-full chooser")
-                part.props(f"{look} data-id={family}").on_value_change(
-                    lambda event, family=family: self._replaced(partial(self.session.choose, family, event.value))
-                )
-
-    def _spread(self) -> None:
-        ui.label("fan of 200 runs").classes("group")
-        words = {MASS: "masses differ by ±", ROAD: "friction differs by ±"}
-        wanted = [MASS, ROAD] if AS_GIVEN in self.session.choices("road") else [MASS]
-        for name in wanted:
-            with ui.element("div").classes("spread"):
-                ui.label(words[name])
-                field = ui.input(value=f"{100 * getattr(self.session.spread, name):g}").props("dense outlined")
-                field.props(f"data-id=fan-{name}")
-                field.on("change", lambda _, name=name, field=field: self._widened(name, field.value))
-                ui.label("%").classes("unit")
-        self.made = ui.label().classes("note").props("data-id=fan")
+            more.on_value_change(open_rest)
 
     async def _widened(self, name: str, given: Any) -> None:
         await self._replaced(partial(self.session.widen, name, given))
@@ -143,7 +139,7 @@ class Controls:
             ui.label(knob.label).classes("name").tooltip(f"{knob.name} in {knob.spec.interval()}")
             field = ui.input(value=knob.text(value)).props("dense outlined hide-bottom-space")
             field.props(f'data-field="{html.escape(key)}" aria-label="{html.escape(knob.name)}"')
-            field.on("change", lambda _: self._take_text(key, field.value))
+            field.on("change", lambda _: self._change(key, str(field.value), 0))
             self.fields[key] = field
             ui.label(unit_words(knob.spec.unit)).classes("unit")
             if knob.low is not None:
@@ -156,9 +152,6 @@ class Controls:
                     js_handler="(place) => emit(place, explorer.edited())",
                 )
                 self.sliders[key] = slider
-
-    def _take_text(self, key: str, text: Any) -> None:
-        self._change(key, str(text), 0)
 
     # The arguments come from the browser, so their types are checked.
     def _take_slider(self, key: str, place: Scalar, edit: Any) -> None:

@@ -127,7 +127,14 @@ def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
         by: Solver of the run; None is the scenario's own.
     """
     run: Run = jax.device_get(rollout(chosen.loop, by or drawing_solver(chosen), chosen.objectives, key=chosen.key()))
-    t, panels = _panels(run, chosen.loop.plant)
+    assert run.trajectory is not None
+    # Samples after the end of the run are no part of the curves.
+    count = len(trajectory_columns(run, chosen.loop.plant)["t"][1])
+    t = np.asarray(run.trajectory.sample.t)[:count]
+    panels = tuple(
+        Panel(panel.unit, tuple(Curve(line.name, _finite(line.values[:count])) for line in panel.lines))
+        for panel in _layout(run, chosen.loop.plant)
+    )
     metrics = {name: float(run.metrics[name]) for name in chosen.objectives}
     return Curves(t, panels, metrics, _describe_end(chosen, run, t), by is not None)
 
@@ -180,7 +187,7 @@ def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
     # Runs end at different times. The longest one has all instants; few remaining runs give no useful quantiles.
     longest = int(np.argmax(going.sum(axis=1)))
     count = int(np.sum(going.mean(axis=0) >= MIN_TRANSIENT_SHARE * max(1e-9, going[:, 0].mean())))
-    shown = [_first_signal(panel) for panel in _layout(run, chosen.loop.plant)]
+    shown = [panel.lines[0].values for panel in _layout(run, chosen.loop.plant)]
     bands = tuple(_quantiles(np.where(going, values, np.nan)[:, :count]) for values in shown)
     return Fan(t[longest, :count], bands, MEMBERS, int(lost.sum()), words)
 
@@ -218,17 +225,6 @@ def _quantiles(values: np.ndarray) -> np.ndarray:
     return np.nanquantile(values, QUANTILES, axis=0)
 
 
-def _panels(run: Run, plant: Part) -> tuple[np.ndarray, tuple[Panel, ...]]:
-    """Return the instants [s] of one run and its panels, cut at the end of the run."""
-    count = len(trajectory_columns(run, plant)["t"][1])
-    assert run.trajectory is not None
-    cut = tuple(
-        Panel(panel.unit, tuple(Curve(line.name, _finite(line.values[:count])) for line in panel.lines))
-        for panel in _layout(run, plant)
-    )
-    return np.asarray(run.trajectory.sample.t)[:count], cut
-
-
 def _layout(run: Run, plant: Part) -> list[Panel]:
     """Return the panels of one run or a batch, in full length.
 
@@ -253,10 +249,6 @@ def _in_kmh(panel: Panel) -> Panel:
     if panel.unit != "m/s":
         return panel
     return Panel("km/h", tuple(Curve(line.name, KMH * line.values) for line in panel.lines))
-
-
-def _first_signal(panel: Panel) -> np.ndarray:
-    return panel.lines[0].values
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

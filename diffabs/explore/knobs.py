@@ -2,12 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.core.types import Part, PyTree
 from diffabs.core.units import unit_at
 from diffabs.core.values import read_number_in_range, wrong_kind_error
 from diffabs.explore.friction import FACTOR_PATH
@@ -119,8 +119,27 @@ def knobs(chosen: Scenario) -> dict[str, Knob]:
     Args:
         chosen: Scenario.
     """
-    found = (knob for path, spec, value in parameters(chosen.loop) for knob in _knob(chosen, path, spec, value))
-    return {knob.key: knob for knob in found}
+    found: dict[str, Knob] = {}
+    for path, spec, value in parameters(chosen.loop):
+        tail = path.rpartition(".")[2]
+        scale = KMH if spec.unit == "m/s" and tail in SPEED_FIELDS and is_vehicle(chosen.loop.plant) else 1.0
+        name = canonical_path(path) + ("_kmh" if scale != 1.0 else "")
+        group, _, label = canonical_path(path).partition(".")
+        label = label.removeprefix(f"{group}.").replace("_", " ")
+        label = "friction factor" if path == FACTOR_PATH else label
+        values = np.asarray(value, float)
+        if values.ndim > 1:
+            continue  # a matrix has no sliders
+        for place in np.ndindex(values.shape):
+            at = place[0] if place else None
+            suffix = "" if at is None else f".{at}"
+            unit = "km/h" if scale != 1.0 else unit_at(spec.unit, at or 0, values.size)
+            own = dataclasses.replace(spec, unit=unit, low=spec.low * scale, high=spec.high * scale)
+            low, high = _slider_ends(own, float(values[place]) * scale, _range_in_scenario(chosen, path, at, scale))
+            words = label if at is None else f"{label} {at + 1}"
+            knob = Knob(path, at, name + suffix, group, words, own, scale, low, high)
+            found[knob.key] = knob
+    return found
 
 
 def is_vehicle(plant: Part) -> bool:
@@ -181,27 +200,6 @@ def mass_path(chosen: Scenario) -> str | None:
         if there:
             return next((path for path in there if path in over), there[0])
     return None
-
-
-def _knob(chosen: Scenario, path: str, spec: ParameterSpec, value: Scalar) -> Iterator[Knob]:
-    """Yield the numbers of one parameter; a matrix has none."""
-    tail = path.rpartition(".")[2]
-    scale = KMH if spec.unit == "m/s" and tail in SPEED_FIELDS and is_vehicle(chosen.loop.plant) else 1.0
-    name = canonical_path(path) + ("_kmh" if scale != 1.0 else "")
-    group, _, label = canonical_path(path).partition(".")
-    label = label.removeprefix(f"{group}.").replace("_", " ")
-    label = "friction factor" if path == FACTOR_PATH else label
-    values = np.asarray(value, float)
-    if values.ndim > 1:
-        return  # a matrix has no sliders
-    for place in np.ndindex(values.shape):
-        at = place[0] if place else None
-        suffix = "" if at is None else f".{at}"
-        unit = "km/h" if scale != 1.0 else unit_at(spec.unit, at or 0, values.size)
-        own = dataclasses.replace(spec, unit=unit, low=spec.low * scale, high=spec.high * scale)
-        low, high = _slider_ends(own, float(values[place]) * scale, _range_in_scenario(chosen, path, at, scale))
-        words = label if at is None else f"{label} {at + 1}"
-        yield Knob(path, at, name + suffix, group, words, own, scale, low, high)
 
 
 def _range_in_scenario(chosen: Scenario, path: str, place: int | None, scale: float) -> tuple[float, float] | None:

@@ -237,11 +237,11 @@ class Page:
         self.later(self._show_curves, found, now, encode_change(charts.change_curves(found)), version, edit)
 
     def _think(self, now: Scenario, version: int) -> None:
-        """Compute everything except the curve: quick results during a drag, the others after a rest.
-
-        The curve is computed first, in another thread.
-        """
-        if not self._curve_is_there(version):
+        """Compute everything except the curve: quick results during a drag, the others after a rest."""
+        # The curve comes first, from another thread.
+        while version == self.version and self.drawn < version:
+            time.sleep(TICK)
+        if version != self.version:
             return
         steps = {"poles": self._poles, "fan": self._fan}
         done = [name for name in steps if self.costs.get(name, math.inf) < QUICK_JOB_S]
@@ -257,7 +257,11 @@ class Page:
         if version == self.version and not self.surrounded:
             self._poles(now, version, corners=True)
         if self._wait_for_rest(PROVING, version):
-            self.later(self._show_verdict, self._prove(now), version)
+            try:
+                found = self.tools.prove(now)
+            except Exception as error:  # the card shows every error, and the thread goes on
+                found = ProofVerdict(NOT_PROVED, _sentence(error))
+            self.later(self._show_verdict, found, version)
         objections(now)  # compiles the check now, before the next edit needs it
 
     def _time_step(self, name: str, step: Callable[[Scenario, int], bool], now: Scenario, version: int) -> None:
@@ -265,12 +269,6 @@ class Page:
         useful = step(now, version)
         # Without a result the step counts as slow, so that a drag does not repeat it.
         self.costs[name] = time.monotonic() - begun if useful else math.inf
-
-    def _curve_is_there(self, version: int) -> bool:
-        """Wait until the curve is drawn, and return whether nothing has changed in the meantime."""
-        while version == self.version and self.drawn < version:
-            time.sleep(TICK)
-        return version == self.version
 
     def _wait_for_rest(self, seconds: float, version: int) -> bool:
         """Wait until nothing has changed for some seconds, and return whether this version is still the newest."""
@@ -298,12 +296,6 @@ class Page:
         found = curves.run_fan(now, self.session.spread)
         self.later(self._show_fan, found, encode_change(charts.change_fan(found)))
         return True
-
-    def _prove(self, now: Scenario) -> ProofVerdict:
-        try:
-            return self.tools.prove(now)
-        except Exception as error:  # the card shows every error, and the thread goes on
-            return ProofVerdict(NOT_PROVED, _sentence(error))
 
 
 def _sentence(error: Exception) -> str:

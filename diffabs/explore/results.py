@@ -45,8 +45,31 @@ class ResultsPanel:
 
     def build(self) -> None:
         """Put the panel into the open column."""
-        self._verdict_card()
-        self._pole_card()
+        with ui.element("div").classes("card-title"):
+            ui.label("certificate over the ranges of [design]")
+            self.proving = ui.label("computing …").classes("busy").props("data-id=proving")
+        with ui.element("div").classes("verdict stale").props("data-id=verdict") as self.verdict_box:
+            self.word = ui.label("").style("font-weight:600; font-size:13.5px").props("data-id=word")
+            self.why = ui.label("").classes("why")
+        self.proved_of = ui.label("").classes("note").props("data-id=proved-of")
+        with ui.element("div").classes("card-title"):
+            ui.label("poles of the linearised loop")
+            self.loop = ui.label("").classes("note").props("data-id=stable")
+            self.solving = ui.label("computing …").classes("busy")
+        self.map = Canvas(charts.pole_chart(), "poles", "poles")
+        self.none = ui.label("").classes("note").props("data-id=about-poles")
+        self.poles_of = ui.label("").classes("note").props("data-id=poles-of")
+        table = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
+        self.margin_cells: dict[str, tuple[PyTree, PyTree]] = {}
+        with table.props("data-id=margins"):
+            for words in ("margins", "here", "worst"):
+                ui.label(words).classes("head" if words == "margins" else "head number")
+            for name, words in MARGINS.items():
+                ui.label(words)
+                cells = [
+                    ui.label(NO_VALUE).classes("number").props(f"data-margin={name}{end}") for end in ("", "-worst")
+                ]
+                self.margin_cells[name] = (cells[0], cells[1])
         with ui.element("div").classes("card-title"):
             ui.label("measured on the run")
             self.measuring = ui.label("computing …").classes("busy")
@@ -108,35 +131,6 @@ class ResultsPanel:
         self.verdict_box.classes(replace=f"verdict {found.word}")
         self.word.set_text(HEADS.get(found.word, "no verdict"))
         self.why.set_text(found.sentence)
-
-    def _verdict_card(self) -> None:
-        with ui.element("div").classes("card-title"):
-            ui.label("certificate over the ranges of [design]")
-            self.proving = ui.label("computing …").classes("busy").props("data-id=proving")
-        with ui.element("div").classes("verdict stale").props("data-id=verdict") as self.verdict_box:
-            self.word = ui.label("").style("font-weight:600; font-size:13.5px").props("data-id=word")
-            self.why = ui.label("").classes("why")
-        self.proved_of = ui.label("").classes("note").props("data-id=proved-of")
-
-    def _pole_card(self) -> None:
-        with ui.element("div").classes("card-title"):
-            ui.label("poles of the linearised loop")
-            self.loop = ui.label("").classes("note").props("data-id=stable")
-            self.solving = ui.label("computing …").classes("busy")
-        self.map = Canvas(charts.pole_chart(), "poles", "poles")
-        self.none = ui.label("").classes("note").props("data-id=about-poles")
-        self.poles_of = ui.label("").classes("note").props("data-id=poles-of")
-        table = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
-        self.margin_cells: dict[str, tuple[PyTree, PyTree]] = {}
-        with table.props("data-id=margins"):
-            for words in ("margins", "here", "worst"):
-                ui.label(words).classes("head" if words == "margins" else "head number")
-            for name, words in MARGINS.items():
-                ui.label(words)
-                cells = [
-                    ui.label(NO_VALUE).classes("number").props(f"data-margin={name}{end}") for end in ("", "-worst")
-                ]
-                self.margin_cells[name] = (cells[0], cells[1])
 
     @staticmethod
     def _of_poles(found: Stability) -> str:

@@ -167,7 +167,12 @@ def computer_program(
         shapes = jax.eval_shape(lambda: _start_input(typed, given_target))
         if not given_target:
             _check_reference(typed, _start_input(typed, False).measured)
-        count = _steps(float(controller.period), step)
+        period = float(controller.period)
+        count = max(round(period / step) if step else 1, 1)
+        if count > MAX_STEPS_PER_SAMPLE:
+            raise NotExported(
+                f"the period of {period:g} s is {count} steps of the solver; {MAX_STEPS_PER_SAMPLE} are the most"
+            )
         work = _Work(typed, count, given_target, shapes)
         state = jax.eval_shape(work.start, parts, shapes)
     units = dict(loop.plant.shows.units)
@@ -175,7 +180,7 @@ def computer_program(
         units["target"] = units[loop.plant.shows._fields[0]]
     moves = count if jax.tree.leaves(state.reference.flow) else 0
     return ComputerProgram(
-        work.start, work.step, work.move, moves, units, shapes, state, parts, np.dtype(dtype), float(controller.period),
+        work.start, work.step, work.move, moves, units, shapes, state, parts, np.dtype(dtype), period,
         float(controller.delay), loop.plant.control_unit,
         tuple(_numbers(loop, typed, shapes, given_target)),
     )  # fmt: skip
@@ -221,16 +226,6 @@ def _start_input(loop: Loop, target: bool) -> Input:
     state = loop.start()
     measured = loop.sensor.output(0.0, state.sensor, loop.plant.output(state.plant))
     return Input(measured, measured[0] if target else ())
-
-
-def _steps(period: float, step: float | None) -> int:
-    """Return the simulation's steps in a period; raise NotExported above MAX_STEPS_PER_SAMPLE."""
-    count = round(period / step) if step else 1
-    if count > MAX_STEPS_PER_SAMPLE:
-        raise NotExported(
-            f"the period of {period:g} s is {count} steps of the solver; {MAX_STEPS_PER_SAMPLE} are the most"
-        )
-    return max(count, 1)
 
 
 def _check_reference(loop: Loop, measured: PyTree) -> None:

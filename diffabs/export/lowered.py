@@ -53,8 +53,10 @@ class Lowered:
         graph = Labelled()
         self.inputs = number_leaves(found.input, graph, INPUTS, lambda path: path.removeprefix("measured."))
         self.numbers = number_leaves(found.parts, graph, NUMBERS, lambda path: path.removeprefix("controller."))
-        self.state = number_leaves(found.state, graph, MEMORY, _short_path)
-        self.values = dict(zip(self.numbers, _numbers_of(found.parts), strict=True))
+        # The field names flow and held in a memory path tell a reader nothing.
+        self.state = number_leaves(found.state, graph, MEMORY, lambda path: re.sub(r"\.(flow|held)(?=\.|$)", "", path))
+        values = [float(x) for leaf in jax.tree.leaves(found.parts) for x in np.asarray(leaf, float).flat]
+        self.values = dict(zip(self.numbers, values, strict=True))
         given, parts = fill_shapes(found.input, self.inputs), fill_shapes(found.parts, self.numbers)
         started = trace_outputs(graph, lambda both: found.start(*both), (found.parts, found.input), [*parts, *given])
         held = fill_shapes(found.state, self.state)
@@ -146,13 +148,3 @@ def trace_outputs(graph: Labelled, function: Any, shape: PyTree, inputs: list[Ar
     graph.labels = {id(eqn): source_label(eqn) for eqn in closed.jaxpr.eqns}
     constants = [constant_array(graph, np.asarray(x)) for x in closed.consts]
     return [node for array in lower_jaxpr(graph, closed.jaxpr, constants, inputs) for node in array.flat]
-
-
-def _numbers_of(parts: Any) -> list[float]:
-    """Return the numbers of some parts in the order of their leaves."""
-    return [float(x) for leaf in jax.tree.leaves(parts) for x in np.asarray(leaf, float).flat]
-
-
-def _short_path(path: str) -> str:
-    """Return a memory path without the field names flow and held, which tell a reader nothing."""
-    return re.sub(r"\.(flow|held)(?=\.|$)", "", path)

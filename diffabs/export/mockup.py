@@ -14,12 +14,10 @@ import sys
 import tempfile
 import uuid
 import zipfile
-from collections.abc import Sequence
 from typing import Any
 from xml.etree import ElementTree as xml
 
 from diffabs.core.loop import Loop
-from diffabs.core.types import PyTree
 from diffabs.core.values import make_printable
 from diffabs.export.c_words import is_name
 from diffabs.export.device import NotExported
@@ -134,7 +132,12 @@ def _description(plant: PlantSource, name: str, guid: str, step: float, duration
     for reference, one in enumerate(plant.variables):
         _variable(variables, one, reference)
     structure = xml.SubElement(root, "ModelStructure")
-    _unknowns(structure, plant.variables)
+    # Every output depends on the state, and in initialization on the parameters.
+    outputs = [k for k, one in enumerate(plant.variables, 1) if one.role == "output"]
+    for tag in ("Outputs", "InitialUnknowns"):
+        parent = xml.SubElement(structure, tag)
+        for index in outputs:
+            xml.SubElement(parent, "Unknown", {"index": str(index)})
     xml.indent(root)
     return xml.tostring(root, encoding="UTF-8", xml_declaration=True)
 
@@ -151,12 +154,3 @@ def _variable(parent: Any, one: FmuVariable, reference: int) -> None:
     xml.SubElement(
         scalar, "Real", {**shown, **start, **({} if one.unit in ("", "1") else {"unit": make_printable(one.unit)})}
     )
-
-
-def _unknowns(structure: PyTree, variables: Sequence[FmuVariable]) -> None:
-    """Add the model structure: every output depends on the state, and in initialization on the parameters."""
-    outputs = [k for k, one in enumerate(variables, 1) if one.role == "output"]
-    for tag in ("Outputs", "InitialUnknowns"):
-        parent = xml.SubElement(structure, tag)
-        for index in outputs:
-            xml.SubElement(parent, "Unknown", {"index": str(index)})

@@ -180,13 +180,9 @@ class _Block:
                 for k, entry in enumerate(node.args[1:]):
                     yield f"{indent}{table}[{k}] := {self._value(entry)};"
             expression = self._expression(node)
-            yield f"{indent}{self._new(node)} := {expression};"
-
-    def _new(self, node: Node) -> str:
-        """Return a new temporary for a number, and declare it."""
-        name = self._variable(node)
-        self.temporary[name] = self._type(node)
-        return name
+            name = self._variable(node)
+            self.temporary[name] = self._type(node)
+            yield f"{indent}{name} := {expression};"
 
     def _variable(self, node: Node) -> str:
         """Return the variable of a number."""

@@ -23,7 +23,7 @@ from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary, round_for_table
-from diffabs.core.types import AnyArray, JsonObject, Matrix, Part, PyTree, Table
+from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
 from diffabs.core.validity import check_part
 from diffabs.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
@@ -151,11 +151,33 @@ def fit(
     points = [where.place(check_part(replace(part, dict(start)))) for start in starts] or [where.place(part)]
     problem = FitProblem(where, part, residuals, data, as_partial(prior), norm, usable)
     n, k = problem.shapes()
-    _check_fit(where.size, n, k, sigma, norm, absolute)
-    deviations = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, float), (n,))
+    if sigma is not None:
+        given = np.asarray(sigma, float)
+        if given.shape not in ((), (n,)):
+            raise ValueError(f"sigma has shape {given.shape}; {n} residuals need a number or ({n},)")
+        if not (np.isfinite(given) & (given > 0)).all():
+            raise ValueError(f"sigma = {np.min(given):g} is not positive and finite")
+    if k and sigma is None:
+        raise ValueError("a prior needs sigma: nothing else says how much the data weigh against it")
     estimated = sigma is None or not absolute
-    watch = _FitMonitor(progress or (lambda _, __: None), stopping)
-    return _fit_all_starts(problem, points, deviations, estimated, tolerances or Tolerances(), watch)
+    # A prior makes up for missing data, but not for the estimate of s^2, which needs n > p.
+    if n < where.size + estimated and not (k and n > 0 and not estimated):
+        more = " and one more for the estimate of s^2" if estimated else ""
+        raise ValueError(f"{n} data do not determine {where.size} parameters{more}: free fewer, or state a prior")
+    if not 2 <= norm < np.inf:
+        raise ValueError(f"norm = {norm:g} is outside [2, inf)")
+    deviations = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, float), (n,))
+    tolerances, watch = tolerances or Tolerances(), _FitMonitor(progress or (lambda _, __: None), stopping)
+    fits: list[Identified | None] = []
+    for z in points:
+        # An interruption skips further starts only if there is a fit to return.
+        if not (any(fits) and watch.stopping()):
+            fits.append(_fit_start(problem, z, deviations, estimated, tolerances, watch))
+    done = tuple(one for one in fits if one is not None)
+    if not done:
+        raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
+    diverged = tuple(_values_by_path(where, z) for z, one in zip(points, fits, strict=False) if one is None)
+    return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
 
 
 class _FitInterrupted(Exception):
@@ -171,49 +193,6 @@ class _FitMonitor:
     before: int = 0
 
 
-def _check_fit(p: int, n: int, k: int, sigma: Matrix, norm: float, absolute: bool) -> None:
-    if sigma is not None:
-        given = np.asarray(sigma, float)
-        if given.shape not in ((), (n,)):
-            raise ValueError(f"sigma has shape {given.shape}; {n} residuals need a number or ({n},)")
-        if not (np.isfinite(given) & (given > 0)).all():
-            raise ValueError(f"sigma = {np.min(given):g} is not positive and finite")
-    if k and sigma is None:
-        raise ValueError("a prior needs sigma: nothing else says how much the data weigh against it")
-    estimated = sigma is None or not absolute
-    # A prior makes up for missing data, but not for the estimate of s^2, which needs n > p.
-    if n < p + estimated and not (k and n > 0 and not estimated):
-        more = " and one more for the estimate of s^2" if estimated else ""
-        raise ValueError(f"{n} data do not determine {p} parameters{more}: free fewer, or state a prior")
-    if not 2 <= norm < np.inf:
-        raise ValueError(f"norm = {norm:g} is outside [2, inf)")
-
-
-def _fit_all_starts(
-    problem: FitProblem,
-    points: Sequence[np.ndarray],
-    sigma: np.ndarray,
-    estimated: bool,
-    tolerances: Tolerances,
-    watch: _FitMonitor,
-) -> Identified:
-    """Return the best fit over these starting points, with the others in `starts`.
-
-    Raises:
-        ValueError: No starting point can be used.
-    """
-    fits: list[Identified | None] = []
-    for z in points:
-        # An interruption skips further starts only if there is a fit to return.
-        if not (any(fits) and watch.stopping()):
-            fits.append(_fit_start(problem, z, sigma, estimated, tolerances, watch))
-    done = tuple(one for one in fits if one is not None)
-    if not done:
-        raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
-    diverged = tuple(_values_by_path(problem.space, z) for z, one in zip(points, fits, strict=False) if one is None)
-    return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
-
-
 def _fit_start(
     problem: FitProblem,
     start: np.ndarray,
@@ -224,34 +203,11 @@ def _fit_start(
 ) -> Identified | None:
     """Return the fit from one start, or None if the start cannot be used."""
     problem.evaluations, problem.last = 0, None
-    if problem.at(start) is None:
+    first = problem.at(start)
+    if first is None:
         return None
-    end, reason, history = _minimise(problem, start, sigma, tolerances, watch)
-    # Read the count first: the final point may be computed once more below, which is no evaluation of the fit.
-    evaluations = problem.evaluations
-    watch.before += evaluations
-    seen = _accepted_evaluation(problem, end)
-    return Identified(
-        part=jax.tree.map(np.asarray, problem.space.at(problem.part, jnp.asarray(end))),
-        values=_values_by_path(problem.space, end),
-        residuals=seen.residuals,
-        sigma=sigma,
-        chi2=float(np.sum((seen.residuals / sigma) ** 2)),
-        cost=float(np.sum(problem.vector(seen, sigma) ** 2)),
-        uncertainty=_parameter_uncertainty(problem.space, end, seen, sigma, estimated),
-        history=history,
-        evaluations=evaluations,
-        reason=reason,
-        start=_values_by_path(problem.space, start),
-    )
-
-
-def _minimise(
-    problem: FitProblem, start: np.ndarray, sigma: np.ndarray, tolerances: Tolerances, watch: _FitMonitor
-) -> tuple[np.ndarray, Reason, list[float]]:
-    """Return the final z, the reason for the end, and the cost at every accepted point."""
     # A residual that is not finite makes SciPy reject the step and shrink its trust region.
-    rejected = np.full(len(problem.vector(_accepted_evaluation(problem, start), sigma)), np.nan)
+    rejected = np.full(len(problem.vector(first, sigma)), np.nan)
     history, accepted = [], [start]
 
     def value(z: np.ndarray) -> np.ndarray:
@@ -280,9 +236,26 @@ def _minimise(
             gtol=tolerances.gradient,
             max_nfev=tolerances.evaluations,
         )
+        end, reason = found.x, SCIPY_REASONS[found.status]
     except _FitInterrupted:
-        return accepted[-1], Reason.INTERRUPTED, history
-    return found.x, SCIPY_REASONS[found.status], history
+        end, reason = accepted[-1], Reason.INTERRUPTED
+    # Read the count first: the final point may be computed once more below, which is no evaluation of the fit.
+    evaluations = problem.evaluations
+    watch.before += evaluations
+    seen = _accepted_evaluation(problem, end)
+    return Identified(
+        part=jax.tree.map(np.asarray, problem.space.at(problem.part, jnp.asarray(end))),
+        values=_values_by_path(problem.space, end),
+        residuals=seen.residuals,
+        sigma=sigma,
+        chi2=float(np.sum((seen.residuals / sigma) ** 2)),
+        cost=float(np.sum(problem.vector(seen, sigma) ** 2)),
+        uncertainty=_parameter_uncertainty(problem.space, end, seen, sigma, estimated),
+        history=history,
+        evaluations=evaluations,
+        reason=reason,
+        start=_values_by_path(problem.space, start),
+    )
 
 
 def _accepted_evaluation(problem: FitProblem, z: np.ndarray) -> ResidualEvaluation:
@@ -306,7 +279,8 @@ def _parameter_uncertainty(
     counts as
     not determined.
     """
-    slope = np.array([float(jax.grad(m.value)(x)) for m, x in zip(_maps(free), z, strict=True)])
+    maps = [m for entry in free.entries for m in entry.maps]
+    slope = np.array([float(jax.grad(m.value)(x)) for m, x in zip(maps, z, strict=True)])
     values = np.concatenate([np.ravel(x) for x in _values_by_path(free, z).values()])
     chi2 = float(np.sum((seen.residuals / sigma) ** 2))
     scale = float(np.sqrt(chi2 / (len(sigma) - free.size))) if estimated else 1.0
@@ -315,10 +289,6 @@ def _parameter_uncertainty(
     data, prior = seen.slopes[0] / sigma[:, None] * over, seen.slopes[1] * over
     # An exact fit has s = 0; the smallest normal number avoids 0/0 below.
     return uncertainty(free.names, size, data, prior, scale or float(np.finfo(float).tiny))
-
-
-def _maps(free: FreeSpace) -> list[PyTree]:
-    return [m for entry in free.entries for m in entry.maps]
 
 
 def _values_by_path(free: FreeSpace, z: np.ndarray) -> JsonObject:

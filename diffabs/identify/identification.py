@@ -60,7 +60,11 @@ def identify(
     """
     check_part(loop)
     comparison = data.against(loop, list(free), solver)
-    _check_starts(loop, starts or ({},), comparison, solver)
+    for start in starts or ({},):
+        if why := _describe_refusal(first := replace(loop, dict(start)), comparison, solver):
+            # If the step is too long, the message gives the longest stable one.
+            most = min(float(stable_steps(canonical_dtypes(batch)).min()) for batch in comparison.loops(first))
+            raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
     return fit(
         loop,
         free,
@@ -76,18 +80,6 @@ def identify(
         progress=progress,
         stopping=stopping,
     )
-
-
-def _check_starts(loop: Loop, starts: Sequence[Table], comparison: Comparison, solver: Solver) -> None:
-    """Check that every run is admissible at each start.
-
-    Raises:
-        ValueError: A run is not admissible. If the step is too long, the message gives the longest stable one.
-    """
-    for start in starts:
-        if why := _describe_refusal(first := replace(loop, dict(start)), comparison, solver):
-            most = min(float(stable_steps(canonical_dtypes(batch)).min()) for batch in comparison.loops(first))
-            raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
 
 
 def _describe_refusal(loop: Part, comparison: Comparison, solver: Solver) -> str | None:

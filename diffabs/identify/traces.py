@@ -112,8 +112,17 @@ class Traces:
             named = ", ".join(self.columns) or "none"
             raise ValueError(f"columns: {named}; there is {', '.join(_output_names(loop))}")
         shapes = (self.shape, self.shape[1:]) if self.shape[0] == 1 else (self.shape,)
-        for name, column in self.columns.items():
-            _check_column(name, np.asarray(column, float), t, shapes)
+        for name, given in self.columns.items():
+            column = np.asarray(given, float)
+            if column.shape not in shapes:
+                needed = " or ".join(map(str, shapes))
+                raise ValueError(f"{name} has shape {column.shape}; t and the runs (over) need {needed}")
+            bad = ~np.isfinite(column)
+            if bad.any():
+                first = t[np.nonzero(bad)[-1][0]]
+                raise ValueError(
+                    f"{name}: {bad.sum()} values are not finite, the first at t = {first:g} s; leave them out"
+                )
         self._check_sigma(loop.plant.shows.units)
         if self.until is not None and np.shape(self.until) not in ((), self.shape[:1]):
             raise ValueError(f"until has shape {np.shape(self.until)}; it must be a number [s] or ({self.shape[0]},)")
@@ -161,12 +170,3 @@ class _TraceResiduals:
         columns = [getattr(run.trajectory.measured, name) for name in self.fields]
         seen = jnp.stack([x[i] + part * (x[i + 1] - x[i]) for x in columns])
         return jnp.where(run.diverged, jnp.nan, seen)
-
-
-def _check_column(name: str, column: np.ndarray, t: np.ndarray, shapes: tuple[tuple[int, ...], ...]) -> None:
-    if column.shape not in shapes:
-        raise ValueError(f"{name} has shape {column.shape}; t and the runs (over) need {' or '.join(map(str, shapes))}")
-    bad = ~np.isfinite(column)
-    if bad.any():
-        first = t[np.nonzero(bad)[-1][0]]
-        raise ValueError(f"{name}: {bad.sum()} values are not finite, the first at t = {first:g} s; leave them out")

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from diffabs.core.types import PyTree
 from diffabs.kernel.elementwise import max_or_min
 from diffabs.kernel.graph import Array, Graph, Node
 from diffabs.kernel.primitives import Unsupported, as_node_array, constant_array, lowering_rule, map_entries
@@ -91,6 +90,7 @@ def _iota(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 REDUCTION_OPERATIONS: dict[str, str] = {"sum": "add", "prod": "mul"}
+NEUTRAL_ELEMENTS = {"sum": 0, "prod": 1, "and": True, "or": False}
 
 
 @lowering_rule("reduce_sum", "axes out_sharding")
@@ -98,7 +98,7 @@ REDUCTION_OPERATIONS: dict[str, str] = {"sum": "add", "prod": "mul"}
 @lowering_rule("reduce_max", "axes out_sharding")
 @lowering_rule("reduce_min", "axes out_sharding")
 @lowering_rule("reduce_and reduce_or", "axes")
-def _reduce(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """Reduce by pairs, as a balanced tree: n entries give a dependency chain of about log2(n) operations."""
     kind, x = eqn.primitive.name.removeprefix("reduce_"), ins[0]
     name: Any = REDUCTION_OPERATIONS.get(kind, kind)
@@ -107,20 +107,17 @@ def _reduce(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
         return max_or_min(graph, name, a, b) if name in ("max", "min") else graph.op(name, a, b)
 
     for axis in sorted(eqn.params["axes"], reverse=True):
-        rows = list(np.moveaxis(x, axis, 0)) or [_reduce_nothing(graph, eqn, np.delete(x.shape, axis))]
+        rows = list(np.moveaxis(x, axis, 0))
+        if not rows:
+            if kind not in NEUTRAL_ELEMENTS:
+                raise Unsupported(eqn.primitive.name, "of nothing")
+            nothing = np.full(np.delete(x.shape, axis), NEUTRAL_ELEMENTS[kind], eqn.outvars[0].aval.dtype)
+            rows = [constant_array(graph, nothing)]
         while len(rows) > 1:
             pairs = [map_entries(join, *rows[i : i + 2]) for i in range(0, len(rows) - 1, 2)]
             rows = pairs + rows[2 * len(pairs) :]
         x = as_node_array(rows[0])
     return [x]
-
-
-def _reduce_nothing(graph: Graph, eqn: Any, shape: PyTree) -> Array:
-    """Return the neutral element of a reduction over an empty axis."""
-    whole = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": True, "reduce_or": False}
-    if eqn.primitive.name not in whole:
-        raise Unsupported(eqn.primitive.name, "of nothing")
-    return constant_array(graph, np.full(shape, whole[eqn.primitive.name], eqn.outvars[0].aval.dtype))
 
 
 @lowering_rule("cumsum", "axis reverse")

@@ -237,56 +237,40 @@ def _batching_rule(
     how = {"lanes": lanes, "begins": begins}
     # Only the seed tangents are batched, as in `jax.jacfwd`: the values run once, with size*many tangents.
     if all(axis is None for axis in axes[:values]):
-        slopes = zip(lanes.slopes(begins), arrays[values:], axes[values:], strict=True)
-        more = [_merge_tangent_axes(key, x, axis, size, as_lanes) for key, x, axis in slopes]
+        more = []
+        # Merge the batch axis in front of the tangent axis, which stands behind the lane axis if there is one.
+        for key, x, axis in zip(lanes.slopes(begins), arrays[values:], axes[values:], strict=True):
+            at = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
+            x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            x = jnp.moveaxis(x, 0, at)
+            more.append(x.reshape(*x.shape[:at], -1, *x.shape[at + 2 :]))
         found = run_lanes_primitive.bind(*arrays[:values], *more, **how, many=size * many, as_lanes=as_lanes)
         results = [
             x.reshape(x.shape[0], size, many, *x.shape[2:]) if key.tangent else x
             for key, x in zip(lanes.ends(begins), found, strict=True)
         ]
         return results, [1 if key.tangent else None for key in lanes.ends(begins)]
+
     keys = [*lanes.keys, *lanes.slopes(begins)]
     own = {k.number for k, axis in zip(keys, axes, strict=True) if k.level == UpdateLevel.UNIFORM and axis is not None}
-    given = [
-        _merge_lane_axes(key, x, axis, size, own, as_lanes, _count(lanes, arrays, axes))
-        for key, x, axis in zip(keys, arrays, axes, strict=True)
-    ]
+    # The last of the values is an array of the carry, so it always has a lane axis.
+    count = arrays[values - 1].shape[1 if axes[values - 1] == 0 else 0]
+    given = []
+    # Merge the batch axis in front of the lane axis.
+    for key, x, axis in zip(keys, arrays, axes, strict=True):
+        shared = key.level == UpdateLevel.UNIFORM and key.number not in as_lanes
+        # A uniform array that is not batched stays as given. A batched one is repeated for every lane.
+        if not shared or key.number in own:
+            x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            if shared:
+                x = jnp.broadcast_to(x[:, None], (size, count, *x.shape[1:]))
+            x = x.reshape(-1, *x.shape[2:])
+        given.append(x)
     found = run_lanes_primitive.bind(*given, **how, many=many, as_lanes=as_lanes | own)
     return [x.reshape(size, -1, *x.shape[1:]) for x in found], [0] * len(found)
 
 
 batching.primitive_batchers[run_lanes_primitive] = _batching_rule
-
-
-def _count(lanes: LanePrograms, arrays: Sequence[PyTree], axes: Sequence[PyTree]) -> int:
-    """Return the number of lanes without the batch axis."""
-    # The last of the values is an array of the carry, so it always has a lane axis.
-    last = len(lanes.keys) - 1
-    return arrays[last].shape[1 if axes[last] == 0 else 0]
-
-
-def _merge_tangent_axes(key: ArrayKey, x: Scalar, axis: int | None, size: int, as_lanes: frozenset[int]) -> PyTree:
-    """Return the seed tangents with the batch axis merged in front of the tangent axis: (batch*tangents, ...)."""
-    at = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
-    x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-    x = jnp.moveaxis(x, 0, at)
-    return x.reshape(*x.shape[:at], -1, *x.shape[at + 2 :])
-
-
-def _merge_lane_axes(
-    key: ArrayKey, x: Scalar, axis: int | None, size: int, own: set[int], as_lanes: frozenset[int], count: int
-) -> Scalar:
-    """Return an array with the batch axis merged in front of the lane axis: (batch*lanes, ...).
-
-    A uniform array that is not batched stays as given. A batched one is repeated for every lane.
-    """
-    shared = key.level == UpdateLevel.UNIFORM and key.number not in as_lanes
-    if shared and key.number not in own:
-        return x
-    x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-    if shared:
-        x = jnp.broadcast_to(x[:, None], (size, count, *x.shape[1:]))
-    return x.reshape(-1, *x.shape[2:])
 
 
 def _refuse_partial_evaluation(trace: Any, *tracers: Any, **how: Any) -> Scalar:

@@ -168,7 +168,11 @@ class CudaDevice:
         ordinal = ctypes.c_int()
         # Several devices may run this program: the memory tells which one to use.
         _call_driver("cuPointerGetAttribute", ctypes.byref(ordinal), ORDINAL, ctypes.c_uint64(room))
-        one = self._loaded_on(code, ordinal.value)
+        at = code, ordinal.value
+        with _lock:
+            if at not in self._loaded:
+                self._loaded[at] = _load(*at)
+            one = self._loaded[at]
         _call_driver("cuCtxPushCurrent_v2", one.context)
         try:
             # At most as many blocks as run at a time: each thread takes further lanes from the counter.
@@ -179,12 +183,6 @@ class CudaDevice:
             _launch(one.run, blocks, cuda.THREADS_PER_BLOCK, context.stream, arrays, shared, counter, lanes)
         finally:
             _call_driver("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
-
-    def _loaded_on(self, code: pathlib.Path, ordinal: int) -> _LoadedCode:
-        with _lock:
-            if (code, ordinal) not in self._loaded:
-                self._loaded[code, ordinal] = _load(code, ordinal)
-            return self._loaded[code, ordinal]
 
 
 def _load(code: pathlib.Path, ordinal: int) -> _LoadedCode:

@@ -87,10 +87,10 @@ def _dynamic_update(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array
     # One pass for each possible position: the block is written where all clamped indices match.
     for start in np.ndindex(*(most + 1 for most in room)):
         hits = [graph.op("eq", s, graph.const(o, s.dtype)) for s, o in zip(starts, start, strict=True)]
-        hit, inside = (
-            _all_true(graph, hits),
-            tuple(slice(o, o + size) for o, size in zip(start, new.shape, strict=True)),
-        )
+        hit = graph.const(True)
+        for one in hits:
+            hit = graph.op("and", hit, one)
+        inside = tuple(slice(o, o + size) for o, size in zip(start, new.shape, strict=True))
         out[inside] = map_entries(lambda a, b, hit=hit: graph.select(hit, a, b), out[inside], new)
     return [out]
 
@@ -116,13 +116,6 @@ def _scatter(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
             lambda a, b, hit=hit: graph.select(hit, a, b), as_node_array(x[i]), new.reshape(x.shape[1:])
         )
     return [out]
-
-
-def _all_true(graph: Graph, truths: list[Node]) -> Node:
-    found = graph.const(True)
-    for one in truths:
-        found = graph.op("and", found, one)
-    return found
 
 
 def _check_writable(eqn: JaxprEqn, count: int) -> None:

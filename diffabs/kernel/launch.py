@@ -6,7 +6,6 @@ import os
 import pathlib
 import threading
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +73,9 @@ def run_lanes(
     # Drop the traced arrays: this object outlives the trace, and a tracer must not leak. They are arguments instead.
     lanes = binding.LanePrograms(functions._replace(uniform=[]), launch, which)
     found = binding.bind_lanes(lanes, given)
-    return tree.unflatten([_like(x, leaf) for x, leaf in zip(found, leaves, strict=True)])
+    return tree.unflatten(
+        [jax.random.wrap_key_data(x) if is_key(leaf) else x for x, leaf in zip(found, leaves, strict=True)]
+    )
 
 
 def _launch_lanes(
@@ -135,8 +136,11 @@ def register_library(path: pathlib.Path) -> str:
     name = f"{LIBRARY_NAME_PREFIX}{path.stem[:32]}"
     with _lock:
         if name not in _loaded:
+            try:
+                handler = ctypes.CDLL(str(path)).diffabs_kernel
+            except (OSError, AttributeError) as error:  # such as in a folder without execution rights
+                raise compilers.NoCompiler(f"{path.parent}: {error}") from None
             # The table keeps the handler alive: XLA holds only its address.
-            handler = _handler(path)
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
             _loaded[name] = handler, path
     return name
@@ -154,16 +158,6 @@ def library_path(name: str) -> pathlib.Path:
         name: Name of the library in XLA.
     """
     return _loaded[name][1]
-
-
-def _handler(path: pathlib.Path) -> PyTree:
-    """Return the library's entry point; raise NoCompiler if it does not load, as from a folder without execution
-    rights.
-    """
-    try:
-        return ctypes.CDLL(str(path)).diffabs_kernel
-    except (OSError, AttributeError) as error:
-        raise compilers.NoCompiler(f"{path.parent}: {error}") from None
 
 
 def thread_count() -> int:
@@ -191,10 +185,6 @@ def unwrap_key(x: Scalar) -> Scalar:
     if is_key(x):
         return jax.random.key_data(x)
     return x if isinstance(x, jax.Array) else jnp.asarray(x)
-
-
-def _like(x: Scalar, leaf: Any) -> Any:
-    return jax.random.wrap_key_data(x) if is_key(leaf) else x
 
 
 def is_key(x: Scalar) -> bool:

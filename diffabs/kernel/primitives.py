@@ -87,31 +87,26 @@ def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Se
     at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
     def read(atom: PyTree) -> Array:
-        return constant_array(graph, atom.val, _dtype(atom)) if isinstance(atom, jex.Literal) else at[atom]
+        if isinstance(atom, jex.Literal):
+            return constant_array(graph, atom.val, atom.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+        return at[atom]
 
     for eqn in jaxpr.eqns:
         graph.begins(eqn)
-        at.update(zip(eqn.outvars, _apply_rule(graph, eqn, [read(atom) for atom in eqn.invars]), strict=True))
+        name, ins = eqn.primitive.name, [read(atom) for atom in eqn.invars]
+        try:
+            if name not in LOWERING_RULES:
+                raise Unsupported(name, "there is no rule for it")
+            # An unknown parameter may change the meaning of the primitive.
+            if new := sorted(set(eqn.params) - LOWERING_RULES[name].known):
+                raise Unsupported(name, f"its parameter {new[0]} is not known")
+            outs = LOWERING_RULES[name].apply(graph, eqn, ins)
+        except Unsupported as error:
+            # The innermost equation names the method first. Outer calls keep that name.
+            error.method = error.method or _calling_method(eqn)
+            raise
+        at.update(zip(eqn.outvars, outs, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
-
-
-def _dtype(atom: PyTree) -> Any:
-    return atom.aval.dtype
-
-
-def _apply_rule(graph: Graph, eqn: JaxprEqn, inputs: list[Array]) -> Sequence[Array]:
-    name = eqn.primitive.name
-    try:
-        if name not in LOWERING_RULES:
-            raise Unsupported(name, "there is no rule for it")
-        # An unknown parameter may change the meaning of the primitive.
-        if new := sorted(set(eqn.params) - LOWERING_RULES[name].known):
-            raise Unsupported(name, f"its parameter {new[0]} is not known")
-        return LOWERING_RULES[name].apply(graph, eqn, inputs)
-    except Unsupported as error:
-        # The innermost equation names the method first. Outer calls keep that name.
-        error.method = error.method or _calling_method(eqn)
-        raise
 
 
 def _calling_method(eqn: JaxprEqn) -> str:

@@ -56,7 +56,18 @@ def replicate_nodes(
     # Nodes that depend only on tangents without a seed are in `slopes` but not in `moving`: they are zero.
     slopes = dependents(nodes, slopes)
     factors = Graph()
-    values = _values(factors, nodes, given, slopes, moving)
+    # Everything but nonzero tangents becomes a node of the factor graph; every result of zero tangents is 0.
+    values: dict[int, Node] = {}
+    for node in nodes:
+        if node.id in moving:
+            continue
+        if node.id in slopes:
+            values[node.id] = factors.const(0, node.dtype)
+        elif node.op == "input":
+            (one,) = given[node.id]
+            values[node.id] = factors.input(one.dtype, one.level, one.attr)
+        else:
+            values[node.id] = factors.again(node, [values[x.id] for x in node.args])
     plan = Elimination(factors, *size)
     for node in nodes:
         if node.id not in moving:
@@ -67,24 +78,6 @@ def replicate_nodes(
             plan.add(node, lambda x: x.id in moving, lambda x: values[x.id])
     plan.reduce({node.id for node in roots if node.id in plan.vertices})
     return _ReplicaWriter(graph, plan, values, given).write(nodes)
-
-
-def _values(
-    graph: Graph, nodes: list[Node], given: dict[int, list[Node]], slopes: set[int], moving: set[int]
-) -> dict[int, Node]:
-    """Return the factor graph's nodes for everything but nonzero tangents; every result of zero tangents is 0."""
-    found: dict[int, Node] = {}
-    for node in nodes:
-        if node.id in moving:
-            continue
-        if node.id in slopes:
-            found[node.id] = graph.const(0, node.dtype)
-        elif node.op == "input":
-            (one,) = given[node.id]
-            found[node.id] = graph.input(one.dtype, one.level, one.attr)
-        else:
-            found[node.id] = graph.again(node, [found[x.id] for x in node.args])
-    return found
 
 
 class _ReplicaWriter:

@@ -151,7 +151,18 @@ def replicate_tangents(
             sizes[level].append(size * copies)
     # In each level the tangents follow the values, so their array numbers start at the number of values.
     slopes = {node.id for place, node in old.inputs.items() if place.array >= len(functions.types[place.level])}
-    ends = {name: _results(functions, one, name) for name in old.results}
+    # The results of each function, array by array: nodes of the program of one tangent, and whether they are tangents.
+    ends: dict[str, list[tuple[list[Node], bool]]] = {}
+    for name, nodes in old.results.items():
+        if name == RUNNING_FUNCTION:
+            ends[name] = [(nodes, False)]
+            continue
+        arrays = _arrays(functions, one, name)
+        moving = [
+            _number(functions, one, ArrayKey(UpdateLevel.STEP, i, True)) for i in one.moved_arrays[UpdateLevel.STEP]
+        ]
+        values = arrays[: len(functions.types[UpdateLevel.STEP])]
+        ends[name] = [(x, False) for x in values] + [(arrays[i], True) for i in moving]
     roots = [node for arrays in ends.values() for nodes, _ in arrays for node in nodes]
     new = replicate_nodes(graph, roots, given, slopes, (many, old.dtype))
     results = {
@@ -167,18 +178,6 @@ def _number(functions: TracedFunctions, one: DerivativeProgram, key: ArrayKey) -
     """Return the number of an array in the program with one tangent."""
     first = len(functions.types[key.level])
     return first + one.differentiable[key.level].index(key.number) if key.tangent else key.number
-
-
-def _results(functions: TracedFunctions, one: DerivativeProgram, name: str) -> list[tuple[list[Node], bool]]:
-    """Return a function's results, array by array, as nodes of one tangent and a truth: whether they are tangents."""
-    if name == RUNNING_FUNCTION:
-        return [(one.program.results[name], False)]
-    arrays = _arrays(functions, one, name)
-    slopes = [
-        arrays[_number(functions, one, ArrayKey(UpdateLevel.STEP, i, True))] for i in one.moved_arrays[UpdateLevel.STEP]
-    ]
-    values = arrays[: len(functions.types[UpdateLevel.STEP])]
-    return [(nodes, False) for nodes in values] + [(nodes, True) for nodes in slopes]
 
 
 def _arrays(functions: TracedFunctions, one: DerivativeProgram, name: str) -> list[list[Node]]:

@@ -161,7 +161,14 @@ def _start_output_and_setpoint(loop: Loop) -> tuple[PyTree, PyTree]:
 @jax.jit
 def _linearize_halves(loop: Loop, setpoint: Scalar) -> _LinearHalves:
     loop, setpoint = canonical_dtypes((loop, setpoint))
-    around, free, residue = _find_rest(loop, setpoint)
+    around = _Surroundings(loop, setpoint)
+    there = around.chart(around.start)
+    there = there.at[0].set(around.setpoint) if around.frozen else there
+    # Newton's method starts on the setpoint, with the other coordinates at their start.
+    near = find_root(lambda z: around.chart(z) - there, around.start)
+    guess = loop.plant.holding(around.output(near), around.setpoint)
+    free = find_root(around.rest_residual, jnp.append(near, guess))
+    residue = jnp.max(jnp.abs(around.rest_residual(free))) / (1 + jnp.max(jnp.abs(free)))
     z, command = free[:-1], free[-1]
     signal, as_signal = ravel_pytree(around.signal(z))
     by_z, b = jax.jacfwd(around.moves, (0, 1))(z, command)
@@ -241,18 +248,6 @@ class _Surroundings:
         rates = self.moves(z, command)[: len(z) - self.held]
         where = self.chart(z)[len(z) - self.held :] - self.chart(self.start)[len(z) - self.held :]
         return jnp.concatenate([rates, where, (self.output(z)[0] - self.setpoint)[None]])
-
-
-def _find_rest(loop: Loop, setpoint: Scalar) -> tuple[_Surroundings, PyTree, PyTree]:
-    """Return the surroundings of the controller, (z, command) at rest, and the relative residual there."""
-    around = _Surroundings(loop, setpoint)
-    there = around.chart(around.start)
-    there = there.at[0].set(around.setpoint) if around.frozen else there
-    # On the setpoint, with the other coordinates at their start.
-    near = find_root(lambda z: around.chart(z) - there, around.start)
-    guess = loop.plant.holding(around.output(near), around.setpoint)
-    free = find_root(around.rest_residual, jnp.append(near, guess))
-    return around, free, jnp.max(jnp.abs(around.rest_residual(free))) / (1 + jnp.max(jnp.abs(free)))
 
 
 def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: Scalar) -> Matrix:

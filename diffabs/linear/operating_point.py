@@ -111,7 +111,11 @@ def operating_point(loop: Loop) -> OperatingPoint:
         raise ValueError("the control is at a limit at the setpoint, or does not act there: no linear model")
     # The plant's states come first in the vector of states.
     plant = np.arange(len(found.A)) < len(ravel_pytree(start.plant)[0])
-    return dataclasses.replace(model, kept=_needed_states(found, plant))  # pyright: ignore[reportArgumentType]
+    # Kept are these, those on which the command depends, and all that influence a kept one.
+    kept = plant | (found.K != 0)
+    for _ in kept:
+        kept = kept | (found.A[kept] != 0).any(axis=0)
+    return dataclasses.replace(model, kept=tuple(np.flatnonzero(kept).tolist()))  # pyright: ignore[reportArgumentType]
 
 
 def loop_gain(loop: Loop, states: tuple[str, ...]) -> AnyArray:
@@ -129,14 +133,6 @@ def _drop_stop(loop: Loop) -> OperatingPoint:
     """Return the operating point with all parts of a loop except its stop."""
     fields = {f.name: getattr(loop, f.name) for f in dataclasses.fields(loop) if f.name != "stop"}  # pyright: ignore[reportArgumentType]
     return OperatingPoint(**fields)
-
-
-def _needed_states(found: LinearLoop, plant: np.ndarray) -> tuple[int, ...]:
-    """Return the states of the plant, the states on which the command depends, and all states that influence these."""
-    kept = plant | (found.K != 0)
-    for _ in kept:
-        kept = kept | (found.A[kept] != 0).any(axis=0)
-    return tuple(np.flatnonzero(kept).tolist())
 
 
 class _IntegratedStates(NamedTuple):

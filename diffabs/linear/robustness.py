@@ -92,15 +92,12 @@ def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, tar
     corners = list(dict.fromkeys(itertools.product(*free.values())))
     inside = low_discrepancy_points(samples if any(low < high for low, high in free.values()) else 0, len(free))
     low, high = np.array(list(free.values())).reshape(-1, 2).T
-    points = [*corners, *(low + (high - low) * inside).tolist()]
-    return Band(
-        tuple(_system(loop, dict(zip(free, map(float, at), strict=True)), target) for at in points), len(corners)
-    )
-
-
-def _system(loop: Loop, values: dict[str, float], target: Scalar) -> System:
-    opened = open_loop(replace(loop, values), target)
-    return System(values, opened, margins(opened))
+    systems = []
+    for at in [*corners, *(low + (high - low) * inside).tolist()]:
+        values = dict(zip(free, map(float, at), strict=True))
+        opened = open_loop(replace(loop, values), target)
+        systems.append(System(values, opened, margins(opened)))
+    return Band(tuple(systems), len(corners))
 
 
 def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:

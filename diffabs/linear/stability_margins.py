@@ -187,41 +187,25 @@ def frequency_grid(system: Transfer) -> np.ndarray:
     Args:
         system: Open loop with one input and one output.
     """
-    poles = system.poles
+    poles, closed = system.poles, closed_loop_poles(system._replace(delay=0.0))
     if system.period is not None:
-        with np.errstate(divide="ignore"):
-            poles = np.log(poles[np.abs(poles) > 1e-12].astype(complex)) / system.period
-    sizes = np.abs(poles)[np.abs(poles) > 1e-9]
+        poles, closed = (np.log(z[np.abs(z) > 1e-12].astype(complex)) / system.period for z in (poles, closed))
+    sizes = np.abs(np.concatenate([poles, closed]))
+    sizes = sizes[sizes > 1e-9]
     half = math.pi / system.period if system.period else math.inf
-    closed = np.abs(_delay_free_closed_poles(system))
-    sizes = np.concatenate([sizes, closed[closed > 1e-9]]) if len(closed) else sizes
     low, high = (sizes.min(), sizes.max()) if len(sizes) else (1.0, 1.0)
     low, high = min(low, half) * 10.0**-GRID_DECADES, min(high * 10.0**GRID_DECADES, half)
     w = np.geomspace(low, high, int(PER_DECADE * math.log10(high / low)) + 2)
     # Extra points around each lightly damped pole, where L changes fast.
     around = [abs(p.imag) + abs(p.real) * np.linspace(-5, 5, 41) for p in poles if p.imag > 0]
     w = np.unique(np.concatenate([w, *around]))
-    w = _resolve_delay_turns(system, w[(w >= low) & (w <= high)])
+    w = w[(w >= low) & (w <= high)]
+    # Extra points between which a delay turns L by a small angle, up to where L is small.
+    large = w[np.abs(_response(system, w)) > SMALL_LOOP_GAIN] if system.delay else w[:0]
+    if len(large):
+        count = min(MAX_GRID_FREQUENCIES, int(large[-1] * system.delay / DELAY_TURN_ANGLE) + 2)
+        w = np.union1d(w, np.linspace(w[0], large[-1], count))
     return _refine_grid(system, w)
-
-
-def _delay_free_closed_poles(system: Transfer) -> np.ndarray:
-    """Return the closed-loop poles without the delay, in s."""
-    poles = np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0)).astype(complex)
-    if system.period is None:
-        return poles
-    return np.log(poles[np.abs(poles) > 1e-12]) / system.period
-
-
-def _resolve_delay_turns(system: Transfer, w: np.ndarray) -> np.ndarray:
-    """Return the grid with added points, between which a delay turns L by a small angle, up to where L is small."""
-    if not system.delay:
-        return w
-    large = w[np.abs(_response(system, w)) > SMALL_LOOP_GAIN]
-    if not len(large):
-        return w
-    count = min(MAX_GRID_FREQUENCIES, int(large[-1] * system.delay / DELAY_TURN_ANGLE) + 2)
-    return np.union1d(w, np.linspace(w[0], large[-1], count))
 
 
 def _refine_grid(system: Transfer, w: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@
 Matrices are NumPy arrays. The delay is exact: its response is e^(-j w delay), without an approximation.
 """
 
+import contextlib
 from typing import NamedTuple
 
 import numpy as np
@@ -76,14 +77,11 @@ def _solve_or_infinite(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.solve(matrices, right)
     except np.linalg.LinAlgError:
-        return np.stack([_solve_one_or_infinite(m, r) for m, r in zip(matrices, right, strict=True)])
-
-
-def _solve_one_or_infinite(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    try:
-        return np.linalg.solve(matrix, right)
-    except np.linalg.LinAlgError:
-        return np.full(right.shape, complex(np.inf))
+        found = np.full(right.shape, complex(np.inf))
+        for x, matrix, one in zip(found, matrices, right, strict=True):
+            with contextlib.suppress(np.linalg.LinAlgError):
+                x[:] = np.linalg.solve(matrix, one)
+        return found
 
 
 def _delay_one_period(system: Transfer) -> Transfer:

@@ -87,11 +87,6 @@ def highest_signal(output: PyTree) -> float:
     return getattr(output, "highest", math.inf)
 
 
-def _side(sample: Sample) -> PyTree:
-    """Return -1 for a negative setpoint, else 1."""
-    return jnp.where(sample.setpoint < 0, -1.0, 1.0)
-
-
 def absolute_integral(cubic: Cubic, integral: Callable[[PyTree], PyTree]) -> Scalar:
     """Return the integral of |p| over [0, 1], for a cubic p with at most one sign change.
 
@@ -206,7 +201,7 @@ class Overshoot:
 
     def start(self, sample: Sample) -> Memory:
         """Return the side of the setpoint and the first value on this side."""
-        side = _side(sample)
+        side = jnp.where(sample.setpoint < 0, -1.0, 1.0)
         return Memory(held=Sided(side, side * sample.output[0]))
 
     def update(self, memory: Memory, segment: Segment) -> Sided:

@@ -206,7 +206,10 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
         table, words = bad / np.maximum(lanes, 1), "share of failed runs [1]"
         colours = {"cmap": "Oranges", "vmin": 0, "vmax": np.max(table)}
     else:
-        table, words = _greatest(cell, found.column(view.leading)[every], lanes), _draw_bound(view)
+        values, greatest = found.column(view.leading)[every], np.full(lanes.size, -np.inf)
+        np.maximum.at(greatest, cell, values)
+        table, bound = greatest.reshape(lanes.shape), view.bounds.get(view.leading)
+        words = f"greatest {view.label(view.leading)}" + ("" if bound is None else f", fails beyond {bound:g}")
         colours = {"cmap": "viridis"}
     mesh = ax.pcolormesh(*[*edges, [0, 1]][:2], np.ma.masked_where(lanes == 0, table).T, **colours)
     figure.colorbar(mesh, ax=ax, label=words)
@@ -216,19 +219,6 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
     bounds = "".join(f", {name} > {bound:g}" for name, bound in view.bounds.items())
     ax.set_title(f"failed: diverged, {describe_wrong_end(found.study['success'])}{bounds}", fontsize=9.5)
     return figure
-
-
-def _greatest(cell: Any, values: np.ndarray, lanes: np.ndarray) -> np.ndarray:
-    """Return the largest value in each cell."""
-    table = np.full(lanes.size, -np.inf)
-    np.maximum.at(table, cell, values)
-    return table.reshape(lanes.shape)
-
-
-def _draw_bound(view: SweepView) -> str:
-    """Return the label of the colour bar for a map without failures."""
-    bound = view.bounds.get(view.leading)
-    return f"greatest {view.label(view.leading)}" + ("" if bound is None else f", fails beyond {bound:g}")
 
 
 def _exceedance_corners(ordered: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:

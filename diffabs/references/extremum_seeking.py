@@ -17,7 +17,7 @@ Automatica 36 (2000).
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 
@@ -86,7 +86,11 @@ class ExtremumSeeking:
         slip, deceleration = signal.slip - m.slip, signal.deceleration - m.deceleration
         products = slip * deceleration - m.covariance, slip * slip - m.variance
         means, moments = (tuple(x / self.time_constant for x in pair) for pair in ((slip, deceleration), products))
-        return SeekingMemory(self._climb(m), *means, *moments)
+        e = self.elasticity(memory)
+        # The gain fades to 0 at a limit, so s never leaves the limits and no clamp kinks the rate there.
+        room = jnp.where(e > 0, jnp.log(self.greatest_slip) - m.logarithm, m.logarithm - jnp.log(self.least_slip))
+        climb = self.gain * e * clamp(room / jnp.log1p(self.band), 0.0, 1.0)
+        return SeekingMemory(climb, *means, *moments)
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
         """Return the target slip with the dither [1]."""
@@ -113,9 +117,3 @@ class ExtremumSeeking:
         """Yield the rules least_slip <= slip <= greatest_slip."""
         yield order_rule(("least_slip", self.least_slip), ("slip", self.slip), "1")
         yield order_rule(("slip", self.slip), ("greatest_slip", self.greatest_slip), "1")
-
-    def _climb(self, m: SeekingMemory) -> Any:
-        e = self.elasticity(Memory(flow=m))
-        # The gain fades to 0 at a limit, so s never leaves the limits and no clamp kinks the rate there.
-        room = jnp.where(e > 0, jnp.log(self.greatest_slip) - m.logarithm, m.logarithm - jnp.log(self.least_slip))
-        return self.gain * e * clamp(room / jnp.log1p(self.band), 0.0, 1.0)

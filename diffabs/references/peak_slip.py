@@ -13,7 +13,7 @@ and the slip is the slip there. The run therefore does not depend on the grid an
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -126,7 +126,7 @@ class PeakLatch:
         """
         del t
         m: PeakMemory = memory.held
-        return (_falling_rate(_rate(_size, signal, rate()), _size(signal), m),)
+        return (_falling_rate(jax.jvp(_size, (signal,), (rate(),))[1], _size(signal), m),)
 
     def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[PyTree]) -> Memory:
         """Return the memory after the event: if it has fired, target and maximum are the present slip and |a|."""
@@ -205,10 +205,6 @@ class PeakRobust:
         moves = fired[1] | (fired[0] & (m.latched > 0.5))
         latched = jnp.where(fired[1], 1.0, m.latched)
         return Memory(memory.flow, m._replace(latched=latched, target=jnp.where(moves, m.slip, m.target)))
-
-
-def _rate(size: Callable[[BrakeOutput], PyTree], signal: BrakeOutput, rate: BrakeOutput) -> Any:
-    return jax.jvp(size, (signal,), (rate,))[1]
 
 
 def _falling_rate(rate: Scalar, deceleration: Scalar, m: PeakMemory) -> Scalar:

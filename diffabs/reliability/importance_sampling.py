@@ -288,12 +288,9 @@ def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> n
         taken = go[better]
         z[taken], score[taken], slope[taken] = trial[better], value[better], steep[better]
         t[go] = np.where(better, 1.0, 0.5 * t[go])
-    return _drop_duplicates(z[np.argsort(np.linalg.norm(z, axis=1), kind="stable")])
-
-
-def _drop_duplicates(points: np.ndarray) -> np.ndarray:
+    # Of searches that end at one design point, the result nearest to the origin is kept.
     kept: list[np.ndarray] = []
-    for point in points:
+    for point in z[np.argsort(np.linalg.norm(z, axis=1), kind="stable")]:
         if all(np.linalg.norm(point - other) > MIN_POINT_DISTANCE for other in kept):
             kept.append(point)
     return np.array(kept)

@@ -181,10 +181,32 @@ def subset_simulation(
     runs = CountedScore(score, gradient, tolerated)
     # Separate streams: importance sampling does not change the draws of subset simulation.
     first, second = (np.random.default_rng(each) for each in np.random.SeedSequence(seed).spawn(2))
-    sequence = _run_levels(runs, dimension, plan, first, progress)
-    subset = _subset_estimate(sequence, plan)
-    tried, note = _importance_estimate(runs, sequence, subset, plan, second)
-    return _build_rare_event(runs, sequence, subset, tried, note, price)
+    made, last, hits, reason = _run_levels(runs, dimension, plan, first, progress)
+    subset = _product_estimate(made, last.family[hits])
+    if not hits.any():
+        subset = subset._replace(interval=(0.0, _upper_bound(made[:-1], last, plan.samples)))
+    tried = None
+    note = "subset simulation: no importance sampling of what one level shows, or without failures or draws"
+    if hits.any() and plan.draws > 0 and len(made) > 1:
+        chain = np.flatnonzero(hits) % plan.chains
+        tried, note = try_importance_sampling(
+            runs, last.z[hits], chain, subset, threshold=plan.threshold, draws=plan.draws, rng=second
+        )
+    # A chain that rejects a proposal repeats its sample: each failure counts once.
+    failing = np.unique(last.z[hits], axis=0)
+    return RareEvent(
+        *(tried.estimate if tried and is_better_estimate(tried, subset) else subset),
+        reason=reason,
+        levels=made,
+        subset=subset,
+        importance=tried,
+        note=note,
+        failing=failing[np.argsort(np.sum(failing**2, axis=1), kind="stable")][:MAX_FAILING_POINTS],
+        evaluations=runs.evaluations,
+        gradients=runs.gradients,
+        diverged=runs.diverged,
+        price=price,
+    )
 
 
 class _Plan(NamedTuple):
@@ -315,52 +337,6 @@ def _level_cov(hits: np.ndarray) -> float:
     # An estimated correlation may be negative by chance; max(0, ...) keeps the variance on the safe side.
     excess = 2 * sum((1 - k / length) * lag for k, lag in enumerate(lags, 1)) / (p * (1 - p))
     return math.sqrt((1 - p) / (p * hits.size) * (1 + max(0.0, excess)))
-
-
-def _subset_estimate(sequence: _LevelSequence, plan: _Plan) -> ProbabilityEstimate:
-    """Return the estimate of the levels; its interval ends at an upper bound if no sample failed."""
-    levels, last, hits, _ = sequence
-    found = _product_estimate(levels, last.family[hits])
-    return found if hits.any() else found._replace(interval=(0.0, _upper_bound(levels[:-1], last, plan.samples)))
-
-
-def _importance_estimate(
-    runs: CountedScore, sequence: _LevelSequence, subset: ProbabilityEstimate, plan: _Plan, rng: Rng
-) -> tuple[ImportanceEstimate | None, str]:
-    """Return the result of importance sampling (or None) and a note on the outcome."""
-    levels, last, hits, _ = sequence
-    if not hits.any() or plan.draws == 0 or len(levels) == 1:
-        return None, "subset simulation: no importance sampling of what one level shows, or without failures or draws"
-    chain = np.flatnonzero(hits) % plan.chains
-    return try_importance_sampling(
-        runs, last.z[hits], chain, subset, threshold=plan.threshold, draws=plan.draws, rng=rng
-    )
-
-
-def _build_rare_event(
-    runs: CountedScore,
-    sequence: _LevelSequence,
-    subset: ProbabilityEstimate,
-    tried: ImportanceEstimate | None,
-    note: str,
-    price: float,
-) -> RareEvent:
-    """Return the result with the better estimate."""
-    # A chain that rejects a proposal repeats its sample.
-    failing = np.unique(sequence.last.z[sequence.hits], axis=0)
-    return RareEvent(
-        *(tried.estimate if tried and is_better_estimate(tried, subset) else subset),
-        reason=sequence.reason,
-        levels=sequence.levels,
-        subset=subset,
-        importance=tried,
-        note=note,
-        failing=failing[np.argsort(np.sum(failing**2, axis=1), kind="stable")][:MAX_FAILING_POINTS],
-        evaluations=runs.evaluations,
-        gradients=runs.gradients,
-        diverged=runs.diverged,
-        price=price,
-    )
 
 
 def _product_estimate(levels: list[SubsetLevel], family: np.ndarray) -> ProbabilityEstimate:

@@ -112,16 +112,8 @@ def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
         return
     for kind, keys in KEYS_BY_KIND.items():
         if all(key in content for key in keys):
-            yield Document(kind, content, _home(kind, content, path))
+            # The output of `sweep --json` counts as the summary in the sweep's folder: figures and manifest are there.
+            if kind == "sweep" and not (path.parent / MANIFEST).exists() and isinstance(content.get("out"), str):
+                path = pathlib.Path(content["out"]) / SUMMARY
+            yield Document(kind, content, path)
             return
-
-
-def _home(kind: str, content: JsonObject, path: pathlib.Path) -> pathlib.Path:
-    """Return the path of a document.
-
-    The output of `sweep --json` counts as the summary in the sweep's folder, because its figures and manifest are
-    there.
-    """
-    if kind == "sweep" and not (path.parent / MANIFEST).exists() and isinstance(content.get("out"), str):
-        return pathlib.Path(content["out"]) / SUMMARY
-    return path

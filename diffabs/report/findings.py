@@ -2,7 +2,6 @@
 
 import pathlib
 from collections.abc import Iterator
-from typing import Any
 
 from diffabs.core.types import Table
 from diffabs.report import proofs
@@ -52,14 +51,11 @@ def tuning_section(document: Document) -> Section:
         certificate=proofs.proof_verdicts(content["certificate"]),
         certificate_tables=proofs.proof_tables(content["certificate"], content),
         notes=["Interrupted: the best so far, not a minimum."] if content.get("interrupted") else [],
-        provenance=describe_origin(content, gradients=content["evaluations"], mode=content["mode"], seed=_seed(content),
+        provenance=describe_origin(content, gradients=content["evaluations"], mode=content["mode"],
+                          seed=((content.get("model") or {}).get("solver") or {}).get("seed"),
                           engine=format_pairs(content["engine"])),
         again=original_command(content),
     )  # fmt: skip
-
-
-def _seed(content: Table) -> Any:
-    return ((content.get("model") or {}).get("solver") or {}).get("seed")
 
 
 def _constraint_row(row: Table) -> ReportVerdict:
@@ -119,7 +115,8 @@ def identification_section(document: Document) -> Section:
         f" {join_words(data['columns'])} until {data['until']:g} s, and how well do these determine them?",
         answer=[f"chi2 = {content['chi2']:.6g} with {content['degrees']} degrees of freedom; it ended because"
                 f" {content['reason']}."],
-        verdicts=_determined_tables(content),
+        verdicts=[ReportVerdict("not determined", row["direction"]) for row in content["undetermined"]]
+        or [ReportVerdict("determined", "every parameter that was free")],
         model=model_tables(content.get("model")),
         model_note="Before the identification." if content.get("model") else UNKNOWN_ORIGIN,
         tables=list(_identification_tables(content)),
@@ -127,11 +124,6 @@ def identification_section(document: Document) -> Section:
         provenance=describe_origin(content, evaluations=content["evaluations"]),
         again=original_command(content),
     )  # fmt: skip
-
-
-def _determined_tables(content: Table) -> list[ReportVerdict]:
-    loose = [ReportVerdict("not determined", row["direction"]) for row in content["undetermined"]]
-    return loose or [ReportVerdict("determined", "every parameter that was free")]
 
 
 def _identification_tables(content: Table) -> Iterator[ReportTable]:

@@ -46,7 +46,8 @@ def sweep_section(document: Document) -> Section:
         KeyError: The document or the manifest lacks a key.
         OSError: The manifest cannot be read.
     """
-    content, manifest = document.content, _manifest(document.folder)
+    content = document.content
+    manifest = json.loads(files.read_content(document.folder / MANIFEST, MAX_DOCUMENT_BYTES))
     study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
     found, note = _scenario_model(source, document.folder)
     varied = list(next(iter(content["sensitivity"].values()), {})) or list(units)
@@ -69,10 +70,6 @@ def sweep_section(document: Document) -> Section:
         ),
         again=[*original_command(content), *_sample(content, document.folder)],
     )  # fmt: skip
-
-
-def _manifest(folder: pathlib.Path) -> JsonObject:
-    return json.loads(files.read_content(folder / MANIFEST, MAX_DOCUMENT_BYTES))
 
 
 def _commit(manifest: Table) -> JsonObject:

@@ -40,7 +40,8 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
     import jinja2
 
     sections = [_section(one) for one in found]
-    text, script = (_content(name) for name in ("report.html.j2", "closer.js"))
+    folder = importlib.resources.files("diffabs.report")
+    text, script = ((folder / name).read_text(encoding="utf-8") for name in ("report.html.j2", "closer.js"))
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
@@ -63,10 +64,6 @@ def script_checksum(script: str) -> str:
         script: Text of the script.
     """
     return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
-
-
-def _content(name: str) -> str:
-    return (importlib.resources.files("diffabs.report") / name).read_text(encoding="utf-8")
 
 
 def _section(document: Document) -> Section:

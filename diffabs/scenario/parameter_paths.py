@@ -237,7 +237,12 @@ def read_entries(
     """
     known = {canonical_path(path): (path, spec, shape, 1.0) for path, (spec, shape) in there.items()}
     known |= {f"{k}_kmh": (path, in_kmh(spec), n, KMH) for k, (path, spec, n, _) in known.items() if spec.unit == "m/s"}
-    known |= {former: item for key, item in known.items() if (former := _current_path(key)) not in (None, *known)}
+    # A limit of a controller is also known by its former name, unless another parameter has this name.
+    older = {new: old for old, new in FORMER_FIELDS.items()}
+    for key, item in list(known.items()):
+        part, _, name = key.rpartition(".")
+        if part.startswith("controller") and name in older:
+            known.setdefault(f"{part}.{older[name]}", item)
     seen = set()
     for key, given in flatten_table(table, section).items():
         if key not in known:
@@ -248,13 +253,6 @@ def read_entries(
             raise ScenarioError(f"{_where(section, canonical_path(path))} is given twice, {how}")
         seen.add(path)
         yield ParameterEntry(path, _where(section, key), given, spec, shape, scale)
-
-
-def _current_path(path: str) -> str | None:
-    """Return the path of a controller's limit under its older name; None for every other parameter."""
-    section, _, name = path.rpartition(".")
-    older = {new: old for old, new in FORMER_FIELDS.items()}
-    return f"{section}.{older[name]}" if section.startswith("controller") and name in older else None
 
 
 def parameters_of(loop: Part) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]]:

@@ -176,18 +176,14 @@ def loads(
         _override(table, override)
     _refuse(_without_inner(before, table))
     if overrides:
-        table |= _retitle(name, overrides)
+        # The texts of the file may be wrong for other values; a text that an override sets itself stays.
+        said = {override.partition("=")[0].strip() for override in overrides}
+        texts = {"title": make_printable(f"{name} with {', '.join(overrides)}"), "description": ""}
+        table |= {key: text for key, text in texts.items() if key not in said}
     scenario = _assemble(name, table, folder)
     asked = (scenario.loop, scenario.solver)
     _refuse(find_mismatches(*asked), find_unstable_step(*asked) if integrated else ())
     return scenario
-
-
-def _retitle(name: str, overrides: Sequence[str]) -> JsonObject:
-    """Return title and description of an overridden scenario, without the texts that an override sets itself."""
-    said = {override.partition("=")[0].strip() for override in overrides}
-    new = {"title": make_printable(f"{name} with {', '.join(overrides)}"), "description": ""}
-    return {key: text for key, text in new.items() if key not in said}
 
 
 def _without_inner(before: Table, table: Table) -> Iterator[str]:

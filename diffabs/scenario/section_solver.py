@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Mapping
 
 from diffabs.core.pytree import ParameterSpec
-from diffabs.core.types import JsonObject, PyTree, Table
+from diffabs.core.types import JsonObject, PyTree
 from diffabs.core.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.types import SOLVER_TYPES, Adaptive, FixedStep, Solver
@@ -52,17 +52,14 @@ def read_solver_section(given: PyTree) -> tuple[Solver, int]:
     Raises:
         ScenarioError: A field is unknown, or a value has the wrong type or is out of range.
     """
-    table = {"type": _default_type(given), **given} if isinstance(given, Mapping) else given
-    found = read_one(SECTIONS, table, "solver")
+    if isinstance(given, Mapping):
+        fixed = {"step", "kinks"} & given.keys() and "rtol" not in given
+        given = {"type": "fixed" if fixed else "adaptive", **given}
+    found = read_one(SECTIONS, given, "solver")
     said = plain_fields(found)
     seed = said.pop("seed")
     kind = next(name for name, section in SECTIONS.items() if type(found) is section)
     return SOLVER_TYPES[kind](**said), seed
-
-
-def _default_type(given: Table) -> str:
-    """Return the type of a section that names none."""
-    return "fixed" if {"step", "kinks"} & given.keys() and "rtol" not in given else "adaptive"
 
 
 def write_solver_section(solver: Solver, seed: int) -> JsonObject:

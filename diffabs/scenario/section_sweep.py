@@ -24,7 +24,7 @@ Running the sweep needs the extra `sweep`.
 
 import dataclasses
 import pathlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from diffabs.core.loop import Loop
@@ -140,7 +140,15 @@ def read_sweep_section(
         correlation=lambda given, path: read_correlation(given, path) if given != {} else None,
         failures=metric_reader(objectives, "bounds by metric", lambda one: unit_of(one, loop.plant)),
     )
-    correlation = plan.correlation and _in_loop(plan.correlation, plan.over)
+    if not plan.correlation:
+        return plan
+    # The correlation may name a path in any allowed form; from here on it has the paths of the loop.
+    known = {canonical_path(path): path for path in plan.over}
+    paths = [canonical_path(path).removesuffix("_kmh") for path in plan.correlation.paths]
+    for path, given in zip(paths, plan.correlation.paths, strict=True):
+        if path not in known:
+            raise unknown_name_error(f"sweep.correlation.paths: {format_given(given)} does not vary", given, known)
+    correlation = dataclasses.replace(plan.correlation, paths=tuple(known[path] for path in paths))
     return dataclasses.replace(plan, correlation=correlation)
 
 
@@ -208,16 +216,6 @@ def _choice(key: str, given: PyTree, default: Any) -> Choice:
     family = key if key in FAMILIES else family_of(key, key)
     items = enumerate(zip(names, table["choices"], strict=True))
     return Choice(given, drawn, {name: build_part(family, item, default, f"{where}.{i}") for i, (name, item) in items})
-
-
-def _in_loop(correlation: Correlation, over: Iterable[str]) -> Correlation:
-    """Return the correlation with paths of the loop, for paths in any allowed form."""
-    known = {canonical_path(path): path for path in over}
-    paths = [canonical_path(path).removesuffix("_kmh") for path in correlation.paths]
-    for path, given in zip(paths, correlation.paths, strict=True):
-        if path not in known:
-            raise unknown_name_error(f"sweep.correlation.paths: {format_given(given)} does not vary", given, known)
-    return dataclasses.replace(correlation, paths=tuple(known[path] for path in paths))
 
 
 def build_study(chosen: Any) -> "Study":

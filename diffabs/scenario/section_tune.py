@@ -25,7 +25,7 @@ Paths are those of `parameter_paths`. Reading the section needs no extra; tuning
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -67,10 +67,6 @@ def _aggregate(given: PyTree, path: str) -> JsonObject:
     }
 
 
-def _mean() -> JsonObject:
-    return {"type": "mean"}
-
-
 @dataclasses.dataclass(frozen=True)
 class Goal:
     """The goal of a tuning, in SI.
@@ -98,7 +94,7 @@ class Goal:
     free: Mapping[str, Ends | None] = dataclasses.field(default_factory=dict)
     objective: Mapping[str, float] = dataclasses.field(default_factory=dict)
     over: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
-    aggregate: Table = table_field(_aggregate, _mean)
+    aggregate: Table = table_field(_aggregate, lambda: {"type": "mean"})
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def table(self) -> JsonObject:
@@ -237,17 +233,15 @@ def check_starts(loop: Loop, free: Mapping[str, Ends | None], section: str) -> N
     Raises:
         ScenarioError: A start is at an end of its range or outside.
     """
-    lines = [line for path, ends in free.items() for line in _at_range_end(loop, path, ends, section)]
+    lines = []
+    for path, ends in free.items():
+        spec, value = next((spec, value) for name, spec, value in parameters(loop) if name == path)
+        low, high = ends or (spec.low, spec.high)
+        low, high, value = np.broadcast_arrays(low, high, np.asarray(value, float))
+        for at in np.ndindex(value.shape):
+            inside = dataclasses.replace(spec, low=low[at], high=high[at], open_low=True, open_high=True)
+            if not inside.holds(value[at]):
+                name = ".".join([canonical_path(path), *map(str, at)])
+                lines.append(f"{name} = {value[at]:g} is outside {inside.interval()}, its range in {section}")
     if lines:
         raise ScenarioError("; ".join(lines))
-
-
-def _at_range_end(loop: Loop, path: str, ends: Ends | None, section: str) -> Iterator[str]:
-    spec, value = next((spec, value) for name, spec, value in parameters(loop) if name == path)
-    low, high = ends or (spec.low, spec.high)
-    low, high, value = np.broadcast_arrays(low, high, np.asarray(value, float))
-    for at in np.ndindex(value.shape):
-        inside = dataclasses.replace(spec, low=low[at], high=high[at], open_low=True, open_high=True)
-        if not inside.holds(value[at]):
-            name = ".".join([canonical_path(path), *map(str, at)])
-            yield f"{name} = {value[at]:g} is outside {inside.interval()}, its range in {section}"

@@ -25,11 +25,6 @@ def parse_toml(text: str) -> JsonObject:
         table = tomllib.loads(text)
     except RecursionError:
         raise ScenarioError("its values are nested too deeply") from None
-    _refuse_extremes(table)
-    return table
-
-
-def _refuse_extremes(table: JsonObject) -> None:
     # A loop with its own stack: recursion would fail on the deep nesting that it must refuse.
     pending: list[tuple[str, int, PyTree]] = [(key, 1, item) for key, item in table.items()]
     while pending:
@@ -41,6 +36,7 @@ def _refuse_extremes(table: JsonObject) -> None:
             pending += [(f"{where}.{key}", level + 1, each) for key, each in inside]
         elif isinstance(item, int) and not -MAX_INTEGER <= item < MAX_INTEGER:
             raise ScenarioError(f"{format_given(where)} is a whole number outside [-2^63, 2^63)")
+    return table
 
 
 def parse_value(text: str) -> Scalar:

@@ -1,8 +1,5 @@
 """Accuracy of a sweep's metrics: a random sample of its runs, repeated with steps of half the length."""
 
-from collections.abc import Iterator
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,7 +39,17 @@ def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
     half = {name: np.full(len(samples), np.nan) for name in found.metrics}
     alike, fine = np.zeros(len(samples), bool), np.zeros(len(samples), bool)
     stopped = found.column("stopped")[samples]
-    for places, run, known in _rerun_halved_step(study, samples):
+    loops, keys = zip(*map(study.lane, samples.tolist()), strict=True) if len(samples) else ((), ())
+
+    def rerun(loop: Part, key: Key) -> tuple[Run, PyTree]:
+        return measure_finer(loop, study.solver, study.objectives, 2, key=key), is_comparable(loop, study.solver, key)
+
+    for places in group_by_structure(loops):  # loops of one structure share a program
+        loop, batch = stack_loops([loops[i] for i in places])
+        lanes = batch.values, jnp.stack([keys[i] for i in places])
+        with precision(study.dtype):
+            both = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, rerun))(*lanes)
+            run, known = jax.device_get(both)
         for name, column in half.items():
             column[places] = run.metrics[name]
         fine[places] = known
@@ -94,24 +101,6 @@ def _has_flag(found: Results, flag: str) -> np.ndarray:
     except KeyError:
         return np.zeros(len(found.column("sample")), bool)
     return column != "" if column.dtype.kind in "OU" else column.astype(bool)
-
-
-def _rerun_halved_step(study: Study, samples: np.ndarray) -> Iterator[tuple[list[int], Run, np.ndarray]]:
-    """Yield for each structure of the loop: places among the samples, their runs, and whether these can be compared."""
-    loops, keys = zip(*map(study.lane, samples.tolist()), strict=True) if len(samples) else ((), ())
-    for places in group_by_structure(loops):
-        loop, batch = stack_loops([loops[i] for i in places])
-        lanes = batch.values, jnp.stack([keys[i] for i in places])
-        with precision(study.dtype):
-            both = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, partial(_measure_half_step, study)))(
-                *lanes
-            )
-            run, known = jax.device_get(both)
-        yield places, run, known
-
-
-def _measure_half_step(study: Study, loop: Part, key: Key) -> tuple[Run, PyTree]:
-    return measure_finer(loop, study.solver, study.objectives, 2, key=key), is_comparable(loop, study.solver, key)
 
 
 def _summarise_changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> JsonObject:

@@ -138,19 +138,14 @@ def _check_manifest(given: PyTree) -> JsonObject:
     manifest = {name: value for name, value in given.items() if name != "digest"}
     if given.get("digest") != json_digest(manifest):
         raise ValueError("it was changed after it was written: its digest is another one")
-    _check_study(read_table(_Manifest, manifest, "", "a manifest"))
-    return manifest
-
-
-def _check_study(manifest: "_Manifest") -> None:
-    """Raise ScenarioError for a study that a reader cannot use."""
-    study = manifest.study
+    study = read_table(_Manifest, manifest, "", "a manifest").study
     for name in study.failures:
         if name not in study.objectives:
             raise unknown_name_error(f"study.failures.{format_given(name)} is not measured", name, study.objectives)
     study.space.check(study.samples)
     for name in {"sample", *FLAG_COLUMNS, *study.space.paths} & study.objectives.keys():
         raise ScenarioError(f"study.objectives.{name}: another column of the table has this name")
+    return manifest
 
 
 def _read_utf8(given: PyTree, path: str) -> str:

@@ -69,9 +69,10 @@ class Runner:
             columns |= {name: np.zeros(len(columns["sample"]), bool) for name in FLAG_COLUMNS[:-1]}
             columns |= {FLAG_COLUMNS[-1]: np.full(len(columns["sample"]), "", object)}
         for names, blocks in self._sort_into_blocks(drawn).items():
+            run = partial(self._run_on_device, self._variant(names), self._program(names))
             for k in range(0, len(blocks), len(self.devices)):
-                together = blocks[k : k + len(self.devices)]
-                for block, found in zip(together, self._run_on_devices(names, together), strict=True):
+                together = blocks[k : k + len(self.devices)]  # at most one for each device
+                for block, found in zip(together, self._pool.map(run, together, self.devices), strict=True):
                     for name, column in found.items():
                         drawn[block.chunk][name][block.lanes] = column[: len(block.lanes)]
         return drawn
@@ -97,13 +98,6 @@ class Runner:
                     found.setdefault(kind, []).append(block)
         return found
 
-    def _run_on_devices(self, names: tuple[str, ...], blocks: list[_Block]) -> Iterator[Columns]:
-        """Run at most one block on each device."""
-        loop, program = self._variant(names), self._program(names)
-        return self._pool.map(
-            lambda block, device: self._run_on_device(loop, program, block, device), blocks, self.devices
-        )
-
     def _run_on_device(self, loop: Part, program: Any, block: _Block, device: Any) -> Columns:
         with jax.default_device(device):
             asked = batch_admissibility(loop, block.values, self.study.solver)
@@ -115,11 +109,6 @@ class Runner:
     def _arguments(self, block: _Block, accepted: Bool) -> tuple[PyTree, ...]:
         values = {path: column.astype(self.study.dtype) for path, column in block.values.items()}
         return values, block.samples.astype(np.uint32), accepted
-
-    def _compile_program(self, names: tuple[str, ...], block: _Block) -> None:
-        """Trace the program of some parts, and compile its kernel."""
-        with precision(self.study.dtype), _convert_compiler_errors():
-            self._program(names).lower(*self._arguments(block, np.ones(self.size, bool)))
 
     def _variant(self, names: tuple[str, ...]) -> Any:
         return self.study.variant(dict(zip(self.study.parts, names, strict=True)))
@@ -155,7 +144,9 @@ def find_study_objection(study: Study) -> str | None:
     runner = Runner(study, jax.local_devices()[:1])
     try:
         for names, blocks in runner._sort_into_blocks([runner._draw_chunk(0)]).items():
-            runner._compile_program(names, blocks[0])
+            with precision(study.dtype), _convert_compiler_errors():
+                # Lowering a program also compiles its kernel.
+                runner._program(names).lower(*runner._arguments(blocks[0], np.ones(runner.size, bool)))
     except ValueError as error:
         return str(error)
     return None

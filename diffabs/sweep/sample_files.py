@@ -35,10 +35,7 @@ def read_column(path: pathlib.Path, column: str) -> np.ndarray:
         raise ValueError(f"{path} is no {path.suffix[1:]} file: {str(error).splitlines()[0]}") from None
     if column not in table.column_names:
         raise unknown_name_error(f"{path} has no column {column}", column, table.column_names)
-    return _parse_numbers(table.column(column), f"{path}, column {column}")
-
-
-def _parse_numbers(values: pa.ChunkedArray, where: str) -> np.ndarray:
+    values, where = table.column(column), f"{path}, column {column}"
     if len(values) == 0:
         raise ValueError(f"{where} is empty")
     found = np.array([_parse_number(value) for value in values.to_pylist()])

@@ -75,16 +75,15 @@ def encode_chunk(columns: Mapping[str, np.ndarray], seal: Seal, units: Mapping[s
         seal: Seal of the chunk.
         units: Units of columns, where they are known; a field's metadata holds its unit under `unit`.
     """
-    arrays = {name: _arrow_array(column) for name, column in columns.items()}
+    arrays = {
+        name: pa.array(column.astype(str)).dictionary_encode() if column.dtype.kind in "OU" else pa.array(column)
+        for name, column in columns.items()
+    }
     told = {name: {"unit": unit} for name, unit in (units or {}).items()}
     schema = pa.schema([pa.field(n, array.type, metadata=told.get(n)) for n, array in arrays.items()], seal.metadata())
     buffer = io.BytesIO()
     pq.write_table(pa.table(list(arrays.values()), schema), buffer, compression="zstd")
     return buffer.getvalue()
-
-
-def _arrow_array(column: np.ndarray) -> pa.Array:
-    return pa.array(column.astype(str)).dictionary_encode() if column.dtype.kind in "OU" else pa.array(column)
 
 
 def chunk_file_name(chunk: int, data: bytes) -> str:
@@ -121,9 +120,16 @@ def verify_chunk(data: bytes, path: pathlib.Path, seal: Seal) -> pq.ParquetFile:
             raise DamagedError(
                 f"{path} is not that chunk: its {_describe_metadata(wrong, told)}; --resume computes it again"
             )
-        _check_table(found, path, seal)
+        missing = sorted(seal.columns - set(found.schema_arrow.names))
+        if missing:
+            raise DamagedError(f"{path} has no column {missing[0]}; --resume computes it again")
+        samples = found.read(["sample"]).column("sample").to_numpy()
+        if not np.array_equal(samples, np.arange(*seal.rows)):
+            wanted = f"samples {seal.rows[0]} to {seal.rows[1] - 1}"
+            raise DamagedError(f"{path} does not have {wanted}; --resume computes it again")
     except (pa.ArrowException, OSError) as error:
-        raise DamagedError(f"{path} is no chunk: {_line(error)}; --resume computes it again") from None
+        why = " ".join(str(error).split())
+        raise DamagedError(f"{path} is no chunk: {why}; --resume computes it again") from None
     return found
 
 
@@ -132,17 +138,6 @@ def _describe_metadata(key: bytes, told: Mapping[bytes, bytes]) -> str:
     return (
         f"{kind} is {told[key].decode(errors='replace')[:DIGEST_DIGITS]!r}" if key in told else f"{kind} is not in it"
     )
-
-
-def _check_table(found: pq.ParquetFile, path: pathlib.Path, seal: Seal) -> None:
-    """Raise DamagedError for missing columns or other samples."""
-    missing = sorted(seal.columns - set(found.schema_arrow.names))
-    if missing:
-        raise DamagedError(f"{path} has no column {missing[0]}; --resume computes it again")
-    samples = found.read(["sample"]).column("sample").to_numpy()
-    if not np.array_equal(samples, np.arange(*seal.rows)):
-        wanted = f"samples {seal.rows[0]} to {seal.rows[1] - 1}"
-        raise DamagedError(f"{path} does not have {wanted}; --resume computes it again")
 
 
 def tables_digest(tables: Iterable[pa.Table]) -> str:
@@ -159,7 +154,3 @@ def tables_digest(tables: Iterable[pa.Table]) -> str:
             whole.update(f"{column}\0{data.dtype}\0".encode())
             whole.update("\0".join(data).encode() if data.dtype.kind == "O" else np.ascontiguousarray(data).data)
     return whole.hexdigest()
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())

@@ -79,9 +79,6 @@ class Correlation:
                 yield f"{name}: {path} is named {self.paths.count(path)} times"
             if variables is not None and (path not in variables or isinstance(variables[path], Rows)):
                 yield f"{name}: {path} is not a variable with a distribution of its own"
-        yield from self._matrix_problems(name)
-
-    def _matrix_problems(self, name: str) -> Iterator[str]:
         n = len(self.paths)
         try:
             matrix = np.asarray(self.matrix, float)
@@ -139,7 +136,10 @@ class Space:
     @property
     def paths(self) -> tuple[str, ...]:
         """Paths of the parameters, in order."""
-        return tuple(path for name, item in self.variables.items() for path in _variable_paths(name, item))
+        paths = []
+        for name, item in self.variables.items():
+            paths += item.columns if isinstance(item, Rows) else [name]
+        return tuple(paths)
 
     def check(self, samples: int | None = None) -> int:
         """Return the number of samples of the design; `samples` is the wanted number, or None.
@@ -234,10 +234,6 @@ def read_space(given: PyTree, where: str) -> Space:
         ScenarioError: One of these is wrong; the message is one line. `Space.check` finds errors in their combination.
     """
     return values.read_table(Space, given, where)
-
-
-def _variable_paths(name: str, item: Any) -> tuple[str, ...]:
-    return tuple(item.columns) if isinstance(item, Rows) else (name,)
 
 
 def _flatten_rows(values: Params) -> dict[str, np.ndarray]:

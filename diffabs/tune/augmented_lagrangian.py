@@ -99,7 +99,31 @@ class AugmentedLagrangianSearch:
         best = min(usable, key=lambda descent_state: self._rank(descent_state.history[-1]))
         if self.stopping() and self.best:
             best = dataclasses.replace(self.best, reason=Reason.INTERRUPTED)
-        return self._build_result(best, descent_states)
+        last = best.history[-1]
+        part = problem.space.at(problem.subject, jnp.asarray(best.z))
+        return Tuned(
+            part=jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, part),
+            values=self._values(best.z),
+            objective=(float(self.before.objective), last.objective),
+            violation=(float(np.max(self.before.excess, initial=0.0)), last.violation),
+            metrics=(self.before.metrics, best.evaluation.metrics),
+            met=last.violation <= 0,
+            reason=best.reason or Reason.LIMIT,
+            history=best.history,
+            starts=[
+                StartResult(
+                    values=self._values(descent_state.z),
+                    objective=descent_state.history[-1].objective,
+                    violation=descent_state.history[-1].violation,
+                    reason=descent_state.reason or Reason.LIMIT,
+                    history=descent_state.history,
+                )
+                for descent_state in descent_states
+            ],
+            mode=problem.mode,
+            diverged=(int(self.before.diverged), int(best.evaluation.diverged)),
+            engine=describe_engine(problem.engine),
+        )
 
     def _run_rounds(self, descent: Descent) -> list[DescentState]:
         """Run descents, each followed by a multiplier update, until every constraint holds or the rounds are spent."""
@@ -157,36 +181,6 @@ class AugmentedLagrangianSearch:
             f"{worst} of {self.problem.batch.size} lanes diverge there"
             if worst
             else self.refused or f"solver.step = {self.problem.solver.step:g} s"
-        )
-
-    def _build_result(self, best: DescentState, descent_states: list[DescentState]) -> Tuned:
-        def start(descent_state: DescentState) -> StartResult:
-            last = descent_state.history[-1]
-            return StartResult(
-                self._values(descent_state.z),
-                last.objective,
-                last.violation,
-                descent_state.reason or Reason.LIMIT,
-                descent_state.history,
-            )
-
-        last = best.history[-1]
-        values = self._values(best.z)
-        part = self.problem.space.at(self.problem.subject, jnp.asarray(best.z))
-        part = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, part)
-        return Tuned(
-            part=part,
-            values=values,
-            objective=(float(self.before.objective), last.objective),
-            violation=(float(np.max(self.before.excess, initial=0.0)), last.violation),
-            metrics=(self.before.metrics, best.evaluation.metrics),
-            met=last.violation <= 0,
-            reason=best.reason or Reason.LIMIT,
-            history=best.history,
-            starts=[start(descent_state) for descent_state in descent_states],
-            mode=self.problem.mode,
-            diverged=(int(self.before.diverged), int(best.evaluation.diverged)),
-            engine=describe_engine(self.problem.engine),
         )
 
     def _values(self, z: np.ndarray) -> dict[str, PyTree]:

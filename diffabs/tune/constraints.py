@@ -86,7 +86,9 @@ class Poles:
 
     def _modes(self, loop: Loop) -> tuple[PyTree, PyTree]:
         """Return Re s and -Re s/|s| of the poles, each of shape (vertices, n)."""
-        modes = jnp.linalg.eigvals(_closed_loop_matrices(self.system, loop))
+        gain = feedback_gain(loop, self.system.states)
+        # A + B K of every vertex, with the gain K of the loop's controller.
+        modes = jnp.linalg.eigvals(jnp.asarray(self.system.A) + jnp.asarray(self.system.B) @ gain[None, :])
         if self.system.period is not None:
             # ln 0 and its derivative are infinite, so a pole at z = 0 is replaced before the logarithm.
             alive = jnp.abs(modes) > MIN_POLE_MAGNITUDE
@@ -117,9 +119,3 @@ class CertifiedDecay:
         system = self.system
         proved = certified_decay(feedback_gain(loop, system.states), system.A, system.B, system.period)
         return ((self.decay - proved) / max(abs(self.decay), 1.0))[None]
-
-
-def _closed_loop_matrices(system: Polytope, loop: Loop) -> PyTree:
-    """Return A + B K of every vertex, shape (vertices, n, n), with the gain K of the loop's controller."""
-    gain = feedback_gain(loop, system.states)
-    return jnp.asarray(system.A) + jnp.asarray(system.B) @ gain[None, :]

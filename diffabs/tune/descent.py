@@ -208,28 +208,26 @@ class Descent:
         self._propose(descent_states, [descent_state.reason is None for descent_state in descent_states])
         self.told(descent_states)
         while any(descent_state.reason is None for descent_state in descent_states) and not self.interrupted():
-            self._try_steps(descent_states)
+            # One trial step of each start that has not ended; the others only fill the compiled batch.
+            trials = np.stack(
+                [descent_state.z + descent_state.t * descent_state.update for descent_state in descent_states]
+            )
+            found, fine = self._evaluate_at(trials)
+            moved = []
+            for i, descent_state in enumerate(descent_states):
+                taken = (
+                    self._judge(descent_state, fine[i], trials[i], slice_start(found, i))
+                    if descent_state.reason is None
+                    else None
+                )
+                if taken:
+                    self._take(descent_state, *taken)
+                moved.append(taken is not None and descent_state.reason is None)
+            self._propose(descent_states, moved)
             self.told(descent_states)
         for descent_state in descent_states:
             descent_state.reason = descent_state.reason or Reason.INTERRUPTED
         return descent_states
-
-    def _try_steps(self, descent_states: list[DescentState]) -> None:
-        trials = np.stack(
-            [descent_state.z + descent_state.t * descent_state.update for descent_state in descent_states]
-        )
-        found, fine = self._evaluate_at(trials)
-        moved = []
-        for i, descent_state in enumerate(descent_states):
-            taken = (
-                self._judge(descent_state, fine[i], trials[i], slice_start(found, i))
-                if descent_state.reason is None
-                else None
-            )
-            if taken:
-                self._take(descent_state, *taken)
-            moved.append(taken is not None and descent_state.reason is None)
-        self._propose(descent_states, moved)
 
     def _evaluate_at(self, z: np.ndarray) -> tuple[LossEvaluation, np.ndarray]:
         """Return the evaluation at z and a mask (starts,) of the finite, admissible points."""

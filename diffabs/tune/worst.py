@@ -27,7 +27,7 @@ from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.types import Run, Solver
+from diffabs.simulate.types import Solver
 from diffabs.tune.descent import Descent, DescentState, Stopping, lbfgs
 from diffabs.tune.problem import DerivativeMode, Multipliers, Problem, choose_gradient_mode
 from diffabs.tune.risk import Mean
@@ -147,56 +147,52 @@ def worst_case(
         ValueError: A path or range does not fit, the metric is unknown, or a screened point cannot be run.
     """
     check_part(loop)
-    measured = _check_objectives(loop, metric, measured)
+    measured = default_objectives(loop.plant) if measured is None else measured
+    if metric not in measured:
+        raise ValueError(f"{metric} is not measured; there is {', '.join(measured)}")
     middle = replace(loop, {path: 0.5 * (np.asarray(a, float) + np.asarray(b, float)) for path, (a, b) in over.items()})
     free, key = parameter_space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
-    corners = _box_corners(np.array(free.ranges))
-    points = np.concatenate([corners, _draw_points(np.array(free.ranges), screen, seed)])
-    lanes = Batch(_values_by_path(free, points), None if key is None else np.repeat(key, len(points)))
-    screened = _run_screening(loop, lanes, solver, measured, engine)
+    ranges = np.array(free.ranges)
+    corners = np.array(list(itertools.islice(itertools.product(*ranges), MAX_CORNERS)))
+    points = np.concatenate([corners, _draw_points(ranges, screen, seed)])
+    batch = Batch(_values_by_path(free, points), None if key is None else np.repeat(key, len(points)))
+    if line := first_refusal(loop, batch.values, solver):
+        raise ValueError(f"the box has points that cannot be run; {line}")
+    screened = jax.device_get(run_batch(loop, batch, solver, measured, accepted=True, engine=engine))
     # NaN sorts last: a diverged point is a counterexample of its own, not a start.
-    worst = np.argsort(-np.nan_to_num(screened.metrics[metric], nan=-np.inf))[:starts]
+    values = np.nan_to_num(screened.metrics[metric], nan=-np.inf)
+    worst = np.argsort(-values)[:starts]
     # The weight -1 turns the minimisation of Problem into a maximisation.
     problem = Problem(
         middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), choose_gradient_mode(free)
     )
     problem = problem.with_engine(engine)
     lanes = _ascend(problem, points[worst], iterations) if starts else []
-    cost = len(points) + (price or _gradient_price(problem)) * sum(lane.evaluations for lane in lanes)
-    return _build_worst_case(loop, free, metric, bound, points, len(corners), screened, lanes, cost)
-
-
-def _check_objectives(loop: Part, metric: str, measured: Mapping[str, Objective] | None) -> Mapping[str, Objective]:
-    """Return the given or the default objectives.
-
-    Raises:
-        ValueError: The metric is not among them.
-    """
-    found = default_objectives(loop.plant) if measured is None else measured
-    if metric not in found:
-        raise ValueError(f"{metric} is not measured; there is {', '.join(found)}")
-    return found
-
-
-def _gradient_price(problem: Problem) -> float:
-    """Return the cost of a gradient in rollouts."""
-    return 1 + 1.5 * problem.space.size if problem.mode is DerivativeMode.FORWARD else 6.0
-
-
-def _run_screening(loop: Part, lanes: Batch, solver: Solver, measured: Mapping[str, Objective], engine: str) -> Run:
-    """Run every point.
-
-    Raises:
-        ValueError: A point cannot be run.
-    """
-    if line := first_refusal(loop, lanes.values, solver):
-        raise ValueError(f"the box has points that cannot be run; {line}")
-    return jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True, engine=engine))
-
-
-def _box_corners(ranges: np.ndarray) -> np.ndarray:
-    """Return the first `MAX_CORNERS` corners of the box, shape (corners, p)."""
-    return np.array(list(itertools.islice(itertools.product(*ranges), MAX_CORNERS)))
+    price = price or (1 + 1.5 * free.size if problem.mode is DerivativeMode.FORWARD else 6.0)
+    # The worst screened point, unless an ascent has found a worse one.
+    i = int(np.argmax(values))
+    place, value = _values_by_path(free, points[i]), float(values[i])
+    metrics = {name: x[i] for name, x in screened.metrics.items()}
+    for lane in lanes:
+        if lane.reason is not Reason.START and -float(lane.evaluation.objective) > value:
+            place, value = free.values(jnp.asarray(lane.z)), -float(lane.evaluation.objective)
+            metrics = {name: x[0] for name, x in lane.evaluation.metrics.items()}
+    place = {path: np.asarray(x) for path, x in place.items()}
+    bad = np.flatnonzero(screened.diverged | np.isnan(screened.metrics[metric]))
+    return WorstCase(
+        metric=metric,
+        values=place,
+        value=value,
+        corners=len(corners),
+        corner=float(np.max(values[: len(corners)])),
+        screened=float(values[i]),
+        metrics={name: float(x) for name, x in metrics.items()},
+        loop=replace(loop, place),
+        rollouts=len(points) + price * sum(lane.evaluations for lane in lanes),
+        bound=bound,
+        diverged=_values_by_path(free, points[bad[0]]) if len(bad) else None,
+        reasons=[lane.reason or Reason.LIMIT for lane in lanes],
+    )
 
 
 def _draw_points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
@@ -238,43 +234,3 @@ def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[Desce
         lambda lanes: None,
     )
     return descent.run(z, none)
-
-
-def _build_worst_case(
-    loop: Part,
-    free: FreeSpace,
-    metric: str,
-    bound: float | None,
-    points: np.ndarray,
-    corners: int,
-    screened: Run,
-    lanes: list[DescentState],
-    rollouts: float,
-) -> WorstCase:
-    values = np.nan_to_num(screened.metrics[metric], nan=-np.inf)
-    i = int(np.argmax(values))
-    place, value, metrics = (
-        _values_by_path(free, points[i]),
-        float(values[i]),
-        {n: x[i] for n, x in screened.metrics.items()},
-    )
-    for lane in lanes:
-        if lane.reason is not Reason.START and -float(lane.evaluation.objective) > value:
-            place, value = free.values(jnp.asarray(lane.z)), -float(lane.evaluation.objective)
-            metrics = {name: x[0] for name, x in lane.evaluation.metrics.items()}
-    bad = np.flatnonzero(screened.diverged | np.isnan(screened.metrics[metric]))
-    place = {path: np.asarray(x) for path, x in place.items()}
-    return WorstCase(
-        metric=metric,
-        values=place,
-        value=value,
-        corners=corners,
-        corner=float(np.max(values[:corners])),
-        screened=float(values[i]),
-        metrics={name: float(x) for name, x in metrics.items()},
-        loop=replace(loop, place),
-        rollouts=rollouts,
-        bound=bound,
-        diverged=_values_by_path(free, points[bad[0]]) if len(bad) else None,
-        reasons=[lane.reason or Reason.LIMIT for lane in lanes],
-    )

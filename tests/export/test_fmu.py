@@ -154,7 +154,7 @@ def test_who_asks_for_another_is_given_none(tmp_path):
     assert Fmu(path, tmp_path / "a", guid="{no}").instance.value is None
 
 
-@killed_by("export/mockup.py", "enumerate(variables, 1)", "enumerate(variables)")
+@killed_by("export/mockup.py", "enumerate(plant.variables, 1)", "enumerate(plant.variables)")
 @killed_by("export/mockup.py", '{"unit": make_printable(one.unit)}', "{}")
 @killed_by("export/mockup.py", "zipfile.ZipInfo(path, LONG_AGO)", "path")
 def test_the_description_says_what_is_what(tmp_path):

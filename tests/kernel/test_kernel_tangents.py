@@ -110,14 +110,14 @@ class TestLaunch:
     )
     @killed_by(
         "kernel/binding.py",
-        "x = jnp.moveaxis(x, 0, at)\n    return",
-        "x = jnp.moveaxis(x[::-1], 0, at)\n    return",
+        "x = jnp.moveaxis(x, 0, at)",
+        "x = jnp.moveaxis(x[::-1], 0, at)",
         case="three tangents",
     )
     @killed_by(
         "kernel/binding.py",
-        "jnp.moveaxis(x, axis, 0)\n    if shared:",
-        "0 * x + jnp.moveaxis(x, axis, 0)[:1]\n    if shared:",
+        "jnp.moveaxis(x, axis, 0)\n            if shared:",
+        "0 * x + jnp.moveaxis(x, axis, 0)[:1]\n            if shared:",
         case="for several gains",
     )
     @pytest.mark.parametrize("way", cases(WAYS, *SECOND))

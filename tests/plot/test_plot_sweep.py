@@ -299,7 +299,7 @@ def test_cells_without_a_run_are_empty(made):
     assert table[4, 1] == table[5, 0] == 1
 
 
-@killed_by("plot/sweeps.py", "np.maximum.at(table, cell, values)", "table[:] = values.max()")
+@killed_by("plot/sweeps.py", "np.maximum.at(greatest, cell, values)", "greatest[:] = values.max()")
 def test_a_map_without_failures_shows_the_strongest_inputs(found, made):
     metrics = {"overshoot": OVERSHOOT, "effort": 5 + A}
     sweep = made({"a": A, "b": B, "c": C}, metrics, failures={"overshoot": 9.0})

@@ -94,7 +94,7 @@ def test_seeking_climbs_at_its_gain_and_stays_within_its_limits():
     np.testing.assert_allclose(block.output(np.pi / 60.0, down, None), 1.1 * block.setpoint(down), rtol=1e-12)
 
 
-@killed_by("references/extremum_seeking.py", "return self.gain * e", "return -self.gain * e")
+@killed_by("references/extremum_seeking.py", "climb = self.gain * e", "climb = -self.gain * e")
 @pytest.mark.slow
 def test_seeking_ends_at_the_peak_of_a_road():
     """From either side, under a controller, on a road whose peak is known."""

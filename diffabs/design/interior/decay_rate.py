@@ -122,28 +122,25 @@ def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree
     def goes_on(path: _DecayPathState) -> Matrix:
         return (path.steps < MAX_DECAY_STEPS) & (path.settled < FINAL_CENTRE_STEPS) & jnp.isfinite(path.decrement)
 
-    path = lax.while_loop(goes_on, lambda path: _advance_path(closed, path, inverse, discrete), start)
+    def advance(path: _DecayPathState) -> _DecayPathState:
+        """Return the state after a step, with the next mu if the step began near the centre."""
+        # M is the unit matrix in balanced units; in the coordinates of the point it is T'M T.
+        scaled = inverse[:, None] * path.T
+        c, m = _transform_loops(closed, path.T), scaled.T @ scaled / jnp.sum(scaled**2)
+        T, s, decrement = _step(c, path, m, discrete)
+        size = _largest_norm(_lyapunov_operator(_transform_loops(closed, T), one, discrete))
+        end = jnp.maximum(SHIFT_GAP * jnp.abs(s), ROUNDING_SHIFT_GAP * size) / (vertices + 1) / n
+        last = path.mu <= 1.01 * end
+        # Without an attained optimum P degenerates and the decrement stays large: after MAX_STEPS_PER_MU steps mu falls
+        # anyway.
+        ahead = ((decrement < CENTRING_DECREMENT) | (path.patience >= MAX_STEPS_PER_MU)) & ~last
+        mu = jnp.where(ahead, jnp.maximum(MU_REDUCTION * path.mu, end), path.mu)
+        patience = jnp.where(ahead, 0, path.patience + 1)
+        return _DecayPathState(path.steps + 1, patience, T, s, mu, decrement, path.settled + (last & (decrement < 0.1)))
+
+    path = lax.while_loop(goes_on, advance, start)
     slack = path.s * one - _lyapunov_operator(_transform_loops(closed, path.T), one, discrete)
     return jnp.where(jnp.isfinite(path.decrement), path.s, jnp.nan), path.T, jnp.linalg.inv(slack)
-
-
-def _advance_path(closed: Matrix, path: _DecayPathState, inverse: Matrix, discrete: bool) -> _DecayPathState:
-    """Return the state after a step, with the next mu if the step began near the centre.
-
-    `inverse` holds 1/unit of each state.
-    """
-    size = inverse[:, None] * path.T
-    T, s, decrement = _step(_transform_loops(closed, path.T), path, size.T @ size / jnp.sum(size**2), discrete)
-    vertices, n, _ = closed.shape
-    size = _largest_norm(_lyapunov_operator(_transform_loops(closed, T), jnp.eye(n), discrete))
-    end = jnp.maximum(SHIFT_GAP * jnp.abs(s), ROUNDING_SHIFT_GAP * size) / (vertices + 1) / n
-    last = path.mu <= 1.01 * end
-    # Without an attained optimum P degenerates and the decrement stays large: after MAX_STEPS_PER_MU steps mu falls
-    # anyway.
-    ahead = ((decrement < CENTRING_DECREMENT) | (path.patience >= MAX_STEPS_PER_MU)) & ~last
-    mu = jnp.where(ahead, jnp.maximum(MU_REDUCTION * path.mu, end), path.mu)
-    patience = jnp.where(ahead, 0, path.patience + 1)
-    return _DecayPathState(path.steps + 1, patience, T, s, mu, decrement, path.settled + (last & (decrement < 0.1)))
 
 
 def _step(c: Scalar, path: _DecayPathState, m: Scalar, discrete: bool) -> tuple[PyTree, PyTree, PyTree]:

@@ -54,11 +54,18 @@ class DesignProgram:
         # near 1.
         self.scale = float(np.trace(weight)) if spec.Q is not None else 1.0
         self.weight = weight / np.trace(weight)
-        self.output, self.disturbance = self._sizes(whole)
+        # In the frame P = I and R = I, so K = -B' is the gain of the Riccati solution.
+        k = -frame.inputs(whole.B[0]).T
+        self.output = self.disturbance = 1.0
+        if (l2 := spec.l2) is not None:
+            # Units of z and w in which the gain of the frame's closed loop is about 1.
+            z = np.linalg.norm(l2.output @ frame.T + l2.feedthrough @ frame.U @ k) / np.sqrt(frame.tau)
+            e = whole.B[0] if l2.disturbance is None else l2.disturbance
+            self.output = float(z) or 1.0
+            self.disturbance = float(np.linalg.norm(frame.inverse @ e)) / np.sqrt(frame.tau) or 1.0
         self.root, self.even = np.zeros((0, n)), np.eye(n)
         if spec.Q is not None:
-            # In the frame P = I and R = I, so K = -B' is the gain of the Riccati solution.
-            k, weight = -frame.inputs(whole.B[0]).T, frame.weight(spec.Q)
+            weight = frame.weight(spec.Q)
             self.root, self.even = _root(weight), whitening_matrix(weight + k.T @ k)
         self.common = list(self._common())
 
@@ -78,16 +85,6 @@ class DesignProgram:
         if self.spec.input is None:
             return 1.0
         return float(((self.frame.inverse @ self.spec.input.points.T) ** 2).sum(axis=0).max())
-
-    def _sizes(self, whole: Polytope) -> tuple[float, float]:
-        """Return units of z and w in which the gain of the frame's closed loop, K = -B', is about 1."""
-        l2, frame = self.spec.l2, self.frame
-        if l2 is None:
-            return 1.0, 1.0
-        k = -frame.inputs(whole.B[0]).T
-        z = np.linalg.norm(l2.output @ frame.T + l2.feedthrough @ frame.U @ k) / np.sqrt(frame.tau)
-        e = whole.B[0] if l2.disturbance is None else l2.disturbance
-        return float(z) or 1.0, float(np.linalg.norm(frame.inverse @ e)) / np.sqrt(frame.tau) or 1.0
 
     def read(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return gains (nodes, m, n) and forms P = X^-1 (nodes, n, n) of `y`, in the original coordinates."""

@@ -61,6 +61,7 @@ def summarise_sweep(found: Results, confidence: float = 0.95) -> JsonObject:
     view = _RowSelection(found, accepted & ~diverged, accepted)
     kind = found.study["space"]["design"]["type"]
     note = INTERVAL_NOTES["one sobol" if kind == "sobol" and view.replicates == 1 else kind]
+    reasons, counts = np.unique(found.column("refused")[~accepted].astype(str), return_counts=True)
     return {
         "samples": len(diverged),
         "complete": found.complete,
@@ -68,7 +69,11 @@ def summarise_sweep(found: Results, confidence: float = 0.95) -> JsonObject:
             "count": int(diverged.sum()),
             "samples": found.column("sample")[diverged][:MAX_LISTED_SAMPLES].tolist(),
         },
-        "refused": _summarise_refused(found, accepted),
+        "refused": {
+            "count": int(np.sum(~accepted)),
+            "samples": found.column("sample")[~accepted][:MAX_LISTED_SAMPLES].tolist(),
+            "reasons": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
+        },
         "confidence": confidence,
         "intervals": note,
         "failures": dict(_failure_probabilities(found, view, confidence)),
@@ -77,16 +82,6 @@ def summarise_sweep(found: Results, confidence: float = 0.95) -> JsonObject:
         "sensitivity": _summarise_sensitivity(found, view, confidence),
         "worst": {name: _worst_samples(found, view, name) for name in found.metrics},
         "digest": found.digest,
-    }
-
-
-def _summarise_refused(found: Results, accepted: np.ndarray) -> JsonObject:
-    """Return the number of refused samples, the first of them, and the count of each reason."""
-    reasons, counts = np.unique(found.column("refused")[~accepted].astype(str), return_counts=True)
-    return {
-        "count": int(np.sum(~accepted)),
-        "samples": found.column("sample")[~accepted][:MAX_LISTED_SAMPLES].tolist(),
-        "reasons": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
     }
 
 
