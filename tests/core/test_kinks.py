@@ -289,7 +289,9 @@ def test_a_step_ends_on_a_comparison_near_the_start():
     np.testing.assert_allclose(found, jax.jit(jax.jacfwd(iae))(gains), rtol=1e-12)
 
 
-@killed_by("simulate/step/fixed.py", "tired & (search.which < kinks)", "tired & False")
+@killed_by(
+    "simulate/step/fixed.py", "tired &= decision.searches & (after.search.which < system.comparisons)", "tired &= False"
+)
 def test_a_run_that_slides_along_a_kink_is_a_run():
     """x' = -sign(x - a) + 0.3: nobody can follow each switch; it stays within a step of the place, and says so."""
 
@@ -306,7 +308,9 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
 
 
 @killed_by(
-    "simulate/step/fixed.py", "fine &= carry.unrestricted | _is_plausible(carry, here) if kinks else True", "pass"
+    "simulate/step/fixed.py",
+    "fine &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True",
+    "pass",
 )
 def test_where_a_step_is_too_long_a_regime_is_not_believed():
     """Below its crawl speed a wheel is stiffer than any step, and a curve of friction beyond its kinks has no bound."""

@@ -51,8 +51,8 @@ class Slips:
 
 
 @killed_by(
-    "simulate/step/adaptive.py",
-    "jnp.where(again, RunStatus.SEEKING, RunStatus.LANDING)",
+    "simulate/step/event_location.py",
+    "jnp.where(missed, RunStatus.SEEKING, RunStatus.REFINING if refines else RunStatus.LANDING)",
     "jnp.asarray(RunStatus.LANDING)",
 )
 @killed_by("simulate/step/event_location.py", "((off > probe) | ((off == 0) & (search.margin != 0)))", "(off > probe)")

@@ -133,7 +133,7 @@ BOUNDS = {"relay": (1e-6, 2.0), "delay": (2e-9, 1.5), "rate limit": (1e-5, 1.4)}
 
 
 @killed_by(
-    "actuators/delay.py", "(h * rate for rate in passage.rates)", "(0.0 * rate for rate in passage.rates)", case="delay"
+    "actuators/delay.py", "(h * rate for rate in step.rates)", "(0.0 * rate for rate in step.rates)", case="delay"
 )
 @pytest.mark.slow
 @pytest.mark.parametrize("name", cases(BOUNDS, "rate limit"))

@@ -223,7 +223,7 @@ class TestAfterARun:
         assert all(np.isnan(x).all() for x in many.metrics.values())
 
     @killed_by(
-        "simulate/step/fixed.py",
+        "simulate/step/advance.py",
         "zero + RunStatus.RUNNING, zero + RunStatus.DIVERGED",
         "zero + RunStatus.RUNNING, zero + RunStatus.STOPPED",
     )

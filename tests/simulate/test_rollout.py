@@ -54,7 +54,7 @@ def test_standstill_of_a_locked_wheel_in_closed_form(step):
     np.testing.assert_allclose(run.metrics["locked_time"], (10 - 0.05) / DECELERATION, rtol=1e-12)
 
 
-@killed_by("simulate/step/fixed.py", "| (to_grid & ~changes))", "| to_grid)")
+@killed_by("simulate/step/advance.py", "(running & exact & ~crosses))", "(running & exact))")
 def test_speed_reached_lands_between_samples():
     loop = dataclasses.replace(SLIDING, stop=SpeedReached(speed=3.0))
     run = d.rollout(loop, d.FixedStep(0.01, 2.0), {"effort": Effort(), "variation": Variation()})
@@ -90,7 +90,7 @@ def test_the_peak_of_a_falling_slip_is_its_first_value():
     "(carry.status == RunStatus.TIMED_OUT) & ~diverged",
     "(carry.status == RunStatus.LANDING) & ~diverged",
 )
-@killed_by("simulate/step/fixed.py", "(on_grid & (carry.k + 1 >= steps))", "(on_grid & False)")
+@killed_by("simulate/step/fixed.py", "request.strikes & (request.strike >= self.steps)", "request.strikes & False")
 def test_a_run_that_does_not_stop_is_charged_the_rest():
     run = d.measure(SLIDING, d.FixedStep(1e-3, 0.5), BRAKING)
     assert run.timed_out

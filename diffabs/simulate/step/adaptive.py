@@ -168,7 +168,7 @@ class AdaptiveStepping:
     def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
         error_limited = jnp.minimum(INITIAL_STEP_S, self.h * self.steps) + 0.0 * self.h
-        foresee = partial(self._forecast_crossing, error_limited, 1.0)
+        foresee = partial(self._forecast_crossing, error_limited, jnp.asarray(False))
         carry = start_carry(self, loop, objectives, key, foresee)
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)

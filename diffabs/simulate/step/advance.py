@@ -100,23 +100,37 @@ class Decision(NamedTuple):
 
 
 class Stepping(Protocol):
-    """A stepping method: what `advance` needs of it.
+    """A stepping method: what `advance` needs of it."""
 
-    Attributes:
-        h: Step of the grid [s].
-        steps: Number of the last instant of the grid.
-        tableau: Coefficients of its Runge-Kutta step.
-        forecasts: True if the rates of all margins are evaluated.
-        searches: True if attempts may search for an event.
-        refines: True if the times of events have second derivatives.
-    """
+    @property
+    def h(self) -> Scalar:
+        """Step of the grid [s]."""
+        ...
 
-    h: Scalar
-    steps: Int
-    tableau: Tableau
-    forecasts: bool
-    searches: bool
-    refines: bool
+    @property
+    def steps(self) -> Int:
+        """Number of the last instant of the grid."""
+        ...
+
+    @property
+    def tableau(self) -> Tableau:
+        """Coefficients of its Runge-Kutta step."""
+        ...
+
+    @property
+    def forecasts(self) -> bool:
+        """True if the rates of all margins are evaluated."""
+        ...
+
+    @property
+    def searches(self) -> bool:
+        """True if attempts may search for an event."""
+        ...
+
+    @property
+    def refines(self) -> bool:
+        """True if the times of events have second derivatives."""
+        ...
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
         """Return True if the run goes on and has not reached the instant `until` of the grid."""

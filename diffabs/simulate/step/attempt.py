@@ -9,7 +9,6 @@ Nothing else integrates, projects or accumulates, and nothing else changes a blo
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -187,7 +186,7 @@ def attempt_step(
     rates = (point.signal_rates, seen.signal_rates)
     segment = Segment(
         *(point.sample, seen.signals.sample, h, request.grid),
-        shown_rates=lambda: tuple(Shown(*map(partial(getattr, one), Shown._fields)) for one in rates),
+        shown_rates=lambda: (Shown.of(rates[0]), Shown.of(rates[1])),
         sample_rates=lambda: rates,
         smooth=smooth,
         within=within,
