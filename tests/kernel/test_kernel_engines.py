@@ -3,8 +3,10 @@
 import dataclasses
 import json
 import logging
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import run
@@ -14,7 +16,8 @@ from seams import replace_seam
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, reliability, roads, scenario, stops, sweep, tune
-from diffabs.core.pytree import get
+from diffabs.core.protocols import no_flow, no_memory
+from diffabs.core.pytree import get, param, pytree
 from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.kernel import binaries, compilers, launch
 from diffabs.objectives import IAE, StopTime
@@ -47,6 +50,20 @@ STUDY = sweep.Study(
     LOCKED, sweep.Space(SPACE), samples=1, solver=d.FixedStep(5e-3, 3.0), objectives={"stop_time": StopTime()}
 )
 DELAYED = d.replace(LOOP, {"actuator": actuators.Delay(capacity=1024)})
+
+
+@pytree
+class SortedTorque:
+    """A controller with an operation for which a kernel has no rule."""
+
+    torque: Any = param(default=20.0, unit="N m")
+
+    start, flow = no_memory, no_flow
+
+    def output(self, t, memory, signal):
+        return jax.lax.sort(jnp.stack([self.torque, signal.target]))[1]
+
+
 NONE = f"{compilers.COMPILER} is empty"
 
 
@@ -118,8 +135,13 @@ class TestTune:
 
     @killed_by("kernel/primitives.py", "error.method = error.method or _calling_method(eqn)", "pass")
     def test_of_what_has_no_rule_names_the_part(self):
+        line = tune.build_problem(braking(controller=SortedTorque()), **TUNED, engine="kernel").objection()
+        assert line == "engine = 'kernel' is not possible: sort: there is no rule for it (in SortedTorque.output)"
+
+    @killed_by("simulate/drive/kernel.py", "if rows.shape[1] > MAX_COMPARED_ENTRIES:", "if False:")
+    def test_of_a_long_past_names_the_part(self):
         line = tune.build_problem(DELAYED, **TUNED, engine="kernel").objection()
-        why = "dynamic_slice: of 1296 entries that differ between lanes (in Delay.tick)"
+        why = "log: of 1296 rows; 64 are the most (in Delay.record)"
         assert line == f"engine = 'kernel' is not possible: {why}"
 
     @pytest.mark.slow

@@ -280,7 +280,11 @@ def test_reverse_mode_is_forward_mode(name):
     np.testing.assert_allclose(reverse(5.7), forward(5.7), rtol=1e-6)
 
 
-@killed_by("simulate/step/attempt.py", "        shift = shift_end(seen)", "        shift = 0.0 * shift_end(seen)")
+@killed_by(
+    "simulate/step/attempt.py",
+    "        shift = request.shift_end(seen)",
+    "        shift = 0.0 * request.shift_end(seen)",
+)
 @pytest.mark.slow
 def test_a_derivative_through_relay_and_latch_is_that_of_rk4():
     structure, loop = random_loops.STRUCTURES["relay, latch, lag"], random_loops.drawn("relay, latch, lag", 3, 0)

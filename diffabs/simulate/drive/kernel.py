@@ -14,12 +14,14 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core.compiling import is_traced
-from diffabs.core.loop import Loop
+from diffabs.core.log import log_rows
+from diffabs.core.loop import BLOCKS, Loop, LoopState
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero, moving_leaves
 from diffabs.core.types import Params, PyTree, Scalar
 from diffabs.kernel.compilers import NoCompiler
+from diffabs.kernel.indexing import MAX_COMPARED_ENTRIES
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
 from diffabs.simulate.drive.engine import check_process
@@ -138,6 +140,7 @@ def _run(
         return finish_run(*built(mine), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)
+    _check_logs(loop, begins.point.state)
     # `wanted` keeps tangents only for leaves of the carry that the results depend on.
     carry = run_lanes(
         lambda lane, carry: method.renew(built(lane[0])[0], carry),
@@ -150,6 +153,16 @@ def _run(
         wanted=moving_leaves(finish, leaves, begins),
     )
     return jax.vmap(finish)(leaves, carry)
+
+
+def _check_logs(loop: Loop, state: LoopState) -> None:
+    """Raise Unsupported if a block records its past in more rows, shape (runs, rows, n), than a kernel can index."""
+    for name in BLOCKS:
+        for rows in log_rows(getattr(state, name)):
+            if rows.shape[1] > MAX_COMPARED_ENTRIES:
+                error = Unsupported("log", f"of {rows.shape[1]} rows; {MAX_COMPARED_ENTRIES} are the most")
+                error.method = f"{type(getattr(loop, name)).__name__}.record"
+                raise error
 
 
 def _stop_unaccepted(accepted: Scalar, carry: PyTree) -> PyTree:

@@ -35,7 +35,6 @@ from diffabs.simulate.step.advance import (
     cast_floats,
     decide_attempt,
     have_same_answers,
-    mode_beyond,
     propose_step,
     start_carry,
 )
@@ -46,7 +45,6 @@ from diffabs.simulate.step.event_location import (
     find_surface_crossing,
     select,
 )
-from diffabs.simulate.step.modes import Mode
 from diffabs.simulate.step.runge_kutta import TSIT5, midpoint_error
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.step_size import (
@@ -242,14 +240,6 @@ class AdaptiveStepping:
         """Return the predicted time to the first change of an answer [s]."""
         return self._forecast_crossing(carry.control.error_limited, carry.unrestricted, seen)
 
-    def regular_length(self, carry: Carry) -> Scalar:
-        """Return the length of the attempt in which the event was first seen [s], the scale of a search."""
-        return jnp.where(carry.status == RunStatus.RUNNING, carry.length, carry.base)
-
-    def shift_end(self, carry: Carry, request: StepRequest) -> None:
-        """Return None: the run is made for its values."""
-        del carry, request
-
     def report(
         self, system: System, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
     ) -> AdaptiveReport:
@@ -268,11 +258,7 @@ class AdaptiveStepping:
         fine = jnp.isfinite(error)  # the maximum over all states: one NaN makes it NaN
         exact = fine & (((error <= 1) & (late <= 0)) | (carry.length <= self.least))
         last = request.strikes & (request.strike >= self.steps)
-        return decide_attempt(system, carry, attempt, active, fine, exact, last=last)
-
-    def mode_after(self, system: System, carry: Carry, attempt: Attempt, decision: Decision) -> Mode:
-        """Return the mode after the changes at the end of an accepted step."""
-        return mode_beyond(system, carry, attempt, decision, frozen=self.notes)
+        return decide_attempt(system, carry, attempt, active, fine, exact, last=last, frozen=self.notes)
 
     def refine(self, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
         """Return the carry `after` an attempt, with the length of the next attempt from there."""
@@ -307,6 +293,7 @@ class AdaptiveStepping:
         )
         return after._replace(
             length=length,
+            base=jnp.where(status == RunStatus.RUNNING, length, carry.base),
             strikes=strikes & ~searches & ~late & ~refreshes,
             unrestricted=unrestricted,
             control=control._replace(

@@ -58,7 +58,7 @@ class Carry(NamedTuple):
         since: Time since that instant [s]. A difference of two times would lose digits.
         length: Length of the next attempt [s].
         strikes: True if the next attempt ends where a clock strikes next, or with the run.
-        base: Length of a regular step [s], the scale of a search.
+        base: Length of the last regular step [s], the scale of a search within it.
         search: Search for an event.
         unrestricted: True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode.
         control: Numbers of the stepping method.
@@ -88,6 +88,7 @@ class Decision(NamedTuple):
         searches: True if an event or a switching surface lies inside and is to be located.
         crosses_surface: True if an accepted attempt ends on a switching surface.
         triggered: True for each event at its end.
+        mode: Mode after the changes at its end.
         over: True if the run ends there.
     """
 
@@ -96,6 +97,7 @@ class Decision(NamedTuple):
     searches: Bool
     crosses_surface: Bool
     triggered: Margins
+    mode: Mode
     over: Bool
 
 
@@ -152,20 +154,8 @@ class Stepping(Protocol):
         """Return what the method needs to know of an attempt, from the dynamics and the state at its end."""
         ...
 
-    def regular_length(self, carry: Carry) -> Scalar:
-        """Return the length of a regular step [s], the scale of a search."""
-        ...
-
-    def shift_end(self, carry: Carry, request: StepRequest) -> Callable[[Evaluation], Scalar] | None:
-        """Return a function for the time [s] to add to the step, or None."""
-        ...
-
     def decide(self, system: System, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool) -> Decision:
         """Return the decision on an attempt."""
-        ...
-
-    def mode_after(self, system: System, carry: Carry, attempt: Attempt, decision: Decision) -> Mode:
-        """Return the mode after the changes at the end of an accepted step."""
         ...
 
     def refine(self, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
@@ -200,8 +190,7 @@ def advance(
 
     def attempt_request() -> Attempt:
         report = partial(stepping.report, system, carry, request.h)
-        shift = stepping.shift_end(carry, request)
-        return attempt_step(system, start, request, stepping.tableau, forecast, report, shift)
+        return attempt_step(system, start, request, stepping.tableau, forecast, report)
 
     # Without the barriers, XLA would compile the attempt again into each expression that uses it.
     attempt = jit_barrier(active, attempt_request)
@@ -210,10 +199,9 @@ def advance(
     strikes = decision.taken & request.strikes
     k = jnp.where(strikes, request.strike, carry.k)
     clock = Clock(attempt.point.t, stepping.h, k, key, strikes)
-    mode = stepping.mode_after(system, carry, attempt, decision)
 
     def commit() -> Point:
-        return commit_step(system, start, attempt, clock, decision.triggered, mode, logs, forecast)
+        return commit_step(system, start, attempt, clock, decision.triggered, decision.mode, logs, forecast)
 
     # Where a run ends, no block changes any more.
     point = select(decision.over, attempt.point, jit_barrier(active, commit) if loop.changes else commit())
@@ -233,19 +221,18 @@ def _search(
     stepping: Stepping, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
 ) -> Carry:
     """Return the carry `after` an attempt with the search for an event continued, and with the next status."""
-    plan, base = SearchPlan(carry.search, carry.length, carry.status), stepping.regular_length(carry)
+    plan = SearchPlan(carry.search, carry.length, carry.status)
 
     def look() -> SearchPlan:
         margins = (jax.tree.leaves(point.margins) for point in (carry.point, attempt.point))
         crossings = find_crossings(carry.search.which, system.comparisons, attempt.report.surface, *margins)
-        found = continue_search(plan, crossings, base, system.comparisons, refines=stepping.refines)
+        found = continue_search(plan, crossings, carry.base, system.comparisons, refines=stepping.refines)
         return select(decision.searches, found, plan)
 
     # Few attempts search, so a batch skips the search unless one of its runs needs it.
     search, length, status = jax.lax.cond(any_lane(decision.searches), look, lambda: plan)
     status = jnp.where(decision.taken, status_after_step(system.loop, carry, attempt, decision), status)
-    base = jnp.where(decision.searches, base, carry.base)
-    return after._replace(base=base, search=search, length=length, status=status)
+    return after._replace(search=search, length=length, status=status)
 
 
 def start_carry(
@@ -304,6 +291,7 @@ def decide_attempt(
     exact: Bool,
     *,
     last: Bool,
+    frozen: bool,
 ) -> Decision:
     """Return the decision on an attempt: accept it, search within it, or end the run.
 
@@ -315,6 +303,7 @@ def decide_attempt(
         fine: True if the numbers of the attempt are finite and plausible.
         exact: True if it is also accurate enough.
         last: True if the run ends at the end of the attempt.
+        frozen: True if a step keeps to a mode.
     """
     running, landing, refreshing = (
         carry.status == one for one in (RunStatus.RUNNING, RunStatus.LANDING, RunStatus.REFRESHING)
@@ -328,24 +317,12 @@ def decide_attempt(
     triggered = [taken & landing & ((which == count + i) | one) for i, one in enumerate(crossed)]
     triggered = jax.tree.unflatten(jax.tree.structure(attempt.point.margins), triggered)
     over = triggered["stop"][0] | (taken & last)
-    on_surface = jnp.asarray(False) if surface is None else taken & landing & (which < count)
-    return Decision(fine, taken, searches, on_surface, triggered, over)
-
-
-def mode_beyond(system: System, carry: Carry, attempt: Attempt, decision: Decision, *, frozen: bool) -> Mode:
-    """Return the mode after the changes at the end of an accepted step.
-
-    Args:
-        system: Dynamics of the loop and its objectives.
-        carry: Carry before the step.
-        attempt: The step.
-        decision: Decision on it.
-        frozen: True if a step keeps to a mode.
-    """
-    if not frozen:
-        return UNCONSTRAINED
-    which, lands = carry.search.which, decision.crosses_surface
-    return mode_after_changes(system, flip_answer(system, attempt.point.words, which, lands), which, lands)
+    lands, mode = jnp.asarray(False), UNCONSTRAINED
+    if frozen:
+        lands = taken & landing & (which < count)
+        words = flip_answer(system, attempt.point.words, which, lands)
+        mode = mode_after_changes(system, words, which, lands)
+    return Decision(fine, taken, searches, lands, triggered, mode, over)
 
 
 def have_same_answers(carry: Carry, attempt: Attempt) -> Bool:

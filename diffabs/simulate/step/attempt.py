@@ -73,6 +73,8 @@ class StepRequest(NamedTuple):
         refresh: True for a step of length 0 that evaluates the rates after an event or a switching surface.
         strikes: True if the step ends where a clock strikes, or with the run.
         strike: Number of that instant of the grid.
+        shift_end: Function that returns the time [s] to add to the step, from the dynamics at its requested end; None
+            for none. The time is zero to rounding, but has the derivative of the event's time there.
     """
 
     h: Scalar
@@ -82,6 +84,7 @@ class StepRequest(NamedTuple):
     refresh: Bool
     strikes: Bool
     strike: Int
+    shift_end: Callable[[Evaluation], Scalar] | None = None
 
 
 class Attempt(NamedTuple):
@@ -143,7 +146,6 @@ def attempt_step(
     tableau: Tableau,
     forecast: Forecast,
     report: Callable[[Evaluation, LoopState, PyTree], PyTree],
-    shift_end: Callable[[Evaluation], Scalar] | None = None,
 ) -> Attempt:
     """Return the end of one Runge-Kutta step from a point.
 
@@ -155,8 +157,6 @@ def attempt_step(
         forecast: What the stepping method foresees from the end.
         report: What the stepping method needs for its decision, from the dynamics at the end, the state there, and the
             shares of the rates in the error.
-        shift_end: Time [s] to add to the step, from the dynamics at its requested end; None for none. It is zero to
-            rounding, but has the derivative of the event's time there.
     """
     loop, (t, h), mode = system.loop, (request.end, request.h), request.mode
     z, held = split_flow_and_held(point.state, point.accumulators)
@@ -166,9 +166,9 @@ def attempt_step(
 
     z, error = runge_kutta_step(tableau, flow, point.t, z, point.rates, h, (held, mode))
     shift = jnp.zeros_like(h)
-    if shift_end:
+    if request.shift_end:
         seen = system.evaluate(t, *with_flow(point.state, point.accumulators, z), mode)
-        shift = shift_end(seen)
+        shift = request.shift_end(seen)
         t, h, z = t + shift, h + shift, axpy(shift, seen.rates, z)
     state, accumulators = with_flow(point.state, point.accumulators, z)
     projected = state._replace(plant=loop.plant.project(state.plant))

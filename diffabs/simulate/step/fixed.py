@@ -25,13 +25,11 @@ from diffabs.simulate.step.advance import (
     cast_floats,
     decide_attempt,
     have_same_answers,
-    mode_beyond,
     propose_step,
     start_carry,
 )
 from diffabs.simulate.step.attempt import Attempt, StepRequest
 from diffabs.simulate.step.event_location import MAX_LOCATION_ATTEMPTS, SurfaceCrossing, find_surface_crossing
-from diffabs.simulate.step.modes import Mode
 from diffabs.simulate.step.runge_kutta import RK4
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import Evaluation, Objectives, System
@@ -141,15 +139,6 @@ class FixedStepping:
         del carry, seen
         return ()
 
-    def regular_length(self, carry: Carry) -> Scalar:
-        """Return the length of a step of the grid [s], the scale of a search."""
-        del carry
-        return self.h
-
-    def shift_end(self, carry: Carry, request: StepRequest) -> None:
-        """Return None: the length of the last step to an event carries the derivative of its time."""
-        del carry, request
-
     def report(
         self, system: System, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
     ) -> FixedStepReport:
@@ -162,11 +151,7 @@ class FixedStepping:
         fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(attempt.point.state.flow())]))
         fine &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True
         last = request.strikes & (request.strike >= self.steps)
-        return decide_attempt(system, carry, attempt, active, fine, fine, last=last)
-
-    def mode_after(self, system: System, carry: Carry, attempt: Attempt, decision: Decision) -> Mode:
-        """Return the mode after the changes at the end of an accepted step."""
-        return mode_beyond(system, carry, attempt, decision, frozen=system.program is not None)
+        return decide_attempt(system, carry, attempt, active, fine, fine, last=last, frozen=system.program is not None)
 
     def refine(self, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
         """Return the carry `after` an attempt, with the next attempt: to the grid, or as the search asks."""

@@ -16,7 +16,6 @@ present state is kept, so the memory of many runs does not grow with their steps
 
 import dataclasses
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -30,7 +29,7 @@ from diffabs.simulate.step.adaptive import AdaptiveStepping, span_step
 from diffabs.simulate.step.advance import Carry, Decision, advance, cast_floats, start_carry
 from diffabs.simulate.step.attempt import Attempt, Point, StepRequest, mode_in_step
 from diffabs.simulate.step.event_location import select
-from diffabs.simulate.step.modes import Mode, ModeBits
+from diffabs.simulate.step.modes import ModeBits
 from diffabs.simulate.step.runge_kutta import TSIT5
 from diffabs.simulate.step.status import RunStatus, is_running
 from diffabs.simulate.step.system import Evaluation, Objectives, System
@@ -149,7 +148,9 @@ class ReplayStepping:
         end = jnp.where(one.refresh, carry.point.t, one.t)
         words = select(one.refresh, one.next_words, one.words)
         mode = mode_in_step(system, words, one.unrestricted)
-        return StepRequest(h, end, self.h, mode, one.refresh, one.k != k, one.k)
+        strikes = one.k != k
+        shift_end = partial(_time_to_event, one, strikes)
+        return StepRequest(h, end, self.h, mode, one.refresh, strikes, one.k, shift_end)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
         """Return nothing: the log says where steps end."""
@@ -163,25 +164,13 @@ class ReplayStepping:
         del system, carry, h, seen, state, error
         return ()
 
-    def regular_length(self, carry: Carry) -> Scalar:
-        """Return the length of the first attempt from the same point [s]."""
-        del carry
-        return self.logged.base
-
-    def shift_end(self, carry: Carry, request: StepRequest) -> Callable[[Evaluation], Scalar]:
-        """Return the function for the time [s] from the logged end of a step to its event or switching surface."""
-        return partial(_time_to_event, self.logged, request.strikes)
-
     def decide(self, system: System, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool) -> Decision:
         """Return the decision on the logged attempt."""
         one, no = self.logged, jnp.asarray(False)
         margins, tree = jax.tree.flatten(attempt.point.margins)
         triggered = tree.unflatten([one.triggered & (1 << i) != 0 for i in range(len(margins))])
-        return Decision(active, active, no, one.lands >= 0, triggered, one.over)
-
-    def mode_after(self, system: System, carry: Carry, attempt: Attempt, decision: Decision) -> Mode:
-        """Return the logged mode of the next step."""
-        return mode_in_step(system, self.logged.next_words, jnp.asarray(False))
+        mode = mode_in_step(system, one.next_words, no)
+        return Decision(active, active, no, one.lands >= 0, triggered, mode, one.over)
 
     def refine(self, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
         """Return the carry `after` an attempt, with its delay behind the log."""
