@@ -186,7 +186,7 @@ class FreeSpace:
     def spread(self, key: jax.Array, count: int) -> np.ndarray:
         """Return `count` random starts z (count, size) from the random `key`.
 
-        On a finite range the values are uniform, or uniform in the logarithm if the map is `Decades`; they stay 2 %
+        On a finite range the values are uniform, or uniform in the logarithm if the map is `Decades`. They stay 2 %
         away from both ends. On other ranges they surround the value x0 that the part had when the space was made. On a
         range with one infinite end, the distance from the finite end changes by at most a factor of about three. On an
         unbounded range, the values differ from x0 by at most 1.2 max(|x0|, 1).

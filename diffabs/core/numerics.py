@@ -43,7 +43,7 @@ def later_of_larger(x: Scalar, y: Scalar, falls: Scalar = False) -> PyTree:
     """Return max(x, y) of two successive values of a signal; where both are equal to rounding, return y.
 
     The choice decides the derivative. At the end of a step of zero length, y moves with the event there, and x does
-    not. If the signal falls at x, the function returns x instead: a peak at an event just before a grid instant does
+    not. If the signal falls at x, the function returns x instead. So a peak at an event just before a grid instant does
     not move with the grid.
 
     Args:
