@@ -104,9 +104,9 @@ def usual_objectives(self: Any) -> dict[str, PyTree]:
 class ArmBalance:
     """Frame, arm and rider under the voltage of the arm's motor. A negative `arm_length` is a hanging arm.
 
-    In the letters of the module's equations, the fields are m1, m2, m3, lg, l, Lg, hg, I1, I2, I3, K, d, Rm, Kt, Kb,
-    fm, N, the limit of the current, Jr and g. The lengths lg, Lg and hg reach to the centres of mass; arm and rider
-    turn at the height l.
+    In the letters of the module's equations, the first ten fields are m1, m2, m3, lg, l, Lg, hg, I1, I2 and I3. The
+    others are K, d, Rm, Kt, Kb, fm, N, the limit of the current, Jr and g. The lengths lg, Lg and hg reach to the
+    centres of mass; arm and rider turn at the height l.
     """
 
     body_mass: Scalar = param(default=30.0, unit="kg", above=0.0)

@@ -1,6 +1,6 @@
 """Energy audits of a run: they detect an unstable integration whose numbers all stay finite.
 
-    energy     E(t + h) - E(t) <= work that the control may have done on the vehicle in that step; of a balance in all
+    energy     E(t + h) - E(t) <= work that the control may have done on the vehicle in that step (balance: in the run)
     braked     distance does not fall, and grows no faster than the speed; friction alone changes the speed
 
 An audit is an objective with a value of at most 1 for a physically possible run. The value is the unexplained gain of
