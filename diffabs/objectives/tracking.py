@@ -190,8 +190,8 @@ class MaxSlip:
 class Overshoot:
     """Overshoot as a fraction of the final setpoint r [1]: max(0, (max y - r)/max(r, 0.01)).
 
-    The floor 0.01 is in the unit of y. It keeps a division by 0 away where an estimator ends at slip 0. If the first
-    setpoint is negative, -y and -r take the places of y and r. A run without overshoot has derivative 0.
+    The floor 0.01, in the unit of y, avoids a division by 0 where a reference ends at slip 0. If the first setpoint is
+    negative, -y and -r take the places of y and r. A run without overshoot has derivative 0.
     """
 
     unit = "1"
