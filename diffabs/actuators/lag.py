@@ -1,4 +1,4 @@
-"""Actuators that are a gain or a first-order differential equation: limits, lag and rate limit."""
+"""Actuators without a dead time: limits, lag and rate limit."""
 
 from collections.abc import Iterator
 

@@ -77,7 +77,8 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
         weighed: True if the task needs the weights Q and R.
 
     Raises:
-        ScenarioError: The gain is not one finite number per state, or the section [design] does not fit the model.
+        ScenarioError: The gain is not one finite number per state. Also raised if the section [design] does not fit the
+            model, or lacks the weights that the task needs.
         ValueError: The loop has no linear model.
         ModuleNotFoundError: The extra `design` is not installed.
     """
@@ -177,8 +178,7 @@ class FurtherFindings(NamedTuple):
     Attributes:
         frozen: Poles of the closed loops at fixed parameters.
         fall: Greatest fall of the speed [m/s^2] that friction allows, if stability is proved for all falls up to it.
-            The
-            proof uses a Lyapunov matrix that depends on the speed. None if it fails or does not apply.
+            The proof uses a Lyapunov matrix that depends on the speed. None if it fails or does not apply.
     """
 
     frozen: "FrozenLoops"
@@ -234,7 +234,7 @@ def proof_document(
         task: Linear systems, gain and specification.
         proof: Certificate; None if there is none. Its values are then null.
         out: File of the certificate, which the document names.
-        reason: Sentence on everything unproved; None if all is proved.
+        reason: Sentence on everything unproved, or on why there is no certificate; None if all is proved.
         known: Results without a common Lyapunov matrix.
         **numbers: Further values by key: "lower_bound", "gap", "residual" and "trace_cost" of a design.
     """
@@ -266,11 +266,11 @@ def proof_document(
 
 
 def slowest_vertex(proof: "Certificate") -> JsonObject:
-    """Return the vertex with the slowest pole, as a table in the form of `worst_vertex`.
+    """Return the vertex with the slowest pole, in the form of `worst_vertex` in the summary of a certificate.
 
-    Its keys are "index", "cell", "corner", "claim" and "margin". The margin is the distance [1/s] of that pole from the
-    imaginary axis. For a sampled loop it is 1 - |z|. A proof about all vertices together has no worst vertex of its
-    own.
+    It stands in for `worst_vertex` where a proof about all vertices together has no worst vertex of its own. The keys
+    are "index", "cell", "corner", "claim" and "margin". The margin is the distance [1/s] of that pole from the
+    imaginary axis. For a sampled loop it is 1 - |z|.
 
     Args:
         proof: Certificate.

@@ -24,14 +24,12 @@ LOOSE, LEAST = 100, 0.01  # a change above LOOSE * rtol * max(|metric|, LEAST) i
 def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
     """Return the accuracy of each metric as JSON values.
 
-    The key "metrics" has a row by metric. "difference" and "relative" give the change by half steps. "finer difference"
-    gives the further change by quarter steps. "float32 difference" gives the change by single precision, null for a
-    loop
-    with noise. "order", "converges" and "error" are estimates from these runs.
+    The key "metrics" has a row by metric. "value" is the metric itself. "difference" and "relative" give its change by
+    half steps, and "finer difference" the further change by quarter steps. "float32 difference" gives the change by
+    single precision, None for a loop with noise. "order", "converges" and "error" are estimates from these runs.
 
     The keys beside it are "solvers", "comparable", "reasons" and "ended alike". If the runs are not comparable,
-    "reasons"
-    says why.
+    "reasons" says why.
 
     Args:
         chosen: Scenario of the run.
@@ -76,9 +74,8 @@ def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
 def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
     """Return a list of one line that names the metrics which depend on `rtol`; the list is empty without such metrics.
 
-    The run is made again with `rtol` / 16. A change is reported if it exceeds 100 `rtol` of the metric's new value.
-    Such a
-    run chatters, or amplifies its errors.
+    The run is made again with `rtol` / 16. A change is reported if it exceeds 100 `rtol` of the metric's new value, or
+    of 0.01 if that value is smaller. Such a run chatters, or amplifies its errors.
 
     Args:
         metrics: Metrics of the run by name.

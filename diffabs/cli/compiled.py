@@ -27,8 +27,7 @@ def use_compilation_cache() -> pathlib.Path | None:
     """Make JAX keep compiled programs in the user's cache folder, and return this folder.
 
     None means that this function changed nothing. The cache is turned off, the user has set JAX's own cache, or the
-    folder
-    cannot be used. Commands then still work. Only a folder that other users may write to gives a warning.
+    folder cannot be used. Commands then still work. Only a folder that other users may write to gives a warning.
     """
     chosen = jax.config.values.get("jax_compilation_cache_dir")
     if os.environ.get(OFF_VARIABLE) or any(name in os.environ for name in USER_VARIABLES) or chosen:

@@ -126,7 +126,7 @@ def describe_run() -> dict[str, str | float]:
 
 
 def describe_source(chosen: Scenario) -> JsonObject:
-    """Return the first keys of every document on a scenario: "scenario", "model" and "made".
+    """Return the entries that documents on a scenario begin with: "scenario", "model" and "made".
 
     They hold its name, the values of `describe_model` and those of `describe_run`.
 
@@ -207,9 +207,10 @@ def is_animated() -> bool:
 
 @contextlib.contextmanager
 def end_on_errors() -> Iterator[None]:
-    """End a command with one line and an exit status for expected errors.
+    """End a command with one line and an exit status for expected errors in the `with` block.
 
-    Expected are bad input, a full disk, Ctrl-C, and parts from outside that raise or exit.
+    Expected are bad input, errors of the system such as a full disk, lack of memory, and Ctrl-C. Parts from outside
+    that raise or exit are expected, too.
 
     Raises:
         typer.Exit: One of these errors occurred.
@@ -266,8 +267,7 @@ def run_with_progress(
     """Return the result of `work`, and show its progress: a spinner on a terminal, else lines on stderr.
 
     The work runs in its own thread, because Ctrl-C cannot interrupt compiled code in the main thread. Its output to
-    stdout
-    goes to stderr.
+    stdout goes to stderr.
 
     Args:
         work: Function to run.

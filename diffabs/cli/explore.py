@@ -68,8 +68,7 @@ def prove_scenario(chosen: Scenario) -> "ProofVerdict":
     """Return the verdict on a scenario's gain over the ranges of its [design].
 
     The word is "certified", "refuted" or "undecided" for quadratic stability. Without any certificate it is "unknown",
-    and
-    the sentence gives the reason.
+    and the sentence gives the reason.
 
     Args:
         chosen: Scenario.

@@ -150,7 +150,7 @@ def show_progress(
 
     Args:
         message: Name of the work.
-        detail: Function that returns the progress.
+        detail: Function that returns the progress. Without it, at most one line is written.
         tell: Function that writes a line, if stderr cannot be redrawn.
         timing: Time [s] of the first line, and time [s] between further lines.
     """

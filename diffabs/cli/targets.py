@@ -102,7 +102,7 @@ def new_target_file(target: pathlib.Path | None, option: str) -> Iterator[pathli
 def new_target_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yield a temporary folder beside `target` that replaces it at the end; an error discards it.
 
-    An older result (a folder with summary.json) is replaced. Any other content is left alone.
+    An empty folder or an older result (a folder with summary.json) is replaced. Any other content is left alone.
 
     Args:
         target: Folder to write.

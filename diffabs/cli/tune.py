@@ -201,8 +201,8 @@ def _format_progress(told: "list[TuningProgress]", most: int | None = None) -> p
 def certify_result(after: Scenario) -> Proved:
     """Return the outcome of a proof for the tuned loop over the ranges of [design].
 
-    The certificate has the fastest provable decay rate, and the required one of [tune] if that can be proved. Without a
-    certificate the outcome gives the reason; no error is raised.
+    The certificate has the fastest decay rate that is found. If [tune] requires a faster one, it has that one if it can
+    be proved. Without a certificate the outcome gives the reason; no error is raised.
 
     Args:
         after: Scenario with the tuned loop.

@@ -34,13 +34,13 @@ class Work(NamedTuple):
 
 
 class Proved(NamedTuple):
-    """The outcome of a proof.
+    """The outcome of an attempt to prove something about a tuned loop.
 
     Attributes:
-        document: JSON values of the certificate; null without a certificate.
+        document: JSON values of the certificate. Without a certificate they are null, and "reason" tells why.
         sentence: Result, or the reason for no certificate.
         task: Linear systems of the proof; None without a certificate.
-        certified: True if there is a certificate.
+        certified: True if there is a certificate, even one without a proved property.
     """
 
     document: JsonObject

@@ -52,8 +52,8 @@ class BackCalculation:
     def rate(self, error: Scalar, gain: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
         """Return I' = error + (limited - raw)/(gain * Tt), in the unit of `error`.
 
-        `gain` is the integral's gain, `raw` the output before the limit and `limited` the output after it.
-        With `gain` = 0 the integral has no effect on the output, so I' = `error`.
+        `gain` is the integral's gain, `raw` the output before the limit and `limited` the output after it. If `gain` is
+        0, the integral has no effect on the output, so I' = `error`.
         """
         # `ratio` is 0 with zero derivatives where its denominator is 0: a PID without integral action has gain 0.
         return error + ratio(limited - raw, gain * self.tracking_time)

@@ -38,6 +38,8 @@ def state_of(output: BalanceOutput) -> PyTree:
 class BalanceFeedback:
     """u = K x [V], with every angle and every rate measured. The default gain is an LQR's (Q = I, R = 1) for the
     paper's machine.
+
+    The target and the feed-forward have no effect.
     """
 
     gain: Vector = param(default=DEFAULT_BALANCE_GAIN, unit="V/rad, V s/rad")
@@ -72,8 +74,9 @@ class ObserverMemory(NamedTuple):
 class ObserverFeedback:
     """u = K x^: a steady-state Kalman filter in discrete time estimates the state x^ from theta and psi.
 
-    The prediction uses the voltage clamped to +-voltage_max. The output itself has no limit.
-    Without `Sampled`, the observer computes in every step of the integration, so A and B must be those of this step.
+    The prediction uses the voltage clamped to +-voltage_max. The output itself has no limit. Without `Sampled`, the
+    observer computes in every step of the integration, so A and B must be those of this step. The target and the
+    feed-forward have no effect.
 
     Attributes:
         gain: K, shape (6,) [V/rad, V s/rad].
@@ -104,7 +107,7 @@ class ObserverFeedback:
         return memory.held.voltage
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """Return the estimate after one sample; the first sample sets it to the measured angles with zero rates.
+        """Return the memory after a sample; the first sets the estimate to the measured angles, with zero rates.
 
         The memory from `start` cannot serve as the first estimate, because a sensor adds no noise before its first
         sample.

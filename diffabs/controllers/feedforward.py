@@ -18,10 +18,10 @@ class ConstantInput:
 
 @pytree
 class HoldingInput:
-    """The control that holds the plant in equilibrium at the setpoint: tau* of Maeda and Sugiura.
+    """The control that holds the plant's first output at the setpoint: tau* of Maeda and Sugiura.
 
-    It uses the plant's own parameters, so it follows a swept mass or road, as for a controller with exact parameters.
-    The other conditions, such as speed and distance, are the measured ones.
+    It uses the plant's own parameters, as if the controller knew a swept mass or road exactly. The other conditions,
+    such as speed and distance, are the measured ones.
     """
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Scalar:

@@ -108,9 +108,10 @@ class Sampled:
     def compute_guarded(
         self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking, lost: Bool = False
     ) -> tuple[Memory, Scalar, PyTree]:
-        """Return inner memory, output, and True if the sample is skipped, where memory and output stay the same.
+        """Return inner memory, output, and whether the sample is skipped.
 
         A sample is skipped if it is lost, if a number that the controller reads is NaN, or if a result is not finite.
+        Memory and output are then the given ones, `memory` and `last`.
 
         Args:
             clock: Clock of the sampling period: its h is the period [s], its k the number of the sample.

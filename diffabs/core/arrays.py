@@ -15,7 +15,7 @@ from diffabs.core.types import Scalar
 def as_array(x: Scalar, dtype: DTypeLike) -> jax.Array:
     """Return `jnp.asarray(x, dtype)`, but convert untraced values by NumPy, since JAX would compile a program for each.
 
-    The array of a Python number is cached: its creation takes longer than many computations with it.
+    The array of a Python float is cached, because its creation takes longer than many computations with it.
 
     Args:
         x: Number, array, or list of numbers.
@@ -31,7 +31,7 @@ def as_array(x: Scalar, dtype: DTypeLike) -> jax.Array:
 
 @functools.lru_cache(maxsize=4096)
 def _number(x: float, sign: float, dtype: np.dtype, around: Any) -> jax.Array:
-    """Return the array of a Python number, from a cache.
+    """Return the array of a Python float, from a cache.
 
     `sign` distinguishes the keys 0.0 and -0.0, which compare equal. `around` holds the settings that decide precision
     and device.

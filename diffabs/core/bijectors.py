@@ -49,7 +49,7 @@ class Interval:
 
 @dataclasses.dataclass(frozen=True)
 class Decades:
-    """The map value = sign exp(Interval in ln |value|) onto a finite range over a decade or more."""
+    """The map value = sign exp(Interval in ln |value|) onto a finite range of one sign and at least a decade."""
 
     logarithm: Interval
     sign: float
@@ -104,8 +104,8 @@ def bijection(low: float, high: float, start: float) -> Bijection:
     Args:
         low: Lower end, or -inf.
         high: Upper end, or inf.
-        start: A value inside the range. It has z = 0 in a range with an infinite end and sets the scale there. A finite
-            range does not use it.
+        start: A value inside the range. For a range with an infinite end it is the value at z = 0, and it sets the
+            scale. A finite range ignores it.
     """
     if math.isfinite(low) and math.isfinite(high):
         if low * high > 0:
@@ -122,7 +122,7 @@ def bijection(low: float, high: float, start: float) -> Bijection:
 
 @dataclasses.dataclass(frozen=True)
 class FreeParameter:
-    """A free parameter: its path, its shape, and map and range of each of its elements."""
+    """A free parameter: its path and shape, and the map and the range of each element, in row-major order."""
 
     path: str
     shape: tuple[int, ...]
@@ -186,11 +186,10 @@ class FreeSpace:
     def spread(self, key: jax.Array, count: int) -> np.ndarray:
         """Return `count` random starts z (count, size) from the random `key`.
 
-        On a finite range the values are uniform (over the logarithm if the range spans a decade). On a range with one
-        infinite
-        end, they change the present value's distance from the finite end by at most a factor of about three. On an
-        unbounded
-        range they differ from the present value by at most 1.2 max(|value|, 1).
+        On a finite range the values are uniform, or uniform in the logarithm if the map is `Decades`. They stay 2 %
+        away from both ends. On other ranges they surround the value x0 that the part had when the space was made. On a
+        range with one infinite end, the distance from the finite end changes by at most a factor of about three. On an
+        unbounded range, the values differ from x0 by at most 1.2 max(|x0|, 1).
         """
         u = np.asarray(jax.random.uniform(key, (count, self.size), minval=0.02, maxval=0.98))
         bounded = [isinstance(m, Interval | Decades) for entry in self.entries for m in entry.maps]

@@ -1,4 +1,4 @@
-"""Compilation of programs that run once, so that their compilation time dominates.
+"""Compilation of programs that run once: compiling them takes most of their time.
 
 A function called with numbers is compiled with options for a faster compilation. Inside jit, and so under vmap and
 grad, the surrounding program decides the options.
@@ -33,11 +33,12 @@ QUICK_COMPILE_OPTIONS: dict[str, PyTree] = {
 def compile_once(static: Iterable[str] | int = (), options: dict[str, PyTree] | None = None) -> Callable[[F], F]:
     """Return a decorator like `jax.jit`, for a function that usually runs only once for each shape of its arguments.
 
-    A call with numbers compiles with the XLA options. A call under jit, grad or vmap compiles without them.
+    A call with concrete numbers or arrays compiles with `options`. A call under jit, grad or vmap compiles without
+    them.
 
     Args:
         static: Names of static arguments, which callers pass by name, or the number of leading static arguments.
-        options: Options of XLA: `SAME_RESULT_OPTIONS`, `QUICK_COMPILE_OPTIONS`, or None.
+        options: XLA's compiler options: `SAME_RESULT_OPTIONS`, `QUICK_COMPILE_OPTIONS`, or None for its defaults.
     """
     leading, names = (static, ()) if isinstance(static, int) else (0, tuple(static))
     fixed: dict[str, PyTree] = {"static_argnums": tuple(range(leading)), "static_argnames": names}

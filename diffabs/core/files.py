@@ -133,7 +133,8 @@ def write_file(target: pathlib.Path, data: bytes) -> None:
 def write_synced(target: pathlib.Path, data: bytes) -> pathlib.Path:
     """Write a file that is whole whenever it exists, also after a power cut, and return its path.
 
-    Several processes may write it at once; the content of the last one stays.
+    Several processes may write it at once; the content of the last one stays. Unlike `write_durably`, the function does
+    not sync the folder, so a power cut may undo the write.
 
     Args:
         target: Path of the file.
@@ -169,8 +170,8 @@ def others_may_write(folder: pathlib.Path) -> bool:
 def write_durably(target: pathlib.Path, data: bytes) -> pathlib.Path:
     """Write a file that is whole whenever it exists, also after a power cut, and return its path.
 
-    Only one process may write it. A killed process leaves at most a file that ends in `.tmp`. The folder is synced,
-    too, so that the new file survives a power cut.
+    Only one process may write it. A killed process leaves at most a file that ends in `.tmp`. Unlike `write_synced`,
+    the function also syncs the folder, so that the new file survives a power cut.
 
     Args:
         target: Path of the file.

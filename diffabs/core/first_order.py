@@ -1,4 +1,4 @@
-"""Errors in place of wrong derivatives: by a parameter without a derivative, and second derivatives of a frozen rule.
+"""Errors in place of wrong derivatives: by a parameter that has none, and the second one of a rule that freezes values.
 
 A derivative rule that freezes values that depend on the parameters has correct first derivatives and wrong second ones.
 Such a rule wraps both its input tangents and its output tangents in `first_order`. A second pass in forward mode meets

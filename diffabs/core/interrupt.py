@@ -34,7 +34,11 @@ def end_early_on_interrupt() -> None:
 
 
 def begin_hearing() -> None:
-    """Count Ctrl-C and SIGTERM from now on, for `take_interrupt`, unless the process ignores them."""
+    """Count Ctrl-C and SIGTERM from now on, for `take_interrupt`.
+
+    A signal that the process ignores, or that another program handles, keeps its handler. The function sets handlers
+    only in the main thread.
+    """
     global _pending
     _pending = 0
     _answer(_press)

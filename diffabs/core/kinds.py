@@ -73,7 +73,7 @@ def value_shape(value: Scalar) -> tuple[int, ...]:
 
 
 def format_value(value: Scalar) -> str:
-    """Return a value for a message: on one line, of bounded length.
+    """Return a value or an array for a message: on one line, of at most 60 characters.
 
     Args:
         value: Any value.

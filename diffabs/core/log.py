@@ -18,11 +18,11 @@ from diffabs.core.types import PyTree, Scalar
 @partial(jax.tree_util.register_dataclass, data_fields=["rows", "place", "row"], meta_fields=["lent"])
 @dataclasses.dataclass(frozen=True)
 class Log:
-    """A table of rows with the place and the value of the row written last.
+    """A table of rows, with the index and the value of the row written last.
 
     Attributes:
         rows: Rows, shape (size, n).
-        place: Place of the row written last.
+        place: Index of the row written last.
         row: That row, shape (n,). While the rows are lent, `rows` does not contain it.
         lent: Whether a solver holds the rows.
     """
@@ -85,8 +85,8 @@ def commit(tree: PyTree, rows: list[PyTree]) -> PyTree:
 def write_last_rows(tree: PyTree) -> list[PyTree]:
     """Return the rows of all logs after the row written last is put in its place.
 
-    A write of the previous step's row followed by a read happens in place. A read before the write needs a copy, unless
-    the row depends on the value read.
+    If a step writes the previous step's row and then reads, the write happens in place. If it reads first, the write
+    needs a copy, unless the row depends on the value read.
 
     Args:
         tree: Pytree with lent logs that have their rows.

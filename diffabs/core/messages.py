@@ -70,7 +70,8 @@ class Clock(NamedTuple):
         k: Number of the last grid instant.
         key: Random key of the run, or None.
         on_grid: Whether this is that grid instant; False for an event between two grid instants.
-        before: Signal of the block before this instant, which an earlier block may have changed; None: unchanged.
+        before: Signal of the block just before this instant. An earlier block in the loop may change the signal at the
+            instant. None stands for an unchanged signal.
     """
 
     t: Scalar
@@ -81,8 +82,9 @@ class Clock(NamedTuple):
     before: Any = None
 
     def ticks(self, period: Scalar | None = None) -> tuple[PyTree, PyTree]:
-        """Return whether a clock of this `period` [s] (None: the grid's) ticks now, and the number of its earlier
-        ticks.
+        """Return whether a clock of this `period` [s] ticks now, and the number of its latest tick, counted from 0.
+
+        A `period` of None is the step of the grid.
         """
         if period is None:
             return jnp.asarray(self.on_grid), self.k
@@ -123,8 +125,8 @@ class Ending(NamedTuple):
 
     sample: Sample
     stopped: Bool
-    time_left: Scalar  # [s]
-    distance_left: Scalar  # [m]
+    time_left: Scalar
+    distance_left: Scalar
 
 
 class Shown(NamedTuple):
@@ -142,8 +144,8 @@ class Shown(NamedTuple):
 class Segment(NamedTuple):
     """A step of a run between two instants, without a jump inside.
 
-    `output`, `error`, `shown_cubic` and `sample` return the cubic of a signal from values and rates at both ends. Its
-    extrema, roots and integrals are those of the run to the order of the method.
+    `output`, `error`, `shown_cubic` and `sample` return the cubic of a signal from values and rates at both ends. The
+    extrema, roots and integrals of the cubic are those of the run to the order of the method.
 
     Attributes:
         start: Sample at the start, after the jumps there.
@@ -152,11 +154,11 @@ class Segment(NamedTuple):
         step: Step of the grid [s].
         shown_rates: Function that returns the rates of plant outputs and setpoint at both ends.
         sample_rates: Function that returns the rates of all signals at both ends.
-        smooth: True if no limit is reached inside, because the step would end there. Otherwise the cubic of a limited
-            signal may exceed the limits.
-        within: Whether the rates at the start and at the end are the rates inside the step, also at a limit. With only
-            one such rate, the cubic of a signal that is no plant output is the parabola through both ends with that
-            rate; with none, the straight line.
+        smooth: True if a step ends where a limit is reached, so that none is reached inside. Otherwise the cubic of a
+            limited signal may exceed the limits.
+        within: For the start and for the end, whether the rate there is also the rate inside the step. At a limit it
+            need not be. With one such rate, the cubic of a signal that is no plant output is the parabola through both
+            ends with that rate. With none, it is the straight line.
     """
 
     start: Sample

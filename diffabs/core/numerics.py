@@ -17,8 +17,7 @@ def clamp(x: Scalar, low: Scalar, high: Scalar) -> Scalar:
 
     The slope in x is 1 at a limit and 0 beyond it; the slope in a limit is 1 beyond that limit. The function uses
     selections for two reasons. The tangent of `jnp.clip` divides. In JAX 0.10, `lax.clamp` refuses to batch an upper
-    limit
-    alone (similar to github.com/jax-ml/jax/issues/5325, whose repair leaves this case out).
+    limit alone (similar to github.com/jax-ml/jax/issues/5325, whose repair leaves this case out).
 
     Args:
         x: Number to limit.
@@ -29,9 +28,9 @@ def clamp(x: Scalar, low: Scalar, high: Scalar) -> Scalar:
 
 
 def larger(x: Scalar, y: Scalar) -> Scalar:
-    """Return max(x, y), with the slope in x where both are equal.
+    """Return max(x, y); where both are equal, its derivative is that of x.
 
-    `jnp.maximum` shares the slope between both, by a division in its tangent.
+    `jnp.maximum` shares the derivative between both, by a division in its tangent.
 
     Args:
         x: First number.
@@ -41,11 +40,11 @@ def larger(x: Scalar, y: Scalar) -> Scalar:
 
 
 def later_of_larger(x: Scalar, y: Scalar, falls: Scalar = False) -> PyTree:
-    """Return max(x, y) of two successive values of a signal, with the slope of y where both are equal to rounding.
+    """Return max(x, y) of two successive values of a signal; where both are equal to rounding, return y.
 
-    If the signal falls after x, the slope is that of x instead. At the end of a step of zero length, y moves with the
-    event
-    there, and x does not. A peak at an event just before a grid instant does not move with the grid.
+    The choice decides the derivative. At the end of a step of zero length, y moves with the event there, and x does
+    not. If the signal falls at x, the function returns x instead. So a peak at an event just before a grid instant does
+    not move with the grid.
 
     Args:
         x: Earlier value.
@@ -58,7 +57,7 @@ def later_of_larger(x: Scalar, y: Scalar, falls: Scalar = False) -> PyTree:
 
 
 def smaller(x: Scalar, y: Scalar) -> Scalar:
-    """Return min(x, y), with the slope in x where both are equal.
+    """Return min(x, y); where both are equal, its derivative is that of x.
 
     Args:
         x: First number.
@@ -101,9 +100,8 @@ def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Sc
 def power(base: Scalar, exponent: Scalar) -> Scalar:
     """Return base ** exponent for exponent > 1, or 0 with zero slopes for base <= 0.
 
-    The formula is exp(q log x), with the logarithm from the square of the base. XLA's own power takes three to four
-    times
-    as long on a CPU. The square keeps the number finite in a trial step that passes base = 0 with frozen comparisons.
+    The formula is exp(q/2 log(base^2)). XLA's own power takes three to four times as long on a CPU. The square keeps
+    the number finite in a trial step that passes base = 0 with frozen comparisons.
 
     Args:
         base: Base.
@@ -152,7 +150,7 @@ def odd(curve: Callable[[PyTree], PyTree], x: Scalar) -> Scalar:
 def interval_shares(x: Scalar, nodes: PyTree) -> Scalar:
     """Return the share of each interval between the nodes that lies below x, from 0 to 1, shape (n - 1,).
 
-    `interpolate_shares` sums over the shares. It looks up no index, to which derivatives would have to scatter.
+    `interpolate_shares` sums over the shares. It looks up no index, so its derivatives need no scatter.
 
     Args:
         x: Number.

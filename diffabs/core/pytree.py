@@ -8,7 +8,7 @@ to a controller is tuning. A second dictionary of parameters does not exist. A f
     static(...)  a shape or a choice fixed at trace time
 
 The construction of a part does not check ranges, because JAX rebuilds parts with tracers and placeholders.
-`check(part)` of `core.validity` checks them on the host, and names every parameter outside its range at once.
+`core.validity.check_part` checks them on the host, and names every parameter outside its range at once.
 """
 
 import dataclasses
@@ -198,7 +198,7 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
 def parameters(part: Part, prefix: str = "", units: Units | None = None) -> Iterator[tuple[str, ParameterSpec, PyTree]]:
     """Yield every parameter below a part as (dotted path, spec, value), in the order of declaration.
 
-    Relative units are resolved below a part with a plant, or in the given `units`.
+    Relative units are resolved by the given `units`, or else by the plant of the part or of a part in it.
 
     Args:
         part: Part.

@@ -42,7 +42,7 @@ _listening = False
 
 
 def count_compilations() -> None:
-    """Count the compilations of JAX from now on."""
+    """Count the time of JAX's compilations, tracing included, from now on."""
     global _listening
     if not _listening:
         _listening = True

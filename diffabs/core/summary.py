@@ -12,7 +12,7 @@ ZERO_TOLERANCE = 1e-14  # smaller numbers, in SI units, are rounding errors
 
 
 def round_for_table(value: Scalar, digits: int = 6) -> str:
-    """Return a number as text for a table; numbers of the size of rounding errors give 0.
+    """Return a number as text for a table; numbers below 1e-14 are rounding errors and give 0.
 
     Args:
         value: Number in SI units.

@@ -53,10 +53,9 @@ def jvp_nonzero(
 def split_batched(make: Callable[[PyTree], PyTree], batch: PyTree) -> tuple[PyTree, Callable[[PyTree], PyTree]]:
     """Return (leaves, whole): the result of `make` for each member of a batch, with constants kept apart.
 
-    `leaves` is a list of those leaves of the result that depend on the member, each (n, ...). `whole(leaves of one
-    member)`
-    is the result of that member. The other leaves are computed once. In a loop over runs they stay numbers, which a
-    processor keeps in registers, instead of columns.
+    `leaves` is a list of those leaves of the result that depend on the member, each (n, ...). `whole` takes these
+    leaves for one member and returns the result of that member. The other leaves are computed once. In a loop over runs
+    they stay numbers, which a processor keeps in registers, instead of columns.
 
     Args:
         make: Function of one member.
@@ -83,7 +82,7 @@ def split_batched(make: Callable[[PyTree], PyTree], batch: PyTree) -> tuple[PyTr
 
 
 def depends_on_signal(function: Callable[[PyTree], PyTree], signal: PyTree) -> bool:
-    """Return whether the traced result of a function depends on its signal; a product with a literal zero does not.
+    """Return whether a function's traced result depends on its signal; a product with a literal zero does not count.
 
     Args:
         function: Function of the signal.
@@ -110,10 +109,9 @@ def leaf_dependence(function: Callable[[PyTree], PyTree], signal: PyTree) -> lis
 
 
 def moving_leaves(function: Callable[[PyTree, PyTree], PyTree], fixed: PyTree, batch: PyTree) -> PyTree:
-    """Return, with the structure of `batch`, for each leaf whether function(fixed, batch) of one member has a
-    derivative by it.
+    """Return for each leaf of `batch` whether function(fixed, batch) of one member has a derivative by it.
 
-    Leaves that only enter decisions have no derivative.
+    The result is a pytree of bools with the structure of `batch`. Leaves that only enter decisions have no derivative.
 
     Args:
         function: Function of one member of `fixed` and of `batch`.

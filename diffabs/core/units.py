@@ -59,7 +59,7 @@ def unit_at(unit: str, place: int, count: int) -> str:
 
 
 def insert_unit(text: str, units: Units | None) -> str:
-    """Return a sentence with ` {control}` replaced by the unit of the control, or removed if the unit is unknown.
+    """Return a sentence with ` {control}` replaced by the unit of the control, or removed if this is unknown or 1.
 
     Args:
         text: Sentence.

@@ -22,8 +22,8 @@ T = TypeVar("T")
 def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> Iterator[str]:
     """Yield one line for each field that is out of range, and for each condition of the parts that fails.
 
-    The conditions are first the shapes of fields (`problems`). If these are correct, the rules between numbers
-    (`rules`) follow.
+    The conditions of a part are evaluated only if its fields, and the parts in it, have no errors. The shapes of fields
+    (`problems`) come first. If they are correct, the rules between numbers (`rules`) follow.
 
     Args:
         part: Part.

@@ -54,7 +54,7 @@ def dotted_path(path: str, key: str) -> str:
 
 
 def format_given(value: Scalar, most: int = 60) -> str:
-    """Return a value for a message: on one line, of bounded length.
+    """Return a value from TOML, JSON or the command line for a message: on one line, of bounded length.
 
     Args:
         value: Any value.
@@ -354,7 +354,7 @@ def read_table(cls: type, given: PyTree, path: str, kind: str = "", **readers: R
         given: Given value.
         path: Path of the table, for messages.
         kind: Name of the dataclass in messages; empty takes the path.
-        readers: Readers of fields that need more than the table, by name.
+        readers: Readers by name of a field, in place of the one that the field declares.
 
     Raises:
         ScenarioError: The value is not a table, a field is unknown or missing, or a reader refuses a value.
@@ -386,7 +386,7 @@ def read_one(kinds: Mapping[str, type], given: PyTree, path: str, **readers: Rea
         kinds: Dataclasses by name.
         given: Given value.
         path: Path of the value, for messages.
-        readers: Readers of fields that need more than the table, by name.
+        readers: Readers by name of a field, in place of the one that the field declares.
 
     Raises:
         ScenarioError: The value is neither a table nor a text, the type is missing or unknown, or as in `read_table`.
@@ -436,7 +436,8 @@ def plain_fields(part: Part, *, brief: bool = False) -> dict[str, PyTree]:
 
     Args:
         part: Instance of a dataclass.
-        brief: Whether to omit fields with their default values.
+        brief: Whether to omit fields with their default values. A field whose default comes from a function always
+            stays.
     """
     found = {}
     for field in dataclasses.fields(part):

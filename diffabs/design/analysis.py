@@ -55,8 +55,9 @@ def certify(
         Certificate with the proved claims; it has none if nothing is proved.
 
     Raises:
-        ValueError: Shapes that do not fit, a field of `spec` out of its range, damping of a discrete loop, or for a
-            schedule a specification as above.
+        ValueError: Shapes that do not fit, a field of `spec` out of its range, or damping of a discrete loop that is
+            proved stable. Also a schedule in discrete time, without `spec.rates`, or with specifications besides decay
+            and cost.
         ModuleNotFoundError: cvxpy is not installed.
 
     Examples:
@@ -136,7 +137,7 @@ class _Analysis:
         return None
 
     def _common(self, rate: float) -> tuple[np.ndarray | None, float, np.ndarray]:
-        """Return P, its margin and the multipliers, in the original coordinates.
+        """Return P (None without an answer), its margin and the multipliers, in the original coordinates.
 
         P has trace at most n in the frame and maximises the smallest margin over the vertices.
         """

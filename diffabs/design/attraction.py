@@ -36,7 +36,7 @@ CAPTURE_LEVEL = 0.98  # value of x'Sx at which a run ends: rounding cannot take 
 
 
 class Outcomes(NamedTuple):
-    """The outcome of each run, as one array of booleans for each kind of outcome.
+    """The outcome of each run, as one array of booleans for each kind of outcome, and the time of its end.
 
     The kinds are those of the module `design.attraction`. All arrays have the shape (runs,), or (n, m) in a `Basin`.
 
@@ -44,7 +44,7 @@ class Outcomes(NamedTuple):
         recovered: Whether the run came to rest, by its ellipsoid or by the band.
         fell: Whether the run reached its stop.
         unstable: Whether the linear loop about rest grows.
-        diverged: Whether the run is invalid.
+        diverged: Whether the run has invalid numbers, or starts beyond its stop.
         time: Time [s] at which the run ended.
     """
 
@@ -247,7 +247,7 @@ def largest_recovered_multiples(
     *,
     engine: str = "xla",
 ) -> list[Reach]:
-    """Return for each row the largest multiple of `direction` up to which all multiples are recovered.
+    """Return for each row the largest of `multiples` up to which the loop recovers from all of them.
 
     It is 0 if the first multiple is not recovered. All runs are one batch.
 

@@ -1,4 +1,4 @@
-"""Bounds that a gain keeps: cost, damping, L2 gain and inputs, each the smallest that a common P proves."""
+"""Bounds that a common P proves for a gain: the smallest cost, L2 gain and inputs, and a given damping ratio."""
 
 import math
 from collections.abc import Callable
@@ -19,10 +19,10 @@ BOUND_LOOSENINGS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
 def decrease_matrix(p: Matrix, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
-    """Return the symmetric matrix of -dV/dt - 2 rate V, for V = x'Px and x' = C x, shape (..., n, n).
+    """Return the symmetric matrix of -dV/dt - 2 rate V, shape (..., n, n), for V = x'P x along dx/dt = C x.
 
     In discrete time, x+ = C x, it is the matrix of exp(-2 rate) V - V+. The matrix is positive definite if V falls
-    faster than the rate.
+    faster than exp(-2 rate t).
 
     Args:
         p: Symmetric P, shape (..., n, n).
@@ -65,8 +65,9 @@ class Bounds:
         )
 
     def damping(self) -> Claim | None:
-        """Return the claim that every frozen system has at least the specified damping ratio; the ratio is not
-        maximised.
+        """Return the claim that every frozen system has at least the specified damping ratio.
+
+        The ratio is not maximised.
         """
         zeta = self.spec.damping
         # Rounded up: the proof requires cot^2 (1 - zeta^2) >= zeta^2 exactly.

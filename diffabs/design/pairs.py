@@ -43,8 +43,8 @@ class Pair(NamedTuple):
 def witnesses(closed: np.ndarray, factor: float | None = None) -> Iterator[np.ndarray]:
     """Yield candidate multipliers W, shape (vertices, n, n), for a proof that no common P exists.
 
-    They are floating point: `design.proof.exact` decides whether they prove anything. The iterator is empty if no pair
-    excludes a common P, or above MAX_PAIRED_VERTICES vertices.
+    They are floating point: `design.proof.exact` decides whether they prove anything. There are at most MAX_PAIRS of
+    them, and none if no pair excludes a common P, or above MAX_PAIRED_VERTICES vertices.
 
     Args:
         closed: Closed loops C, shape (vertices, n, n); in continuous time with the rate already added to the diagonal.
@@ -134,10 +134,10 @@ def multipliers(pair: Pair, flows: np.ndarray, inverses: np.ndarray) -> np.ndarr
 
 
 def least_dominating_factor(strength: np.ndarray, taken: np.ndarray) -> float:
-    """Return the smallest c for which c strength + taken is positive semidefinite; inf for an indefinite strength.
+    """Return the smallest c for which c strength + taken is positive semidefinite.
 
     Args:
-        strength: Symmetric matrix, shape (n, n).
+        strength: Symmetric matrix, shape (n, n). The result is inf if it is not positive definite.
         taken: Symmetric matrix, shape (n, n).
     """
     try:

@@ -140,15 +140,15 @@ def _require_scipy() -> None:
 
 
 def check_box_bounds(model: Part, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the low and the high end of every interval, after a check of each.
+    """Return the low and the high end of every interval by path, after a check of each.
 
     Args:
         model: Model whose parameters the paths name.
         over: Box {path: (low, high)}.
 
     Raises:
-        ValueError: A path that is no scalar parameter, an inverted interval, a value out of range, or a period that
-            varies.
+        ValueError: A path that is no scalar parameter, ends that are no interval, a value out of range, or a period
+            that varies.
     """
     known = {path: value for path, _, value in parameters(model)}
     for path, ends in over.items():
@@ -174,7 +174,7 @@ def _batch(model: Part, free: tuple[str, ...], points: PyTree) -> AnyArray:
 
 
 def evaluate_systems(model: Part, free: tuple[str, ...], points: np.ndarray) -> _SystemRows:
-    """Return the matrices at points of the box, in float64.
+    """Return the systems at points of the box, in float64; A and B are the property `matrices` of the result.
 
     Args:
         model: Model with `matrices()`.
@@ -293,7 +293,7 @@ class _Hull(NamedTuple):
         return cls(frame, frame.from_plane(v), v, spread, True)
 
     def reach(self, rows: np.ndarray) -> tuple[float, int]:
-        """Return the largest gauge of the rows, and the number of rows."""
+        """Return the largest gauge of the rows, and the number of checked rows."""
         if not self.frame.holds(rows):
             return np.inf, len(rows)
         x = self.frame.to_plane(rows)

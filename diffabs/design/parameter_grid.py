@@ -21,7 +21,7 @@ from diffabs.design.polytopes import MAX_VERTICES, Polytope
 def grid_polytope(model: Part, over: Mapping[str, Sequence[float]], points: int = 3) -> Polytope:
     """Return the polytope whose vertices are the systems of `model` on a grid over a box, its ends included.
 
-    All grid systems are vertices, in the order of `corners`. `coverage` is None.
+    All grid systems are vertices. `corners` has the parameters of each, and `coverage` is None.
 
     Args:
         model: Model with `matrices()`, `states` and `period`.

@@ -27,8 +27,8 @@ class Coverage:
         checked: Number of systems that were checked: corners, grid points and random points. Large hulls check only the
             extreme ones.
         furthest: Largest gauge [1] of these systems.
-        spread: Factor [1] by which the corners were spread about their mean to cover all systems; above 2 a box
-            replaced the corners.
+        spread: Factor [1] by which corners had to be spread about their mean to cover all systems. Above 2 a box
+            replaced the corners, unless it had too many vertices.
     """
 
     checked: int
@@ -45,7 +45,7 @@ class Polytope:
         B: Input matrices of the vertices, shape (V, n, m).
         period: Sampling period [s] of a discrete-time system; None for continuous time.
         states: Names of the states, as labels.
-        corners: Parameters at each vertex, as labels.
+        corners: Parameters by path at each vertex, as labels.
         coverage: Check of the hull, if there is one.
 
     Raises:
@@ -113,7 +113,7 @@ class Schedule:
     cells: tuple[Polytope, ...]
 
     def __post_init__(self) -> None:
-        """Check that the nodes increase and that one cell lies between two nodes."""
+        """Convert the nodes to float64; check that they increase, and that one cell lies between two of them."""
         object.__setattr__(self, "nodes", np.array(self.nodes, float))
         if len(self.nodes) != len(self.cells) + 1 or not self.cells or not (np.diff(self.nodes) > 0).all():
             raise ValueError(f"a schedule of {len(self.cells)} cells needs one node more, increasing: {self.nodes}")

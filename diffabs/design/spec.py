@@ -56,7 +56,7 @@ class Spec:
         decay: Decay rate [1/s], >= 0: |x| <= c exp(-decay t).
         damping: Smallest damping ratio [1] of the poles of every frozen system, in [0, 1); continuous time only.
         input: Limit of the inputs.
-        l2: Bound of the L2 gain.
+        l2: L2 gain to bound, or to minimise.
         rates: Lowest and highest d(parameter)/dt of a `Schedule`, in the parameter's unit per second.
     """
 

@@ -105,7 +105,8 @@ def feedback_gain(loop: Loop, states: Sequence[str]) -> AnyArray:
 
     Args:
         loop: Closed loop with a linear controller.
-        states: Names of the states of a linear model such as `SlipModel`.
+        states: Names of the states of a linear model such as `SlipModel`; not used for a `BalanceFeedback`, whose gain
+            is returned whole.
 
     Raises:
         ValueError: A controller that is not linear.

@@ -13,11 +13,10 @@ from diffabs.linear.slip_model import Continuous, Sampling
 
 
 def reduce_balance_loop(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tuple[str, ...]]:
-    """Return the linear model about upright, the gain (6,), whether they are exact, and the neglected parts in
-    sentences.
+    """Return the linear model about upright, the gain (6,), whether they are exact, and the neglected parts.
 
     They are exact if the sensor passes the output unchanged. A voltage limit is neglected but does not count against
-    it.
+    it. The neglected parts are sentences.
 
     Args:
         loop: Closed loop of a balance.

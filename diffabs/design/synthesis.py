@@ -41,7 +41,7 @@ CLAIM_OF_SPECIFICATION = {"Q": "cost", "decay": "decay", "damping": "damping", "
 
 
 class DesignError(RuntimeError):
-    """The error that no gain passes its checks; its message has the numbers."""
+    """No gain passes its checks; the message has the numbers."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -347,7 +347,7 @@ def is_positive_definite(m: Matrix, semi: bool = False) -> bool:
 
     Args:
         m: Square matrix.
-        semi: Whether to test for positive semidefiniteness: a zero pivot then needs a zero row.
+        semi: Whether semidefiniteness is enough: a zero pivot then needs a zero row.
     """
     if m != transpose_matrix(m):
         return False

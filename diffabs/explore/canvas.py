@@ -20,8 +20,7 @@ class Canvas:
         """Apply the change `option` to the chart.
 
         `edit` is the browser's number of the user's edit that this change shows, or 0. If the chart does not exist yet,
-        the
-        browser applies the change later.
+        the browser applies the change later.
         """
         self.send(encode_change(option), edit)
 

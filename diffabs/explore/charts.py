@@ -182,7 +182,7 @@ def _points(values: np.ndarray, period: float | None) -> list[list[float]]:
 
 
 def round_for_screen(values: PyTree) -> list[float | None]:
-    """Return numbers rounded to the digits that a screen can show, with None for numbers that are not finite.
+    """Return numbers rounded to `CHART_DIGITS` digits, with None for numbers that are not finite.
 
     Args:
         values: Numbers, shape (n,).

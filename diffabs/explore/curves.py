@@ -52,7 +52,7 @@ class Curves(NamedTuple):
         panels: Panels of the chart.
         metrics: Metrics by name.
         end: Sentence about the end of the run.
-        draft: True for a quick run with long steps.
+        draft: True for a quick run by another solver than the scenario's.
     """
 
     t: np.ndarray
@@ -143,10 +143,8 @@ def transient_end(found: Curves) -> float:
     """Return the end [s] of a time axis that fits the transient.
 
     It is 1.5 times the settling time of the first signal, and at most the end of the run. Settled means within 5 % of
-    the
-    largest distance from the target. Without a target the last value takes its place. A run that does not settle is
-    shown
-    whole.
+    the largest distance from the target. Without a target the last value takes its place. A run that does not settle is
+    shown whole.
 
     Args:
         found: Curves of the run.
@@ -165,7 +163,7 @@ def transient_end(found: Curves) -> float:
 
 
 def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
-    """Return the quantiles of `MEMBERS` runs with different masses and roads, or None if the loop has neither.
+    """Return the quantiles of `MEMBERS` runs with different masses and roads, or None if nothing differs.
 
     Diverged runs do not count. The fan ends where too few runs still go on.
 
@@ -196,8 +194,8 @@ def fan_members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray]
     """Return the values of a fan's members by path, each of shape (MEMBERS,) in SI, and their spread in words.
 
     Every call uses the same low-discrepancy points, so the fan does not flicker during a drag. Values stay below the
-    upper
-    end of the parameter's range. The dictionary is empty if the loop has neither mass nor friction factor.
+    upper end of the parameter's range. A parameter without spread is left out. The dictionary is empty if no parameter
+    remains.
 
     Args:
         chosen: Scenario.

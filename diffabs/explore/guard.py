@@ -60,7 +60,10 @@ class Guard:
             await _answer(send, 403, STRANGER)
 
     def is_allowed(self, scope: Table) -> bool:
-        """Return whether the request with this `scope` comes from this machine and from a page of the explorer."""
+        """Return whether the request with this `scope` comes from this machine and names the explorer as its host.
+
+        If the request states the page that sent it, this page must be the explorer's.
+        """
         given = _headers(scope)
         host, origin = given.get(b"host", []), given.get(b"origin", [])
         here = len(host) == 1 and host[0] in self.hosts

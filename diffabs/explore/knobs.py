@@ -86,10 +86,10 @@ class Knob:
         return float(np.clip(SLIDER_STEPS * (self._line(at) - low) / (high - low), 0, SLIDER_STEPS))
 
     def value_at(self, place: float) -> float:
-        """Return the value [SI] at a slider position `place`, 0 to `SLIDER_STEPS`, rounded to five digits when
-        displayed.
+        """Return the value [SI] at a slider position `place`, 0 to `SLIDER_STEPS`.
 
-        The number must have a slider: `low` and `high` are not None.
+        Between the ends of the slider, the displayed value is rounded to five digits. The number must have a slider:
+        `low` and `high` are not None.
         """
         assert self.low is not None
         assert self.high is not None
@@ -155,7 +155,7 @@ def unit_words(unit: str) -> str:
     """Return a unit as the page shows it, or "" for plain numbers.
 
     Args:
-        unit: Unit as in `Spec`.
+        unit: Unit as in `ParameterSpec`.
     """
     return "" if unit == "1" else unit.replace("^2", "²")
 
@@ -163,9 +163,9 @@ def unit_words(unit: str) -> str:
 def first_knobs(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
     """Return the keys of the numbers that the page shows at once, at most `MOST_FIRST`, sorted by group.
 
-    In order of priority they are mass, speed, friction, tuned parameters, filters, gains, and parameters that vary in
-    the
-    scenario. Numbers without a slider are left out.
+    In order of priority they are mass, speed, friction, tuned parameters, filters, gains, parameters that vary in the
+    scenario, and numbers of the start. Gains are left out if the scenario tunes a parameter of the controller. Numbers
+    without a slider are left out, too.
 
     Args:
         chosen: Scenario.
@@ -188,8 +188,7 @@ def mass_path(chosen: Scenario) -> str | None:
     """Return the path of the mass that differs between vehicles or riders, or None.
 
     A mass that the scenario varies has priority over the plant's first one. If the loop has no mass, the same rule
-    selects
-    a moment of inertia.
+    selects a moment of inertia.
 
     Args:
         chosen: Scenario.

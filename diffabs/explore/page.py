@@ -37,8 +37,7 @@ class Page:
         """Prepare the page of a `session`.
 
         `tools` are the functions that need extras, `folder` is the folder for saved files, and `thread` is the name of
-        the
-        worker threads.
+        the worker threads.
         """
         self.session, self.tools = session, tools
         self.client, self.server = ui.context.client, asyncio.get_running_loop()

@@ -20,8 +20,8 @@ def save_scenario(chosen: Scenario, folder: pathlib.Path, name: str, *, replacin
         replacing: Whether a file of that name may be replaced; else it stays unchanged.
 
     Raises:
-        ScenarioError: The file exists and must not be replaced, or the name is not valid.
-        ScenarioError: The command line would refuse the scenario, or the folder cannot be written.
+        ScenarioError: The file exists and must not be replaced, or the name is not valid. Also raised if the command
+            line would refuse the scenario, or the folder cannot be written.
     """
     path = folder / _check_name(name)
     text = dump(chosen).encode()

@@ -33,7 +33,7 @@ def listen_on_loopback(port: int) -> socket.socket:
         port: Port; 0 is any free one.
 
     Raises:
-        OSError: The port is in use.
+        OSError: The port cannot be used, for example because it is in use.
     """
     # The socket listens before the server starts, so that a port in use is reported at once.
     there = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -107,8 +107,7 @@ def write_redirect_file(url: str, folder: pathlib.Path) -> pathlib.Path:
     """Return the path of a new HTML file, readable by its owner only, that redirects a browser to an address.
 
     Every user of the machine can see the command line that starts a browser. So the browser gets this file in place of
-    the
-    address, which contains the token.
+    the address, which contains the token.
 
     Args:
         url: Address with the token.

@@ -49,7 +49,7 @@ class CornerLoops(NamedTuple):
     The corners do not depend on the current values of the parameters that have a range.
 
     Attributes:
-        of: Key that the corners follow from, for comparison.
+        of: Key of `corners_of`: equal keys mean equal corners.
         poles: Poles of all corners.
         worst: Worst margins by name.
         unstable: Number of unstable corners.

@@ -37,7 +37,7 @@ class TuningFound(NamedTuple):
 
 
 def tunable_parameters(chosen: Scenario) -> list[str]:
-    """Return the paths of the tunable parameters: the scenario's own first, then those of controller and reference.
+    """Return the paths of the tunable parameters: those of [tune.free], then others of controller and reference.
 
     Args:
         chosen: Scenario.
@@ -102,19 +102,19 @@ def scenario_with_goal(
     """Return the scenario with these free parameters, and an objective that contains this metric.
 
     If [tune.objective] already weighs the metric, its weights stay, also those of other metrics. Otherwise the metric
-    is
-    the whole objective. The tuning has a single start.
+    is the whole objective. The tuning has a single start.
 
     Args:
         chosen: Scenario; its constraints stay.
         paths: Paths of the free parameters.
         metric: Name of the metric.
         known: Numbers of the loop by key.
-        bounded: Typed bounds (low, high) by key of a number. The default is that of `bounds_on_page`.
+        bounded: Typed bounds (low, high) in the displayed unit, by key of a number. Other numbers have the bounds of
+            `bounds_on_page`.
 
     Raises:
-        ScenarioError: There is no free parameter, or no such metric.
-        ScenarioError: A bound is not in the parameter's range, or the lower bound is not below the upper one.
+        ScenarioError: There is no free parameter, or no such metric. Also raised for a bound that is not in the
+            parameter's range, and for a lower bound that is not below the upper one.
     """
     if not paths:
         raise ScenarioError("tune.free is empty: choose at least one parameter")

@@ -9,7 +9,7 @@ Job = Callable[[], None]
 class NewestJobThread:
     """A thread that runs jobs one after the other.
 
-    A new job replaces a job that still waits. So the results are never behind the requests by more than one job.
+    A new job replaces a job that still waits, so at most one job waits.
     """
 
     def __init__(self, name: str, failed: Callable[[Exception], None]):

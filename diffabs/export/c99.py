@@ -17,10 +17,10 @@ def c_source(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> st
     """Return the text of a C99 file that runs a controller.
 
     The file has the number type `NAME_real`, the structs `NAME_state`, `NAME_input` and `NAME_parameters` with
-    `NAME_defaults`, and the functions `NAME_start` and `NAME_step`. `NAME_step` returns the command.
-    The structs hold only the inputs, parameters and memory that the command depends on.
-    Under `#ifdef NAME_MAIN`, with the name in capitals, it has a main function for tests.
-    That function reads a line of inputs for each sample from standard input and writes a line with the command.
+    `NAME_defaults`, and the functions `NAME_start` and `NAME_step`. `NAME_step` returns the command. The structs hold
+    only the inputs, parameters and memory that the command depends on. Under `#ifdef NAME_MAIN`, with the name in
+    capitals, it has a main function for tests. That function reads a line of inputs for each sample from standard input
+    and writes a line with the command.
 
     Args:
         found: The computer's part of a loop.

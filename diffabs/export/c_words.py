@@ -149,7 +149,7 @@ def is_name(name: str) -> bool:
 
 
 def identifier(path: str) -> str:
-    """Return a path as an identifier of C; empty if no character of the path is allowed in one.
+    """Return a path as an identifier of C; empty if the path has no ASCII letter or digit.
 
     Args:
         path: Text such as a path in a pytree.

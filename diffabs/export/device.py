@@ -3,10 +3,9 @@
     memory, measured --> target, feed-forward, controller --> memory, command
 
 The functions are the loop's own code, traced: reference, feed-forward and the controller within `Sampled`
-(`Sampled.compute_guarded`).
-The parameters of these three remain variables. Those of the plant, period and delay become constants.
-A target that moves by itself, such as a filtered one, is advanced by the Runge-Kutta steps of the simulation.
-Sensors and actuators belong to the machine, not to the computer.
+(`Sampled.compute_guarded`). The parameters of these three remain variables. Those of the plant, period and delay become
+constants. A target that moves by itself, such as a filtered one, is advanced by the Runge-Kutta steps of the
+simulation. Sensors and actuators belong to the machine, not to the computer.
 """
 
 import dataclasses
@@ -91,7 +90,7 @@ class DeviceParameter(NamedTuple):
         return f"{self.path} = {values}{'' if self.spec.unit in ('', '1') else f' {self.spec.unit}'}"
 
     def name_entries(self) -> Iterator[tuple[str, str]]:
-        """Yield, for each number of the value, its name in the exported code and a description (unit and range)."""
+        """Yield, for each number of the value, its name in `Lowered.numbers` and a description (unit and range)."""
         # Twice: the controller stands within `Sampled`, which itself is the loop's controller.
         path = self.path.removeprefix("controller.").removeprefix("controller.")
         units = [unit.strip() for unit in self.spec.unit.split(",")]
@@ -105,13 +104,12 @@ class ComputerProgram:
     """The computer's part of a loop as functions to trace.
 
     A program calls `start` once before the first sample. At each sample it calls `step` once, and then `move` `moves`
-    times.
-    All shapes are `jax.ShapeDtypeStruct`s with the real type `dtype`.
+    times. The shapes are `jax.ShapeDtypeStruct`s, whose real numbers have the type `dtype`.
 
     Attributes:
-        start: start(parts, input) -> state.
-        step: step(parts, state, input) -> (controller's memory, samples, command, held).
-            `held` is true if the sample cannot be used. Memory and command then stay the same, but `samples` counts it.
+        start: start(parts, input) -> state before the first sample.
+        step: step(parts, state, input) -> (controller's memory, samples, command, held). `held` is true if the sample
+            cannot be used. Memory and command then stay the same, but `samples` counts it.
         move: move(parts, state, i) -> reference's memory after the i-th simulation step, for i = 0, 1, ..., moves - 1.
         moves: Number of calls of `move` after each sample; 0 for a reference without continuous memory.
         units: Units of the inputs by name.

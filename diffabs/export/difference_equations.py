@@ -14,8 +14,8 @@ def difference_equations(loop: Loop, target: Scalar = None) -> JsonObject:
     """Return the coefficients of the controller, linearized at rest on the setpoint.
 
     x(k+1) = F x(k) + G y(k) and u(k) = H x(k) + J y(k), all as differences from rest.
-    The inputs y are not only measurements: "target" and "feedforward" are inputs, too.
-    An input without any nonzero coefficient is left out. The computing delay is not in the equations.
+    The inputs y are not only measurements: "target" and "feedforward" are inputs, too. An input without any nonzero
+    coefficient is left out. The computing delay is not in the equations.
 
     Args:
         loop: Closed loop whose controller is `Sampled` or `SampledOnGrid`.

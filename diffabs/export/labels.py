@@ -1,9 +1,8 @@
 """Names for the numbers of a traced program, taken from the variables of its source.
 
-JAX records with each operation the source lines that it comes from.
-The innermost line outside JAX and this package's helpers decides: if it assigns a variable, that name is used.
-If it does not, such as a return statement, the function's name is used.
-If the source is not readable, the numbers get the names of their operations.
+JAX records with each operation the source lines that it comes from. The innermost line outside JAX and this package's
+helpers decides: if it assigns a variable, that name is used. If it does not, such as a return statement, the function's
+name is used. If the source is not readable, the numbers get the names of their operations.
 """
 
 import ast

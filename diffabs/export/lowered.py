@@ -1,7 +1,7 @@
 """A controller as operations on single numbers, in a form that every target language can write.
 
-The operations come from the jaxprs of the loop's own functions, by the rules of package `kernel`.
-So a part needs no code for any language.
+The operations come from the jaxprs of the loop's own functions, by the rules of package `kernel`. So a part needs no
+code for any language.
 """
 
 import re
@@ -26,6 +26,7 @@ class Lowered:
     """A controller whose memory, inputs and parameters are numbers with names.
 
     Attributes:
+        device: The computer's part of the loop.
         inputs, numbers, state: Input nodes of measurements, parameters and memory, by name.
         values: Initial values of the parameters, by name.
         begun: Nodes of the memory before the first sample, by name.
@@ -34,9 +35,9 @@ class Lowered:
         place: Node of the counter of these steps.
         command: Node of the command.
         held: Boolean node: the sample cannot be used.
-        kept: Names of the memory that the command depends on, at once or later.
-        read: Names of the inputs that the kept memory depends on.
-        used: Names of the parameters that the kept memory depends on.
+        kept: Names of the memory that the command or `held` depends on, at once or later, and "command" itself.
+        read: Names of the inputs that the kept memory or `held` depends on.
+        used: Names of the parameters that the kept memory or `held` depends on.
         stored: Nodes of the memory after a sample for the names in `kept`, without `moving`.
     """
 

@@ -1,7 +1,7 @@
 """A plant as an FMU (FMI 2.0 for co-simulation): compiled C that needs neither Python nor this package at run time.
 
-Libraries that make FMUs of Python code run Python, and here JAX, in every step of the importing tool.
-`plant_c` writes the plant as C, so the FMU consists of its library, its source and a description.
+Libraries that make FMUs of Python code run Python, and here JAX, in every step of the importing tool. `plant_c` writes
+the plant as C, so the FMU consists of its library, its source and a description.
 """
 
 import hashlib
@@ -38,8 +38,8 @@ CAUSES = {
 def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str = "") -> bytes:
     """Return an FMU of a loop's plant as the bytes of its zip archive; it runs on this kind of machine.
 
-    The control is the input, and the signals of the plant's output are the outputs.
-    Every number of the plant and of its initial condition is a parameter that the importing tool may set.
+    The control is the input, and the signals of the plant's output are the outputs. Every number of the plant and of
+    its initial condition is a parameter that the importing tool may set.
 
     Args:
         loop: Closed loop; controller, sensor and actuator are not part of the FMU.

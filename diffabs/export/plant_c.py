@@ -47,12 +47,12 @@ class FmuVariable(NamedTuple):
 
 
 class PlantSource(NamedTuple):
-    """A plant as C, without the struct `model` that the functions take.
+    """A plant as C, without a definition of the struct `model` that the functions take.
 
     Attributes:
         text: C functions `plant_start(m)`, `plant_step(m, t, h)` and `plant_show(m)` of a pointer `m` to a struct with
-            the arrays `v` (variables, in their order) and `x` (states).
-            They set `x` at the start, advance `x` from t by h seconds, and store the outputs in `v`.
+            the arrays `v` (variables, in their order) and `x` (states). They set `x` at the start, advance `x` from t
+            by h seconds, and store the outputs in `v`.
         variables: Variables of the FMU: outputs, control, parameters.
         states: Number of states.
     """

@@ -1,10 +1,8 @@
 """A controller as a function block in Structured Text (IEC 61131-3) for a PLC, with the same operations as in C.
 
 Every operation is an assignment to a typed variable. This leaves no order of evaluation and no type mixing to a
-compiler.
-The language has no literals for infinity and NaN: infinite limits become the largest finite number, and a NaN raises
-NotExported.
-Comparisons with NaN are false, as in C, if the PLC follows IEEE 754.
+compiler. The language has no literals for infinity and NaN: infinite limits become the largest finite number, and a NaN
+raises NotExported. Comparisons with NaN are false, as in C, if the PLC follows IEEE 754.
 """
 
 import re
@@ -50,9 +48,9 @@ OWN = {"command", "held", "reset", "started", "i"}  # names that the block itsel
 def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
     """Return the text of a FUNCTION_BLOCK that runs a controller.
 
-    The inputs are the measurements that the controller reads and `reset`, the outputs `command` and `held`.
-    `held` is true if the sample could not be used. The parameters are variables of the block.
-    Call the block once a period. It starts at its first call, and again whenever `reset` is true.
+    Its inputs are `reset` and the measurements that the controller reads. Its outputs are `command` and `held`, which
+    is true if the sample could not be used. The parameters are variables of the block. Call the block once a period.
+    It starts at its first call, and again whenever `reset` is true.
 
     Args:
         found: The computer's part of a loop.

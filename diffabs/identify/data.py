@@ -34,7 +34,7 @@ class Data(Protocol):
         """Return the comparison of these data with a loop.
 
         Args:
-            loop: Loop that is compared with the data.
+            loop: Loop whose parameters are identified.
             free: Paths of the free parameters.
             solver: Solver of every run.
 

@@ -5,8 +5,8 @@
 The fit works in the unbounded coordinates z of `parameter_space`, so no step leaves a parameter's range. SciPy's
 trust-region reflective method minimises the cost. The Jacobian is computed in forward mode, through events and stops.
 
-A norm of 2 is least squares. A norm of 8 or more approaches the minimum of the largest residual.
-A point with a number that is not finite is rejected, and the trust region shrinks.
+A norm of 2 is least squares. A norm of 8 or more approaches the minimum of the largest residual. A point with a number
+that is not finite is rejected, and the trust region shrinks.
 
 Source: M. A. Branch, T. F. Coleman and Y. Li, SIAM J. Sci. Comput. 21 (1999).
 """
@@ -33,7 +33,7 @@ SCIPY_REASONS = {0: Reason.LIMIT, 1: Reason.GRADIENT, 2: Reason.CHANGE, 3: Reaso
 
 @dataclasses.dataclass(frozen=True)
 class Tolerances:
-    """Stopping criteria of a fit, for each start.
+    """Stopping criteria of a fit, for each start; one of them is enough.
 
     Attributes:
         cost: Relative change of the cost.
@@ -125,22 +125,23 @@ def fit(
         residuals: JAX function residuals(part, *data) that returns shape (n,).
         data: Arrays that are passed to `residuals`. Other arrays of the same shapes do not compile again.
         sigma: Standard deviations of the residuals, a number or shape (n,). Without it all residuals have equal weight,
-            and
-            the residuals estimate the variance s^2 of one residual.
+            and they estimate the variance s^2 of one residual.
         absolute: False if only the ratios of sigma are known. The residuals then estimate a factor s^2 of all
             variances.
         prior: JAX function of the part that returns deviations from prior knowledge, in standard deviations. `gaussian`
             makes one; a roughness penalty is another. Arguments in a `jax.tree_util.Partial` are traced.
-        starts: Initial values by path, instead of the part's own. The best fit is returned.
-        norm: Norm of the weighted residuals, >= 2: 2 is least squares, larger norms approach the largest residual.
+        starts: For each start, initial values by path; empty for one start from the part's own. The fit with the lowest
+            cost is returned.
+        norm: Exponent of the weighted residuals, >= 2: 2 is least squares, larger ones approach the largest residual.
         tolerances: Stopping criteria of each start, with the maximum number of evaluations.
         usable: Function of a part that returns whether it may be evaluated; it runs outside jit.
-        progress: Callback at each accepted point, with the number of evaluations over all starts so far and the cost.
-        stopping: Callback before every evaluation. True ends the fit at the last accepted point and skips further
-            starts.
+        progress: Called at each start and accepted point, with the number of evaluations over all starts so far and the
+            cost.
+        stopping: Called before every evaluation. True ends the fit at the last accepted point and skips further starts.
 
     Raises:
-        ValueError: A path or range does not fit, sigma is not positive and finite, or norm is outside [2, inf).
+        ValueError: A path, a range or the shape of sigma does not fit, sigma is not positive and finite, or norm is
+            outside [2, inf).
         ValueError: There are fewer residuals than parameters and no prior. An estimate of s^2 needs one residual more,
             also with a prior.
         ValueError: There is a prior without sigma.
@@ -259,7 +260,7 @@ def _fit_start(
 
 
 def _accepted_evaluation(problem: FitProblem, z: np.ndarray) -> ResidualEvaluation:
-    """Return the evaluation of an accepted point, which is computed again if the cache holds another point.
+    """Return the evaluation of an accepted point; compute it again if the cache holds another point.
 
     Raises:
         RuntimeError: The point is not finite the second time.
@@ -276,8 +277,7 @@ def _parameter_uncertainty(
     """Return the uncertainty in the parameters themselves.
 
     Each parameter has its own z, so dr/dp = dr/dz / (dp/dz). A parameter at the end of its range has dp/dz = 0 and
-    counts as
-    not determined.
+    counts as not determined.
     """
     maps = [m for entry in free.entries for m in entry.maps]
     slope = np.array([float(jax.grad(m.value)(x)) for m, x in zip(maps, z, strict=True)])

@@ -47,13 +47,7 @@ def identify(
         data: Measured traces, or a table of metrics.
         free: Dotted paths of the free parameters, each with a range, or with None for the declared range.
         solver: Solver of every run.
-        absolute: As in `fit`.
-        prior: As in `fit`.
-        starts: As in `fit`.
-        norm: As in `fit`.
-        tolerances: As in `fit`.
-        progress: As in `fit`.
-        stopping: As in `fit`.
+        absolute, prior, starts, norm, tolerances, progress, stopping: As in `fit`.
 
     Raises:
         ValueError: `fit` or the data refuse their arguments, or a run is not admissible at a start.

@@ -52,7 +52,7 @@ def gaussian(known: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
 
 
 def as_partial(prior: Prior | None) -> Prior:
-    """Return a prior as a callable pytree; a `Partial` is returned unchanged, so that its arguments are traced.
+    """Return a prior as a callable pytree. A `Partial` is returned unchanged; its arguments are traced.
 
     Args:
         prior: Prior of a fit; None is the empty prior.

@@ -45,7 +45,7 @@ class Table:
         """Return the comparison with the metrics of every row's loop.
 
         Args:
-            loop: Loop with the free parameters.
+            loop: Loop whose parameters are identified; the rows' own loops are run, with these parameters.
             free: Paths of the parameters that all rows share.
             solver: Solver of every run.
 

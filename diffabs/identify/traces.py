@@ -25,18 +25,15 @@ class Traces:
     """Measured signals over time.
 
     The simulated signals are those behind the loop's sensor. They are interpolated linearly between the instants that
-    the
-    solver keeps (`solver.every`). A run that ends before its data stays at its last sample. If the rest was left out,
-    an
-    early end would lower the cost. If the loop's stop ends a run other than at rest, cut longer data with `until`.
+    the solver keeps (`solver.every`). A run that ends before its data stays at its last sample: without the rest, an
+    early end would lower the cost. If the loop's stop ends a run that is not at rest, cut longer data with `until`.
 
     Attributes:
         t: Instants [s] from the start of the run, shape (n,), increasing, not necessarily equally spaced.
         columns: Measured values by the name of a field of the plant's output, shape (n,), or (runs, n) for several
             runs.
         sigma: Standard deviation of each column's noise, in its unit: a number, shape (n,) or (runs, n). None if
-            unknown,
-            with one column only.
+            unknown, with one column only.
         over: Parameters that differ between runs, by path, with one row for each run.
         until: Last instant [s] of each run that is compared, a number or shape (runs,). None compares all instants.
     """
@@ -61,7 +58,7 @@ class Traces:
             solver: Solver of every run.
 
         Raises:
-            ValueError: A parameter is both free and in `over`, or `t` leaves the solver's duration.
+            ValueError: A parameter is both free and in `over`, or `t` does not increase within the solver's duration.
             ValueError: A column is not an output, or a shape, a value or sigma is wrong.
         """
         self._check(loop, free, solver)

@@ -5,8 +5,8 @@
 with s = 1 if sigma is known absolutely. The model is linearised at the identified parameters. The covariance therefore
 does not cover other minima. It does not cover errors of the model either, which s^2 only averages.
 
-The directions are the right singular vectors of A diag(size)/s, from the data alone. Along the k-th direction, one
-standard deviation of the data is a relative change by 1/(singular value).
+The directions are the right singular vectors of A diag(size)/s, from the data alone. A relative change by 1/(singular
+value) along a direction changes the residuals by one standard deviation.
 
 The `size` of a parameter is |p|, or dp/dz of its unbounded coordinate if that is larger. So a parameter that happens
 to be zero has a size, too. On a half-open range dp/dz is the distance from the end, on a finite range at most a quarter
@@ -26,7 +26,7 @@ MAX_RELATIVE_SPREAD = 1.0
 
 
 class Direction(NamedTuple):
-    """A unit vector of relative parameter changes p/size.
+    """A unit vector of relative parameter changes, (change of p)/size.
 
     Attributes:
         spread: Relative standard deviation along the vector, 1/(singular value); infinite if that is zero to rounding.

@@ -1,8 +1,8 @@
 """A cache of compiled libraries in the user's cache folder, with a check for damage before a library is loaded.
 
-A file name holds two digests: one of every input of the compilation, and one of the file's content.
-If the content does not match its digest (empty, truncated, changed, or another library), the file is removed and the
-library is compiled again.
+A file name holds two digests: one of every input of the compilation, and one of the file's content. If the content does
+not match its digest (empty, truncated, changed, or another library), the file is removed and the library is compiled
+again.
 """
 
 import contextlib
@@ -83,8 +83,8 @@ def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
 def write_library(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
     """Write a library to the cache and return its file.
 
-    The write is atomic: a file with a library's name is always complete.
-    A cache above MAX_CACHE_BYTES first loses its least recently used files.
+    The write is atomic: a file with a library's name is always complete. A cache above MAX_CACHE_BYTES first loses its
+    least recently used files.
 
     Args:
         made_of: Digest of every input that decides the library.

@@ -1,8 +1,8 @@
 """The JAX primitive `run_lanes`: rules for jit, vmap and forward-mode derivatives of a kernel launch.
 
-vmap adds lanes: a uniform array that differs within the batch becomes an array of each lane.
-If only tangents are batched, as in `jax.jacfwd`, the batch stays one launch with more tangents.
-Only this module uses JAX's interfaces for new primitives.
+vmap adds lanes: a uniform array that differs within the batch becomes an array of each lane. If only tangents are
+batched, as in `jax.jacfwd`, the batch stays one launch with more tangents. Only this module uses JAX's interfaces for
+new primitives.
 """
 
 import functools
@@ -48,10 +48,10 @@ class LanePrograms:
         Args:
             functions: The traced functions of one lane.
             launch: Function (program, arrays before the carry, carry) -> carry that runs a program.
-            wanted: Numbers of the carry's arrays whose tangents matter at the end, None for all.
+            wanted: Indices of the carry's arrays whose tangents matter at the end, None for all.
 
         Raises:
-            Unsupported: A function uses an operation without a lowering rule.
+            Unsupported: As in `lower_functions`.
         """
         self.functions, self.launch, self.wanted = functions, launch, wanted
         self._derivatives: dict[PyTree, PyTree] = {}
@@ -60,11 +60,11 @@ class LanePrograms:
     def derivative(self, begins: tuple[tuple[UpdateLevel, int], ...] | None) -> DerivativeProgram:
         """Return the program with one tangent direction, for tangents that start in the seeded arrays.
 
-        `begins` lists the seeded arrays as (level, index); None means the plain program without tangents.
-        The result is kept for the next call.
+        `begins` lists the seeded arrays as (level, index); None means the plain program without tangents. The result is
+        kept for the next call.
 
         Raises:
-            Unsupported: A derivative uses an operation without a lowering rule, or there are too many operations.
+            Unsupported: As in `lower_functions`, for the derivative.
         """
         if begins not in self._derivatives:
             moving = {level: tuple(i for one, i in begins or () if one == level) for level in INPUT_LEVELS}
@@ -83,7 +83,7 @@ class LanePrograms:
         per lane.
 
         Raises:
-            Unsupported: The program has too many operations, or one without a lowering rule.
+            Unsupported: As in `lower_functions`.
         """
         one = self.derivative(begins)
         if begins is None and not as_lanes:
@@ -100,8 +100,9 @@ class LanePrograms:
         return [ArrayKey(level, i, True) for level, i in begins or ()]
 
     def ends(self, begins: PyTree) -> list[ArrayKey]:
-        """Return the keys of the results for the seeds in `begins`: all arrays of the carry, then the tangents that may
-        differ from 0.
+        """Return the keys of the results for the seeds in `begins`.
+
+        These are all arrays of the carry, and then the tangents that may differ from 0 and influence a wanted array.
         """
         carry = range(len(self.functions.types[UpdateLevel.STEP]))
         do = self.derivative(begins).moved_arrays[UpdateLevel.STEP]

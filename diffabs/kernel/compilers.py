@@ -38,7 +38,7 @@ PROBE_TIMEOUT_S = 30  # for the version output, or for a library of one line
 
 
 class NoCompiler(Exception):
-    """An error: no C++ or CUDA compiler on this machine makes a library that loads. The message gives the reason."""
+    """An error: this machine cannot compile a kernel, or cannot load the result. The message gives the reason."""
 
 
 class Compiler(NamedTuple):

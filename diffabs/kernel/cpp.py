@@ -1,8 +1,8 @@
 """A scalar program as C++ text: each thread runs a block of a few SIMD vectors of lanes.
 
-A program's operation becomes one line per vector of the block, one after the other.
-The processor overlaps these independent lines, which hides the latency of each result.
-Between rounds, a lane that has ended hands its place to the next lane.
+A program's operation becomes one line per vector of the block, one after the other. The processor overlaps these
+independent lines, which hides the latency of each result. Between rounds, a lane that has ended hands its place to the
+next lane.
 """
 
 import re
@@ -25,7 +25,8 @@ class LaunchShape(NamedTuple):
     Attributes:
         vectors: SIMD vectors in a block.
         steps: Calls of `step` after each call of `renew`.
-        rounds: Rounds of `renew` and `steps` between two checks for lanes that have ended.
+        rounds: Rounds between two checks for lanes that have ended. A round is one call of `renew` and `steps` calls of
+            `step`.
     """
 
     vectors: int
@@ -57,8 +58,8 @@ def operands_by_name(node: Node) -> tuple[Node, ...]:
 class Text:
     """A writer of the text's parts.
 
-    A subclass for another back end replaces HEAD and DRIVER, the includes before and after, and keeps the names
-    between.
+    A subclass for another back end replaces HEAD and DRIVER. HEAD defines the types and functions that the parts use.
+    DRIVER comes after the parts and calls them.
     """
 
     HEAD, DRIVER = '#include "functions.h"', '#include "drive.h"'

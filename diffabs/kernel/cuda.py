@@ -1,7 +1,7 @@
 """A scalar program as CUDA C++, one lane for each thread.
 
-The program's lines are the same as in the processor's text (`cpp`).
-Before them, `lane.h` defines their names for single numbers; after them, `threads.h` contains the kernels to launch.
+The program's lines are the same as in the processor's text (`cpp`). Before them, `lane.h` defines their names for
+single numbers; after them, `threads.h` contains the kernels to launch.
 """
 
 from typing import NamedTuple

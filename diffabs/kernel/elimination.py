@@ -1,9 +1,8 @@
 """A choice of the tangents that a program computes: vertex elimination for the fewest operations.
 
 A chain of linear operations on a tangent equals one product with the product of the factors, which is the same for all
-tangents.
-So a vertex is eliminated from the graph of one tangent wherever the given number of tangents costs fewer operations
-without it.
+tangents. So a vertex is eliminated from the graph of one tangent if the given number of tangents then needs no more
+operations than before.
 """
 
 from collections.abc import Callable, Iterable
@@ -33,7 +32,7 @@ class Elimination:
 
         Args:
             graph: Graph that the factors are nodes of.
-            many: Number of tangents.
+            many: Number of tangent directions.
             dtype: Type of the tangents.
         """
         self.graph, self.many, self.algebra = graph, many, Algebra(graph, dtype)
@@ -81,9 +80,8 @@ class Elimination:
     def _can_choose_factors(self, vertex: Vertex) -> bool:
         """Return whether a selection between tangents may become a selection between factors.
 
-        The factor 0 does not remove a NaN or infinity in the branch not taken.
-        So a tangent in one branch only must be an input that is constant over the steps: an iterate of a step may
-        diverge.
+        The factor 0 does not remove a NaN or infinity in the branch not taken. So a tangent in one branch only must be
+        an input that is constant over the steps: an iterate of a step may diverge.
         """
         once = set(vertex.sum) ^ set(vertex.others)
         return vertex.which is not None and all(
@@ -133,7 +131,10 @@ class Elimination:
     # elimination ------------------------------------------------------------------------------------------------------
 
     def reduce(self, roots: Iterable[int]) -> None:
-        """Eliminate each vertex whose removal costs no operations, except `roots`, the ids of the results."""
+        """Eliminate each vertex that changes with each step, if this does not raise the number of operations.
+
+        The results, whose ids are `roots`, and all tangents in `kept` remain.
+        """
         self.kept.update(roots)
         # An elimination changes the costs of its neighbours, so passes repeat until one removes nothing.
         left = True

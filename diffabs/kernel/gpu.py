@@ -54,7 +54,7 @@ class GpuDevice(Protocol):
 
 
 def find_gpu() -> GpuDevice | None:
-    """Return the GPU that JAX runs on by default, or None if this default device is a processor.
+    """Return the GPU that JAX runs on by default, or None if JAX runs on a CPU by default.
 
     Raises:
         NoCompiler: JAX runs on an accelerator that is not an NVIDIA GPU.

@@ -1,8 +1,7 @@
 """An expression graph of single numbers, without duplicates: equal operations on equal operands are one node.
 
-A node's level says how often its value changes.
-Constants are folded. Uniform values are computed once a launch, values of a lane once when it starts, and the rest in
-every step.
+A node's level says how often its value changes. Constants are folded. Uniform values are computed once a launch, values
+of a lane once when it starts, and the rest in every step.
 """
 
 import enum
@@ -57,7 +56,8 @@ class Gate(NamedTuple):
 
     Attributes:
         number: Index of the conditional in its graph.
-        any: True if a back end may skip the branch only where the condition is false in all lanes.
+        any: True if the condition is a marker of `Graph.any`. A constant result of the branch not taken is then a
+            placeholder, which no lane uses.
     """
 
     number: int
@@ -151,7 +151,8 @@ class Graph:
     def gate(self, which: Node, no: Iterable[Node], yes: Iterable[Node]) -> list[Node]:
         """Return selections that a back end may compute as a conditional jump, one for each result.
 
-        `no` and `yes` are the results of the two branches; `which` is a boolean of a lane, or the node `any` of one.
+        `no` and `yes` are the results of the two branches. `which` is a boolean of a lane, or the marker that `any`
+        returns for one.
         """
         pairs = list(zip(no, yes, strict=True))
         asked = which.args[0] if which.op == "any" else which

@@ -34,12 +34,12 @@ def run_lanes(
 ) -> PyTree:
     """Return the carry of n lanes after all have ended (pytree, leading axis n), with the structure of `carry`.
 
-    A lane calls `renew` once and `step` `steps` times, and repeats this `rounds` times. Then `running` decides if it
-    goes on.
-    So every lane computes at least `rounds` * `steps` steps, also if `running` is false for its initial carry.
-    A lane that never ends keeps the call from returning.
-    The function works under jit and vmap, with forward-mode derivatives.
-    Arrays that the functions close over are the same for all lanes.
+    A round is one call of `renew` and then `steps` calls of `step`. After every `rounds` rounds, `running` decides
+    whether the lane goes on. So every lane computes at least `rounds` * `steps` steps, even if `running` is false for
+    its initial carry. A lane that never ends keeps the call from returning.
+
+    The function works under jit and vmap, with forward-mode derivatives. Arrays that the functions close over are the
+    same for all lanes.
 
     Args:
         renew: Function of one lane, (lane, carry) -> carry, called before every `steps` steps.
@@ -49,14 +49,14 @@ def run_lanes(
         lane: Pytree of each lane's constants, (n, ...) each.
         carry: Pytree of each lane's initial values, (n, ...) each. Its real numbers share one type, float32 or float64.
         steps: Calls of `step` after each call of `renew`.
-        rounds: Rounds of `renew` and `steps` between two calls of `running`.
-        wanted: Pytree of booleans like `carry`: arrays whose derivatives matter afterwards, None for all.
-            The derivatives of an array that influences none of these may be returned as zero.
+        rounds: Rounds between two calls of `running`.
+        wanted: Pytree of booleans like `carry`: arrays whose derivatives matter afterwards, None for all. The
+            derivatives of an array that influences none of these may be returned as zero.
 
     Raises:
         Unsupported: A function uses an operation without a lowering rule, has too many operations, or the carry mixes
             real types.
-        NoCompiler: There is no compiler for the processor or GPU.
+        NoCompiler: There is no compiler for the processor or GPU, or it does not compile the program.
         ValueError: Reverse mode or a second derivative is requested.
     """
     if not gpu.find_gpu():
@@ -114,7 +114,7 @@ def build_target(made: program.ScalarProgram, shape: cpp.LaunchShape) -> str:
 
 
 def describe_kernel_build() -> dict[str, str]:
-    """Return a dictionary with "compiler", "flags" and "processor" of the present back end.
+    """Return a dictionary with "compiler", "flags" and "processor" of the back end for JAX's default device.
 
     With a program's text, they determine a kernel's numbers to the last bit.
 
@@ -156,6 +156,9 @@ def library_path(name: str) -> pathlib.Path:
 
     Args:
         name: Name of the library in XLA.
+
+    Raises:
+        KeyError: No library of this name is registered.
     """
     return _loaded[name][1]
 

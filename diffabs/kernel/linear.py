@@ -174,7 +174,7 @@ def _is_zero_tangent(node: Node) -> bool:
 
 
 def changes_in_step(factor: Factor) -> bool:
-    """Return whether a factor changes within a step.
+    """Return whether a factor changes with each step.
 
     Args:
         factor: Factor of a tangent.

@@ -1,7 +1,7 @@
 """Compilation of CUDA C++ to machine code of a given architecture by NVRTC, NVIDIA's runtime compiler.
 
-NVRTC comes with JAX for GPUs. It needs neither a GPU nor a driver.
-The user's cache folder keeps the machine code, like the libraries of `compilers`.
+NVRTC comes with JAX for GPUs. It needs neither a GPU nor a driver. The user's cache folder keeps the machine code, like
+the libraries of `compilers`.
 """
 
 import ctypes
@@ -53,6 +53,8 @@ def build_cubin(text: str, architecture: str) -> pathlib.Path:
 
 def parse_register_usage(log: str) -> dict[str, dict[str, int]]:
     """Return, by kernel name, the registers of a thread ("registers") and its spilled bytes ("spilled").
+
+    The spilled bytes are those of stores and loads together.
 
     Args:
         log: Messages of the assembler.

@@ -1,9 +1,8 @@
 """The translation of JAX primitives on arrays into operations on single numbers, by one lowering rule for each
 primitive.
 
-Shapes are known, so an array becomes a NumPy array of nodes, and moving its entries costs nothing.
-A rule lists the parameters it handles. A primitive without a rule, or with an unknown parameter (as in a later JAX),
-raises Unsupported.
+Shapes are known, so an array becomes a NumPy array of nodes, and moving its entries costs nothing. A rule lists the
+parameters it handles. A primitive without a rule, or with an unknown parameter (as in a later JAX), raises Unsupported.
 """
 
 import pathlib
@@ -82,7 +81,7 @@ def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Se
         inputs: Arrays of nodes for its inputs.
 
     Raises:
-        Unsupported: A primitive has no rule, or a parameter that its rule does not handle.
+        Unsupported: A primitive has no rule, or its rule does not handle a parameter, a type or a shape.
     """
     at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
@@ -158,7 +157,7 @@ def map_entries(function: Callable[..., Node], *arrays: PyTree) -> Array:
 
 
 def inline_program(graph: Graph, program: Any, inputs: Sequence[Array]) -> list[Array]:
-    """Return the outputs of a program (jaxpr, closed or not) that another one calls.
+    """Lower a program (jaxpr, closed or not) that another one calls, and return its outputs as arrays of nodes.
 
     Args:
         graph: Graph that receives the nodes.
@@ -166,7 +165,7 @@ def inline_program(graph: Graph, program: Any, inputs: Sequence[Array]) -> list[
         inputs: Arrays of nodes for its inputs.
 
     Raises:
-        Unsupported: A primitive has no rule, or a parameter that its rule does not handle.
+        Unsupported: As in `lower_jaxpr`.
     """
     jaxpr, constants = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, ())
     return lower_jaxpr(graph, jaxpr, [constant_array(graph, x) for x in constants], inputs)

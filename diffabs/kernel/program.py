@@ -16,7 +16,7 @@ from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel, is_real
 from diffabs.kernel.primitives import Unsupported, constant_array, lower_jaxpr
 
 RULE_MODULES = (arrays, draws, elementwise, indexing, nested)  # imported because each registers its rules
-MAX_OPERATIONS = 60_000  # of a step; a compiler takes minutes for more
+MAX_OPERATIONS = 60_000  # nodes of a program; a compiler takes minutes for more
 
 
 class InputPlace(NamedTuple):
@@ -126,8 +126,7 @@ def build_program(
         carry: Pytree with shapes and types of a lane's carry, without the axis of lanes.
 
     Raises:
-        Unsupported: A function uses an operation without a lowering rule, there are too many operations, or the carry's
-            real numbers do not share one type, float32 or float64.
+        Unsupported: As in `lower_functions`.
     """
     return lower_functions(trace_functions(functions, lane, carry))
 
@@ -169,10 +168,10 @@ def check_size(program: ScalarProgram, operations: int) -> ScalarProgram:
 
     Args:
         program: Program to return.
-        operations: Number of its operations.
+        operations: Number of nodes in its graph, inputs and constants included.
 
     Raises:
-        Unsupported: There are more than MAX_OPERATIONS operations.
+        Unsupported: `operations` is greater than MAX_OPERATIONS.
     """
     if operations > MAX_OPERATIONS:
         raise Unsupported("step", f"of {operations} operations; {MAX_OPERATIONS} are the most")

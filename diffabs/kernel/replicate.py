@@ -11,7 +11,7 @@ from diffabs.kernel.program import live_nodes
 
 
 def dependents(nodes: Iterable[Node], first: set[int]) -> set[int]:
-    """Return the ids in `first`, and of all nodes that depend on them.
+    """Return the ids in `first`, and the ids of all nodes that depend on them.
 
     Args:
         nodes: Nodes, operands first.
@@ -41,8 +41,8 @@ def replicate_nodes(
 ) -> dict[int, list[Node]]:
     """Return, for each node id that the roots need, its nodes in a program of several tangent directions.
 
-    A value has one node, a nonzero tangent one for each direction, a zero tangent the constant 0.
-    A node that the elimination has removed has no entry.
+    A value has one node, a nonzero tangent one for each direction, a zero tangent the constant 0. A node that the
+    elimination has removed has no entry.
 
     Args:
         graph: Graph that receives the nodes.

@@ -1,9 +1,8 @@
 """Forward-mode derivatives of functions of one lane: one program of the values and several tangents of each number.
 
-The program comes from `jax.jvp`, traced with one tangent for every array that could have one.
-Reachability in its graph then shows which arrays have nonzero tangents: the seeded ones, and everything they reach from
-step to step.
-Only these tangents are repeated, as often as requested. All other tangents are zero, and so are their results.
+The program comes from `jax.jvp`, traced with one tangent for every array that could have one. Reachability in its graph
+then shows which arrays have nonzero tangents: the seeded ones, and everything they reach from step to step. Only these
+tangents are repeated, as often as requested. All other tangents are zero, and so are their results.
 """
 
 from collections.abc import Iterable
@@ -45,12 +44,13 @@ class ArrayKey(NamedTuple):
 
 
 class DerivativeProgram(NamedTuple):
-    """A program with one tangent, whose arrays of each level are followed by their tangents.
+    """A program with one tangent direction. In each level, the tangents of the arrays follow the arrays.
 
     Attributes:
         program: Operations and results.
-        differentiable: Arrays that have a tangent in the program.
-        moved_arrays: Arrays whose tangents can be nonzero: the seeded ones, and in the carry all that depend on them.
+        differentiable: Indices of the arrays that have a tangent in the program, by level.
+        moved_arrays: Indices of the arrays whose tangents are repeated, by level. In the carry these can be nonzero and
+            influence an output that is needed. In the other levels they are the seeded ones.
     """
 
     program: ScalarProgram
@@ -69,7 +69,7 @@ def differentiate_functions(
         outputs_needed: Indices of the carry's arrays whose tangents matter at the end, None for all.
 
     Raises:
-        Unsupported: A derivative uses an operation without a lowering rule, or there are too many operations.
+        Unsupported: As in `lower_functions`, for the derivative.
     """
     differentiable = seeded | {
         UpdateLevel.STEP: tuple(i for i, x in enumerate(functions.types[UpdateLevel.STEP]) if is_real(x.dtype))
@@ -90,7 +90,7 @@ def lower_without_tangents(functions: TracedFunctions) -> DerivativeProgram:
         functions: Traced functions.
 
     Raises:
-        Unsupported: A function uses an operation without a lowering rule, or there are too many operations.
+        Unsupported: As in `lower_functions`.
     """
     none: TangentArrays = dict.fromkeys(INPUT_LEVELS, ())
     return DerivativeProgram(lower_functions(functions), none, none)

@@ -1,7 +1,7 @@
 """Linear systems in pure JAX: linearisation, sampling, Riccati and Lyapunov equations, LQR, LQG, and stability margins.
 
-Everything except the margins works under `jit` and automatic differentiation, and `vmap` solves many systems at once.
-Margins, frequency responses and conversions to python-control are NumPy.
+Models, equations, regulators and filters work under `jit` and automatic differentiation, and `vmap` solves many systems
+at once. Open loops, margins, frequency responses and conversions to python-control are NumPy.
 """
 
 from diffabs.linear.balance_model import BalanceModel as BalanceModel

@@ -1,6 +1,7 @@
 """The linear model of a balancing plant about upright, used to design its feedback u = K x.
 
-The first line is the model in continuous time; the second is the model sampled with period T.
+The first line is the model in continuous time; the second is the model sampled with period T. G(T) is the integral of
+e^(A r) over r in [0, T].
 
     x' = A x + B u
     x+ = e^(A T) x + G(T) B u

@@ -43,8 +43,7 @@ def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
     """Return the steady-state Kalman filter of x+ = A x + w, y = C x + v; NaN where no such filter exists.
 
     The gain L corrects the prediction: x^ = x^- + L (y - C x^-). The predictor's gain is A L. The result is
-    differentiable
-    in every argument.
+    differentiable in every argument.
 
     Args:
         A: State matrix, shape (n, n).
@@ -71,11 +70,10 @@ def lqg(
     noise: Any = (1e-3, 1e-3),
     voltage_max: float = np.inf,
 ) -> Sampled:
-    """Return an LQG controller for a balancing plant, sampled, which measures only theta and psi.
+    """Return a sampled LQG controller for a balancing plant, which measures only theta and psi.
 
     It is an LQR on the estimate of a steady-state Kalman filter. Each sample corrects the estimate before the command
-    is
-    computed, without a computing delay.
+    is computed, without a computing delay.
 
     Args:
         plant: Two-wheeler; it is linearised upright.
@@ -86,7 +84,7 @@ def lqg(
         disturbance: Standard deviations of unknown accelerations of theta, psi, phi [rad/s^2], constant over a period.
             With larger values the filter trusts its prediction less.
         noise: Standard deviations of the measured angles theta and psi [rad].
-        voltage_max: Limit of the command [V].
+        voltage_max: Limit of the voltage in the filter's prediction [V]. The command itself has no limit.
 
     Raises:
         ValueError: The same cases as in `dlqr`.

@@ -140,8 +140,7 @@ def used_leaves(plant: Plant, state: PyTree, outputs: Sequence[str]) -> list[boo
     """Return for each leaf of the state whether at least one of the outputs depends on it.
 
     Dependence is read from the traced computation, not from values. A leaf counts even if its coefficient is zero, and
-    the
-    parameters may be tracers.
+    the parameters may be tracers.
 
     Args:
         plant: Plant with an `output`.

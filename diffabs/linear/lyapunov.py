@@ -40,7 +40,7 @@ def lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
 
     Args:
         A: State matrix, shape (n, n).
-        Q: Right side, shape (n, n); it need not be symmetric.
+        Q: Constant term, shape (n, n); it need not be symmetric.
     """
     A, Q = as_float_arrays(A, Q)
     I = jnp.eye(len(A), dtype=A.dtype)
@@ -56,7 +56,7 @@ def discrete_lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
 
     Args:
         A: State matrix, shape (n, n).
-        Q: Right side, shape (n, n); it need not be symmetric.
+        Q: Constant term, shape (n, n); it need not be symmetric.
     """
     A, Q = as_float_arrays(A, Q)
     P = _solve_vectorised(jnp.kron(A.T, A.T) - jnp.eye(A.size, dtype=A.dtype), Q)
@@ -112,7 +112,10 @@ def transpose(X: jax.Array) -> jax.Array:
 
 
 def times(*factors: jax.Array) -> jax.Array:
-    """Return the product of matrices, in their order. It is a sum of outer products, which XLA fuses into one loop."""
+    """Return the product of `factors`, each of shape (rows, columns, batch), in their order.
+
+    Each product is a sum of outer products, which XLA fuses into one loop.
+    """
     return reduce(lambda X, Y: reduce(add, (X[:, k, None] * Y[None, k] for k in range(len(Y)))), factors)
 
 

@@ -57,9 +57,8 @@ class OpenLoop(NamedTuple):
     def transfer(self, more: float = 0.0) -> Transfer:
         """Return the open loop L from the command to minus the controller's command, so the feedback is negative.
 
-        With a sampled controller L is discrete. States that do not influence its output are left out. `more` adds to
-        the delay
-        [s].
+        With a sampled controller L is discrete. States that do not influence its output are left out. `more` [s] adds
+        to the delay.
         """
         delay = self.delay + more
         if self.period is None:
@@ -77,14 +76,12 @@ def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
     Args:
         loop: Loop to open.
         target: Setpoint in the unit of the first signal; None takes the setpoint of the loop's reference. A reference
-            that
-            searches for its target has no setpoint yet: state the value that it will find.
+            that searches for its target has no setpoint yet: give the value that it will find.
 
     Raises:
         ValueError: A block acts at instants (a relay, a controller that computes in every step but is not `Sampled`);
             or the plant does not come to rest at the setpoint; or the command does not respond to a measured signal
-            there,
-            for example at a limit.
+            there, for example at a limit.
     """
     rational, delay = _split_off_delays(loop)
     _check_continuous(rational)

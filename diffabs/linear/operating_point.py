@@ -36,7 +36,7 @@ class LinearLoop(NamedTuple):
         A: State matrix, shape (n, n).
         B: Input matrix, shape (n, 1).
         K: Gain of the loop's controller, shape (n,).
-        residue: Largest rate or error at the operating point, relative to the size of the state.
+        residue: Largest rate or error at the operating point, over 1 plus the largest state or command.
     """
 
     A: AnyArray
@@ -225,8 +225,8 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
 def find_root(function: Any, x: Scalar) -> AnyArray:
     """Return a root of a vector function, shape (n,), by the Gauss-Newton method.
 
-    If there is none, the result is the least-squares minimiser. It is differentiable twice in the parameters of the
-    function.
+    Without a root, the result is the least-squares minimiser. The result is differentiable twice in the parameters of
+    the function.
 
     Args:
         function: Function of a vector that returns a vector.

@@ -26,8 +26,7 @@ def recoverable_bound(A: AnyArray, B: AnyArray, start: PyTree, limit: Scalar) ->
     """Return the largest multiple of `start` from which some |u| <= limit returns, for a system with one unstable pole.
 
     The result is a scalar, differentiable in all arguments. It is NaN if A has poles on the imaginary axis. With
-    several
-    unstable poles it is not a bound: use `mode_bounds`.
+    several unstable poles it is not a bound: use `mode_bounds`.
 
     Args:
         A: State matrix, shape (n, n), with one unstable pole.
@@ -45,10 +44,9 @@ def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[f
     mode.
 
     Some |u| <= limit returns the mode from every smaller multiple, and none from a larger one. Each mode is taken
-    alone, so
-    no control returns from more than the smallest multiple. If only one pole is unstable, some control returns from
-    every
-    smaller multiple. A multiple is infinite where `start` does not excite the mode. Complex pairs are left out.
+    alone, so no control returns the whole system from more than the least of the multiples. If only one pole is
+    unstable, some control returns from every smaller multiple. A multiple is infinite where `start` does not excite the
+    mode. Complex pairs are left out.
 
     Args:
         A: State matrix, shape (n, n).
@@ -67,8 +65,7 @@ def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[f
 
 
 def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
-    """Return the finite transmission zeros of x' = A x + B u, y = c'x, shape (n - r,) for relative
-    degree r.
+    """Return the finite transmission zeros of x' = A x + B u, y = c'x, shape (n - r,) for relative degree r.
 
     At a zero the Rosenbrock matrix loses rank. The zeros are the poles of the inverse system, whose states keep y at 0.
     They are eigenvalues of the matrix below, without its r eigenvalues nearest to zero, which come from the projection.

@@ -3,8 +3,8 @@
     lqr    minimises the integral of x'Q x + 2 x'S u + u'R u,  x' = A x + B u    K = -R^-1 (B'P + S')
     dlqr   minimises the sum,                                  x+ = A x + B u    K = -(R + B'P B)^-1 (B'P A + S')
 
-Both are pure JAX: compiled, batched and differentiable in every matrix. If the matrices are numbers, errors are raised
-before the equation is solved. Inside `jit` and `vmap` the flag `stabilising` reports a failure, and K is NaN.
+Both are pure JAX: compiled, batched and differentiable in every matrix. Untraced matrices are checked before the
+equation is solved. Inside `jit` and `vmap` the flag `stabilising` reports a failure, and K is NaN.
 """
 
 from typing import NamedTuple
@@ -77,8 +77,8 @@ def dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
         A: State matrix, shape (n, n).
         B: Input matrix, shape (n, m).
         Q: Weight of the states, shape (n, n).
-        R: Weight of the inputs, shape (m, m). If it is traced it may be singular where R + B'P B > 0; else positive
-            definite.
+        R: Weight of the inputs, shape (m, m). An untraced R must be positive definite. A traced one may be singular
+            where R + B'P B > 0.
         S: Cross weight, shape (n, m); None for zero.
 
     Raises:

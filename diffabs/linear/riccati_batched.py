@@ -1,7 +1,8 @@
-"""Solvers for many Riccati equations at once, on stacks of shape (rows, columns, batch).
+"""Solvers for many Riccati equations at once.
 
-Nested `vmap` calls join their axes into one batch. `riccati` states the equations and the method; this file contains
-its steps.
+`solve_care` and `solve_dare` have the batch as their first axis; the steps work on stacks of shape (rows, columns,
+batch). Nested `vmap` calls join their axes into one batch. `riccati` states the equations and the method; this file
+contains its steps.
 """
 
 from collections.abc import Callable
@@ -36,7 +37,7 @@ MAX_RELATIVE_RESIDUAL = 1e-9  # largest admitted relative residual in the given 
 
 @partial(jax.jit, static_argnums=0)
 def solve_one(solver: Callable, data: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-    """Return (P, residual) of one equation.
+    """Return (P, residual) of one equation, shapes (n, n) and ().
 
     Args:
         solver: `solve_care` or `solve_dare`.
@@ -74,7 +75,7 @@ def _batch_over_matrices(solver: Callable) -> Callable:
 
 @_batch_over_matrices
 def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Matrix:
-    """Return (P, residual) of continuous equations; P is NaN where it is not proven.
+    """Return (P, residual) of continuous equations, shapes (batch, n, n) and (batch,); P is NaN where it is not proven.
 
     Args:
         A: State matrices, shape (batch, n, n).
@@ -97,13 +98,13 @@ def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
 
 @_batch_over_matrices
 def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Matrix:
-    """Return (P, residual) of discrete equations; P is NaN where it is not proven.
+    """Return (P, residual) of discrete equations, shapes (batch, n, n) and (batch,); P is NaN where it is not proven.
 
     Args:
         A: State matrices, shape (batch, n, n).
         B: Input matrices, shape (batch, n, m).
         Q: Weights of the states, shape (batch, n, n), symmetric.
-        R: Weights of the inputs, shape (batch, m, m), symmetric positive semidefinite; singular where R + B' P B > 0.
+        R: Weights of the inputs, shape (batch, m, m), symmetric positive semidefinite; singular only if R + B' P B > 0.
         S: Cross weights, shape (batch, n, m).
     """
     pivots, diagonal = (jnp.sum(x * eye(len(R), R), 1) for x in (cholesky(R), R))

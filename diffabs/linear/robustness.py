@@ -71,7 +71,7 @@ class Band(NamedTuple):
 def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, target: Scalar = None) -> Band:
     """Return the margins of a loop over a box {path: (low, high)}: at its corners, and at samples that fill it evenly.
 
-    Equal corners count once, so a range with low = high adds none. If all ranges are such, there are no samples.
+    Equal corners count once, so a range with low = high adds none. If low = high in all ranges, there are no samples.
 
     Args:
         loop: Loop to examine.
@@ -103,8 +103,8 @@ def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, tar
 def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:
     """Return points (count, dimensions) that fill the unit cube evenly, the same in every call.
 
-    The points are multiples of powers of the root of x^(d+1) = x + 1 (Roberts, 2018). In one dimension the root is the
-    golden ratio.
+    Coordinate i of point k is 1/2 + k/x^i modulo 1, both counted from 1. Here x is the root of x^(d+1) = x + 1
+    (Roberts, 2018). In one dimension the root is the golden ratio.
 
     Args:
         count: Number of points.

@@ -70,7 +70,7 @@ class SlipModel:
         [control of the previous sample], [slip error behind `filter`]
 
     With `Sampling` the model is discrete, as `Sampled` computes. Integral and filter use forward Euler from the sample
-    that the control uses; the other states are exact.
+    that the control uses; the other states are exact. An `actuator` or `filter` that is `Direct` adds no state.
     """
 
     plant: Plant = part(default=MirroredRig)

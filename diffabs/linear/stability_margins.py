@@ -34,10 +34,9 @@ class Margins(NamedTuple):
 
     Attributes:
         stable: Whether the closed loop is stable.
-        gain: Factors (low, high), low < 1 < high, between which the loop's gain may be multiplied; 0 and infinity
-            without
-            a limit.
-        gain_at: Frequencies of both [rad/s]; NaN without a limit.
+        gain: Factors (low, high), low < 1 < high: the loop is stable for its gain times any factor between them. They
+            are 0 and infinity without a limit.
+        gain_at: Frequencies (low, high) at which the factors bring L to -1 [rad/s]; NaN without a limit.
         phase: Phase margin [rad]: the smallest angle, lag or lead, that reaches -1; infinity without a crossover.
         phase_at: Its frequency [rad/s].
         delay: Delay margin [s]; infinity without a limit.
@@ -71,9 +70,9 @@ class Crossovers(NamedTuple):
 
     Attributes:
         gain_at: Frequencies with |L| = 1 [rad/s].
-        phases: Phase above -pi at these, in (-pi, pi].
+        phases: Phase of L above -pi at these frequencies, in (-pi, pi] [rad].
         phase_at: Frequencies at which L is real and negative [rad/s].
-        factors: 1/|L| at these.
+        factors: 1/|L| at the frequencies `phase_at`.
     """
 
     gain_at: np.ndarray

@@ -25,7 +25,7 @@ class Transfer(NamedTuple):
         C: Output matrix, shape (p, n).
         D: Direct path, shape (p, m).
         period: Sampling period [s]; None in continuous time.
-        delay: Pure delay [s].
+        delay: Pure delay [s], a whole number of periods for a sampled system.
     """
 
     A: Matrix

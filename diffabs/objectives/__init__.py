@@ -1,6 +1,7 @@
 """Objectives: streamed measures of a run.
 
-Reports use `BRAKING` for a plant that shows a `BrakeOutput` and `BALANCE` for a plant that shows a `BalanceOutput`.
+By default a run has the objectives `BRAKING` for a braked wheel, `BALANCE` for a balance, and `TRACKING` for any other
+plant.
 """
 
 from diffabs.core.protocols import Objective, Plant

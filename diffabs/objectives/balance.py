@@ -152,7 +152,7 @@ class PeakTorque:
 
 @pytree
 class SoftLoss:
-    """1/(1 + (radius/|x|)^(1/softness)) of the last state x [1]. The square of |x| is the sum of `weight` times x^2.
+    """1/(1 + (radius/|x|)^(1/softness)) of the last state x [1]. Here |x|^2 is the sum of `weight` times x^2.
 
     x is (theta, psi, phi, theta', psi', phi') in rad and rad/s. The loss is near 0 for a run that comes to rest, near 1
     for one that diverges, and smooth between. Its mean over starts is 1 minus a soft share of the region of attraction;
@@ -184,7 +184,7 @@ class RestTime:
 
     unit = "s"
     physical = (0.0, math.inf)
-    unreached = math.inf  # the value of a run that does not come to rest
+    unreached = math.inf
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
 

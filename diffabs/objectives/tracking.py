@@ -88,11 +88,11 @@ def highest_signal(output: PyTree) -> float:
 
 
 def absolute_integral(cubic: Cubic, integral: Callable[[PyTree], PyTree]) -> Scalar:
-    """Return the integral of |p| over [0, 1], for a cubic p with at most one sign change.
+    """Return the integral of |p|, or of |p| times a positive weight, over [0, 1]; p changes its sign at most once.
 
     Args:
-        cubic: p; a sign change counts if p(0) and p(1) differ in sign.
-        integral: Function of x that returns the integral from 0 to x of p, or of p times a positive weight.
+        cubic: The cubic p; its sign changes if p(0) and p(1) differ in sign.
+        integral: Function of x that returns the integral from 0 to x of p, or of p times the weight.
     """
     whole = integral(1.0)
     left = integral(cubic.root())
@@ -190,8 +190,8 @@ class MaxSlip:
 class Overshoot:
     """Overshoot as a fraction of the final setpoint r [1]: max(0, (max y - r)/max(r, 0.01)).
 
-    The floor 0.01 is in the unit of y. It keeps a division by 0 away where an estimator ends at slip 0. If the first
-    setpoint is negative, -y and -r take the places of y and r. A run without overshoot has derivative 0.
+    The floor 0.01, in the unit of y, avoids a division by 0 where a reference ends at slip 0. If the first setpoint is
+    negative, -y and -r take the places of y and r. A run without overshoot has derivative 0.
     """
 
     unit = "1"
@@ -248,7 +248,7 @@ class SettlingTime:
 
     unit = "s"
     physical = (0.0, math.inf)
-    unreached = math.inf  # the value of a run that does not settle
+    unreached = math.inf
 
     share: Scalar = param(default=0.02, unit="1", low=0.0, below=1.0)
     band: Scalar = param(default=0.0, unit="signal", low=0.0)

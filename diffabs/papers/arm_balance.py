@@ -117,7 +117,7 @@ def loop(plant: Part, gain: Matrix, start: PyTree = PAPER_START, voltage: float 
     Args:
         plant: A two-wheeler.
         gain: K of u = K x, shape (6,).
-        start: Start (theta, psi, phi, ...), of which the angles count [rad].
+        start: Angles theta, psi and phi [rad] at the start; further entries have no effect.
         voltage: Limit of the motor voltage [V].
     """
     return dataclasses.replace(
@@ -132,8 +132,7 @@ def runs() -> dict[str, Run]:
     """Return the five runs by name, as NumPy arrays.
 
     They are Fig. 3 in the printed equations, its start in the correct model with two voltage limits, and two gains of
-    the
-    hanging arm.
+    the hanging arm.
     """
     upright, hanging = lqr_gain(ArmBalance()), lqr_gain(HANGING, WEIGHTS, EFFORT)
     cases = {
@@ -150,7 +149,7 @@ def runs() -> dict[str, Run]:
 
 
 def recovered_multiples(one: Loop, rows: Table) -> list[Reach]:
-    """Return for each row the largest of `MULTIPLES` of the paper's start up to which all of them are recovered.
+    """Return, for each row, the greatest of `MULTIPLES` up to which every multiple of the paper's start is recovered.
 
     Args:
         one: Closed loop.
@@ -211,8 +210,7 @@ def robust_gains(progress: Callable[[str], None]) -> JsonObject:
     """Return pairs of a gain and its recovered multiples over the riders, by name of the gain.
 
     The gains are the LQR of one rider, tuned weights, and the LMI for all riders of 40 to 100 kg. The LMI is left out
-    if
-    the extra `design` is not installed.
+    if the extra `design` is not installed.
 
     Args:
         progress: Function that receives a sentence before each long computation.

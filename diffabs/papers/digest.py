@@ -41,7 +41,7 @@ class Digest(NamedTuple):
         headings: Headings of the table.
         lines: Lines of the table.
         agreement: Sentences on the numbers that agree.
-        verdicts: Verdicts and claims.
+        verdicts: Pairs of a word ("refuted" or "holds") and a sentence, one pair for each claim.
         figures: Number of figures.
     """
 
@@ -161,7 +161,7 @@ def _share(rows: Sequence[Row], agrees: Callable[[Row], bool], words: str) -> st
 
 
 def verdict(rows: Sequence[Row], claim: Refuted) -> tuple[str, str] | None:
-    """Return "refuted" or "holds", and a sentence of the claim with its numbers; None if the record lacks one of them.
+    """Return "refuted" or "holds", and a sentence of the claim with its numbers; None if the record lacks a number.
 
     Args:
         rows: Rows of the record.

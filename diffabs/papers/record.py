@@ -91,7 +91,7 @@ def origin_of_numbers() -> dict[str, str]:
 
 
 def write_summary(folder: pathlib.Path, summary: JsonObject, name: str = "summary.json") -> JsonObject:
-    """Write a summary atomically, and return it as a reader of the file gets it.
+    """Write a summary atomically, and return it as it reads back from the file.
 
     Args:
         folder: Existing folder.

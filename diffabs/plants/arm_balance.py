@@ -102,7 +102,12 @@ def usual_objectives(self: Any) -> dict[str, PyTree]:
 
 @pytree
 class ArmBalance:
-    """Frame, arm and rider under the voltage of the arm's motor. A negative `arm_length` is a hanging arm."""
+    """Frame, arm and rider under the voltage of the arm's motor. A negative `arm_length` is a hanging arm.
+
+    In the letters of the module's equations, the first ten fields are m1, m2, m3, lg, l, Lg, hg, I1, I2 and I3. The
+    others are K, d, Rm, Kt, Kb, fm, N, the limit of the current, Jr and g. The lengths lg, Lg and hg reach to the
+    centres of mass; arm and rider turn at the height l.
+    """
 
     body_mass: Scalar = param(default=30.0, unit="kg", above=0.0)
     arm_mass: Scalar = param(default=20.0, unit="kg", above=0.0)
@@ -245,8 +250,7 @@ class ArmBalance:
         return self.torque(state.psi_rate, control) * state.psi_rate, self.damping * state.phi_rate**2
 
     def limits(self, gain: AnyArray) -> np.ndarray:
-        """Return one row of the motor's linear range, shape (..., 1, 6): its current is within the limit where |row x|
-        <= 1.
+        """Return the row, shape (..., 1, 6), for which the motor's current is within its limit where |row x| <= 1.
 
         The state x is (theta, psi, phi) and their rates, in the order of `ArmState`.
 

@@ -1,14 +1,14 @@
 """Energy audits of a run: they detect an unstable integration whose numbers all stay finite.
 
-    energy     E(t + h) - E(t) <= work that the control may have done on the vehicle in that step; of a balance in all
+    energy     E(t + h) - E(t) <= work that the control may have done on the vehicle in that step (balance: in the run)
     braked     distance does not fall, and grows no faster than the speed; friction alone changes the speed
 
 An audit is an objective with a value of at most 1 for a physically possible run. The value is the unexplained gain of
 energy divided by the tolerance, 1 % of the energy scale at the start.
 
-The bound of the work takes the greatest control and speed at both ends of the step, times 2. Both may be greater inside
-the step. A nonnegative brake torque does no work on the vehicle. The bound thus covers legitimate gains: a negative
-torque that drives the wheel, or a motor that rights a two-wheeler.
+The bound on a step's work is twice its length times the greatest control and the greatest speed at its ends. Both may
+be greater inside the step. A nonnegative brake torque does no work on the vehicle. The bound thus covers legitimate
+gains: a negative torque that drives the wheel, or a motor that rights a two-wheeler.
 """
 
 from typing import Any
@@ -70,8 +70,8 @@ class BrakeAudit:
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum of the steps' unexplained gains of energy [J], this step included.
 
-        A step's gain counts beyond the work of a driving torque and the rounding. The sum is infinite after a step that
-        no car can make.
+        Only the gain beyond the work of a driving torque and beyond rounding counts. The sum is infinite after a step
+        that no car can make.
         """
         # An audit decides on validity only, so it needs no derivatives.
         before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))

@@ -68,6 +68,9 @@ class LabRigState(NamedTuple):
 class LabRig:
     """Two wheels, a lever, bearing friction, and a brake with a 49 ms lag. The control u in [0, 1] is the brake
     command.
+
+    In the letters of the module's equations, the first eight fields are r1, r2, J1, J2, d1, d2, M10 and M20. Then
+    follow L, phi, Mg, c31, b1, b2 and u0. `crawl_speed` is the least denominator of the slip.
     """
 
     wheel_radius: Scalar = param(default=0.0995, unit="m", above=0.0)

@@ -39,7 +39,10 @@ class RigState(NamedTuple):
 
 @pytree
 class MirroredRig:
-    """J1 omega1' = m g r1 mu - tau1, c m r2^2 omega2' = -m g r2 mu."""
+    """J1 omega1' = m g r1 mu - tau1, c m r2^2 omega2' = -m g r2 mu.
+
+    The fields are m, r1, r2, J1 and c; `crawl_speed` is the least denominator of the slip.
+    """
 
     mass: Scalar = param(default=5.3, unit="kg", above=0.0)
     wheel_radius: Scalar = param(default=0.0995, unit="m", above=0.0)

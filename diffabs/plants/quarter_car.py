@@ -38,7 +38,10 @@ class QuarterCarState(NamedTuple):
 
 @pytree
 class QuarterCar:
-    """m v' = -mu m g, J omega' = r mu m g - u. The inertia was identified together with the spline road."""
+    """m v' = -mu m g, J omega' = r mu m g - u. The inertia was identified together with the spline road.
+
+    `crawl_speed` is the least denominator of the slip.
+    """
 
     mass: Scalar = param(default=15.0, unit="kg", above=0.0)
     radius: Scalar = param(default=0.2, unit="m", above=0.0)

@@ -22,9 +22,10 @@ def describe_axes(figure: Figure) -> list[JsonObject]:
     - `x`, `y`: ends of the axes.
     - `log`: for both axes, whether they are logarithmic.
     - `names`: labels of the axes.
-    - `series`: points in the axes' units.
+    - `series`: for each curve or cloud its name, colour, and at most `MAX_SERIES_POINTS` points in the axes' units.
 
-    Filled areas, invisible axes and axes with a scale other than linear or logarithmic are left out.
+    Filled areas are left out. So are axes without a series, invisible axes, and axes with a scale other than linear or
+    logarithmic.
 
     Args:
         figure: Figure that is already drawn, so that its axes have their final places.

@@ -33,7 +33,19 @@ class AxisVariable(NamedTuple):
 
 
 class SweepView:
-    """The rows, metrics and variables of a sweep that its figures show."""
+    """The rows, metrics and variables of a sweep that its figures show.
+
+    Attributes:
+        found: Results of the sweep.
+        units: Units by the name of a column.
+        bounds: Bounds of a failure by metric.
+        design: Type of the sampling design.
+        accepted: Mask of the samples that were not refused.
+        good: Mask of the accepted runs that did not diverge.
+        rows: Mask of the good runs that statistics use: of a Saltelli design one of each group, else all of them.
+        varying: Metrics whose finite values differ by more than rounding.
+        leading: First varying metric with a bound, else the first varying metric; "" if none varies.
+    """
 
     def __init__(self, found: Results, units: Mapping[str, str] = {}):
         """Select the rows and metrics of the sweep `found`; `units` are by the name of a column."""
@@ -94,10 +106,8 @@ class SweepView:
         mask `rows`.
 
         The first variable explains the largest variance between cells. The second explains the largest variance of the
-        rest.
-        With `numbers_first`, a variable with names is chosen only if no numeric one varies. Variables with names come
-        last in
-        the list, because the vertical axis has room for them.
+        rest. With `numbers_first`, a variable with names is chosen only if no numeric one varies. Variables with names
+        come last in the list, because the vertical axis has room for them.
         """
         best: list[str] = []
         for _ in range(2 if len(result) else 0):
@@ -137,8 +147,7 @@ def cell_means(one: AxisVariable, result: np.ndarray) -> np.ndarray:
     """Return for each run the mean of the result over its cell, shape (runs,).
 
     The variance of these means measures influence. Unlike a correlation, it also shows a result that is worst in the
-    middle
-    of a range, and the influence of a variable with names.
+    middle of a range, and the influence of a variable with names.
 
     Args:
         one: Variable to divide into cells.

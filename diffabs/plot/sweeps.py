@@ -106,10 +106,8 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
     """Return a scatter of the runs over two variables, coloured by a metric, or None if nothing varies.
 
     The metric is the first varying one with a bound of failure, else the first varying one. The variables are the two
-    that
-    influence it most, numeric ones first. With one variable, the figure shows the metric over it. The worst runs, with
-    the
-    greatest values, are marked with sample number and value.
+    that influence it most, numeric ones first. With one variable, the figure shows the metric over it. The worst runs,
+    with the greatest values, are marked with sample number and value.
 
     Args:
         found: Results of the sweep.
@@ -175,11 +173,9 @@ def draw_sensitivity(found: Results, document: Table) -> Figure | None:
 def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """Return a map of the share of failed runs over two variables, or None if there is nothing to draw.
 
-    The variables are the two that influence failure most. With fewer than ten runs on either side, failed or not, they
-    are
-    the two of `draw_worst`. If no run failed, the colour is the largest value of that metric in a cell. Cells without a
-    run
-    are grey.
+    The variables are the two that influence failure most. With fewer than ten failed runs, or fewer than ten others,
+    they are the two that influence the metric of `draw_worst` most. If no run failed, the colour is the largest value
+    of that metric in a cell. Cells without a run are grey.
 
     The function returns None if no variable varies, and if no run failed and no metric varies.
 

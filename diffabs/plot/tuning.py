@@ -25,7 +25,7 @@ SETTLED_MULTIPLE = 1.5  # length of the time axis, in transients
 
 
 def draw_history(points: Sequence[PyTree], *, title: str = "") -> Figure:
-    """Return a figure of the objective and the gradient over the number of computed gradients.
+    """Return a figure of objective, violation and gradient over the number of computed gradients.
 
     Args:
         points: Points of the iteration with `evaluations`, `objective`, `gradient` and `violation`.
@@ -91,8 +91,7 @@ def pareto_front(x: Scalar, y: Scalar) -> np.ndarray:
     """Return the indices of the Pareto-optimal points (both objectives are minimised), in ascending order of x.
 
     A point is left out if another point is at least as small in both objectives. Of equal points one is kept. Points
-    that
-    are not finite are left out.
+    that are not finite are left out.
 
     Args:
         x: First objective, shape (n,).
@@ -112,7 +111,7 @@ def pareto_front(x: Scalar, y: Scalar) -> np.ndarray:
 def draw_worst_case(
     nominal: Trajectory, worst: Trajectory, parameters: Table, *, metric: str = "", title: str = ""
 ) -> Figure:
-    """Return a figure of the nominal run and the worst run, with the parameters of the worst run.
+    """Return a figure of the nominal and the worst braking run, with the parameters of the worst run.
 
     Args:
         nominal: Trajectory of the nominal run.

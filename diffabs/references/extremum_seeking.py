@@ -8,9 +8,9 @@
 
 Krstic and Wang multiply by the dither itself. Here the deceleration is correlated with the measured slip. There are no
 dynamics between them, a = mu(slip) g. The slope is therefore correct for any phase lag of the loop behind the dither.
-Any movement of the slip contributes to the estimate. Slope and step are relative, so one gain fits ice and asphalt. On
-a straight line through any point c = (da/ds) q. Noise of the deceleration has zero mean in c, and a constant bias has
-none in a - b.
+Any movement of the slip contributes to the estimate. Slope and step are relative, so one gain fits ice and asphalt. If
+the deceleration is a linear function of the slip, c = (da/ds) q. Noise of the deceleration adds nothing to c on
+average, and a constant bias cancels in a - b.
 
 Source: M. Krstic and H.-H. Wang, Stability of extremum seeking feedback for general nonlinear dynamic systems,
 Automatica 36 (2000).

@@ -34,7 +34,7 @@ class PeakMemory(NamedTuple):
     Attributes:
         latched: 1 once latched, else 0.
         greatest: Greatest |a| so far; in `PeakRobust`, of the signed filtered deceleration [m/s^2].
-        slip: Slip at this maximum [1].
+        slip: Slip at this maximum [1]; in `PeakLiteral`, the first slip.
         target: Target slip [1].
     """
 
@@ -61,8 +61,6 @@ def _fresh_memory(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMem
 @pytree
 class PeakLiteral:
     """The paper's estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake.
-
-    It shows that the printed rule, read literally, cannot brake.
 
     Attributes:
         slip: Target until |a| exceeds its first sample [1].
@@ -149,7 +147,7 @@ class PeakRobust:
     `threshold` of the maximum.
 
     Deceleration and slip pass the same low-pass filter, so their delays cancel. The deceleration keeps its sign,
-    because the absolute value of noise has a nonzero mean. No maximum up to `arming` latches.
+    because the absolute value of noise has a nonzero mean. A maximum of at most `arming` does not latch.
 
     Attributes:
         slip: Target before the latch [1].
@@ -183,8 +181,8 @@ class PeakRobust:
         """Return two margins: of a new maximum [m/s^3], and of the fall that latches [m/s^2].
 
         The first is the filtered deceleration's rate where it exceeds its maximum, else the absolute value of the rate.
-        The second is the filtered deceleration minus (1 - threshold) times its maximum.
-        After the latch, or while the maximum is at most `arming`, it is the absolute value, so it causes no event.
+        The second is the filtered deceleration minus (1 - threshold) times its maximum. After the latch, or while the
+        maximum is at most `arming`, the second is an absolute value, so it causes no event.
         """
         del rate
         m: PeakMemory = memory.held

@@ -35,15 +35,15 @@ def failure_probability(
 ) -> RareEvent:
     """Return an estimate of P[metric >= bound] over the space of a study, with runs on the study's engine.
 
-    The study's design and its number of samples have no influence. Runs that diverge do not count as failures; the
-    result reports their number.
+    The study's design and its number of samples have no influence; its seed determines the sensor noise only. Runs that
+    diverge do not count as failures; the result reports their number.
 
     Args:
         study: Loop, space, solver and objectives.
         metric: Name of a metric that the study measures.
         bound: Bound on the metric, in its unit.
-        gradients: True draws around design points, too, found by gradients through the run.
-        options: Options of `subset_simulation`.
+        gradients: Whether to offer importance sampling design points as centres, found by gradients through the run.
+        options: Keyword arguments of `subset_simulation`, such as `samples` and the `seed` of the draws.
 
     Raises:
         ValueError: The metric is not measured, the study draws parts, the bound is not finite, or a drawn point cannot
@@ -168,7 +168,7 @@ def _compile_derivatives(study: Study, metric: str) -> Callable[[Table], PyTree]
 
 
 def _parameter_slopes(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:
-    """Return dv/dz (n, dimension) of each parameter; it is zero for lists of values, except close to their edges."""
+    """Return dv/dz (n, dimension) of each parameter; zero for one drawn from a list, except where its value changes."""
     n, d = z.shape
     offsets = DIFFERENCE_STEP * np.eye(d)
     points = np.stack([z[:, None] + offsets, z[:, None] - offsets]).reshape(-1, d)

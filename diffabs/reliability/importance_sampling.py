@@ -113,7 +113,7 @@ class CountedScore:
         return np.where(lost, -np.inf, score)
 
     def since(self, evaluations: int, diverged: int) -> int:
-        """Return the number of runs that diverged since the counts `evaluations` and `diverged`.
+        """Return the number of runs that diverged since the counters were at `evaluations` and `diverged`.
 
         Raises:
             DivergenceError: The share of diverged runs exceeds the tolerated share.
@@ -139,7 +139,7 @@ class Mixture(NamedTuple):
 
     centres: np.ndarray
     weights: np.ndarray
-    scales: np.ndarray  # s
+    scales: np.ndarray
 
     @property
     def directions(self) -> np.ndarray:
@@ -158,8 +158,7 @@ class Mixture(NamedTuple):
         return -np.logaddexp.reduce(self._terms(z)[0], axis=1)
 
     def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return each centre's share of the density at `z` (n, d), and squared distances from the centres' lines, each
-        (n, k).
+        """Return each centre's share of the density at `z` (n, d), and the squared distance from its line, each (n, k).
 
         The share is the probability that z was drawn around that centre. The line passes through the origin and the
         centre.
@@ -180,12 +179,10 @@ class Mixture(NamedTuple):
 def fit_proposal(
     failures: np.ndarray, group: np.ndarray, probability: float, centres: np.ndarray | None = None
 ) -> tuple[Mixture, float]:
-    """Return the mixture with the least predicted second moment E_q[w^2 1_F]/P^2 of all fits, and the logarithm of that
-    moment.
+    """Return the fitted mixture with the least predicted moment E_q[w^2 1_F]/P^2, and the logarithm of the moment.
 
     The fits have 1, 2, 4, 8 and 16 centres from the failures; one more takes the given `centres`. The logarithm is
-    infinite
-    if all failures are in odd groups, or all in even groups.
+    infinite if all failures are in odd groups, or all in even groups.
 
     Args:
         failures: Points (n, d), distributed as phi on F.
@@ -258,7 +255,7 @@ def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> n
         z' = (a'z + threshold - g) a/|a|^2,   a = dg/dz
 
     A search moves to z + t (z' - z) if the merit |z|^2/2 + 2 (|z| + 1)/|a| |threshold - g| falls. Otherwise t is
-    halved. All searches advance together.
+    halved. All searches advance together. Of ends closer than 0.5 to each other, the nearest to the origin is returned.
 
     A search that meets a kink, a plateau (a = 0) or a diverged run stops there. The point is then a poor centre, but
     the estimate stays unbiased for any centre.
@@ -308,8 +305,8 @@ def try_importance_sampling(
 ) -> tuple[ImportanceEstimate | None, str]:
     """Return the estimate of importance sampling, and a note that names the better estimate and the reason.
 
-    The estimate is None, without draws, unless the failures predict at most half the coefficient of variation of subset
-    simulation. With a gradient, design points are further candidates for centres.
+    The failures must predict at most half the coefficient of variation of subset simulation. Otherwise the estimate is
+    None and nothing is drawn. With a gradient, design points are further candidates for centres.
 
     Args:
         runs: Score and its gradient.
@@ -340,10 +337,10 @@ def try_importance_sampling(
 
 
 def is_better_estimate(found: ImportanceEstimate, subset: ProbabilityEstimate) -> bool:
-    """Return whether importance sampling has at most the coefficient of variation of subset simulation and is not far
-    below it.
+    """Return whether importance sampling is no more uncertain than subset simulation, and not far below it.
 
-    Far below means more than four standard deviations in log P: such an estimate misses failures.
+    The uncertainty is the coefficient of variation. Far below means more than four standard deviations in log P: such
+    an estimate misses failures.
 
     Args:
         found: Result of importance sampling.
@@ -363,7 +360,7 @@ def importance_sampling(
 
     The coefficient of variation is the greater of the observed and the predicted one, since both are low if heavy
     weights are rare. The interval is an interval of log P, from Student's t with (effective size - 1) degrees of
-    freedom.
+    freedom. If no draw fails, the probability is 0, the coefficient of variation inf and the interval (0, 1).
 
     Args:
         score: Function z (n, d) -> score (n,).

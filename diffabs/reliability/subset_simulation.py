@@ -13,9 +13,9 @@ estimate is consistent; its bias is O(1/samples) (positive, a few per cent by de
 
 A level's relative variance is (1 - p)/(p n) (1 + correlation along chains). The levels depend on each other, too. The
 total variance comes from the failures' ancestors among the first samples, sum_a (share of a)^2 (A. Lee and N. Whiteley,
-Biometrika 105 (2018)). It is bounded by the value for independent levels below and for fully dependent levels above
-(the bounds of Au and Beck). The interval is log-normal, with quantiles of Student's t and one degree of freedom for
-each effective ancestor.
+Biometrika 105 (2018)). It is kept between the values for independent and for fully dependent levels (the bounds of Au
+and Beck). The interval is log-normal, with quantiles of Student's t and one degree of freedom for each effective
+ancestor.
 
 Importance sampling follows if the failures predict that it at least halves the coefficient of variation
 (`importance_sampling`). Its estimate replaces that of subset simulation unless it proves more uncertain or far lower. A
@@ -50,7 +50,7 @@ Rng = np.random.Generator
 
 
 class SubsetReason(enum.Enum):
-    """The reason why the last level is the last: the threshold was reached, no progress, or no levels left."""
+    """The reason why no further level follows: the threshold was reached, no progress, or no levels left."""
 
     REACHED = "the threshold was reached"
     PLATEAU = "no progress: no sample is above the score that they share"
@@ -70,7 +70,7 @@ class SubsetProgress(NamedTuple):
     level: int
     threshold: float
     share: float
-    evaluations: int  # so far
+    evaluations: int
 
 
 class SubsetLevel(NamedTuple):
@@ -85,11 +85,11 @@ class SubsetLevel(NamedTuple):
         diverged: Number of the level's runs that diverged.
     """
 
-    threshold: float  # b_j
+    threshold: float
     share: float
-    cov: float  # coefficient of variation of the share, with the correlation along chains
-    acceptance: float  # of the proposals; 1 for the first level, whose samples are independent
-    spread: float  # s, after the last step
+    cov: float
+    acceptance: float
+    spread: float
     diverged: int
 
 
@@ -100,16 +100,16 @@ class RareEvent:
     Attributes:
         probability: Probability of the better estimate; 0 if no sample failed.
         cov: Coefficient of variation of the better estimate; infinite if no sample failed.
-        interval: 95 % interval of the better estimate; its upper end is an upper bound if no sample failed.
+        interval: 95 % interval of the better estimate; from 0 to an upper bound if no sample failed.
         reason: Reason why no further level was made.
         levels: The levels of subset simulation.
         subset: Estimate of subset simulation.
-        importance: Result of importance sampling, or None if it was not tried.
+        importance: Result of importance sampling, or None if nothing was drawn for it.
         note: Name of the better estimate, and the reason for the choice.
         failing: Different failures (k, d) of subset simulation, distributed as phi on F, the most likely first; at most
             100.
         evaluations: Number of runs of both methods, without the gradients.
-        gradients: Number of gradients.
+        gradients: Number of gradients, one for each point.
         diverged: Number of runs and gradients with a NaN score. They count as not failing; a score of +inf counts as
             failing.
         price: Cost of a gradient in runs.
@@ -166,15 +166,15 @@ def subset_simulation(
         levels: Greatest number of levels.
         draws: Number of draws of importance sampling, >= 2; 0 for no importance sampling.
         gradient: Function (n, dimension) -> score (n,), its derivative (n, dimension), n at most 8; or None. It locates
-            design points as centres. In many dimensions (from about 20) the failures alone do not locate them.
+            design points, which serve importance sampling as centres. In many dimensions (from about 20) the failures
+            alone do not locate them.
         price: Cost of a gradient in runs, for `RareEvent.cost`.
         tolerated: Greatest share of diverged runs in a level, and among the draws.
         progress: Called after every level.
 
     Raises:
-        ValueError: The dimension, the threshold or a number of samples, levels or draws is invalid, or the score has
-            the
-            wrong shape.
+        ValueError: The dimension, the threshold, the share or a number of samples, levels or draws is invalid, or the
+            score or its derivative has the wrong shape.
         importance_sampling.DivergenceError: Too many runs diverge.
     """
     plan = _make_plan(dimension, threshold, samples, share, levels, draws)

@@ -27,7 +27,7 @@ READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, design and certify
 
 
 class ReportError(ValueError):
-    """A source without a readable document; the message gives the reason in one line."""
+    """An error: a source has no readable document, or a document is not complete. The message is one line."""
 
 
 class Document(NamedTuple):

@@ -100,7 +100,7 @@ class Section:
 def shown_numbers(value: Scalar) -> list[ShownNumber | str]:
     """Return the texts and numbers that a cell shows.
 
-    A list shows its first `MAX_SHOWN_ENTRIES` entries and its length; nested lists are flattened.
+    A longer list than `MAX_SHOWN_ENTRIES` shows its first entries and its length. Nested lists are flattened.
 
     Args:
         value: Content of the cell.

@@ -128,10 +128,11 @@ def certificate_section(document: Document) -> Section:
     """Return the section of a saved certificate, whose claims are proved again.
 
     Args:
-        document: Certificate in its own file.
+        document: Certificate in its own file, which is read again.
 
     Raises:
         KeyError: The document lacks a key.
+        ValueError: The file is not a certificate that `verify_file` can read in time.
     """
     content = document.content
     proved = verify_file(document.path)

@@ -35,7 +35,7 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
         title: Title of the report; by default the title of the only section, or the number of results.
 
     Raises:
-        ReportError: A document lacks a key of its kind.
+        ReportError: A document is not complete, or a file that belongs to it cannot be read.
     """
     import jinja2
 

@@ -32,12 +32,14 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
     """Return the readings in a CSV file.
 
     Args:
-        path: File of UTF-8 text, at most `MAX_FILE_BYTES` long, with the column `t [s]`.
+        path: File of UTF-8 text, at most `MAX_MEASUREMENT_BYTES` long, with the column `t [s]`. Columns of target,
+            command and control are ignored.
         units: Units of the plant's signals by name: a column's header is `name [unit]`.
 
     Raises:
-        ScenarioError: The file cannot be read, a column is unknown, a cell is no finite number, or the instants do not
-            increase. The message names the line of the file.
+        ScenarioError: The file cannot be read, a column is unknown, or there is no signal or no row. Also raised for a
+            cell that is no finite number, and for an instant that is negative or not after the one before. The message
+            names the line of such a cell or instant.
     """
     try:
         raw = files.read_content(path, MAX_MEASUREMENT_BYTES + 1)

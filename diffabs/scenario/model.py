@@ -32,7 +32,7 @@ def describe_model(chosen: Scenario) -> JsonObject:
 
 
 def describe_parts(chosen: Scenario) -> dict[str, JsonObject]:
-    """Return every part by its path: its type, and its fields that are not parameters.
+    """Return every part, objectives included, by its path: its type, and its fields that are not parameters.
 
     Args:
         chosen: Scenario to describe.
@@ -44,7 +44,7 @@ def describe_parts(chosen: Scenario) -> dict[str, JsonObject]:
 
 
 def describe_numbers(chosen: Scenario) -> dict[str, JsonObject]:
-    """Return value (in SI) and unit of every parameter by its path.
+    """Return value (in SI) and unit of every parameter, those of objectives included, by its path.
 
     JSON has no infinity and no NaN: these become texts, which an override accepts.
 

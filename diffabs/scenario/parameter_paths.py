@@ -82,13 +82,12 @@ class ParameterEntry:
 
         Args:
             or_else: Alternative to a range, for messages. A text that is not empty also selects the rules of a free
-                parameter
-                of a tuning. Its ends must then differ, and may be ends that the parameter's own range excludes.
+                parameter of a tuning. Its ends must then differ, and may be ends that the parameter's own range
+                excludes.
 
         Raises:
             ScenarioError: The value is not a pair, an end is outside the parameter's range, or the ends are in the
-                wrong
-                order.
+                wrong order.
         """
         needed = f"a range [low, high] in {self.spec.interval()}"
         if not isinstance(self.given, list):

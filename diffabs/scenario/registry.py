@@ -155,7 +155,7 @@ def _packaged_parts(family: str) -> Table:
 
 
 def name_of(family: str, part: Part) -> str:
-    """Return the name of a named constant, else the name of the part's class.
+    """Return the name of a part in scenarios: that of a named constant, else that of the part's class.
 
     Args:
         family: Family of the part.

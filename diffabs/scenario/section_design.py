@@ -89,7 +89,7 @@ class DesignTask:
     over: Mapping[str, Range] = dataclasses.field(default_factory=dict)
 
     def box(self, loop: Loop) -> dict[str, Range]:
-        """Return the ranges (low, high) in SI by path of the linear model of `loop`, also ranges of a single value.
+        """Return the ranges (low, high) in SI by path of the linear model of `loop`, single values included.
 
         A speed without a range gets the range from the loop's stop to its start, even if nothing else has a range.
         """
@@ -100,8 +100,7 @@ class DesignTask:
         """Return the ranges (low, high) in SI by path of `loop`, without ranges of a single value.
 
         The dictionary is empty if [design.over] is empty. Otherwise the speed of a brake without a range gets the range
-        from
-        the loop's stop to its start.
+        from the loop's stop to its start.
         """
         over = self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else self.over
         return {path: ends for path, ends in over.items() if ends[0] < ends[1]}

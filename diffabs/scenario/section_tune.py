@@ -107,8 +107,7 @@ class Goal:
 
         Raises:
             ScenarioError: No parameter is free, no metric has a weight, or a start is not inside its range. Also raised
-                if the
-                initial speed of a run is not above the speed at which runs stop.
+                if an initial speed in [tune.over] is not above the speed at which runs stop.
         """
         for name, example in (("free", '"controller.gain" = [-20000.0, -80.0]'), ("objective", "iae = 1.0")):
             if not getattr(self, name):
@@ -169,7 +168,7 @@ def read_tune_section(table: PyTree, loop: Loop, objectives: Mapping[str, Object
 def metric_reader(
     objectives: Mapping[str, Objective], what: str, unit: Callable[[Objective], str] = lambda _: "1"
 ) -> Reader:
-    """Return the reader of a table of numbers by metric.
+    """Return the reader (given, path) -> {metric: number} of a table, which raises ScenarioError for a wrong one.
 
     Args:
         objectives: Objectives by name, whose names are the allowed keys.

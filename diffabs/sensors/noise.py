@@ -20,10 +20,10 @@ from diffabs.core.types import Key, PyTree
 class Noise:
     """Independent Gaussian noise of each channel, drawn every `period` and held; the distance has none.
 
-    The slip has noise of its own: it is not computed again from the noisy speeds.
-    A run needs a random key (`rollout(..., key=)`), also with all deviations 0.
-    The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations. A channel
-    with deviation 0 draws nothing, because drawing would take most of the run's time.
+    The slip has noise of its own: it is not computed again from the noisy speeds. A run needs a random key
+    (`rollout(..., key=)`), also with all deviations 0. The k-th draw is a function of (key, k), so a run is
+    deterministic and differentiable in the deviations. A channel with deviation 0 draws nothing, because drawing would
+    take most of the run's time.
 
     Attributes:
         slip: Standard deviation of the slip [1].
@@ -75,8 +75,8 @@ class WheelNoise:
     """Gaussian noise of the wheel speed, proportional to the vehicle speed: w_seen = w - v n, with n drawn every
     `period` and held.
 
-    The slip shown is slip + n at any speed. A run needs a random key, also with deviation 0.
-    Teeth of unequal width cause such noise. It also enters an estimate of the vehicle speed from the wheel speed.
+    The slip shown is slip + n at any speed. A run needs a random key, also with deviation 0. Teeth of unequal width
+    cause such noise. It also enters an estimate of the vehicle speed from the wheel speed.
 
     Attributes:
         slip: Standard deviation of n [1].
@@ -117,9 +117,8 @@ class PlayedWheelNoise:
     """A given error of the wheel speed, proportional to the vehicle speed: w_seen = w - v n.
 
     Each period holds one entry of `noise` (length,), cyclically. The slip shown is slip + n. No random key is
-    necessary.
-    The entries of `noise` are parameters in place of the draws of `WheelNoise`: a recorded sequence, or the result of a
-    search. A repeating sequence models the teeth of a wheel.
+    necessary. The entries of `noise` are parameters in place of the draws of `WheelNoise`: a recorded sequence, or the
+    result of a search. A repeating sequence models the teeth of a wheel.
 
     Attributes:
         noise: Values of n, shape (length,) [1].
@@ -150,8 +149,8 @@ class PlayedWheelNoise:
 def draw_noise(deviation: Scalar, key: Key, number: Scalar) -> PyTree:
     """Return deviation * z as a scalar, with z standard normal; a draw happens only if necessary.
 
-    A deviation of 0 without a tangent draws nothing and returns 0.
-    The tangent is z times the deviation's tangent, also at deviation 0.
+    A deviation of 0 without a tangent draws nothing and returns 0. The tangent is z times the deviation's tangent, also
+    at deviation 0.
 
     Args:
         deviation: Standard deviation, shape ().
@@ -205,9 +204,9 @@ class Bias:
 class Quantisation:
     """measured = q round(true/q) for each channel; q = 0 leaves the channel unchanged.
 
-    Every field is the q of its channel. The distance has none.
-    The derivative with respect to the signal is 0, as on the treads of a staircase; it does not contain the jumps. A
-    run does not depend smoothly on q: a derivative with respect to q raises a ValueError.
+    Every field is the q of its channel. The distance has none. The derivative with respect to the signal is 0, as on
+    the treads of a staircase; it does not contain the jumps. A run does not depend smoothly on q: a derivative with
+    respect to q raises a ValueError.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0, tunable=False)

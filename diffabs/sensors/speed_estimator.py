@@ -12,27 +12,27 @@ Every period h, from the measured deceleration a and wheel speed w:
 
 The filter starts from v = w, P = R and f = g. It restarts where s >= gate and f < rest. While the wheel still rolls, it
 averages the first samples (L = 1/2, 1/3, ...). Once the wheel is braked or locked, the filter uses the accelerometer
-alone and P grows. It then trusts a rolling wheel the sooner. The filter always trusts a wheel that is faster than the
-estimate, because a braked wheel is not faster than the car. The accelerometer's bias is no state of the filter: in the
-first milliseconds of braking it cannot be distinguished from noise.
+alone and P grows. The larger P is, the sooner the filter trusts a rolling wheel again. The filter always trusts a wheel
+that is faster than the estimate, because a braked wheel is not faster than the car. The accelerometer's bias is no
+state of the filter: in the first milliseconds of braking it cannot be distinguished from noise.
 
-**False slip of a rolling wheel.** With an accelerometer bias b < 0, v_seen - v grows by |b| t. A controller that holds
-the estimated slip at s* sets the wheel speed to w = (1 - s*) v_seen. When v_seen reaches v/(1 - s*), this is w = v: the
-wheel rolls, its estimated slip is s*, and the controller releases the brake. Then nothing slows the car, the estimated
-slip does not end, and the gate never opens. Real slip causes a force, which tells the two cases apart. A wheel slower
-than the car, locked or not, decelerates it by mu(s) g (twice this on the mirrored rig). The accelerometer shows exactly
-this, also on a slope:
+**False slip of a rolling wheel.** If the measured deceleration has a bias b < 0, v_seen - v grows by |b| t. A
+controller that holds the estimated slip at s* sets the wheel speed to w = (1 - s*) v_seen. Once v_seen is v/(1 - s*),
+this is w = v: the wheel rolls, its estimated slip is s*, and the controller releases the brake. Then nothing slows the
+car, the estimated slip does not end, and the gate never opens. Real slip causes a force, which tells the two cases
+apart. A wheel slower than the car, locked or not, decelerates it by mu(s) g (twice this on the mirrored rig). The
+accelerometer shows exactly this, also on a slope:
 
     f >= a >= min of mu(s') g over s' >= s      so, with m(s) for that minimum,      f < m(s_0)  proves  s < s_0.
 
 m rises from m(0) = 0 to its value for a locked wheel, or for the least friction beyond the peak. `rest` must lie above
 bias and noise and below this value. Then f < rest proves that the wheel's slip is at most m^-1(rest), for any estimated
-s, and the filter restarts from the wheel speed. A wheel that is locked on the road has f >= rest and is not trusted for
-any duration. On the rig m is at least 6.8 m/s^2 from a slip of 0.1 on, and m^-1(1 m/s^2) is a slip of 0.8 %.
+s, and the filter restarts from the wheel speed. A wheel that is locked on the road has f >= rest and is never trusted.
+On the rig m is at least 6.8 m/s^2 from a slip of 0.1 on, and m^-1(1 m/s^2) is a slip of 0.8 %.
 
 The assumption is a road that gives `rest`: with mu < rest/g the filter would trust a locked wheel. Because f rises at
 once, there is no restart between two actuations of the brake. It decays from g to rest in hold ln(g/rest), 46 ms. For
-this time there is no restart after the start either, when the brake is about to act.
+as long there is no restart after the start either, when the brake is about to act.
 """
 
 from typing import NamedTuple

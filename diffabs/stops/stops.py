@@ -42,7 +42,7 @@ class Standstill:
     v^2/(2 a) [m].
 
     Slip is stiff near standstill (its rate is proportional to 1/v), so the last centimetres are not integrated. The
-    result does not depend on the speed between 0.01 and 1 m/s.
+    result does not depend on `speed` between 0.01 and 1 m/s.
     """
 
     speed: Scalar = param(default=0.05, unit="m/s", above=0.0)

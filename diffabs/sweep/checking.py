@@ -28,7 +28,8 @@ def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
     - `metrics`: For each metric the `median` and `largest` relative change, and the `sample` with the largest. Its
       `difference` is the absolute change of this sample, in the metric's unit.
 
-    A change is relative to the metric's absolute value, or to the median of these if that is larger.
+    A change is relative to the metric's absolute value, or to the median of these if that is larger. A metric without
+    finite values is left out of `metrics`.
 
     Args:
         study: Study of the sweep.

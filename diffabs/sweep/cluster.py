@@ -44,11 +44,10 @@ POLL_SECONDS = 0.05  # time between checks for finished chunks [s]; workers alre
 
 
 class Dask:
-    """An engine that computes chunks on a Dask cluster: the one of `scheduler` (tcp://host:port), or processes on this
-    machine.
+    """An engine that computes chunks on a Dask cluster.
 
     Attributes:
-        scheduler: Address of a scheduler; None starts workers on this machine.
+        scheduler: Address of a scheduler, tcp://host:port; None starts workers on this machine.
         workers: Number of worker processes on this machine.
     """
 
@@ -128,8 +127,9 @@ def _start_workers(workers: int) -> Iterator[PyTree]:
 
 
 def dask_setup(_: Any) -> None:
-    """Ignore Ctrl-C in a worker, so that only the process in the terminal handles it. Dask calls this in each new
-    worker.
+    """Ignore Ctrl-C in a worker, so that only the process in the terminal handles it.
+
+    Dask calls this in each new worker.
 
     Args:
         _: Worker, not used.
@@ -226,8 +226,9 @@ def _wait_for_chunk(client: Client, finished: Scalar, stopping: Callable[[], boo
 
 
 def _convert_to_numpy(study: Study) -> Study:
-    """Return the study with NumPy arrays. A process with float32 as default would read JAX arrays with half of their
-    digits.
+    """Return the study with NumPy arrays.
+
+    A process with float32 as default would read JAX arrays with half of their digits.
     """
 
     def plain(x: Scalar) -> Any:

@@ -25,8 +25,8 @@ from diffabs.core.values import (
 def choose_indices(u: ArrayLike, count: int, weights: Sequence[float] | None = None) -> np.ndarray:
     """Return the index of the item that each uniform u picks.
 
-    It is the smallest k with u < F(k), with probabilities in proportion to the weights. At u = 1 it is the last item
-    with a positive weight.
+    It is the smallest k with u < F(k), where F(k) is the weight of the items 0 to k over the weight of all. At u = 1 it
+    is the last item with a positive weight.
 
     Args:
         u: Uniforms in [0, 1], any shape.
@@ -185,7 +185,7 @@ class Rows(_Discrete):
         return {path: np.asarray(column)[rows] for path, column in self.columns.items()}
 
     def middles(self) -> np.ndarray:
-        """Return values of u that give each row once."""
+        """Return values of u that give each row with a positive weight once."""
         return probability_midpoints(self.size, self.weights)
 
     def problems(self, name: str) -> Iterator[str]:

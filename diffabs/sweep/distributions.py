@@ -207,7 +207,7 @@ DISTRIBUTION_TYPES = {
 
 
 def read_distribution(given: PyTree, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Scalar:
-    """Return the distribution of a table.
+    """Return the distribution that a table describes.
 
     Args:
         given: Table with `type` and fields.

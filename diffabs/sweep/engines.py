@@ -63,8 +63,9 @@ class Local:
     def run(
         self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
     ) -> Generator[ComputedChunk, None, None]:
-        """Yield the `chunks` of a `study` in order, until `stopping()` is true. The next chunks run while one is
-        encoded.
+        """Yield the `chunks` of a `study` in order, until `stopping()` is true.
+
+        The next chunks run while one is encoded.
         """
         runner, seals = Runner(study, self.devices), Seals(describe_owner(study))
         rest = group_items(chunks[jax.process_index() :: jax.process_count()], len(self.devices))
@@ -107,7 +108,7 @@ def is_accepted(refused: Bool) -> np.ndarray:
 
 
 def has_failed(study: Study, columns: Any) -> np.ndarray:
-    """Return which runs diverged, had a wrong end, or exceeded a bound of the study, shape (samples,).
+    """Return which runs diverged, had a wrong end, or exceeded one of `Study.failure_bounds`, shape (samples,).
 
     A sample that was not run has not failed.
 

@@ -23,9 +23,9 @@ from diffabs.sweep.study import FLAG_COLUMNS
 class Results:
     """The finished chunks of a sweep as one table, with a row for each sample.
 
-    The columns are parameters, metrics, `stopped`, `diverged` and `refused`. A sample that `simulate` would refuse does
-    not run, and `refused` gives the reason. Its metrics are NaN, and `diverged` is set so that no mean includes it. No
-    statistic counts it.
+    The columns are `sample` (its number), parameters, metrics, `stopped`, `diverged` and `refused`. A sample that
+    `simulate` would refuse does not run, and `refused` gives the reason. Its metrics are NaN, and `diverged` is set so
+    that no mean includes it. No statistic counts it.
 
     Each file is verified before its first number is used, and again after a change. The folder `chunks` is a Parquet
     data set for `pandas.read_parquet`, `polars.scan_parquet` and DuckDB; these do not verify it.
@@ -135,8 +135,7 @@ class Results:
         """Return which samples failed, as {kind: mask}, each of shape (samples,).
 
         The kinds are "diverged", a wrong end ("stopped" or "not stopped"), and "METRIC > BOUND". A sample may have
-        several. A
-        refused sample has not failed.
+        several. A refused sample has not failed.
         """
         study, run = self.study, self.accepted
         kinds = {

@@ -72,7 +72,7 @@ def sweep(
         out: Folder for the results; it is created.
         resume: Continue with a folder that already contains chunks of this study.
         on: Engine that computes the chunks; None is every device of this process.
-        progress: Function that is called with the progress after every chunk.
+        progress: Function that is called with the progress at the start and after every chunk.
         stopping: Function that is called after every chunk; True ends the run, and `resume` continues it later.
         source: Notes for the manifest, such as name and text of the scenario.
 

@@ -1,5 +1,6 @@
-"""Execution of chunks in compiled functions. A sample that `simulate` would refuse does not run; its row gives the
-reason.
+"""Execution of chunks in compiled functions.
+
+A sample that `simulate` would refuse does not run; its row gives the reason.
 
 A block is a fixed number of runs with one structure of the loop. On D devices, D blocks run at once, each in a program
 of its own. A program sharded over the devices (`shard_map`) would differ for each D, and round differently. This
@@ -43,7 +44,7 @@ class _Block(NamedTuple):
     """
 
     chunk: int
-    lanes: np.ndarray  # places in the chunk
+    lanes: np.ndarray
     values: dict[str, np.ndarray]
     samples: np.ndarray
 
@@ -60,8 +61,9 @@ class Runner:
         self._pool = ThreadPoolExecutor(len(self.devices))
 
     def run(self, chunks: Sequence[int]) -> list[Columns]:
-        """Return the columns of each of the `chunks`: sample, parameters, metrics, stopped, diverged, refused (reason,
-        or '').
+        """Return the columns of each of the `chunks`, by name.
+
+        They are sample, parameters, metrics, stopped, diverged, and refused (the reason, or '').
         """
         drawn = [self._draw_chunk(c) for c in chunks]
         for columns in drawn:

@@ -43,10 +43,10 @@ class SamplingDesign(Protocol):
     """A rule by which samples fill the unit cube."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
-        """Return samples start, ..., stop - 1, shape (stop - start, dimension), in (0, 1), or in [0, 1] for grids and
-        corners.
+        """Return samples start, ..., stop - 1, shape (stop - start, dimension).
 
-        `seed` selects the points of a random design; `samples` is the number of all samples.
+        They lie in (0, 1), those of grids and corners in [0, 1]. `seed` selects the points of a random design;
+        `samples` is the number of all samples.
         """
         ...
 
@@ -77,7 +77,11 @@ class Random(SamplingDesign):
         return (high * 2.0**20 + (low >> 12) + 0.5) * 2.0**-52
 
     def count(self, variables: Table, samples: int | None) -> int:
-        """Return `samples`, for any `variables`."""
+        """Return `samples`, for any `variables`.
+
+        Raises:
+            ValueError: `samples` is None, or outside [1, 2^32 - 1].
+        """
         del variables
         return _check_samples(samples)
 
@@ -137,8 +141,9 @@ def _sobol_points(seed: int, replicate: int, start: int, stop: int, dimension: i
 
 @dataclasses.dataclass(frozen=True)
 class LatinHypercube(SamplingDesign):
-    """SciPy's Latin hypercube: each variable has one sample in each of its N strata. All samples are drawn and kept
-    together.
+    """SciPy's Latin hypercube: each variable has one sample in each of its N strata.
+
+    All samples are drawn and kept together.
     """
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:

@@ -47,7 +47,7 @@ class Seal(NamedTuple):
     owner: str
     chunk: int
     seed: int
-    rows: tuple[int, int]  # its first sample, and one past its last
+    rows: tuple[int, int]
     columns: frozenset[str] = frozenset()
 
     def metadata(self) -> dict[bytes, bytes]:

@@ -96,9 +96,10 @@ class Store:
         files.write_durably(self.folder / MANIFEST_NAME, encode_manifest(manifest))
 
     def scan(self, seals: Seals) -> tuple[dict[int, pathlib.Path], list[int]]:
-        """Return the whole chunks of the sweep with these `seals` by number, and the numbers of the damaged ones.
+        """Return the paths of the intact chunks by number, and the numbers of the damaged ones.
 
-        A damaged file is removed. A file with another name stays.
+        A chunk is intact if `verify_chunk` accepts it with its seal of `seals`. A damaged file is removed. A file with
+        another name stays.
 
         Raises:
             SweepError: A chunk belongs to another sweep, or is not a file.
@@ -176,8 +177,8 @@ def describe_differences(there: Any, wanted: PyTree, path: str = "") -> Iterator
     """Yield one line for each difference between two documents.
 
     Args:
-        there: JsonObject that exists.
-        wanted: JsonObject to compare with.
+        there: Existing document, of JSON values.
+        wanted: Document to compare with.
         path: Path of both documents, for messages.
     """
     if isinstance(there, dict) and isinstance(wanted, dict):

@@ -1,7 +1,8 @@
 """The definition of a sweep: a loop, its varying parameters, its solver, and its metrics.
 
-Run i is a function of (seed, i) alone: the design gives its parameters, and `fold_in(key, i)` its noise. Chunk i //
-chunk contains it. The process, device and time of the computation do not change it.
+Run i is a function of (seed, i), and for a finite design of the number of samples (`sampling`). The design gives its
+parameters, and `fold_in(key, i)` its noise. Chunk i // chunk contains it. The process, device and time of the
+computation do not change it.
 """
 
 import contextlib
@@ -51,8 +52,8 @@ class Study:
         engine: "xla" or "kernel" (`simulate.batch.run_batch`). Their results differ in the last bits. Those of a kernel
             also depend on the compiler and the processor, which are part of the sweep's identity.
         parts: For a path drawn by a `Categorical` of names, the part that each name stands for.
-        failures: Bounds of metrics; a larger value is a failure. Divergence, an end that the stop does not call a
-            success, and the objectives' own bounds (`failure`) are always failures.
+        failures: Bounds of metrics; a larger value is a failure. A bound replaces the objective's own (`failure`),
+            which otherwise applies. Divergence, and an end that the stop does not call a success, are always failures.
     """
 
     loop: Loop
@@ -129,7 +130,7 @@ class Study:
             return replace(self.variant(values), numeric_values(values)), noise_key(self.seed, i)
 
     def variant(self, values: Params) -> Loop:
-        """Return the loop with the alternative parts that `values` names; the numbers in `values` are not set."""
+        """Return the loop with the alternative parts that `values` names by path; numbers in `values` are not set."""
         return replace(self.loop, {path: self.parts[path][str(values[path])] for path in self.parts})
 
     def table(self) -> JsonObject:
@@ -223,7 +224,7 @@ def numeric_values(values: Params) -> JsonObject:
 
 @contextlib.contextmanager
 def precision(dtype: str) -> Iterator[None]:
-    """Set JAX's default type in this context.
+    """Set JAX's default type of numbers in this context.
 
     Args:
         dtype: "float32" or "float64".

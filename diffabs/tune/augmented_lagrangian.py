@@ -1,11 +1,12 @@
 """Constrained minimisation by the method of multipliers (augmented Lagrangian).
 
-Each round descends under fixed multipliers and then updates them:
+A first descent has the multipliers zero. Each round then updates them and descends again:
 
     m <- max(0, m + c (g + d))
 
-g are the excesses of the constraints, d is the margin and c the penalty. The penalty c grows if the violation has not
-shrunk to `MAX_VIOLATION_RATIO` of its earlier value. Rounds end when every constraint holds.
+g are the excesses of the constraints, d is the margin and c the penalty. Each start has its own m and c. The penalty c
+grows if the violation has not shrunk to `MAX_VIOLATION_RATIO` of its earlier value. Rounds end when every constraint
+holds at every start, or after `Method.rounds` of them.
 
 Source: J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4.
 """
@@ -44,6 +45,7 @@ class AugmentedLagrangianSearch:
         """Choose the starts and evaluate the objective at the subject's own parameters.
 
         The first start is the subject itself. The method draws the others at random from the ranges of the parameters.
+        `progress` and `stopping` are those of `tune`.
 
         Raises:
             StartError: The subject cannot run with its own parameters, and the method has no other start.
@@ -126,7 +128,7 @@ class AugmentedLagrangianSearch:
         )
 
     def _run_rounds(self, descent: Descent) -> list[DescentState]:
-        """Run descents, each followed by a multiplier update, until every constraint holds or the rounds are spent."""
+        """Run a descent, then rounds of a multiplier update and a descent, until all constraints hold at all starts."""
         m = self._multipliers()
         descent_states = descent.run(self.starts, m)
         if not self.problem.excesses:
@@ -149,7 +151,7 @@ class AugmentedLagrangianSearch:
         return descent_states
 
     def _multipliers(self) -> Multipliers:
-        """Return the multipliers of the first round: zero, with the initial penalty and the margin of the method."""
+        """Return the multipliers of the first descent: zero, with the initial penalty and the margin of the method."""
         count, k = len(self.starts), self.problem.excesses
         return Multipliers(np.zeros((count, k)), np.full(count, FIRST_PENALTY), np.full(count, self.method.margin))
 

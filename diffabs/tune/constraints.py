@@ -40,8 +40,9 @@ class AtMost:
     bound: Scalar
 
     def excess(self, loop: Loop, metrics: Params) -> PyTree:
-        """Return (metric - bound)/|bound| from `metrics`, shape (runs,), or the metric for a zero bound; `loop` is not
-        used.
+        """Return (metric - bound)/|bound|, shape (runs,); for a zero bound the metric itself.
+
+        The metric is an entry of `metrics`; `loop` is not used.
         """
         del loop
         bound = jnp.asarray(self.bound)
@@ -69,11 +70,10 @@ class Poles:
     damping: float = 0.0
 
     def excess(self, loop: Loop, metrics: Params) -> PyTree:
-        """Return the excesses of each vertex and pole of `loop`, flat; `metrics` is not used.
+        """Return the excesses of each vertex and pole of `loop`, shape (k,); `metrics` is not used.
 
-        First come (decay + Re s)/decay, or Re s without a decay rate. Then come damping + Re s/|s|, absent without a
-        damping
-        ratio.
+        First come (decay + Re s)/decay, or Re s without a decay rate. If a damping ratio is given, damping + Re s/|s|
+        follow.
         """
         del metrics
         real, ratios = self._modes(loop)

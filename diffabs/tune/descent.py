@@ -41,7 +41,7 @@ class Stopping:
 
     Attributes:
         gradient: Tolerance of the greatest |component| of the gradient of L; at the start it is of order one.
-        change: Relative change of L that each of three consecutive steps must not exceed.
+        change: Relative change of L; the descent ends after three consecutive steps that change L by no more.
         iterations: Greatest number of accepted steps.
     """
 
@@ -58,16 +58,16 @@ class DescentPoint(NamedTuple):
         objective: Objective J, not scaled.
         loss: Loss L.
         gradient: Greatest |component| of the gradient of L.
-        violation: Greatest excess over all constraints, at least 0.
+        violation: Greatest excess over all constraints, in units of their scales, at least 0.
         evaluations: Number of gradients so far, including rejected trials.
     """
 
     iteration: int
     objective: float
     loss: float
-    gradient: float  # greatest component
-    violation: float  # greatest excess, in units of the constraints' scales
-    evaluations: int  # total so far, including rejected trials
+    gradient: float
+    violation: float
+    evaluations: int
 
 
 class FeasiblePoint(NamedTuple):
@@ -80,7 +80,25 @@ class FeasiblePoint(NamedTuple):
 
 @dataclasses.dataclass
 class DescentState:
-    """The state of the descent from one start."""
+    """The state of the descent from one start.
+
+    Attributes:
+        z: Present point, shape (p,).
+        loss, gradient, evaluation: Loss L at `z`, its gradient (p,), and the evaluation of the objective.
+        update: Update u from the optimiser, shape (p,).
+        t: Factor of the next trial step t u.
+        low: Greatest t known to be too short.
+        high: Least t known to be too long.
+        better: Point and evaluation at `low`, or None.
+        trials: Number of trials since the last accepted step.
+        idle: Number of consecutive accepted steps without a significant change of the loss.
+        jumps: Number of consecutive line searches that end at `MAX_TRIALS` with an upper bound on t.
+        evaluations: Number of gradients so far.
+        iterations: Number of accepted steps so far.
+        reason: Reason for the end; None while the descent continues.
+        history: Start, and the points after the accepted steps.
+        kept: Best feasible step so far.
+    """
 
     z: np.ndarray
     loss: float
@@ -88,8 +106,8 @@ class DescentState:
     evaluation: Any
     update: np.ndarray
     t: float = 1.0
-    low: float = 0.0  # greatest t known to be too short; `better` is the point there
-    high: float = np.inf  # least t known to be too long
+    low: float = 0.0
+    high: float = np.inf
     better: tuple[np.ndarray, PyTree] | None = None
     trials: int = 0
     idle: int = 0
@@ -98,7 +116,7 @@ class DescentState:
     iterations: int = 0
     reason: Reason | None = None
     history: list[DescentPoint] = dataclasses.field(default_factory=list)
-    kept: FeasiblePoint | None = None  # best feasible step so far
+    kept: FeasiblePoint | None = None
 
     def note(self) -> None:
         """Append the present point to the history, and keep it if it is the best feasible point so far."""
@@ -122,7 +140,7 @@ class DescentState:
             self.kept = other
 
     def go_back(self) -> None:
-        """Return to the feasible point that was kept, if the present point violates a constraint."""
+        """Go back to the feasible point that was kept, and note it, if the present point violates a constraint."""
         last = self.history[-1]
         if self.kept and not last.violation <= 0:
             self.z, self.evaluation, self.reason = self.kept.z, self.kept.evaluation, Reason.KEPT
@@ -172,8 +190,8 @@ class Descent:
         """Set the evaluations and the conditions that end the descent.
 
         Args:
-            evaluate: Loss and gradient of all starts.
-            loss: Loss of one start, for optimisers with a line search of their own.
+            evaluate: Function (z (starts, p), multipliers) -> loss and gradient of all starts.
+            loss: Function (z (p,), multipliers) -> loss of one start, for optimisers with a line search of their own.
             steady: Maps z (starts, p) to whether every run there is admissible, shape (starts,).
             optimiser: Source of the updates.
             stopping: Conditions that end the descent of a start.
@@ -192,9 +210,7 @@ class Descent:
         self._update = jax.jit(jax.vmap(update))
 
     def run(self, starts: np.ndarray, multipliers: Multipliers) -> list[DescentState]:
-        """Run the descent from each of `starts` (starts, p) under `multipliers` to its end, and return the final
-        states.
-        """
+        """Run the descent from each of `starts` (starts, p) under `multipliers`, and return the final states."""
         self.multipliers = multipliers
         first, fine = self._evaluate_at(starts)
         descent_states = [
@@ -326,8 +342,9 @@ class Descent:
 def _next_step_factor(descent_state: DescentState, loss: float, slope: float) -> float:
     """Return the next step factor t of a line search.
 
-    Without an upper bound on t the step expands. With both bounds it is bisected. With only an upper bound, t is the
-    minimum of the parabola through both losses and the slope. If the loss at t is not finite, t is divided by 4.
+    Without an upper bound on t the step expands. With both bounds it is bisected. With only an upper bound, the next t
+    is the minimum of the parabola through both losses and the slope, kept between 0.1 t and 0.5 t. If the loss at t is
+    not finite, it is t/4.
     """
     if not np.isfinite(descent_state.high):
         return min(STEP_EXPANSION * descent_state.t, MAX_UPDATE_COMPONENT / float(np.max(np.abs(descent_state.update))))

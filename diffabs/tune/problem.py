@@ -118,7 +118,7 @@ class Problem:
         """Return the problem with its runs on `engine`: "xla", "kernel" or "auto".
 
         "auto" chooses a kernel if one can make the runs; otherwise it logs the reason once and keeps XLA. A kernel
-        computes forward derivatives unless `mode` is reverse.
+        computes forward derivatives only, so "auto" keeps XLA if `mode` is reverse.
 
         Raises:
             ValueError: The engine is unknown.
@@ -155,7 +155,7 @@ class Problem:
     def evaluate(self, z: AnyArray) -> ObjectiveEvaluation:
         """Return objective, excesses, number of diverged runs and metrics at `z` (p,).
 
-        A weight of a run in the batch multiplies the run's sum of metrics before the aggregate.
+        If the batch has weights, each multiplies its run's sum of metrics before the aggregate.
         """
         runs = self.runs(z)
         each = sum(weight * runs.metrics[name] for name, weight in self.weights.items())
@@ -213,14 +213,13 @@ class Problem:
         return jax.jit(jax.vmap(self.evaluate))
 
     def find_refusal(self) -> str | None:
-        """Return a one-line reason why the first inadmissible run cannot start at the subject's own values, or None."""
+        """Return one line on why the first inadmissible run is refused at the subject's own values, or None."""
         return first_refusal(build_subject_loop(self.subject), self.batch.values, self.solver)
 
     def steady(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the function z (starts, p) -> mask (starts,) of the starts at which every run is admissible.
+        """Return the compiled function z (starts, p) -> mask (starts,) of the starts at which every run is admissible.
 
-        A run is admissible if it meets the rules of its parts and its integration step is stable. The program is
-        compiled once.
+        A run is admissible if it meets the rules of its parts and its integration step is stable.
         """
 
         def loops(z: AnyArray) -> Loop:

@@ -26,8 +26,8 @@ class Method:
         starts: Number of starts: the first is the part itself, the others are drawn from the ranges.
         seed: Seed of the drawn starts.
         mode: Forward or reverse mode; None decides by the number of parameters.
-        stopping: Conditions that end a descent; with constraints there is one descent in each round.
-        rounds: Greatest number of rounds of the augmented Lagrangian.
+        stopping: Conditions that end a descent. With constraints each round has a descent of its own.
+        rounds: Greatest number of rounds of the augmented Lagrangian, after a first descent without multipliers.
         margin: Distance inside each constraint at which the search aims, in units of the constraint's scale (relative
             to the bound). The result then meets the constraints without a tolerance.
         memory: Number of steps that L-BFGS stores; a number greater than the number of parameters is of little use.
@@ -44,10 +44,16 @@ class Method:
 
 
 class TuningProgress(NamedTuple):
-    """The progress of a search: round, number of running starts, and the last point of the best start so far."""
+    """The progress of a search.
+
+    Attributes:
+        round: Number of the round, 0 in the first descent.
+        starts: Number of starts whose descent has not ended.
+        point: Best of the last points of all starts. Its iterations and evaluations count from the start of the round.
+    """
 
     round: int
-    starts: int  # starts whose descent has not ended
+    starts: int
     point: DescentPoint
 
 
@@ -83,7 +89,7 @@ class Tuned:
         violation: Pair of greatest excesses, each at least 0.
         metrics: Pair of dictionaries of metrics, each of shape (runs,).
         met: Whether every constraint holds, without a tolerance.
-        reason: Reason why the descent of the best start ended, in its last round.
+        reason: Reason for the end of the best start's last descent.
         history: History of the best start.
         starts: Results and histories of all starts.
         mode: Mode of differentiation.

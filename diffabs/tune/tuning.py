@@ -45,7 +45,8 @@ def tune(
 
     Args:
         subject: A Loop, or a part with a method `closed_loop()`.
-        free: Dotted paths of the free parameters, with the ranges that bound them (None: the declared range).
+        free: Dotted paths of the free parameters. A mapping gives the range that bounds each; None is the declared
+            range.
         objective: Weight of each metric of `measured` in the objective, `{"stop_distance": 1.0, "effort": 1e-4}`.
         over: The runs, as parameters of the loop by path; None is one run of the loop itself.
         solver: Solver of every run.
@@ -53,7 +54,7 @@ def tune(
         aggregate: Map from one number for each run to one number: Mean (also for None), SmoothWorst, CVaR, Quantile.
         constraints: Constraints: AtMost of a metric in every run, Poles, CertifiedDecay.
         method: Optimiser, starts, iterations; None is L-BFGS from the subject's own values.
-        progress: Called with the best point so far after every evaluation.
+        progress: Called after every evaluation, with the best of the last points of all starts.
         stopping: Called after every evaluation; True ends the search with the best point so far.
         engine: Engine of the runs and their derivatives, as in `run_batch`. A kernel computes forward derivatives for
             any number of parameters.
@@ -62,7 +63,7 @@ def tune(
         ValueError: A path, range, metric or batch does not fit, or a run is inadmissible for every choice of
             parameters.
         EngineError: The engine is "kernel", and a kernel cannot make the runs.
-        StartError: A start diverges or its integration step is not stable, and there is no other start.
+        StartError: At every start a run diverges or is inadmissible, or the objective or its gradient is not finite.
 
     >>> import diffabs as d
     >>> from diffabs import controllers, objectives, plants, roads, stops, tune

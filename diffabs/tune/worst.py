@@ -2,10 +2,10 @@
 
     maximise metric(p),  p in [low, high]
 
-One batch screens the box's corners and random points. Gradient ascent starts from the worst of them. The method is
-local: a bound exceeded is a proven counterexample, but the worst case found depends on the starts. The worst case is
-often a corner; a run of all corners then finds it without a gradient. `WorstCase.report` states how the search found
-the worst case, and whether a certificate covers the box.
+One batch screens up to 64 corners of the box and random points. Gradient ascent starts from the worst of them. The
+method is local: a bound exceeded is a proven counterexample, but the worst case found depends on the starts. The worst
+case is often a corner; a run of all corners then finds it without a gradient. `WorstCase.report` states how the search
+found the worst case, and whether a certificate covers the box.
 """
 
 import dataclasses
@@ -125,7 +125,7 @@ def worst_case(
     price: float | None = None,
     engine: str = "xla",
 ) -> WorstCase:
-    """Return the greatest value of a metric found in a box, by a screening of points and then gradient ascent.
+    """Search a box for the greatest value of a metric: run a screening of points, then gradient ascent from the worst.
 
     Args:
         loop: A Loop. The box replaces its values of these parameters.
@@ -135,16 +135,17 @@ def worst_case(
         measured: Objectives by metric; None takes the default objectives of the plant.
         bound: Bound on the metric; the result then states whether the metric exceeds it.
         screen: Number of points of a scrambled Sobol sequence that are run first, in addition to up to 64 corners.
-        starts: Number of the worst screened points from which ascents start, all together; 0 only runs the screening.
+        starts: Number of ascents, one from each of the worst screened points, in one batch; 0 only runs the screening.
         iterations: Greatest number of steps of each ascent.
         seed: Seed of the Sobol sequence.
-        seed_of_noise: Seed of noisy sensors, or None.
+        seed_of_noise: Seed of noisy sensors, the same in every run; or None.
         price: Cost of a gradient in rollouts. None is 6 in reverse mode and 1 + 1.5 p in forward mode, for p numbers in
             the box.
         engine: Engine of the runs and their derivatives, as in `run_batch`.
 
     Raises:
-        ValueError: A path or range does not fit, the metric is unknown, or a screened point cannot be run.
+        ValueError: A path or range does not fit, the metric is unknown, a screened point cannot be run, or a requested
+            kernel is impossible.
     """
     check_part(loop)
     measured = default_objectives(loop.plant) if measured is None else measured

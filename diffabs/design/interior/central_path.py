@@ -100,6 +100,8 @@ def follow_path(
 ) -> CentralPathState:
     """Return the state at the end of the path: at the last centre, or `stuck` if there is no such centre.
 
+    The path also ends at an invalid number, and after MAX_PATH_STEPS steps.
+
     Args:
         problem: Vertices and weights.
         path: Initial state.
@@ -202,7 +204,7 @@ def directions(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def solve_newton_system(hessian: Matrix, right: Any) -> Matrix:
-    """Return H^-1 b for a positive definite H, solved with a unit diagonal.
+    """Return H^-1 b for a positive definite H, which is first scaled to a unit diagonal.
 
     Args:
         hessian: H, shape (d, d).

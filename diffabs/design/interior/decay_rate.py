@@ -67,8 +67,9 @@ def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -
 
         He[P C_i] + 2 rate P <= 0,   C_i'P C_i <= exp(-2 rate period) P,      C_i = A_i + B_i K
 
-    The rate also holds while the system varies. It is negative if no common P proves stability. It is below the largest
-    rate by at most 1e-8 of itself, up to rounding.
+    The first inequality is for continuous time, the second for discrete time. The rate also holds while the system
+    varies. It is negative if no common P proves stability. It is below the largest rate by at most 1e-8 of itself, up
+    to rounding.
 
     The function works under jit, vmap and both modes of differentiation, to first order only. The derivative uses the
     multipliers W_i of the optimum: sum <W_i, d left side> = 0.

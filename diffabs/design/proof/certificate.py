@@ -34,13 +34,18 @@ QUADRATIC_KINDS = ("decay", "cost", "damping", "l2", "input")  # each has one P 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Claim:
-    """One inequality of a kind listed above and the numbers that prove it; arrays are copied and read-only."""
+    """One inequality and the numbers that prove it; arrays are copied and read-only.
+
+    Attributes:
+        kind: Kind of the claim, one of those in the table of this module.
+        data: Numbers and arrays by name.
+    """
 
     kind: str
     data: Mapping[str, float | np.ndarray]
 
     def __post_init__(self) -> None:
-        """Convert the numbers to floats."""
+        """Convert the numbers to floats, and the arrays to read-only copies."""
         data = {name: as_read_only_array(value) for name, value in self.data.items()}
         data = {name: value if value.ndim else float(value) for name, value in data.items()}
         object.__setattr__(self, "data", MappingProxyType(data))
@@ -285,6 +290,8 @@ class Certificate:
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Certificate":
         """Return the certificate saved at `path`, with nothing proved yet.
+
+        Its polytopes have no `corners` and no `coverage`.
 
         Raises:
             OSError: The file cannot be read.

@@ -130,7 +130,7 @@ def is_positive_definite(matrix: list[list[int]], strict: bool = True) -> bool:
 
     Args:
         matrix: Symmetric matrix of Python integers; its lower triangle is overwritten.
-        strict: Whether to test for definiteness.
+        strict: Whether to require definiteness; False also accepts a semidefinite matrix.
     """
     n, last = len(matrix), 1
     for k in range(n):

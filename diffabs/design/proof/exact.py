@@ -30,8 +30,8 @@ from diffabs.design.proof.schema import check_claim
 class Inequality(NamedTuple):
     """The inequality sum(terms) > 0 (>= 0 if not `strict`) over terms of shape (..., k, k).
 
-    `vertex` is the number of the first vertex of an inequality for each vertex. It is ALL_VERTICES if the inequality
-    concerns all vertices together, and None for a side condition such as P > 0.
+    The terms may be stacks with one inequality for each vertex; `vertex` is then the number of the first vertex. It is
+    ALL_VERTICES if the inequality concerns all vertices together, and None for a side condition such as P > 0.
     """
 
     terms: tuple[Matrix, ...]
@@ -112,8 +112,8 @@ def decay_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[I
 def cost_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """Yield the conditions for V' <= -x' (Q + K' R K) x.
 
-    The integral (sum) of x' (Q + K' R K) x from x0 is then at most x0' P x0. V falls without Q and R too. V therefore
-    goes to 0, and the bound needs no sign of Q, which may have rounding errors.
+    The integral (sum) of x' (Q + K' R K) x from x0 is then at most x0' P x0. A further condition is that V falls,
+    without Q and R. V therefore goes to 0, and the bound needs no sign of Q, which may have rounding errors.
 
     Args:
         loop: Closed loops of the vertices.
@@ -222,7 +222,7 @@ def schedule_conditions(
 
     Args:
         cells: A and B of the vertices of each cell.
-        nodes: Nodes of the parameter, shape (N,).
+        nodes: Nodes of the parameter, N of them.
         gain: Gain, shape (m, n), or one for each node, shape (N, m, n).
         data: Data of the claim.
     """
@@ -261,7 +261,7 @@ def conditions(kind: str, system: Polytope | Schedule, gain: Matrix, data: Param
         system: A polytope or a schedule.
         gain: Gain of the certificate.
         data: Data of the claim.
-        proof: Whether to use exact numbers with errors of the vertices, or floats.
+        proof: True for exact numbers with errors of the vertices, False for floats.
 
     Raises:
         ValueError: Data that do not fit.

@@ -32,12 +32,12 @@ INFEASIBLE_RANGES = {"factor": ("be positive", FIELD_RANGES["gamma"][1])}
 
 
 def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Params) -> None:
-    """Raise ValueError for a claim that does not fit the system and gain.
+    """Check that a claim fits the system and the gain.
 
     Args:
         kind: Kind of the claim.
         system: A polytope or a schedule.
-        gain: Gain, shape (m, n), or (N, m, n) for a schedule.
+        gain: Gain, shape (m, n), or (N, m, n) for a schedule of N nodes.
         data: Data of the claim.
 
     Raises:
@@ -76,7 +76,7 @@ def check_gain(system: Polytope | Schedule, gain: np.ndarray) -> dict[str, int]:
 
     Args:
         system: A polytope or a schedule.
-        gain: Gain, shape (m, n), or (N, m, n) for a schedule.
+        gain: Gain, shape (m, n), or (N, m, n) for a schedule of N nodes.
 
     Raises:
         ValueError: A gain of another shape, or not finite.
@@ -96,7 +96,7 @@ def matches_shape(value: Scalar, letters: str, sizes: dict[str, int]) -> bool:
     Args:
         value: Number or array.
         letters: One letter for each axis.
-        sizes: Sizes by letter; a new letter is added with its size.
+        sizes: Sizes by letter; the function adds a new letter with its size.
     """
     shape = np.shape(value)
     return len(shape) == len(letters) and all(

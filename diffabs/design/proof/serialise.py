@@ -54,7 +54,7 @@ def reject_duplicate_names(pairs: list[tuple[str, PyTree]]) -> dict[str, PyTree]
 
 
 def read_members(value: Scalar, where: str, *names: str) -> list[PyTree]:
-    """Return the values of an object with exactly these members, in their order.
+    """Return the values of an object with exactly these members, in the order of `names`.
 
     Args:
         value: JSON value.
@@ -90,7 +90,7 @@ def read_numbers(value: Scalar, where: str = "a number") -> Matrix:
     """Return a finite number, or lists of them of equal lengths, as an array.
 
     Args:
-        value: JSON value.
+        value: JSON value whose numbers are all floats, integers included.
         where: Name of the value for messages.
 
     Raises:

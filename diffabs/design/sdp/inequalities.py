@@ -26,7 +26,7 @@ def cost_lmi(
     Args:
         x: X, shape (..., n, n).
         flow: A X + B F, shape (..., n, n).
-        drift: dX/dt, shape (..., n, n).
+        drift: dX/dt, shape (..., n, n); not used in discrete time.
         q_root: Root of the weight, Q = q_root' q_root.
         f: F, shape (..., m, n).
         even: Congruence, shape (n, n).
@@ -61,7 +61,7 @@ def decay_lmi(x: Matrix, flow: Matrix, drift: Matrix, rate: float, *, discrete: 
     Args:
         x: X, shape (..., n, n).
         flow: A X + B F, shape (..., n, n).
-        drift: dX/dt, shape (..., n, n).
+        drift: dX/dt, shape (..., n, n); not used in discrete time.
         rate: Decay rate per unit of time; in discrete time per step.
         discrete: Whether the system is in discrete time.
     """
@@ -93,7 +93,7 @@ def l2_gain_lmi(
     Args:
         x: X, shape (..., n, n).
         flow: A X + B F, shape (..., n, n).
-        drift: dX/dt, shape (..., n, n).
+        drift: dX/dt, shape (..., n, n); not used in discrete time.
         z: C X + D F, shape (..., z, n).
         e: Input matrix E of w, shape (n, w).
         g: Squared gain.

@@ -70,7 +70,10 @@ class DesignProgram:
         self.common = list(self._common())
 
     def objective(self) -> np.ndarray:
-        """Return c, with c'y times `scale` as the objective."""
+        """Return the coefficients c (unknowns,) of the objective c'y.
+
+        With Q and R, the mean of trace Z in the original coordinates is `scale` c'y.
+        """
         trace = self.unknowns.row(
             lambda v: sum(np.einsum("ij,dji->d", self.weight, v[f"Z{i}"]) for i in range(self.nodes)) / self.nodes
         )
@@ -81,7 +84,7 @@ class DesignProgram:
         return group_blocks([*self.common, *self._input(level)])
 
     def least_level(self) -> float:
-        """Return the smallest V of the frame's own solution that holds the starts of the input limit."""
+        """Return the largest V of the frame's own solution over the starts of the input limit; 1 without a limit."""
         if self.spec.input is None:
             return 1.0
         return float(((self.frame.inverse @ self.spec.input.points.T) ** 2).sum(axis=0).max())

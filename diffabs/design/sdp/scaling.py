@@ -52,8 +52,8 @@ class Frame(NamedTuple):
 def whitening_matrix(weight: np.ndarray) -> np.ndarray:
     """Return D with D' `weight` D = I, except in directions with less than 1e-12 of the largest weight.
 
-    A slow closed loop beside a fast one has a small cost per unit of time. The congruence D' M D of an inequality M >=
-    0 makes a solver's tolerance relative.
+    A slow closed loop beside a fast one has a small cost per unit of time. If M >= 0 is an inequality, the congruence
+    D' M D makes a solver's tolerance relative.
 
     Args:
         weight: Symmetric positive semidefinite matrix, shape (n, n).
@@ -72,7 +72,7 @@ def lyapunov_frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: boo
         discrete: Whether the system is in discrete time.
 
     Raises:
-        LinAlgError: P is not positive definite.
+        LinAlgError: P or R is not positive definite.
     """
     lower = np.linalg.cholesky((p + p.T) / 2)
     inverse = lower.T

@@ -26,7 +26,7 @@ SOLVER_LOCK = threading.Lock()  # threads share a compiled program, which holds 
 
 
 class SdpBlock(NamedTuple):
-    """Inequalities of one size: h (b, k, k), G (b, d, k, k)."""
+    """Inequalities h + sum_d y_d G_d >= 0, b of them, of one size k: h (b, k, k), G (b, d, k, k)."""
 
     h: np.ndarray
     G: np.ndarray

@@ -97,8 +97,9 @@ def upper_level(confidence: float) -> float:
 
 
 def percentile_index(replicates: int, confidence: float) -> int:
-    """Return the index i of the interval's ends among sorted replicates: elements i and -1 - i, at the levels a/2 and 1
-    - a/2.
+    """Return the index i of an interval's ends among sorted replicates.
+
+    The ends are the elements i and -1 - i, at the levels a/2 and 1 - a/2.
 
     Args:
         replicates: Number of replicates.
@@ -176,7 +177,7 @@ class Count(NamedTuple):
         """Return the share of failures with the Clopper-Pearson interval, which has at least the given `confidence`.
 
         Raises:
-            ValueError: There are no samples, or the failures are not between 0 and their number.
+            ValueError: There are no samples, or the number of failures is not between 0 and that of samples.
         """
         k, n, top = self.failures, self.samples, upper_level(confidence)
         if not (0 <= k <= n and n > 0):
@@ -220,10 +221,9 @@ class Tail:
 def quantile(values: PyTree, level: float, *, confidence: float = 0.95) -> IntervalEstimate:
     """Return a quantile by linear interpolation (`numpy.quantile`), with an interval between two order statistics.
 
-    The interval covers any law at least with this confidence; a continuous law with exactly P(r <= B < s), where r and
-    s
-    are the ranks of its ends and B is binomial. An end is infinite where no order statistic reaches the confidence. The
-    value is clipped to the interval.
+    The interval covers the quantile of any law at least with this confidence. For a continuous law the probability is
+    exactly P(r <= B < s), where r and s are the ranks of its ends and B is binomial. An end is infinite where no order
+    statistic reaches the confidence. The value is clipped to the interval.
 
     Args:
         values: Samples, shape (n,).
@@ -243,9 +243,8 @@ def cvar(
 
     The interval is a studentised bootstrap. Its ends are -inf and inf with fewer than 10 samples in the tail. A tail
     without spread has percentile ends instead. Coverage of 95 % intervals was measured for n = 500 to 2000, levels 0.9
-    and
-    0.95, six laws. The percentile bootstrap covers 89 to 95 %, BCa 90 to 95 %, and the studentised bootstrap 92 to 96
-    %.
+    and 0.95, six laws. The percentile bootstrap covers 89 to 95 %, BCa 90 to 95 %, and the studentised bootstrap 92 to
+    96 %.
 
     Args:
         values: Samples, shape (n,).
@@ -276,8 +275,9 @@ def mean_of_replicates(estimates: Any, *, confidence: float = 0.95) -> IntervalE
 def summarise_column(
     values: PyTree, confidence: float = 0.95, levels: Sequence[float] = (0.05, 0.5, 0.95), tail: float = 0.95
 ) -> dict[str, dict[str, float]]:
-    """Return the fields of each `IntervalEstimate` by name: `mean`, `deviation`, `quantile 0.05` and so on, `cvar
-    0.95`.
+    """Return the fields of each `IntervalEstimate` by its name.
+
+    The names are `mean`, `deviation`, `quantile 0.05` and so on, and `cvar 0.95`.
 
     Args:
         values: Samples, shape (n,).
@@ -359,8 +359,9 @@ def _merge_into_atoms(tail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _resample_atoms(sizes: np.ndarray, n: int, replicates: int, seed: int) -> Iterator[np.ndarray]:
-    """Yield the counts of each atom when n samples are drawn of n, in blocks (replicates, atoms); the rest is below the
-    tail.
+    """Yield the counts of each atom when n samples are drawn of n, in blocks (replicates, atoms).
+
+    The other samples are below the tail.
     """
     random, total = np.random.default_rng(seed), int(sizes.sum())
     totals = random.binomial(n, total / n, size=replicates)

@@ -223,9 +223,7 @@ def _resample_groups(replicates: int, groups: int, random: np.random.Generator) 
 
 
 def _indices_from_sums(sums: np.ndarray) -> np.ndarray:
-    """Return first-order, then total indices (replicates, 2 d), from sums of features over the rows (replicates, 3 + 2
-    d).
-    """
+    """Return first-order, then total indices (replicates, 2 d), from sums of features (replicates, 3 + 2 d)."""
     n = sums[:, :1]
     mean, square = sums[:, 1:2] / (2 * n), sums[:, 2:3] / (2 * n)
     products, squares = sums[:, 3::2] / n, sums[:, 4::2] / n

@@ -105,8 +105,9 @@ class _RowSelection:
         return [block[np.isfinite(block)] for block in np.split(values, self.replicates)]
 
     def never(self, name: str) -> JsonObject:
-        """Return the runs with an infinite value, which never reach the measured event. No other statistic includes
-        them.
+        """Return the number and the first samples of runs with an infinite value, which never reach the measured event.
+
+        No other statistic includes them.
         """
         rows = self.good & self.rows & np.isinf(self.found.column(name))
         return {"count": int(rows.sum()), "samples": self.found.column("sample")[rows][:MAX_LISTED_SAMPLES].tolist()}
