@@ -16,7 +16,7 @@ from seams import replace_seam
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, reliability, roads, scenario, stops, sweep, tune
-from diffabs.core.protocols import no_flow, no_memory
+from diffabs.core.protocols import Memory, no_flow
 from diffabs.core.pytree import get, param, pytree
 from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.kernel import binaries, compilers, launch
@@ -58,10 +58,16 @@ class SortedTorque:
 
     torque: Any = param(default=20.0, unit="N m")
 
-    start, flow = no_memory, no_flow
+    flow = no_flow
+
+    def start(self, signal):
+        return Memory(held=self.torque + 0.0 * signal.target)
 
     def output(self, t, memory, signal):
-        return jax.lax.sort(jnp.stack([self.torque, signal.target]))[1]
+        return memory.held
+
+    def tick(self, clock, memory, signal):
+        return Memory(held=jax.lax.sort(jnp.stack([self.torque, signal.target]))[1])
 
 
 NONE = f"{compilers.COMPILER} is empty"
@@ -136,7 +142,7 @@ class TestTune:
     @killed_by("kernel/primitives.py", "error.method = error.method or _calling_method(eqn)", "pass")
     def test_of_what_has_no_rule_names_the_part(self):
         line = tune.build_problem(braking(controller=SortedTorque()), **TUNED, engine="kernel").objection()
-        assert line == "engine = 'kernel' is not possible: sort: there is no rule for it (in SortedTorque.output)"
+        assert line == "engine = 'kernel' is not possible: sort: there is no rule for it (in SortedTorque.tick)"
 
     @killed_by("simulate/drive/kernel.py", "if rows.shape[1] > MAX_COMPARED_ENTRIES:", "if False:")
     def test_of_a_long_past_names_the_part(self):
