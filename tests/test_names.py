@@ -18,7 +18,6 @@ SHARED_FUNCTIONS = {
     *("certify", "design", "identify", "margins", "sweep", "tune"),
     *("compact", "figures", "loop", "reproduce", "run", "table"),
     *("usual_objectives", "usual_parts"),
-    *("attempt_step", "commit_step", "init_carry", "step"),
     *("he", "is_positive_definite"),
 }
 # The parts of a paper's module, and tables of a checker that imports nothing of the package.

@@ -59,7 +59,7 @@ from diffabs.simulate.step.step_size import (
     spectral_step_limit,
     time_since_crossing,
 )
-from diffabs.simulate.step.system import Evaluation, Objectives, System
+from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import Trajectory
 
 MIN_RTOL_EPS = 32  # multiples of machine epsilon: the smallest error that a step can reach
@@ -198,7 +198,7 @@ class AdaptiveStepping:
         return carry._replace(control=control._replace(limit=limit, tries_at_renewal=renewed))
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
-        """Return True if the run goes on and has not reached the instant `until` of the grid."""
+        """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
         return carry.running if until is None else carry.running & (carry.point.t < until * self.h)
 
     def observe_at(self, loop: Loop, carry: Carry, instant: Scalar) -> Trajectory:
@@ -232,18 +232,22 @@ class AdaptiveStepping:
         del loop
         return True
 
-    def propose(self, system: System, carry: Carry) -> StepRequest:
-        """Return the next step to attempt."""
+    def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
+        """Return the next step to attempt, by the run of `carry` in `system`."""
         return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.notes)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> Scalar:
-        """Return the predicted time to the first change of an answer [s]."""
+        """Return the predicted time [s] to the first change of an answer, from `seen`, for the run of `carry`."""
         return self._forecast_crossing(carry.control.error_limited, carry.unrestricted, seen)
 
     def report(
-        self, system: System, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
     ) -> AdaptiveReport:
-        """Return the error of an attempt, and the comparisons that change in it."""
+        """Return the error of an attempt by the run of `carry` in `system`, and the comparisons that change in it.
+
+        The attempt has the length `h`. The dynamics `seen` and the `state` are those at its end, and `error` holds the
+        shares of the rates in the error.
+        """
         sample, point = seen.signals.sample, carry.point
         changed = tuple(a ^ b for a, b in zip(seen.words, point.words, strict=True))
         scale = jax.tree.map(jnp.maximum, carry.control.scale, error_scales(state, sample))
@@ -252,16 +256,24 @@ class AdaptiveStepping:
         surface = find_surface_crossing(seen, carry.search.which, h) if self.notes else None
         return AdaptiveReport(relative, scale, time_since_crossing(seen.surfaces, changed, h), surface)
 
-    def decide(self, system: System, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool) -> Decision:
-        """Return the decision on an attempt: its error must be small, and no comparison may change within it."""
+    def decide(
+        self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
+    ) -> Decision:
+        """Return the decision on the `attempt` that answers the `request`, by the run of `carry` in `system`.
+
+        Its error must be small, and no comparison may change within it. `active` is False if the run needs no attempt.
+        """
         error, late = attempt.report.error, attempt.report.late
         fine = jnp.isfinite(error)  # the maximum over all states: one NaN makes it NaN
         exact = fine & (((error <= 1) & (late <= 0)) | (carry.length <= self.least))
         last = request.strikes & (request.strike >= self.steps)
         return decide_attempt(system, carry, attempt, active, fine, exact, last=last, frozen=self.notes)
 
-    def refine(self, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an attempt, with the length of the next attempt from there."""
+    def refine(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+        """Return the carry `after` an `attempt` with the length of the next attempt.
+
+        `carry` is the run in `system` before the attempt, and `decision` the decision on it.
+        """
         control, report, taken = carry.control, attempt.report, decision.taken
         new = carry.status == RunStatus.RUNNING
         error_limited = self._error_limited_length(carry, attempt, decision)

@@ -46,7 +46,7 @@ from diffabs.simulate.step.event_location import (
 from diffabs.simulate.step.modes import Mode
 from diffabs.simulate.step.runge_kutta import Tableau
 from diffabs.simulate.step.status import RunStatus, is_running, status_after_step
-from diffabs.simulate.step.system import UNCONSTRAINED, Evaluation, Objectives, System, build_system
+from diffabs.simulate.step.system import UNCONSTRAINED, Evaluation, LoopSystem, Objectives, build_system
 
 
 class Carry(NamedTuple):
@@ -135,31 +135,46 @@ class Stepping(Protocol):
         ...
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
-        """Return True if the run goes on and has not reached the instant `until` of the grid."""
+        """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
         ...
 
     def is_switched(self, loop: Loop) -> bool:
-        """Return True if the comparisons of the flow are visible."""
+        """Return True if the comparisons of the `loop`'s flow are visible."""
         ...
 
-    def propose(self, system: System, carry: Carry) -> StepRequest:
-        """Return the next step to attempt."""
+    def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
+        """Return the next step to attempt, by the run of `carry` in `system`."""
         ...
 
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
-        """Return what the method foresees from the end of a step."""
+        """Return what the method foresees from the dynamics `seen` at the end of a step, for the run of `carry`."""
         ...
 
-    def report(self, system: System, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree) -> Any:
-        """Return what the method needs to know of an attempt, from the dynamics and the state at its end."""
+    def report(
+        self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
+    ) -> Any:
+        """Return what the method needs to know of an attempt by the run of `carry` in `system`.
+
+        The attempt has the length `h`. The dynamics `seen` and the `state` are those at its end, and `error` holds the
+        shares of the rates in the error.
+        """
         ...
 
-    def decide(self, system: System, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool) -> Decision:
-        """Return the decision on an attempt."""
+    def decide(
+        self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
+    ) -> Decision:
+        """Return the decision on the `attempt` that answers the `request`, by the run of `carry` in `system`.
+
+        `active` is False if the run needs no attempt.
+        """
         ...
 
-    def refine(self, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an attempt, with the next attempt."""
+    def refine(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+        """Return the carry `after` an `attempt` with the next attempt planned.
+
+        `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has its new point
+        and, if the run searches for an event, the search.
+        """
         ...
 
 
@@ -218,7 +233,7 @@ def advance(
 
 
 def _search(
-    stepping: Stepping, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
+    stepping: Stepping, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
 ) -> Carry:
     """Return the carry `after` an attempt with the search for an event continued, and with the next status."""
     plan = SearchPlan(carry.search, carry.length, carry.status)
@@ -263,7 +278,7 @@ def start_carry(
     return Carry(point, zero, none, stepping.h, yes, stepping.h, search, no, (), status)
 
 
-def propose_step(stepping: Stepping, system: System, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:
+def propose_step(stepping: Stepping, system: LoopSystem, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:
     """Return the attempt that a carry asks for.
 
     Args:
@@ -283,7 +298,7 @@ def propose_step(stepping: Stepping, system: System, carry: Carry, strike: Int, 
 
 
 def decide_attempt(
-    system: System,
+    system: LoopSystem,
     carry: Carry,
     attempt: Attempt,
     active: Bool,

@@ -27,8 +27,8 @@ from diffabs.simulate.step.step_size import valid_end_rates
 from diffabs.simulate.step.system import (
     Accumulators,
     Evaluation,
+    LoopSystem,
     Objectives,
-    System,
     split_flow_and_held,
     with_flow,
 )
@@ -42,7 +42,7 @@ class Point(NamedTuple):
         state: State of the loop.
         accumulators: Accumulators of the objectives.
         sample: Sample of the signals.
-        signal_rates: Rates of the signals, as `System.signal_rates` says.
+        signal_rates: Rates of the signals, as `LoopSystem.signal_rates` says.
         recorded: Signals that blocks record, and their rates, each by block.
         rates: Rates of the loop's flow and of the objectives' integrals.
         margins: Margins of the stop and of the blocks' events.
@@ -124,7 +124,7 @@ def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopS
 
 
 def evaluate_point(
-    system: System, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode, forecast: Forecast
+    system: LoopSystem, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode, forecast: Forecast
 ) -> Point:
     """Return the point at an instant.
 
@@ -140,7 +140,7 @@ def evaluate_point(
 
 
 def attempt_step(
-    system: System,
+    system: LoopSystem,
     point: Point,
     request: StepRequest,
     tableau: Tableau,
@@ -200,7 +200,7 @@ def attempt_step(
 
 
 def commit_step(
-    system: System,
+    system: LoopSystem,
     point: Point,
     attempt: Attempt,
     clock: Clock,
@@ -239,7 +239,7 @@ def commit_step(
     return end._replace(state=state, words=end.words if mode.words is None else mode.words)
 
 
-def mode_in_step(system: System, words: ModeBits, free: Bool) -> Mode:
+def mode_in_step(system: LoopSystem, words: ModeBits, free: Bool) -> Mode:
     """Return the mode of a step in which the comparisons keep the answers `words`, or are evaluated where it is `free`.
 
     Args:
@@ -251,7 +251,7 @@ def mode_in_step(system: System, words: ModeBits, free: Bool) -> Mode:
     return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.words)))
 
 
-def mode_after_changes(system: System, words: ModeBits, which: Scalar, lands: Bool) -> Mode:
+def mode_after_changes(system: LoopSystem, words: ModeBits, which: Scalar, lands: Bool) -> Mode:
     """Return the mode after the changes at the end of a step, which ended in the mode `words`.
 
     All comparisons are evaluated, but for that on whose switching surface the step ended: its answer stays. At the zero
@@ -267,7 +267,7 @@ def mode_after_changes(system: System, words: ModeBits, which: Scalar, lands: Bo
     return Mode(words, ~lands, tuple(~bit for bit in kept))
 
 
-def flip_answer(system: System, words: ModeBits, which: Scalar, lands: Bool) -> ModeBits:
+def flip_answer(system: LoopSystem, words: ModeBits, which: Scalar, lands: Bool) -> ModeBits:
     """Return the answers with that of one comparison reversed where a step ends on its switching surface.
 
     Args:

@@ -32,7 +32,7 @@ from diffabs.simulate.step.attempt import Attempt, StepRequest
 from diffabs.simulate.step.event_location import MAX_LOCATION_ATTEMPTS, SurfaceCrossing, find_surface_crossing
 from diffabs.simulate.step.runge_kutta import RK4
 from diffabs.simulate.step.status import RunStatus
-from diffabs.simulate.step.system import Evaluation, Objectives, System
+from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import Trajectory
 
 EVENT_ATTEMPTS_PER_STEP, SPARE_ATTEMPTS = 4, 64  # attempts to locate events: for each step of the grid, and in addition
@@ -101,7 +101,7 @@ class FixedStepping:
         return carry
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
-        """Return True if the run goes on and has not reached the instant `until` of the grid."""
+        """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
         return carry.running if until is None else carry.running & (carry.k < until)
 
     def observe_at(self, loop: Loop, carry: Carry, instant: Scalar) -> Trajectory:
@@ -130,31 +130,42 @@ class FixedStepping:
         """Return True if the comparisons of the `loop`'s flow are visible."""
         return loop.jumps if self.kinks is None else self.kinks
 
-    def propose(self, system: System, carry: Carry) -> StepRequest:
-        """Return the next step to attempt."""
+    def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
+        """Return the next step to attempt, by the run of `carry` in `system`."""
         return propose_step(self, system, carry, carry.k + 1, frozen=system.program is not None)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
-        """Return nothing: fixed steps need no forecast."""
+        """Return nothing: fixed steps need no forecast from `seen` for the run of `carry`."""
         del carry, seen
         return ()
 
     def report(
-        self, system: System, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
     ) -> FixedStepReport:
-        """Return the contradicted comparisons of an attempt."""
+        """Return the contradicted comparisons of an attempt by the run of `carry` in `system`, from `seen` at its end.
+
+        `h` is the length of the attempt. The `state` and the shares of the `error` have no influence.
+        """
         del state, error
         return FixedStepReport(find_surface_crossing(seen, carry.search.which, h) if system.program else None)
 
-    def decide(self, system: System, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool) -> Decision:
-        """Return the decision on an attempt: its numbers must be finite and, within a mode, plausible."""
+    def decide(
+        self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
+    ) -> Decision:
+        """Return the decision on the `attempt` that answers the `request`, by the run of `carry` in `system`.
+
+        Its numbers must be finite and, within a mode, plausible. `active` is False if the run needs no attempt.
+        """
         fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(attempt.point.state.flow())]))
         fine &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True
         last = request.strikes & (request.strike >= self.steps)
         return decide_attempt(system, carry, attempt, active, fine, fine, last=last, frozen=system.program is not None)
 
-    def refine(self, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an attempt, with the next attempt: to the grid, or as the search asks."""
+    def refine(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+        """Return the carry `after` an `attempt` with the next attempt planned: to the grid, or as the search asks.
+
+        `carry` is the run in `system` before the attempt, and `decision` the decision on it.
+        """
         control, on_grid = carry.control, decision.taken & carry.strikes
         extra = control.extra + jnp.where(on_grid | (carry.status == RunStatus.REFINING), 0, 1)
         here = jnp.where(on_grid, 0, control.here + extra - control.extra)

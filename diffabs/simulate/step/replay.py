@@ -32,7 +32,7 @@ from diffabs.simulate.step.event_location import select
 from diffabs.simulate.step.modes import ModeBits
 from diffabs.simulate.step.runge_kutta import TSIT5
 from diffabs.simulate.step.status import RunStatus, is_running
-from diffabs.simulate.step.system import Evaluation, Objectives, System
+from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import ADAPTIVE_ERROR_ORDER, Adaptive
 
 # Capacity of the log: attempts at an rtol of 1e-5, and attempts for each instant of a grid with clocks.
@@ -132,7 +132,7 @@ class ReplayStepping:
         return advance(dataclasses.replace(self, entry=entry), loop, objectives, key, carry)
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
-        """Return True if the logged attempt was accepted."""
+        """Return True if the logged attempt was accepted; `carry` and `until` have no influence."""
         del carry, until
         return self.logged.taken
 
@@ -141,8 +141,11 @@ class ReplayStepping:
         del loop
         return True
 
-    def propose(self, system: System, carry: Carry) -> StepRequest:
-        """Return the logged attempt. The step still ends at the logged time where the last one ended late."""
+    def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
+        """Return the logged attempt, for the replay `carry` in `system`.
+
+        If the last step ended late, this one is shorter: it ends at the logged time.
+        """
         one, k = self.logged, carry.k
         h = jnp.where(one.refresh, 0.0, one.length - carry.control.late)
         end = jnp.where(one.refresh, carry.point.t, one.t)
@@ -153,27 +156,35 @@ class ReplayStepping:
         return StepRequest(h, end, self.h, mode, one.refresh, strikes, one.k, shift_end)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
-        """Return nothing: the log says where steps end."""
+        """Return nothing, from `seen` for `carry`: the log says where steps end."""
         del carry, seen
         return ()
 
     def report(
-        self, system: System, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
     ) -> PyTree:
-        """Return nothing: the log says what is decided."""
+        """Return nothing of `system`, `carry`, `h`, `seen`, `state` and `error`: the log says what is decided."""
         del system, carry, h, seen, state, error
         return ()
 
-    def decide(self, system: System, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool) -> Decision:
-        """Return the decision on the logged attempt."""
+    def decide(
+        self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
+    ) -> Decision:
+        """Return the logged decision on the `attempt`, with the mode in `system` that was logged.
+
+        `active` is True if it was accepted. The numbers of `carry` and `request` have no influence.
+        """
         one, no = self.logged, jnp.asarray(False)
         margins, tree = jax.tree.flatten(attempt.point.margins)
         triggered = tree.unflatten([one.triggered & (1 << i) != 0 for i in range(len(margins))])
         mode = mode_in_step(system, one.next_words, no)
         return Decision(active, active, no, one.lands >= 0, triggered, mode, one.over)
 
-    def refine(self, system: System, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an attempt, with its delay behind the log."""
+    def refine(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+        """Return the carry `after` an `attempt` with the new delay behind the log.
+
+        `carry` is the replay in `system` before the attempt, and `decision` the decision on it.
+        """
         late, last = carry.control
         late = jnp.where(decision.taken & ~self.logged.refresh, attempt.shift, late)
         if self.live.keeps:

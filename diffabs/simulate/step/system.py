@@ -80,7 +80,7 @@ class Evaluation(NamedTuple):
     margin_rates: PyTree
 
 
-class System(NamedTuple):
+class LoopSystem(NamedTuple):
     """A loop and its objectives, with the program of their dynamics.
 
     Attributes:
@@ -157,7 +157,7 @@ def build_system(
     *,
     switched: bool,
     forecasts: bool = False,
-) -> System:
+) -> LoopSystem:
     """Return the system of a loop. Its program is traced once for each structure and for arguments of these shapes.
 
     Args:
@@ -184,13 +184,13 @@ def build_system(
             else None
         )
         _traced[key] = program, _find_asked_rates(loop, objectives, t, state, accumulators, smooth=switched)
-    return System(_traced[key][0], loop, objectives, _traced[key][1], forecasts)
+    return LoopSystem(_traced[key][0], loop, objectives, _traced[key][1], forecasts)
 
 
 def _find_asked_rates(
     loop: Loop, objectives: Objectives, t: Scalar, state: LoopState, accumulators: Accumulators, *, smooth: bool
 ) -> str:
-    """Return the signals of a segment whose rates the objectives ask for, as `System.signal_rates`."""
+    """Return the signals of a segment whose rates the objectives ask for, as `LoopSystem.signal_rates`."""
     asked = set()
 
     def note(what: str, rates: PyTree) -> tuple[PyTree, PyTree]:
