@@ -13,7 +13,7 @@ PACKAGE = ROOT / "diffabs"
 TREES = {path.relative_to(PACKAGE): ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
 
 # The same verb, the same meaning: a command and the function that it calls; the methods of a paper's module; of a
-# plant; a step of fixed and of adaptive runs; a formula of a checker that imports nothing of the package.
+# plant; a formula of a checker that imports nothing of the package.
 SHARED_FUNCTIONS = {
     *("certify", "design", "identify", "margins", "sweep", "tune"),
     *("compact", "figures", "loop", "reproduce", "run", "table"),

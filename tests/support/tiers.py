@@ -1,13 +1,14 @@
 """Run a tier of the tests and write into docs/test-status.md when it ran, on which commit, how long, and what failed.
 
-    python tests/support/tiers.py fast | nightly | weekly
+    python tests/support/tiers.py fast | nightly | weekly [JOB ...]
 
 fast      tests without the mark `slow`: every change, `make test`
 nightly   slow tests without the mark `weekly`, fast tests of the engine with the compiler flags that users have, and a
           seventh of the mutants, another one each day
 weekly    all slow tests, all fast tests with these flags, all mutants, and the fuzzers
 
-The exit status is 1 if something failed. A tier that is interrupted writes nothing."""
+JOB: only jobs whose name contains one of these texts. Each job writes its row when it ends, so the rows of a tier may be of
+several days and commits. The exit status is 1 if something failed. A job that is interrupted writes nothing."""
 
 import datetime
 import os
@@ -88,34 +89,37 @@ def _has(case: ElementTree.Element, *kinds: str) -> bool:
     return any(case.find(kind) is not None for kind in kinds)
 
 
-def write_status(tier: str, commit: str, minutes: float, rows: list[tuple[Job, float, str, list[str]]]) -> None:
-    """Replace the tier's section of docs/test-status.md."""
-    section = [f"## {tier.capitalize()}", ""]
-    section += [f"{datetime.date.today()}, commit {commit}, {os.cpu_count()} cores: {minutes:.1f} min.", ""]
-    section += ["| job | minutes | outcome |", "|---|---|---|"]
-    section += [f"| {job.name} | {spent:.1f} | {outcome.replace('|', ' ')} |" for job, spent, outcome, _ in rows]
-    failed = [name for *_, names in rows for name in names]
-    if failed:
-        section += ["", "Failed:", "", *(f"- `{name}`" for name in failed[:SHOWN_FAILURES])]
-        section += [f"- and {len(failed) - SHOWN_FAILURES} more"] if len(failed) > SHOWN_FAILURES else []
+def write_status(tier: str, jobs: list[Job], new: Job, commit: str, minutes: float, outcome: str) -> None:
+    """Replace the row of one job in the tier's section of docs/test-status.md; rows of other jobs stay."""
     text = PAGE.read_text(encoding="utf-8")
     old = re.compile(rf"^## {tier.capitalize()}\n.*?(?=^## |\Z)", re.MULTILINE | re.DOTALL)
+    found = old.search(text)
+    rows = dict(re.findall(r"^\| ([^|]+?) (\|.*)$", found[0] if found else "", re.MULTILINE))
+    rows[new.name] = f"| {datetime.date.today()} | {commit} | {minutes:.1f} | {outcome.replace('|', ' ')} |"
+    none = "| | | | not run yet |"
+    section = [f"## {tier.capitalize()}", "", "| job | date | commit | minutes | outcome |", "|---|---|---|---|---|"]
+    section += [f"| {job.name} {rows.get(job.name, none)}" for job in jobs]
     PAGE.write_text(old.sub(lambda _: "\n".join([*section, "", ""]), text).rstrip() + "\n", encoding="utf-8")
 
 
-def main(tier: str) -> int:
-    """Run a tier and write its section."""
+def main(tier: str, names: list[str]) -> int:
+    """Run a tier, or the jobs of these names, and write the rows."""
     commit = subprocess.run(
         ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.strip()
-    rows, begun = [], time.monotonic()
-    for job in jobs_of_tier(tier, datetime.date.today()):
+    jobs, status = jobs_of_tier(tier, datetime.date.today()), 0
+    for job in jobs:
+        if names and not any(name in job.name for name in names):
+            continue
         start = time.monotonic()
         outcome, failed = run_job(job)
-        rows.append((job, (time.monotonic() - start) / 60, outcome, failed))
-    write_status(tier, commit, (time.monotonic() - begun) / 60, rows)
-    return int(any(failed for *_, failed in rows))
+        if failed:
+            status = 1
+            more = f" and {len(failed) - SHOWN_FAILURES} more" if len(failed) > SHOWN_FAILURES else ""
+            outcome += ": " + ", ".join(f"`{name}`" for name in failed[:SHOWN_FAILURES]) + more
+        write_status(tier, jobs, job, commit, (time.monotonic() - start) / 60, outcome)
+    return status
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1]))
+    raise SystemExit(main(sys.argv[1], sys.argv[2:]))
