@@ -7,8 +7,8 @@ nightly   slow tests without the mark `weekly`, fast tests of the engine with th
           seventh of the mutants, another one each day
 weekly    all slow tests, all fast tests with these flags, all mutants, and the fuzzers
 
-JOB: only jobs whose name contains one of these texts. Each job writes its row when it ends, so the rows of a tier may be of
-several days and commits. The exit status is 1 if something failed. A job that is interrupted writes nothing."""
+JOB: only jobs whose name contains one of these texts. Each job writes its row when it ends, so the rows of a tier may
+be of several days and commits. The exit status is 1 if something failed. A job that is interrupted writes nothing."""
 
 import datetime
 import os
