@@ -12,8 +12,6 @@ and has no derivative. `objectives.SoftLoss` is its differentiable surrogate: th
 the same starts. Its time T is so early that a run that will fall has not yet landed.
 """
 
-import concurrent.futures
-import os
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -28,7 +26,6 @@ from diffabs.design.capture import capture_ellipsoids
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.types import Solver
 
-MIN_RUNS_PER_CORE = 256  # a core gets at least so many runs
 # Search for the largest multiple: relative width of the last interval; runs of one batch.
 MULTIPLE_TOLERANCE, SEARCH_POINTS = 1e-4, 33
 INITIAL_PREFIX = "initial."  # paths of the start, on which the system and its ellipsoid do not depend
@@ -124,10 +121,6 @@ class _Ellipsoids(NamedTuple):
         root, hopeless = own
         return (jnp.sum((root @ state_of(output)) ** 2) <= CAPTURE_LEVEL) | hopeless
 
-    def of(self, runs: slice) -> "_Ellipsoids":
-        """Return the same ellipsoids for the selected runs."""
-        return self._replace(system=self.system[runs])
-
     def contain(self, x: np.ndarray) -> np.ndarray:
         """Return whether each state (runs, 6) is inside its ellipsoid; False for NaN."""
         return np.sum(np.einsum("nij,nj->ni", self.roots[self.system], x) ** 2, axis=1) <= 1
@@ -179,28 +172,16 @@ def _classify_starts(
     count = len(inside.system)
     # fold_in by the run's number, so that the draws do not depend on the split over cores.
     keys = None if key is None else jax.vmap(lambda i: jax.random.fold_in(key, i))(np.arange(count))
-    parts = (
-        max(1, min(os.cpu_count() or 1, count // MIN_RUNS_PER_CORE)) if engine == "xla" else 1
-    )  # a kernel has its threads
-
-    def part(runs: slice) -> Matrix:
-        """Return the batch of one strided slice of the runs."""
-        mine = {path: column[runs] for path, column in starts.items()}
-        own = None if keys is None else keys[runs]
-        enough = inside.of(runs) if early else None
-        return jax.device_get(run_batch(loop, Batch(mine, own), solver, enough=enough, engine=engine))
-
-    found = Outcomes(*np.zeros((4, count), bool), time=np.zeros(count))
-    # Strided slices: neighbouring starts take about equally long, so each thread gets an equal share of slow runs.
-    slices = [slice(i, None, parts) for i in range(parts)]
-    with concurrent.futures.ThreadPoolExecutor(parts) as pool:
-        for runs, run in zip(slices, pool.map(part, slices), strict=True):
-            found.fell[runs], found.diverged[runs] = run.stopped, run.diverged
-            found.time[runs] = run.ending.sample.t
-            x = np.stack(list(state_of(run.ending.sample.output)), axis=-1)
-            found.recovered[runs] = inside.of(runs).contain(x) & ~run.stopped & ~run.diverged
-    found.unstable[:] = inside.hopeless[inside.system] & ~found.fell & ~found.diverged
-    return found
+    enough = inside if early else None
+    run = jax.device_get(run_batch(loop, Batch(starts, keys), solver, enough=enough, engine=engine))
+    x = np.stack(list(state_of(run.ending.sample.output)), axis=-1)
+    return Outcomes(
+        recovered=inside.contain(x) & ~run.stopped & ~run.diverged,
+        fell=run.stopped,
+        unstable=inside.hopeless[inside.system] & ~run.stopped & ~run.diverged,
+        diverged=run.diverged,
+        time=run.ending.sample.t,
+    )
 
 
 def region_of_attraction(

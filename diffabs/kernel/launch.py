@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-import os
 import pathlib
 import threading
 from collections.abc import Callable
@@ -11,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.process import core_count
 from diffabs.core.types import PyTree, Scalar
 from diffabs.kernel import binding, compilers, cpp, gpu, program
 
@@ -166,12 +166,7 @@ def library_path(name: str) -> pathlib.Path:
 def thread_count() -> int:
     """Return the number of threads for a launch: this process's processors divided among JAX's CPU devices."""
     # JAX may run a program on each of its CPU devices at the same time.
-    return max(1, _processors() // max(1, jax.local_device_count("cpu")))
-
-
-@functools.cache
-def _processors() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, core_count() // max(1, jax.local_device_count("cpu")))
 
 
 def _lane_type(x: Scalar) -> Scalar:

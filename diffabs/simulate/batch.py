@@ -14,11 +14,11 @@ from diffabs.core.compiling import is_traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import as_arrays, get, parameters, replace
-from diffabs.core.types import Bool, Key, Params, Part, PyTree
+from diffabs.core.types import Array, Bool, Key, Params, Part, PyTree
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.drive.engine import check_process, run_with_engine
 from diffabs.simulate.drive.packed import EarlyEnd, run_packed
-from diffabs.simulate.drive.sharding import run_on_auto_mesh
+from diffabs.simulate.drive.sharding import run_on_all_cores, run_on_auto_mesh
 from diffabs.simulate.run import refuse, run_unchecked
 from diffabs.simulate.types import Run, Solver
 
@@ -239,7 +239,14 @@ def _dispatch_batch(
 
     def by_xla() -> Run:
         if not as_one:
-            return run_packed(*given, enough)
+            values, keys, runs = given[1], given[2], given[-1]
+
+            def run(columns: PyTree, numbers: Array) -> Run:
+                return run_packed(loop, *columns[:2], solver, objectives, columns[2], enough, numbers)
+
+            if live:
+                return run((values, keys, runs), jnp.arange(count))
+            return run_on_all_cores(run, (values, keys, runs), count)
         return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories), accepted)
 
     why_not = TOGETHER_REASON if trajectories or together or (as_one and engine == "auto") else ""

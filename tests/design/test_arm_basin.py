@@ -64,7 +64,7 @@ def test_a_region_is_what_its_runs_do():
 
 
 @killed_by(
-    "design/attraction.py", "inside.of(runs).contain(x) & ~run.stopped & ~run.diverged", "~run.stopped & ~run.diverged"
+    "design/attraction.py", "inside.contain(x) & ~run.stopped & ~run.diverged", "~run.stopped & ~run.diverged"
 )
 @pytest.mark.slow
 def test_a_timeout_is_undecided():

@@ -106,6 +106,24 @@ class TestLanes:
         run = d.run_batch(LOOP, Batch(VALUES, keys), SOLVER, MEASURED, accepted=True, enough=never)
         same(jax.device_get(run), expected)
 
+    @killed_by("simulate/drive/sharding.py", "reshape(cores, each).T.ravel()[:count]", "ravel()[:count]")
+    @killed_by(
+        "simulate/drive/packed.py",
+        "known = numbers[jnp.minimum(slots",
+        "known = slots.number + 0 * numbers[jnp.minimum(slots",
+    )
+    def test_are_those_of_single_runs_on_two_cores(self, keys, expected, monkeypatch):
+        """Shares of different runs, the last ones filled by copies; each run knows its own speed at which it ends."""
+        replace_seam(monkeypatch, "core_count", lambda: 2)
+        replace_seam(monkeypatch, "min_runs_per_core", 3)
+        assert len(SPEEDS) % 2
+        lanes, ends = Batch(VALUES, keys), Slow(jnp.where(jnp.arange(len(SPEEDS)) % 2 == 0, 1e3, 0.0))
+        found = jax.device_get(d.run_batch(LOOP, lanes, SOLVER, MEASURED, accepted=True, enough=ends))
+        odd = slice(1, None, 2)
+        same(*(jax.tree.map(lambda x: x[odd], run) for run in (found, expected)))
+        assert expected.stopped[[0, 8]].all()
+        assert not found.stopped[[0, 8]].any()
+
     @killed_by("core/compiling.py", "isinstance(jax.device_put(0), Tracer) or any(", "any(")
     @pytest.mark.slow
     def test_are_those_of_single_runs_together(self, keys, expected):
@@ -190,7 +208,7 @@ class TestLanes:
 
 @killed_by(
     "simulate/drive/packed.py",
-    "free = ~slots.carry.running | _lanes_ended_early(enough, built, slots)",
+    "free = ~slots.carry.running | _lanes_ended_early(enough, built, slots, numbers)",
     "free = ~slots.carry.running",
 )
 @pytest.mark.parametrize("width", cases(WIDTHS, 4))

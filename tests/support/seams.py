@@ -55,6 +55,8 @@ SEAMS = {
     "max_saved_carries": "diffabs.simulate.drive.loops.MAX_SAVED_CARRIES",
     "max_lanes_per_launch": "diffabs.simulate.drive.kernel.MAX_LANES_PER_LAUNCH",
     "lanes_at_once": "diffabs.simulate.drive.packed.LANES_AT_ONCE",
+    "core_count": "diffabs.simulate.drive.sharding.core_count",
+    "min_runs_per_core": "diffabs.simulate.drive.sharding.MIN_RUNS_PER_CORE",
     "min_entrywise_matrices": "diffabs.simulate.stability.MIN_ENTRYWISE_MATRICES",
     "timeout_seconds": "diffabs.sweep.cluster.TIMEOUT_SECONDS",
     "runner": "diffabs.sweep.engines.Runner",

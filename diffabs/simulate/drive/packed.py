@@ -15,7 +15,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.tracing import split_batched
-from diffabs.core.types import Params, PyTree, Scalar
+from diffabs.core.types import Array, Params, PyTree, Scalar
 from diffabs.simulate.drive.loops import STEPS_PER_BLOCK, Carry
 from diffabs.simulate.result import finish_run, prepare
 from diffabs.simulate.run import forbid_derivatives, prepare_arguments
@@ -46,6 +46,7 @@ def run_packed(
     objectives: Mapping[str, Objective],
     accepted: Scalar,
     enough: EarlyEnd | None = None,
+    numbers: Array | None = None,
 ) -> Run:
     """Return the result of `jax.vmap` of `measure` for runs that differ in their values and keys. Not for reverse mode.
 
@@ -57,6 +58,7 @@ def run_packed(
         objectives: Objectives by the names of their metrics.
         accepted: Runs to execute, bool, shape (runs,).
         enough: Condition that ends runs early, or None.
+        numbers: Numbers by which `enough` knows the runs, shape (runs,); None for 0, 1, 2, ...
 
     Raises:
         ValueError: `measure` rejects the arguments.
@@ -64,7 +66,8 @@ def run_packed(
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
     values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     values = {**values, **forbid_derivatives(loop, values)}
-    return _run(loop, values, objectives, method, keys, accepted, enough, width=LANES_AT_ONCE)
+    numbers = jnp.arange(len(accepted)) if numbers is None else numbers
+    return _run(loop, values, objectives, method, keys, accepted, enough, numbers, width=LANES_AT_ONCE)
 
 
 def split_by_lane(
@@ -118,6 +121,7 @@ def _run(
     keys: PyTree,
     accepted: Scalar,
     enough: EarlyEnd | None,
+    numbers: Array,
     *,
     width: int,
 ) -> Run:
@@ -143,7 +147,7 @@ def _run(
             return jax.lax.scan(some, renew_all(slots.leaves, carry), length=STEPS_PER_BLOCK)[0], None
 
         slots = slots._replace(carry=jax.lax.scan(rounds, slots.carry, length=STEPS_PER_EXCHANGE // STEPS_PER_BLOCK)[0])
-        free = ~slots.carry.running | _lanes_ended_early(enough, built, slots)
+        free = ~slots.carry.running | _lanes_ended_early(enough, built, slots, numbers)
         return _exchange_lanes(slots, free, over, take_lanes, count)
 
     number = jnp.arange(min(width, count))
@@ -154,12 +158,15 @@ def _run(
     return jax.lax.while_loop(lambda slots: jnp.any(slots.number < count), round_, slots).ended
 
 
-def _lanes_ended_early(enough: EarlyEnd | None, built: Callable[[PyTree], PyTree], slots: _LaneSlots) -> PyTree:
+def _lanes_ended_early(
+    enough: EarlyEnd | None, built: Callable[[PyTree], PyTree], slots: _LaneSlots, numbers: Array
+) -> PyTree:
     """Return True for each slot whose run ends early; `built` returns the loop and objectives of one run."""
     if enough is None:
         return jnp.zeros_like(slots.carry.running)
     output = jax.vmap(lambda mine, at: built(mine)[0].plant.output(at.point.state.plant))(slots.leaves, slots.carry)
-    return jax.vmap(lambda number, output: enough.has_reached(enough.own(number), output))(slots.number, output)
+    known = numbers[jnp.minimum(slots.number, len(numbers) - 1)]
+    return jax.vmap(lambda number, output: enough.has_reached(enough.own(number), output))(known, output)
 
 
 def _exchange_lanes(

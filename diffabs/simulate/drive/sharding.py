@@ -1,22 +1,61 @@
-"""Batches on several devices: XLA divides the runs by itself if the axes of the mesh are of type Auto.
+"""Batches on all cores of a processor, and on several devices.
 
-Auto axes suit programs that do not specify the placement of their arrays, and no part of a loop specifies it.
+XLA computes a program of small steps on one core. A batch is therefore dealt to threads, each with a share of the runs.
+
+On a mesh XLA divides the runs by itself if the axes are of type Auto. They suit programs that do not specify the
+placement of their arrays, and no part of a loop specifies it.
 """
 
 import contextlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding
 
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.process import core_count
+from diffabs.core.types import Array, PyTree, Scalar
 
+MIN_RUNS_PER_CORE = 256  # a core gets at least so many runs
 TRACED_EXPLICIT_AXES = (
     "lanes lie on a mesh with axes of type Explicit, within jit or a derivative; there they need Auto ones:"
     " jax.make_mesh(..., axis_types=(jax.sharding.AxisType.Auto,))"
 )
+
+
+def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, count: int) -> PyTree:
+    """Return run(columns, numbers of the runs), computed on all cores of this processor.
+
+    Arrays on several devices, or on another device than a processor, are left to XLA.
+
+    Args:
+        run: Function that returns the results of some runs, a pytree with leaves (runs, ...).
+        columns: Data of the runs, a pytree with leaves (count, ...).
+        count: Number of runs.
+    """
+    cores = min(core_count(), count // MIN_RUNS_PER_CORE)
+    placed = [x for x in jax.tree.leaves(columns) if isinstance(x, jax.Array) and len(x.sharding.device_set) > 1]
+    if cores < 2 or placed or jax.default_backend() != "cpu":
+        return run(columns, jnp.arange(count))
+    # Threads do not inherit these settings.
+    wide, device, each = jax.config.jax_enable_x64, jax.config.jax_default_device, -(-count // cores)
+
+    def run_share(numbers: np.ndarray) -> PyTree:
+        with jax.enable_x64(wide), jax.default_device(device):
+            mine = jax.tree.map(lambda x: x[numbers], columns)
+            return jax.block_until_ready(run(mine, jnp.asarray(numbers)))
+
+    # Every `cores`-th run: neighbours take about equally long. Copies of the last run fill shares of one shape, so that
+    # all shares have one program.
+    shares = [np.minimum(np.arange(i, i + each * cores, cores), count - 1) for i in range(cores)]
+    with ThreadPoolExecutor(cores) as pool:
+        found = list(pool.map(run_share, shares))
+    order = np.arange(each * cores).reshape(cores, each).T.ravel()[:count]
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *found)
 
 
 def run_on_auto_mesh(run: Callable[..., PyTree], given: tuple[PyTree, ...]) -> PyTree:
