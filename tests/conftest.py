@@ -8,6 +8,7 @@ import gc
 import importlib.metadata
 import os
 import pathlib
+import signal
 
 from marks import readable_id
 from project import CACHE
@@ -22,6 +23,10 @@ if os.environ.get("DIFFABS_TEST_XLA") != "default" and "XLA_FLAGS" not in os.env
 os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("DIFFABS_JAX_CACHE", CACHE)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # programs without the lines of Python that each operation is from
+
+# A background job ignores SIGINT, and so would the processes that tests interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 gc.disable()  # until all is imported: what imports make stays, and looking through it took a fourth of the time
 

@@ -53,3 +53,14 @@ def rematerialise(body: Any) -> PyTree:
         body: Function to wrap, usually the body of a scan.
     """
     return jax.checkpoint(body, policy=jax.checkpoint_policies.nothing_saveable, prevent_cse=False)
+
+
+def select(which: Bool, a: X, b: X) -> X:
+    """Return a if `which`, else b.
+
+    Args:
+        which: Condition.
+        a: Pytree.
+        b: Pytree of the same structure.
+    """
+    return jax.tree.map(lambda x, y: jnp.where(which, x, y), a, b)

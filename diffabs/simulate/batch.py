@@ -239,14 +239,15 @@ def _dispatch_batch(
 
     def by_xla() -> Run:
         if not as_one:
-            values, keys, runs = given[1], given[2], given[-1]
+            everything = given[1], given[2], given[-1]  # values, keys, accepted
 
             def run(columns: PyTree, numbers: Array) -> Run:
-                return run_packed(loop, *columns[:2], solver, objectives, columns[2], enough, numbers)
+                values, keys, accepted = columns
+                return run_packed(loop, values, keys, solver, objectives, accepted, enough, numbers)
 
             if live:
-                return run((values, keys, runs), jnp.arange(count))
-            return run_on_all_cores(run, (values, keys, runs), count)
+                return run(everything, jnp.arange(count))
+            return run_on_all_cores(run, everything, count)
         return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories), accepted)
 
     why_not = TOGETHER_REASON if trajectories or together or (as_one and engine == "auto") else ""

@@ -1,8 +1,8 @@
 """Single runs of a loop by fixed or adaptive Runge-Kutta steps, with a trajectory or with metrics only.
 
-If a step crosses the stop or the event of a block, shorter steps are attempted until one ends there (`landing`). So
-every objective is exact to the order of the method and differentiable, independent of the place of the crossing in the
-step.
+If a step crosses the stop or the event of a block, shorter steps are attempted until one ends there
+(`step/event_location`). So every objective is exact to the order of the method and differentiable, independent of the
+place of the crossing in the step.
 """
 
 import math
@@ -23,7 +23,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import as_arrays, canonical_dtypes, parameters, prepare_derivatives, replace
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero
-from diffabs.core.types import Int, Key, Params, PyTree, Scalar
+from diffabs.core.types import Key, Params, PyTree, Scalar
 from diffabs.core.validity import find_broken, find_misshapen, part_rules
 from diffabs.objectives import Variation
 from diffabs.simulate.admissible import find_impossible_values
@@ -39,8 +39,8 @@ from diffabs.simulate.drive.loops import (
 from diffabs.simulate.result import finish_run, observe, prepare
 from diffabs.simulate.step.adaptive import AdaptiveStepping, clip_rtol
 from diffabs.simulate.step.fixed import FixedStepping
-from diffabs.simulate.step.replay import ReplayedRun, ReplayStepping, log_attempt, log_capacity
-from diffabs.simulate.step.status import RunStatus
+from diffabs.simulate.step.replay import ReplayedRun, ReplayStepping, log_attempt, log_capacity, states_between
+from diffabs.simulate.step.status import end_unfinished
 from diffabs.simulate.types import Adaptive, Run, Solver, Trajectory
 
 OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
@@ -123,7 +123,9 @@ def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
     between = min(every, steps) if every else round_up_capacity(steps)
-    tries = log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.capacity(loop, between)
+    tries = round_up_capacity(
+        log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.capacity(loop, between)
+    )
     method = method.with_trajectory() if every else method
     places = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
@@ -341,12 +343,12 @@ def _run_reversible(
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
     carry, (tries, instants, every) = method.start(loop, objectives, key), places
     if not every:
-        return finish_run(loop, objectives, scan_to_end(stepped, carry, tries))[0]
+        return finish_run(loop, objectives, end_unfinished(scan_to_end(stepped, carry, tries)))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     carry, seen = scan_with_trajectory(
         stepped, method.is_active, partial(method.observe_at, loop), carry, every, count, instants, tries
     )
-    return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
+    return _attach_trajectory(finish_run(loop, objectives, end_unfinished(carry)), first, seen)
 
 
 def _run_by_replay(
@@ -366,7 +368,7 @@ def _run_by_replay(
         tries,
     )
     log = jax.lax.stop_gradient(log)
-    status = jnp.where(carry.running, RunStatus.DIVERGED, carry.status)  # a run beyond the capacity of the log
+    status = end_unfinished(carry).status
     replay = ReplayStepping(live)
     start = replay.start(loop, objectives, key)
     again, spans = replay_log(
@@ -380,18 +382,11 @@ def _run_by_replay(
     if not every:
         return judged[0]
 
-    # Skipped blocks are zero and come after the end: infinity keeps the start times sorted for the search.
-    starts = jnp.where(jnp.any(log.taken, axis=1)[:, None], jax.lax.stop_gradient(spans.flow.start), jnp.inf)
-    spans = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), spans)
-
-    def observe_at(instant: Int) -> Trajectory:
-        t = instant * live.h
-        place = jnp.searchsorted(starts.ravel(), t, side="right") - 1
-        span = jax.tree.map(lambda x: x[place], spans)
-        return observe(loop, t, span.at(t), t < jax.lax.stop_gradient(again.point.t))
-
+    instants = jnp.arange(1, instants + 1) * every * live.h
+    states = states_between(spans, log.taken, instants)
+    goes_on = instants < jax.lax.stop_gradient(again.point.t)
     first = observe(loop, start.point.t, start.point.state, jnp.asarray(True))
-    return _attach_trajectory(judged, first, jax.vmap(observe_at)(jnp.arange(1, instants + 1) * every))
+    return _attach_trajectory(judged, first, jax.vmap(partial(observe, loop))(instants, states, goes_on))
 
 
 def _prepare_run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key) -> tuple[Loop, PyTree, PyTree]:

@@ -134,6 +134,21 @@ def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
         assert answers.words == held(one, 2.2).words
 
 
+@killed_by("simulate/step/modes.py", "jnp.where(below > 0, first + below - 1, NO_BIT)", "first + below - 1")
+def test_a_search_below_all_knots_has_one_side():
+    """Bit 0 is max(x, p), the next five are the knots. Below all knots the search has no lower side."""
+    one = program(lambda x, p: jnp.maximum(x, p) + jnp.arange(6.0)[searchsorted(jnp.asarray(KNOTS) + 10.0, x)])
+    answers = one.look(same, 0.5, 0.6, held(one, 0.7))[1]
+    found = find_contradicted(answers, jnp.asarray(0), jnp.asarray(0.5))
+    assert found[1]
+    assert found[3] == pytest.approx(-0.1)
+
+
+@killed_by("simulate/step/comparisons.py", '"remat", "remat2", ', "")
+def test_a_comparison_within_a_checkpoint_is_seen():
+    assert program(jax.checkpoint(lambda x, p: jnp.maximum(x, p))).answers == 1
+
+
 @killed_by("simulate/step/modes.py", "most.eps**ROUNDING_POWER *", "0.0 *")
 def test_numbers_that_are_equal_to_rounding_say_nothing():
     one = program(lambda x, p: jnp.where(x > p, 1.0, 0.0))

@@ -63,9 +63,7 @@ def test_a_region_is_what_its_runs_do():
     assert not np.array_equal(found.outcomes.recovered[:5], found.outcomes.recovered[:5][::-1])
 
 
-@killed_by(
-    "design/attraction.py", "inside.contain(x) & ~run.stopped & ~run.diverged", "~run.stopped & ~run.diverged"
-)
+@killed_by("design/attraction.py", "inside.contain(x) & ~run.stopped & ~run.diverged", "~run.stopped & ~run.diverged")
 @pytest.mark.slow
 def test_a_timeout_is_undecided():
     """The slow LQR after 3 s: neither on the ground nor where it surely returns. In the end 32.8 % return, not 23.0."""

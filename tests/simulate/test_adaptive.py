@@ -13,14 +13,17 @@ from mutants import killed_by
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references, roads, stops
-from diffabs.core.cubic import Cubic
+from diffabs.core.cubic import Cubic, HermiteStep
+from diffabs.core.loop import LoopState
+from diffabs.core.protocols import Memory
 from diffabs.core.pytree import as_arrays, canonical_dtypes, get, prepare_parts, refine_parts
 from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
 from diffabs.simulate.run import prepare_arguments
 from diffabs.simulate.step import step_size, system
-from diffabs.simulate.step.replay import BASE_LOG_CAPACITY, log_capacity
+from diffabs.simulate.step.adaptive import StateSpan
+from diffabs.simulate.step.replay import BASE_LOG_CAPACITY, log_capacity, states_between
 from diffabs.tune import worst_case
 
 LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
@@ -465,3 +468,16 @@ def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
     jacobian, longest = both()
     radius = np.max(np.abs(np.linalg.eigvals(jacobian)))
     assert 0.7 < float(longest) * radius / step_size.STABILITY_RADIUS < 1.4
+
+
+@killed_by("simulate/step/replay.py", "order = jnp.argsort(begins)", "order = jnp.arange(len(begins))")
+def test_a_trajectory_passes_over_rejected_attempts():
+    """Six steps of 0.1 s in blocks of two, of which the second block has none; the state is t, its rate 1."""
+    starts = jnp.array([[0.0, 0.1], [0.0, 0.0], [0.2, 0.3]])
+    taken = jnp.array([[True, True], [False, False], [True, True]])
+    ends, one = starts + 0.1, jnp.ones_like(starts)
+    flows = [(x, (), (), (), ()) for x in (starts, ends, one, one)]
+    state = LoopState(starts, *4 * [Memory()])
+    spans = StateSpan(state, HermiteStep(starts, ends, (flows[0], flows[1]), (flows[2], flows[3])))
+    instants = jnp.array([0.05, 0.15, 0.25, 0.35])
+    np.testing.assert_allclose(states_between(spans, taken, instants).plant, instants, rtol=1e-12)

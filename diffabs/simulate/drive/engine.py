@@ -1,4 +1,4 @@
-"""Selection of the engine of a batch: XLA, or a program of this machine (`native`), imported only on request."""
+"""Selection of the engine of a batch: XLA, or a program of this machine (`kernel`), imported only on request."""
 
 import functools
 import logging

@@ -42,7 +42,8 @@ def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, co
     if cores < 2 or placed or jax.default_backend() != "cpu":
         return run(columns, jnp.arange(count))
     # Threads do not inherit these settings.
-    wide, device, each = jax.config.jax_enable_x64, jax.config.jax_default_device, -(-count // cores)
+    wide, each = jnp.result_type(float) == jnp.float64, -(-count // cores)
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
     def run_share(numbers: np.ndarray) -> PyTree:
         with jax.enable_x64(wide), jax.default_device(device):

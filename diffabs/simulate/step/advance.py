@@ -4,7 +4,7 @@
     attempt    `attempt.attempt_step`: the same for every method
     decide     accept the step, search within it, or end the run
     commit     `attempt.commit_step`: the same for every method
-    refine     the length of the next attempt
+    plan_next  the length of the next attempt
 
 `FixedStepping`, `AdaptiveStepping` and `ReplayStepping` differ in these and in the coefficients of their step.
 """
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from diffabs.core.lanes import any_lane, jit_barrier
+from diffabs.core.lanes import any_lane, jit_barrier, select
 from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.protocols import Clock
@@ -41,7 +41,6 @@ from diffabs.simulate.step.event_location import (
     falls_through,
     find_crossings,
     init_search,
-    select,
 )
 from diffabs.simulate.step.modes import Mode
 from diffabs.simulate.step.runge_kutta import Tableau
@@ -55,10 +54,10 @@ class Carry(NamedTuple):
     Attributes:
         point: Point of the run that the last accepted attempt reached.
         k: Number of the last instant of the grid at which a clock struck.
-        since: Time since that instant [s]. A difference of two times would lose digits.
+        since: Time since that instant [s]. It is summed, because the difference of two large times would lose digits.
         length: Length of the next attempt [s].
         strikes: True if the next attempt ends where a clock strikes next, or with the run.
-        base: Length of the last regular step [s], the scale of a search within it.
+        base: Length of the regular attempt from this point [s], the scale of a search within it.
         search: Search for an event.
         unrestricted: True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode.
         control: Numbers of the stepping method.
@@ -120,7 +119,7 @@ class Stepping(Protocol):
         ...
 
     @property
-    def forecasts(self) -> bool:
+    def has_margin_rates(self) -> bool:
         """True if the rates of all margins are evaluated."""
         ...
 
@@ -130,7 +129,7 @@ class Stepping(Protocol):
         ...
 
     @property
-    def refines(self) -> bool:
+    def second_order(self) -> bool:
         """True if the times of events have second derivatives."""
         ...
 
@@ -169,7 +168,7 @@ class Stepping(Protocol):
         """
         ...
 
-    def refine(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+    def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
         """Return the carry `after` an `attempt` with the next attempt planned.
 
         `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has its new point
@@ -199,7 +198,7 @@ def advance(
     system = build_system(
         *(loop, objectives, start.t, start.state, start.accumulators),
         switched=stepping.is_switched(loop),
-        forecasts=stepping.forecasts,
+        has_margin_rates=stepping.has_margin_rates,
     )
     request, forecast = stepping.propose(system, carry), partial(stepping.forecast, carry)
 
@@ -225,7 +224,7 @@ def advance(
     after = carry._replace(point=point, k=k, since=since)
     if stepping.searches:
         after = _search(stepping, system, carry, attempt, decision, after)
-    after = stepping.refine(system, carry, attempt, decision, after)
+    after = stepping.plan_next(system, carry, attempt, decision, after)
     after = after._replace(status=jnp.where(active, after.status, carry.status).astype(carry.status.dtype))
     if until is not None:  # without a pause, the other fields of a run that is over have no effect
         after = select(active, after, carry)
@@ -241,7 +240,7 @@ def _search(
     def look() -> SearchPlan:
         margins = (jax.tree.leaves(point.margins) for point in (carry.point, attempt.point))
         crossings = find_crossings(carry.search.which, system.comparisons, attempt.report.surface, *margins)
-        found = continue_search(plan, crossings, carry.base, system.comparisons, refines=stepping.refines)
+        found = continue_search(plan, crossings, carry.base, system.comparisons, refines=stepping.second_order)
         return select(decision.searches, found, plan)
 
     # Few attempts search, so a batch skips the search unless one of its runs needs it.
@@ -269,8 +268,11 @@ def start_carry(
     none, zero = 0.0 * stepping.h, jnp.asarray(0)
     state, accumulators = start_state(loop, objectives, Clock(none, stepping.h, zero, key))
     logs, state = log_rows(state), borrow(state, None)
-    switched = stepping.is_switched(loop)
-    system = build_system(loop, objectives, none, state, accumulators, switched=switched, forecasts=stepping.forecasts)
+    system = build_system(
+        *(loop, objectives, none, state, accumulators),
+        switched=stepping.is_switched(loop),
+        has_margin_rates=stepping.has_margin_rates,
+    )
     point = evaluate_point(system, none, state, accumulators, UNCONSTRAINED, forecast)
     status = jnp.where(point.margins["stop"][0] > 0, zero + RunStatus.RUNNING, zero + RunStatus.DIVERGED)
     point = point._replace(state=borrow(state, logs))

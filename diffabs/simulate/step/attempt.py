@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.cubic import HermiteStep
+from diffabs.core.lanes import select
 from diffabs.core.log import borrow
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
 from diffabs.core.types import Bool, Int, PyTree, Scalar
-from diffabs.simulate.step.event_location import select
 from diffabs.simulate.step.modes import Mode, ModeBits, single_bit
 from diffabs.simulate.step.runge_kutta import Tableau, runge_kutta_step
 from diffabs.simulate.step.step_size import valid_end_rates
@@ -180,7 +180,7 @@ def attempt_step(
     smooth, within = system.program is not None, (True, True)
     if frozen:
         smooth, within = ~mode.free, (True, ~mode.free)
-    elif system.forecasts:
+    elif system.has_margin_rates:
         changed = tuple(a ^ b for a, b in zip(seen.words, point.words, strict=True))
         within = valid_end_rates(seen.surfaces, changed, h)
     rates = (point.signal_rates, seen.signal_rates)

@@ -22,7 +22,7 @@ from jax.extend.core import JaxprEqn
 from diffabs.core.types import PyTree, Scalar
 from diffabs.simulate.step.modes import WORD_BITS, BitRange, ComparisonAnswers, ComparisonTrace, Mode
 
-INLINED_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint")
+INLINED_CALLS = ("jit", "pjit", "remat", "remat2", "checkpoint")
 SEARCHSORTED = "searchsorted"  # of `jax.numpy` or `core.numerics`, in at most WORD_BITS knots
 
 

@@ -15,8 +15,8 @@ a later correction.
     probe   an attempt beside it, on the same side of the zero, measures how the margin falls there
     land    the final step has the length place - margin(place)/fall. Its derivative is that of the event's time by the
             implicit function theorem: the margin at the end of an attempt carries the derivative
-    refine  for derivatives: one more attempt of this length. A Newton step from there is right to the second
-            derivative, as the step before is right to the first: each step doubles the order
+    refine  for second derivatives: one more attempt of the located length. The margin at its end gives one more Newton
+            step, which doubles the order of the derivative
     refresh a step of length 0 evaluates the rates after an event, or within the mode beyond a switching surface. In a
             loop with a clock the rates are evaluated after every step, and no step of length 0 is needed
 
@@ -31,6 +31,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.lanes import select
 from diffabs.core.numerics import ratio
 from diffabs.core.types import AnyArray, Bool, Int, PyTree, Scalar
 from diffabs.simulate.step.modes import ComparisonAnswers, find_contradicted
@@ -435,14 +436,3 @@ def _pick(which: Int, values: list[PyTree]) -> Any:
     for i, value in enumerate(values[1:], 1):
         found = jnp.where(which == i, value, found)
     return found
-
-
-def select(which: Scalar, a: Scalar, b: Scalar) -> Scalar:
-    """Return a if `which`, else b.
-
-    Args:
-        which: Condition.
-        a: Pytree.
-        b: Pytree of the same structure.
-    """
-    return jax.tree.map(lambda x, y: jnp.where(which, x, y), a, b)

@@ -4,7 +4,7 @@ A step goes to the next instant of the grid. If an event lies within it, shorter
 the event (`event_location`). The next step goes on to the grid.
 
 Steps keep to a mode if switching surfaces are located. A search on a switching surface may fail, or its mode may lead
-to invalid numbers. Then one unrestricted step goes to the grid, in which each stage evaluates its comparisons: it is
+to invalid numbers. Then the step is unrestricted: it goes to the grid, and each stage evaluates its comparisons. It is
 accurate to the order of the kink. Later steps are unrestricted, too, until no comparison changes in one of them.
 """
 
@@ -64,7 +64,7 @@ class FixedStepReport(NamedTuple):
     surface: SurfaceCrossing | None
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["kinks", "refines"])
+@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["kinks", "second_order"])
 @dataclasses.dataclass(frozen=True)
 class FixedStepping:
     """Steps of a `FixedStep` solver.
@@ -73,14 +73,14 @@ class FixedStepping:
         h: Length of a step [s].
         steps: Number of steps.
         kinks: True if switching surfaces are located. None locates them for derivatives, and if a rate jumps there.
-        refines: True if the times of events have second derivatives.
+        second_order: True if the times of events have second derivatives.
     """
 
     h: Scalar
     steps: Int
     kinks: bool | None = None
-    refines: bool = False
-    tableau, forecasts, searches = RK4, False, True
+    second_order: bool = False
+    tableau, has_margin_rates, searches = RK4, False, True
 
     def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
@@ -115,7 +115,7 @@ class FixedStepping:
 
     def for_derivatives(self) -> "FixedStepping":
         """Return the method for derivatives."""
-        return dataclasses.replace(self, kinks=self.kinks is not False, refines=True)
+        return dataclasses.replace(self, kinks=self.kinks is not False, second_order=True)
 
     def capacity(self, loop: Loop, steps: int) -> int:
         """Return the greatest number of attempts in a number of `steps` of this `loop`: the capacity of a scan.
@@ -161,7 +161,7 @@ class FixedStepping:
         last = request.strikes & (request.strike >= self.steps)
         return decide_attempt(system, carry, attempt, active, fine, fine, last=last, frozen=system.program is not None)
 
-    def refine(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+    def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
         """Return the carry `after` an `attempt` with the next attempt planned: to the grid, or as the search asks.
 
         `carry` is the run in `system` before the attempt, and `decision` the decision on it.

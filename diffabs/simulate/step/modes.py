@@ -10,6 +10,7 @@ import numpy as np
 from diffabs.core.types import PyTree, Scalar
 
 WORD_BITS = 32  # answers in a word
+NO_BIT = -2  # number of no comparison; -1 is the number of a comparison that was not found
 ROUNDING_POWER = 0.75  # eps to this power is a relative difference that may come from rounding alone
 
 ModeBits = tuple[Any, ...]
@@ -168,7 +169,11 @@ class ComparisonTrace:
         count = len(knots)
         low = jnp.where(below > 0, x - knots[jnp.maximum(below - 1, 0)], jnp.inf)
         high = jnp.where(below < count, knots[jnp.minimum(below, count - 1)] - x, jnp.inf)
-        self.margins += [(first + below - 1, low), (first + below, high)]
+        # A side without a knot has no bit: `first - 1` and `first + count` belong to other comparisons.
+        self.margins += [
+            (jnp.where(below > 0, first + below - 1, NO_BIT), low),
+            (jnp.where(below < count, first + below, NO_BIT), high),
+        ]
         return low, high
 
     def _pack(self, words: list[PyTree], first: int, answer: Scalar) -> None:

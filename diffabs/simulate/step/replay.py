@@ -1,17 +1,16 @@
 """Derivatives of a run with adaptive steps: the run is made once for its values and logged, and then its steps are
 replayed.
 
-    log        for each accepted attempt: the time at its end, its mode and the next one, and the comparison, events and
-               clock instant at its end
+    log        for each attempt: whether it was accepted, the time at its end, its mode and the next one, and the
+               comparison, events and clock instant at its end
     replay     the same attempts within the same modes, which are smooth. If a comparison changes or an event happens at
                the end of a step, the step ends at the zero of its margin g. Newton's step -g/(dg/dt) from the logged
                end has the derivative of the event's time, by the implicit function theorem
 
-So the derivative is that of a run whose steps end at the logged times, or on its switching surfaces and events. The
-lengths of all other steps are constants.
+The derivative treats the logged lengths as constants. Only ends on events and switching surfaces move.
 
-Reverse mode logs the whole run first. Forward mode replays each attempt at once (`LaggedReplayStepping`): only the
-present state is kept, so the memory of many runs does not grow with their steps.
+Under XLA, both modes log the whole run and then replay it. Forward mode in a kernel replays each attempt at once
+(`LaggedReplayStepping`). It keeps only the present state, so the memory of many runs does not grow with their steps.
 """
 
 import dataclasses
@@ -22,23 +21,21 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.lanes import any_lane
+from diffabs.core.lanes import any_lane, select
 from diffabs.core.loop import Loop, LoopState
-from diffabs.core.types import Bool, Int, Key, PyTree, Scalar
-from diffabs.simulate.step.adaptive import AdaptiveStepping, span_step
+from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
+from diffabs.simulate.step.adaptive import AdaptiveStepping, StateSpan, span_step
 from diffabs.simulate.step.advance import Carry, Decision, advance, cast_floats, start_carry
 from diffabs.simulate.step.attempt import Attempt, Point, StepRequest, mode_in_step
-from diffabs.simulate.step.event_location import select
 from diffabs.simulate.step.modes import ModeBits
-from diffabs.simulate.step.runge_kutta import TSIT5
+from diffabs.simulate.step.runge_kutta import Tableau
 from diffabs.simulate.step.status import RunStatus, is_running
 from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import ADAPTIVE_ERROR_ORDER, Adaptive
 
 # Capacity of the log: attempts at an rtol of 1e-5, and attempts for each instant of a grid with clocks.
 BASE_LOG_CAPACITY, LOG_CAPACITY_PER_TICK = 4096, 3
-# Fraction of the attempt with the first sign of an event. No event or crossing at the end of a step is farther from its
-# zero than this: a larger Newton step would come from a margin that hardly falls.
+# Fraction of `base`. A longer Newton step to an event is ignored, because its margin hardly falls.
 MAX_SHIFT_FRACTION = 1e-3
 
 
@@ -97,7 +94,12 @@ class ReplayStepping:
 
     live: AdaptiveStepping
     entry: StepLog | None = None
-    tableau, forecasts, searches, refines = TSIT5, True, False, False
+    has_margin_rates, searches, second_order = True, False, False
+
+    @property
+    def tableau(self) -> Tableau:
+        """Coefficients of the Runge-Kutta step of the logged run."""
+        return self.live.tableau
 
     @property
     def h(self) -> Scalar:
@@ -180,7 +182,7 @@ class ReplayStepping:
         mode = mode_in_step(system, one.next_words, no)
         return Decision(active, active, no, one.lands >= 0, triggered, mode, one.over)
 
-    def refine(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+    def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
         """Return the carry `after` an `attempt` with the new delay behind the log.
 
         `carry` is the replay in `system` before the attempt, and `decision` the decision on it.
@@ -297,6 +299,24 @@ def log_attempt(old: Carry, new: Carry) -> StepLog:
         refresh=old.status == RunStatus.REFRESHING,
         over=~new.running,
     )
+
+
+def states_between(spans: StateSpan, taken: Bool, instants: Array) -> LoopState:
+    """Return the states at these instants, leaves (n, ...), from the steps of a replayed run.
+
+    Args:
+        spans: Steps of the attempts, in blocks with leaves (blocks, attempts, ...).
+        taken: True for each attempt that was accepted, shape (blocks, attempts). The span of another attempt is that of
+            the last accepted one, or zero in a block without an accepted attempt.
+        instants: Times [s], shape (n,).
+    """
+    begins = jax.lax.stop_gradient(spans.flow.start)
+    begins = jnp.where(jnp.any(taken, axis=1)[:, None], begins, jnp.inf).ravel()
+    spans = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), spans)
+    # A block without an accepted attempt may lie between others: sorting moves all of them to the end.
+    order = jnp.argsort(begins)
+    place = order[jnp.searchsorted(begins[order], instants, side="right") - 1]
+    return jax.vmap(StateSpan.at)(jax.tree.map(lambda x: x[place], spans), instants)
 
 
 def _time_to_event(one: StepLog, strikes: Bool, end: Evaluation) -> Scalar:

@@ -39,6 +39,16 @@ def is_running(carry: PyTree) -> Bool:
     return carry.status <= RunStatus.REFRESHING
 
 
+def end_unfinished(carry: PyTree) -> PyTree:
+    """Return the carry after the last attempt for which there is capacity: a run that still goes on has diverged.
+
+    Args:
+        carry: Carry of the run, with a `status`.
+    """
+    status = jnp.where(is_running(carry), RunStatus.DIVERGED, carry.status)
+    return carry._replace(status=status.astype(carry.status.dtype))
+
+
 def status_after_step(loop: Loop, carry: PyTree, attempt: PyTree, decision: PyTree) -> Scalar:
     """Return the status after an accepted attempt.
 

@@ -1,8 +1,8 @@
 """The dynamics of the loop and its objectives, as one function of time and state.
 
-For values by fixed steps, the parts are evaluated directly. Otherwise the function is a program whose comparisons are
-visible (`comparisons`), so that a step has one mode. Without a mode, the derivative of a step with a kink inside is
-wrong by up to one step in the kink's time. The value may still be exact.
+Fixed steps for values evaluate the parts directly, unless switching surfaces are located. All other runs trace a
+program whose comparisons are visible (`comparisons`). Steps that locate switching surfaces, and logged steps, freeze a
+mode. Without a mode, the derivative of a step places a kink up to one step too early or too late.
 """
 
 from typing import NamedTuple
@@ -88,14 +88,14 @@ class LoopSystem(NamedTuple):
         loop: Loop with the parameters of the run.
         objectives: Objectives by name.
         signal_rates: Signals whose rates an evaluation has: "sample", "shown" (plant outputs and setpoint), or "".
-        forecasts: True if an evaluation has the rates of all margins.
+        has_margin_rates: True if an evaluation has the rates of all margins.
     """
 
     program: SwitchedProgram | None
     loop: Loop
     objectives: Objectives
     signal_rates: str
-    forecasts: bool
+    has_margin_rates: bool
 
     @property
     def words(self) -> int:
@@ -128,18 +128,18 @@ class LoopSystem(NamedTuple):
             seen, answers = look(t, z)
             sample = seen.signals.sample
             shown = {"sample": sample, "shown": Shown.of(sample), "": ()}[self.signal_rates]
-            margins = (seen.margins, [margin for _, margin in answers.margins]) if self.forecasts else ((), [])
+            margins = (seen.margins, [margin for _, margin in answers.margins]) if self.has_margin_rates else ((), [])
             return (shown, seen.signals.recorded, *margins), answers
 
         seen, answers = look(t, z)
         surfaces = [SwitchingFunction(*one) for one in answers.margins]
         signal_rates, recorded_rates, margin_rates = (), seen.signals.recorded, ()
-        if self.signal_rates or self.forecasts or self.loop.recorders:
+        if self.signal_rates or self.has_margin_rates or self.loop.recorders:
             # The derivative along (1, dz/dt) is the total time derivative on the trajectory.
             along = (jnp.ones_like(t), seen[:2])
             (_, _, _, values), moves, answers = jax.jvp(moving_signals, (t, z), along, has_aux=True)
             signal_rates, recorded_rates, margin_rates, rates = moves
-            if self.forecasts:
+            if self.has_margin_rates:
                 each = zip(answers.margins, values, rates, strict=True)
                 surfaces = [SwitchingFunction(numbers, value, rate) for (numbers, _), value, rate in each]
         return Evaluation(
@@ -156,7 +156,7 @@ def build_system(
     accumulators: Accumulators,
     *,
     switched: bool,
-    forecasts: bool = False,
+    has_margin_rates: bool = False,
 ) -> LoopSystem:
     """Return the system of a loop. Its program is traced once for each structure and for arguments of these shapes.
 
@@ -167,24 +167,25 @@ def build_system(
         state: State of the loop.
         accumulators: Accumulators of the objectives.
         switched: True for a program with visible comparisons; False for direct evaluation.
-        forecasts: True if an evaluation has the rates of all margins.
+        has_margin_rates: True if an evaluation has the rates of all margins.
     """
     z, held = split_flow_and_held(state, accumulators)
     args = ((t, *z), (held, loop, objectives))
     leaves, tree = jax.tree.flatten(args)
     # `result_type(float)` is part of the key: with another precision the same shapes give another program.
     key = (tree, tuple(map(jax.typeof, leaves)), jnp.result_type(float), switched)
-    if key not in _traced:
+    found = _traced.get(key)
+    if found is None:
         while len(_traced) >= MAX_CACHED_SYSTEMS:
-            _traced.pop(next(iter(_traced)))  # a dict keeps the order of insertion: the oldest goes first
+            _traced.pop(next(iter(_traced)), None)  # a dict keeps the order of insertion: the oldest goes first
         # `counts`: only comparisons that influence rates or recorded signals produce a kink in the run.
         program = (
             SwitchedProgram(_evaluate_loop, *args, counts=lambda seen: (seen[:2], seen.signals.recorded))
             if switched
             else None
         )
-        _traced[key] = program, _find_asked_rates(loop, objectives, t, state, accumulators, smooth=switched)
-    return LoopSystem(_traced[key][0], loop, objectives, _traced[key][1], forecasts)
+        found = _traced[key] = program, _find_asked_rates(loop, objectives, t, state, accumulators, smooth=switched)
+    return LoopSystem(found[0], loop, objectives, found[1], has_margin_rates)
 
 
 def _find_asked_rates(
