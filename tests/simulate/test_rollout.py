@@ -180,7 +180,7 @@ def test_another_duration_compiles_nothing_new(duration, like):
     run = d.measure(RIG, solver, BRAKING)
     assert _run._cache_size() == before
     loop, objectives, method = prepare_arguments(RIG, solver, BRAKING)
-    alone = plainly(loop, objectives, method, method.capacity(loop, solver.steps))
+    alone = plainly(loop, objectives, method, 2 * solver.steps + 200)
     assert bool(run.stopped) == (duration == 3.0)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-13), run, alone)
 
