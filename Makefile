@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow test-nightly test-weekly coverage versions lint docs bench bench-peers bench-check bench-figure mutants mutate-changes fuzz clean
+.PHONY: demo test test-nightly test-weekly coverage versions lint docs bench bench-peers bench-check bench-figure mutants mutate-changes fuzz clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -15,9 +15,6 @@ test: $(VENV)/.test
 # the share of lines and branches that the fast tests run; the last line is the number
 coverage: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" --cov=diffabs --cov-branch --cov-report=term:skip-covered
-
-test-slow: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 # two larger tiers; each writes into docs/test-status.md when it ran and what failed
 test-nightly test-weekly: test-%: $(VENV)/.test

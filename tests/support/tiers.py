@@ -3,9 +3,11 @@
     python tests/support/tiers.py fast | nightly | weekly [JOB ...]
 
 fast      tests without the mark `slow`: every change, `make test`
-nightly   slow tests without the mark `weekly`, fast tests of the engine with the compiler flags that users have, and a
-          seventh of the mutants, another one each day
+nightly   a quarter of the slow tests and a seventh of the mutants, others each day, and fast tests of the engine with
+          the compiler flags that users have
 weekly    all slow tests, all fast tests with these flags, all mutants, and the fuzzers
+
+Each quarter of the slow tests has processes of its own: JAX keeps compiled programs, some 20 MB for each slow test.
 
 JOB: only jobs whose name contains one of these texts. Each job writes its row when it ends, so the rows of a tier may
 be of several days and commits. The exit status is 1 if something failed. A job that is interrupted writes nothing."""
@@ -29,6 +31,7 @@ PYTEST = ("-m", "pytest", "-n", "2", "--dist", "loadfile", "--no-loadscope-reord
 ENGINE = ("tests/core", "tests/simulate", "tests/objectives", "tests/controllers", "tests/actuators")
 USERS_FLAGS = MappingProxyType({"DIFFABS_TEST_XLA": "default"})
 SHOWN_FAILURES = 12
+SLOW_PARTS, MUTANT_PARTS = 4, 7
 
 
 class Job(NamedTuple):
@@ -41,16 +44,20 @@ class Job(NamedTuple):
 
 def jobs_of_tier(tier: str, today: datetime.date) -> list[Job]:
     """Return the jobs of a tier on a day. Raises KeyError for a tier that does not exist."""
-    mutants, fuzz = "tests/support/mutants.py", "tests/support/fuzz_"
+    mutants, fuzz, day = "tests/support/mutants.py", "tests/support/fuzz_", today.toordinal()
+
+    def slow_tests(name: str, part: int) -> Job:
+        return Job(name, (*PYTEST, "-m", "slow"), MappingProxyType({"DIFFABS_TEST_PART": f"{part}/{SLOW_PARTS}"}))
+
     return {
         "fast": [Job("fast tests", (*PYTEST, "-m", "not slow"))],
         "nightly": [
-            Job("slow tests", (*PYTEST, "-m", "slow and not weekly")),
+            slow_tests("a quarter of the slow tests", day % SLOW_PARTS),
             Job("the engine's tests, users' flags", (*PYTEST, "-m", "not slow", *ENGINE), USERS_FLAGS),
-            Job("a seventh of the mutants", (mutants, "--part", f"{today.toordinal() % 7}/7")),
+            Job("a seventh of the mutants", (mutants, "--part", f"{day % MUTANT_PARTS}/{MUTANT_PARTS}")),
         ],
         "weekly": [
-            Job("slow tests", (*PYTEST, "-m", "slow")),
+            *(slow_tests(f"slow tests, part {part + 1} of {SLOW_PARTS}", part) for part in range(SLOW_PARTS)),
             Job("fast tests, users' flags", (*PYTEST, "-m", "not slow"), USERS_FLAGS),
             Job("all mutants", (mutants,)),
             Job("scenarios of the fuzzer", (f"{fuzz}scenarios.py", "--count", "20000", "--seed", "0")),
