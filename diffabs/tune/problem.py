@@ -36,7 +36,7 @@ from diffabs.tune.risk import Aggregate
 
 MAX_QUICK_COMPILE_RUNS = 64  # above this number of runs, a fully optimised compilation pays for itself
 NO_REVERSE_MESSAGE = "a kernel has no reverse mode; forward mode, or engine = 'xla'"
-MAX_KERNEL_PARAMETERS = 32  # parameters up to which a kernel's forward mode is cheaper than XLA (docs/performance.md)
+MAX_KERNEL_PARAMETERS = 64  # parameters up to which a kernel's forward mode is cheaper than XLA (docs/performance.md)
 MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is cheaper (benchmarks/bench_gradient.py)
 
 

@@ -29,7 +29,7 @@ from diffabs.scenario.defaults import braking
 from diffabs.simulate.drive import kernel as native
 from diffabs.simulate.drive.engine import ENGINE_VARIABLE, log_kernel, log_xla_reason
 from diffabs.stops import SpeedReached
-from diffabs.sweep import SweepError, sweep
+from diffabs.sweep import Local, SweepError, sweep
 from diffabs.sweep.selection import REMOTE_REASON, choose_study_engine
 
 pytestmark = pytest.mark.xdist_group("kernel")  # one worker compiles what these share
@@ -278,7 +278,8 @@ class TestSweep:
         assert study.engine == "auto"
         xla = dataclasses.replace(study, engine="xla")
         for folder, first in (("one", study), ("other", xla)):
-            assert not sweep(first, tmp_path / folder, stopping=lambda: True).complete
+            part = sweep(first, tmp_path / folder, on=Local(jax.local_devices()), stopping=lambda: True)
+            assert not part.complete
         monkeypatch.setenv(ENGINE_VARIABLE, "xla")
         assert sweep(study, tmp_path / "one", resume=True).complete
         monkeypatch.delenv(ENGINE_VARIABLE)

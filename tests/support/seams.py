@@ -59,6 +59,7 @@ SEAMS = {
     "min_runs_per_core": "diffabs.simulate.drive.sharding.MIN_RUNS_PER_CORE",
     "min_entrywise_matrices": "diffabs.simulate.stability.MIN_ENTRYWISE_MATRICES",
     "timeout_seconds": "diffabs.sweep.cluster.TIMEOUT_SECONDS",
+    "chunk_cores": "diffabs.sweep.engines.core_count",
     "runner": "diffabs.sweep.engines.Runner",
     "random_words": "diffabs.sweep.sampling._random_words",
     "max_tail_atoms": "diffabs.sweep.statistics.estimates.MAX_TAIL_ATOMS",
