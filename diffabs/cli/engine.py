@@ -14,6 +14,8 @@ Engine = Annotated[
     str, typer.Option(help="Engine of the runs: kernel (by a C++ compiler), xla, or auto: a kernel where possible.")
 ]
 
+COMPILING_KERNEL = "compiling a kernel"
+
 
 def check_engine_name(engine: str) -> None:
     """Check the name of an engine.
@@ -45,7 +47,7 @@ def choose_engine(engine: str, objection: Callable[[], str | None]) -> str:
     engine = resolve_request(engine)
     if engine != "auto":
         return engine
-    line = console.run_with_progress(lambda: describe_placement(()) or objection(), "compiling a kernel")
+    line = console.run_with_progress(lambda: describe_placement(()) or objection(), COMPILING_KERNEL)
     if line:
         console.say(f"note: runs are made by XLA: {line}")
     return "xla" if line else "kernel"

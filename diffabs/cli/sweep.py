@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 PLACES = ("local", "dask")
 SUMMARY, FIGURES = "summary.json", "figures"
-COMPILING = "compiling a kernel"
 
 
 def sweep(
@@ -213,11 +212,13 @@ def _with_engine(study: "Study", engine: str, out: pathlib.Path, resume: bool, r
         lambda: choose_study_engine(
             dataclasses.replace(study, engine=engine).check(), out, resume=resume, remote=remote
         ),
-        COMPILING,
+        engines.COMPILING_KERNEL,
     )
     if why:
         console.say(f"note: runs are made by XLA: {why}")
-    if study.engine == "kernel" and (line := console.run_with_progress(lambda: find_study_objection(study), COMPILING)):
+    if study.engine == "kernel" and (
+        line := console.run_with_progress(lambda: find_study_objection(study), engines.COMPILING_KERNEL)
+    ):
         console.fail(line)
     return study
 

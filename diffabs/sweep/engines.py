@@ -63,7 +63,11 @@ class Local:
         self.devices = list(devices) if devices else None
 
     def places(self, study: Study) -> list[PyTree]:
-        """Return the devices of the chunks that run at a time, one for each; a processor appears once for each core."""
+        """Return the devices of the chunks that run at a time, one for each; a processor appears once for each core.
+
+        Args:
+            study: Study of the sweep, with engine "xla" or "kernel".
+        """
         if self.devices is not None:
             return self.devices
         devices = jax.local_devices()

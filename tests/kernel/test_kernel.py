@@ -184,8 +184,8 @@ class TestObjections:
 
     @killed_by(
         "simulate/batch.py",
-        "why_not = TOGETHER_REASON if trajectories or together or",
-        "why_not = TOGETHER_REASON if False and",
+        "why_not = TOGETHER_REASON if trajectories or together else",
+        "why_not = TOGETHER_REASON if False else",
     )
     @pytest.mark.parametrize("more", [{"together": True}, {"trajectories": True}])
     def test_of_lanes_that_run_together(self, more):
