@@ -257,7 +257,7 @@ def _dispatch_batch(
     why_not = TOGETHER_REASON if trajectories or together else ""
     traced = live or is_traced(given, enough)  # such as by keys, under vmap
     why_xla = TRACED_REASON if traced else TOGETHER_REASON if as_one else describe_placement(given)
-    return run_with_engine(engine, by_kernel, by_xla, why_not, why_xla)
+    return run_with_engine(engine, by_kernel, by_xla, (given, enough), why_not, why_xla)
 
 
 def _run_vmapped(

@@ -156,6 +156,7 @@ class TestObjections:
 
     @killed_by("kernel/compilers.py", "if said is not None and not said.strip():", "if False:")
     @killed_by("simulate/drive/engine.py", "    log_xla_reason(why_not)\n", "")
+    @killed_by("simulate/drive/engine.py", "    _refused[structure] = why_not\n", "")
     def test_without_a_compiler(self, users_engine, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
         log_xla_reason.cache_clear()
@@ -169,6 +170,9 @@ class TestObjections:
             runs = [d.run_batch(loop, d.Batch(VALUES), SOLVER, {}, accepted=True, engine="auto") for _ in range(2)]
         assert [record.getMessage() for record in caplog.records] == [f"runs are made by XLA, not by a kernel: {line}"]
         assert runs[0].stopped.tolist() == runs[1].stopped.tolist()
+        replace_seam(monkeypatch, "find_compiler", None)  # not looked for again
+        loop = d.replace(loop, {"plant.mass": 6.0})
+        d.run_batch(loop, d.Batch(VALUES), SOLVER, {}, accepted=True)
 
     @killed_by("kernel/compilers.py", "            _check_loads(command)\n", "", case="false")
     @pytest.mark.parametrize("command", ["false", "/no/such/compiler"])

@@ -58,7 +58,12 @@ LOCKED = braking(
 )
 SPACE = {"initial.speed": sweep.Normal(10.0, 0.5, low=6.0, high=14.0)}
 STUDY = sweep.Study(
-    LOCKED, sweep.Space(SPACE), samples=1, solver=d.FixedStep(5e-3, 3.0), objectives={"stop_time": StopTime()}
+    LOCKED,
+    sweep.Space(SPACE),
+    samples=1,
+    solver=d.FixedStep(5e-3, 3.0),
+    objectives={"stop_time": StopTime()},
+    engine="xla",
 )
 DELAYED = d.replace(LOOP, {"actuator": actuators.Delay(capacity=1024)})
 
@@ -260,7 +265,7 @@ class TestTune:
 @killed_by("tune/worst.py", "accepted=True, engine=engine)", "accepted=True)")
 @killed_by("tune/worst.py", "    problem = problem.with_engine(engine)\n", "")
 @pytest.mark.slow
-def test_the_worst_case_is_that_of_xla(monkeypatch):
+def test_the_worst_case_is_that_of_xla(users_engine, monkeypatch):
     """Screened without derivatives and ascended with them, both by a kernel."""
     native._run.clear_cache()
     launches, launched = [], launch._launch_lanes
@@ -268,8 +273,10 @@ def test_the_worst_case_is_that_of_xla(monkeypatch):
     over = {"plant.mass": (14.0, 16.0), "initial.speed": (25.0, 28.0)}
     given = {"over": over, "metric": "iae", "solver": TUNED["solver"], "measured": TUNED["measured"]}
     found, expected = (
-        tune.worst_case(LOOP, **given, screen=16, starts=3, iterations=3, engine=e) for e in ("kernel", "xla")
+        tune.worst_case(LOOP, **given, screen=16, starts=3, iterations=3, engine=e) for e in ("auto", "xla")
     )
+    assert found.engine == {"name": "kernel", **compilers.describe_compiler()}
+    assert expected.engine == {"name": "xla"}
     assert found.value == pytest.approx(expected.value, rel=1e-9)
     assert found.values.keys() == expected.values.keys()
     assert {bool(made.tangents) for made in launches} == {False, True}
@@ -302,14 +309,17 @@ class TestSweep:
 
 
 class TestRare:
+    @killed_by("reliability/failure.py", 'if engine == "auto":', "if False:", case="True")
     @killed_by("reliability/failure.py", 'forward if study.engine == "kernel" else slopes', "slopes", case="True")
     @pytest.mark.slow
     @pytest.mark.parametrize("gradients", [pytest.param(False, marks=pytest.mark.slow), True])
-    def test_is_that_of_xla(self, gradients):
-        """P[stop_time >= 0.878] = 1.1e-3 in closed form."""
-        study = dataclasses.replace(STUDY, engine="kernel")
+    def test_is_that_of_xla(self, users_engine, gradients):
+        """P[stop_time >= 0.878] = 1.1e-3 in closed form. The default engine is a kernel."""
+        study = dataclasses.replace(STUDY, engine="auto")
         given = {"gradients": gradients, "samples": 200}
         found, expected = (reliability.failure_probability(s, "stop_time", 0.878, **given) for s in (study, STUDY))
+        assert found.engine == {"name": "kernel", **compilers.describe_compiler()}
+        assert expected.engine == {"name": "xla"}
         assert found.probability == pytest.approx(expected.probability, rel=1e-6)
         assert found.evaluations == expected.evaluations
         assert found.gradients == expected.gradients

@@ -8,16 +8,19 @@ runs.
 import functools
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
+import jax
 from jax._src.xla_bridge import backends_are_initialized  # JAX has no public function that does not start the backends
 
+from diffabs.core.types import PyTree
 from diffabs.simulate.types import Run
 
 REQUESTABLE_ENGINES = ("auto", "xla", "kernel")
 ENGINE_VARIABLE = "DIFFABS_ENGINE"  # environment variable: the engine that "auto" stands for, "xla" or "kernel"
 log = logging.getLogger("diffabs")
+_refused: dict[Hashable, str] = {}  # reason against a kernel, by `describe_structure`
 _forked_process = 0  # id of the first process that forked while XLA's threads ran; 0 without one
 
 
@@ -71,15 +74,41 @@ def resolve_request(engine: str) -> str:
     return meant
 
 
+def describe_structure(given: PyTree) -> Hashable:
+    """Return what decides whether a kernel is possible: structure and shapes of the data, and the compiler asked for.
+
+    Args:
+        given: Data of the runs, a pytree.
+    """
+    from diffabs.kernel.compilers import COMPILER
+
+    def describe(x: Any) -> Hashable:
+        if hasattr(x, "dtype"):
+            return x.shape, x.dtype
+        return type(x) if isinstance(x, bool | int | float) else repr(x)  # a solver is a leaf
+
+    leaves, structure = jax.tree.flatten(given)
+    return structure, tuple(map(describe, leaves)), os.environ.get(COMPILER)
+
+
 def run_with_engine(
-    engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "", why_xla: str = ""
+    engine: str,
+    native: Callable[[], Run],
+    otherwise: Callable[[], Run],
+    given: PyTree,
+    why_not: str = "",
+    why_xla: str = "",
 ) -> Run:
     """Return the run of an engine; "auto" uses the kernel if possible, and otherwise XLA.
+
+    If a kernel is impossible, "auto" does not try again for data of the same structure: the trial takes longer than
+    many a batch.
 
     Args:
         engine: "kernel", "xla" or "auto", as `resolve_request` returns it.
         native: Function that runs the kernel.
         otherwise: Function that runs XLA.
+        given: Data of the runs, a pytree.
         why_not: Reason against a kernel that is already known, or "".
         why_xla: Reason for which "auto" does not try a kernel, or "".
 
@@ -91,6 +120,8 @@ def run_with_engine(
     if engine == "auto" and (why_not or why_xla):
         log_own_choice(why_not or why_xla)
         return otherwise()
+    structure = describe_structure(given) if engine == "auto" else None
+    why_not = why_not or _refused.get(structure, "")
     if not why_not:
         # A local import: `import diffabs` must not need the kernel package.
         from diffabs.kernel.compilers import NoCompiler
@@ -105,6 +136,7 @@ def run_with_engine(
             return run
     if engine == "kernel":
         raise EngineError.of(why_not)
+    _refused[structure] = why_not
     log_xla_reason(why_not)
     return otherwise()
 
