@@ -72,7 +72,7 @@ class WorstCase:
     bound: float | None
     diverged: dict[str, PyTree] | None
     reasons: list[Reason]
-    engine: dict[str, str]
+    engine: dict[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def met(self) -> bool | None:
