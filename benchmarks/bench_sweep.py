@@ -10,6 +10,7 @@ ratios within a round. All cases must end with the same table: digests are compa
 """
 
 import argparse
+import dataclasses
 import json
 import pathlib
 import resource
@@ -39,13 +40,14 @@ def child(options):
     count = int(options.case.split()[0])
     if "device" in options.case:
         jax.config.update("jax_num_cpu_devices", count)
-        engine = Local()
+        engine = Local(jax.devices())  # one chunk for each device
     else:
         from diffabs.sweep.cluster import Dask
 
         engine = Dask(workers=count)
     sizes = (f"sweep.samples={options.samples}", f"sweep.chunk={options.chunk}", f'sweep.dtype="{options.dtype}"')
     study = section_sweep.build_study(load("slip-lmi", (*CHANGES, *sizes)))
+    study = dataclasses.replace(study, engine="xla")
     seen, begun = [], time.perf_counter()
     found = sweep(
         study,

@@ -67,7 +67,7 @@ def reference(name: str, problem: problems.Problem, options: Any) -> tuple[dict[
 
 def solved(problem: problems.Problem, batch: diffabs.Batch, solver: Any) -> dict[str, np.ndarray]:
     """Return the metrics of every lane."""
-    run = diffabs.run_batch(problem.loop, batch, solver, problem.metrics)
+    run = diffabs.run_batch(problem.loop, batch, solver, problem.metrics, engine="xla")
     return {name: np.asarray(value, float) for name, value in run.metrics.items()}
 
 

@@ -20,6 +20,7 @@ if importlib.metadata.version("jaxlib").startswith("0.10."):  # later ones end t
 
 if os.environ.get("DIFFABS_TEST_XLA") != "default" and "XLA_FLAGS" not in os.environ:  # a worker inherits it
     os.environ["XLA_FLAGS"] = " ".join(QUICK)
+os.environ.setdefault("DIFFABS_ENGINE", "xla")  # and in the processes that are started; `users_engine` has the default
 os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("DIFFABS_JAX_CACHE", CACHE)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # programs without the lines of Python that each operation is from
@@ -93,6 +94,12 @@ def without_load():
     with pytest.MonkeyPatch.context() as patch:
         replace_seam(patch, "patience", np.inf)
         yield
+
+
+@pytest.fixture
+def users_engine(monkeypatch: pytest.MonkeyPatch):
+    """The default engine is that of users. Elsewhere it is XLA: kernels are compiled only where tests ask for them."""
+    monkeypatch.delenv("DIFFABS_ENGINE")
 
 
 @pytest.fixture

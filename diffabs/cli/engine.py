@@ -6,12 +6,15 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console
-from diffabs.core.values import unknown_name_error
-from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES
+from diffabs.core.values import ScenarioError, unknown_name_error
+from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES, resolve_request
+from diffabs.simulate.drive.sharding import describe_placement
 
 Engine = Annotated[
-    str, typer.Option(help="Engine of the runs: xla, kernel (compiled by this machine's C++ compiler) or auto.")
+    str, typer.Option(help="Engine of the runs: kernel (by a C++ compiler), xla, or auto: a kernel where possible.")
 ]
+
+COMPILING_KERNEL = "compiling a kernel"
 
 
 def check_engine_name(engine: str) -> None:
@@ -21,24 +24,30 @@ def check_engine_name(engine: str) -> None:
         engine: Value of the option.
 
     Raises:
-        ScenarioError: The name is unknown.
+        ScenarioError: The name is unknown, or that in `DIFFABS_ENGINE`.
     """
-    if engine not in REQUESTABLE_ENGINES:
-        raise unknown_name_error(f"--engine {engine} is unknown", engine, REQUESTABLE_ENGINES)
+    try:
+        resolve_request(engine)
+    except ValueError as error:
+        if engine in REQUESTABLE_ENGINES:  # the environment variable has another name
+            raise ScenarioError(str(error)) from None
+        raise unknown_name_error(f"--engine {engine} is unknown", engine, REQUESTABLE_ENGINES) from None
 
 
 def choose_engine(engine: str, objection: Callable[[], str | None]) -> str:
     """Return "xla" or "kernel", the engine that makes the runs.
 
-    "auto" becomes "kernel" unless there is an objection. A line on stderr then gives the reason for XLA.
+    "auto" becomes "kernel" unless there is an objection. A line on stderr then gives the reason for XLA. The
+    environment variable `DIFFABS_ENGINE` replaces "auto".
 
     Args:
         engine: Value of the option: "auto", or an engine, which is returned as it is.
         objection: Function that compiles a kernel, and returns None or the reason why it cannot be used.
     """
+    engine = resolve_request(engine)
     if engine != "auto":
         return engine
-    line = console.run_with_progress(objection, "compiling a kernel")
+    line = console.run_with_progress(lambda: describe_placement(()) or objection(), COMPILING_KERNEL)
     if line:
         console.say(f"note: runs are made by XLA: {line}")
     return "xla" if line else "kernel"

@@ -19,7 +19,6 @@ from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.toml import parse_value
-from diffabs.simulate.drive.engine import describe_engine
 
 if TYPE_CHECKING:
     from diffabs.reliability.subset_simulation import RareEvent, SubsetProgress
@@ -39,7 +38,7 @@ def rare(
     gradients: Annotated[
         bool, typer.Option("--gradients", help="Also sample around points of failure that gradients find.")
     ] = False,
-    engine: engines.Engine = "xla",
+    engine: engines.Engine = "auto",
     as_json: console.Json = False,
 ) -> None:
     """Compute the probability that a metric reaches a bound.
@@ -133,6 +132,6 @@ def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str,
         "gradients": found.gradients,
         "diverged": found.diverged,
         "seed": study.seed,
-        "engine": describe_engine(study.engine),
+        "engine": dict(found.engine),
         "versions": provenance.versions("numpy", "scipy"),
     }

@@ -47,7 +47,7 @@ def sweep(
     samples: Annotated[int | None, typer.Option(help="Number of samples; the same as --set sweep.samples=N.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the samples; the same as --set sweep.seed=N.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the sweep in the folder.")] = False,
-    engine: engines.Engine = "xla",
+    engine: engines.Engine = "auto",
     on: Annotated[str, typer.Option(help="Place of the runs: local or dask.")] = "local",
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Address of a Dask scheduler, tcp://host:port.")
@@ -73,7 +73,7 @@ def sweep(
             scenario, console.add_option_overrides(changes, "sweep", samples=samples, seed=seed)
         )
         out = out or pathlib.Path("out") / f"sweep-{chosen.name}"
-        study = _with_engine(section_sweep.build_study(chosen), engine)
+        study = _with_engine(section_sweep.build_study(chosen), engine, out, resume, remote=scheduler is not None)
         kept = _numbers(keep, study.samples)
         for number in kept:
             _check_runnable(study, number)
@@ -203,19 +203,24 @@ def _numbers(keep: str | None, samples: int) -> list[int]:
     return numbers
 
 
-def _with_engine(study: "Study", engine: str) -> "Study":
-    """Return the study with its engine: "kernel" if it is chosen, or if it is "auto" and possible."""
-    if engine == "xla":
-        return study
+def _with_engine(study: "Study", engine: str, out: pathlib.Path, resume: bool, remote: bool) -> "Study":
+    """Return the study with its engine, "xla" or "kernel". A line on stderr says why "auto" became XLA."""
     from diffabs.sweep.runner import find_study_objection
+    from diffabs.sweep.selection import choose_study_engine
 
-    by_kernel = dataclasses.replace(study.check(), engine="kernel")
-    line = console.run_with_progress(lambda: find_study_objection(by_kernel), "compiling a kernel")
-    if line and engine == "kernel":
+    study, why = console.run_with_progress(
+        lambda: choose_study_engine(
+            dataclasses.replace(study, engine=engine).check(), out, resume=resume, remote=remote
+        ),
+        engines.COMPILING_KERNEL,
+    )
+    if why:
+        console.say(f"note: runs are made by XLA: {why}")
+    if study.engine == "kernel" and (
+        line := console.run_with_progress(lambda: find_study_objection(study), engines.COMPILING_KERNEL)
+    ):
         console.fail(line)
-    if line:
-        console.say(f"note: runs are made by XLA: {line}")
-    return study if line else by_kernel
+    return study
 
 
 def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:

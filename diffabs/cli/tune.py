@@ -35,7 +35,7 @@ def tune(
     scenario: console.ScenarioName,
     changes: console.Changes = None,
     starts: Annotated[int | None, typer.Option(help="Number of descents; the same as --set tune.starts=N.")] = None,
-    engine: engines.Engine = "xla",
+    engine: engines.Engine = "auto",
     as_json: console.Json = False,
     out: Annotated[
         pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write the tuned scenario to this file.")
@@ -170,7 +170,12 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     }
     loop = work.chosen.loop
     most = None if work.constraints else goal.iterations  # with constraints the number of rounds is unknown
-    engine = engines.choose_engine(engine, lambda: tune.build_problem(loop, **posed, engine="kernel").objection())
+
+    def objection() -> str | None:
+        problem = tune.build_problem(loop, **posed, engine="kernel")
+        return problem.choose_xla() or problem.objection()
+
+    engine = engines.choose_engine(engine, objection)
 
     def run_tuning() -> "Tuned":
         told_to = {"method": method, "progress": told.append, "stopping": ending}

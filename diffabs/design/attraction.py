@@ -133,7 +133,7 @@ def classify_starts(
     *,
     band: float | None = None,
     key: PyTree = None,
-    engine: str = "xla",
+    engine: str = "auto",
 ) -> Outcomes:
     """Return the outcome of each run within the solver's duration, shape (runs,).
 
@@ -193,7 +193,7 @@ def region_of_attraction(
     paths: tuple[str, str] = ("initial.theta", "initial.phi"),
     band: float | None = None,
     key: PyTree = None,
-    engine: str = "xla",
+    engine: str = "auto",
 ) -> Basin:
     """Return the region of attraction over the cells of two axes, the first axis in rows.
 
@@ -226,7 +226,7 @@ def largest_recovered_multiples(
     multiples: np.ndarray,
     solver: Solver,
     *,
-    engine: str = "xla",
+    engine: str = "auto",
 ) -> list[Reach]:
     """Return for each row the largest of `multiples` up to which the loop recovers from all of them.
 
@@ -266,7 +266,7 @@ def recoverable_multiple(
     most: float = 1.0,
     band: float | None = None,
     key: PyTree = None,
-    engine: str = "xla",
+    engine: str = "auto",
 ) -> Reach:
     """Return the largest c in [0, most] such that the loop recovers from every tried multiple of `direction` up to c.
 

@@ -164,9 +164,9 @@ def library_path(name: str) -> pathlib.Path:
 
 
 def thread_count() -> int:
-    """Return the number of threads for a launch: this process's processors divided among JAX's CPU devices."""
-    # JAX may run a program on each of its CPU devices at the same time.
-    return max(1, core_count() // max(1, jax.local_device_count("cpu")))
+    """Return the number of threads for a launch: all cores, whatever the number of JAX's CPU devices."""
+    # Launches on several devices at once share the cores: a thread takes its next lane when it has time.
+    return core_count()
 
 
 def _lane_type(x: Scalar) -> Scalar:

@@ -13,6 +13,7 @@ The derivative dm/dv passes through the run, in reverse mode or, with a kernel, 
 costs no run and comes from central differences.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -25,6 +26,8 @@ from diffabs.reliability.importance_sampling import DESIGN_POINT_STARTS, Gradien
 from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.drive.engine import describe_engine, log_kernel, log_xla_reason, resolve_request
+from diffabs.simulate.drive.sharding import describe_placement
 from diffabs.sweep.study import Study, noise_key, precision
 
 DIFFERENCE_STEP = 1e-4  # step in z: relative errors of 1e-9 (truncation) and 1e-12 (rounding)
@@ -35,6 +38,7 @@ def failure_probability(
 ) -> RareEvent:
     """Return an estimate of P[metric >= bound] over the space of a study, with runs on the study's engine.
 
+    The engine "auto" becomes a kernel where one can make the runs; the log says once why XLA makes them, if it does.
     The study's design and its number of samples have no influence; its seed determines the sensor noise only. Runs that
     diverge do not count as failures; the result reports their number.
 
@@ -66,11 +70,24 @@ def failure_probability(
     if study.parts:
         raise ValueError(f"{', '.join(study.parts)}: alternatives of parts have no normal coordinates")
 
+    study = _choose_engine(study, metric)
+
     def score(z: np.ndarray) -> np.ndarray:
         return _run_scores(study, metric, z)
 
     gradient = _make_gradient(study, metric) if gradients else None
-    return subset_simulation(score, study.space.dimension, bound, gradient=gradient, **options)
+    found = subset_simulation(score, study.space.dimension, bound, gradient=gradient, **options)
+    return dataclasses.replace(found, engine=describe_engine(study.engine))
+
+
+def _choose_engine(study: Study, metric: str) -> Study:
+    """Return the study with engine "xla" or "kernel" for the runs of this metric."""
+    engine = resolve_request(study.engine)
+    if engine == "auto":
+        line = describe_placement(()) or find_metric_objection(study, metric)
+        log_xla_reason(line) if line else log_kernel()
+        engine = "xla" if line else "kernel"
+    return dataclasses.replace(study, engine=engine)
 
 
 def find_metric_objection(study: Study, metric: str) -> str | None:

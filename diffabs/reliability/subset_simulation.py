@@ -27,7 +27,7 @@ consistent estimates adds a small bias.
 import dataclasses
 import enum
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -113,6 +113,7 @@ class RareEvent:
         diverged: Number of runs and gradients with a NaN score. They count as not failing; a score of +inf counts as
             failing.
         price: Cost of a gradient in runs.
+        engine: Engine of the runs, with compiler and flags if it is a kernel; empty if the score is another function.
     """
 
     probability: float
@@ -128,6 +129,7 @@ class RareEvent:
     gradients: int
     diverged: int
     price: float
+    engine: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def cost(self) -> float:

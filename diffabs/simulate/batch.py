@@ -16,14 +16,15 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import as_arrays, get, parameters, replace
 from diffabs.core.types import Array, Bool, Key, Params, Part, PyTree
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
-from diffabs.simulate.drive.engine import check_process, run_with_engine
+from diffabs.simulate.drive.engine import check_process, resolve_request, run_with_engine
 from diffabs.simulate.drive.packed import EarlyEnd, run_packed
-from diffabs.simulate.drive.sharding import run_on_all_cores, run_on_auto_mesh
+from diffabs.simulate.drive.sharding import describe_placement, run_on_all_cores, run_on_auto_mesh
 from diffabs.simulate.run import refuse, run_unchecked
 from diffabs.simulate.types import Run, Solver
 
 # Part of a message: why a batch cannot run in a kernel.
 TOGETHER_REASON = "lanes run together, for trajectories or for derivatives in either mode"
+TRACED_REASON = "the call is traced (jit, grad, vmap)"
 MAX_LENGTH_RATIO = 2.0  # runs in one group differ by less than this factor in duration
 
 
@@ -143,7 +144,7 @@ def run_batch(
     together: bool | None = None,
     accepted: Bool | None = None,
     enough: EarlyEnd | None = None,
-    engine: str = "xla",
+    engine: str = "auto",
 ) -> Run:
     """Simulate every run of a batch and return a `Run` with a leading axis (runs,), in the order of the batch.
 
@@ -167,8 +168,10 @@ def run_batch(
             for runs that step together.
         engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine, which needs a
             C++ compiler. It returns the same numbers to rounding and has forward derivatives (`jax.jvp`, `jax.jacfwd`),
-            but no reverse mode and no trajectories. "auto" uses the kernel for values where possible, and XLA
-            otherwise.
+            but no reverse mode and no trajectories. "auto" uses a kernel for values on a processor where possible. It
+            uses XLA if the call is traced or the runs step together. It also does so on a GPU or on several devices,
+            and if a kernel is impossible; only then the log has a warning. The environment variable `DIFFABS_ENGINE`
+            replaces "auto" by "xla" or "kernel".
 
     Examples:
         >>> import diffabs as d
@@ -185,6 +188,7 @@ def run_batch(
         KeyError: A path does not exist.
         RuntimeError: A kernel is requested in a process that was forked after JAX had started.
     """
+    engine = resolve_request(engine)
     if engine != "xla":
         check_process()
 
@@ -245,13 +249,15 @@ def _dispatch_batch(
                 values, keys, accepted = columns
                 return run_packed(loop, values, keys, solver, objectives, accepted, enough, numbers)
 
-            if live:
+            if traced:
                 return run(everything, jnp.arange(count))
             return run_on_all_cores(run, everything, count)
         return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories), accepted)
 
-    why_not = TOGETHER_REASON if trajectories or together or (as_one and engine == "auto") else ""
-    return run_with_engine(engine, by_kernel, by_xla, why_not)
+    why_not = TOGETHER_REASON if trajectories or together else ""
+    traced = live or is_traced(given, enough)  # such as by keys, under vmap
+    why_xla = TRACED_REASON if traced else TOGETHER_REASON if as_one else describe_placement(given)
+    return run_with_engine(engine, by_kernel, by_xla, (given, enough), why_not, why_xla)
 
 
 def _run_vmapped(

@@ -55,6 +55,11 @@ class Dask:
         """Set the cluster: `scheduler`, or else `workers` processes here, by default one for each processor."""
         self.scheduler, self.workers = scheduler, workers or os.cpu_count() or 1
 
+    @property
+    def remote(self) -> bool:
+        """Whether other machines may compute the chunks."""
+        return self.scheduler is not None
+
     def run(
         self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
     ) -> Generator[ComputedChunk, None, None]:

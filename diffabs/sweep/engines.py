@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
+from diffabs.core.process import core_count
 from diffabs.core.types import Bool, PyTree
 from diffabs.sweep.manifest import DECISIVE_PACKAGES as DECISIVE_PACKAGES
 from diffabs.sweep.manifest import Seals, describe_owner
@@ -53,12 +54,25 @@ class Engine(Protocol):
 class Local:
     """An engine that runs one chunk at a time on each device of this process.
 
-    With P processes (`jax.distributed`), each process takes every P-th chunk.
+    XLA computes a chunk on one core, so a processor then gets as many chunks at a time as it has cores. A kernel uses
+    all cores for one chunk. With P processes (`jax.distributed`), each process takes every P-th chunk.
     """
 
     def __init__(self, devices: Sequence[PyTree] | None = None):
         """Set the `devices`; by default all local ones."""
-        self.devices = list(devices or jax.local_devices())
+        self.devices = list(devices) if devices else None
+
+    def places(self, study: Study) -> list[PyTree]:
+        """Return the devices of the chunks that run at a time, one for each; a processor appears once for each core.
+
+        Args:
+            study: Study of the sweep, with engine "xla" or "kernel".
+        """
+        if self.devices is not None:
+            return self.devices
+        devices = jax.local_devices()
+        alone = study.engine == "kernel" or any(device.platform != "cpu" for device in devices)
+        return devices * (1 if alone else max(1, core_count() // len(devices)))
 
     def run(
         self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
@@ -67,8 +81,9 @@ class Local:
 
         The next chunks run while one is encoded.
         """
-        runner, seals = Runner(study, self.devices), Seals(describe_owner(study))
-        rest = group_items(chunks[jax.process_index() :: jax.process_count()], len(self.devices))
+        places = self.places(study)
+        runner, seals = Runner(study, places), Seals(describe_owner(study))
+        rest = group_items(chunks[jax.process_index() :: jax.process_count()], len(places))
         with ThreadPoolExecutor(1) as beside:
             together = next(rest, None)
             coming = beside.submit(runner.run, together) if together else None

@@ -12,10 +12,12 @@ from jax.experimental import multihost_utils
 
 from diffabs.core import provenance, stopwatch
 from diffabs.core.types import PyTree, Scalar, Table
+from diffabs.simulate.drive.engine import log_xla_reason
 from diffabs.sweep.engines import Engine, Local
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.results import Results
 from diffabs.sweep.runner import find_study_objection
+from diffabs.sweep.selection import choose_study_engine
 from diffabs.sweep.store import Store, SweepError
 from diffabs.sweep.study import Study
 
@@ -68,7 +70,7 @@ def sweep(
     whole table. A process that fails raises its error after the others have finished their shares.
 
     Args:
-        study: Study to run.
+        study: Study to run. For its engine "auto", the log says once why XLA makes the runs, if it does.
         out: Folder for the results; it is created.
         resume: Continue with a folder that already contains chunks of this study.
         on: Engine that computes the chunks; None is every device of this process.
@@ -81,7 +83,9 @@ def sweep(
         SweepError: The folder contains something else, is in use, or cannot be written; or another process died.
         OSError: The disk is full. Finished chunks stay, and `resume` continues.
     """
-    study.check()
+    study, why_xla = choose_study_engine(study.check(), out, resume=resume, remote=getattr(on, "remote", False))
+    if why_xla:
+        log_xla_reason(why_xla)
     if study.engine != "xla" and (line := find_study_objection(study)):
         raise ValueError(line)
     store = Store(pathlib.Path(out))

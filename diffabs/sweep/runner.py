@@ -53,7 +53,7 @@ class Runner:
     """A runner of a study's chunks on devices of this process; it compiles once for each structure of the loop."""
 
     def __init__(self, study: Study, devices: Sequence[PyTree] | None = None):
-        """Set the `study` and the `devices`; by default all local ones."""
+        """Set the `study` and the `devices`, one for each block that runs at a time; by default all local ones once."""
         self.study = study
         self.devices = list(devices or jax.local_devices())
         self.size = study.chunk if not study.parts else -(-study.chunk // BLOCKS_PER_CHUNK)

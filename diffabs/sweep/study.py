@@ -24,12 +24,12 @@ from diffabs.core.values import as_plain, unknown_name_error
 from diffabs.kernel import launch
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import find_solver_faults
+from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES
 from diffabs.simulate.types import Solver, describe_solver
 from diffabs.sweep.discrete import Categorical
 from diffabs.sweep.variables import Space
 
 DTYPES = ("float32", "float64")
-STUDY_ENGINES = ("xla", "kernel")
 RANGES = {"samples": (1, 2**32 - 1), "chunk": (1, 2**20), "seed": (0, 2**32 - 1)}  # keys are folded with 32 bits
 # Noise keys fold this into the seed, where the random design folds the number of a sample: the streams never meet.
 NOISE_STREAM = 2**32 - 1
@@ -49,8 +49,9 @@ class Study:
         seed: Seed of parameters and noise.
         chunk: Number of runs that are computed and stored together. Results are equal to the bit for equal `chunk`.
         dtype: "float32" or "float64".
-        engine: "xla" or "kernel" (`simulate.batch.run_batch`). Their results differ in the last bits. Those of a kernel
-            also depend on the compiler and the processor, which are part of the sweep's identity.
+        engine: "xla", "kernel" or "auto" (`simulate.batch.run_batch`). `sweep` replaces "auto" by one of the others,
+            and a resumed sweep by the one that its manifest records. Results of the two differ in the last bits. Those
+            of a kernel also depend on the compiler and the processor, which are part of the sweep's identity.
         parts: For a path drawn by a `Categorical` of names, the part that each name stands for.
         failures: Bounds of metrics; a larger value is a failure. A bound replaces the objective's own (`failure`),
             which otherwise applies. Divergence, and an end that the stop does not call a success, are always failures.
@@ -64,7 +65,7 @@ class Study:
     seed: int = 0
     chunk: int = 4096
     dtype: str = "float64"
-    engine: str = "xla"
+    engine: str = "auto"
     parts: Mapping[str, Table] = dataclasses.field(default_factory=dict)
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
@@ -134,14 +135,14 @@ class Study:
         return replace(self.loop, {path: self.parts[path][str(values[path])] for path in self.parts})
 
     def table(self) -> JsonObject:
-        """Return everything that decides the results, as JSON values.
+        """Return everything that decides the results, as JSON values; without "engine" for XLA.
 
         Raises:
             NoCompiler: The engine is a kernel, and there is no compiler.
         """
         own: JsonObject = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
         own |= {"failures": self.failure_bounds, "success": self.success}
-        if self.engine != "xla":
+        if self.engine == "kernel":
             own |= {"engine": {"name": self.engine, **launch.describe_kernel_build()}}
         return json.loads(
             json.dumps(
@@ -165,8 +166,8 @@ class Study:
                 yield f"{name} = {value} is outside [{least}, {most}]"
         if self.dtype not in DTYPES:
             yield f"dtype = {self.dtype} is neither {' nor '.join(DTYPES)}"
-        if self.engine not in STUDY_ENGINES:
-            yield f"engine = {self.engine} is neither {' nor '.join(STUDY_ENGINES)}"
+        if self.engine not in REQUESTABLE_ENGINES:
+            yield f"engine = {self.engine} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}"
         for name in ("step", "duration"):
             if not 0 < getattr(self.solver, name) < np.inf:
                 yield f"solver.{name} = {getattr(self.solver, name)} is not positive and finite"

@@ -28,13 +28,15 @@ from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar, Vector
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES, EngineError, log_xla_reason
+from diffabs.simulate.drive.engine import EngineError, log_kernel, log_own_choice, log_xla_reason, resolve_request
+from diffabs.simulate.drive.sharding import describe_placement
 from diffabs.simulate.types import Run, Solver
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.risk import Aggregate
 
 MAX_QUICK_COMPILE_RUNS = 64  # above this number of runs, a fully optimised compilation pays for itself
 NO_REVERSE_MESSAGE = "a kernel has no reverse mode; forward mode, or engine = 'xla'"
+MAX_KERNEL_PARAMETERS = 64  # parameters up to which a kernel's forward mode is cheaper than XLA (docs/performance.md)
 MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is cheaper (benchmarks/bench_gradient.py)
 
 
@@ -117,25 +119,41 @@ class Problem:
     def with_engine(self, engine: str, mode: DerivativeMode | None = None) -> "Problem":
         """Return the problem with its runs on `engine`: "xla", "kernel" or "auto".
 
-        "auto" chooses a kernel if one can make the runs; otherwise it logs the reason once and keeps XLA. A kernel
-        computes forward derivatives only, so "auto" keeps XLA if `mode` is reverse.
+        "auto" chooses a kernel if one can make the runs and forward derivatives are cheap enough. Otherwise it logs the
+        reason once and keeps XLA.
 
         Raises:
             ValueError: The engine is unknown.
             EngineError: The engine is "kernel" and the mode is reverse.
         """
-        if engine not in REQUESTABLE_ENGINES:
-            raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
+        engine = resolve_request(engine)
         if engine == "xla":
             return self
-        line = NO_REVERSE_MESSAGE if mode is DerivativeMode.REVERSE else None
         found = dataclasses.replace(self, engine="kernel", mode=DerivativeMode.FORWARD)
-        if engine == "kernel" and line:
-            raise EngineError.of(line)
-        if engine == "auto" and (line := line or found.objection()):
+        if engine == "kernel":
+            if mode is DerivativeMode.REVERSE:
+                raise EngineError.of(NO_REVERSE_MESSAGE)
+            return found
+        if line := self.choose_xla(mode):
+            log_own_choice(line)
+            return self
+        if line := found.objection():
             log_xla_reason(line)
             return self
+        log_kernel()
         return found
+
+    def choose_xla(self, mode: DerivativeMode | None = None) -> str:
+        """Return why "auto" keeps XLA even where a kernel is possible, or "".
+
+        `mode` is the requested mode of differentiation, None for any. A kernel has no reverse mode, and its forward
+        mode is dearer than XLA's reverse mode for more than `MAX_KERNEL_PARAMETERS` parameters.
+        """
+        if mode is DerivativeMode.REVERSE:
+            return NO_REVERSE_MESSAGE
+        if self.space.size > MAX_KERNEL_PARAMETERS:
+            return f"{self.space.size} free parameters are more than {MAX_KERNEL_PARAMETERS}"
+        return describe_placement((self.subject, dict(self.batch.values), self.batch.keys))
 
     def objection(self) -> str | None:
         """Return why the engine of the problem cannot make the runs and their derivatives, or None.

@@ -36,7 +36,7 @@ def tune(
     method: Method | None = None,
     progress: Callable[[TuningProgress], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
-    engine: str = "xla",
+    engine: str = "auto",
 ) -> Tuned:
     """Minimise an aggregate, over a batch of runs, of a weighted sum of metrics, and return the best part found.
 
@@ -56,8 +56,9 @@ def tune(
         method: Optimiser, starts, iterations; None is L-BFGS from the subject's own values.
         progress: Called after every evaluation, with the best of the last points of all starts.
         stopping: Called after every evaluation; True ends the search with the best point so far.
-        engine: Engine of the runs and their derivatives, as in `run_batch`. A kernel computes forward derivatives for
-            any number of parameters.
+        engine: Engine of the runs and their derivatives, "xla", "kernel" or "auto". A kernel computes forward
+            derivatives for any number of parameters. "auto" takes a kernel where one is possible and the parameters
+            are few (`Problem.choose_xla`). `Tuned.engine` names the engine.
 
     Raises:
         ValueError: A path, range, metric or batch does not fit, or a run is inadmissible for every choice of
@@ -108,7 +109,7 @@ def build_problem(
     aggregate: Aggregate | None = None,
     constraints: Sequence[Constraint] = (),
     mode: DerivativeMode | None = None,
-    engine: str = "xla",
+    engine: str = "auto",
 ) -> Problem:
     """Return the problem that `tune` solves, for use with another search.
 

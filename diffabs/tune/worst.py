@@ -27,6 +27,7 @@ from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.drive.engine import describe_engine
 from diffabs.simulate.types import Solver
 from diffabs.tune.descent import Descent, DescentState, Stopping, lbfgs
 from diffabs.tune.problem import DerivativeMode, Multipliers, Problem, choose_gradient_mode
@@ -56,6 +57,7 @@ class WorstCase:
         bound: Bound on the metric, or None.
         diverged: Parameters of the first screened point at which the run diverges or the metric is NaN, or None.
         reasons: Reason for the end of each ascent.
+        engine: Engine of the ascents, with compiler and flags if it is a kernel.
     """
 
     metric: str
@@ -70,6 +72,7 @@ class WorstCase:
     bound: float | None
     diverged: dict[str, PyTree] | None
     reasons: list[Reason]
+    engine: dict[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def met(self) -> bool | None:
@@ -123,7 +126,7 @@ def worst_case(
     seed: int = 0,
     seed_of_noise: int | None = None,
     price: float | None = None,
-    engine: str = "xla",
+    engine: str = "auto",
 ) -> WorstCase:
     """Search a box for the greatest value of a metric: run a screening of points, then gradient ascent from the worst.
 
@@ -141,7 +144,7 @@ def worst_case(
         seed_of_noise: Seed of noisy sensors, the same in every run; or None.
         price: Cost of a gradient in rollouts. None is 6 in reverse mode and 1 + 1.5 p in forward mode, for p numbers in
             the box.
-        engine: Engine of the runs and their derivatives, as in `run_batch`.
+        engine: Engine of the runs and their derivatives, as in `tune`.
 
     Raises:
         ValueError: A path or range does not fit, the metric is unknown, a screened point cannot be run, or a requested
@@ -193,6 +196,7 @@ def worst_case(
         bound=bound,
         diverged=_values_by_path(free, points[bad[0]]) if len(bad) else None,
         reasons=[lane.reason or Reason.LIMIT for lane in lanes],
+        engine=describe_engine(problem.engine),
     )
 
 

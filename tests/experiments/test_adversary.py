@@ -8,6 +8,7 @@ from project import ROOT
 from scipy.optimize import linprog
 
 pytest.importorskip("cma")
+pytestmark = pytest.mark.usefixtures("users_engine")
 FOLDER = ROOT / "experiments"
 NAMES = ("set", "ascent", "attack", "loops", "search", "check", "minmax")
 

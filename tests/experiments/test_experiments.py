@@ -238,6 +238,7 @@ def test_tuned_weights_recover_more_starts_and_are_proved(tmp_path):
     assert rows["Q = diag(1, 100, 1, 1, 1, 1)"]["common P over the riders"] == "none"
 
 
+@pytest.mark.usefixtures("users_engine")
 def test_an_observer_recovers_nearly_what_the_whole_state_does(tmp_path):
     module = experiment("arm_lqg")
     config = module.Config(noises=((3e-3, 3e-3),), seeds=4, multiples=(0.06, 0.09, 16), duration=6.0, out=str(tmp_path))

@@ -27,9 +27,10 @@ from diffabs.objectives import BRAKING
 from diffabs.scenario import section_sweep
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.drive import kernel as native
-from diffabs.simulate.drive.engine import log_xla_reason
+from diffabs.simulate.drive.engine import ENGINE_VARIABLE, log_kernel, log_xla_reason
 from diffabs.stops import SpeedReached
-from diffabs.sweep import SweepError, sweep
+from diffabs.sweep import Local, SweepError, sweep
+from diffabs.sweep.selection import REMOTE_REASON, choose_study_engine
 
 pytestmark = pytest.mark.xdist_group("kernel")  # one worker compiles what these share
 
@@ -88,6 +89,17 @@ class TestRuns:
         assert len(np.unique(expected.metrics["iae"])) == LANES - 1  # NaN once
         same(found, expected, rtol=1e-13, atol=1e-15)
 
+    @killed_by("simulate/batch.py", 'engine: str = "auto",', 'engine: str = "xla",')
+    @killed_by("simulate/drive/engine.py", "            log_kernel()\n", "")
+    def test_are_made_by_default(self, runs, users_engine, caplog):
+        log_kernel.cache_clear()
+        with caplog.at_level(logging.INFO, "diffabs"):
+            found = [d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, accepted=True) for _ in range(2)]
+        line = f"runs are made by a kernel ({compilers.find_compiler().version})"
+        assert [record.getMessage() for record in caplog.records] == [line]
+        for name, value in runs[0].metrics.items():
+            np.testing.assert_array_equal(found[0].metrics[name], value)
+
     def test_do_not_depend_on_their_order_nor_on_threads(self, runs, monkeypatch):
         replace_seam(monkeypatch, "thread_count", lambda: 3)
         native._run.clear_cache()
@@ -144,7 +156,8 @@ class TestObjections:
 
     @killed_by("kernel/compilers.py", "if said is not None and not said.strip():", "if False:")
     @killed_by("simulate/drive/engine.py", "    log_xla_reason(why_not)\n", "")
-    def test_without_a_compiler(self, monkeypatch, caplog):
+    @killed_by("simulate/drive/engine.py", "    _refused[structure] = why_not\n", "")
+    def test_without_a_compiler(self, users_engine, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
         log_xla_reason.cache_clear()
         native._run.clear_cache()
@@ -157,6 +170,9 @@ class TestObjections:
             runs = [d.run_batch(loop, d.Batch(VALUES), SOLVER, {}, accepted=True, engine="auto") for _ in range(2)]
         assert [record.getMessage() for record in caplog.records] == [f"runs are made by XLA, not by a kernel: {line}"]
         assert runs[0].stopped.tolist() == runs[1].stopped.tolist()
+        replace_seam(monkeypatch, "find_compiler", None)  # not looked for again
+        loop = d.replace(loop, {"plant.mass": 6.0})
+        d.run_batch(loop, d.Batch(VALUES), SOLVER, {}, accepted=True)
 
     @killed_by("kernel/compilers.py", "            _check_loads(command)\n", "", case="false")
     @pytest.mark.parametrize("command", ["false", "/no/such/compiler"])
@@ -172,8 +188,8 @@ class TestObjections:
 
     @killed_by(
         "simulate/batch.py",
-        "why_not = TOGETHER_REASON if trajectories or together or",
-        "why_not = TOGETHER_REASON if False and",
+        "why_not = TOGETHER_REASON if trajectories or together else",
+        "why_not = TOGETHER_REASON if False else",
     )
     @pytest.mark.parametrize("more", [{"together": True}, {"trajectories": True}])
     def test_of_lanes_that_run_together(self, more):
@@ -237,7 +253,7 @@ class TestObjections:
 class TestSweep:
     SETTINGS = ("sweep.samples=40", "sweep.chunk=16", "solver.step=2e-3", "solver.duration=0.4", "stop.speed_kmh=40.0")
 
-    @killed_by("sweep/study.py", 'if self.engine != "xla":', "if False:")
+    @killed_by("sweep/study.py", 'if self.engine == "kernel":', "if False:")
     @pytest.mark.slow
     def test_is_that_of_xla_and_says_what_made_it(self, tmp_path):
         """Another engine does not go on with it."""
@@ -253,7 +269,37 @@ class TestSweep:
         assert written == {"name": "kernel", **compilers.describe_compiler()}
         assert "engine" not in json.loads((tmp_path / "xla" / "manifest.json").read_text())["study"]
         with pytest.raises(SweepError, match="engine"):
-            sweep(study, tmp_path / "kernel", resume=True)
+            sweep(dataclasses.replace(study, engine="xla"), tmp_path / "kernel", resume=True)
+
+    @killed_by(
+        "sweep/run.py", "choose_study_engine(study.check(), out, resume=resume,", "choose_study_engine(study, out,"
+    )
+    @killed_by("sweep/selection.py", "if resume and (", "if False and (")
+    @pytest.mark.slow
+    def test_resumed_keeps_its_engine(self, users_engine, tmp_path, monkeypatch):
+        """The manifest decides, also where the default engine would now be another one."""
+        study = section_sweep.build_study(scenario.load("slip-lmi", self.SETTINGS))
+        assert study.engine == "auto"
+        xla = dataclasses.replace(study, engine="xla")
+        for folder, first in (("one", study), ("other", xla)):
+            part = sweep(first, tmp_path / folder, on=Local(jax.local_devices()), stopping=lambda: True)
+            assert not part.complete
+        monkeypatch.setenv(ENGINE_VARIABLE, "xla")
+        assert sweep(study, tmp_path / "one", resume=True).complete
+        monkeypatch.delenv(ENGINE_VARIABLE)
+        assert sweep(study, tmp_path / "other", resume=True).complete
+        engines = [
+            json.loads((tmp_path / name / "manifest.json").read_text())["study"].get("engine")
+            for name in ("one", "other")
+        ]
+        assert engines == [{"name": "kernel", **compilers.describe_compiler()}, None]
+
+    @killed_by("sweep/selection.py", "if remote else describe_placement(())", "if False else describe_placement(())")
+    def test_of_other_machines_is_made_by_xla(self, users_engine, tmp_path):
+        """Their compilers and processors are not known."""
+        study = section_sweep.build_study(scenario.load("slip-lmi", self.SETTINGS))
+        chosen, why = choose_study_engine(study, tmp_path, remote=True)
+        assert (chosen.engine, why) == ("xla", REMOTE_REASON)
 
     @killed_by("sweep/run.py", 'if study.engine != "xla" and', "if False and")
     def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
@@ -264,11 +310,12 @@ class TestSweep:
             sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
-    @killed_by("cli/sweep.py", 'if engine == "xla":', "if True:", case="kernel-")
-    @killed_by("cli/sweep.py", 'if line and engine == "kernel":', "if line:", case="auto-note: runs are made by XLA:")
+    @killed_by("cli/sweep.py", "study, engine=engine).check()", "study).check()", case="kernel-")
+    @killed_by("cli/sweep.py", '    if study.engine == "kernel" and (', "    if False and (", case="kernel-")
+    @killed_by("cli/sweep.py", "    if why:\n", "    if False:\n", case="auto-note: runs are made by XLA:")
     @pytest.mark.slow
     @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA:"), ("kernel", "")])
-    def test_by_the_command(self, engine, line, tmp_path, monkeypatch):
+    def test_by_the_command(self, engine, line, users_engine, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, "")
         native._run.clear_cache()
         changes = [part for setting in self.SETTINGS for part in ("--set", setting)]

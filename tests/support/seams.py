@@ -59,11 +59,13 @@ SEAMS = {
     "min_runs_per_core": "diffabs.simulate.drive.sharding.MIN_RUNS_PER_CORE",
     "min_entrywise_matrices": "diffabs.simulate.stability.MIN_ENTRYWISE_MATRICES",
     "timeout_seconds": "diffabs.sweep.cluster.TIMEOUT_SECONDS",
+    "chunk_cores": "diffabs.sweep.engines.core_count",
     "runner": "diffabs.sweep.engines.Runner",
     "random_words": "diffabs.sweep.sampling._random_words",
     "max_tail_atoms": "diffabs.sweep.statistics.estimates.MAX_TAIL_ATOMS",
     "max_row_groups": "diffabs.sweep.statistics.sensitivity.MAX_ROW_GROUPS",
     "read_manifest": "diffabs.sweep.store.read_manifest",
+    "max_kernel_parameters": "diffabs.tune.problem.MAX_KERNEL_PARAMETERS",
     "tune_tune": "diffabs.tune.tune",
 }
 

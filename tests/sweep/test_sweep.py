@@ -191,7 +191,7 @@ def test_objectives_of_another_precision_do_not_lower_it(study, swept, tmp_path)
 
 
 def test_stopped_and_continued_is_the_same_to_the_bit(study, swept, tmp_path):
-    part = sweep(study, tmp_path / "out", stopping=lambda: True)
+    part = sweep(study, tmp_path / "out", on=Local(jax.local_devices()), stopping=lambda: True)
     assert (len(part.files), part.complete) == (1, False)
     told = []
     whole = sweep(study, tmp_path / "out", resume=True, progress=told.append)
@@ -220,6 +220,17 @@ def test_two_devices_change_no_bit(over_roads, file, tmp_path):
         env=os.environ | {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir},
     )
     assert json.loads(done.stdout)["digest"] == over_roads.digest
+
+
+@killed_by("sweep/engines.py", 'study.engine == "kernel" or', "True or")
+@killed_by("sweep/engines.py", 'alone = study.engine == "kernel" or', "alone =")
+def test_xla_computes_a_chunk_on_each_core(study, swept, tmp_path, monkeypatch):
+    """A kernel uses all cores for one chunk. No bit depends on the number of cores."""
+    replace_seam(monkeypatch, "chunk_cores", lambda: 3)
+    devices = jax.local_devices()
+    assert Local().places(dataclasses.replace(study, engine="kernel")) == devices
+    assert Local().places(study) == 3 * devices
+    assert sweep(study, tmp_path / "out").digest == swept.digest
 
 
 def test_every_device_is_used(study, monkeypatch):

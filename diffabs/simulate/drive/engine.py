@@ -1,17 +1,26 @@
-"""Selection of the engine of a batch: XLA, or a program of this machine (`kernel`), imported only on request."""
+"""Selection of the engine of a batch: XLA, or a program of this machine (`kernel`).
+
+The default engine is "auto": a kernel where one can make the runs, and XLA otherwise. A kernel has its first result
+earlier than XLA, also if its C++ compiler has to run (`docs/performance.md`). So "auto" does not ask for the number of
+runs.
+"""
 
 import functools
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
+import jax
 from jax._src.xla_bridge import backends_are_initialized  # JAX has no public function that does not start the backends
 
+from diffabs.core.types import PyTree
 from diffabs.simulate.types import Run
 
 REQUESTABLE_ENGINES = ("auto", "xla", "kernel")
+ENGINE_VARIABLE = "DIFFABS_ENGINE"  # environment variable: the engine that "auto" stands for, "xla" or "kernel"
 log = logging.getLogger("diffabs")
+_refused: dict[Hashable, str] = {}  # reason against a kernel, by `describe_structure`
 _forked_process = 0  # id of the first process that forked while XLA's threads ran; 0 without one
 
 
@@ -46,34 +55,88 @@ class EngineError(ValueError):
         return cls(f"engine = 'kernel' is not possible: {line}")
 
 
-def run_with_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "") -> Run:
-    """Return the run of an engine; "auto" uses the kernel if possible, and otherwise XLA with one log message.
+def resolve_request(engine: str) -> str:
+    """Return the engine that a request means: the engine itself, or that of $DIFFABS_ENGINE for "auto" if it is set.
 
     Args:
-        engine: "kernel", "xla" or "auto".
-        native: Function that runs the kernel.
-        otherwise: Function that runs XLA.
-        why_not: Reason against a kernel that is already known, or "".
+        engine: "auto", "xla" or "kernel".
 
     Raises:
-        ValueError: The name of the engine is unknown.
-        EngineError: Engine "kernel" is requested but not possible.
+        ValueError: The name is unknown.
     """
     if engine not in REQUESTABLE_ENGINES:
         raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
+    if engine != "auto":
+        return engine
+    meant = os.environ.get(ENGINE_VARIABLE) or engine
+    if meant not in REQUESTABLE_ENGINES:
+        raise ValueError(f"{ENGINE_VARIABLE} = {meant!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
+    return meant
+
+
+def describe_structure(given: PyTree) -> Hashable:
+    """Return what decides whether a kernel is possible: structure and shapes of the data, and the compiler asked for.
+
+    Args:
+        given: Data of the runs, a pytree.
+    """
+    from diffabs.kernel.compilers import COMPILER
+
+    def describe(x: Any) -> Hashable:
+        if hasattr(x, "dtype"):
+            return x.shape, x.dtype
+        return type(x) if isinstance(x, bool | int | float) else repr(x)  # a solver is a leaf
+
+    leaves, structure = jax.tree.flatten(given)
+    return structure, tuple(map(describe, leaves)), os.environ.get(COMPILER)
+
+
+def run_with_engine(
+    engine: str,
+    native: Callable[[], Run],
+    otherwise: Callable[[], Run],
+    given: PyTree,
+    why_not: str = "",
+    why_xla: str = "",
+) -> Run:
+    """Return the run of an engine; "auto" uses the kernel if possible, and otherwise XLA.
+
+    If a kernel is impossible, "auto" does not try again for data of the same structure: the trial takes longer than
+    many a batch.
+
+    Args:
+        engine: "kernel", "xla" or "auto", as `resolve_request` returns it.
+        native: Function that runs the kernel.
+        otherwise: Function that runs XLA.
+        given: Data of the runs, a pytree.
+        why_not: Reason against a kernel that is already known, or "".
+        why_xla: Reason for which "auto" does not try a kernel, or "".
+
+    Raises:
+        EngineError: Engine "kernel" is requested but not possible.
+    """
     if engine == "xla":
         return otherwise()
+    if engine == "auto" and (why_not or why_xla):
+        log_own_choice(why_not or why_xla)
+        return otherwise()
+    structure = describe_structure(given) if engine == "auto" else None
+    why_not = why_not or _refused.get(structure, "")
     if not why_not:
         # A local import: `import diffabs` must not need the kernel package.
         from diffabs.kernel.compilers import NoCompiler
         from diffabs.kernel.primitives import Unsupported
 
         try:
-            return native()
+            run = native()
         except (Unsupported, NoCompiler) as error:
             why_not = str(error)
+        else:
+            log_kernel()
+            return run
     if engine == "kernel":
         raise EngineError.of(why_not)
+    _refused[structure] = why_not
     log_xla_reason(why_not)
     return otherwise()
 
@@ -94,9 +157,25 @@ def describe_engine(engine: str) -> dict[str, str]:
 
 @functools.cache
 def log_xla_reason(why_not: str) -> None:
-    """Log the reason for XLA under engine "auto", once for each reason.
+    """Warn that "auto" takes XLA because a kernel is impossible, once for each reason.
 
     Args:
         why_not: Reason against a kernel.
     """
     log.warning("runs are made by XLA, not by a kernel: %s", why_not)
+
+
+@functools.cache
+def log_own_choice(why: str) -> None:
+    """Log that "auto" takes XLA because the call is of a kind that XLA serves, once for each reason.
+
+    Args:
+        why: Reason for XLA.
+    """
+    log.info("runs are made by XLA: %s", why)
+
+
+@functools.cache
+def log_kernel() -> None:
+    """Log once that runs are made by a kernel, and the compiler that made it."""
+    log.info("runs are made by a kernel (%s)", describe_engine("kernel")["compiler"])

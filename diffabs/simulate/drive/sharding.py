@@ -27,6 +27,20 @@ TRACED_EXPLICIT_AXES = (
 )
 
 
+def describe_placement(given: PyTree) -> str:
+    """Return why the runs of these arrays are not made on one processor, or "" if they are.
+
+    Args:
+        given: Data of the runs, a pytree.
+    """
+    places = [x.sharding.device_set for x in jax.tree.leaves(given) if isinstance(x, jax.Array)]
+    if any(len(devices) > 1 for devices in places):
+        return "the runs lie on several devices"
+    if jax.default_backend() != "cpu" or any(device.platform != "cpu" for devices in places for device in devices):
+        return "the runs lie on an accelerator, for which a kernel is made on request only"
+    return ""
+
+
 def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, count: int) -> PyTree:
     """Return run(columns, numbers of the runs), computed on all cores of this processor.
 
@@ -38,8 +52,7 @@ def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, co
         count: Number of runs.
     """
     cores = min(core_count(), count // MIN_RUNS_PER_CORE)
-    placed = [x for x in jax.tree.leaves(columns) if isinstance(x, jax.Array) and len(x.sharding.device_set) > 1]
-    if cores < 2 or placed or jax.default_backend() != "cpu":
+    if cores < 2 or describe_placement(columns):
         return run(columns, jnp.arange(count))
     # Threads do not inherit these settings.
     wide, each = jnp.result_type(float) == jnp.float64, -(-count // cores)
