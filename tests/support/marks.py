@@ -1,4 +1,4 @@
-"""Cases of tests: which are left to `make test-slow`, and ids that a reader can type."""
+"""Cases of tests: which are slow, and ids that a reader can type."""
 
 import re
 
