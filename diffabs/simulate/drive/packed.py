@@ -22,7 +22,7 @@ from diffabs.simulate.run import forbid_derivatives, prepare_arguments
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.types import Run, Solver
 
-LANES_AT_ONCE = 1024  # runs that step at a time: their state stays in a processor's cache
+LANES_AT_ONCE = 512  # runs that step at a time: their state stays in a processor's cache
 STEPS_PER_EXCHANGE = 64  # steps between two exchanges of runs
 
 
