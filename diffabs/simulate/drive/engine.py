@@ -1,8 +1,8 @@
 """Selection of the engine of a batch: XLA, or a program of this machine (`kernel`).
 
 The default engine is "auto": a kernel where one can make the runs, and XLA otherwise. A kernel has its first result
-earlier than XLA, also if its C++ compiler has to run (`docs/performance.md`). So "auto" does not ask for the number of
-runs.
+about as early as XLA if its C++ compiler has to run, and earlier otherwise (`docs/performance.md`). So "auto" does not
+depend on the number of runs.
 """
 
 import functools
