@@ -44,6 +44,7 @@ def test_the_document_is_about_the_table(swept):
     assert json.loads((folder / "a" / "summary.json").read_text()) == document
 
 
+@pytest.mark.slow
 def test_a_comparison_is_sample_by_sample(swept):
     folder, _ = swept
     result = json.loads(run("compare", folder / "a", folder / "b", "--metric", "overshoot", "--json").stdout)

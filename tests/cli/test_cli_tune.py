@@ -159,6 +159,7 @@ def test_json_has_what_scripts_rely_on(tuned):
     assert said == "no proof\n"
 
 
+@pytest.mark.slow
 @killed_by("cli/tune.py", 'after = chosen.with_loop(found.loop, "tuned")', "after = chosen")
 def test_the_tuned_scenario_simulates_to_the_reported_numbers(tuned):
     folder, document, _ = tuned

@@ -328,6 +328,7 @@ def test_the_vertices_are_the_systems_on_the_grid():
         np.testing.assert_allclose(found.B[place], b, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_one_gain_for_all_riders_is_proved(robust):
     """On the grid that it was designed on, and on one that has as many points between."""
     assert robust.certificate.verified_exactly

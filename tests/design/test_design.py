@@ -451,6 +451,7 @@ def test_published_gain_is_proved_for_a_speed_that_cannot_jump():
         before = after
 
 
+@pytest.mark.slow
 @killed_by("design/sdp/program.py", "slope = rate / width / frame.tau", "slope = 0.0 * rate / width / frame.tau")
 def test_scheduled_gain():
     system = chain(6)

@@ -127,6 +127,7 @@ def test_the_readme_says_how_weak_the_cure_is(module, corner):
     assert cells("tuned: ")[1] == f"{corner['as designed for']:.2f} %"
 
 
+@pytest.mark.slow
 def test_more_is_asked_for_than_is_allowed(module, cure):
     """Windup: there is no anti-windup, and with the limits in the actuator nothing else changes."""
     box, solver = module.Box(masses=(6.2,), speeds=(50.0,)), FixedStep(step=STEP, duration=0.2)

@@ -258,6 +258,7 @@ def test_a_file_is_only_replaced_when_that_is_said(session, tmp_path):
     assert left_in(folder) == {"mine.toml"}
 
 
+@pytest.mark.slow
 @killed_by("explore/curves.py", "here * (1 + sign * part)", "here * (1 + sign * part / 2)")
 @killed_by(
     "explore/curves.py",

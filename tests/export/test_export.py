@@ -309,6 +309,7 @@ def test_a_compiler_without_nan_is_refused(tmp_path):
     assert "compile without -ffast-math" in result.stderr
 
 
+@pytest.mark.slow
 @killed_by(
     "export/c_words.py",
     'np.format_float_positional(x, trim="0")',

@@ -72,6 +72,7 @@ def distances(factor, kinds, folder):
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds",
     [

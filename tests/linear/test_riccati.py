@@ -330,6 +330,7 @@ def test_what_has_no_solution_is_reported(a, b, q):
     assert np.isnan(found.P).all()
 
 
+@pytest.mark.slow
 def test_a_weight_that_is_not_definite_is_reported():
     a, b = rig()
     assert not CARE(a, b, np.eye(2), -np.eye(1)).stabilising

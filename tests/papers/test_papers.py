@@ -323,6 +323,7 @@ def short():
     return rollout(braking(reference=FixedSlip()), FixedStep(step=1e-2, duration=0.1), BRAKING)
 
 
+@pytest.mark.slow
 def test_braking_draws_the_run(short, tmp_path):
     figure = plot.draw_braking(short, title="a run")
     slip, speed, torque, deceleration = figure.axes

@@ -284,6 +284,7 @@ def test_equations_4_and_6_lack_gravity():
         np.testing.assert_allclose(missing, -(9.81 - 1) * 70 * 0.7 * np.cos(q[0]), rtol=1e-11)
 
 
+@pytest.mark.slow
 @killed_by("papers/arm_equations.py", "eighth - m2 * lg * sin2", "eighth - m2 * l * lg * sin2")
 def test_the_printed_equations_miss_terms_of_their_lagrangian():
     """Eq. (8) lacks l in one term; (9) and (10) have the other sign in the centrifugal term and in gravity."""
@@ -317,6 +318,7 @@ def test_equation_7_is_the_lagrangian_of_another_machine():
         assert np.max(np.abs(arm_equations.euler_lagrange(arm_equations.lagrangian, ARM, q, v, a))) > 1
 
 
+@pytest.mark.slow
 def test_printed_gravity_comes_from_no_potential():
     """Its stiffness would have to be symmetric; the one of eq. (7) is."""
     stiffness = arm_equations.gravity_stiffness(ARM)

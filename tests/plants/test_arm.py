@@ -90,6 +90,7 @@ def test_the_fall_of_the_papers_start():
     np.testing.assert_allclose(state, run.y[:, -1], rtol=0, atol=2e-9)
 
 
+@pytest.mark.slow
 def test_published_gain_of_the_acrobot():
     """Spong's, with Q = I and R = 1, of frame and arm; the rider without mass is a state of its own."""
     a, b = model(ACROBOT)
@@ -217,6 +218,7 @@ def test_printed_gravity_is_no_machines():
     )
 
 
+@pytest.mark.slow
 def test_fig_3_is_that_of_the_printed_equations():
     """Every angle returns, after 4.37 rad of the arm and 479 V; 1 ms and less than 3 s find both peaks."""
     plant = PrintedArm()

@@ -37,6 +37,7 @@ def by_eigenvectors(a, b, start, limit):
     return abs(w @ b[:, 0]) * limit / (poles[place].real * abs(w @ start))
 
 
+@pytest.mark.slow
 @killed_by("linear/recoverable.py", "return 2 * limit / jnp.sqrt", "return limit / jnp.sqrt")
 def test_the_bound_is_that_of_the_unstable_mode():
     a, b = (np.asarray(x) for x in model(HANGING))
@@ -101,6 +102,7 @@ def observer():
     return lqg(HANGING, WEIGHTS, EFFORT, voltage_max=48.0)
 
 
+@pytest.mark.slow
 @killed_by("linear/gaussian.py", "dare(A.T, C.T, W, V)", "dare(A.T, C.T, 0.5 * W, V)")
 def test_kalman_is_scipys():
     random = np.random.default_rng(6)
@@ -126,6 +128,7 @@ def corrected(observer, last, x, k=1):
     return observer.tick(Clock(0.01 * k, 0.01, k, None), Memory(held=last), seen(x)).held
 
 
+@pytest.mark.slow
 @killed_by(
     "linear/gaussian.py", "jnp.linalg.solve(spread, C @ found.P).T", "jnp.linalg.solve(spread, C @ found.P @ A.T).T"
 )

@@ -152,6 +152,7 @@ def best_stop(mass, v0, road, torque, width=None, edge=np.inf):
     return x + v**2 / (2 * g * friction[0](1 - r * w / v))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mass", "mu"),
     [pytest.param(12.0, 0.3, marks=pytest.mark.slow), (15.0, 0.98), pytest.param(20.0, 1.1, marks=pytest.mark.slow)],

@@ -39,13 +39,13 @@ def misses(found, expected, tolerance, least=0.0):
     ]
 
 
-@pytest.mark.parametrize("name", cases(LOOPS, "fixed slip, PI, clamping", "relay"))
+@pytest.mark.parametrize("name", cases(LOOPS, "fixed slip, PI, clamping", "relay", "latch, P"))
 def test_derivative_through_events(name, ours):
     least = np.maximum(0.1 * np.abs(event_oracle.values(name)), FLOOR)
     assert misses(ours(name)[1], event_oracle.sensitivities(name), 1e-3, least) == []
 
 
-@pytest.mark.parametrize("name", cases(LOOPS, "fixed slip, PI, clamping", "relay"))
+@pytest.mark.parametrize("name", cases(LOOPS, "fixed slip, PI, clamping", "relay", "latch, P"))
 def test_value_across_events(name, ours):
     assert misses(ours(name)[0], event_oracle.values(name), 1e-8, FLOOR) == []
 

@@ -92,6 +92,7 @@ def test_a_run_says_what_it_is(run):
     assert repr(lost).startswith("Run that diverged")
 
 
+@pytest.mark.slow
 def test_many_runs_are_counted_and_a_traced_one_can_be_shown():
     said = []
 
@@ -221,6 +222,7 @@ def test_what_was_missed_or_refused_is_told_apart(swept, monkeypatch):
     assert np.flatnonzero(swept.failures()["not stopped"]).tolist() == [3]
 
 
+@pytest.mark.slow
 def test_a_sweep_of_before_has_no_units(swept):
     older = Results(swept.folder)
     older.manifest.pop("units")

@@ -81,6 +81,7 @@ def test_no_metric_without_a_flag_is_impossible(task, seed):
     assert done.diverged.shape == (LANES,)
 
 
+@pytest.mark.slow
 def test_a_brake_never_speeds_the_car_up_without_a_flag():
     """A lag from well resolved to far beyond the step, around a brake with limits: the car is no faster at the end than
     at the start, or the run has diverged."""

@@ -177,6 +177,7 @@ class TestBeforeARun:
         assert stable_step.is_step_stable(RIG, alike, 1e-4).all()
         assert not stable_step.is_step_stable(RIG, alike, 2e-2).any()
 
+    @pytest.mark.slow
     @killed_by(
         "simulate/stability.py",
         "bound = jnp.max(jnp.minimum(rows, columns))",

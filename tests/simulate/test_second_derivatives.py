@@ -162,6 +162,7 @@ def test_the_certified_decay_has_first_derivatives_only():
         jax.eval_shape(jax.hessian(rate), jnp.array([[-2.0, -2.0]]))
 
 
+@pytest.mark.slow
 @killed_by("roads/optimum.py", "s0 - ratio(slope(s0), curvature)", "s0")
 def test_a_road_peak_has_closed_form_second_derivatives():
     """mu = s exp(-(a s)^2): the peak is at 1/(sqrt(2) a), its height exp(-1/2)/(sqrt(2) a)."""

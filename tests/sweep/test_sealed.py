@@ -79,6 +79,7 @@ def test_every_flipped_bit_of_a_chunk_is_seen(copy, seed):
         path.write_bytes(data)
 
 
+@pytest.mark.slow
 def test_compare_sees_it_too(copy, whole):
     path = chunk_files(copy)[2]
     data = path.read_bytes()

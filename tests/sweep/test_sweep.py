@@ -295,6 +295,7 @@ def test_the_folder_of_chunks_is_a_data_set(made):
     assert polars.scan_parquet(chunks / "*.parquet").select("sample").collect().height == 150
 
 
+@pytest.mark.slow
 def test_trajectories_are_those_of_rollout(study, tmp_path):
     import xarray
 
@@ -335,6 +336,7 @@ def test_the_command_computes_the_table(by_command, swept):
         assert tables_digest([found.table().slice(0, 64)]) == tables_digest([swept.table().slice(0, 64)])
 
 
+@pytest.mark.slow
 def test_a_sample_that_is_simulated_again_is_its_row(by_command):
     folder, document, _ = by_command
     table = Results(folder).pandas()

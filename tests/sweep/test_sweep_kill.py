@@ -170,6 +170,7 @@ def test_killed_at_each_step_of_writing(tmp_path):
         assert not list(store.folder.rglob("*.tmp"))
 
 
+@pytest.mark.slow
 def test_what_a_kill_leaves_behind(copy, whole):
     """Beginnings of files, and a folder of trajectories that were being written."""
     (copy / "manifest.json.tmp").write_text("{")
