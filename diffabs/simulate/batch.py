@@ -210,7 +210,7 @@ def _dispatch_batch(
     count = batch.size
     columns = {path: jnp.asarray(x) if isinstance(x, list | tuple) else x for path, x in batch.values.items()}
     batch = dataclasses.replace(batch, values=columns)
-    refuse(replace(loop, {path: column[0] for path, column in batch.values.items()}), solver, objectives)
+    refuse(replace(loop, {path: _first_member(column) for path, column in batch.values.items()}), solver, objectives)
     # Traced values cannot be checked. A traced batch runs every member, and an impossible one diverges.
     live = is_traced(loop, dict(batch.values), dict(objectives))
     if accepted is None:
@@ -252,6 +252,12 @@ def _dispatch_batch(
 
     why_not = TOGETHER_REASON if trajectories or together or (as_one and engine == "auto") else ""
     return run_with_engine(engine, by_kernel, by_xla, why_not)
+
+
+def _first_member(column: PyTree) -> Any:
+    """Return column[0]; for a column on the processor by NumPy, since JAX's indexing costs as much as 20 runs."""
+    on_processor = isinstance(column, jax.Array) and not is_traced(column) and column.platform() == "cpu"
+    return (np.asarray(column) if on_processor and column.is_fully_addressable else column)[0]
 
 
 def _run_vmapped(
