@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import jax
+import jax.extend.core as jex
 from jax.core import Tracer
 
 from diffabs.core.types import PyTree
@@ -63,5 +64,20 @@ def is_traced(*trees: PyTree) -> bool:
     Args:
         trees: Pytrees of numbers or tracers.
     """
+    return _is_tracing() or any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
+
+
+def _is_tracing() -> bool:
+    state = jex.get_opaque_trace_state(convention="nnx")
+    if state in _states_without_trace:
+        return False
     # Under jit, device_put of a constant is staged and returns a tracer.
-    return isinstance(jax.device_put(0), Tracer) or any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
+    tracing = isinstance(jax.device_put(0), Tracer)
+    if not tracing and not _states_without_trace:
+        _states_without_trace.append(state)
+    return tracing
+
+
+# The first state in which no trace was under way. Its comparison costs a hundredth of `device_put`. It is not known at
+# import, which must not start JAX: a process may fork before.
+_states_without_trace: list[PyTree] = []

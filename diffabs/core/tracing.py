@@ -108,27 +108,31 @@ def leaf_dependence(function: Callable[[PyTree], PyTree], signal: PyTree) -> lis
     return [atom in needed for atom in program.invars]
 
 
-def moving_leaves(function: Callable[[PyTree, PyTree], PyTree], fixed: PyTree, batch: PyTree) -> PyTree:
-    """Return for each leaf of `batch` whether function(fixed, batch) of one member has a derivative by it.
+def read_leaves(
+    function: Callable[[PyTree, PyTree], PyTree], fixed: PyTree, batch: PyTree, *, differentiably: bool = False
+) -> PyTree:
+    """Return for each leaf of `batch` whether function(fixed, batch) of one member depends on it.
 
-    The result is a pytree of bools with the structure of `batch`. Leaves that only enter decisions have no derivative.
+    The result is a pytree of bools with the structure of `batch`.
 
     Args:
         function: Function of one member of `fixed` and of `batch`.
-        fixed: Pytree with leaves (n, ...), also batched; its derivatives do not count.
+        fixed: Pytree with leaves (n, ...), also batched.
         batch: Pytree with leaves (n, ...).
+        differentiably: Whether only leaves count by which the function has a derivative. Leaves that only enter
+            decisions have none.
     """
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (fixed, batch))
     program = jax.make_jaxpr(function)(*one).jaxpr
 
-    def moves(atom: PyTree) -> bool:
-        return not hasattr(atom, "val") and jnp.issubdtype(atom.aval.dtype, jnp.inexact)
+    def counts(atom: PyTree) -> bool:
+        # Integer and boolean values carry no derivative: a comparison ends the dependence.
+        return not hasattr(atom, "val") and (not differentiably or jnp.issubdtype(atom.aval.dtype, jnp.inexact))
 
-    # Integer and boolean values carry no derivative: a comparison ends the dependence.
-    needed = {atom for atom in program.outvars if moves(atom)}
+    needed = {atom for atom in program.outvars if counts(atom)}
     for step in reversed(program.eqns):
         if not needed.isdisjoint(step.outvars):
-            needed.update(atom for atom in step.invars if moves(atom))
+            needed.update(atom for atom in step.invars if counts(atom))
     leaves, tree = jax.tree.flatten(batch)
     return tree.unflatten([atom in needed for atom in program.invars[-len(leaves) :]])
 

@@ -19,7 +19,7 @@ from jax.interpreters import partial_eval as pe
 from diffabs.core.types import PyTree, Scalar
 from diffabs.kernel import tangents
 from diffabs.kernel.graph import UpdateLevel, is_real
-from diffabs.kernel.program import ScalarProgram, TracedFunctions
+from diffabs.kernel.program import ScalarProgram, TracedFunctions, keep_read
 from diffabs.kernel.tangents import INPUT_LEVELS, ArrayKey, DerivativeProgram
 
 MAX_TANGENTS_PER_LAUNCH = 8  # more tangents take several launches
@@ -35,6 +35,7 @@ class LanePrograms:
         functions: The traced functions of one lane.
         launch: Function (program, arrays before the carry, carry) -> carry that runs a program.
         wanted: Indices of the carry's arrays whose tangents matter at the end, None for all.
+        read: Indices of the carry's arrays whose values matter at the end, None for all.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class LanePrograms:
         functions: TracedFunctions,
         launch: Callable[[ScalarProgram, list[PyTree], list[PyTree]], list[PyTree]],
         wanted: tuple[int, ...] | None = None,
+        read: tuple[int, ...] | None = None,
     ):
         """Store the functions and lower them to the plain program, so that an error appears at once.
 
@@ -49,11 +51,12 @@ class LanePrograms:
             functions: The traced functions of one lane.
             launch: Function (program, arrays before the carry, carry) -> carry that runs a program.
             wanted: Indices of the carry's arrays whose tangents matter at the end, None for all.
+            read: Indices of the carry's arrays whose values matter at the end, None for all.
 
         Raises:
             Unsupported: As in `lower_functions`.
         """
-        self.functions, self.launch, self.wanted = functions, launch, wanted
+        self.functions, self.launch, self.wanted, self.read = functions, launch, wanted, read
         self._derivatives: dict[PyTree, PyTree] = {}
         self.derivative(None)
 
@@ -86,9 +89,13 @@ class LanePrograms:
             Unsupported: As in `lower_functions`.
         """
         one = self.derivative(begins)
-        if begins is None and not as_lanes:
-            return one.program
-        return tangents.replicate_tangents(self.functions, one, many, as_lanes)
+        whole = one.program
+        if begins is not None or as_lanes:
+            whole = tangents.replicate_tangents(self.functions, one, many, as_lanes)
+        if self.read is None:
+            return whole
+        order = tangents.arrange_arrays(self.functions, one.moved_arrays, as_lanes)[UpdateLevel.STEP]
+        return keep_read(whole, [i for i, key in enumerate(order) if key.tangent or key.number in self.read])
 
     @functools.cached_property
     def keys(self) -> list[ArrayKey]:

@@ -6,7 +6,7 @@ next lane.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +53,60 @@ def operands_by_name(node: Node) -> tuple[Node, ...]:
         node: Operation.
     """
     return node.args[:1] if node.op == "table" else node.args
+
+
+class RareNumbers(NamedTuple):
+    """Numbers of the carry that a function touches only within a conditional with a jump.
+
+    A vector without the jump leaves them in memory, instead of a load and a store of the same number.
+
+    Attributes:
+        stored: Numbers that only the conditional changes, by the id of the gate that returns the new number.
+        loaded: Numbers that only the conditional reads, by the id of its first gate.
+    """
+
+    stored: dict[int, Node]
+    loaded: dict[int, list[Node]]
+
+
+def find_rare_numbers(block: ScheduleBlock, nodes: Sequence[Node], changed: Sequence[tuple[Node, Node]]) -> RareNumbers:
+    """Return the numbers that only one of the outermost conditionals touches.
+
+    Args:
+        block: Operations of a function.
+        nodes: All nodes that the function needs.
+        changed: Numbers of the carry that the function changes, each with its result.
+    """
+    found = RareNumbers({}, {})
+    readers: dict[int, set[int]] = {node.id: set() for node in nodes}
+    for node in nodes:
+        for x in node.args:
+            readers[x.id].add(node.id)
+    results = [result.id for _, result in changed]
+    for branch in (item for item in block if isinstance(item, Branch) and branch_jumps(item)):
+        gates = {gate.id for gate in branch.gates}
+        stored = {
+            gate.id: number
+            for number, gate in changed
+            if gate.id in gates and gate.args[1] is number and not readers[gate.id] and results.count(gate.id) == 1
+        }
+        inside = {*stored, *(node.id for node in branch.yes.nodes())}
+        read = {x.id: x for node in nodes if node.id in inside for x in node.args if x.op == "input"}
+        found.loaded[branch.gates[0].id] = [
+            x for x in read.values() if x.level == UpdateLevel.STEP and readers[x.id] <= inside and x.id not in results
+        ]
+        found.stored.update(stored)
+    return found
+
+
+def branch_jumps(branch: Branch) -> bool:
+    """Return whether a conditional is long enough for a jump.
+
+    Args:
+        branch: Conditional.
+    """
+    # `size` includes the gates, which execute with or without a jump.
+    return branch.size >= MIN_BRANCH_OPERATIONS + len(branch.gates)
 
 
 class Text:
@@ -171,10 +225,11 @@ class Text:
         # Compute all results of all vectors before the first store: each may read the old carry.
         changed = [(c, r) for c, r in zip(carried, results, strict=True) if c is not r]
         yield f"BODY void {name}(Block& b, const Shared& s) {{ (void)b; (void)s;"
-        yield from self._body([r for _, r in changed])
+        yield from self._body([r for _, r in changed], changed)
         for q in range(self.shape.vectors):
             for c, r in changed:
-                yield f"  b.c{c.id}[{q}] = {self._name(r, q)};"
+                if r.id not in self.rare.stored:
+                    yield f"  b.c{c.id}[{q}] = {self._name(r, q)};"
         yield "}"
 
     def _running_function(self) -> Iterator[str]:
@@ -186,8 +241,10 @@ class Text:
             yield f"  on[{q}] = {self._name(root, q)};"
         yield "}"
 
-    def _body(self, roots: list[Node]) -> Iterator[str]:
-        nodes = live_nodes(roots)
+    def _body(self, roots: list[Node], changed: Sequence[tuple[Node, Node]] = ()) -> Iterator[str]:
+        nodes, block = live_nodes(roots), schedule_nodes(roots, UpdateLevel.STEP)
+        self.rare = find_rare_numbers(block, nodes, changed)
+        loaded_later = {node.id for numbers in self.rare.loaded.values() for node in numbers}
         own = {node.id for node in nodes}
         steps = [node for node in nodes if node.level == UpdateLevel.STEP]
         yield from self._uniform([*steps, *roots])
@@ -195,11 +252,15 @@ class Text:
         lanes = {x.id: x for x in read if x.level == UpdateLevel.LANE}
         for q in range(self.shape.vectors):
             for node in self.program.carry_inputs():
-                if node.id in own:
-                    yield f"  const {vector_type(node.dtype)} v{node.id}_{q} = b.c{node.id}[{q}];"
+                if node.id in own - loaded_later:
+                    yield self._load(node, q, "  ")
             for node in lanes.values():
                 yield f"  const {vector_type(node.dtype)} v{node.id}_{q} = b.l{node.id}[{q}];"
-        yield from self._lines(schedule_nodes(roots, UpdateLevel.STEP), range(self.shape.vectors), "  ")
+        yield from self._lines(block, range(self.shape.vectors), "  ")
+
+    def _load(self, node: Node, q: int, indent: str) -> str:
+        """Return the declaration of a number of the carry."""
+        return f"{indent}const {vector_type(node.dtype)} {self._name(node, q)} = b.c{node.id}[{q}];"
 
     def _uniform(self, readers: list[Node]) -> Iterator[str]:
         """Yield declarations of the shared values that these nodes read."""
@@ -244,17 +305,18 @@ class Text:
         A vector takes the jump if any of its lanes does. The gates then discard the results of its other lanes.
         """
         yield from self._lines(branch.no, vectors, indent)
-        # `size` includes the gates, which execute with or without a jump.
-        if branch.size < MIN_BRANCH_OPERATIONS + len(branch.gates):
+        if not branch_jumps(branch):
             yield from self._lines(branch.yes, vectors, indent)
             yield from self._gates(branch, vectors, indent + "const ")
             return
-        for gate in branch.gates:
+        for gate in (gate for gate in branch.gates if gate.id not in self.rare.stored):
             # Initialize the results with the branch not taken, so that a vector that skips the jump has valid values.
             names = ", ".join(f"{self._name(gate, q)} = {self._name(gate.args[1], q)}" for q in vectors)
             yield f"{indent}{vector_type(gate.dtype)} {names};"
         for q in vectors:
             yield f"{indent}if (any({self._name(branch.which, q)})) {{"
+            for node in self.rare.loaded.get(branch.gates[0].id, ()):
+                yield self._load(node, q, indent + "  ")
             yield from self._lines(branch.yes, range(q, q + 1), indent + "  ")
             yield from self._gates(branch, range(q, q + 1), indent + "  ", declared=True)
             yield indent + "}"
@@ -263,7 +325,10 @@ class Text:
         for gate in branch.gates:
             for q in vectors:
                 which, no, yes = (self._name(x, q) for x in gate.args)
-                left = self._name(gate, q) if declared else f"{vector_type(gate.dtype)} {self._name(gate, q)}"
+                if gate.id in self.rare.stored:
+                    left = f"b.c{self.rare.stored[gate.id].id}[{q}]"
+                else:
+                    left = self._name(gate, q) if declared else f"{vector_type(gate.dtype)} {self._name(gate, q)}"
                 yield f"{indent}{left} = sel({which}, {yes}, {no});"
 
     def _name(self, node: Node, q: int) -> str:

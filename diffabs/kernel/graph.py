@@ -234,6 +234,11 @@ def _mul(graph: Graph, x: Node, y: Node) -> Node | None:
             return b
         if a.is_number(-1):
             return graph.op("neg", b)
+        # Two factors that are constant over the steps become one: fewer operations, with another rounding.
+        if is_real(x.dtype) and a.level < UpdateLevel.STEP and b.op == "mul" and b.level == UpdateLevel.STEP:
+            for c, rest in (b.args, b.args[::-1]):
+                if c.level < UpdateLevel.STEP:
+                    return graph.op("mul", graph.op("mul", a, c), rest)
     return None
 
 

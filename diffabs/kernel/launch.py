@@ -30,6 +30,7 @@ def run_lanes(
     *,
     steps: int,
     rounds: int,
+    read: PyTree = None,
     wanted: PyTree = None,
 ) -> PyTree:
     """Return the carry of n lanes after all have ended (pytree, leading axis n), with the structure of `carry`.
@@ -50,6 +51,8 @@ def run_lanes(
         carry: Pytree of each lane's initial values, (n, ...) each. Its real numbers share one type, float32 or float64.
         steps: Calls of `step` after each call of `renew`.
         rounds: Rounds between two calls of `running`.
+        read: Pytree of booleans like `carry`: arrays whose values matter afterwards, None for all. An array that
+            influences none of these, nor `running`, may be returned with its initial values.
         wanted: Pytree of booleans like `carry`: arrays whose derivatives matter afterwards, None for all. The
             derivatives of an array that influences none of these may be returned as zero.
 
@@ -69,9 +72,12 @@ def run_lanes(
     leaves, tree = jax.tree.flatten(carry)
     given = [unwrap_key(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
     launch = functools.partial(_launch_lanes, shape=cpp.LaunchShape(VECTORS_PER_BLOCK, steps, rounds))
-    which = None if wanted is None else tuple(i for i, on in enumerate(jax.tree.leaves(wanted)) if on)
+
+    def numbers(which: PyTree) -> tuple[int, ...] | None:
+        return None if which is None else tuple(i for i, on in enumerate(jax.tree.leaves(which)) if on)
+
     # Drop the traced arrays: this object outlives the trace, and a tracer must not leak. They are arguments instead.
-    lanes = binding.LanePrograms(functions._replace(uniform=[]), launch, which)
+    lanes = binding.LanePrograms(functions._replace(uniform=[]), launch, numbers(wanted), numbers(read))
     found = binding.bind_lanes(lanes, given)
     return tree.unflatten(
         [jax.random.wrap_key_data(x) if is_key(leaf) else x for x, leaf in zip(found, leaves, strict=True)]

@@ -4,7 +4,7 @@ Values that the functions close over are inputs, the same for all lanes. So new 
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +16,7 @@ from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel, is_real
 from diffabs.kernel.primitives import Unsupported, constant_array, lower_jaxpr
 
 RULE_MODULES = (arrays, draws, elementwise, indexing, nested)  # imported because each registers its rules
+RUNNING_FUNCTION = "running"  # name of the function that says whether a lane goes on
 MAX_OPERATIONS = 60_000  # nodes of a program; a compiler takes minutes for more
 
 
@@ -178,6 +179,37 @@ def check_size(program: ScalarProgram, operations: int) -> ScalarProgram:
     return program
 
 
+def keep_read(program: ScalarProgram, arrays: Iterable[int]) -> ScalarProgram:
+    """Return the program without the results that never influence `running` or the given arrays of the carry.
+
+    These numbers stay as they are in the initial carry.
+
+    Args:
+        program: Program of functions that update the carry, and `running`.
+        arrays: Indices of the carry's arrays whose values matter at the end.
+    """
+    updates = [nodes for name, nodes in program.results.items() if name != RUNNING_FUNCTION]
+    carried, chosen = program.carry_inputs(), set(arrays)
+    number = {node.id: i for i, node in enumerate(carried)}
+    read = {number[node.id] for node in carried if node.attr.array in chosen}
+    left = [*program.results[RUNNING_FUNCTION], *(nodes[i] for nodes in updates for i in read)]
+    seen: set[int] = set()
+    while left:
+        node = left.pop()
+        if node.id not in seen:
+            seen.add(node.id)
+            left += node.args
+            # A number that some result reads is a result itself, since the next step reads it.
+            if (i := number.get(node.id)) is not None and i not in read:
+                read.add(i)
+                left += [nodes[i] for nodes in updates]
+    results = {
+        name: nodes if name == RUNNING_FUNCTION else [node if i in read else carried[i] for i, node in enumerate(nodes)]
+        for name, nodes in program.results.items()
+    }
+    return dataclasses.replace(program, results=results)
+
+
 def _real_type(inputs: dict[InputPlace, Node]) -> np.dtype:
     """Return the type of the carry's real numbers; raise Unsupported unless it is the only one, of 32 or 64 bits."""
     kinds = {
@@ -246,6 +278,15 @@ class ScheduleBlock:
     def size(self) -> int:
         """Number of operations in the block and its branches."""
         return sum(item.size if isinstance(item, Branch) else 1 for item in self.items.values())
+
+    def nodes(self) -> Iterator[Node]:
+        """Yield the operations of the block and of its branches, gates included, in any order."""
+        for item in self.items.values():
+            if isinstance(item, Branch):
+                yield from item.gates
+                yield from (*item.yes.nodes(), *item.no.nodes())
+            else:
+                yield item
 
     def __iter__(self) -> Iterator[Node | Branch]:
         """Yield operations and branches, operands first."""

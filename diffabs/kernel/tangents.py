@@ -14,6 +14,7 @@ import jax.extend.core as jex
 from diffabs.core.types import PyTree
 from diffabs.kernel.graph import Graph, Node, UpdateLevel, is_real
 from diffabs.kernel.program import (
+    RUNNING_FUNCTION,
     InputPlace,
     ScalarProgram,
     TracedFunction,
@@ -25,7 +26,6 @@ from diffabs.kernel.program import (
 from diffabs.kernel.replicate import dependents, replicate_nodes, tangent_copy
 
 INPUT_LEVELS = (UpdateLevel.UNIFORM, UpdateLevel.LANE, UpdateLevel.STEP)
-RUNNING_FUNCTION = "running"  # returns a truth, which has no tangents
 TangentArrays = dict[UpdateLevel, tuple[int, ...]]  # numbers of the arrays with tangents, by level
 
 

@@ -20,8 +20,10 @@ from seams import replace_seam
 
 import diffabs as d
 from diffabs import controllers, plants, scenario, sensors
+from diffabs.core.lanes import any_lane
 from diffabs.kernel import binaries, compilers, launch
 from diffabs.kernel.graph import Graph, UpdateLevel
+from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported, constant_array, lower_jaxpr
 from diffabs.objectives import BRAKING
 from diffabs.scenario import section_sweep
@@ -355,6 +357,74 @@ class TestGraph:
         assert (product.op, min(arg.level for arg in product.args)) == ("mul", UpdateLevel.UNIFORM)
         assert graph.op("div", x, tiny).op == "div"  # its inverse is infinite
         assert graph.op("div", x, x).op == "div"
+
+    @killed_by("kernel/graph.py", 'a.level < UpdateLevel.STEP and b.op == "mul"', 'False and b.op == "mul"')
+    def test_two_factors_of_before_the_step_are_one(self):
+        graph = Graph()
+        x, fixed = graph.input(float, UpdateLevel.STEP, 0), graph.input(float, UpdateLevel.UNIFORM, 1)
+        product = graph.op("mul", graph.const(0.5), graph.op("mul", x, fixed))
+        assert x in product.args
+        assert min(arg.level for arg in product.args) == UpdateLevel.UNIFORM
+        assert graph.op("mul", x, graph.op("mul", x, fixed)).args != product.args
+
+
+class TestCarry:
+    STEPS = 40
+
+    def runs(self, step, carry, levels, **more):
+        """What a kernel makes of the carry, and JAX itself."""
+
+        def native(levels, carry):
+            return run_lanes(
+                lambda _, c: c, step, lambda _, c: c[0] < self.STEPS, levels, carry, steps=8, rounds=1, **more
+            )
+
+        def known(level, carry):
+            return jax.lax.scan(lambda c, _: (step(level, c), None), carry, length=self.STEPS)[0]
+
+        return jax.device_get((jax.jit(native)(levels, carry), jax.jit(jax.vmap(known))(levels, carry)))
+
+    @killed_by("kernel/program.py", "left += [nodes[i] for nodes in updates]", "pass")
+    @killed_by("kernel/program.py", "i in read else carried[i]", "True else carried[i]")
+    def test_what_nothing_reads_stays_as_it_was(self):
+        """The last number of these leads to none that is read; those before it lead to the fourth, one by one."""
+
+        def step(level, carry):
+            i, x, y, z, unread = carry
+            return i + 1, x + level, y + jnp.sin(x), z + y, unread + z
+
+        ones = jnp.ones(5)
+        carry = (jnp.zeros(5, int), ones, ones, ones, 7.0 * ones)
+        found, expected = self.runs(step, carry, jnp.arange(5.0), read=(False, False, False, True, False))
+        np.testing.assert_allclose(found[3], expected[3], rtol=1e-13)
+        np.testing.assert_array_equal(found[4], carry[4])
+
+    @killed_by("kernel/cpp.py", "gate.args[1] is number and ", "")
+    @killed_by("kernel/cpp.py", "if r.id not in self.rare.stored:", "if True:")
+    def test_of_a_rare_branch_is_right_with_and_without_it(self):
+        """Numbers that only the branch changes: `seen` is read by every step, too, `kept` by the branch alone. The
+        last one becomes another number without the branch."""
+
+        def step(level, carry):
+            i, x, seen, kept, total, _ = carry
+            far = jnp.sin(x) > level
+
+            def look():
+                y = kept
+                for _ in range(12):
+                    y = y + 0.1 * jnp.tanh(y + x)
+                return tuple(jnp.where(far, a, b) for a, b in ((seen + y, seen), (y, kept), (total, seen)))
+
+            new, more, end = jax.lax.cond(any_lane(far), look, lambda: (seen, kept, seen))
+            return i + 1, x + 0.3, new, more, total + seen, end
+
+        zero, levels = jnp.zeros(70), jnp.linspace(0.5, 1.2, 70)
+        carry = (jnp.zeros(70, int), levels, zero, zero, zero, zero)
+        found, expected = self.runs(step, carry, levels)
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+        assert (found[2] != 0).any()
+        assert (found[2] == 0).any()
 
 
 class TestLibrary:

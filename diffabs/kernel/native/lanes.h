@@ -143,8 +143,8 @@ FN vreal up(vreal x) { return (vreal)REALLY(roundscale)((register_of_reals)x, 10
 FN vreal scaled(vreal x, vreal n) { return (vreal)REALLY(scalef)((register_of_reals)x, (register_of_reals)n); }
 FN vreal parted(vreal x, vreal& n) {
   const vreal m = (vreal)REALLY(getmant)((register_of_reals)x, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_src);
-  const vreal e = (vreal)REALLY(getexp)((register_of_reals)x);
-  n = sel(lt(size(m), all((REAL)1)), e + (REAL)1, e);
+  /* the exponent of m is 0, or -1 for m < 1 */
+  n = (vreal)REALLY(getexp)((register_of_reals)x) - (vreal)REALLY(getexp)((register_of_reals)m);
   return m; }
 #endif
 FN mask sel(mask a, mask yes, mask no) { return (a & yes) | (~a & no); }

@@ -18,7 +18,7 @@ from diffabs.core.log import log_rows
 from diffabs.core.loop import BLOCKS, Loop, LoopState
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, prepare_derivatives
-from diffabs.core.tracing import differentiated_paths, jvp_nonzero, moving_leaves
+from diffabs.core.tracing import differentiated_paths, jvp_nonzero, read_leaves
 from diffabs.core.types import Params, PyTree, Scalar
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.indexing import MAX_COMPARED_ENTRIES
@@ -141,7 +141,7 @@ def _run(
 
     begins = jax.vmap(start)(leaves, keys, accepted)
     _check_logs(loop, begins.point.state)
-    # `wanted` keeps tangents only for leaves of the carry that the results depend on.
+    # The kernel computes only leaves of the carry that the results depend on, and tangents that move the results.
     carry = run_lanes(
         lambda lane, carry: method.renew(built(lane[0])[0], carry),
         lambda lane, carry: method.step(*built(lane[0]), lane[1], carry),
@@ -150,7 +150,8 @@ def _run(
         begins,
         steps=STEPS_PER_BLOCK,
         rounds=1 if enough is None else STEPS_PER_EXCHANGE // STEPS_PER_BLOCK,
-        wanted=moving_leaves(finish, leaves, begins),
+        read=read_leaves(finish, leaves, begins),
+        wanted=read_leaves(finish, leaves, begins, differentiably=True),
     )
     return jax.vmap(finish)(leaves, carry)
 
