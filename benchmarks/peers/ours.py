@@ -7,7 +7,7 @@ from diffabs import controllers, objectives, plants, stops
 from diffabs.scenario.defaults import braking
 from peers import on_devices, problem
 
-PACKAGES, MANY = ("diffabs", "jax", "jaxlib"), None
+PACKAGES, MANY = ("diffabs-control", "jax", "jaxlib"), None
 MEASURED = {name: objectives.BRAKING[name] for name in problem.METRICS}
 LOOP = braking(
     plant=plants.MirroredRig(),
