@@ -322,7 +322,8 @@ def states_between(spans: StateSpan, taken: Bool, instants: Array) -> LoopState:
 def _time_to_event(one: StepLog, strikes: Bool, end: Evaluation) -> Scalar:
     """Return the time [s] from the logged end of a step to its event or to the zero of its comparison.
 
-    The time is 0 without an event or comparison, or if a clock determines the end.
+    The time is 0 without an event or comparison. It is also 0 for a comparison if a clock determines the end; an event
+    there keeps its time.
     """
     shift, most = jnp.zeros_like(one.length), MAX_SHIFT_FRACTION * one.base
     for surface in end.surfaces:
@@ -341,7 +342,7 @@ def _time_to_event(one: StepLog, strikes: Bool, end: Evaluation) -> Scalar:
 
 
 def _time_to_zero(on: Bool, margin: Scalar, fall: Scalar, most: Scalar) -> tuple[Bool, Scalar]:
-    """Return True if a margin is zero within `most` seconds, and the time to its zero [s]."""
+    """Return True if a margin is zero within `most` seconds and is `on`, and the time to its zero [s]."""
     close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(most) * fall))
     # The fall may be frozen: its derivative is multiplied by the margin, which is 0 except for rounding.
     return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))
