@@ -40,6 +40,7 @@ def by_scipy(mass, speed, tolerance=1e-11):
     for margin in margins:
         margin.terminal, margin.direction = True, 0
     options = {"rtol": tolerance, "atol": np.array([1e-9, 1e-9, 1e-13, 1e-11, 1e-13]), "dense_output": True}
+    options["max_step"] = 1e-3  # s; a longer step could cross a margin twice, unseen
     while True:
         run = solve_ivp(lambda t, y: rates(y, mass, hold)[0], (t, 5.0), y, "DOP853", events=margins, **options)
         before, t, y = run.y[:, -2], float(run.t[-1]), run.y[:, -1]

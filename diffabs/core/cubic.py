@@ -58,8 +58,7 @@ class Cubic(NamedTuple):
         """Return the x in [0, 1] at which p changes sign.
 
         It is 0 if p is zero at the start, and 1 if both ends have the same sign. The derivative of x follows from the
-        implicit
-        function theorem.
+        implicit function theorem.
         """
         # The iterations run without derivatives; `_refine_zero` adds the derivative of the root once at the end.
         still = jax.lax.stop_gradient(self)

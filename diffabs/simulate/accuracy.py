@@ -218,8 +218,16 @@ def has_same_noise(loop: Loop, solver: Solver, times: int, key: PyTree) -> Bool:
 
 
 def _draws(loop: Loop, h: float, times: int, count: int, key: PyTree) -> Scalar:
-    """Return the sensor's output after each `times` steps, with a leading axis (count,), for a plant that rests at its
-    start.
+    """Return the sensor's outputs at the times 0, `times` h, 2 `times` h, ..., a pytree with leaves (count, ...).
+
+    The plant stays in its start state.
+
+    Args:
+        loop: Closed loop.
+        h: Length of a step [s].
+        times: Number of steps from one returned output to the next.
+        count: Number of returned outputs.
+        key: Random key, or None.
     """
     signal = loop.plant.output(loop.plant.start(loop.initial))
     signal = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), signal)
@@ -236,6 +244,10 @@ def _draws(loop: Loop, h: float, times: int, count: int, key: PyTree) -> Scalar:
 
 
 def _estimate(coarse: Scalar, half: Scalar, quarter: Scalar, fine: Bool) -> ErrorEstimate:
+    """Return the error estimate of a metric from its values m(h), m(h/2) and m(h/4).
+
+    `fine` is True if the runs with these steps are comparable.
+    """
     d1, d2 = half - coarse, quarter - half
     # The inner `where` replaces a zero divisor: the quotient of the branch not taken stays finite.
     q = jnp.where(d1 == 0, jnp.where(d2 == 0, 0.0, jnp.inf), jnp.abs(d2) / jnp.where(d1 == 0, 1.0, jnp.abs(d1)))

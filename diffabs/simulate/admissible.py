@@ -84,6 +84,9 @@ def check(part: T, solver: Solver | None = None) -> T:
 def find_impossible_values(loop: Loop, step: float) -> list[str]:
     """Return one line for each value of a loop that no run may have; an empty list if all are allowed.
 
+    Three groups are checked in order: ranges and rules of the parts, the start against the stop, the parts against the
+    step. The lines are those of the first group with a fault.
+
     Args:
         loop: Closed loop with concrete parameters.
         step: Step of the grid [s].
@@ -98,6 +101,9 @@ def find_impossible_values(loop: Loop, step: float) -> list[str]:
 
 def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
     """Yield one line for each mismatch between start and stop, or between the parts and the step.
+
+    Three groups are checked in order: the start against the stop, the solver itself, the parts against the step. The
+    lines are those of the first group with a fault.
 
     Args:
         loop: Closed loop with concrete parameters.
@@ -193,7 +199,9 @@ def _name_reasons(loop: Loop | None, values: PyTree, step: float, codes: np.ndar
 
 
 def first_refusal(loop: Loop, values: Params, solver: Solver) -> str | None:
-    """Return one line about the first refused run and the reason, with its numbers; None if all runs are accepted.
+    """Return a text about the first refused run and its reasons, with their numbers; None if all runs are accepted.
+
+    A semicolon separates two reasons.
 
     Args:
         loop: Loop that the runs have in common. Without values it is the only run.
@@ -219,6 +227,7 @@ def first_refusal(loop: Loop, values: Params, solver: Solver) -> str | None:
 
 
 def _lane(loop: Loop | None, values: PyTree) -> Loop:
+    """Return the loop of one run: the common loop with the run's values or, without a common loop, `values` itself."""
     return values if loop is None else replace(loop, values)
 
 
@@ -248,7 +257,10 @@ def _margin(plant: Part, initial: Part, stop: Part) -> jax.Array:
 
 
 def _start_rule(loop: Loop) -> Rule:
-    """Return the rule that a run starts before its stop."""
+    """Return the rule that a run starts before its stop: the stop's margin is positive there.
+
+    If start and stop both have a `speed`, that of the start must also be the greater one.
+    """
     after = ": the run would end before it starts"
     # Arrays instead of Python numbers: a Python number overflows with an OverflowError, an array becomes infinite.
     margin = _margin(*canonical_dtypes((loop.plant, loop.initial, loop.stop)))

@@ -161,9 +161,11 @@ def run_batch(
         together: True is `jax.vmap` of `measure`: all runs step until the last has ended, and derivatives exist in both
             modes, with respect to the loop and the batch's values. False has no reverse mode, but a run that has ended
             makes room for the next, so that a few long runs do not delay the rest. Both agree to rounding. None is True
-            if the call is traced (inside jit, grad, vmap). Trajectories and an empty batch always use True.
+            if loop, values or objectives are traced (inside jit, grad, vmap). Trajectories always use True. An empty
+            batch uses True under XLA. Runs of a kernel never step together.
         accepted: Runs to execute, shape (runs,), or True for all. The others have `diverged`, and their metrics are
-            NaN. None means the runs that `batch_admissibility` accepts, or all if the call is traced.
+            NaN, also where they step together with the rest. None means the runs that `batch_admissibility` accepts, or
+            all if the call is traced.
         enough: Condition that ends runs early. Such a run has neither stopped, timed out nor diverged. Not
             for runs that step together.
         engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine, which needs a
@@ -186,7 +188,7 @@ def run_batch(
             step together. Also if engine "kernel" is impossible; `simulate.drive.kernel.kernel_objection` returns
             the reason without a run.
         KeyError: A path does not exist.
-        RuntimeError: A kernel is requested in a process that was forked after JAX had started.
+        RuntimeError: The engine is "auto" or "kernel", in a process that was forked after JAX had started.
     """
     engine = resolve_request(engine)
     if engine != "xla":
@@ -211,11 +213,15 @@ def _dispatch_batch(
     enough: EarlyEnd | None,
     engine: str,
 ) -> Run:
+    """Return the result of `run_batch`, whose arguments these are; `engine` is resolved (`resolve_request`).
+
+    Under XLA the runs step together (`_run_vmapped`) or make room for each other (`run_packed`, on all cores).
+    """
     count = batch.size
     columns = {path: jnp.asarray(x) if isinstance(x, list | tuple) else x for path, x in batch.values.items()}
     batch = dataclasses.replace(batch, values=columns)
     refuse(replace(loop, {path: _first_member(column) for path, column in batch.values.items()}), solver, objectives)
-    # Traced values cannot be checked. A traced batch runs every member, and an impossible one diverges.
+    # Traced values cannot be checked. A traced batch runs every member, also an impossible one.
     live = is_traced(loop, dict(batch.values), dict(objectives))
     if accepted is None:
         asked = bool(batch.values) and not live

@@ -26,8 +26,10 @@ def is_concrete(run: PyTree) -> bool:
 
 
 def summarise_run(run: PyTree) -> Summary:
-    """Return a summary of a run: how it ended, and its metrics. A batch gets mean, least and greatest value of each
-    metric.
+    """Return a summary of a run: how it ended, and its metrics.
+
+    A batch gets mean, least and greatest value of each metric, over the runs that have not diverged. A traced run gets
+    only the number of its metrics.
 
     Args:
         run: One run, or the runs of a batch.

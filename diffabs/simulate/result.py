@@ -65,8 +65,10 @@ def observe(loop: Loop, t: Scalar, state: LoopState, running: AnyArray) -> Traje
 
 
 def _is_impossible(name: str, objective: Objective, value: Scalar) -> Bool:
-    """Return True if no real run has this value: more than 1 for an audit, outside its range or not finite for a
-    metric.
+    """Return True if no real run has this value.
+
+    An audit must be at most 1. A metric must be finite and within its range `physical`, or equal to its `unreached`. A
+    metric without a physical range may have any value, also NaN.
     """
     if name == AUDIT_METRIC:
         # The negation counts NaN as impossible, too.

@@ -57,8 +57,9 @@ def rollout(
 
     The function is pure and compiled once per structure of the loop: new values and another duration do not compile
     again. A trajectory or a derivative does compile again if it outgrows its capacity, which is at most an eighth more
-    than requested. The stability of the step is not checked here but in `check`. A run with impossible traced
-    parameters diverges.
+    than requested. The stability of the step is not checked here but in `check`. Traced
+    parameters are not checked against their ranges. A run with impossible ones diverges only if its numbers are invalid
+    or not physically possible (`Run.diverged`).
 
     Args:
         loop: Closed loop with every part and parameter; differentiable in each leaf, and batched by `jax.vmap` over
@@ -107,7 +108,10 @@ def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, 
 
 
 def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: PyTree, every: int) -> Run:
-    """Return a run without a check of the parameters' values; a run with impossible values has diverged.
+    """Return a run without a check of the parameters' values.
+
+    A run with impossible values has diverged only if its numbers are invalid or not physically possible
+    (`Run.diverged`).
 
     Args:
         loop: Closed loop with every part and parameter.
@@ -137,9 +141,9 @@ class RunCapacity(NamedTuple):
     """Capacities that are fixed at compilation.
 
     Attributes:
-        tries: Capacity for attempts in the run, or between two instants of a trajectory.
-        instants: Capacity for instants of a trajectory; 0 without one.
-        every: Number of grid steps between two instants.
+        tries: Capacity for attempts in the whole run. For fixed steps with a trajectory: between two of its instants.
+        instants: Capacity for instants of a trajectory after t = 0; 0 without one.
+        every: Number of grid steps between two instants; 0 without a trajectory.
     """
 
     tries: int
@@ -154,6 +158,8 @@ def _truncate_trajectory(trajectory: PyTree, count: int) -> Any:
 
 def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, PyTree, PyTree]:
     """Return loop, objectives and stepping method of one data type.
+
+    In a traced loop the derivative by a parameter that is not tunable raises an error (`forbid_derivatives`).
 
     Args:
         loop: Closed loop with every part and parameter.
@@ -390,6 +396,7 @@ def _run_by_replay(
 
 
 def _prepare_run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key) -> tuple[Loop, PyTree, PyTree]:
+    """Return the prepared loop, the objectives with the plant's audit, and the step as a function of the carry."""
     loop, audit = prepare(loop)
     objectives = objectives | audit
     return loop, objectives, partial(method.step, loop, objectives, key)

@@ -145,8 +145,14 @@ def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
 
 
 def _power_norm_bound(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Array:
-    """Return the greatest bound for matrices (k, n, n) with their balancing D (k, n), in the row-sum or column-sum
-    norm.
+    """Return an upper bound on |lambda| of all eigenvalues of k matrices, a scalar; infinite if unknown.
+
+    The bound of a matrix is |(D^-1 A D)^p|^(1/p) with p = 2^`squarings`, in the smaller of row-sum and column-sum norm.
+
+    Args:
+        matrices: Matrices A, shape (k, n, n).
+        balance: Diagonals of D, shape (k, n).
+        squarings: Number of squarings of each matrix.
     """
     a = matrices * (balance[:, None, :] / balance[:, :, None])
     log = jnp.zeros(len(a), a.dtype)  # logarithm of the k-th root of the scales that have been divided out
@@ -189,13 +195,16 @@ def _balance(matrices: jax.Array) -> jax.Array:
 
 
 def _radius(direction: np.ndarray) -> np.ndarray:
-    """Return the distance from the origin to which RK4 is stable, along each direction of the complex plane."""
+    """Return the greatest stable |h lambda| of RK4 along each direction, with the shape of `direction`.
+
+    A direction is lambda/|lambda|, a complex number in the left half-plane.
+    """
     angles = np.abs(np.angle(direction))  # the region is symmetric
     return np.interp(angles, BOUNDARY_ANGLES, BOUNDARY_RADII)
 
 
 def _find_boundary_radii(angle: np.ndarray) -> np.ndarray:
-    """Return the first of `RADII` along each direction at which RK4 grows, or the last one."""
+    """Return the first of `RADII` at which RK4 grows, or the last one, along each direction of this `angle` [rad]."""
     # Bisection, because the region is star-shaped: a table of all radii would cost every command half a second.
     low, high = np.zeros(angle.shape, int), np.full(angle.shape, len(RADII) - 1)
     for _ in range(len(RADII).bit_length()):
@@ -212,13 +221,14 @@ MIN_BOUNDARY_RADIUS = float(BOUNDARY_RADII.min())  # every damped mode is stable
 
 
 def _jacobians_of(loop: Loop) -> jax.Array:
-    """Return d(flow)/d(flow), shape (k, n, n), at the points of `_map_over_probes`."""
+    """Return the Jacobians d(dz/dt)/dz [1/s], shape (k, n, n), at the points of `_map_over_probes`; z is the flow."""
     return _map_over_probes(_flow_jacobian, loop)
 
 
 def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
-    """Return the results of a function (k, ...) for the loop at the points where the plant says that it may be stiffest
-    (`probes`).
+    """Return the results of `function` at k points, stacked: leaves (k, ...).
+
+    A point is the loop with another start. The plant says by `probes` where the loop may be stiffest.
 
     Without `probes` the points are the start and a start of zero, each far from the target and on it.
     """
@@ -264,6 +274,7 @@ class _AtTarget:
 
 
 def _flow_jacobian(loop: Loop) -> jax.Array:
+    """Return the Jacobian d(dz/dt)/dz of the loop's flow z at its start [1/s], shape (n, n)."""
     state = loop.start()
     z, unravel = jax.flatten_util.ravel_pytree(state.flow())
 

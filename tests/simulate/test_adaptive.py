@@ -148,6 +148,17 @@ def test_the_other_runs_of_a_batch_change_no_number():
     np.testing.assert_array_equal(np.isnan(others.metrics["iae"]), np.arange(36) < 2)
 
 
+@killed_by("simulate/step/adaptive.py", "return jnp.where(due, new, control.limit)", "return new")
+def test_the_stability_limit_of_a_run_does_not_depend_on_its_neighbours():
+    """Runs that wait for an instant of a trajectory have made different numbers of attempts."""
+
+    def run(masses):
+        lanes, solver = d.Batch({"plant.mass": masses}), d.Adaptive(1e-4, 1.0, 1e-2, every=20)
+        return d.run_batch(d.braking(), lanes, solver, {"iae": IAE()}, trajectories=True).metrics["iae"][0]
+
+    np.testing.assert_allclose(run([12.0, 18.0]), run([12.0, 12.0]), rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_a_computer_in_single_precision_keeps_its_time():
     """Between two instants of a clock, times are known to a ten-thousandth of a period."""
@@ -369,11 +380,14 @@ def test_the_region_of_attraction_is_that_of_fixed_steps():
     assert 0.2 < found.share < 0.8
 
 
+@killed_by("simulate/step/replay.py", "clip_rtol(np.asarray(solver.rtol, float))", "solver.rtol")
 def test_there_is_room_for_smaller_steps():
     loop, sampled = rig().loop, load("slip-cured").loop
     assert log_capacity(loop, d.Adaptive(1e-5, 2.5)) == BASE_LOG_CAPACITY
     assert log_capacity(loop, d.Adaptive(1e-9, 2.5)) == 10 * BASE_LOG_CAPACITY
     assert log_capacity(sampled, d.Adaptive(1e-5, 2.0, 1e-3)) == BASE_LOG_CAPACITY + 3 * 2000
+    # A run has no smaller error than 32 roundings.
+    assert log_capacity(loop, d.Adaptive(1e-20, 2.5)) == log_capacity(loop, d.Adaptive(32 * np.finfo(float).eps, 2.5))
 
 
 @pytest.mark.parametrize(

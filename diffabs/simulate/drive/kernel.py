@@ -2,7 +2,7 @@
 
 XLA computes the starts and the results, as for every other run. The package `kernel` translates the step of `FixedStep`
 or `Adaptive` from its jaxpr, with everything that the parts contribute to it. A run that has ended makes room for the
-next one, as in `packed`.
+next one, as in `packed`. The kernel deals the runs to threads of its own, on all cores of the processor.
 """
 
 import operator
@@ -70,15 +70,16 @@ def run_native(
     own = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
     lanes = values, keys, accepted, own
 
-    def run_lanes(mine: PyTree) -> Run:
+    def run_launch(mine: PyTree) -> Run:
+        """Return the runs of one launch; `mine` holds their rows of `lanes`."""
         given = loop, mine[0], dict(objectives), method, *mine[1:], enough
         # A call through a derivative rule costs more than a short run.
         return _run_differentiable(given) if is_traced(given) else _run(*given)
 
     if count <= MAX_LANES_PER_LAUNCH:
-        return run_lanes(lanes)
+        return run_launch(lanes)
     runs = [
-        run_lanes(jax.tree.map(operator.itemgetter(slice(i, i + MAX_LANES_PER_LAUNCH)), lanes))
+        run_launch(jax.tree.map(operator.itemgetter(slice(i, i + MAX_LANES_PER_LAUNCH)), lanes))
         for i in range(0, count, MAX_LANES_PER_LAUNCH)
     ]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
@@ -91,7 +92,11 @@ def _run_differentiable(given: PyTree) -> Run:
 
 
 def _rule(primals: PyTree, tangents: PyTree) -> tuple[Run, Run]:
-    """Return the runs and their tangents, by steps that end on switching surfaces, as in `run`."""
+    """Return the runs and their tangents.
+
+    Fixed steps are those of `FixedStepping.for_derivatives`. Adaptive steps are replayed one by one
+    (`LaggedReplayStepping`).
+    """
 
     moves, (given_loop, _, measured, method, *_) = tangents[0], primals[0]
     refuse_derivative(given_loop, measured, method)
@@ -125,6 +130,7 @@ def _run(
     own: PyTree,
     enough: EarlyEnd | None,
 ) -> Run:
+    """Return the results of all runs; `method` is the stepping method, and `own` the runs' data for `enough`."""
     leaves, built = split_by_lane(loop, values, objectives)
 
     def start(mine: PyTree, key: PyTree, accepted: Scalar) -> Any:

@@ -21,7 +21,8 @@ from diffabs.core.types import Bool, Int, PyTree
 
 X = TypeVar("X")
 Carry = Any  # pytree of the stepping method, with an attribute `running`
-Step = Callable[..., Carry]  # function of a carry and, for trajectories, of `until`, the instant at which to pause
+# Function of a carry and, for trajectories, of `until`, the number of the grid instant at which to pause.
+Step = Callable[..., Carry]
 SCAN_GROUP_STEPS = 32  # steps that are skipped together, in scans of at most MAX_SAVED_CARRIES steps
 MAX_SAVED_CARRIES = 1800  # carries that reverse mode keeps in one scan: some 0.2 MB for each run of a batch
 STEPS_PER_BLOCK = 16  # steps between two checks of `running`, which is a reduction over the whole batch
@@ -67,10 +68,11 @@ def run_with_trajectory(
     The samples have a leading axis of `room`; those beyond `count` are zero. Not for reverse mode.
 
     Args:
-        step: Function of the carry and of `until`, the instant at which it pauses: one attempt of a step.
+        step: Function of the carry and of `until`, the number of the grid instant at which it pauses: one attempt of a
+            step.
         renew: Function from carry to carry, called once before each attempt.
-        before: Function of carry and instant: True if the run goes on and has not reached that instant.
-        look: Function of carry and instant that returns the sample.
+        before: Function of the carry and an instant's number: True if the run goes on and has not reached that instant.
+        look: Function of the carry and an instant's number that returns the sample there.
         carry: Carry at t = 0.
         every: Number of grid steps between two samples.
         count: Number of samples.
@@ -91,7 +93,9 @@ def run_with_trajectory(
 
 
 def scan_to_end(step: Step, carry: Carry, room: int) -> Carry:
-    """Return the carry at the end of a run after at most `room` attempts; for derivatives.
+    """Return the carry at the end of a run; for derivatives.
+
+    A run that needs more attempts than there is room for is still running in the result (`end_unfinished`).
 
     Args:
         step: Function from carry to carry: one attempt of a step.
@@ -111,12 +115,16 @@ def scan_with_trajectory(
     instants: int,
     room: int,
 ) -> tuple[Carry, PyTree]:
-    """Return the result of `run_with_trajectory` with room for `instants` samples; for derivatives.
+    """Return the carry after `count` times `every` steps of the grid, and a sample after each `every`-th step.
+
+    The samples have a leading axis of `instants`; those beyond `count` come from the final carry. This is the loop for
+    derivatives: reverse mode keeps the carry at each sample, and computes the steps between two samples again.
 
     Args:
-        step: Function of the carry and of `until`, the instant at which it pauses: one attempt of a step.
-        before: Function of carry and instant: True if the run goes on and has not reached that instant.
-        look: Function of carry and instant that returns the sample.
+        step: Function of the carry and of `until`, the number of the grid instant at which it pauses: one attempt of a
+            step.
+        before: Function of the carry and an instant's number: True if the run goes on and has not reached that instant.
+        look: Function of the carry and an instant's number that returns the sample there.
         carry: Carry at t = 0.
         every: Number of grid steps between two samples.
         count: Number of samples.
@@ -146,9 +154,10 @@ def _any_running(running: Bool) -> Bool:
 
 
 def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X], PyTree]) -> X:
-    """Return the carry after `capacity` applications of `step`, in nested scans.
+    """Return the carry after at least `capacity` applications of `step`, in nested scans.
 
-    Groups of steps are skipped while `on(carry)` is False; there, `step` must return its argument. In a batch under
+    Groups of steps are skipped where `on(carry)` is False. Within a group `on` is not asked, so `step` must then return
+    its argument. In a batch under
     `jax.vmap` groups are skipped only if `on` returns one value for all runs (`any_lane`). Reverse mode keeps the carry
     of each step. Beyond `MAX_SAVED_CARRIES` steps it keeps the carry of each group and computes the steps of a group
     again.
@@ -156,7 +165,7 @@ def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X
     Args:
         step: Function from carry to carry.
         carry: Carry before the first step.
-        capacity: Number of steps for which there is room.
+        capacity: Least number of steps; whole groups are computed.
         on: Function of the carry: True if the run goes on.
     """
     outer, inner = nested_scan_lengths(capacity)
@@ -189,7 +198,8 @@ def log_run(
 ) -> tuple[Carry, PyTree]:
     """Return the carry at the end of a run after at most `room` attempts, and the log of the attempts.
 
-    The log is in blocks of shape (blocks, `STEPS_PER_BLOCK`, ...). Blocks after the end of the run are zero.
+    The room is rounded up to whole blocks. The log is in blocks of shape (blocks, `STEPS_PER_BLOCK`, ...). Blocks after
+    the end of the run are zero.
 
     Args:
         step: Function from carry to carry: one attempt of a step.
@@ -217,6 +227,9 @@ def replay_log(
     log: PyTree,
 ) -> tuple[Carry, PyTree]:
     """Return the carry after all logged attempts, and what is kept of each, in the blocks of the log.
+
+    A block without an accepted attempt is skipped: what is kept of it is zero. Reverse mode keeps the carry before each
+    block, and computes the attempts of a block again.
 
     Args:
         step: Function of the carry and a log entry: one attempt.

@@ -125,6 +125,7 @@ def _run(
     *,
     width: int,
 ) -> Run:
+    """Return the results of all runs, in their order; `width` runs step at a time, by the stepping method `method`."""
     count = len(accepted)
     leaves, built = split_by_lane(loop, values, objectives)
     step_all = jax.vmap(lambda mine, key, carry: method.step(*built(mine), key, carry))

@@ -1,6 +1,7 @@
 """Batches on all cores of a processor, and on several devices.
 
-XLA computes a program of small steps on one core. A batch is therefore dealt to threads, each with a share of the runs.
+XLA computes a program of small steps on one core. A batch of `run_packed` is therefore dealt to threads, each with a
+share of the runs (`run_on_all_cores`). Runs that step together are one program. A kernel has threads of its own.
 
 On a mesh XLA divides the runs by itself if the axes are of type Auto. They suit programs that do not specify the
 placement of their arrays, and no part of a loop specifies it.
@@ -44,7 +45,9 @@ def describe_placement(given: PyTree) -> str:
 def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, count: int) -> PyTree:
     """Return run(columns, numbers of the runs), computed on all cores of this processor.
 
-    Arrays on several devices, or on another device than a processor, are left to XLA.
+    Each core gets a thread with a share of the runs. All shares have one shape and therefore one program. A share has
+    at least `MIN_RUNS_PER_CORE` runs, so a small batch uses fewer cores. Arrays on several devices, or on another
+    device than a processor, are left to XLA.
 
     Args:
         run: Function that returns the results of some runs, a pytree with leaves (runs, ...).

@@ -98,7 +98,7 @@ class AdaptiveControl(NamedTuple):
     Attributes:
         error_limited: Length that the error allows [s].
         limit: Longest stable step [s].
-        scale: Largest values of the states so far.
+        scale: Largest values of the first signal and of the states so far, as `error_scales` returns them.
         tries: Number of attempts so far.
         tries_at_renewal: Number of attempts at the last update of the stability limit.
         last_step: Last step, a `StateSpan`; () without a trajectory.
@@ -125,7 +125,7 @@ class AdaptiveReport(NamedTuple):
 
     Attributes:
         error: Error as a multiple of the allowed error.
-        scale: Largest values of the states so far.
+        scale: Largest values of the first signal and of the states so far, as `error_scales` returns them.
         late: Time from the first change of a comparison inside the step to its end [s], or 0.
         surface: Contradicted comparisons; None if steps keep to no mode.
     """
@@ -188,10 +188,13 @@ class AdaptiveStepping:
         """Return the `carry` with a new stability limit of the `loop`, once in `ATTEMPTS_PER_RENEWAL` attempts."""
         control, at = carry.control, carry.point
         due = carry.running & (control.tries - control.tries_at_renewal >= ATTEMPTS_PER_RENEWAL)
+
+        def renew_due() -> Scalar:
+            new = spectral_step_limit(loop, at.t, at.state, control.scale)
+            return jnp.where(due, new, control.limit)
+
         # One condition for the whole batch: `cond` with one for each run would execute both branches.
-        limit = jax.lax.cond(
-            any_lane(due), lambda: spectral_step_limit(loop, at.t, at.state, control.scale), lambda: control.limit
-        )
+        limit = jax.lax.cond(any_lane(due), renew_due, lambda: control.limit)
         renewed = jnp.where(due, control.tries, control.tries_at_renewal)
         return carry._replace(control=control._replace(limit=limit, tries_at_renewal=renewed))
 
@@ -235,7 +238,10 @@ class AdaptiveStepping:
         return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.notes)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> Scalar:
-        """Return the predicted time [s] to the first change of an answer, from `seen`, for the run of `carry`."""
+        """Return the predicted time [s] to the first change of an answer, from `seen`, for the run of `carry`.
+
+        A step that keeps its mode gets `CROSSING_OVERREACH` times this time, so that the change lies within it.
+        """
         return self._forecast_crossing(carry.control.error_limited, carry.unrestricted, seen)
 
     def report(
@@ -259,7 +265,8 @@ class AdaptiveStepping:
     ) -> Decision:
         """Return the decision on the `attempt` that answers the `request`, by the run of `carry` in `system`.
 
-        Its error must be small, and no comparison may change within it. `active` is False if the run needs no attempt.
+        Its error must be small, and no comparison may change within it, unless its length is the shortest one. `active`
+        is False if the run needs no attempt.
         """
         error, late = attempt.report.error, attempt.report.late
         fine = jnp.isfinite(error)  # the maximum over all states: one NaN makes it NaN
@@ -322,6 +329,7 @@ class AdaptiveStepping:
         )
 
     def _next_strike(self, loop: Loop, k: Int) -> Int:
+        """Return the number of the first grid instant after the `k`-th at which a clock strikes or the run ends."""
         return jnp.minimum(loop.next_tick(k, self.h), self.steps) if loop.ticks else self.steps
 
     def _forecast_crossing(self, error_limited: Scalar, unrestricted: Bool, seen: Evaluation) -> Scalar:

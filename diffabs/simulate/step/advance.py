@@ -53,7 +53,7 @@ class Carry(NamedTuple):
 
     Attributes:
         point: Point of the run that the last accepted attempt reached.
-        k: Number of the last instant of the grid at which a clock struck.
+        k: Number of the last instant of the grid at which a clock struck. With fixed steps one strikes at each instant.
         since: Time since that instant [s]. It is summed, because the difference of two large times would lose digits.
         length: Length of the next attempt [s].
         strikes: True if the next attempt ends where a clock strikes next, or with the run.
@@ -257,6 +257,8 @@ def start_carry(
     forecast: Callable[[Evaluation], PyTree] = lambda seen: (),
 ) -> Carry:
     """Return the carry of a run at t = 0, without the numbers of the stepping method.
+
+    A run that starts at its stop or beyond has diverged.
 
     Args:
         stepping: Stepping method.

@@ -252,14 +252,14 @@ def mode_in_step(system: LoopSystem, words: ModeBits, free: Bool) -> Mode:
 
 
 def mode_after_changes(system: LoopSystem, words: ModeBits, which: Scalar, lands: Bool) -> Mode:
-    """Return the mode after the changes at the end of a step, which ended in the mode `words`.
+    """Return the mode in which the dynamics are evaluated after the changes at the end of a step.
 
-    All comparisons are evaluated, but for that on whose switching surface the step ended: its answer stays. At the zero
-    of its margin, rounding could turn it back.
+    All comparisons are evaluated, but for that on whose switching surface the step ended: it keeps its answer in
+    `words`. At the zero of its margin, rounding could turn it back.
 
     Args:
         system: Dynamics of the loop and its objectives.
-        words: Answers to the comparisons.
+        words: Answers to the comparisons beyond the switching surface, as `flip_answer` returns them.
         which: Number of a comparison.
         lands: True if the step ended on its switching surface.
     """

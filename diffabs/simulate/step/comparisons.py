@@ -50,7 +50,10 @@ class SwitchedProgram:
     def __init__(
         self, f: Callable[[PyTree, PyTree], PyTree], moving: PyTree, fixed: PyTree, counts: Callable[[PyTree], PyTree]
     ):
-        """Trace `f` for arguments with the shapes of `moving` and `fixed`; `counts` picks outputs."""
+        """Trace `f` for arguments with the shapes of `moving` and `fixed`.
+
+        `counts` picks those outputs of `f` whose comparisons get numbers.
+        """
         closed, shape = jax.make_jaxpr(f, return_shape=True)(moving, fixed)
         self.ops: list[_Op] = []
         self.places: list[BitRange] = []
@@ -77,7 +80,7 @@ class SwitchedProgram:
         return max(1, -(-self.answers // WORD_BITS))
 
     def __call__(self, pick: Callable[[PyTree], PyTree], moving: PyTree, fixed: PyTree, mode: Mode) -> Scalar:
-        """Return the outputs that `pick` picks."""
+        """Return the outputs that `pick` picks at (`moving`, `fixed`) in `mode`."""
         return self._run(pick, moving, fixed, mode, False)[0]
 
     def look(
@@ -87,7 +90,10 @@ class SwitchedProgram:
         return self._run(pick, moving, fixed, mode, True)
 
     def _run(self, pick: Any, moving: PyTree, fixed: PyTree, mode: Mode, look: bool) -> tuple[PyTree, PyTree]:
-        """Evaluate only the operations that the picked outputs need."""
+        """Return the picked outputs and, with `look`, the answers to all comparisons; otherwise None.
+
+        Only the operations that these outputs need are evaluated.
+        """
         values = dict(self._constants)
         values.update(zip(self._inputs, map(jnp.asarray, jax.tree.leaves((moving, fixed))), strict=True))
         picked, tree = jax.tree.flatten(pick(self.outputs))

@@ -106,7 +106,7 @@ class AttemptCrossings(NamedTuple):
     Attributes:
         sought: Margin that the search looks for.
         falls: True if the sought margin falls through zero within the attempt.
-        other: Another margin that falls through zero.
+        other: Another margin that falls through zero; of several events the earliest, by linear interpolation.
         another: True if such another margin exists.
     """
 

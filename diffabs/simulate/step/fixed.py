@@ -46,7 +46,7 @@ class FixedStepControl(NamedTuple):
     """Numbers of `FixedStepping` in a carry.
 
     Attributes:
-        extra: Number of attempts so far that did not end on the grid.
+        extra: Number of attempts so far, not counting accepted steps to the grid and attempts in REFINING.
         here: Number of such attempts since the last instant of the grid.
     """
 
@@ -114,7 +114,10 @@ class FixedStepping:
         return self
 
     def for_derivatives(self) -> "FixedStepping":
-        """Return the method for derivatives."""
+        """Return the method for derivatives: it locates switching surfaces unless `kinks` is False.
+
+        The times of its events have second derivatives.
+        """
         return dataclasses.replace(self, kinks=self.kinks is not False, second_order=True)
 
     def capacity(self, loop: Loop, steps: int) -> int:

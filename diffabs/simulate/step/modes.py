@@ -37,8 +37,8 @@ class ComparisonAnswers(NamedTuple):
     Attributes:
         words: Answers that were used.
         contradicted: Answers that the numbers contradict by more than rounding, and that did not give way.
-        margins: Margins until the numbers contradict the answers, negative after that, each with the numbers of its
-            bits. Without frozen answers the margins are x - y, with either sign.
+        margins: Pairs (numbers of the bits, margins): one for each comparison, two for a search in knots. A margin is
+            negative where the numbers contradict the answer. Without frozen answers it is x - y, with either sign.
     """
 
     words: ModeBits
@@ -91,7 +91,10 @@ class ComparisonTrace:
     """The comparisons of one evaluation of a program."""
 
     def __init__(self, places: Sequence[BitRange], words: int, mode: Mode, look: bool):
-        """Set the bits of the comparisons; `look` keeps the margins."""
+        """Begin an evaluation in `mode`; `look` records contradictions and margins.
+
+        `places` holds the bits of each comparison, by its number, and `words` is the number of words.
+        """
         self.places, self.mode, self.look = places, mode, look
         self.taken: dict[int, PyTree] = {}
         self.against: list[PyTree] = [jnp.uint32(0)] * words
@@ -99,7 +102,10 @@ class ComparisonTrace:
         self.margins: list[tuple[PyTree, PyTree]] = []
 
     def __call__(self, ask: tuple[int, bool], x: Scalar, y: Scalar, strict: bool) -> Scalar:
-        """Return the answer to x > y if strict, else to x >= y."""
+        """Return the answer to x > y if strict, else to x >= y.
+
+        `ask` holds the number of the comparison, and True if that number denotes the negation.
+        """
         number, turned = ask
         if number not in self.taken:
             self.taken[number] = self._compare(number, *((y, x, not strict) if turned else (x, y, strict)))
@@ -135,9 +141,8 @@ class ComparisonTrace:
     def search(self, ask: tuple[int, bool], says: Callable[[], PyTree], knots: Scalar, x: Scalar) -> Scalar:
         """Return the number of knots that are not above `x`, as an integer; each knot has one bit.
 
-        `ask` holds the number of the search and is otherwise not used. `says()` is the search by the numbers, and
-        `knots` (n,)
-        are the knots.
+        `ask` holds the number of the search and is otherwise not used. `says()` is the search by the numbers. The
+        `knots` have the shape (n,).
         """
         number, count = ask[0], len(knots)
         first = self.places[number][0]
@@ -165,7 +170,10 @@ class ComparisonTrace:
         self.margins.append((first + np.arange(np.prod(shape)).reshape(shape) if shape else first, margin))
 
     def _between(self, first: int, below: Scalar, knots: Scalar, x: Scalar) -> tuple[PyTree, PyTree]:
-        """Return the distances of x from the knots on either side of it."""
+        """Return the distances of x from the knots below and above it, and record them as margins.
+
+        `below` is the number of knots that count as not above x, and `first` the bit of the first knot.
+        """
         count = len(knots)
         low = jnp.where(below > 0, x - knots[jnp.maximum(below - 1, 0)], jnp.inf)
         high = jnp.where(below < count, knots[jnp.minimum(below, count - 1)] - x, jnp.inf)

@@ -20,11 +20,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.lanes import any_lane, select
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
-from diffabs.simulate.step.adaptive import AdaptiveStepping, StateSpan, span_step
+from diffabs.simulate.step.adaptive import AdaptiveStepping, StateSpan, clip_rtol, span_step
 from diffabs.simulate.step.advance import Carry, Decision, advance, cast_floats, start_carry
 from diffabs.simulate.step.attempt import Attempt, Point, StepRequest, mode_in_step
 from diffabs.simulate.step.modes import ModeBits
@@ -271,7 +272,8 @@ def log_capacity(loop: Loop, solver: Adaptive) -> int:
         loop: Closed loop.
         solver: Solver of the run.
     """
-    return math.ceil(BASE_LOG_CAPACITY * max(1.0, 1e-5 / solver.rtol) ** (1 / ADAPTIVE_ERROR_ORDER)) + (
+    rtol = float(clip_rtol(np.asarray(solver.rtol, float)))
+    return math.ceil(BASE_LOG_CAPACITY * max(1.0, 1e-5 / rtol) ** (1 / ADAPTIVE_ERROR_ORDER)) + (
         LOG_CAPACITY_PER_TICK * solver.steps if loop.ticks else 0
     )
 
@@ -322,7 +324,8 @@ def states_between(spans: StateSpan, taken: Bool, instants: Array) -> LoopState:
 def _time_to_event(one: StepLog, strikes: Bool, end: Evaluation) -> Scalar:
     """Return the time [s] from the logged end of a step to its event or to the zero of its comparison.
 
-    The time is 0 without an event or comparison, or if a clock determines the end.
+    The time is 0 without an event or comparison. It is also 0 for a comparison if a clock determines the end; an event
+    there keeps its time.
     """
     shift, most = jnp.zeros_like(one.length), MAX_SHIFT_FRACTION * one.base
     for surface in end.surfaces:
@@ -341,7 +344,7 @@ def _time_to_event(one: StepLog, strikes: Bool, end: Evaluation) -> Scalar:
 
 
 def _time_to_zero(on: Bool, margin: Scalar, fall: Scalar, most: Scalar) -> tuple[Bool, Scalar]:
-    """Return True if a margin is zero within `most` seconds, and the time to its zero [s]."""
+    """Return True if a margin is zero within `most` seconds and is `on`, and the time to its zero [s]."""
     close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(most) * fall))
     # The fall may be frozen: its derivative is multiplied by the margin, which is 0 except for rounding.
     return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))

@@ -100,8 +100,8 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
     """Return the stability limit of a step, 3/rho [s], with an estimate rho of the spectral radius of the flow's
     Jacobian.
 
-    A power iteration estimates rho: the growth of a vector per multiplication by the Jacobian. Lengths are relative to
-    the largest values so far.
+    A power iteration estimates rho: the growth of a vector per multiplication by the Jacobian. The components of
+    the vector are relative to the largest values of the states so far.
 
     Args:
         loop: Closed loop.
@@ -144,6 +144,8 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
 def forecast_crossing(surfaces: Sequence[SwitchingFunction], natural: Scalar, shortest: Scalar) -> Scalar:
     """Return the time [s] to the first predicted crossing of a switching surface; `NEVER_S` without one.
 
+    A crossing nearer than `shortest`, or than `IMMEDIATE_FRACTION` of `natural`, is not counted.
+
     Args:
         surfaces: Margins of the comparisons and their rates, at an instant.
         natural: Length that the error allows [s].
@@ -159,6 +161,8 @@ def forecast_crossing(surfaces: Sequence[SwitchingFunction], natural: Scalar, sh
 
 def time_since_crossing(surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> Scalar:
     """Return the time [s] between the first crossing inside a step and the end of the step; 0 without one.
+
+    A crossing counts as inside between `STEP_START_FRACTION` and `STEP_END_FRACTION` of the step.
 
     Args:
         surfaces: Margins of the comparisons and their rates, at the end of the step.

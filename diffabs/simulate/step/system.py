@@ -104,7 +104,7 @@ class LoopSystem(NamedTuple):
 
     @property
     def comparisons(self) -> int:
-        """Number of comparisons whose switching surfaces are located."""
+        """Number of bits that hold the answers to the comparisons; margins of events have the numbers after them."""
         return self.program.answers if self.program else 0
 
     def rates(self, t: Scalar, z: PyTree, held: PyTree, mode: Mode) -> PyTree:
@@ -159,6 +159,8 @@ def build_system(
     has_margin_rates: bool = False,
 ) -> LoopSystem:
     """Return the system of a loop. Its program is traced once for each structure and for arguments of these shapes.
+
+    Of time, state and accumulators only shapes and types matter.
 
     Args:
         loop: Closed loop, prepared.
