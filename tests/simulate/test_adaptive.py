@@ -153,7 +153,7 @@ def test_the_stability_limit_of_a_run_does_not_depend_on_its_neighbours():
     """Runs that wait for an instant of a trajectory have made different numbers of attempts."""
 
     def run(masses):
-        lanes, solver = d.Batch({"plant.mass": masses}), d.Adaptive(1e-4, 1.0, 1e-2, every=20)
+        lanes, solver = d.Batch({"plant.mass": masses}), d.Adaptive(1e-5, 3.0, 1e-2, every=50)
         return d.run_batch(d.braking(), lanes, solver, {"iae": IAE()}, trajectories=True).metrics["iae"][0]
 
     np.testing.assert_allclose(run([12.0, 18.0]), run([12.0, 12.0]), rtol=1e-12)
