@@ -190,8 +190,14 @@ def describe_differences(there: Any, wanted: PyTree, path: str = "") -> Iterator
 
 
 def _decisive_entries(manifest: Table) -> JsonObject:
-    """Return the entries that decide the results: all except the notes on commit, source and units."""
-    return {key: value for key, value in manifest.items() if key not in ("commit", "source", "units")}
+    """Return the entries that decide the results: all except the notes on commit, source and units.
+
+    A manifest without an engine is that of a sweep by XLA.
+    """
+    study = {"engine": {"name": "xla"}, **manifest.get("study", {})}
+    return {
+        key: value for key, value in (manifest | {"study": study}).items() if key not in ("commit", "source", "units")
+    }
 
 
 def _abbreviate(value: Scalar) -> str:

@@ -372,6 +372,7 @@ CHANGED = [
     (("--set", "sweep.over.plant.mass=5.3,6.3"), 'study.space.variables.plant.mass.high is 6.2 there, 6.3 here'),
     (("--set", "sweep.design=sobol"), 'study.space.design.type is "random" there, "sobol" here'),
     (("--set", "sweep.failures.overshoot=0.5"), "study.failures.overshoot is null there, 0.5 here"),
+    (("--engine", "kernel"), 'study.engine.name is "xla" there, "kernel" here'),
 ]  # fmt: skip
 
 
