@@ -196,7 +196,7 @@ def _decisive_entries(manifest: Table) -> JsonObject:
     """
     study = {"engine": {"name": "xla"}, **manifest.get("study", {})}
     return {
-        key: value for key, value in (manifest | {"study": study}).items() if key not in ("commit", "source", "units")
+        key: value for key, value in {**manifest, "study": study}.items() if key not in ("commit", "source", "units")
     }
 
 
