@@ -3,11 +3,11 @@
     python tests/support/tiers.py fast | nightly | weekly [JOB ...]
 
 fast      tests without the mark `slow`: every change, `make test`
-nightly   a quarter of the slow tests and a seventh of the mutants, others each day, and fast tests of the engine with
+nightly   a sixth of the slow tests and a seventh of the mutants, others each day, and fast tests of the engine with
           the compiler flags that users have
 weekly    all slow tests, all fast tests with these flags, all mutants, and the fuzzers
 
-Each quarter of the slow tests has processes of its own: JAX keeps compiled programs, some 20 MB for each slow test.
+Each sixth of the slow tests has processes of its own: JAX keeps compiled programs, some 35 MB for each slow test.
 
 JOB: only jobs whose name contains one of these texts. Each job writes its row when it ends, so the rows of a tier may
 be of several days and commits. The exit status is 1 if something failed. A job that is interrupted writes nothing."""
@@ -31,7 +31,7 @@ PYTEST = ("-m", "pytest", "-n", "2", "--dist", "loadfile", "--no-loadscope-reord
 ENGINE = ("tests/core", "tests/simulate", "tests/objectives", "tests/controllers", "tests/actuators")
 USERS_FLAGS = MappingProxyType({"DIFFABS_TEST_XLA": "default"})
 SHOWN_FAILURES = 12
-SLOW_PARTS, MUTANT_PARTS = 4, 7
+SLOW_PARTS, MUTANT_PARTS = 6, 7
 
 
 class Job(NamedTuple):
@@ -52,7 +52,7 @@ def jobs_of_tier(tier: str, today: datetime.date) -> list[Job]:
     return {
         "fast": [Job("fast tests", (*PYTEST, "-m", "not slow"))],
         "nightly": [
-            slow_tests("a quarter of the slow tests", day % SLOW_PARTS),
+            slow_tests("a sixth of the slow tests", day % SLOW_PARTS),
             Job("the engine's tests, users' flags", (*PYTEST, "-m", "not slow", *ENGINE), USERS_FLAGS),
             Job("a seventh of the mutants", (mutants, "--part", f"{day % MUTANT_PARTS}/{MUTANT_PARTS}")),
         ],
