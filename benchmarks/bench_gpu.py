@@ -31,10 +31,12 @@ from rich.table import Column, Table
 
 import diffabs
 from diffabs import scenario
+from diffabs.compiler import pipeline
+from diffabs.compiler.emit import cuda
+from diffabs.compiler.ir import UpdateLevel, is_real
+from diffabs.compiler.runtime import gpu, nvrtc
+from diffabs.compiler.trace import ScalarProgram, live_nodes
 from diffabs.core.pytree import get
-from diffabs.kernel import cuda, gpu, launch, nvrtc
-from diffabs.kernel.graph import UpdateLevel, is_real
-from diffabs.kernel.program import ScalarProgram, live_nodes
 from diffabs.simulate.drive import kernel as native
 
 ACCURACY = 1e-4
@@ -163,7 +165,7 @@ def translated(name, dtype):
     one, path = scenario.load(name), "initial.theta" if name.startswith("arm") else "initial.speed"
     lanes = diffabs.Batch({path: np.full(2, float(get(one.loop, path)))}, np.arange(2))
     given = (one.loop, lanes, one.solver, one.objectives)
-    with jax.enable_x64(dtype == "float64"), mock.patch.object(launch, "_launch_lanes", launched):
+    with jax.enable_x64(dtype == "float64"), mock.patch.object(pipeline, "_launch_lanes", launched):
         native._run.clear_cache()
         try:
             diffabs.run_batch(*given, together=False, accepted=True, engine="kernel")

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from diffabs.core import provenance
+from diffabs.runtime import provenance
 
 OUT = pathlib.Path("out/benchmarks")
 

@@ -1,6 +1,6 @@
 """Simulate, differentiate, tune and certify controllers for braking wheels and two-wheelers."""
 
-from diffabs.core import interrupt as _interrupt
+from diffabs.runtime import interrupt as _interrupt
 
 _interrupt.end_early_on_interrupt()  # before JAX, whose import takes seconds
 

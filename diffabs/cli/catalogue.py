@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console, show, targets
-from diffabs.core import values
+from diffabs.config import values
 from diffabs.core.types import JsonObject
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import dump, names, read_header

@@ -15,17 +15,17 @@ import jax
 import numpy as np
 
 from diffabs.cli import console
+from diffabs.config.values import ScenarioError, format_given
 from diffabs.controllers import ProportionalFeedback
 from diffabs.controllers.sampled import inner_controller
-from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import parameters, replace
 from diffabs.core.types import JsonObject, Part, PyTree, Scalar
-from diffabs.core.values import ScenarioError, format_given
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import SlipModel
 from diffabs.plants import BrakeStart
+from diffabs.runtime import provenance
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:

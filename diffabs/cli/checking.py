@@ -7,8 +7,8 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from diffabs.config.values import ScenarioError
 from diffabs.core.types import JsonObject, Key, Params
-from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, needs_key
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS

@@ -8,8 +8,8 @@ import typer
 
 from diffabs.cli import console, show, show_samples
 from diffabs.cli.sweep import warn_of_strays
+from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.types import JsonObject
-from diffabs.core.values import ScenarioError, unknown_name_error
 
 if TYPE_CHECKING:
     from diffabs.sweep import Results

@@ -12,7 +12,7 @@ import warnings
 
 import jax
 
-from diffabs.core import files, provenance
+from diffabs.runtime import files, provenance
 
 OFF_VARIABLE = "DIFFABS_NO_CACHE"  # if set, no program is kept
 WORTH = 0.05  # s of compiling; faster programs are not kept

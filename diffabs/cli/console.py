@@ -18,9 +18,9 @@ import typer
 from rich.console import Console
 
 from diffabs.cli import progress
-from diffabs.core import files, interrupt, provenance, stopwatch
+from diffabs.config.values import ScenarioError
 from diffabs.core.types import Int, JsonObject
-from diffabs.core.values import ScenarioError
+from diffabs.runtime import files, interrupt, provenance, stopwatch
 from diffabs.scenario import outside
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import Scenario, dump, load, names

@@ -11,9 +11,9 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import certificates, console, show, targets
-from diffabs.core import provenance
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
+from diffabs.runtime import provenance
 
 CHECK = "check it with: diffabs verify"
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console
-from diffabs.core.values import ScenarioError, unknown_name_error
+from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES, resolve_request
 from diffabs.simulate.drive.sharding import describe_placement
 

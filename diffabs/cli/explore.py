@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from diffabs.cli import console, tune
-from diffabs.core import interrupt
-from diffabs.core.values import ScenarioError
+from diffabs.config.values import ScenarioError
+from diffabs.runtime import interrupt
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:

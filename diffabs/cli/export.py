@@ -12,11 +12,11 @@ from rich.table import Table
 
 from diffabs import __version__
 from diffabs.cli import console, show, targets
-from diffabs.core.provenance import versions
+from diffabs.config.values import ScenarioError
 from diffabs.core.types import PyTree
 from diffabs.core.units import units_of
 from diffabs.core.validity import find_problems
-from diffabs.core.values import ScenarioError
+from diffabs.runtime.provenance import versions
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.types import FixedStep
 

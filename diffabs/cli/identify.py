@@ -13,10 +13,10 @@ import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, progress, show, targets
-from diffabs.core import provenance
+from diffabs.config.values import ScenarioError, format_given, unknown_name_error
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import JsonObject, PyTree
-from diffabs.core.values import ScenarioError, format_given, unknown_name_error
+from diffabs.runtime import provenance
 from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read_measurements
 from diffabs.scenario.parameter_paths import flatten_table

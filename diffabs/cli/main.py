@@ -42,10 +42,10 @@ from diffabs.cli import (
     usage,
 )
 from diffabs.cli.checking import check_run_accuracy, describe_check, describe_loose_metrics
-from diffabs.core import interrupt, provenance
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Key, Scalar
 from diffabs.objectives import at_limits
+from diffabs.runtime import interrupt, provenance
 from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.matlab import write_mat

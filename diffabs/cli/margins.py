@@ -10,10 +10,10 @@ import typer
 from rich.table import Table
 
 from diffabs.cli import console, show, targets
-from diffabs.core import provenance
+from diffabs.config.values import ScenarioError, format_given, read_number_in_range
 from diffabs.core.pytree import ParameterSpec, replace
 from diffabs.core.types import JsonObject, Scalar
-from diffabs.core.values import ScenarioError, format_given, read_number_in_range
+from diffabs.runtime import provenance
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario

@@ -11,10 +11,10 @@ import typer
 
 from diffabs.cli import console, progress, show, show_samples
 from diffabs.cli import engine as engines
-from diffabs.core import provenance
+from diffabs.config.values import ScenarioError, read_number, unknown_name_error
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject
-from diffabs.core.values import ScenarioError, read_number, unknown_name_error
+from diffabs.runtime import provenance
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario

@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console, targets
-from diffabs.core import files
-from diffabs.core.values import ScenarioError
+from diffabs.config.values import ScenarioError
+from diffabs.runtime import files
 
 DEFAULT_NAME = "report.html"
 ENDINGS = (".html", ".htm")

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from diffabs.cli import console, progress, report, show, targets
-from diffabs.core import provenance, values
+from diffabs.config import values
 from diffabs.core.types import JsonObject
+from diffabs.runtime import provenance
 
 if TYPE_CHECKING:
     from diffabs.papers import Reproduction

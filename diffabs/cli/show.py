@@ -14,9 +14,9 @@ from rich.table import Table
 from diffabs.cli.console import say
 from diffabs.cli.tables import fit_table
 from diffabs.core.loop import run_signals
-from diffabs.core.summary import round_for_table
 from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.papers.digest import Digest
+from diffabs.runtime.summary import round_for_table
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.types import Trajectory

@@ -20,10 +20,10 @@ import typer
 
 from diffabs.cli import console, progress, report, show, show_samples
 from diffabs.cli import engine as engines
-from diffabs.core import files
+from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.pytree import elements
 from diffabs.core.types import JsonObject, PyTree
-from diffabs.core.values import ScenarioError, unknown_name_error
+from diffabs.runtime import files
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads

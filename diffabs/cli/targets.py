@@ -6,7 +6,7 @@ import pathlib
 from collections.abc import Iterator
 
 from diffabs.cli.console import fail, need_matplotlib
-from diffabs.core import files
+from diffabs.runtime import files
 
 PICTURES = (".png", ".pdf", ".svg")
 

@@ -16,8 +16,8 @@ import typer
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
 from diffabs.cli.tune_document import Proved, Work, tuning_document
+from diffabs.config.values import ScenarioError
 from diffabs.core.types import JsonObject, Part
-from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.drive.engine import EngineError

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from diffabs.cli import certificates, console
-from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import JsonObject, Part, Scalar
+from diffabs.runtime import provenance
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:

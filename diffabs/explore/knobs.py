@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from diffabs.config.values import read_number_in_range, wrong_kind_error
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import Part, PyTree
 from diffabs.core.units import unit_at
-from diffabs.core.values import read_number_in_range, wrong_kind_error
 from diffabs.explore.friction import FACTOR_PATH
 from diffabs.scenario.parameter_paths import canonical_path
 from diffabs.scenario.registry import KMH

@@ -10,8 +10,8 @@ from typing import Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
+from diffabs.config.values import ScenarioError
 from diffabs.core.types import PyTree
-from diffabs.core.values import ScenarioError
 from diffabs.explore import charts, curves, stability
 from diffabs.explore.canvas import Canvas, encode_change
 from diffabs.explore.controls import Controls

@@ -6,7 +6,7 @@ from typing import Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
-from diffabs.core.values import ScenarioError
+from diffabs.config.values import ScenarioError
 from diffabs.explore import saving
 from diffabs.explore.session import Session
 

@@ -3,8 +3,8 @@
 import os
 import pathlib
 
-from diffabs.core import files
-from diffabs.core.values import ScenarioError, format_given
+from diffabs.config.values import ScenarioError, format_given
+from diffabs.runtime import files
 from diffabs.scenario.scenario import Scenario, dump, loads
 
 MAX_NAME_LENGTH = 120  # characters, with the suffix

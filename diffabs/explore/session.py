@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.config.values import ScenarioError, read_number_in_range, unknown_name_error, wrong_kind_error
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, get, replace
 from diffabs.core.types import PyTree, Scalar
 from diffabs.core.validity import find_problems
-from diffabs.core.values import ScenarioError, read_number_in_range, unknown_name_error, wrong_kind_error
 from diffabs.explore import friction, knobs, tuning
 from diffabs.explore.curves import Spread
 from diffabs.explore.knobs import Knob

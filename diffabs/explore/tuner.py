@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
+from diffabs.config.values import ScenarioError
 from diffabs.core.types import PyTree, Scalar
-from diffabs.core.values import ScenarioError
 from diffabs.explore import curves, tuning
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words

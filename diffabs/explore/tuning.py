@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import PyTree
-from diffabs.core.values import ScenarioError
 from diffabs.explore.knobs import Knob
 from diffabs.scenario.scenario import Scenario
 

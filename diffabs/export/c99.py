@@ -5,12 +5,11 @@ from collections.abc import Iterator, Sequence
 import jax
 import numpy as np
 
-from diffabs.export.c_words import Words, comment_text, identifiers, is_name
+from diffabs.compiler.emit.c99_words import Words, comment_text, identifiers, is_name
+from diffabs.compiler.ir import Node, live_nodes
+from diffabs.compiler.lower.rules import Unsupported
 from diffabs.export.device import ComputerProgram, NotExported
 from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
-from diffabs.kernel.graph import Node
-from diffabs.kernel.primitives import Unsupported
-from diffabs.kernel.program import live_nodes
 
 
 def c_source(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:

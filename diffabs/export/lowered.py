@@ -10,14 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, live_nodes
+from diffabs.compiler.lower.labels import Labelled, source_label
+from diffabs.compiler.lower.rules import constant_array, lower_jaxpr
 from diffabs.core.types import PyTree
 from diffabs.export.device import ComputerProgram
-from diffabs.export.labels import Labelled, source_label
-from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel
-from diffabs.kernel.primitives import constant_array, lower_jaxpr
-from diffabs.kernel.program import RULE_MODULES, live_nodes
-
-assert RULE_MODULES is not None  # keeps the import, which registers the rules
 
 MEMORY, INPUTS, NUMBERS = "s", "in", "p"  # origins of the graph's inputs, the first entry of a node's `attr`
 

@@ -17,12 +17,12 @@ import zipfile
 from typing import Any
 from xml.etree import ElementTree as xml
 
+from diffabs.compiler.emit.c99_words import is_name
+from diffabs.compiler.runtime.toolchain import NoCompiler, find_compiler
+from diffabs.config.values import make_printable
 from diffabs.core.loop import Loop
-from diffabs.core.values import make_printable
-from diffabs.export.c_words import is_name
 from diffabs.export.device import NotExported
 from diffabs.export.plant_c import FmuVariable, PlantSource, plant_source
-from diffabs.kernel.compilers import NoCompiler, find_compiler
 
 FMU_COMPILER_FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC")
 MOCKUP_COMPILE_TIMEOUT_S = 600

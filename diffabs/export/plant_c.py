@@ -12,16 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.compiler.emit.c99_words import Words
+from diffabs.compiler.ir import Node, UpdateLevel, is_real, live_nodes
+from diffabs.compiler.lower.labels import Labelled
+from diffabs.compiler.lower.rules import Unsupported
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, canonical_dtypes, parameters, prepare_parts
 from diffabs.core.types import Part, PyTree, Scalar
-from diffabs.export.c_words import Words
 from diffabs.export.device import NotExported
-from diffabs.export.labels import Labelled
 from diffabs.export.lowered import fill_shapes, number_leaves, trace_outputs
-from diffabs.kernel.graph import Node, UpdateLevel, is_real
-from diffabs.kernel.primitives import Unsupported
-from diffabs.kernel.program import live_nodes
 from diffabs.simulate.step.runge_kutta import rk4_step
 
 CONTROL = "control"

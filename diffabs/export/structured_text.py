@@ -11,26 +11,15 @@ from collections.abc import Iterator, Sequence
 import jax
 import numpy as np
 
-from diffabs.export.c_words import comment_text
+from diffabs.compiler.emit.c99_words import comment_text
+from diffabs.compiler.ir import Node, is_real, live_nodes
+from diffabs.compiler.lower.rules import Unsupported
+from diffabs.compiler.operations import OPERATIONS
 from diffabs.export.device import ComputerProgram, NotExported
 from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
-from diffabs.kernel.graph import Node, is_real
-from diffabs.kernel.primitives import Unsupported
-from diffabs.kernel.program import live_nodes
 
 INTEGERS = {"int64": "LINT", "uint64": "ULINT", "int32": "DINT", "uint32": "UDINT"}
-ST_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/"}
-COMPARED = {"lt": "<", "le": "<=", "eq": "=", "ne": "<>"}
-LOGICAL = {"and": "AND", "or": "OR", "xor": "XOR"}
-ST_FUNCTIONS = {
-    **{"exp": "EXP", "log": "LN", "sin": "SIN", "cos": "COS", "tan": "TAN", "atan": "ATAN", "asin": "ASIN"},
-    **{"acos": "ACOS", "sqrt": "SQRT", "abs": "ABS", "pow": "EXPT", "atan2": "ATAN2"},
-}
-HYPERBOLIC = {
-    "sinh": "(EXP({0}) - EXP(-{0})) / {2}",
-    "cosh": "(EXP({0}) + EXP(-{0})) / {2}",
-    "tanh": "{1} - {2} / (EXP({2} * {0}) + {1})",
-}
+LOGICAL = {"and", "or", "xor", "not"}  # in this language for truths only
 LINE = 110  # width of a list of variables
 ST_KEYWORDS_TEXT = (
     "abs acos action and any array asin at atan atan2 begin bool by byte case configuration constant cos date "
@@ -220,51 +209,23 @@ class _Block:
 
     def _expression(self, node: Node) -> str:
         args, op = [self._value(x) for x in node.args], node.op
-        boolean = node.args[0].dtype.kind == "b"
-        if op in ST_INFIX or (op in COMPARED and not (boolean and op in ("lt", "le"))):
-            return f"{args[0]} {(ST_INFIX | COMPARED)[op]} {args[1]}"
-        if op in LOGICAL and boolean:
-            return f"{args[0]} {LOGICAL[op]} {args[1]}"
-        if op == "not" and boolean:
-            return f"NOT {args[0]}"
-        if op in ("lower", "higher"):
-            return f"SEL({args[0]} {'<' if op == 'lower' else '>'} {args[1]}, {args[1]}, {args[0]})"
-        # a <> a detects NaN in a. For NaN in b the comparison is false, so b is returned: the result is NaN either way.
-        if op in ("min", "max"):
-            a, b = args
-            return f"SEL(({a} <> {a}) OR ({a} {'<' if op == 'min' else '>'} {b}), {b}, {a})"
-        if op in ("select", "gate"):
-            # SEL(G, IN0, IN1) has the operands in the order of `select`: truth, no, yes.
-            return f"SEL({', '.join(args)})"
-        if op == "neg":
-            return f"-{args[0]}"
-        if op == "any":
-            return args[0]
-        if op == "rem" and not is_real(node.dtype):
-            return f"{args[0]} MOD {args[1]}"
-        if op == "table":
-            return f"{self._variable(node)}_table[{args[0]}]"
-        if op == "is_finite":
-            return f"ABS({args[0]}) <= {_scientific(np.finfo(self.device.dtype).max)}"
-        if op == "convert":
-            return self._convert(node, args[0])
-        return self._function(node, args)
-
-    def _function(self, node: Node, args: list[str]) -> str:
-        """Return a call of a standard function, or a formula for one that the standard lacks."""
-        op = node.op
-        if op == "abs" or (op in ST_FUNCTIONS and is_real(node.dtype)):
-            return f"{ST_FUNCTIONS[op]}({', '.join(args)})"
-        if op in HYPERBOLIC:
-            return HYPERBOLIC[op].format(args[0], "1.0", "2.0")
-        # The conversion of IEC 61131-3 rounds to the nearest integer, half to even.
-        whole = f"LINT_TO_{self.real}({self.real}_TO_LINT({args[0]}))"
-        if op == "rint":
-            return whole
-        if op in ("floor", "ceil"):
-            beyond, sign = (">", "-") if op == "floor" else ("<", "+")
-            return f"SEL({whole} {beyond} {args[0]}, {whole}, {whole} {sign} 1.0)"
-        raise Unsupported(op, "there is none")
+        boolean, real = node.args[0].dtype.kind == "b", is_real(node.dtype)
+        match op:
+            case "select" | "gate":
+                # SEL(G, IN0, IN1) has the operands in the order of `select`: truth, no, yes.
+                return f"SEL({', '.join(args)})"
+            case "any":
+                return args[0]
+            case "rem" if not real:
+                return f"{args[0]} MOD {args[1]}"
+            case "table":
+                return f"{self._variable(node)}_table[{args[0]}]"
+            case "convert":
+                return self._convert(node, args[0])
+        template = OPERATIONS[op].st if op in OPERATIONS else None
+        if template is None or (op in LOGICAL and not boolean) or (op in ("lt", "le") and boolean):
+            raise Unsupported(op, "there is none")
+        return template.format(*args, real=self.real, most=_scientific(np.finfo(self.device.dtype).max))
 
     def _convert(self, node: Node, arg: str) -> str:
         """Return a number converted to another type; to an integer by truncation, as in C."""

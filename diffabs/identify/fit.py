@@ -22,11 +22,11 @@ from scipy.optimize import least_squares
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
-from diffabs.core.summary import Summary, round_for_table
 from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
 from diffabs.core.validity import check_part
 from diffabs.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
+from diffabs.runtime.summary import Summary, round_for_table
 
 SCIPY_REASONS = {0: Reason.LIMIT, 1: Reason.GRADIENT, 2: Reason.CHANGE, 3: Reason.CHANGE, 4: Reason.CHANGE}
 

@@ -16,7 +16,6 @@ import jax
 import numpy as np
 
 from diffabs.controllers import BalanceFeedback
-from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
 from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Table
@@ -29,6 +28,7 @@ from diffabs.objectives import BALANCE
 from diffabs.papers import arm_equations, arm_figures, record
 from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
+from diffabs.runtime import provenance
 from diffabs.scenario.defaults import balancing
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Adaptive, FixedStep, Run, describe_solver

@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from diffabs import plot
-from diffabs.core import files, provenance
 from diffabs.core.types import JsonObject, Params, Scalar
+from diffabs.runtime import files, provenance
 from diffabs.simulate.types import FixedStep, Run
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from diffabs import plot
 from diffabs.controllers import PID, ConstantTorque
-from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Reference
 from diffabs.core.types import JsonObject, Table
@@ -25,6 +24,7 @@ from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.plants import GRAVITY, QuarterCar
 from diffabs.references import FixedSlip, PeakLatch, PeakLiteral
 from diffabs.roads import MagicFormula, peak
+from diffabs.runtime import provenance
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.batch import run_batch, stack_loops
 from diffabs.simulate.run import rollout

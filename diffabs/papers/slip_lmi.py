@@ -16,7 +16,6 @@ import numpy as np
 
 from diffabs import plot
 from diffabs.controllers import HoldingInput, StateFeedback
-from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject, Part, Table
 from diffabs.objectives import BRAKING
@@ -25,6 +24,7 @@ from diffabs.papers.digest import Digest, digest
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip
 from diffabs.roads import RIG, peak
+from diffabs.runtime import provenance
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.batch import run_batch, stack_loops
 from diffabs.simulate.run import rollout

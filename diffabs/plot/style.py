@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core import files, pictures
 from diffabs.core.types import PyTree, Scalar
+from diffabs.runtime import files, pictures
 
 try:
     from matplotlib.axes import Axes

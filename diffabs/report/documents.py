@@ -8,9 +8,9 @@ import sys
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from diffabs.core import files
 from diffabs.core.types import JsonObject
 from diffabs.papers import PAPERS
+from diffabs.runtime import files
 
 MAX_DOCUMENT_BYTES = 2**27  # bytes of a document
 SUMMARY, MANIFEST = "summary.json", "manifest.json"

@@ -8,9 +8,9 @@ import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from diffabs.core import files, pictures
-from diffabs.core.summary import round_for_table
 from diffabs.core.types import Params, PyTree, Scalar, Table
+from diffabs.runtime import files, pictures
+from diffabs.runtime.summary import round_for_table
 
 IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 LARGEST_IMAGE = 2**25  # bytes

@@ -4,7 +4,6 @@ import json
 import pathlib
 from collections.abc import Iterator, Mapping
 
-from diffabs.core import files
 from diffabs.core.types import JsonObject, Table
 from diffabs.report.documents import MANIFEST, MAX_DOCUMENT_BYTES, Document
 from diffabs.report.page import (
@@ -21,6 +20,7 @@ from diffabs.report.page import (
     original_command,
     table_unit,
 )
+from diffabs.runtime import files
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import ScenarioError, loads
 

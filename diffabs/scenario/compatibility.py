@@ -7,11 +7,11 @@ from typing import Any
 
 import jax
 
+from diffabs.config.values import kebab_case
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Objective, Sample, resting_segment
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import PyTree
-from diffabs.core.values import kebab_case
 from diffabs.scenario.registry import join_path
 from diffabs.simulate.step.attempt import start_state
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.core import files
-from diffabs.core.values import ScenarioError, format_given, unknown_name_error
+from diffabs.config.values import ScenarioError, format_given, unknown_name_error
+from diffabs.runtime import files
 
 MAX_MEASUREMENT_BYTES = 100_000_000  # bytes
 TIME_COLUMN = "t [s]"

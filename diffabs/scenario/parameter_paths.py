@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
-from diffabs.core.values import (
+from diffabs.config.values import (
     FORMER_FIELDS,
     ScenarioError,
     format_given,
@@ -26,6 +24,8 @@ from diffabs.core.values import (
     unknown_name_error,
     wrong_kind_error,
 )
+from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
 from diffabs.scenario.registry import KMH, MAX_DEPTH, in_kmh
 
 Ends = tuple[Any, Any]  # low and high, tuples where the parameter is a list

@@ -19,12 +19,7 @@ from typing import Any
 import numpy as np
 
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors, stops
-from diffabs.core import blocks, protocols
-from diffabs.core.loop import Loop
-from diffabs.core.pytree import ParameterSpec
-from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
-from diffabs.core.units import Units, resolve_unit, units_of
-from diffabs.core.values import (
+from diffabs.config.values import (
     FORMER_FIELDS,
     ScenarioError,
     dotted_path,
@@ -36,6 +31,11 @@ from diffabs.core.values import (
     unknown_name_error,
     wrong_kind_error,
 )
+from diffabs.core import blocks, protocols
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
+from diffabs.core.units import Units, resolve_unit, units_of
 from diffabs.scenario import outside
 from diffabs.scenario.defaults import braking
 

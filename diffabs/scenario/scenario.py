@@ -23,13 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.core import files
-from diffabs.core.loop import Loop
-from diffabs.core.protocols import Objective
-from diffabs.core.types import JsonObject, Table
-from diffabs.core.units import units_of
-from diffabs.core.validity import find_cautions, find_problems
-from diffabs.core.values import (
+from diffabs.config.values import (
     FORMER_FIELDS,
     as_plain,
     format_given,
@@ -39,8 +33,14 @@ from diffabs.core.values import (
     unknown_name_error,
     wrong_kind_error,
 )
-from diffabs.core.values import ScenarioError as ScenarioError
+from diffabs.config.values import ScenarioError as ScenarioError
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.types import JsonObject, Table
+from diffabs.core.units import units_of
+from diffabs.core.validity import find_cautions, find_problems
 from diffabs.objectives import BRAKING, default_objectives
+from diffabs.runtime import files
 from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
 from diffabs.scenario.compatibility import find_misfits
 from diffabs.scenario.defaults import braking

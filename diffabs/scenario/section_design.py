@@ -17,12 +17,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.actuators import Lag, RateLimit
-from diffabs.controllers import Sampled
-from diffabs.core.blocks import Series
-from diffabs.core.loop import Loop
-from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Scalar
-from diffabs.core.values import (
+from diffabs.config.values import (
     ScenarioError,
     format_given,
     plain_fields,
@@ -33,7 +28,12 @@ from diffabs.core.values import (
     table_reader,
     wrong_kind_error,
 )
-from diffabs.core.values import read_table as read_table
+from diffabs.config.values import read_table as read_table
+from diffabs.controllers import Sampled
+from diffabs.core.blocks import Series
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Scalar
 from diffabs.linear.slip_model import SlipModel
 from diffabs.scenario.parameter_paths import read_entries
 

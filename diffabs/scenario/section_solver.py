@@ -6,9 +6,9 @@ Without a type, `step` or `kinks` select fixed steps. Otherwise, and always with
 import dataclasses
 from collections.abc import Mapping
 
+from diffabs.config.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject, PyTree
-from diffabs.core.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.types import SOLVER_TYPES, Adaptive, FixedStep, Solver
 

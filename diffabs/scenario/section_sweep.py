@@ -27,11 +27,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from diffabs.core.loop import Loop
-from diffabs.core.protocols import Objective
-from diffabs.core.pytree import elements, get
-from diffabs.core.types import JsonObject, Params, PyTree, Table
-from diffabs.core.values import (
+from diffabs.config.values import (
     ScenarioError,
     as_plain,
     choice_reader,
@@ -45,7 +41,11 @@ from diffabs.core.values import (
     whole_reader,
     wrong_kind_error,
 )
-from diffabs.core.values import read_table as read_table
+from diffabs.config.values import read_table as read_table
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import elements, get
+from diffabs.core.types import JsonObject, Params, PyTree, Table
 from diffabs.scenario.parameter_paths import ParameterEntry, canonical_path, flatten_table, read_entries
 from diffabs.scenario.registry import FAMILIES, build_part, family_of, unit_of
 from diffabs.scenario.section_tune import metric_reader

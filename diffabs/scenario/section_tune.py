@@ -29,11 +29,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
-from diffabs.core.loop import Loop
-from diffabs.core.protocols import Objective
-from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import JsonObject, PyTree, Table
-from diffabs.core.values import (
+from diffabs.config.values import (
     Reader,
     ScenarioError,
     as_plain,
@@ -48,7 +44,11 @@ from diffabs.core.values import (
     unknown_name_error,
     whole_reader,
 )
-from diffabs.core.values import read_table as read_table
+from diffabs.config.values import read_table as read_table
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import JsonObject, PyTree, Table
 from diffabs.scenario.parameter_paths import Ends, ParameterEntry, canonical_path, parameters_of, read_entries
 from diffabs.scenario.registry import unit_of
 from diffabs.simulate.batch import Batch, grid, latin

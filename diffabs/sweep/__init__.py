@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from diffabs.core.exports import lazy_getattr
+from diffabs.runtime.exports import lazy_getattr
 
 if TYPE_CHECKING:
     from diffabs.sweep.discrete import Categorical as Categorical

@@ -26,9 +26,9 @@ import numpy as np
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
 from distributed.comm.core import connect
 
-from diffabs.core import files, provenance
+from diffabs.compiler import pipeline
 from diffabs.core.types import PyTree, Scalar
-from diffabs.kernel import launch
+from diffabs.runtime import files, provenance
 from diffabs.sweep.engines import DECISIVE_PACKAGES, ComputedChunk, encode_computed_chunk
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.runner import Runner
@@ -180,7 +180,7 @@ def _check_workers(client: Client, engine: str) -> None:
 def _result_versions(engine: str) -> dict[str, str]:
     """Return the versions here that can change a bit of the results. A kernel adds its compiler and processor."""
     return provenance.describe_platform(*DECISIVE_PACKAGES) | (
-        launch.describe_kernel_build() if engine == "kernel" else {}
+        pipeline.describe_kernel_build() if engine == "kernel" else {}
     )
 
 

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffabs.core.pytree import ParameterSpec
-from diffabs.core.types import PyTree, Table
-from diffabs.core.values import (
+from diffabs.config.values import (
     FINITE_SPEC,
     POSITIVE_SPEC,
     as_plain,
@@ -20,6 +18,8 @@ from diffabs.core.values import (
     table_field,
     table_reader,
 )
+from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import PyTree, Table
 
 
 def choose_indices(u: ArrayLike, count: int, weights: Sequence[float] | None = None) -> np.ndarray:

@@ -15,9 +15,9 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffabs.config.values import check_sound, format_table, kebab_case, read_one
 from diffabs.core.pytree import ParameterSpec, param
 from diffabs.core.types import PyTree, Scalar
-from diffabs.core.values import check_sound, format_table, kebab_case, read_one
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from diffabs.core.process import core_count
 from diffabs.core.types import Bool, PyTree
+from diffabs.runtime.process import core_count
 from diffabs.sweep.manifest import DECISIVE_PACKAGES as DECISIVE_PACKAGES
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.runner import Columns, Runner

@@ -17,10 +17,7 @@ import pathlib
 from collections.abc import Mapping
 from functools import partial
 
-from diffabs.core import files, provenance
-from diffabs.core.pytree import ParameterSpec
-from diffabs.core.types import JsonObject, PyTree, Table
-from diffabs.core.values import (
+from diffabs.config.values import (
     FINITE_SPEC,
     ScenarioError,
     choice_reader,
@@ -37,6 +34,9 @@ from diffabs.core.values import (
     whole_reader,
     wrong_kind_error,
 )
+from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import JsonObject, PyTree, Table
+from diffabs.runtime import files, provenance
 from diffabs.sweep import variables
 from diffabs.sweep.seal import Seal, SweepError, json_digest
 from diffabs.sweep.study import DTYPES, FLAG_COLUMNS, RANGES, Study

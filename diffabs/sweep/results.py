@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from diffabs.core import files
-from diffabs.core.summary import Summary
 from diffabs.core.types import JsonObject, Matrix, PyTree, Scalar
+from diffabs.runtime import files
+from diffabs.runtime.summary import Summary
 from diffabs.sweep import seal
 from diffabs.sweep.engines import describe_wrong_end, has_wrong_end, is_accepted
 from diffabs.sweep.manifest import Seals, read_manifest

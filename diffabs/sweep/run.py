@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from diffabs.core import provenance, stopwatch
 from diffabs.core.types import PyTree, Scalar, Table
+from diffabs.runtime import provenance, stopwatch
 from diffabs.simulate.drive.engine import log_xla_reason
 from diffabs.sweep.engines import Engine, Local
 from diffabs.sweep.manifest import Seals, describe_owner

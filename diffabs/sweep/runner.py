@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.types import Bool, JsonObject, Params, Part, PyTree
-from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.drive.engine import EngineError

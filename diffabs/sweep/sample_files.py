@@ -7,8 +7,8 @@ import pyarrow as pa
 import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
-from diffabs.core import files
-from diffabs.core.values import unknown_name_error
+from diffabs.config.values import unknown_name_error
+from diffabs.runtime import files
 
 TABLE_READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
 

@@ -18,8 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import PyTree, Table
-from diffabs.core.values import (
+from diffabs.config.values import (
     check_sound,
     format_table,
     kebab_case,
@@ -31,6 +30,7 @@ from diffabs.core.values import (
     table_reader,
     whole_reader,
 )
+from diffabs.core.types import PyTree, Table
 from diffabs.sweep.distributions import support_interval
 
 # Largest number of samples, whose numbers have 32 bits in JAX's keys and in the sequences; and largest seed.

@@ -18,8 +18,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from diffabs.config.values import ScenarioError
 from diffabs.core.types import Scalar
-from diffabs.core.values import ScenarioError
 
 CHUNK_NAME_PATTERN = re.compile(r"part-(\d{8,})-([0-9a-f]{16})\.parquet")
 DIGEST_DIGITS = 16

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from diffabs.kernel import launch
+from diffabs.compiler import pipeline
 from diffabs.simulate.drive.engine import resolve_request
 from diffabs.simulate.drive.sharding import describe_placement
 from diffabs.sweep.manifest import read_manifest
@@ -63,7 +63,7 @@ def _is_common_kernel(possible: bool) -> bool:
     """Return whether every process of the sweep can make a kernel, all by one compiler for one processor."""
     vote = 0  # of a process without a kernel
     if possible:
-        build = json.dumps(launch.describe_kernel_build(), sort_keys=True)
+        build = json.dumps(pipeline.describe_kernel_build(), sort_keys=True)
         vote = 1 + int(hashlib.sha256(build.encode()).hexdigest()[:7], 16)
     votes: Any = np.asarray(multihost_utils.process_allgather(np.int32(vote)))
     return bool(vote and (votes == vote).all())

@@ -15,8 +15,8 @@ from typing import Any
 
 import filelock
 
-from diffabs.core import files
 from diffabs.core.types import JsonObject, PyTree, Scalar, Table
+from diffabs.runtime import files
 from diffabs.sweep import seal
 from diffabs.sweep.manifest import MANIFEST_NAME as MANIFEST_NAME
 from diffabs.sweep.manifest import Seals, encode_manifest

@@ -14,14 +14,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from diffabs.compiler import pipeline
+from diffabs.config.values import as_plain, unknown_name_error
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, parameters, replace
 from diffabs.core.types import Int, JsonObject, Params, Table
 from diffabs.core.units import resolve_unit, units_of
 from diffabs.core.validity import find_problems
-from diffabs.core.values import as_plain, unknown_name_error
-from diffabs.kernel import launch
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import find_solver_faults
 from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES
@@ -143,7 +143,7 @@ class Study:
         own: JsonObject = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
         own |= {"failures": self.failure_bounds, "success": self.success}
         if self.engine == "kernel":
-            own |= {"engine": {"name": self.engine, **launch.describe_kernel_build()}}
+            own |= {"engine": {"name": self.engine, **pipeline.describe_kernel_build()}}
         return json.loads(
             json.dumps(
                 {

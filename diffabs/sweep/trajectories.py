@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import zarr
 
-from diffabs.core import files
 from diffabs.core.loop import run_signals
+from diffabs.runtime import files
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Trajectory
 from diffabs.sweep.study import Study, precision

@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core import values
-from diffabs.core.pytree import ParameterSpec
-from diffabs.core.types import AnyArray, JsonObject, Matrix, Params, PyTree, Table
-from diffabs.core.values import (
+from diffabs.config import values
+from diffabs.config.values import (
     as_plain,
     check_sound,
     kebab_case,
@@ -19,6 +17,8 @@ from diffabs.core.values import (
     table_field,
     table_reader,
 )
+from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import AnyArray, JsonObject, Matrix, Params, PyTree, Table
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.discrete import Rows as Rows
 from diffabs.sweep.distributions import Distribution, Normal, describe_out_of_range

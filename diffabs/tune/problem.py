@@ -19,13 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.bijectors import FreeSpace
 from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar, Vector
-from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.drive.engine import EngineError, log_kernel, log_own_choice, log_xla_reason, resolve_request

@@ -7,8 +7,8 @@ import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
-from diffabs.core.summary import Summary
 from diffabs.core.types import Part, PyTree
+from diffabs.runtime.summary import Summary
 from diffabs.tune.descent import DescentPoint, Stopping
 from diffabs.tune.problem import DerivativeMode, build_subject_loop
 

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.bijectors import Range, parameter_space
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import get
 from diffabs.core.types import Part
 from diffabs.core.validity import check_part
-from diffabs.kernel.compilers import NoCompiler
 from diffabs.objectives import default_objectives
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import EngineError

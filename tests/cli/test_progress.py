@@ -12,7 +12,7 @@ from seams import replace_seam
 
 from diffabs.cli import console, progress
 from diffabs.cli.progress import WorkProgress, WorkTiming
-from diffabs.core import stopwatch
+from diffabs.runtime import stopwatch
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def clock(monkeypatch):
     return now, watch
 
 
-@killed_by("core/stopwatch.py", "while self._spans and", "while False and")
+@killed_by("runtime/stopwatch.py", "while self._spans and", "while False and")
 def test_spans_that_overlap_count_once():
     watch = stopwatch.Stopwatch()
     for start, end in ((1.0, 2.0), (4.0, 5.0), (4.5, 6.0), (3.5, 7.0), (9.0, 10.0)):
@@ -35,7 +35,7 @@ def test_spans_that_overlap_count_once():
     assert watch.seconds(since=20.0) == 0.0
 
 
-@killed_by("core/stopwatch.py", "if event.startswith(COMPILE_EVENT):", "if False:")
+@killed_by("runtime/stopwatch.py", "if event.startswith(COMPILE_EVENT):", "if False:")
 def test_what_jax_compiles_is_counted():
     stopwatch.count_compilations()
     stopwatch.count_compilations()  # once is enough

@@ -66,7 +66,8 @@ def test_workers_end_with_their_sweep(file, room, times):
 LEAVING = """
 import pathlib, sys, time
 from diffabs.cli import console
-from diffabs.core import files, interrupt
+from diffabs.runtime import files
+from diffabs.runtime import interrupt
 
 def work():
     with files.temporary_path(pathlib.Path(sys.argv[1]) / "half.tmp") as path:

@@ -19,7 +19,7 @@ from sweeping import SCENARIO, chunks, environment, tune_section
 from terminal import COLUMNS, SPINNER, Terminal, assert_fits, assert_orderly, words
 
 from diffabs.cli import console, tables
-from diffabs.core import interrupt
+from diffabs.runtime import interrupt
 
 TUNED = tune_section(200, 1.0)
 SPREAD = "sweep.over.initial.speed={ type = 'normal', mean = 8.3, deviation = 0.3, low = 7.2, high = 11.0 }"

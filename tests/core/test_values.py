@@ -11,10 +11,8 @@ from marks import readable_id
 from mutants import killed_by
 from project import ROOT
 
-from diffabs.core import files, provenance, values
-from diffabs.core.exports import lazy_getattr
-from diffabs.core.pytree import ParameterSpec
-from diffabs.core.values import (
+from diffabs.config import values
+from diffabs.config.values import (
     ScenarioError,
     as_plain,
     choice_reader,
@@ -24,7 +22,10 @@ from diffabs.core.values import (
     table_reader,
     whole_reader,
 )
+from diffabs.core.pytree import ParameterSpec
 from diffabs.roads import Burckhardt
+from diffabs.runtime import files, provenance
+from diffabs.runtime.exports import lazy_getattr
 from diffabs.scenario.scenario import dump, load, loads
 from diffabs.sweep.distributions import Normal, Uniform
 from diffabs.sweep.sampling import Sobol
@@ -45,7 +46,7 @@ def test_a_table_becomes_a_dataclass():
 
 
 @killed_by(
-    "core/values.py",
+    "config/values.py",
     '            raise unknown_name_error(f"{dotted_path(path, key)} is not a field',
     '            continue\n            raise unknown_name_error(f"{dotted_path(path, key)} is not a field',
 )
@@ -89,7 +90,7 @@ def test_nan_is_in_no_range():
 
 
 @killed_by(
-    "core/values.py",
+    "config/values.py",
     "return value if type(value) in PLAIN_TYPES else",
     "return value if isinstance(value, PLAIN_TYPES) else",
 )
@@ -138,7 +139,7 @@ def test_packages_export_what_they_say_and_no_more():
 
 
 @killed_by(
-    "core/files.py",
+    "runtime/files.py",
     "        yield temporary\n        if temporary.exists():\n            temporary.replace(target)",
     "        try:\n            yield temporary\n        finally:\n            temporary.replace(target)",
 )
@@ -162,7 +163,7 @@ def test_a_file_is_the_old_one_or_the_whole_new_one(tmp_path):
 
 
 @killed_by(
-    "core/files.py",
+    "runtime/files.py",
     "        new.mkdir()\n        yield new\n",
     "        new.mkdir()\n        with contextlib.suppress(KeyError):\n            yield new\n",
 )

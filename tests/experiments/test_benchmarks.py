@@ -214,13 +214,14 @@ def test_the_figure_has_a_panel_for_each_problem(tmp_path):
 
 def test_useful_operations_are_those_of_real_numbers_in_a_step():
     """Not what is worked out before it, nor whole numbers, nor what only chooses."""
-    from diffabs.kernel import program
+    from diffabs.compiler.program import lower_functions
+    from diffabs.compiler.trace import trace_functions
 
     def step(lane, carry):
         x, k = carry
         return jnp.where(x > 1.0, (x * lane + 2.0 * lane) / x - 1.0, x), k + 1
 
-    found = program.build_program({"step": step}, 1.0, (1.0, 1))
+    found = lower_functions(trace_functions({"step": step}, 1.0, (1.0, 1)))
     assert module("bench_gpu").arithmetic(found) == 4
 
 

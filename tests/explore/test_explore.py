@@ -17,8 +17,8 @@ from mutants import killed_by
 from seams import replace_seam
 
 from diffabs.cli import console
+from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get, parameters, replace
-from diffabs.core.values import ScenarioError
 from diffabs.explore import charts, curves, friction, saving, stability, tuning
 from diffabs.explore.curves import Curve, Curves, Fan, Panel, Spread
 from diffabs.explore.guard import STRANGER, Guard

@@ -145,15 +145,15 @@ def commands_of_c(found, text, name, seen, folder):
 
 
 @killed_by(
-    "export/c_words.py",
-    'CLAMP_COMPARISONS = {"lower": "<", "higher": ">"}',
-    'CLAMP_COMPARISONS = {"lower": ">", "higher": "<"}',
+    "compiler/operations.py",
+    '"lower({0}, {1})", "{0} < {1} ? {0} : {1}"',
+    '"lower({0}, {1})", "{0} > {1} ? {0} : {1}"',
     case="PID, filtered derivative-float64",
 )
 @killed_by(
-    "export/c_words.py",
-    'return f"{which} ? {yes} : {no}"',
-    'return f"{which} ? {no} : {yes}"',
+    "compiler/emit/c99_words.py",
+    'return f"{args[0]} ? {args[2]} : {args[1]}"',
+    'return f"{args[0]} ? {args[1]} : {args[2]}"',
     case="conditional integration-float64",
 )
 @killed_by("export/c99.py", "i < {self.device.moves}", "i < 1", case="filtered target-float64")
@@ -311,7 +311,7 @@ def test_a_compiler_without_nan_is_refused(tmp_path):
 
 @pytest.mark.slow
 @killed_by(
-    "export/c_words.py",
+    "compiler/emit/c99_words.py",
     'np.format_float_positional(x, trim="0")',
     'np.format_float_positional(x, precision=7, trim="0")',
 )
@@ -535,9 +535,9 @@ def commands_of_text(text, seen):
     case="conditional integration-float64",
 )
 @killed_by(
-    "export/structured_text.py",
-    "{'<' if op == 'lower' else '>'}",
-    "{'>' if op == 'lower' else '<'}",
+    "compiler/operations.py",
+    '"SEL({0} < {1}, {1}, {0})"',
+    '"SEL({0} > {1}, {1}, {0})"',
     case="PID, filtered derivative-float64",
 )
 @killed_by("export/structured_text.py", "self.device.moves - 1", "self.device.moves", case="filtered target-float64")
@@ -626,7 +626,7 @@ class Kinds:
 
 
 @killed_by("export/structured_text.py", "_TRUNC_{after}", "_TO_{after}")
-@killed_by("export/structured_text.py", '(">", "-") if op == "floor"', '(">", "+") if op == "floor"')
+@killed_by("compiler/operations.py", "{_ST_RINT} - 1.0", "{_ST_RINT} + 1.0")
 def test_structured_text_knows_every_kind_of_operation():
     loop = rig(Kinds())
     seen = measured(loop, seed=3)

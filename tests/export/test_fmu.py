@@ -18,9 +18,9 @@ from mutants import killed_by
 from structured_text import Block
 
 import diffabs as d
+from diffabs.compiler.runtime.toolchain import COMPILER
 from diffabs.controllers import PID, ConstantInput, ConstantTorque, Sampled
 from diffabs.export import NotExported, build_fmu, computer_program, structured_text
-from diffabs.kernel.compilers import COMPILER
 from diffabs.plants import MirroredRig
 from diffabs.references import FixedSlip
 from diffabs.scenario.defaults import braking

@@ -11,9 +11,9 @@ import pytest
 import diffabs as d
 from diffabs import actuators, controllers, objectives, references, stops
 from diffabs.cli.show import numbers_at_bounds
+from diffabs.config.values import ScenarioError
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import param, pytree
-from diffabs.core.values import ScenarioError
 from diffabs.objectives import SettlingTime, at_limits
 from diffabs.scenario.scenario import load, loads
 

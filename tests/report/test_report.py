@@ -23,11 +23,11 @@ pytest.importorskip("matplotlib")
 from mutants import killed_by
 
 from diffabs.cli import report as reporting
-from diffabs.core.pictures import AXES_KEY, with_text, without_text
 from diffabs.report import ReportError, build_report, find_documents
 from diffabs.report.charts import draw_lines
 from diffabs.report.page import embed_image
 from diffabs.report.writing import SECTION_BY_KIND
+from diffabs.runtime.pictures import AXES_KEY, with_text, without_text
 
 TUNED = tune_section(2, 1.0)
 HOSTILE = '<script>alert("x")</script><img src=http://x.test/a.png onerror=alert(1)>'
@@ -282,7 +282,7 @@ def test_axes_lie_where_the_picture_has_them(tmp_path):
     assert abs(rows[-1] + 0.5 - y1) <= 2
 
 
-@killed_by("core/pictures.py", "return picture[:start] + picture[end:],", "return picture,")
+@killed_by("runtime/pictures.py", "return picture[:start] + picture[end:],", "return picture,")
 def test_numbers_of_a_picture_leave_no_trace_in_its_bytes(tmp_path):
     drawn(tmp_path / "a.png")
     whole = (tmp_path / "a.png").read_bytes()

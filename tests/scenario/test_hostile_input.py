@@ -35,7 +35,7 @@ def strange(path, kind):
 KINDS = ["a folder", "a pipe", "a loop"]
 
 
-@killed_by("core/files.py", "if not stat.S_ISREG(os.fstat(handle).st_mode):", "if False:")
+@killed_by("runtime/files.py", "if not stat.S_ISREG(os.fstat(handle).st_mode):", "if False:")
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_no_file_is_not_read(tmp_path, kind):
     scenario = strange(tmp_path / "x.toml", kind)

@@ -14,10 +14,10 @@ from mutants import killed_by
 import diffabs as d
 from diffabs import objectives
 from diffabs.controllers import HoldingInput, StateFeedback
-from diffabs.core.summary import Summary, format_cell, round_for_table
 from diffabs.identify import Traces, identify
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FixedSlip
+from diffabs.runtime.summary import Summary, format_cell, round_for_table
 from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached
 from diffabs.sweep import Results, Space, Study, Uniform, sweep
@@ -42,7 +42,7 @@ def run():
     return d.rollout(rig(), SOLVER, objectives.BRAKING)
 
 
-@killed_by("core/summary.py", "ZERO_TOLERANCE = 1e-14", "ZERO_TOLERANCE = 0.0")
+@killed_by("runtime/summary.py", "ZERO_TOLERANCE = 1e-14", "ZERO_TOLERANCE = 0.0")
 @pytest.mark.parametrize(
     ("value", "text"),
     [
@@ -65,7 +65,7 @@ def test_a_cell_of_a_list_is_its_beginning():
     assert format_cell(True) == "True"
 
 
-@killed_by("core/summary.py", "<strong>{html.escape(self.title)}</strong>", "<strong>{self.title}</strong>")
+@killed_by("runtime/summary.py", "<strong>{html.escape(self.title)}</strong>", "<strong>{self.title}</strong>")
 def test_a_summary_is_text_and_html():
     found = Summary("a <title>", ("name", "value"), (("x", 1 / 3), ("longer", 8e-17)), "note")
     assert str(found).splitlines() == [

@@ -5,7 +5,8 @@ import pathlib
 
 import numpy as np
 
-from diffabs.kernel import compilers, cuda
+from diffabs.compiler.emit import cuda
+from diffabs.compiler.runtime import toolchain
 
 HERE = pathlib.Path(__file__).parent
 THREADS = 5  # so that some lanes are taken by threads that have ended others
@@ -21,7 +22,7 @@ class Processor:
 
     def compile(self, text):
         before, after = ((HERE / name).read_text() for name in ("stand_ins.h", "one_by_one.h"))
-        return compilers.build_library(before + text + after)
+        return toolchain.build_library(before + text + after)
 
     def address(self, buffer):
         array = np.asarray(buffer)

@@ -9,7 +9,7 @@ import numpy as np
 from project import CACHE
 
 import diffabs as d
-from diffabs.kernel.launch import run_lanes
+from diffabs.compiler.pipeline import run_lanes
 
 FOLDER = str(pathlib.Path(os.environ.get("DIFFABS_JAX_CACHE", CACHE)) / "kernel")  # kept between runs
 

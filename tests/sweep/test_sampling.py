@@ -15,8 +15,8 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 from seams import replace_seam
 
+from diffabs.config.values import as_plain
 from diffabs.core.pytree import ParameterSpec
-from diffabs.core.values import as_plain
 from diffabs.scenario.toml import write_toml
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep import variables as space

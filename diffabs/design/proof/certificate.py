@@ -24,10 +24,10 @@ from types import MappingProxyType
 
 import numpy as np
 
-from diffabs.core import files
 from diffabs.core.types import Matrix, Params, PyTree, Scalar
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact, schema, serialise
+from diffabs.runtime import files
 
 QUADRATIC_KINDS = ("decay", "cost", "damping", "l2", "input")  # each has one P > 0 that decreases at every vertex
 

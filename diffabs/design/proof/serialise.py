@@ -7,9 +7,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from diffabs.core import files
 from diffabs.core.types import Matrix, Params, PyTree, Scalar
 from diffabs.design.polytopes import Polytope, Schedule
+from diffabs.runtime import files
 
 CERTIFICATE_FORMAT, CERTIFICATE_VERSION = "diffabs certificate", 1
 MAX_CERTIFICATE_BYTES, MAX_STATES_PLUS_INPUTS = 2**24, 64  # bytes; states and inputs together

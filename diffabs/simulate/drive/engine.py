@@ -80,7 +80,7 @@ def describe_structure(given: PyTree) -> Hashable:
     Args:
         given: Data of the runs, a pytree.
     """
-    from diffabs.kernel.compilers import COMPILER
+    from diffabs.compiler.runtime.toolchain import COMPILER
 
     def describe(x: Any) -> Hashable:
         if hasattr(x, "dtype"):
@@ -124,8 +124,8 @@ def run_with_engine(
     why_not = why_not or _refused.get(structure, "")
     if not why_not:
         # A local import: `import diffabs` must not need the kernel package.
-        from diffabs.kernel.compilers import NoCompiler
-        from diffabs.kernel.primitives import Unsupported
+        from diffabs.compiler.lower.rules import Unsupported
+        from diffabs.compiler.runtime.toolchain import NoCompiler
 
         try:
             run = native()
@@ -150,9 +150,9 @@ def describe_engine(engine: str) -> dict[str, str]:
     """
     if engine != "kernel":
         return {"name": engine}
-    from diffabs.kernel import launch
+    from diffabs.compiler import pipeline
 
-    return {"name": engine} | launch.describe_kernel_build()
+    return {"name": engine} | pipeline.describe_kernel_build()
 
 
 @functools.cache

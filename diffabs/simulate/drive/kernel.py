@@ -13,6 +13,10 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from diffabs.compiler.lower.indexing import MAX_COMPARED_ENTRIES
+from diffabs.compiler.lower.rules import Unsupported
+from diffabs.compiler.pipeline import run_lanes
+from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.compiling import is_traced
 from diffabs.core.log import log_rows
 from diffabs.core.loop import BLOCKS, Loop, LoopState
@@ -20,10 +24,6 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero, read_leaves
 from diffabs.core.types import Params, PyTree, Scalar
-from diffabs.kernel.compilers import NoCompiler
-from diffabs.kernel.indexing import MAX_COMPARED_ENTRIES
-from diffabs.kernel.launch import run_lanes
-from diffabs.kernel.primitives import Unsupported
 from diffabs.simulate.drive.engine import check_process
 from diffabs.simulate.drive.loops import STEPS_PER_BLOCK
 from diffabs.simulate.drive.packed import STEPS_PER_EXCHANGE, EarlyEnd, split_by_lane

@@ -18,8 +18,8 @@ import numpy as np
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding
 
-from diffabs.core.process import core_count
 from diffabs.core.types import Array, PyTree, Scalar
+from diffabs.runtime.process import core_count
 
 MIN_RUNS_PER_CORE = 256  # a core gets at least so many runs
 TRACED_EXPLICIT_AXES = (

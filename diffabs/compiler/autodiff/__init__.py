@@ -1,0 +1,1 @@
+"""Forward-mode derivatives of a program: tangents, their elimination and their replication."""

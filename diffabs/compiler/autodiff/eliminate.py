@@ -1,0 +1,216 @@
+"""A choice of the tangents that a program computes: vertex elimination for the fewest operations.
+
+A chain of linear operations on a tangent equals one product with the product of the factors, which is the same for all
+tangents. So a vertex is eliminated from the graph of one tangent if the given number of tangents then needs no more
+operations than before.
+"""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from diffabs.compiler.autodiff.linear import FACTOR_ONE, Algebra, Factor, Sum, Vertex, changes_in_step, count_terms
+from diffabs.compiler.ir import Graph, Node, UpdateLevel
+
+
+class Elimination:
+    """The linear graph of one tangent direction of a program, reduced for several directions.
+
+    Attributes:
+        graph: Graph of the factors.
+        many: Number of tangent directions.
+        algebra: Operations on sums of tangents.
+        vertices: Computed tangents by node id.
+        readers: For each tangent, the ids of the vertices that read it.
+        kept: Ids of tangents that nonlinear operations or results read, which must remain.
+        levels: For each tangent, how often its value changes.
+        any_factor: Placeholder for a factor whose value does not matter for a count of operations.
+    """
+
+    def __init__(self, graph: Graph, many: int, dtype: np.dtype):
+        """Create an empty linear graph.
+
+        Args:
+            graph: Graph that the factors are nodes of.
+            many: Number of tangent directions.
+            dtype: Type of the tangents.
+        """
+        self.graph, self.many, self.algebra = graph, many, Algebra(graph, dtype)
+        self.vertices: dict[int, Vertex] = {}
+        self.readers: dict[int, set[int]] = {}
+        self.kept: set[int] = set()
+        self.levels: dict[int, UpdateLevel] = {}
+        self.any_factor = graph.input(dtype, UpdateLevel.STEP, "any factor")
+
+    def begin(self, node: int, level: UpdateLevel) -> None:
+        """Add a seeded tangent: `node` is its id, `level` tells how often its value changes."""
+        self.levels[node] = level
+        self.readers[node] = set()
+
+    def add(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> None:
+        """Add an operation on tangents; its operands must be there already.
+
+        Args:
+            node: Operation in the graph of one tangent.
+            moves: Function that returns True if a node is a nonzero tangent.
+            value: Function that returns the factor graph's node for any other number.
+        """
+        new = self.vertices[node.id] = self.algebra.vertex(node, moves, value)
+        self.readers[node.id] = set()
+        reads = {x for sum in new.sums() for x in sum} | set(new.reads)
+        self.kept.update(new.reads)
+        for x in reads:
+            self.readers[x].add(node.id)
+        factors = [f.number.level for sum in new.sums() for f in sum.values() if f.number is not None]
+        factors += [new.which.level] if new.which is not None else []
+        self.levels[node.id] = max([UpdateLevel.UNIFORM, *factors, *(self.levels[x] for x in reads)])
+        # A nonlinear operation also changes as often as its operands that are no tangents.
+        if new.reads and any(not moves(x) for x in node.args):
+            self.levels[node.id] = max([self.levels[node.id], *(value(x).level for x in node.args if not moves(x))])
+
+    # costs ------------------------------------------------------------------------------------------------------------
+
+    def _cost(self, vertex: Vertex) -> int:
+        """Return the operations of a vertex for all tangents, by the cheaper of selecting tangents and selecting
+        factors.
+        """
+        cost = self.many * (sum(map(count_terms, vertex.sums())) + (vertex.which is not None))
+        return min(cost, self._factor_choice_cost(vertex)) if self._can_choose_factors(vertex) else cost
+
+    def _can_choose_factors(self, vertex: Vertex) -> bool:
+        """Return whether a selection between tangents may become a selection between factors.
+
+        The factor 0 does not remove a NaN or infinity in the branch not taken. So a tangent in one branch only must be
+        an input that is constant over the steps: an iterate of a step may diverge.
+        """
+        once = set(vertex.sum) ^ set(vertex.others)
+        return vertex.which is not None and all(
+            x not in self.vertices and self.levels[x] < UpdateLevel.STEP for x in once
+        )
+
+    def _factor_choice_cost(self, vertex: Vertex) -> int:
+        """Return the operations of a vertex for all tangents with a selection between factors."""
+        keys = set(vertex.sum) | set(vertex.others)
+        chosen = [x for x in keys if vertex.sum.get(x) != vertex.others.get(x)]
+        # One term with the factor 1 starts the sum and needs no operation.
+        units = any(x not in chosen and vertex.sum[x].number is None for x in keys)
+        return self.many * (len(keys) - units) + len(chosen)
+
+    def _saving_without(self, key: int, inner: Sum) -> int:
+        """Return the number of operations saved if the readers of a vertex use its sum `inner` instead."""
+        spared = self.many * count_terms(inner)
+        for reader in self.readers[key]:
+            old = self.vertices[reader]
+            new, more = [], 0
+            for outer in old.sums():
+                merged, products = self._substituted_sum(outer, key, inner) if key in outer else (outer, 0)
+                new.append(merged)
+                more += products
+            spared += self._cost(old) - self._cost(Vertex(new[0], old.which, *new[1:])) - more
+        return spared
+
+    def _substituted_sum(self, outer: Sum, key: int, inner: Sum) -> tuple[Sum, int]:
+        """Return `outer` with `inner` in place of a vertex, and the extra operations on factors.
+
+        The factors of the result are placeholders: only their number matters here.
+        """
+        factor, more = outer[key], 0
+        found = {x: one for x, one in outer.items() if x != key}
+        for x, one in inner.items():
+            many = sum(map(changes_in_step, (factor, one)))
+            if x in found:
+                more += many > 0 or changes_in_step(found[x])
+                found[x] = Factor(False, self.any_factor)
+            else:
+                more += many == 2
+                found[x] = (
+                    one if factor.number is None else factor if one.number is None else Factor(False, self.any_factor)
+                )
+        return found, more
+
+    # elimination ------------------------------------------------------------------------------------------------------
+
+    def reduce(self, roots: Iterable[int]) -> None:
+        """Eliminate each vertex that changes with each step, if this does not raise the number of operations.
+
+        The results, whose ids are `roots`, and all tangents in `kept` remain.
+        """
+        self.kept.update(roots)
+        # An elimination changes the costs of its neighbours, so passes repeat until one removes nothing.
+        left = True
+        while left:
+            before = len(self.vertices)
+            # From the results back: an eliminated vertex passes its sum to readers that are already reduced.
+            for key in sorted(self.vertices, reverse=True):
+                self._try(key)
+            left = len(self.vertices) < before
+
+    def _try(self, key: int) -> None:
+        vertex = self.vertices[key]
+        # Nonlinear operations stay. Work outside the steps is not worth a reduction.
+        if vertex.reads or self.levels[key] < UpdateLevel.STEP:
+            return
+        if not self.readers[key] and key not in self.kept:
+            self._replace_by_sum(key, {})
+            self._eliminate(key)
+            return
+        if key not in self.kept and self._join_choices(key):
+            return
+        decided, before = vertex.sum, self._cost(vertex)
+        if vertex.which is not None:
+            if not self._can_choose_factors(vertex):
+                return
+            decided = self.algebra.decide(vertex)
+        spared = before - (self._factor_choice_cost(vertex) if vertex.which is not None else before)
+        if key not in self.kept and spared + self._saving_without(key, decided) >= 0:
+            self._replace_by_sum(key, decided)
+            self._eliminate(key)
+        elif vertex.which is not None and spared >= 0:
+            self._replace_by_sum(key, decided)
+
+    def _join_choices(self, key: int) -> bool:
+        """Merge a selection of one tangent or zero into its readers if all are such selections; return success."""
+        vertex = self.vertices[key]
+        one = vertex.sum or vertex.others
+        if vertex.which is None or len(one) != 1 or (vertex.sum and vertex.others):
+            return False
+        whole = {key: FACTOR_ONE}
+        readers = [self.vertices[reader] for reader in self.readers[key]]
+        if any(r.which is None or any(side and side not in (one, whole) for side in r.sums()) for r in readers):
+            return False
+        # Both selections pick the same tangent or zero, so one truth, the nested selection, describes each reader.
+        sides = (self.graph.const(bool(side)) for side in vertex.sums())
+        taken = self.graph.select(vertex.which, *sides)
+        for reader in readers:
+            assert reader.which is not None
+            on = (taken if side == whole else self.graph.const(bool(side)) for side in reader.sums())
+            reader.which, reader.sum, reader.others = self.graph.select(reader.which, *on), {}, one
+        (x,) = one
+        self.readers[x] |= self.readers.pop(key)
+        self.readers[x].discard(key)
+        del self.vertices[key]
+        return True
+
+    def _replace_by_sum(self, key: int, decided: Sum) -> None:
+        """Replace a vertex by a plain sum and update the readers of its former operands."""
+        old = self.vertices[key]
+        self.vertices[key] = Vertex(decided)
+        for x in {x for sum in old.sums() for x in sum} - set(decided):
+            self.readers[x].discard(key)
+
+    def _eliminate(self, key: int) -> None:
+        """Remove a vertex: substitute its sum into each reader."""
+        inner = self.vertices[key]
+        for reader in self.readers.pop(key):
+            vertex = self.vertices[reader]
+            if key in vertex.sum:
+                vertex.sum = self.algebra.within(vertex.sum, key, inner.sum)
+            if key in vertex.others:
+                vertex.others = self.algebra.within(vertex.others, key, inner.sum)
+            # Terms may cancel in the merged sum, so operands are added to or removed from the reader lists.
+            now = {x for sum in vertex.sums() for x in sum}
+            for x in inner.sum:
+                (self.readers[x].add if x in now else self.readers[x].discard)(reader)
+        del self.vertices[key]
+        for x in inner.sum:
+            self.readers[x].discard(key)

@@ -1,0 +1,279 @@
+"""Forward-mode derivatives of functions of one lane: one program of the values and several tangents of each number.
+
+The program comes from `jax.jvp`, traced with one tangent for every array that could have one. Reachability in its graph
+then shows which arrays have nonzero tangents: the seeded ones, and everything they reach from step to step. Only these
+tangents are repeated, as often as requested. All other tangents are zero, and so are their results.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax
+import jax.extend.core as jex
+
+from diffabs.compiler.autodiff.replicate import dependents, replicate_nodes, tangent_copy
+from diffabs.compiler.ir import Graph, Node, UpdateLevel, is_real, live_nodes
+from diffabs.compiler.program import RUNNING_FUNCTION, InputPlace, ScalarProgram, check_size, lower_functions
+from diffabs.compiler.trace import TracedFunction, TracedFunctions
+from diffabs.core.types import PyTree
+
+INPUT_LEVELS = (UpdateLevel.UNIFORM, UpdateLevel.LANE, UpdateLevel.STEP)
+TangentArrays = dict[UpdateLevel, tuple[int, ...]]  # numbers of the arrays with tangents, by level
+
+
+class ArrayKey(NamedTuple):
+    """The identity of an array or of its tangents.
+
+    Attributes:
+        level: Level of the array when the functions were traced.
+        number: Index of the array in that level.
+        tangent: True if the key means the array's tangents.
+    """
+
+    level: UpdateLevel
+    number: int
+    tangent: bool
+
+
+class DerivativeProgram(NamedTuple):
+    """A program with one tangent direction. In each level, the tangents of the arrays follow the arrays.
+
+    Attributes:
+        program: Operations and results.
+        differentiable: Indices of the arrays that have a tangent in the program, by level.
+        moved_arrays: Indices of the arrays whose tangents are repeated, by level. In the carry these can be nonzero and
+            influence an output that is needed. In the other levels they are the seeded ones.
+    """
+
+    program: ScalarProgram
+    differentiable: TangentArrays
+    moved_arrays: TangentArrays
+
+
+def differentiate_functions(
+    functions: TracedFunctions, seeded: TangentArrays, outputs_needed: Iterable[int] | None = None
+) -> DerivativeProgram:
+    """Return the program of the functions' values and one tangent direction.
+
+    Args:
+        functions: Traced functions.
+        seeded: Indices of the arrays that have nonzero tangents at the start, by level.
+        outputs_needed: Indices of the carry's arrays whose tangents matter at the end, None for all.
+
+    Raises:
+        Unsupported: As in `lower_functions`, for the derivative.
+    """
+    differentiable = seeded | {
+        UpdateLevel.STEP: tuple(i for i, x in enumerate(functions.types[UpdateLevel.STEP]) if is_real(x.dtype))
+    }
+    program = lower_functions(_jvp_functions(functions, differentiable))
+    reached = _reached_arrays(program, functions, differentiable, seeded)
+    if outputs_needed is not None:
+        needed = _needed_arrays(program, functions, differentiable, set(outputs_needed))
+        # A tangent that no requested result needs is set to zero and costs nothing.
+        reached = tuple(i for i in reached if i in needed)
+    return DerivativeProgram(program, differentiable, seeded | {UpdateLevel.STEP: reached})
+
+
+def lower_without_tangents(functions: TracedFunctions) -> DerivativeProgram:
+    """Return the plain program of the functions, as a derivative program without tangents.
+
+    Args:
+        functions: Traced functions.
+
+    Raises:
+        Unsupported: As in `lower_functions`.
+    """
+    none: TangentArrays = dict.fromkeys(INPUT_LEVELS, ())
+    return DerivativeProgram(lower_functions(functions), none, none)
+
+
+def arrange_arrays(
+    functions: TracedFunctions, moved_arrays: TangentArrays, per_lane_uniforms: frozenset[int]
+) -> dict[UpdateLevel, list[ArrayKey]]:
+    """Return the keys of a program's arrays by level, in the order of its arguments: values, then tangents.
+
+    A uniform array with a value per lane stands in the level of the lanes.
+
+    Args:
+        functions: Traced functions.
+        moved_arrays: Indices of the arrays that have tangents, by level.
+        per_lane_uniforms: Indices of the uniform arrays that vmap has given a value per lane.
+    """
+    found: dict[UpdateLevel, list[ArrayKey]] = {level: [] for level in INPUT_LEVELS}
+    for tangent in (False, True):
+        for level in INPUT_LEVELS:
+            for i in moved_arrays[level] if tangent else range(len(functions.types[level])):
+                moved = level == UpdateLevel.UNIFORM and i in per_lane_uniforms
+                found[UpdateLevel.LANE if moved else level].append(ArrayKey(level, i, tangent))
+    return found
+
+
+def replicate_tangents(
+    functions: TracedFunctions, one: DerivativeProgram, many: int, per_lane_uniforms: frozenset[int] = frozenset()
+) -> ScalarProgram:
+    """Return the program with several tangent directions; an array's tangents have the shape (many, ...).
+
+    Args:
+        functions: Traced functions.
+        one: Program with one tangent direction.
+        many: Number of tangent directions.
+        per_lane_uniforms: Indices of the uniform arrays that vmap has given a value per lane.
+
+    Raises:
+        Unsupported: There are too many operations.
+    """
+    graph, old = Graph(), one.program
+    inputs: dict[InputPlace, Node] = {}
+    given: dict[int, list[Node]] = {}
+    sizes: dict[UpdateLevel, list[int]] = {level: [] for level in INPUT_LEVELS}
+    for level, keys in arrange_arrays(functions, one.moved_arrays, per_lane_uniforms).items():
+        for array, key in enumerate(keys):
+            number = _number(functions, one, key)
+            size, copies = old.sizes[key.level][number], many if key.tangent else 1
+            for k in range(copies):
+                for entry in range(size):
+                    node, place = (
+                        old.inputs[InputPlace(key.level, number, entry)],
+                        InputPlace(level, array, k * size + entry),
+                    )
+                    # A uniform array that is now an array of lanes changes its level here, not the functions.
+                    inputs[place] = graph.input(node.dtype, level, place)
+                    given.setdefault(node.id, []).append(inputs[place])
+            sizes[level].append(size * copies)
+    # In each level the tangents follow the values, so their array numbers start at the number of values.
+    slopes = {node.id for place, node in old.inputs.items() if place.array >= len(functions.types[place.level])}
+    # The results of each function, array by array: nodes of the program of one tangent, and whether they are tangents.
+    ends: dict[str, list[tuple[list[Node], bool]]] = {}
+    for name, nodes in old.results.items():
+        if name == RUNNING_FUNCTION:
+            ends[name] = [(nodes, False)]
+            continue
+        arrays = _arrays(functions, one, name)
+        moving = [
+            _number(functions, one, ArrayKey(UpdateLevel.STEP, i, True)) for i in one.moved_arrays[UpdateLevel.STEP]
+        ]
+        values = arrays[: len(functions.types[UpdateLevel.STEP])]
+        ends[name] = [(x, False) for x in values] + [(arrays[i], True) for i in moving]
+    roots = [node for arrays in ends.values() for nodes, _ in arrays for node in nodes]
+    new = replicate_nodes(graph, roots, given, slopes, (many, old.dtype))
+    results = {
+        name: [
+            tangent_copy(new[x.id], k) for nodes, moves in arrays for k in range(many if moves else 1) for x in nodes
+        ]
+        for name, arrays in ends.items()
+    }
+    return check_size(ScalarProgram(inputs, results, functions.uniform, sizes, old.dtype, many), len(graph.nodes))
+
+
+def _number(functions: TracedFunctions, one: DerivativeProgram, key: ArrayKey) -> int:
+    """Return the number of an array in the program with one tangent."""
+    first = len(functions.types[key.level])
+    return first + one.differentiable[key.level].index(key.number) if key.tangent else key.number
+
+
+def _arrays(functions: TracedFunctions, one: DerivativeProgram, name: str) -> list[list[Node]]:
+    """Return the results of a function that updates the carry, array by array."""
+    rest = iter(one.program.results[name])
+    return [[next(rest) for _ in range(size)] for size in one.program.sizes[UpdateLevel.STEP]]
+
+
+def _reached_arrays(
+    program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays, seeded: TangentArrays
+) -> tuple[int, ...]:
+    """Return the arrays of the carry whose tangents can be nonzero after any number of steps."""
+    one, ends = (
+        DerivativeProgram(program, differentiable, differentiable),
+        _tangent_results(program, functions, differentiable),
+    )
+    nodes = live_nodes([node for nodes in ends.values() for node in nodes])
+    # A fixed point: arrays that one step reaches may reach more arrays in the next.
+    moved_arrays = seeded
+    while True:
+        starts = {
+            (level, _number(functions, one, ArrayKey(level, i, True)))
+            for level in INPUT_LEVELS
+            for i in moved_arrays[level]
+        }
+        found = dependents(nodes, {node.id for p, node in program.inputs.items() if (p.level, p.array) in starts})
+        reached = tuple(
+            i for i, nodes in ends.items() if i in moved_arrays[UpdateLevel.STEP] or any(x.id in found for x in nodes)
+        )
+        if reached == moved_arrays[UpdateLevel.STEP]:
+            return reached
+        moved_arrays = moved_arrays | {UpdateLevel.STEP: reached}
+
+
+def _needed_arrays(
+    program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays, outputs_needed: set[int]
+) -> set[int]:
+    """Return the arrays of the carry whose tangents influence the requested ones after any number of steps."""
+    ends, found = _tangent_results(program, functions, differentiable), set(outputs_needed)
+    first = len(functions.types[UpdateLevel.STEP])
+    numbers = {first + at: i for at, i in enumerate(differentiable[UpdateLevel.STEP])}
+    left = [i for i in outputs_needed if i in ends]
+    while left:
+        read = [n.attr for n in live_nodes(ends[left.pop()]) if n.op == "input" and n.attr.level == UpdateLevel.STEP]
+        new = {numbers[place.array] for place in read if place.array >= first} - found
+        found |= new
+        left += new
+    return found
+
+
+def _tangent_results(
+    program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays
+) -> dict[int, list[Node]]:
+    """Return, for each differentiable array of the carry, the tangents that all functions assign to it."""
+    one = DerivativeProgram(program, differentiable, differentiable)
+    arrays = [_arrays(functions, one, name) for name in program.results if name != RUNNING_FUNCTION]
+    return {
+        i: [node for each in arrays for node in each[_number(functions, one, ArrayKey(UpdateLevel.STEP, i, True))]]
+        for i in differentiable[UpdateLevel.STEP]
+    }
+
+
+def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) -> TracedFunctions:
+    """Return the functions of values and tangents; each level has its arrays, then tangents of differentiable ones."""
+    types = {level: [*all, *(all[i] for i in differentiable[level])] for level, all in functions.types.items()}
+    uniform = len(types[UpdateLevel.UNIFORM])
+    each: dict[str, TracedFunction] = {}
+    for name, function in functions.each.items():
+        push = _jvp_function(functions, function, differentiable, name != RUNNING_FUNCTION)
+        closed = jax.make_jaxpr(push)(*(x for level in INPUT_LEVELS for x in types[level]))
+        shared, rest = closed.jaxpr.invars[:uniform], closed.jaxpr.invars[uniform:]
+        # The uniform inputs become constvars, as in a traced function: `lower_functions` passes them by number.
+        jaxpr = closed.jaxpr.replace(constvars=[*shared, *closed.jaxpr.constvars], invars=rest)
+        each[name] = TracedFunction(jaxpr, tuple(range(uniform)), tuple(closed.consts))
+    return TracedFunctions(each, types, functions.uniform)
+
+
+def _jvp_function(
+    functions: TracedFunctions, function: TracedFunction, differentiable: TangentArrays, moves: bool
+) -> PyTree:
+    """Return a function of values and tangents that computes values and tangents; without `moves`, values alone."""
+
+    def call(arrays: dict[UpdateLevel, list[PyTree]]) -> list[PyTree]:
+        shared = [*(arrays[UpdateLevel.UNIFORM][i] for i in function.closed), *function.constants]
+        closed = jex.ClosedJaxpr(function.jaxpr, shared)
+        return jex.jaxpr_as_fun(closed)(*arrays[UpdateLevel.LANE], *arrays[UpdateLevel.STEP])
+
+    def push(*given: PyTree) -> list[PyTree]:
+        rest, arrays, slopes = iter(given), {}, {}
+        for level in INPUT_LEVELS:
+            arrays[level] = [next(rest) for _ in functions.types[level]]
+            slopes[level] = [next(rest) for _ in differentiable[level]]
+        if not moves:
+            return call(arrays)
+
+        def call_at(moving: dict[UpdateLevel, list[PyTree]]) -> list[PyTree]:
+            now = {level: list(xs) for level, xs in arrays.items()}
+            for level in INPUT_LEVELS:
+                for i, x in zip(differentiable[level], moving[level], strict=True):
+                    now[level][i] = x
+            return call(now)
+
+        moving = {level: [arrays[level][i] for i in differentiable[level]] for level in INPUT_LEVELS}
+        values, tangents = jax.jvp(call_at, (moving,), (slopes,))
+        return [*values, *(tangents[i] for i in differentiable[UpdateLevel.STEP])]
+
+    return push

@@ -1,0 +1,194 @@
+"""Tangents as linear combinations of other tangents, with factors that are the same for all tangents.
+
+A factor is a number of the program, such as a partial derivative. It is computed once for all tangents.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from diffabs.compiler.ir import Graph, Node, UpdateLevel
+
+TANGENT_OPERANDS = {"add": (0, 1), "sub": (0, 1), "select": (1, 2)}  # operands that must be tangents or zero
+
+
+class Factor(NamedTuple):
+    """A signed factor of a tangent.
+
+    Attributes:
+        negative: True if the factor is -`number`.
+        number: Node of the factor, None for 1.
+    """
+
+    negative: bool
+    number: Node | None
+
+
+FACTOR_ONE = Factor(False, None)
+Sum = dict[int, Factor]  # factors by the id of their tangents
+
+
+class Vertex:
+    """A tangent: a sum of other tangents, a selection between two sums, or a nonlinear operation.
+
+    Attributes:
+        sum: Factors by the id of their tangents; in a selection, the sum where `which` is false.
+        which: Boolean node that selects; None without a selection.
+        others: The sum where `which` is true.
+        reads: Ids of the tangents that a nonlinear operation reads; empty for a sum or a selection.
+    """
+
+    __slots__ = ("others", "reads", "sum", "which")
+
+    def __init__(self, sum: Sum, which: Node | None = None, others: Sum | None = None, reads: tuple[int, ...] = ()):
+        """Store a tangent.
+
+        Args:
+            sum: Factors by the id of their tangents.
+            which: Truth of a selection, None without one.
+            others: The sum where `which` is true.
+            reads: Ids of the tangents that a nonlinear operation reads.
+        """
+        self.sum, self.which, self.others, self.reads = sum, which, others or {}, reads
+
+    def sums(self) -> tuple[Sum, ...]:
+        """Return the sum, or both sums of a selection."""
+        return (self.sum,) if self.which is None else (self.sum, self.others)
+
+
+class Algebra:
+    """Operations on sums of tangents.
+
+    Attributes:
+        graph: Graph that the factors are nodes of.
+        dtype: Type of the factors.
+    """
+
+    def __init__(self, graph: Graph, dtype: np.dtype):
+        """Store the graph, which grows with new factors.
+
+        Args:
+            graph: Graph that the factors are nodes of.
+            dtype: Type of the factors.
+        """
+        self.graph, self.dtype = graph, dtype
+
+    def vertex(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> Vertex:
+        """Return an operation on tangents as a sum or selection of its operands, or as a nonlinear operation.
+
+        Args:
+            node: Operation in the graph of one tangent.
+            moves: Function that returns True if a node is a nonzero tangent.
+            value: Function that returns the factor graph's node for any other number.
+        """
+        on, args = [moves(x) for x in node.args], node.args
+
+        def alone(i: int, negative: bool = False) -> Sum:
+            return {args[i].id: Factor(negative, None)} if on[i] else {}
+
+        # A tangent plus a number other than 0 is no linear combination, so it remains as an operation of its own.
+        linear = all(on[i] or _is_zero_tangent(value(args[i])) for i in TANGENT_OPERANDS.get(node.op, ()))
+        match node.op:
+            case "add" | "sub" if linear:
+                return Vertex(self._plus(alone(0), alone(1, node.op == "sub")))
+            case "neg":
+                return Vertex(alone(0, True))
+            case "mul" if not all(on):
+                x, y = args if on[0] else args[::-1]
+                return Vertex({x.id: _factor(value(y))})
+            # A division by a factor becomes a product: the inverse is computed once for all tangents.
+            case "div" if on == [True, False]:
+                inverse = self.graph.op("div", self.graph.const(1, node.dtype), value(args[1]))
+                return Vertex({args[0].id: _factor(inverse)})
+            case "select" if linear and not on[0]:
+                return Vertex(alone(1), value(args[0]), alone(2))
+        return Vertex({}, reads=tuple(x.id for x, on in zip(args, on, strict=True) if on))
+
+    def _number(self, factor: Factor) -> Node:
+        return self.graph.const(1, self.dtype) if factor.number is None else factor.number
+
+    def _times(self, x: Factor, y: Factor) -> Factor:
+        """Return the product of two factors."""
+        negative = x.negative != y.negative
+        if x.number is None or y.number is None:
+            return Factor(negative, x.number or y.number)
+        for a, b in ((x.number, y.number), (y.number, x.number)):
+            # The product moves into the branch of the selection, so that its zero remains an exact zero.
+            if a.op == "select" and a.args[1].is_number(0):
+                return Factor(negative, self.graph.select(a.args[0], a.args[1], self.graph.op("mul", b, a.args[2])))
+        return Factor(negative, self.graph.op("mul", x.number, y.number))
+
+    def _plus(self, sum: Sum, more: Sum) -> Sum:
+        """Return the sum of two sums."""
+        found = dict(sum)
+        for key, new in more.items():
+            old = found.pop(key, None)
+            if old is None:
+                found[key] = new
+            elif old.negative == new.negative:
+                found[key] = Factor(old.negative, self.graph.op("add", self._number(old), self._number(new)))
+            # Equal terms of opposite sign cancel: the tangent leaves the sum.
+            elif old.number is not new.number:
+                first, second = (new, old) if old.negative else (old, new)
+                found[key] = Factor(False, self.graph.op("sub", self._number(first), self._number(second)))
+        return found
+
+    def within(self, sum: Sum, key: int, inner: Sum) -> Sum:
+        """Return `sum` with the tangent `key` replaced by the sum `inner`, times its factor."""
+        factor = sum[key]
+        more = {x: self._times(factor, one) for x, one in inner.items()}
+        return self._plus({x: one for x, one in sum.items() if x != key}, more)
+
+    def decide(self, vertex: Vertex) -> Sum:
+        """Return the selection of `vertex` as one sum whose factors are selections."""
+        assert vertex.which is not None
+        found = {}
+        for x in [*vertex.sum, *(x for x in vertex.others if x not in vertex.sum)]:
+            no, yes = vertex.sum.get(x), vertex.others.get(x)
+            if no == yes:
+                found[x] = no
+                continue
+            # A sign that both branches share stays outside of the selection.
+            signs = {one.negative for one in (no, yes) if one is not None}
+            sides = []
+            for one in (no, yes):
+                number = self.graph.const(0, self.dtype) if one is None else self._number(one)
+                turned = one is not None and len(signs) > 1 and one.negative
+                sides.append(self.graph.op("neg", number) if turned else number)
+            found[x] = Factor(len(signs) == 1 and signs.pop(), self.graph.select(vertex.which, *sides))
+        return found
+
+
+def _factor(node: Node) -> Factor:
+    if node.op == "neg":
+        return Factor(True, node.args[0])
+    return Factor(node.is_number(-1), None) if node.is_number(1) or node.is_number(-1) else Factor(False, node)
+
+
+def _is_zero_tangent(node: Node) -> bool:
+    """Return whether a number is a zero tangent: the constant 0, a product with it, or a sum of zeros."""
+    if node.op in ("mul", "neg", "div"):
+        return any(_is_zero_tangent(x) for x in node.args[: 1 if node.op == "div" else None])
+    return node.is_number(0) or (node.op in ("add", "sub") and all(map(_is_zero_tangent, node.args)))
+
+
+def changes_in_step(factor: Factor) -> bool:
+    """Return whether a factor changes with each step.
+
+    Args:
+        factor: Factor of a tangent.
+    """
+    return factor.number is not None and factor.number.level == UpdateLevel.STEP
+
+
+def count_terms(sum: Sum) -> int:
+    """Return the operations that a sum needs in each tangent direction.
+
+    A product with the following addition counts as one (FMA). A copy or an empty sum counts as 0.
+
+    Args:
+        sum: Sum of tangents.
+    """
+    alone = len(sum) == 1 and next(iter(sum.values())) == FACTOR_ONE
+    return 0 if alone or not sum else max(1, len(sum) - any(one == FACTOR_ONE for one in sum.values()))

@@ -1,0 +1,1 @@
+"""Back ends: the text of a program in C++, CUDA C++ and C99."""

@@ -1,0 +1,173 @@
+"""C99 for operations on single numbers, shared by the exports of controllers and plants.
+
+An operation without a translation raises Unsupported with its name.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import numpy as np
+
+from diffabs.compiler.ir import Node, is_real
+from diffabs.compiler.lower.rules import Unsupported
+from diffabs.compiler.operations import OPERATIONS
+from diffabs.core.types import Scalar
+
+C_TYPES = {"int64": "int64_t", "uint64": "uint64_t", "int32": "int32_t", "uint32": "uint32_t", "bool": "bool"}
+FUNCTION = re.compile(r"(\w+)\{f\}")  # a function of the C library, in a template
+C_KEYWORDS_TEXT = (
+    "auto break case char const continue default do double else enum extern float for goto if inline int long "
+    "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
+    "bool true false"
+)
+C_KEYWORDS = set(C_KEYWORDS_TEXT.split())
+C_FUNCTIONS = {name for row in OPERATIONS.values() for name in FUNCTION.findall(row.c99 or "")}
+TAKEN = {*C_FUNCTIONS, "s", "p", "in", "i", "m", "t", "h"}  # names that a variable must not hide
+
+
+class Words:
+    """A writer of C99 for the nodes of a graph.
+
+    Attributes:
+        real: C type of the real numbers.
+        place: Function (where, path) -> C expression of an input of the graph.
+        single: Whether real numbers have single precision.
+    """
+
+    def __init__(self, real: str, place: Callable[[str, str], str], single: bool = False):
+        """Create a writer without variables.
+
+        Args:
+            real: C type of the real numbers.
+            place: Function (where, path) -> C expression of an input of the graph.
+            single: Whether real numbers have single precision.
+        """
+        self.real, self.place, self.single = real, place, single
+        self._names: dict[int, str] = {}
+        self._taken = {*TAKEN, real}
+
+    def operations(self, nodes: Sequence[Node], indent: str) -> Iterator[str]:
+        """Yield a C declaration for each of the `nodes`, which come operands first; every line begins with `indent`.
+
+        Constants and inputs need none.
+
+        Raises:
+            Unsupported: An operation has no translation to C.
+        """
+        for node in nodes:
+            if node.op in ("const", "input"):
+                continue
+            if node.op == "table":
+                rows = ", ".join(self.name(x) for x in node.args[1:])
+                yield f"{indent}const {self.type(node)} {self.name(node)}_table[] = {{{rows}}};"
+            yield f"{indent}const {self.type(node)} {self.name(node)} = {self._expression(node)};"
+
+    def type(self, node: Node) -> str:
+        """Return the C type of the number `node`."""
+        return self.real if is_real(node.dtype) else C_TYPES[node.dtype.name]
+
+    def name(self, node: Node) -> str:
+        """Return the C expression of `node`: a literal, a variable, or the place of an input."""
+        if node.op == "const":
+            return self._literal(node)
+        if node.op == "input":
+            return self.place(*node.attr)
+        if node.id not in self._names:
+            self._names[node.id] = fresh_name(identifier(node.label) or node.op, self._taken)
+        return self._names[node.id]
+
+    def _literal(self, node: Node) -> str:
+        """Return the C literal of a constant."""
+        x = node.attr
+        if node.dtype.kind == "b":
+            return "true" if x else "false"
+        return self.literal(x) if is_real(node.dtype) else f"(({C_TYPES[node.dtype.name]}){int(x)})"
+
+    def literal(self, x: Scalar) -> str:
+        """Return the C literal of the real number `x` (a NumPy scalar): the shortest decimal that reads back as `x`."""
+        if np.isnan(x):
+            return "NAN"
+        if np.isinf(x):
+            return "(-INFINITY)" if x < 0 else "INFINITY"
+        short = 1e-4 <= abs(x) < 1e7 or x == 0
+        text = np.format_float_positional(x, trim="0") if short else np.format_float_scientific(x, trim="0")
+        text += "f" if self.single else ""
+        # Parentheses, so that a - (-1.0) does not become a--1.0. signbit, so that -0.0 keeps its sign.
+        return f"({text})" if np.signbit(x) else text
+
+    def _expression(self, node: Node) -> str:
+        args, real = [self.name(x) for x in node.args], is_real(node.dtype)
+        template = OPERATIONS[node.op].c99 if node.op in OPERATIONS else None
+        match node.op:
+            # isnan returns an int: any nonzero value means NaN.
+            case "ne" if node.args[0] is node.args[1]:
+                return f"isnan({args[0]}) != 0"
+            case "not" if node.dtype.kind == "b":
+                return f"!{args[0]}"
+            case "rem" if not real:
+                return f"{args[0]} % {args[1]}"
+            case "select" | "gate":
+                return f"{args[0]} ? {args[2]} : {args[1]}"
+            case "any":
+                return args[0]
+            case "convert":
+                return f"({self.type(node)}){args[0]}"
+            case "table":
+                return f"{self.name(node)}_table[{args[0]}]"
+        if template is None or ("{f}" in template and not real):
+            raise Unsupported(node.op, "there is none")
+        return template.format(*args, f="f" if self.single else "")
+
+
+def is_name(name: str) -> bool:
+    """Return whether a text can name a function in C: an ASCII letter, then letters, digits and _, and no keyword.
+
+    Args:
+        name: Text to test.
+    """
+    return bool(re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII)) and name not in C_KEYWORDS
+
+
+def identifier(path: str) -> str:
+    """Return a path as an identifier of C; empty if the path has no ASCII letter or digit.
+
+    Args:
+        path: Text such as a path in a pytree.
+    """
+    name = re.sub(r"\W+", "_", path, flags=re.ASCII).strip("_")
+    name = f"x{name}" if name[:1].isdigit() else name
+    return f"{name}_" if name in C_KEYWORDS else name
+
+
+def identifiers(paths: Iterable[str]) -> dict[str, str]:
+    """Return a dictionary from each path to an identifier of C; all identifiers differ.
+
+    Args:
+        paths: Texts such as paths in a pytree.
+    """
+    taken: set[str] = set()
+    return {path: fresh_name(identifier(path) or "x", taken) for path in paths}
+
+
+def fresh_name(name: str, taken: set[str]) -> str:
+    """Return `name`, or `name` with a number such as name_2 if it is in `taken`, and add the result to `taken`.
+
+    Args:
+        name: Preferred name.
+        taken: Names in use; the function adds the new name.
+    """
+    number, new = 2, name
+    while new in taken:
+        number, new = number + 1, f"{name}_{number}"
+    taken.add(new)
+    return new
+
+
+def comment_text(text: str) -> str:
+    """Return a text that is safe in a comment of any language: one line, with `_` for each unsafe character.
+
+    Args:
+        text: Text of a comment.
+    """
+    # The alphabet lacks * and the backslash: no block comment can begin or end, and no line can continue.
+    return re.sub(r"[^A-Za-z0-9 .,:;=+_/()\[\]<>'^%&|-]", "_", " ".join(text.split()))

@@ -1,0 +1,345 @@
+"""An expression graph of single numbers, without duplicates: equal operations on equal operands are one node.
+
+A node's level says how often its value changes. Constants are folded. Uniform values are computed once a launch, values
+of a lane once when it starts, and the rest in every step.
+"""
+
+import enum
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+from jax.typing import DTypeLike
+
+from diffabs.compiler.operations import MIRRORED, NEGATED, OPERATIONS
+from diffabs.core.types import PyTree, Scalar
+
+Array = Any  # NumPy array of nodes
+
+
+class UpdateLevel(enum.IntEnum):
+    """The rate at which a value changes: KNOWN never, UNIFORM with each launch, LANE with each lane, STEP with each
+    step.
+    """
+
+    KNOWN, UNIFORM, LANE, STEP = range(4)
+
+
+class Node:
+    """A number: an operation on other numbers.
+
+    Attributes:
+        id: Index of the node in its graph; operands have smaller ones.
+        op: Name of the operation; "const" for a constant, "input" for a number from outside.
+        args: Operands.
+        dtype: NumPy type of the number.
+        attr: Data of the operation: a constant's value, an input's place, a conditional's `Gate`.
+        level: Rate at which the value changes.
+        label: Variable name in the source, for graphs that record it, else empty.
+    """
+
+    __slots__ = ("args", "attr", "dtype", "id", "label", "level", "op")
+
+    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: PyTree, level: UpdateLevel):
+        """Store the fields. Only a `Graph` creates nodes."""
+        self.id, self.op, self.args, self.dtype, self.attr, self.level = id, op, args, dtype, attr, level
+        self.label = ""
+
+    def is_number(self, value: float) -> bool:
+        """Return whether the node is a constant equal to `value`."""
+        return self.op == "const" and bool(self.attr == value)
+
+
+class Gate(NamedTuple):
+    """The identity of a conditional, shared by the selections of all its results.
+
+    Attributes:
+        number: Index of the conditional in its graph.
+        any: True if the condition is a marker of `Graph.any`. A constant result of the branch not taken is then a
+            placeholder, which no lane uses.
+    """
+
+    number: int
+    any: bool
+
+
+class Graph:
+    """A list of nodes in topological order, operands first; equal nodes are one."""
+
+    def __init__(self) -> None:
+        """Create an empty graph."""
+        self.nodes: list[Node] = []
+        self._known: dict[PyTree, Node] = {}
+        self._gates = 0
+
+    def begins(self, eqn: JaxprEqn) -> None:
+        """Note that the following nodes come from the JAX equation `eqn`; a subclass may record labels."""
+
+    def _make(
+        self, op: str, args: tuple[Node, ...], dtype: DTypeLike, attr: PyTree = None, level: UpdateLevel | None = None
+    ) -> Node:
+        dtype = np.dtype(dtype)
+        key = (op, tuple(arg.id for arg in args), dtype, attr)
+        if key not in self._known:
+            most = max((UpdateLevel.UNIFORM, *(arg.level for arg in args))) if level is None else level
+            self.nodes.append(Node(len(self.nodes), op, args, dtype, attr, most))
+            self._known[key] = self.nodes[-1]
+        return self._known[key]
+
+    def const(self, value: Scalar, dtype: DTypeLike | None = None) -> Node:
+        """Return the constant `value` of type `dtype`."""
+        x = np.asarray(value, dtype)[()]
+        # The key has the bytes, because 0 == -0 and NaN != NaN.
+        key = ("const", x.dtype, x.tobytes())
+        if key not in self._known:
+            self.nodes.append(Node(len(self.nodes), "const", (), x.dtype, x, UpdateLevel.KNOWN))
+            self._known[key] = self.nodes[-1]
+        return self._known[key]
+
+    def input(self, dtype: DTypeLike, level: UpdateLevel, place: Scalar) -> Node:
+        """Return a number from outside: type `dtype`, rate of change `level`, origin `place`."""
+        return self._make("input", (), dtype, place, level)
+
+    def op(self, name: str, *args: Node) -> Node:
+        """Return the node of the operation `name` on numbers `args` of one type, folded and simplified where possible.
+
+        `name` is a row of `OPERATIONS`, or "gt" or "ge". A comparison gives a boolean.
+        """
+        if name in MIRRORED:
+            name, args = MIRRORED[name], args[::-1]
+        operation = OPERATIONS[name]
+        dtype = np.dtype(bool) if operation.compares else args[0].dtype
+        # Folding may overflow or give NaN, as the operation itself does, so NumPy's warnings are off.
+        if operation.fold and all(arg.op == "const" for arg in args):
+            with np.errstate(all="ignore"):
+                return self.const(operation.fold(*(arg.attr for arg in args)), dtype)
+        found = _SIMPLIFICATIONS[name](self, *args) if name in _SIMPLIFICATIONS else None
+        if found is not None:
+            return found
+        # One order of operands for commutative operations, so that x + y and y + x are one node.
+        if operation.symmetric and args[0].id > args[1].id:
+            args = args[::-1]
+        return self._make(name, args, dtype)
+
+    def select(self, which: Node, no: Node, yes: Node) -> Node:
+        """Return `yes` where `which` is true, else `no`."""
+        if which.op == "const" or no is yes:
+            return yes if no is yes or which.attr else no
+        if which.op == "not":
+            return self.select(which.args[0], yes, no)
+        if no.dtype == bool:
+            return self._select_boolean(which, no, yes)
+        # A nested selection on the same truth has only one reachable branch.
+        yes = yes.args[2] if yes.op == "select" and yes.args[0] is which else yes
+        no = no.args[1] if no.op == "select" and no.args[0] is which else no
+        if no is yes:
+            return yes
+        # `lower` and `higher` are the processor's min and max. They return the second operand for NaN, as here.
+        if which.op == "lt" and {yes, no} == set(which.args):
+            return self._make("lower" if yes is which.args[0] else "higher", (yes, no), yes.dtype)
+        return self._make("select", (which, no, yes), yes.dtype)
+
+    def _select_boolean(self, which: Node, no: Node, yes: Node) -> Node:
+        """Return a selection between truths, as logical operations."""
+        if yes.op == "const":
+            return self.op("or", which, no) if yes.attr else self.op("and", self.op("not", which), no)
+        if no.op == "const":
+            return self.op("or", self.op("not", which), yes) if no.attr else self.op("and", which, yes)
+        return self.op("or", self.op("and", which, yes), self.op("and", self.op("not", which), no))
+
+    def gate(self, which: Node, no: Iterable[Node], yes: Iterable[Node]) -> list[Node]:
+        """Return selections that a back end may compute as a conditional jump, one for each result.
+
+        `no` and `yes` are the results of the two branches. `which` is a boolean of a lane, or the marker that `any`
+        returns for one.
+        """
+        pairs = list(zip(no, yes, strict=True))
+        asked = which.args[0] if which.op == "any" else which
+        if asked.op == "const":
+            return [b if asked.attr else a for a, b in pairs]
+        gate, self._gates = Gate(self._gates, which.op == "any"), self._gates + 1
+        return [b if a is b else self._gate(gate, asked, a, b) for a, b in pairs]
+
+    def _gate(self, gate: Gate, which: Node, no: Node, yes: Node) -> Node:
+        # A constant in the other branch is a placeholder: only lanes with a true `which` use the result.
+        if gate.any and no.op == "const":
+            return yes
+        return self._make("gate", (which, no, yes), yes.dtype, gate)
+
+    def any(self, which: Node) -> Node:
+        """Return a marker of the condition "`which` is true in some lane"; its value in a lane is `which` itself."""
+        return which if which.op in ("const", "any") else self._make("any", (which,), bool)
+
+    def convert(self, x: Node, dtype: DTypeLike) -> Node:
+        """Return the number `x` converted to `dtype`; as a boolean, x != 0."""
+        dtype = np.dtype(dtype)
+        if x.dtype == dtype:
+            return x
+        if x.op == "const":
+            with np.errstate(all="ignore"):
+                return self.const(np.asarray(x.attr).astype(dtype)[()])
+        if dtype.kind == "b":
+            return self.op("ne", x, self.const(0, x.dtype))
+        return self._make("convert", (x,), dtype)
+
+    def bits(self, x: Node, dtype: DTypeLike) -> Node:
+        """Return the bits of `x`, read as a number of the type `dtype` of the same size."""
+        if x.dtype == np.dtype(dtype):
+            return x
+        return self.const(x.attr.view(dtype)) if x.op == "const" else self._make("bits", (x,), dtype)
+
+    def table(self, index: Node, column: tuple[Node, ...]) -> Node:
+        """Return the entry of `column` at a valid `index`; the column is the same for all lanes."""
+        return self._make("table", (index, *column), column[0].dtype)
+
+    def again(self, node: Node, args: list[Node]) -> Node:
+        """Return the operation of `node`, which may belong to another graph, on the operands `args` of this graph."""
+        match node.op:
+            case "const":
+                return self.const(node.attr)
+            case "convert" | "bits":
+                return (self.convert if node.op == "convert" else self.bits)(args[0], node.dtype)
+            case "table":
+                return self.table(args[0], tuple(args[1:]))
+            case "select" | "any":
+                return self.select(*args) if node.op == "select" else self.any(args[0])
+            case "gate":
+                return self._gate(node.attr, *args) if args[0].op != "const" and args[1] is not args[2] else args[2]
+        return self.op(node.op, *args)
+
+
+def is_real(dtype: DTypeLike) -> bool:
+    """Return whether a type is real (floating point).
+
+    Args:
+        dtype: NumPy type.
+    """
+    return np.issubdtype(dtype, np.floating)
+
+
+def live_nodes(roots: Sequence[Node]) -> list[Node]:
+    """Return the roots and all nodes that they depend on, without duplicates, operands first.
+
+    Args:
+        roots: Nodes.
+    """
+    found: dict[int, Node] = {}
+    left = list(roots)
+    while left:
+        node = left.pop()
+        if node.id not in found:
+            found[node.id] = node
+            left.extend(node.args)
+    # Node ids grow from operands to results, so sorting is a topological order.
+    return [found[i] for i in sorted(found)]
+
+
+# x + 0 becomes x although -0 + 0 is +0.
+def _add(graph: Graph, x: Node, y: Node) -> Node | None:
+    return y if x.is_number(0) else x if y.is_number(0) else None
+
+
+def _sub(graph: Graph, x: Node, y: Node) -> Node | None:
+    return x if y.is_number(0) else None
+
+
+# x*0 is not folded: it is NaN for an infinite x.
+def _mul(graph: Graph, x: Node, y: Node) -> Node | None:
+    for a, b in ((x, y), (y, x)):
+        if a.is_number(1):
+            return b
+        if a.is_number(-1):
+            return graph.op("neg", b)
+        # Two factors that are constant over the steps become one: fewer operations, with another rounding.
+        if is_real(x.dtype) and a.level < UpdateLevel.STEP and b.op == "mul" and b.level == UpdateLevel.STEP:
+            for c, rest in (b.args, b.args[::-1]):
+                if c.level < UpdateLevel.STEP:
+                    return graph.op("mul", graph.op("mul", a, c), rest)
+    return None
+
+
+def _div(graph: Graph, x: Node, y: Node) -> Node | None:
+    """Multiply by the inverse of a divisor that is constant over the steps: faster, with one rounding more."""
+    if y.is_number(1):
+        return x
+    if not is_real(x.dtype) or x.level < UpdateLevel.STEP or y.level == UpdateLevel.STEP:
+        return None
+    inverse = graph.op("div", graph.const(1, y.dtype), y)
+    # A subnormal or infinite inverse would lose digits.
+    if inverse.op == "const" and not np.finfo(y.dtype).tiny <= abs(inverse.attr) < np.inf:
+        return None
+    return graph.op("mul", x, inverse)
+
+
+def _and(graph: Graph, x: Node, y: Node) -> Node | None:
+    if x is y:
+        return x
+    for a, b in ((x, y), (y, x)):
+        if a.op == "const" and x.dtype == bool:
+            return b if a.attr else a
+        if a.is_number(0):
+            return a
+        if a.op == "not" and a.args[0] is b and x.dtype == bool:
+            return graph.const(False)
+    return None
+
+
+def _or(graph: Graph, x: Node, y: Node) -> Node | None:
+    if x is y:
+        return x
+    for a, b in ((x, y), (y, x)):
+        if a.op == "const" and x.dtype == bool:
+            return a if a.attr else b
+        if a.is_number(0):
+            return b
+        if a.op == "not" and a.args[0] is b and x.dtype == bool:
+            return graph.const(True)
+    return None
+
+
+def _xor(graph: Graph, x: Node, y: Node) -> Node | None:
+    return y if x.is_number(0) else x if y.is_number(0) else None
+
+
+def _not(graph: Graph, x: Node) -> Node | None:
+    if x.op == "not":
+        return x.args[0]
+    return graph.op(NEGATED[x.op], *x.args) if x.op in NEGATED else None
+
+
+def _ne(graph: Graph, x: Node, y: Node) -> Node | None:
+    """Simplify x != 0 for a truth that was converted to a number, and comparisons of a truth with a constant."""
+    for a, b in ((x, y), (y, x)):
+        if b.is_number(0) and a.op == "convert" and a.args[0].dtype == bool:
+            return a.args[0]
+        if x.dtype == bool and b.op == "const":
+            return graph.op("not", a) if b.attr else a
+    return None
+
+
+def _eq(graph: Graph, x: Node, y: Node) -> Node | None:
+    found = _ne(graph, x, y)
+    return None if found is None else graph.op("not", found)
+
+
+def _same_shift(graph: Graph, x: Node, y: Node) -> Node | None:
+    return x if y.is_number(0) else None
+
+
+_SIMPLIFICATIONS: dict[str, Callable[..., Node | None]] = {
+    "add": _add,
+    "sub": _sub,
+    "mul": _mul,
+    "div": _div,
+    "and": _and,
+    "or": _or,
+    "xor": _xor,
+    "not": _not,
+    "quotient": lambda graph, x, y: x if y.is_number(1) else None,
+    "neg": lambda graph, x: x.args[0] if x.op == "neg" else None,
+    "ne": _ne,
+    "eq": _eq,
+    "shift_left": _same_shift,
+    "shift_right_logical": _same_shift,
+}

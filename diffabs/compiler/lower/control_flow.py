@@ -1,0 +1,101 @@
+"""Lowering rules for programs within a program: calls, conditionals and loops of known length."""
+
+from typing import Any
+
+import jax
+import jax.extend.core as jex
+import numpy as np
+
+from diffabs.compiler.ir import Array, Graph
+from diffabs.compiler.lower.rules import (
+    Unsupported,
+    as_node_array,
+    inline_program,
+    lowering_rule,
+    map_entries,
+    scalar_array,
+)
+
+MAX_UNROLLED_STEPS = 64  # bound on the length of a scan, because its steps are unrolled
+
+
+@lowering_rule(
+    "jit pjit closed_call core_call remat remat2 checkpoint",
+    "jaxpr call_jaxpr name inline in_shardings out_shardings in_layouts out_layouts donated_invars ctx_mesh keep_unused"
+    " compiler_options_kvs prevent_cse differentiated policy",
+)
+@lowering_rule("custom_jvp_call", "call_jaxpr jvp_jaxpr_fun num_consts symbolic_zeros")
+@lowering_rule("custom_vjp_call", "call_jaxpr fwd_jaxpr_thunk bwd num_consts out_trees symbolic_zeros")
+def _call(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return inline_program(graph, eqn.params["call_jaxpr" if "call_jaxpr" in eqn.params else "jaxpr"], ins)
+
+
+@lowering_rule("custom_vmap_call", "call rule in_tree out_tree")
+def _custom_vmap_any(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """Lower a call with a custom rule for vmap, if that rule is `any` of a truth; raise Unsupported for other rules."""
+    call = eqn.params["call"].jaxpr
+    truth = len(ins) == 1 and eqn.invars[0].aval.dtype == bool and ins[0].ndim == 0
+    if not truth or call.eqns or call.invars != call.outvars or not _is_any_rule(eqn):
+        raise Unsupported("custom_vmap_call", "its rule for batches is not `any`")
+    return [scalar_array(graph.any(ins[0].item()))]
+
+
+def _is_any_rule(eqn: Any) -> bool:
+    """Return whether a custom rule for vmap computes `any` over the batch, by evaluation of three batches of two."""
+    told = jex.DebugInfo("kernel", "any", None, None)
+    body = jex.Jaxpr((), list(eqn.invars), list(eqn.outvars), [eqn], eqn.effects, told)
+    found = jax.vmap(lambda x: jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))(x)[0])
+    # The lowering may itself run under a trace. The test needs numbers.
+    with jax.ensure_compile_time_eval():
+        return all(bool(found(np.array(x)).all()) == any(x) for x in ([False, False], [False, True], [True, True]))
+
+
+@lowering_rule("cond", "branches")
+def _cond(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    which, rest, branches = ins[0].item(), ins[1:], eqn.params["branches"]
+    if which.op == "const":
+        # XLA clamps an index that is out of range.
+        return inline_program(graph, branches[int(np.clip(which.attr, 0, len(branches) - 1))], rest)
+    # A chain of conditionals: branch i replaces the result so far where the index is at least i.
+    taken = inline_program(graph, branches[0], rest)
+    for i, branch in enumerate(branches[1:], 1):
+        asked = graph.convert(which, bool)
+        if len(branches) > 2:
+            asked = graph.op("ge", which, graph.const(i, which.dtype))
+        other = inline_program(graph, branch, rest)
+        flat = [[node for array in arrays for node in array.flat] for arrays in (taken, other)]
+        gated = iter(graph.gate(asked, *flat))
+        taken = [map_entries(lambda _: next(gated), array) for array in taken]  # noqa: B023  used at once
+    return taken
+
+
+@lowering_rule("scan", "length reverse jaxpr num_consts num_carry linear unroll _split_transpose ft_in ft_out")
+def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    p = eqn.params
+    if p["length"] > MAX_UNROLLED_STEPS:
+        raise Unsupported("scan", f"of {p['length']} steps within a step; {MAX_UNROLLED_STEPS} are the most")
+    constants, many = _scan_input_counts(p, len(ins))
+    fixed, carry, rows = ins[:constants], ins[constants : constants + many], ins[constants + many :]
+    order = range(p["length"])[:: -1 if p["reverse"] else 1]
+    seen: dict[int, list[Array]] = {}
+    for i in order:
+        outs = inline_program(graph, p["jaxpr"], [*fixed, *carry, *(as_node_array(row[i]) for row in rows)])
+        carry, seen[i] = outs[:many], outs[many:]
+    # A reversed scan fills its outputs from the end, so they are sorted by index.
+    return [*carry, *(np.stack(column) for column in zip(*(seen[i] for i in sorted(seen)), strict=True))]
+
+
+def _scan_input_counts(params: Any, inputs: int) -> tuple[int, int]:
+    """Return how many inputs of a scan are constants and how many are carried.
+
+    Until JAX 0.10 these are numbers. Later versions store a structure with three groups of inputs, in their order.
+    """
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    try:
+        groups = [list(group) for group in params["ft_in"].update(range(inputs)).unpack()]
+    except (AssertionError, AttributeError, TypeError, ValueError):
+        groups = []
+    if len(groups) != 3 or [i for group in groups for i in group] != [*range(inputs)]:
+        raise Unsupported("scan", "its parameter ft_in is not known")
+    return len(groups[0]), len(groups[1])

@@ -1,0 +1,124 @@
+"""Lowering rules for entries at indices that a lane computes: slices, gather and scatter.
+
+A graph of single numbers has no memory, so an index is compared with every candidate. Uniform columns become tables.
+"""
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel
+from diffabs.compiler.lower.elementwise import max_or_min
+from diffabs.compiler.lower.rules import Unsupported, as_node_array, lowering_rule, map_entries
+from diffabs.core.types import PyTree
+
+MAX_COMPARED_ENTRIES = 64  # candidates of one read or write by comparison
+
+
+def _clamp_index(graph: Graph, index: Node, most: int) -> Node:
+    low = max_or_min(graph, "max", index, graph.const(0, index.dtype))
+    return max_or_min(graph, "min", low, graph.const(most, index.dtype))
+
+
+@lowering_rule("dynamic_slice", "slice_sizes")
+def _dynamic_slice(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+    x, places = ins[0], [place.item() for place in ins[1:]]
+    for axis, (size, place) in enumerate(zip(eqn.params["slice_sizes"], places, strict=True)):
+        x = _part(graph, x, axis, place, size)
+    return [x]
+
+
+def _part(graph: Graph, x: Array, axis: int, place: Node, size: int) -> Array:
+    """Return `size` entries along an axis from index `place`, which is clamped so that they lie inside."""
+    most = x.shape[axis] - size
+    if most == 0:
+        return x
+    rows = np.moveaxis(x, axis, 0)
+    if place.op == "const":
+        start = int(np.clip(place.attr, 0, most))
+        return np.moveaxis(rows[start : start + size], 0, axis)
+    place = _clamp_index(graph, place, most)
+    taken: PyTree = [map_entries(lambda *x: _entry(graph, place, x), *rows[i : i + most + 1]) for i in range(size)]
+    return np.moveaxis(np.stack(taken), 0, axis)
+
+
+def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
+    """Return the entry of a column at an index, as a table if the column is uniform, else by comparisons."""
+    if len(column) > 2 and all(x.level < UpdateLevel.LANE for x in column):
+        return graph.table(index, column)
+    if len(column) > MAX_COMPARED_ENTRIES:
+        raise Unsupported("dynamic_slice", f"of {len(column)} entries that differ between lanes")
+    # The last entry needs no comparison, because the index is valid.
+    (_, found), *others = reversed([*enumerate(column)])
+    for i, x in others:
+        found = graph.select(graph.op("eq", index, graph.const(i, index.dtype)), found, x)
+    return found
+
+
+@lowering_rule("gather", "dimension_numbers slice_sizes indices_are_sorted unique_indices mode fill_value")
+def _gather(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+    """Return x[i] along the first axis for each index i."""
+    x, places = ins
+    n, p = eqn.params["dimension_numbers"], eqn.params
+    simple = (
+        n.start_index_map == (0,)
+        and n.collapsed_slice_dims == (0,)
+        and not n.operand_batching_dims
+        and n.offset_dims == tuple(range(places.ndim - 1, places.ndim - 2 + x.ndim))
+        and p["slice_sizes"] == (1, *x.shape[1:])
+    )
+    # Both modes allow `_part` to clamp the index. FILL_OR_DROP would need a fill value.
+    mode = str(p["mode"]).rsplit(".", 1)[-1]
+    if not simple or mode not in ("PROMISE_IN_BOUNDS", "CLIP"):
+        raise Unsupported("gather", f"with {n}, {mode}")
+    out = np.empty((*places.shape[:-1], *x.shape[1:]), object)
+    for at in np.ndindex(places.shape[:-1]):
+        out[(*at, ...)] = _part(graph, x, 0, places[(*at, 0)], 1)[0]
+    return [out]
+
+
+@lowering_rule("dynamic_update_slice")
+def _dynamic_update(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+    x, new, places = ins[0], ins[1], [place.item() for place in ins[2:]]
+    for axis, place in enumerate(places):
+        _check_writable(eqn, x.shape[axis] if new.shape[axis] != x.shape[axis] and place.op != "const" else 0)
+    room = [a - b for a, b in zip(x.shape, new.shape, strict=True)]
+    starts = [_clamp_index(graph, place, most) for place, most in zip(places, room, strict=True)]
+    out = x.copy()
+    # One pass for each possible position: the block is written where all clamped indices match.
+    for start in np.ndindex(*(most + 1 for most in room)):
+        hits = [graph.op("eq", s, graph.const(o, s.dtype)) for s, o in zip(starts, start, strict=True)]
+        hit = graph.const(True)
+        for one in hits:
+            hit = graph.op("and", hit, one)
+        inside = tuple(slice(o, o + size) for o, size in zip(start, new.shape, strict=True))
+        out[inside] = map_entries(lambda a, b, hit=hit: graph.select(hit, a, b), out[inside], new)
+    return [out]
+
+
+@lowering_rule("scatter", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr")
+def _scatter(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+    """Return x.at[i].set(value) for one index i along the first axis; an index outside changes nothing."""
+    x, places, new = ins
+    n = eqn.params["dimension_numbers"]
+    whole = n.update_window_dims == tuple(range(x.ndim - 1)) and n.inserted_window_dims == (0,)
+    if not whole or n.scatter_dims_to_operand_dims != (0,) or n.operand_batching_dims or places.size != 1:
+        raise Unsupported("scatter", f"with {n}")
+    mode = str(eqn.params["mode"]).rsplit(".", 1)[-1]
+    if mode not in ("FILL_OR_DROP", "PROMISE_IN_BOUNDS", "CLIP"):
+        raise Unsupported("scatter", f"with the mode {mode}")
+    _check_writable(eqn, len(x))
+    index, out = places.ravel()[0], np.empty(x.shape, object)
+    # Without the clamp, an index outside matches no entry, so the array stays, as FILL_OR_DROP demands.
+    index = _clamp_index(graph, index, len(x) - 1) if mode == "CLIP" else index
+    for i in range(len(x)):
+        hit = graph.op("eq", index, graph.const(i, index.dtype))
+        out[i, ...] = map_entries(
+            lambda a, b, hit=hit: graph.select(hit, a, b), as_node_array(x[i]), new.reshape(x.shape[1:])
+        )
+    return [out]
+
+
+def _check_writable(eqn: JaxprEqn, count: int) -> None:
+    """Raise Unsupported for a write that compares an index with more than MAX_COMPARED_ENTRIES candidates."""
+    if count > MAX_COMPARED_ENTRIES:
+        raise Unsupported(eqn.primitive.name, f"into {count} entries; {MAX_COMPARED_ENTRIES} are the most")

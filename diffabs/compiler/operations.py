@@ -1,0 +1,103 @@
+"""The operations of a program in one table: value for constants, symmetry, and text in each language.
+
+A template has the operands {0} and {1}. In C++ and CUDA the functions are those of `native/functions.h` and
+`native/lane.h`. In C99, {f} is the suffix of a function's name in single precision, and a template with {f} is for real
+numbers only. In Structured Text, {real} is the type of the real numbers and {most} the largest of them.
+
+An operation without a template in a language has no translation. The back ends translate these themselves, because they
+need more than operands: `const`, `input`, `convert`, `bits`, `select`, `gate`, `any`, `table`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from diffabs.core.types import PyTree
+
+
+class Operation(NamedTuple):
+    """An operation on single numbers of one type.
+
+    Attributes:
+        fold: NumPy's function for constant operands; None if constants are left to the back end.
+        cpp: Template in C++ and CUDA C++, for vectors of lanes.
+        c99: Template in C99; None without a translation.
+        st: Template in Structured Text; None without a translation.
+        symmetric: True if the operands may be exchanged.
+        compares: True if the result is a boolean.
+    """
+
+    fold: PyTree
+    cpp: str
+    c99: str | None = None
+    st: str | None = None
+    symmetric: bool = False
+    compares: bool = False
+
+
+def _round_down_towards_zero(x: PyTree, y: PyTree) -> PyTree:
+    """Return x / y rounded towards zero as in C, unlike NumPy's //."""
+    return (np.abs(x) // np.abs(y)) * np.sign(x) * np.sign(y)
+
+
+def _function(name: str, st: str | None = None, *, arity: int = 1, fold: PyTree = None) -> Operation:
+    """Return the row of an elementary function, whose name in C is `name`; ... in `st` stands for the operands."""
+    given = ", ".join(f"{{{i}}}" for i in range(arity))
+    return Operation(fold, f"k_{name}({given})", f"{name}{{f}}({given})", st and st.replace("...", given))
+
+
+# a != a detects NaN in a. For NaN in b the comparison is false, so b is returned: the result is NaN either way.
+_C_MIN, _ST_MIN = "{0} != {0} || {0} < {1} ? {0} : {1}", "SEL(({0} <> {0}) OR ({0} < {1}), {1}, {0})"
+_C_MAX, _ST_MAX = "{0} != {0} || {0} > {1} ? {0} : {1}", "SEL(({0} <> {0}) OR ({0} > {1}), {1}, {0})"
+# The conversion of IEC 61131-3 rounds to the nearest integer, half to even.
+_ST_RINT = "LINT_TO_{real}({real}_TO_LINT({0}))"
+
+OPERATIONS: dict[str, Operation] = {
+    "add": Operation(np.add, "{0} + {1}", "{0} + {1}", "{0} + {1}", symmetric=True),
+    "sub": Operation(np.subtract, "{0} - {1}", "{0} - {1}", "{0} - {1}"),
+    "mul": Operation(np.multiply, "{0} * {1}", "{0} * {1}", "{0} * {1}", symmetric=True),
+    "div": Operation(np.divide, "{0} / {1}", "{0} / {1}", "{0} / {1}"),
+    "quotient": Operation(_round_down_towards_zero, "{0} / {1}", "{0} / {1}", "{0} / {1}"),
+    "rem": Operation(np.fmod, "rest({0}, {1})", "fmod{f}({0}, {1})"),
+    "neg": Operation(np.negative, "-{0}", "-{0}", "-{0}"),
+    "abs": Operation(np.abs, "size({0})", "fabs{f}({0})", "ABS({0})"),
+    # For NaN `min` and `max` return NaN, `lower` and `higher` the second operand, as the processor's do.
+    "min": Operation(np.minimum, "least({0}, {1})", _C_MIN, _ST_MIN),
+    "max": Operation(np.maximum, "most({0}, {1})", _C_MAX, _ST_MAX),
+    "lower": Operation(None, "lower({0}, {1})", "{0} < {1} ? {0} : {1}", "SEL({0} < {1}, {1}, {0})"),
+    "higher": Operation(None, "higher({0}, {1})", "{0} > {1} ? {0} : {1}", "SEL({0} > {1}, {1}, {0})"),
+    "eq": Operation(np.equal, "eq({0}, {1})", "{0} == {1}", "{0} = {1}", symmetric=True, compares=True),
+    "ne": Operation(np.not_equal, "ne({0}, {1})", "{0} != {1}", "{0} <> {1}", symmetric=True, compares=True),
+    "lt": Operation(np.less, "lt({0}, {1})", "{0} < {1}", "{0} < {1}", compares=True),
+    "le": Operation(np.less_equal, "le({0}, {1})", "{0} <= {1}", "{0} <= {1}", compares=True),
+    "is_finite": Operation(np.isfinite, "finite({0})", "isfinite({0}) != 0", "ABS({0}) <= {most}", compares=True),
+    "and": Operation(np.bitwise_and, "{0} & {1}", "{0} & {1}", "{0} AND {1}", symmetric=True),
+    "or": Operation(np.bitwise_or, "{0} | {1}", "{0} | {1}", "{0} OR {1}", symmetric=True),
+    "xor": Operation(np.bitwise_xor, "{0} ^ {1}", "{0} ^ {1}", "{0} XOR {1}", symmetric=True),
+    "not": Operation(np.invert, "~{0}", "~{0}", "NOT {0}"),
+    "shift_left": Operation(np.left_shift, "{0} << {1}", "{0} << {1}"),
+    "shift_right_logical": Operation(np.right_shift, "{0} >> {1}", "{0} >> {1}"),
+    "sqrt": Operation(np.sqrt, "root({0})", "sqrt{f}({0})", "SQRT({0})"),
+    "rint": Operation(np.rint, "whole({0})", "rint{f}({0})", _ST_RINT),
+    "floor": Operation(
+        np.floor, "down({0})", "floor{f}({0})", f"SEL({_ST_RINT} > {{0}}, {_ST_RINT}, {_ST_RINT} - 1.0)"
+    ),
+    "ceil": Operation(np.ceil, "up({0})", "ceil{f}({0})", f"SEL({_ST_RINT} < {{0}}, {_ST_RINT}, {_ST_RINT} + 1.0)"),
+    "exp": _function("exp", "EXP(...)", fold=np.exp),
+    "log": _function("log", "LN(...)", fold=np.log),
+    "log1p": _function("log1p"),
+    "expm1": _function("expm1"),
+    "sin": _function("sin", "SIN(...)"),
+    "cos": _function("cos", "COS(...)"),
+    "tan": _function("tan", "TAN(...)"),
+    "asin": _function("asin", "ASIN(...)"),
+    "acos": _function("acos", "ACOS(...)"),
+    "atan": _function("atan", "ATAN(...)"),
+    "atan2": _function("atan2", "ATAN2(...)", arity=2),
+    "pow": _function("pow", "EXPT(...)", arity=2),
+    "sinh": _function("sinh", "(EXP({0}) - EXP(-{0})) / 2.0"),
+    "cosh": _function("cosh", "(EXP({0}) + EXP(-{0})) / 2.0"),
+    "tanh": _function("tanh", "1.0 - 2.0 / (EXP(2.0 * {0}) + 1.0)"),
+}
+MIRRORED = {"gt": "lt", "ge": "le"}  # the same comparison with the operands exchanged
+NEGATED = {"eq": "ne", "ne": "eq"}  # not "lt" and "ge": both are false for NaN

@@ -1,0 +1,144 @@
+"""JAX functions of one lane as native code for many lanes, each until its own end.
+
+    trace      trace.trace_functions                  a jaxpr for each function
+    lower      program.lower_functions                operations on single numbers (`ir`), by the rules of `lower`
+    jvp        autodiff.jvp.differentiate_functions   the same program with one tangent
+    replicate  autodiff.jvp.replicate_tangents        with several tangents, by the fewest operations (`eliminate`)
+    schedule   schedule.schedule_nodes                operations inside the conditionals that need them
+    emit       emit.cpp.emit_cpp, emit.cuda           text
+    build      runtime.cpu.build_target, runtime.gpu  a library
+    bind       runtime.jax_primitive.bind_lanes       a JAX primitive, with rules for jit, vmap and jvp
+
+`operations.OPERATIONS` has a row for each operation: its value for constants, and its text in each language.
+`diffabs compile SCENARIO --show PASS` prints a program after a pass.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.compiler.emit.cpp import LaunchShape
+from diffabs.compiler.lane_programs import LanePrograms
+from diffabs.compiler.program import ScalarProgram
+from diffabs.compiler.runtime import cpu, gpu, toolchain
+from diffabs.compiler.runtime.jax_primitive import bind_lanes
+from diffabs.compiler.trace import trace_functions
+from diffabs.core.types import PyTree, Scalar
+
+VECTORS_PER_BLOCK = 4
+
+
+def run_lanes(
+    renew: Callable[[PyTree, PyTree], PyTree],
+    step: Callable[[PyTree, PyTree], PyTree],
+    running: Callable[[PyTree, PyTree], PyTree],
+    lane: PyTree,
+    carry: PyTree,
+    *,
+    steps: int,
+    rounds: int,
+    read: PyTree = None,
+    wanted: PyTree = None,
+) -> PyTree:
+    """Return the carry of n lanes after all have ended (pytree, leading axis n), with the structure of `carry`.
+
+    A round is one call of `renew` and then `steps` calls of `step`. After every `rounds` rounds, `running` decides
+    whether the lane goes on. So every lane computes at least `rounds` * `steps` steps, even if `running` is false for
+    its initial carry. A lane that never ends keeps the call from returning.
+
+    The function works under jit and vmap, with forward-mode derivatives. Arrays that the functions close over are the
+    same for all lanes.
+
+    Args:
+        renew: Function of one lane, (lane, carry) -> carry, called before every `steps` steps.
+        step: Function of one lane, (lane, carry) -> carry. In a lane that has ended, it must change nothing that
+            matters.
+        running: Function of one lane, (lane, carry) -> boolean: True if the lane continues.
+        lane: Pytree of each lane's constants, (n, ...) each.
+        carry: Pytree of each lane's initial values, (n, ...) each. Its real numbers share one type, float32 or float64.
+        steps: Calls of `step` after each call of `renew`.
+        rounds: Rounds between two calls of `running`.
+        read: Pytree of booleans like `carry`: arrays whose values matter afterwards, None for all. An array that
+            influences none of these, nor `running`, may be returned with its initial values.
+        wanted: Pytree of booleans like `carry`: arrays whose derivatives matter afterwards, None for all. The
+            derivatives of an array that influences none of these may be returned as zero.
+
+    Raises:
+        Unsupported: A function uses an operation without a lowering rule, has too many operations, or the carry mixes
+            real types.
+        NoCompiler: There is no compiler for the processor or GPU, or it does not compile the program.
+        ValueError: Reverse mode or a second derivative is requested.
+    """
+    if not gpu.find_gpu():
+        toolchain.find_compiler()
+    functions = trace_functions(
+        {"renew": renew, "step": step, "running": running},
+        jax.tree.map(_lane_type, lane),
+        jax.tree.map(_lane_type, carry),
+    )
+    leaves, tree = jax.tree.flatten(carry)
+    given = [unwrap_key(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
+    launch = functools.partial(_launch_lanes, shape=LaunchShape(VECTORS_PER_BLOCK, steps, rounds))
+
+    def numbers(which: PyTree) -> tuple[int, ...] | None:
+        return None if which is None else tuple(i for i, on in enumerate(jax.tree.leaves(which)) if on)
+
+    # Drop the traced arrays: this object outlives the trace, and a tracer must not leak. They are arguments instead.
+    lanes = LanePrograms(functions._replace(uniform=[]), launch, numbers(wanted), numbers(read))
+    found = bind_lanes(lanes, given)
+    return tree.unflatten(
+        [jax.random.wrap_key_data(x) if is_key(leaf) else x for x, leaf in zip(found, leaves, strict=True)]
+    )
+
+
+def _launch_lanes(made: ScalarProgram, before: list[PyTree], carry: list[PyTree], shape: LaunchShape) -> list[PyTree]:
+    """Return the final carry of all lanes; `before` holds the uniform arrays and the arrays of the lanes."""
+    first, results = len(before), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
+    if gpu.find_gpu():
+        return gpu.call_kernel(made, shape, [*before, *carry], results)
+    call = jax.ffi.ffi_call(
+        cpu.build_target(made, shape),
+        results,
+        # The carry is updated in place, because result i shares its buffer with the argument.
+        input_output_aliases={first + i: i for i in range(len(carry))},
+    )
+    return list(call(*before, *carry, threads=np.int64(cpu.thread_count())))
+
+
+def describe_kernel_build() -> dict[str, str]:
+    """Return a dictionary with "compiler", "flags" and "processor" of the back end for JAX's default device.
+
+    With a program's text, they determine a kernel's numbers to the last bit.
+
+    Raises:
+        NoCompiler: There is no compiler for the processor or GPU.
+    """
+    return gpu.describe_gpu_compiler() if gpu.find_gpu() else toolchain.describe_compiler()
+
+
+def _lane_type(x: Scalar) -> Scalar:
+    """Return shape and type of one lane of an array."""
+    return jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype)
+
+
+def unwrap_key(x: Scalar) -> Scalar:
+    """Return random keys as their words (uint32, one more axis), and anything else as a JAX array.
+
+    Args:
+        x: Array or random keys.
+    """
+    if is_key(x):
+        return jax.random.key_data(x)
+    return x if isinstance(x, jax.Array) else jnp.asarray(x)
+
+
+def is_key(x: Scalar) -> bool:
+    """Return whether an array holds random keys.
+
+    Args:
+        x: Array or random keys.
+    """
+    return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

@@ -1,0 +1,145 @@
+"""A program of single numbers, lowered from traced functions of one lane."""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, is_real
+from diffabs.compiler.lower.random import key_shape
+from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr
+from diffabs.compiler.trace import TracedFunctions
+from diffabs.core.types import PyTree
+
+RUNNING_FUNCTION = "running"  # name of the function that says whether a lane goes on
+MAX_OPERATIONS = 60_000  # nodes of a program; a compiler takes minutes for more
+
+
+class InputPlace(NamedTuple):
+    """The origin of an input.
+
+    Attributes:
+        level: Rate of change of the array.
+        array: Index of the array among those of its level.
+        entry: Index of the number within one lane's flat array.
+    """
+
+    level: UpdateLevel
+    array: int
+    entry: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ScalarProgram:
+    """A program of single numbers.
+
+    Attributes:
+        inputs: Nodes of the carry, the lanes and the uniform arrays, by place.
+        results: For each function, by name, its outputs as single numbers.
+        uniform: Arrays that all lanes share.
+        sizes: For each level, the sizes of its arrays in one lane.
+        dtype: Type of the real numbers.
+        tangents: Number of tangent directions in a program of `replicate_tangents`, else 0.
+    """
+
+    inputs: dict[InputPlace, Node]
+    results: dict[str, list[Node]]
+    uniform: list[PyTree]
+    sizes: dict[UpdateLevel, list[int]]
+    dtype: np.dtype
+    tangents: int = 0
+
+    def carry_inputs(self) -> list[Node]:
+        """Return the input nodes of the carry, array by array and entry by entry."""
+        return [node for place, node in self.inputs.items() if place.level == UpdateLevel.STEP]
+
+
+def lower_functions(functions: TracedFunctions) -> ScalarProgram:
+    """Return the program of single numbers of traced functions.
+
+    Args:
+        functions: Traced functions.
+
+    Raises:
+        Unsupported: A function uses an operation without a lowering rule, there are too many operations, or the carry's
+            real numbers do not share one type, float32 or float64.
+    """
+    graph, inputs = Graph(), {}
+    sizes: dict[UpdateLevel, list[int]] = {level: [] for level in functions.types}
+
+    def take_inputs(aval: Any, level: UpdateLevel) -> Array:
+        shape, dtype = key_shape(aval)
+        array, out = len(sizes[level]), np.empty(shape, object)
+        for entry, at in enumerate(np.ndindex(shape)):
+            place = InputPlace(level, array, entry)
+            inputs[place] = out[at] = graph.input(dtype, level, place)
+        sizes[level].append(out.size)
+        return out
+
+    given = {level: [take_inputs(aval, level) for aval in avals] for level, avals in functions.types.items()}
+    results: dict[str, list[Node]] = {}
+    for name, (jaxpr, closed, constants) in functions.each.items():
+        shared = [given[UpdateLevel.UNIFORM][i] for i in closed] + [constant_array(graph, x) for x in constants]
+        outs = lower_jaxpr(graph, jaxpr, shared, [*given[UpdateLevel.LANE], *given[UpdateLevel.STEP]])
+        results[name] = [node for array in outs for node in array.flat]
+    found = ScalarProgram(inputs, results, functions.uniform, sizes, _real_type(inputs))
+    return check_size(found, len(graph.nodes))
+
+
+def check_size(program: ScalarProgram, operations: int) -> ScalarProgram:
+    """Return the program unchanged, or raise if it is too large.
+
+    Args:
+        program: Program to return.
+        operations: Number of nodes in its graph, inputs and constants included.
+
+    Raises:
+        Unsupported: `operations` is greater than MAX_OPERATIONS.
+    """
+    if operations > MAX_OPERATIONS:
+        raise Unsupported("step", f"of {operations} operations; {MAX_OPERATIONS} are the most")
+    return program
+
+
+def keep_read(program: ScalarProgram, arrays: Iterable[int]) -> ScalarProgram:
+    """Return the program without the results that never influence `running` or the given arrays of the carry.
+
+    These numbers stay as they are in the initial carry.
+
+    Args:
+        program: Program of functions that update the carry, and `running`.
+        arrays: Indices of the carry's arrays whose values matter at the end.
+    """
+    updates = [nodes for name, nodes in program.results.items() if name != RUNNING_FUNCTION]
+    carried, chosen = program.carry_inputs(), set(arrays)
+    number = {node.id: i for i, node in enumerate(carried)}
+    read = {number[node.id] for node in carried if node.attr.array in chosen}
+    left = [*program.results[RUNNING_FUNCTION], *(nodes[i] for nodes in updates for i in read)]
+    seen: set[int] = set()
+    while left:
+        node = left.pop()
+        if node.id not in seen:
+            seen.add(node.id)
+            left += node.args
+            # A number that some result reads is a result itself, since the next step reads it.
+            if (i := number.get(node.id)) is not None and i not in read:
+                read.add(i)
+                left += [nodes[i] for nodes in updates]
+    results = {
+        name: nodes if name == RUNNING_FUNCTION else [node if i in read else carried[i] for i, node in enumerate(nodes)]
+        for name, nodes in program.results.items()
+    }
+    return dataclasses.replace(program, results=results)
+
+
+def _real_type(inputs: dict[InputPlace, Node]) -> np.dtype:
+    """Return the type of the carry's real numbers; raise Unsupported unless it is the only one, of 32 or 64 bits."""
+    kinds = {
+        np.dtype(node.dtype)
+        for place, node in inputs.items()
+        if place.level == UpdateLevel.STEP and is_real(node.dtype)
+    }
+    if len(kinds) != 1 or not kinds <= {np.dtype(np.float32), np.dtype(np.float64)}:
+        raise Unsupported("carry", f"of the types {', '.join(sorted(map(str, kinds))) or 'without a real number'}")
+    return kinds.pop()

@@ -1,0 +1,65 @@
+"""Programs on the processor: C++ text, compiled to a library and registered with XLA."""
+
+import ctypes
+import pathlib
+import threading
+
+import jax
+
+from diffabs.compiler.emit import cpp
+from diffabs.compiler.program import ScalarProgram
+from diffabs.compiler.runtime import toolchain
+from diffabs.core.types import PyTree
+from diffabs.runtime.process import core_count
+
+MAX_STEP_LINES = 10_000  # lines of a step; a larger program gets fewer vectors a block, or compiling takes too long
+LIBRARY_NAME_PREFIX = "diffabs_kernel_"
+_lock = threading.Lock()
+_loaded: dict[str, PyTree] = {}
+
+
+def build_target(made: ScalarProgram, shape: cpp.LaunchShape) -> str:
+    """Compile a program for the processor, if necessary, and return its name as an FFI target of XLA.
+
+    Args:
+        made: Operations and results.
+        shape: Loop structure of the launch; a large program or one with tangents gets fewer `vectors`.
+
+    Raises:
+        NoCompiler: No compiler works, or the library does not load.
+    """
+    # Tangents are independent of each other too and hide latency, so they replace vectors of the block.
+    shape = shape._replace(vectors=max(1, shape.vectors // max(1, made.tangents)))
+    source = cpp.emit_cpp(made, shape)
+    while cpp.count_operations(source) * shape.vectors > MAX_STEP_LINES and shape.vectors > 1:
+        shape = shape._replace(vectors=shape.vectors // 2)
+        source = cpp.emit_cpp(made, shape)
+    return register_library(toolchain.build_library(source))
+
+
+def register_library(path: pathlib.Path) -> str:
+    """Register a library with XLA and return its name there.
+
+    Args:
+        path: File of the library.
+
+    Raises:
+        NoCompiler: The library does not load.
+    """
+    name = f"{LIBRARY_NAME_PREFIX}{path.stem[:32]}"
+    with _lock:
+        if name not in _loaded:
+            try:
+                handler = ctypes.CDLL(str(path)).diffabs_kernel
+            except (OSError, AttributeError) as error:  # such as in a folder without execution rights
+                raise toolchain.NoCompiler(f"{path.parent}: {error}") from None
+            # The table keeps the handler alive: XLA holds only its address.
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
+            _loaded[name] = handler, path
+    return name
+
+
+def thread_count() -> int:
+    """Return the number of threads for a launch: all cores, whatever the number of JAX's CPU devices."""
+    # Launches on several devices at once share the cores: a thread takes its next lane when it has time.
+    return core_count()

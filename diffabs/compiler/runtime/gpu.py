@@ -1,0 +1,232 @@
+"""Launches on an NVIDIA GPU: machine code from `nvrtc`, started through the CUDA driver on XLA's stream.
+
+Only this module uses the driver and `jax.experimental.buffer_callback`, which makes a launch an operation of XLA.
+"""
+
+import ctypes
+import functools
+import pathlib
+import threading
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+from diffabs.compiler.emit import cuda
+from diffabs.compiler.emit.cpp import LaunchShape
+from diffabs.compiler.ir import UpdateLevel
+from diffabs.compiler.program import ScalarProgram
+from diffabs.compiler.runtime import nvrtc
+from diffabs.compiler.runtime.toolchain import NoCompiler
+from diffabs.core.types import PyTree
+
+# CUDA's enumerators CU_POINTER_ATTRIBUTE_DEVICE_ORDINAL and CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT.
+ORDINAL, MULTIPROCESSORS = 9, 16
+_lock = threading.Lock()
+
+
+class GpuDevice(Protocol):
+    """A GPU that compiles and starts kernels."""
+
+    def compile(self, text: str) -> pathlib.Path:
+        """Return the file with the machine code of a CUDA C++ `text`.
+
+        Raises:
+            NoCompiler: The text does not compile, or there is no compiler.
+        """
+        ...
+
+    def address(self, buffer: Any) -> int:
+        """Return the device address of a `buffer` of XLA."""
+        ...
+
+    def start(self, code: pathlib.Path, arrays: PyTree, room: int, count: int, context: PyTree) -> None:
+        """Start the kernels `begin_all` and then `run_all` of a program.
+
+        Args:
+            code: File with the machine code.
+            arrays: The struct `Arrays` of `threads.h`.
+            room: Device address of the memory for the counter and the shared values.
+            count: Number of lanes.
+            context: XLA's execution context, which has the stream.
+        """
+        ...
+
+
+def find_gpu() -> GpuDevice | None:
+    """Return the GPU that JAX runs on by default, or None if JAX runs on a CPU by default.
+
+    Raises:
+        NoCompiler: JAX runs on an accelerator that is not an NVIDIA GPU.
+    """
+    home = jax.config.jax_default_device or jax.devices()[0]  # pyright: ignore[reportAttributeAccessIssue]
+    platform = home if isinstance(home, str) else home.platform
+    return None if platform == "cpu" else _find_cuda_device(platform)
+
+
+def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[PyTree], results: list[PyTree]) -> list[PyTree]:
+    """Return the carry's arrays after all lanes have ended, as an operation of XLA on the GPU.
+
+    Args:
+        program: Operations and results.
+        shape: Loop structure of the launch.
+        given: Uniform arrays, arrays of the lanes and arrays of the carry; the last two have a leading axis of lanes.
+        results: Shapes and types of the carry.
+
+    Raises:
+        NoCompiler: The program does not compile, or there is no compiler.
+    """
+    on = find_gpu()
+    assert on is not None
+    source = cuda.emit_cuda(program, shape)
+    code = on.compile(source.text)
+    sizes = [len(program.sizes[level]) for level in (UpdateLevel.UNIFORM, UpdateLevel.LANE, UpdateLevel.STEP)]
+    count = given[-1].shape[0]
+
+    def start(context: PyTree, outs: Any, *ins: Any) -> None:
+        *found, room = [on.address(buffer) for buffer in outs]
+        if count:
+            on.start(code, _pack_addresses([*map(on.address, ins), *found], [*sizes, sizes[-1]]), room, count, context)
+
+    # XLA allocates the kernels' own memory as one more result, which is dropped.
+    whole = [*results, jax.ShapeDtypeStruct((source.room,), np.uint8)]
+    return buffer_callback(start, whole)(*given)[:-1]
+
+
+def describe_gpu_compiler() -> dict[str, str]:
+    """Return a dictionary with "compiler", "flags" and "processor" (the architecture, such as sm_90) of the GPU back
+    end.
+
+    With a program's text, they determine a kernel's numbers to the last bit. JAX must run on a GPU.
+
+    Raises:
+        NoCompiler: There is no CUDA compiler.
+    """
+    on = find_gpu()
+    assert isinstance(on, CudaDevice)
+    major, minor = nvrtc.nvrtc_version()
+    return {"compiler": f"NVRTC {major}.{minor}", "flags": " ".join(nvrtc.NVRTC_FLAGS), "processor": on.architecture}
+
+
+def _pack_addresses(addresses: list[int], sizes: list[int]) -> PyTree:
+    """Return the struct `Arrays` of `threads.h`: each group of addresses ends with one more entry, a null pointer."""
+    rest, found = iter(addresses), []
+    for size in sizes:
+        # C++ has no arrays of length 0, so every group has one more entry.
+        found += [*(next(rest) for _ in range(size)), 0]
+    return (ctypes.c_void_p * len(found))(*found)
+
+
+# CUDA -----------------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _find_cuda_device(platform: str) -> "CudaDevice":
+    capability = getattr(jax.devices(platform)[0], "compute_capability", "")
+    if not capability.replace(".", "").isdigit():
+        raise NoCompiler(f"kernels are for processors and NVIDIA's GPUs, not for {platform} {capability}".strip())
+    return CudaDevice(f"sm_{capability.replace('.', '')}")
+
+
+class _LoadedCode(NamedTuple):
+    """Machine code in a device's memory.
+
+    Attributes:
+        context: The driver's context.
+        begin: Kernel `begin_all`.
+        run: Kernel `run_all`.
+        blocks: Blocks of `run_all` that the device holds at a time.
+    """
+
+    context: PyTree
+    begin: Any
+    run: PyTree
+    blocks: int
+
+
+class CudaDevice:
+    """The NVIDIA GPUs of this process, all of one architecture such as sm_90."""
+
+    def __init__(self, architecture: str):
+        """Store the architecture; the driver is loaded at the first launch."""
+        self.architecture = architecture
+        self._loaded: dict[tuple[pathlib.Path, int], _LoadedCode] = {}
+
+    def compile(self, text: str) -> pathlib.Path:
+        """Return the file with the machine code of a CUDA C++ `text`; see `GpuDevice.compile`."""
+        return nvrtc.build_cubin(text, self.architecture)
+
+    def address(self, buffer: Any) -> int:
+        """Return the device address of a `buffer` of XLA."""
+        return buffer.__cuda_array_interface__["data"][0]
+
+    def start(self, code: pathlib.Path, arrays: PyTree, room: int, count: int, context: PyTree) -> None:
+        """Start `begin_all` and `run_all` on the device that holds `room`.
+
+        The arguments `code`, `arrays`, `room`, `count` and `context` are those of `GpuDevice.start`.
+        """
+        ordinal = ctypes.c_int()
+        # Several devices may run this program: the memory tells which one to use.
+        _call_driver("cuPointerGetAttribute", ctypes.byref(ordinal), ORDINAL, ctypes.c_uint64(room))
+        at = code, ordinal.value
+        with _lock:
+            if at not in self._loaded:
+                self._loaded[at] = _load(*at)
+            one = self._loaded[at]
+        _call_driver("cuCtxPushCurrent_v2", one.context)
+        try:
+            # At most as many blocks as run at a time: each thread takes further lanes from the counter.
+            blocks = min(one.blocks, -(-count // cuda.THREADS_PER_BLOCK))
+            shared, counter = ctypes.c_uint64(room + cuda.COUNTER), ctypes.c_uint64(room)
+            threads, lanes = ctypes.c_int64(blocks * cuda.THREADS_PER_BLOCK), ctypes.c_int64(count)
+            _launch(one.begin, 1, 1, context.stream, arrays, shared, counter, threads)
+            _launch(one.run, blocks, cuda.THREADS_PER_BLOCK, context.stream, arrays, shared, counter, lanes)
+        finally:
+            _call_driver("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
+
+
+def _load(code: pathlib.Path, ordinal: int) -> _LoadedCode:
+    """Load machine code into the primary context of a device, which XLA uses too."""
+    context, module, number = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
+    begin, run = ctypes.c_void_p(), ctypes.c_void_p()
+    _call_driver("cuDevicePrimaryCtxRetain", ctypes.byref(context), ordinal)
+    _call_driver("cuCtxPushCurrent_v2", context)
+    try:
+        _call_driver("cuModuleLoadData", ctypes.byref(module), code.read_bytes())
+        for kernel, name in ((begin, b"begin_all"), (run, b"run_all")):
+            _call_driver("cuModuleGetFunction", ctypes.byref(kernel), module, name)
+        _call_driver("cuDeviceGetAttribute", ctypes.byref(number), MULTIPROCESSORS, ordinal)
+        blocks = number.value
+        _call_driver(
+            "cuOccupancyMaxActiveBlocksPerMultiprocessor",
+            ctypes.byref(number),
+            run,
+            cuda.THREADS_PER_BLOCK,
+            ctypes.c_size_t(0),
+        )
+    finally:
+        _call_driver("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
+    return _LoadedCode(context, begin, run, blocks * max(1, number.value))
+
+
+def _launch(kernel: Any, blocks: int, threads: int, stream: int, *args: PyTree) -> None:
+    # cuLaunchKernel takes an array with the address of each argument.
+    given = (ctypes.c_void_p * len(args))(*(ctypes.addressof(x) for x in args))
+    nothing = ctypes.c_void_p()
+    _call_driver("cuLaunchKernel", kernel, blocks, 1, 1, threads, 1, 1, 0, ctypes.c_void_p(stream), given, nothing)
+
+
+def _call_driver(name: str, *args: PyTree) -> None:
+    """Call a function of the driver; raise RuntimeError with the name of the error it returns."""
+    if failed := getattr(_load_driver(), name)(*args):
+        said = ctypes.c_char_p()
+        _load_driver().cuGetErrorName(failed, ctypes.byref(said))
+        raise RuntimeError(f"{name}: {(said.value or b'error').decode()} ({failed})")
+
+
+@functools.cache
+def _load_driver() -> Any:
+    driver = ctypes.CDLL("libcuda.so.1")
+    driver.cuInit(0)
+    return driver

@@ -1,0 +1,204 @@
+"""The JAX primitive `run_lanes`: rules for jit, vmap and forward-mode derivatives of a kernel launch.
+
+vmap adds lanes: a uniform array that differs within the batch becomes an array of each lane. If only tangents are
+batched, as in `jax.jacfwd`, the batch stays one launch with more tangents. Only this module uses JAX's interfaces for
+new primitives.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.extend.core as jex
+import jax.numpy as jnp
+from jax.interpreters import ad, batching, mlir
+from jax.interpreters import partial_eval as pe
+
+from diffabs.compiler.autodiff.jvp import ArrayKey, arrange_arrays
+from diffabs.compiler.ir import UpdateLevel, is_real
+from diffabs.compiler.lane_programs import LanePrograms
+from diffabs.core.types import PyTree, Scalar
+
+MAX_TANGENTS_PER_LAUNCH = 8  # more tangents take several launches
+NO_REVERSE_MODE = (
+    "a kernel has no reverse mode: forward mode (jax.jvp, jax.jacfwd) has its derivatives, engine = 'xla' both"
+)
+
+
+run_lanes_primitive = jex.Primitive("run_lanes")
+run_lanes_primitive.multiple_results = True
+
+
+def bind_lanes(lanes: LanePrograms, arrays: Sequence[PyTree]) -> list[PyTree]:
+    """Return the carry's arrays after all lanes have ended, in the order of its leaves.
+
+    Args:
+        lanes: The functions and their programs.
+        arrays: Uniform arrays, then arrays of the lanes, then the carry; random keys as their words (uint32).
+    """
+    return run_lanes_primitive.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=frozenset())
+
+
+@run_lanes_primitive.def_impl
+def _run(*arrays: PyTree, **how: Any) -> list[PyTree]:
+    # The primitive has a lowering but no eager evaluation, so a call outside jit compiles as well.
+    return jax.jit(functools.partial(run_lanes_primitive.bind, **how))(*arrays)
+
+
+@run_lanes_primitive.def_abstract_eval
+def _shapes(*arrays: PyTree, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: frozenset[int]) -> list[PyTree]:
+    carry = arrays[len(lanes.keys) - len(lanes.functions.types[UpdateLevel.STEP]) : len(lanes.keys)]
+
+    def shape(key: ArrayKey) -> Any:
+        x = carry[key.number]
+        # Results have fixed types, also where the initial carry is weakly typed.
+        return x.update(shape=(x.shape[0], many, *x.shape[1:])) if key.tangent else x.update(weak_type=False)
+
+    return [shape(key) for key in lanes.ends(begins)]
+
+
+def _launch_in_parts(
+    *arrays: PyTree, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: frozenset[int]
+) -> list[PyTree]:
+    """Launch the tangents in groups of equal size <= MAX_TANGENTS_PER_LAUNCH; zeros fill the last group."""
+    keys = [*lanes.keys, *lanes.slopes(begins)]
+    launches = max(1, math.ceil(many / MAX_TANGENTS_PER_LAUNCH))
+    # Groups of one size share one compiled program. The padding tangents are zero and are cut off at the end.
+    each = math.ceil(many / launches)
+    given = dict(zip(keys, arrays, strict=True))
+    if not many:
+        return _launch_once(lanes, begins, 0, as_lanes, given)
+
+    def part(first: int) -> list[PyTree]:
+        def cut(key: ArrayKey, x: Scalar) -> Any:
+            # Tangents of arrays of lanes are (lanes, tangents, ...), of uniform arrays (tangents, ...).
+            axis = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
+            lacking = max(0, first + each - many)
+            wide = [(0, lacking if i == axis else 0) for i in range(x.ndim)]
+            return jax.lax.slice_in_dim(jnp.pad(x, wide), first, first + each, axis=axis)
+
+        some = {key: cut(key, x) if key.tangent else x for key, x in given.items()}
+        return _launch_once(lanes, begins, each, as_lanes, some)
+
+    parts = [part(first) for first in range(0, each * launches, each)]
+    return [
+        jnp.concatenate([one[i] for one in parts], 1)[:, :many] if key.tangent else parts[0][i]
+        for i, key in enumerate(lanes.ends(begins))
+    ]
+
+
+mlir.register_lowering(run_lanes_primitive, mlir.lower_fun(_launch_in_parts, multiple_results=True))
+
+
+def _launch_once(
+    lanes: LanePrograms, begins: PyTree, many: int, as_lanes: frozenset[int], given: dict[ArrayKey, PyTree]
+) -> list[PyTree]:
+    """Return the results of one launch; arrays that need tangents but have no seed get zeros."""
+
+    def array(key: ArrayKey) -> Any:
+        if key in given:
+            return given[key]
+        x = given[key._replace(tangent=False)]
+        return jnp.zeros((x.shape[0], many, *x.shape[1:]), x.dtype)
+
+    order = arrange_arrays(lanes.functions, lanes.derivative(begins).moved_arrays, as_lanes)
+    carry = [array(key) for key in order[UpdateLevel.STEP]]
+    before = [array(key) for level in (UpdateLevel.UNIFORM, UpdateLevel.LANE) for key in order[level]]
+    return lanes.launch(lanes.program(begins, many, as_lanes), before, carry)
+
+
+def _jvp_rule(
+    arrays: Sequence[PyTree], slopes: Sequence[PyTree], *, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: Any
+) -> PyTree:
+    """Return values and tangents of a kernel for `jax.jvp`."""
+    if begins is not None:
+        raise ValueError("a kernel has no second derivatives; engine = 'xla' has")
+    # Integers and truths have tangents of type float0 in JAX. They carry no derivative.
+    moving = [type(x) is not ad.Zero and is_real(jax.typeof(x).dtype) for x in slopes]
+    begins = tuple((key.level, key.number) for key, on in zip(lanes.keys, moving, strict=True) if on)
+    if not begins:
+        found = run_lanes_primitive.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=as_lanes)
+        return found, [_zero_tangent(x) for x in found]
+
+    # Build the derivative here: JAX 0.12 forbids tracing inside the abstract evaluation, where `ends` needs it.
+    lanes.derivative(begins)
+
+    def alone(key: ArrayKey, x: Scalar) -> Any:
+        return jnp.expand_dims(x, 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1)
+
+    given = [alone(key, x) for key, x, on in zip(lanes.keys, slopes, moving, strict=True) if on]
+    found = run_lanes_primitive.bind(*arrays, *given, lanes=lanes, begins=begins, many=1, as_lanes=as_lanes)
+    values = found[: len(lanes.functions.types[UpdateLevel.STEP])]
+    results = [_zero_tangent(x) for x in values]
+    for key, x in zip(lanes.ends(begins)[len(values) :], found[len(values) :], strict=True):
+        results[key.number] = x[:, 0]
+    return values, results
+
+
+ad.primitive_jvps[run_lanes_primitive] = _jvp_rule
+
+
+def _zero_tangent(x: Scalar) -> Any:
+    return ad.Zero(jax.typeof(x).to_tangent_aval())
+
+
+def _batching_rule(
+    arrays: Sequence[PyTree], axes: Sequence[PyTree], *, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: Any
+) -> PyTree:
+    """Apply vmap: merge the batch axis into the tangent axis if only tangents are batched, else into the lane axis."""
+    values = len(lanes.keys)
+    size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
+    how = {"lanes": lanes, "begins": begins}
+    # Only the seed tangents are batched, as in `jax.jacfwd`: the values run once, with size*many tangents.
+    if all(axis is None for axis in axes[:values]):
+        more = []
+        # Merge the batch axis in front of the tangent axis, which stands behind the lane axis if there is one.
+        for key, x, axis in zip(lanes.slopes(begins), arrays[values:], axes[values:], strict=True):
+            at = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
+            x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            x = jnp.moveaxis(x, 0, at)
+            more.append(x.reshape(*x.shape[:at], -1, *x.shape[at + 2 :]))
+        found = run_lanes_primitive.bind(*arrays[:values], *more, **how, many=size * many, as_lanes=as_lanes)
+        results = [
+            x.reshape(x.shape[0], size, many, *x.shape[2:]) if key.tangent else x
+            for key, x in zip(lanes.ends(begins), found, strict=True)
+        ]
+        return results, [1 if key.tangent else None for key in lanes.ends(begins)]
+
+    keys = [*lanes.keys, *lanes.slopes(begins)]
+    own = {k.number for k, axis in zip(keys, axes, strict=True) if k.level == UpdateLevel.UNIFORM and axis is not None}
+    # The last of the values is an array of the carry, so it always has a lane axis.
+    count = arrays[values - 1].shape[1 if axes[values - 1] == 0 else 0]
+    given = []
+    # Merge the batch axis in front of the lane axis.
+    for key, x, axis in zip(keys, arrays, axes, strict=True):
+        shared = key.level == UpdateLevel.UNIFORM and key.number not in as_lanes
+        # A uniform array that is not batched stays as given. A batched one is repeated for every lane.
+        if not shared or key.number in own:
+            x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            if shared:
+                x = jnp.broadcast_to(x[:, None], (size, count, *x.shape[1:]))
+            x = x.reshape(-1, *x.shape[2:])
+        given.append(x)
+    found = run_lanes_primitive.bind(*given, **how, many=many, as_lanes=as_lanes | own)
+    return [x.reshape(size, -1, *x.shape[1:]) for x in found], [0] * len(found)
+
+
+batching.primitive_batchers[run_lanes_primitive] = _batching_rule
+
+
+def _refuse_partial_evaluation(trace: Any, *tracers: Any, **how: Any) -> Scalar:
+    """Raise ValueError: JAX linearizes the kernel (`jax.grad`, `jax.linearize`), and no reverse mode exists."""
+    del trace, tracers, how
+    raise ValueError(NO_REVERSE_MODE)
+
+
+def _refuse_transpose(*args: PyTree, **how: Any) -> Any:
+    del args, how
+    raise ValueError(NO_REVERSE_MODE)
+
+
+pe.custom_partial_eval_rules[run_lanes_primitive] = _refuse_partial_evaluation
+ad.primitive_transposes[run_lanes_primitive] = _refuse_transpose

@@ -1,0 +1,103 @@
+"""A cache of compiled libraries in the user's cache folder, with a check for damage before a library is loaded.
+
+A file name holds two digests: one of every input of the compilation, and one of the file's content. If the content does
+not match its digest (empty, truncated, changed, or another library), the file is removed and the library is compiled
+again.
+"""
+
+import contextlib
+import errno
+import hashlib
+import logging
+import os
+import pathlib
+import sys
+
+from diffabs.runtime import files
+
+CACHE = "DIFFABS_KERNEL_CACHE"  # environment variable: folder of the compiled libraries
+MAX_CACHE_BYTES = 1 << 28  # about 800 libraries; a larger cache loses its least recently used half
+CONTENT = 32  # hexadecimal digits of the content digest in a file name
+log = logging.getLogger("diffabs")
+
+
+def cache_folder() -> pathlib.Path:
+    """Return the folder of the compiled libraries, which need not exist.
+
+    This is $DIFFABS_KERNEL_CACHE, or the subfolder diffabs/kernel of the user's cache folder.
+
+    Raises:
+        OSError: The user has no home folder.
+    """
+    if said := os.environ.get(CACHE):
+        return pathlib.Path(said)
+    try:
+        caches = pathlib.Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+    except RuntimeError:
+        raise OSError(errno.ENOENT, f"the user has no home folder; name a folder in {CACHE}") from None
+    if sys.platform != "darwin" and (said := os.environ.get("XDG_CACHE_HOME")):
+        caches = pathlib.Path(said)
+    return caches / "diffabs" / "kernel"
+
+
+def make_cache_folder() -> pathlib.Path:
+    """Create the cache folder if it is missing, and return it.
+
+    Raises:
+        OSError: The folder cannot be created, or other users may write to it and so could place their own code there.
+    """
+    folder = cache_folder()
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if files.others_may_write(folder):
+        raise OSError(errno.EPERM, f"other users may write to it: `chmod go-w` it, or name another folder in {CACHE}")
+    return folder
+
+
+def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
+    """Return the file of a library, or None if the cache does not hold it.
+
+    A damaged file is removed, with one line in the log.
+
+    Args:
+        made_of: Digest of every input that decides the library.
+        suffix: End of the file's name, such as ".so".
+
+    Raises:
+        OSError: A file cannot be read, or `make_cache_folder` fails.
+    """
+    for path in sorted(make_cache_folder().glob(f"{made_of}-*{suffix}")):
+        try:
+            content = files.read_content(path)
+        except FileNotFoundError:  # another process removed the file
+            continue
+        if _file_name(made_of, content, suffix) == path.name:
+            # The time stamp orders the files for eviction by last use. A read-only folder cannot store it.
+            with contextlib.suppress(OSError):
+                os.utime(path)
+            return path
+        log.warning("%s is damaged; it is compiled again", path)
+        path.unlink(missing_ok=True)
+    return None
+
+
+def write_library(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
+    """Write a library to the cache and return its file.
+
+    The write is atomic: a file with a library's name is always complete. A cache above MAX_CACHE_BYTES first loses its
+    least recently used files.
+
+    Args:
+        made_of: Digest of every input that decides the library.
+        suffix: End of the file's name, such as ".so".
+        content: Bytes of the library.
+
+    Raises:
+        OSError: The folder or the file cannot be written, or `make_cache_folder` fails.
+    """
+    folder = make_cache_folder()
+    files.make_room(folder, f"*{suffix}", MAX_CACHE_BYTES)
+    return files.write_synced(folder / _file_name(made_of, content, suffix), content)
+
+
+def _file_name(made_of: str, content: bytes, suffix: str) -> str:
+    return f"{made_of}-{hashlib.sha256(content).hexdigest()[:CONTENT]}{suffix}"

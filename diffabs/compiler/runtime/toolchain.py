@@ -1,0 +1,181 @@
+"""Compilation of C++ to a shared library by a compiler of this machine, with the cache of `binaries`.
+
+The digest of text, headers, compiler, flags and processor identifies a library.
+"""
+
+import contextlib
+import ctypes
+import functools
+import hashlib
+import importlib.util
+import os
+import pathlib
+import platform
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from typing import NamedTuple
+
+import jax.ffi
+
+from diffabs.compiler.runtime.library_cache import cache_folder, find_library, make_cache_folder, write_library
+from diffabs.runtime import stopwatch
+
+NATIVE_FOLDER = pathlib.Path(__file__).parents[1] / "native"
+COMPILER = "DIFFABS_KERNEL_COMPILER"  # environment variable: compiler command; empty means no compiler
+CANDIDATES = (["c++"], ["clang++"], ["g++"])
+# Flags must preserve NaN and infinity, so -ffast-math is reduced to no-math-errno and no-trapping-math. Linking with
+# -ffast-math is wrong too: it makes the whole process flush subnormal numbers to zero.
+CPP_FLAGS = (
+    *("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
+    *("-fno-exceptions", "-fno-rtti", "-fPIC", "-shared", "-pthread", "-w"),
+)
+COMPILE_TIMEOUT_S = 300  # for a kernel; the largest take about 20 s
+PROBE_TIMEOUT_S = 30  # for the version output, or for a library of one line
+
+
+class NoCompiler(Exception):
+    """An error: this machine cannot compile a kernel, or cannot load the result. The message gives the reason."""
+
+
+class Compiler(NamedTuple):
+    """A compiler command that works, with the first line of its version output."""
+
+    command: tuple[str, ...]
+    version: str
+
+
+@functools.cache
+def _probe_compiler(command: tuple[str, ...]) -> Compiler | str:
+    """Return the compiler of a command, or a text that says why it does not work.
+
+    A compiler works if it makes a library that this process can load. A note in the cache folder records the success,
+    so that later processes skip the trial.
+    """
+    try:
+        version = _run_command([*command, "--version"], PROBE_TIMEOUT_S)
+        made = Compiler(command, version.stdout.partition("\n")[0].strip())
+        note = cache_folder() / f".{_digest('works', made)[:32]}"
+        if not note.is_file():
+            _check_loads(command)
+            with contextlib.suppress(OSError):
+                (make_cache_folder() / note.name).touch()
+    except (OSError, NoCompiler) as error:
+        return f"{' '.join(command)}: {error}"
+    return made
+
+
+def _check_loads(command: tuple[str, ...]) -> None:
+    """Compile a library of one function and load it; raise NoCompiler or OSError if that fails."""
+    with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
+        source, library = pathlib.Path(folder) / "one.cpp", pathlib.Path(folder) / "one.so"
+        # functions.h needs vector extensions and headers, so this line fails where a kernel would fail.
+        source.write_text('#include "functions.h"\nextern "C" double one(double x) { return k_exp(all(x))[0]; }\n')
+        _compile(command, source, library, PROBE_TIMEOUT_S)
+        ctypes.CDLL(str(library))
+
+
+def find_compiler() -> Compiler:
+    """Return the first C++ compiler that makes a library which loads: c++, clang++, g++, then that of the package
+    ziglang.
+
+    $DIFFABS_KERNEL_COMPILER replaces this list by one command; if it is set but empty, no compiler is used.
+
+    Raises:
+        NoCompiler: No command works; the message gives a reason for each.
+    """
+    said = os.environ.get(COMPILER)
+    if said is not None and not said.strip():
+        raise NoCompiler(f"{COMPILER} is empty")
+    commands = [shlex.split(said)] if said else [command for command in CANDIDATES if shutil.which(command[0])]
+    if not said and importlib.util.find_spec("ziglang"):
+        commands.append([sys.executable, "-m", "ziglang", "cc", "-x", "c++"])
+    reasons = []
+    for command in commands:
+        tried = _probe_compiler(tuple(command))
+        if isinstance(tried, Compiler):
+            return tried
+        reasons.append(tried)
+    raise NoCompiler("; ".join(reasons) or 'no C++ compiler; pip install ".[kernel]" in a clone brings one')
+
+
+def build_library(text: str) -> pathlib.Path:
+    """Compile a C++ text, unless the cache holds its library, and return the library's file.
+
+    Args:
+        text: C++ source.
+
+    Raises:
+        NoCompiler: No compiler works, compilation fails, or the cache folder is unusable: not writable, or writable for
+            other users.
+    """
+    made = find_compiler()
+    digest = _digest(text, made)
+    try:
+        if path := find_library(digest, ".so"):
+            return path
+        # Compile inside the cache folder, which only this user can write to.
+        with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=make_cache_folder()) as own:
+            source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
+            source.write_text(text)
+            with stopwatch.count_as_compiling():
+                _compile(made.command, source, result, COMPILE_TIMEOUT_S)
+            return write_library(digest, ".so", result.read_bytes())
+    except OSError as error:
+        raise NoCompiler(f"no kernel in {cache_folder()}: {error.strerror or error}") from None
+
+
+def describe_compiler() -> dict[str, str]:
+    """Return a dictionary with "compiler", "flags" and "processor" of the C++ back end.
+
+    With a program's text, they determine a kernel's numbers to the last bit.
+
+    Raises:
+        NoCompiler: No compiler works on this machine.
+    """
+    return {"compiler": find_compiler().version, "flags": " ".join(CPP_FLAGS), "processor": _processor()}
+
+
+def _compile(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path, longest: float) -> None:
+    include = [f"-I{NATIVE_FOLDER}", f"-I{jax.ffi.include_dir()}"]
+    done = _run_command([*command, *CPP_FLAGS, *include, "-o", str(result), str(source), "-lm"], longest)
+    if done.returncode or not result.is_file():
+        lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"exit status {done.returncode}"]
+        errors = [line for line in lines if "error" in line]
+        raise NoCompiler(f"{' '.join(command)}: {(errors or lines)[0][:300]}")
+
+
+def _run_command(words: list[str], longest: float) -> subprocess.CompletedProcess[str]:
+    """Run a command for at most `longest` seconds; raise NoCompiler on timeout, OSError if there is no such command."""
+    told = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, **told, start_new_session=True) as process:
+        try:
+            out, errors = process.communicate(timeout=longest)
+        except BaseException as error:
+            # A compiler starts child processes that hold the pipes. Kill the whole session, or `with` waits for them.
+            with contextlib.suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL) if hasattr(os, "killpg") else process.kill()
+            if isinstance(error, subprocess.TimeoutExpired):
+                raise NoCompiler(f"{words[0]} did not end within {longest:g} s and was stopped") from None
+            raise
+        return subprocess.CompletedProcess(words, process.returncode, out, errors)
+
+
+def _digest(text: str, made: Compiler) -> str:
+    # The FFI header belongs to the digest: a new jaxlib may change the layout of the call frame.
+    interface = pathlib.Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
+    headers = [path.read_bytes() for path in (*sorted(NATIVE_FOLDER.glob("*.h")), interface)]
+    said = [text.encode(), *headers, repr((made, CPP_FLAGS, _processor())).encode()]
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in said)).hexdigest()
+
+
+@functools.cache
+def _processor() -> str:
+    """Return a name for the processor with a digest of its features, because -march=native depends on them."""
+    lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines() if os.path.exists("/proc/cpuinfo") else []
+    wanted = [line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "flags", "Features"))]
+    features = hashlib.sha256("\n".join(sorted(set(wanted))).encode()).hexdigest()[:12] if wanted else ""
+    return f"{platform.machine()} {platform.processor() or next(iter(wanted), '')} {features}".strip()

@@ -1,0 +1,75 @@
+"""Tracing of functions of one lane, (lane, carry) to carry, to jaxprs.
+
+Values that the functions close over are inputs, the same for all lanes. So new values need no new compilation.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+from diffabs.compiler.ir import UpdateLevel
+from diffabs.core.types import PyTree, Scalar
+
+
+class TracedFunction(NamedTuple):
+    """A function of one lane as a jaxpr of the arrays of lane and carry.
+
+    Attributes:
+        jaxpr: Jaxpr; its constvars are first the uniform arrays, then constants.
+        closed: Indices of the arrays in `TracedFunctions.uniform` that the function closes over.
+        constants: Further constants that it closes over.
+    """
+
+    jaxpr: Any
+    closed: tuple[int, ...]
+    constants: tuple[PyTree, ...] = ()
+
+
+class TracedFunctions(NamedTuple):
+    """Traced functions of one lane with the arrays they share.
+
+    Attributes:
+        each: Functions by name.
+        types: Shapes and types of the arrays of each level: uniform, lane, carry.
+        uniform: The uniform arrays, which may be tracers.
+    """
+
+    each: dict[str, TracedFunction]
+    types: dict[UpdateLevel, list[PyTree]]
+    uniform: list[PyTree]
+
+
+def trace_functions(
+    functions: dict[str, Callable[[PyTree, PyTree], PyTree]], lane: PyTree, carry: PyTree
+) -> TracedFunctions:
+    """Return functions of (lane, carry) as jaxprs, with the arrays that they close over.
+
+    Args:
+        functions: Functions by name.
+        lane: Pytree with shapes and types of a lane's constants, without the axis of lanes.
+        carry: Pytree with shapes and types of a lane's carry, without the axis of lanes.
+    """
+    uniform: list[PyTree] = []
+    numbers: dict[int, int] = {}
+    each: dict[str, TracedFunction] = {}
+    for name, function in functions.items():
+        closed = jax.make_jaxpr(function)(lane, carry)
+        for x in closed.consts:
+            # Functions that close over the same array share one input. Equal values in two arrays stay two inputs.
+            if id(x) not in numbers:
+                numbers[id(x)] = len(uniform)
+                uniform.append(x)
+        each[name] = TracedFunction(closed.jaxpr, tuple(numbers[id(x)] for x in closed.consts))
+    types = {
+        UpdateLevel.UNIFORM: uniform,
+        UpdateLevel.LANE: jax.tree.leaves(lane),
+        UpdateLevel.STEP: jax.tree.leaves(carry),
+    }
+    return TracedFunctions(each, {level: [_type(x) for x in xs] for level, xs in types.items()}, uniform)
+
+
+def _type(x: Scalar) -> Scalar:
+    """Return shape and type of an array without its sharding, because the program is for one lane."""
+    aval = x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)
+    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=getattr(aval, "weak_type", False))

@@ -1,0 +1,1 @@
+"""Reading of values that a person wrote: numbers, texts and tables, each refused in one line."""
