@@ -11,7 +11,7 @@ from diffabs.scenario.defaults import balancing as balancing
 from diffabs.scenario.defaults import braking as braking
 from diffabs.simulate.admissible import check as check
 from diffabs.simulate.batch import Batch as Batch
-from diffabs.simulate.batch import run_batch as run_batch
+from diffabs.simulate.ensemble import run_batch as run_batch
 from diffabs.simulate.run import measure as measure
 from diffabs.simulate.run import rollout as rollout
 from diffabs.simulate.types import Adaptive as Adaptive

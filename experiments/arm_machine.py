@@ -5,7 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 
 from diffabs import Loop
-from diffabs.core.pytree import Scalar, Vector, param, part, pytree, replace, static
+from diffabs.core.pytree import param, part, pytree, replace, static
+from diffabs.core.types import Scalar, Vector
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.regulator import lqr
 from diffabs.plants import ArmBalance

@@ -13,7 +13,8 @@ from diffabs import Batch, Loop
 from diffabs.controllers import PID, BackCalculation
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_memory
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 from diffabs.plants import QuarterCar
 from diffabs.references import ExtremumSeeking, FixedSlip, PeakLatch, PeakRobust, SlipByDeceleration
 from diffabs.roads import MagicFormula, Patches

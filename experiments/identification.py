@@ -23,7 +23,8 @@ from jax.tree_util import Partial
 
 from diffabs import FixedStep, Loop
 from diffabs.controllers import PID, ConstantTorque
-from diffabs.core.pytree import Scalar, Vector, canonical_dtypes, param, pytree
+from diffabs.core.pytree import canonical_dtypes, param, pytree
+from diffabs.core.types import Scalar, Vector
 from diffabs.identify.fit import Identified, Tolerances
 from diffabs.identify.identification import identify
 from diffabs.identify.residuals import gaussian

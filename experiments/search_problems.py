@@ -22,7 +22,8 @@ import numpy as np
 from diffabs import Batch, BrakeStart, FixedStep, Loop, plot
 from diffabs.actuators import Lag
 from diffabs.controllers import PID, BackCalculation, ConstantInput, HoldingInput, ScheduledFeedback, StateFeedback
-from diffabs.core.pytree import Vector, param, part, pytree, replace
+from diffabs.core.pytree import param, part, pytree, replace
+from diffabs.core.types import Vector
 from diffabs.design.parameter_box import polytope
 from diffabs.linear.regulator import lqr
 from diffabs.linear.slip_model import SlipModel

@@ -24,7 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from diffabs.tune.problem import DerivativeMode, Multipliers, Problem
+from diffabs.tune.method import DerivativeMode
+from diffabs.tune.problem import Multipliers, Problem
 
 FORWARD = 6  # parameters beyond which forward mode is not timed: benchmarks/bench_gradient.py found it slower there
 REJECTED = 1e6  # the value of a run that failed, as the libraries want it

@@ -20,12 +20,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.arrays import as_rule_array
 from diffabs.core.cubic import Cubic, HermiteStep
 from diffabs.core.log import Log
 from diffabs.core.protocols import Clock, Memory, no_flow
-from diffabs.core.pytree import Scalar, param, pytree, static
-from diffabs.core.rules import Rule, as_rule_array
-from diffabs.core.types import Int, PyTree
+from diffabs.core.pytree import param, pytree, static
+from diffabs.core.rules import Rule
+from diffabs.core.types import Int, PyTree, Scalar
 
 TIME_ROUNDING = 1e-6  # relative rounding of single precision
 WINDOW_PIECES = 6  # pieces; a step that spans more is cut

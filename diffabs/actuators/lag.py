@@ -6,8 +6,9 @@ import numpy as np
 
 from diffabs.core.numerics import clamp, quotient
 from diffabs.core.protocols import Memory, no_flow, no_memory
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule, order_rule
+from diffabs.core.types import Scalar
 
 
 @pytree

@@ -2,7 +2,8 @@
 
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, no_flow, no_memory
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 
 
 @pytree

@@ -7,7 +7,7 @@ import numpy as np
 import typer
 
 from diffabs.cli import console, show, show_samples
-from diffabs.cli.sweep import warn_of_strays
+from diffabs.cli.show_samples import warn_of_strays
 from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.types import JsonObject
 

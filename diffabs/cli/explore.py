@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from diffabs.cli import console, tune
+from diffabs.cli import console, tuning_task
 from diffabs.config.values import ScenarioError
 from diffabs.runtime import interrupt
 from diffabs.scenario.scenario import Scenario
@@ -75,7 +75,7 @@ def prove_scenario(chosen: Scenario) -> "ProofVerdict":
     """
     from diffabs.explore.session import CERTIFIED, NOT_PROVED, REFUTED, UNDECIDED, ProofVerdict
 
-    found = tune.certify_result(chosen)
+    found = tuning_task.certify_result(chosen)
     sentence = found.sentence.partition(": ")[2]
     if not found.certified:
         return ProofVerdict(NOT_PROVED, sentence)
@@ -95,7 +95,7 @@ def pose_tuning(chosen: Scenario) -> "TuningTask":
     from diffabs.explore.tuning import TuningTask
 
     try:
-        work = tune.build_work(chosen)
+        work = tuning_task.build_work(chosen)
     except ModuleNotFoundError as error:
         raise ScenarioError(str(error)) from None
     return TuningTask(work.batch, list(work.constraints.values()))

@@ -1,5 +1,7 @@
 """Tables of the commands on many samples: a sweep, a small probability, a comparison of two sweeps."""
 
+from typing import TYPE_CHECKING
+
 from rich.table import Table
 
 from diffabs.cli.console import say
@@ -7,6 +9,9 @@ from diffabs.cli.show import format_brief, show_titled_table
 from diffabs.core.types import JsonObject
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from diffabs.sweep import Results
 
 
 def show_sweep(result: JsonObject, chosen: Scenario) -> None:
@@ -137,3 +142,14 @@ def show_comparison(result: JsonObject) -> None:
 
 def _estimate(row: JsonObject) -> list[str]:
     return ["" if row[key] is None else format_brief(row[key]) for key in ("value", "low", "high")]
+
+
+def warn_of_strays(found: "Results") -> None:
+    """Warn of files among the chunks that are not part of the sweep: other readers would read them too.
+
+    Args:
+        found: Results of the sweep.
+    """
+    if found.strays:
+        more = f" (and {len(found.strays) - 1} more)" if found.strays[1:] else ""
+        say(f"warning: {found.strays[0]}{more} is not a chunk of this sweep; other programs would read it, too")

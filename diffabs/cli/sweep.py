@@ -79,7 +79,7 @@ def sweep(
             _check_runnable(study, number)
         with _explain_resume(out, resume):
             found = _run(study, chosen, out, resume, lambda: _computer(on, scheduler, workers))
-            warn_of_strays(found)
+            show_samples.warn_of_strays(found)
             if not found.complete:
                 raise KeyboardInterrupt
             check = chosen.sweep.check
@@ -134,17 +134,6 @@ def _check_runnable(study: "Study", number: int) -> tuple[PyTree, jax.Array]:
     if line := first_refusal(loop, {}, study.solver):
         raise ScenarioError(f"sample {number} was refused: {line}")
     return loop, key
-
-
-def warn_of_strays(found: "Results") -> None:
-    """Warn of files among the chunks that are not part of the sweep: other readers would read them too.
-
-    Args:
-        found: Results of the sweep.
-    """
-    if found.strays:
-        more = f" (and {len(found.strays) - 1} more)" if found.strays[1:] else ""
-        console.say(f"warning: {found.strays[0]}{more} is not a chunk of this sweep; other programs would read it, too")
 
 
 @contextlib.contextmanager

@@ -15,20 +15,15 @@ import typer
 
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
-from diffabs.cli.tune_document import Proved, Work, tuning_document
-from diffabs.config.values import ScenarioError
+from diffabs.cli.tuning_task import Work, build_work, certify_result, tuning_document, without_certificate
 from diffabs.core.types import JsonObject, Part
 from diffabs.scenario.scenario import Scenario, dump
-from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Trajectory
 
 if TYPE_CHECKING:
     from diffabs.tune import Tuned, TuningProgress
-
-OF_THE_COMMAND = ("scenario", "model", "made", "versions", "files")  # keys of a certificate that the tuning has too
-BOUND_ROUNDING = 1e-9  # relative; rounding of a decay rate that is proved as a factor per period is smaller
 
 
 def tune(
@@ -100,7 +95,7 @@ def _tune_and_document(
         proved = console.run_with_progress(lambda: certify_result(after), "certifying the result")
         result = console.run_with_progress(lambda: tuning_document(work, found, proved), "comparing before and after")
     except KeyboardInterrupt:
-        interrupted, proved = True, _without_certificate("interrupted")
+        interrupted, proved = True, without_certificate("interrupted")
         result = _without_proof(work, tuning_document(work._replace(task=None), found, proved))
     if out and result["met"]:
         out.write_text(dump(after), encoding="utf-8")
@@ -124,31 +119,6 @@ def _without_proof(work: Work, result: JsonObject) -> JsonObject:
         if name not in seen
     ]
     return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
-
-
-def build_work(chosen: Scenario) -> Work:
-    """Return the runs and constraints of a tuning.
-
-    Args:
-        chosen: Scenario with a section `[tune]`.
-
-    Raises:
-        ScenarioError: The section does not fit the loop.
-        ModuleNotFoundError: An extra is not installed.
-    """
-    from diffabs.tune import AtMost, CertifiedDecay, Poles
-
-    goal = chosen.tune.check(chosen.loop)
-    batch = goal.batch(chosen.seed).check(chosen.loop)
-    if line := first_refusal(chosen.loop, batch.values, chosen.solver):
-        raise ScenarioError(f"tune.over: {line}")
-    constraints: JsonObject = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
-    task = certificates.build_proof_task(chosen) if goal.decay or goal.damping else None
-    if task and goal.decay:
-        constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
-    if task and goal.damping:
-        constraints["damping"] = Poles(task.polytope, damping=goal.damping)
-    return Work(chosen, batch, constraints, task)
 
 
 def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
@@ -201,40 +171,6 @@ def _format_progress(told: "list[TuningProgress]", most: int | None = None) -> p
         f" {total} evaluations, {last.starts} under way"
     )
     return progress.WorkProgress(words, max(one.point.iteration for one in told), most, at_most=True)
-
-
-def certify_result(after: Scenario) -> Proved:
-    """Return the outcome of a proof for the tuned loop over the ranges of [design].
-
-    The certificate has the fastest decay rate that is found. If [tune] requires a faster one, it has that one if it can
-    be proved. Without a certificate the outcome gives the reason; no error is raised.
-
-    Args:
-        after: Scenario with the tuned loop.
-    """
-    decay = after.tune.decay
-    try:
-        task = certificates.build_proof_task(after)
-        found = certificates.certify_gain(task)
-        if (found.decay_rate or 0.0) < decay:  # the search for the fastest decay ends slightly below the optimum
-            asked = certificates.certify_gain(
-                task._replace(spec=dataclasses.replace(task.spec, decay=decay * (1 + BOUND_ROUNDING)))
-            )
-            found = asked if (asked.decay_rate or 0.0) >= decay else found
-    except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
-        return _without_certificate(" ".join(str(error).split()))
-    known = certificates.find_further(task, found)
-    reason = certificates.describe_unproved(found, task.spec, known) or None
-    document = certificates.proof_document(task, found, reason=reason, known=known)
-    document = {key: value for key, value in document.items() if key not in OF_THE_COMMAND}
-    rate = document["decay_rate"]
-    over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
-    said = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"
-    return Proved(document, f"certificate: {said}", task, certified=True)
-
-
-def _without_certificate(why: str) -> Proved:
-    return Proved({**dict.fromkeys(certificates.FROM_PROOF), "reason": why}, f"no certificate: {why}")
 
 
 def _draw(work: Work, found: "Tuned", path: pathlib.Path) -> None:

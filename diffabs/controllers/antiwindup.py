@@ -7,7 +7,8 @@ The error has the controller's own sign: target - signal in a PID, signal - targ
 import jax.numpy as jnp
 
 from diffabs.core.numerics import ratio
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 
 
 @pytree

@@ -16,8 +16,8 @@ import numpy as np
 
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking, no_flow, no_memory
-from diffabs.core.pytree import Matrix, Scalar, Vector, param, pytree
-from diffabs.core.types import Part, PyTree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Matrix, Part, PyTree, Scalar, Vector
 
 STATE_NAMES = ("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate")
 MEASURED_NAMES = ("theta", "psi")

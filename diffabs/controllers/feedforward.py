@@ -1,7 +1,8 @@
 """Feed-forward inputs: the control to which a controller adds its feedback."""
 
 from diffabs.core.protocols import BrakeOutput, Plant
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 
 
 @pytree

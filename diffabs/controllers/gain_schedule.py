@@ -18,9 +18,9 @@ from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.controllers.feedback import StateFeedback
 from diffabs.core.numerics import interpolate_shares, interval_shares
 from diffabs.core.protocols import Memory, Tracking
-from diffabs.core.pytree import Scalar, Vector, param, part, pytree
+from diffabs.core.pytree import param, part, pytree
 from diffabs.core.rules import Rule, increase_rule
-from diffabs.core.types import Part
+from diffabs.core.types import Part, Scalar, Vector
 
 
 @pytree

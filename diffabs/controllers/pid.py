@@ -16,9 +16,9 @@ import numpy as np
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking
-from diffabs.core.pytree import Scalar, param, part, pytree
+from diffabs.core.pytree import param, part, pytree
 from diffabs.core.rules import Rule, order_rule
-from diffabs.core.types import Part
+from diffabs.core.types import Part, Scalar
 
 
 class PIDMemory(NamedTuple):

@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.controllers.pid import PID
+from diffabs.core.arrays import as_rule_array
 from diffabs.core.blocks import offers
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
-from diffabs.core.pytree import Scalar, param, part, pytree
-from diffabs.core.rules import Rule, as_rule_array
-from diffabs.core.timing import whole_steps
+from diffabs.core.pytree import param, part, pytree
+from diffabs.core.rules import Rule, whole_steps
 from diffabs.core.tracing import leaf_dependence
-from diffabs.core.types import Bool, Part, PyTree
+from diffabs.core.types import Bool, Part, PyTree, Scalar
 
 PERIOD_EPS = 16.0  # in machine epsilons of the time: closer instants count as equal
 

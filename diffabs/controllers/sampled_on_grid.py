@@ -18,9 +18,9 @@ from diffabs.controllers.pid import PID
 from diffabs.controllers.sampled import PERIOD_EPS, Sampled, replace_nan, within_period
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
-from diffabs.core.pytree import Scalar, param, part, pytree
-from diffabs.core.rules import Rule
-from diffabs.core.timing import whole_steps
+from diffabs.core.pytree import param, part, pytree
+from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.types import Scalar
 
 
 class GridMemory(NamedTuple):

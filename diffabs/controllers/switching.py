@@ -7,9 +7,9 @@ import numpy as np
 
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking, no_flow, no_memory
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule, order_rule
-from diffabs.core.types import PyTree
+from diffabs.core.types import PyTree, Scalar
 
 
 @pytree

@@ -1,4 +1,4 @@
-"""Conversion of numbers to JAX arrays without a compiled program for each number."""
+"""Conversion of numbers: to arrays without a compiled program for each number, and to whole steps."""
 
 import functools
 import math
@@ -38,3 +38,26 @@ def _number(x: float, sign: float, dtype: np.dtype, around: Any) -> jax.Array:
     """
     del sign, around
     return jax.device_put(np.asarray(x, dtype))
+
+
+def as_rule_array(x: Scalar) -> Scalar:
+    """Return x as an array: JAX arrays and tracers in their own type, other numbers as NumPy float64.
+
+    Args:
+        x: Number, array, or list of numbers.
+    """
+    if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(x)):
+        return jnp.asarray(x)
+    return np.asarray(x, float)
+
+
+def steps_in_period(period: Scalar, h: Scalar) -> Scalar:
+    """Return the number of steps of length h in a period, rounded to an integer of at least 1.
+
+    The number has no derivative.
+
+    Args:
+        period: Period [s].
+        h: Step [s].
+    """
+    return jnp.maximum(jnp.round(jax.lax.stop_gradient(period / h)), 1).astype(int)

@@ -7,11 +7,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.arrays import steps_in_period
 from diffabs.core.cubic import HermiteStep
 from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
-from diffabs.core.pytree import Scalar, part, pytree
-from diffabs.core.timing import steps_in_period
-from diffabs.core.types import Int, Part, PyTree
+from diffabs.core.pytree import part, pytree
+from diffabs.core.types import Int, Part, PyTree, Scalar
 
 
 @pytree

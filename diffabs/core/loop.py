@@ -29,8 +29,8 @@ from diffabs.core.protocols import (
     Tracking,
     no_flow,
 )
-from diffabs.core.pytree import Scalar, part, parts, pytree
-from diffabs.core.types import Int, Part, PyTree
+from diffabs.core.pytree import part, parts, pytree
+from diffabs.core.types import Int, Part, PyTree, Scalar
 
 
 class LoopState(NamedTuple):

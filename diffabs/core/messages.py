@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.arrays import steps_in_period
 from diffabs.core.cubic import Cubic
-from diffabs.core.pytree import Scalar
-from diffabs.core.timing import steps_in_period
-from diffabs.core.types import Bool, Int, Key, PyTree
+from diffabs.core.types import Bool, Int, Key, PyTree, Scalar
 
 
 class BrakeOutput(NamedTuple):

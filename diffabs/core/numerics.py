@@ -6,8 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.pytree import Scalar
-from diffabs.core.types import PyTree
+from diffabs.core.types import PyTree, Scalar
 
 EQUAL_EPS = 1024.0  # in units of eps: difference of a signal between instants that are equal to rounding
 

@@ -67,8 +67,7 @@ from diffabs.core.messages import Segment as Segment
 from diffabs.core.messages import Shown as Shown
 from diffabs.core.messages import Tracking as Tracking
 from diffabs.core.messages import resting_segment as resting_segment
-from diffabs.core.pytree import Scalar
-from diffabs.core.types import Bool, Part, PyTree
+from diffabs.core.types import Bool, Part, PyTree, Scalar
 
 
 class Road(Protocol):

@@ -22,13 +22,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from diffabs.core import kinds
-from diffabs.core.arrays import as_array
+from diffabs.core.arrays import as_array, as_rule_array
 from diffabs.core.compiling import is_traced
-from diffabs.core.rules import as_rule_array
-from diffabs.core.types import Matrix as Matrix
-from diffabs.core.types import Params, Part, PyTree
-from diffabs.core.types import Scalar as Scalar
-from diffabs.core.types import Vector as Vector
+from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.core.units import Units, resolve_unit, units_of
 
 T = TypeVar("T")

@@ -7,10 +7,9 @@ are evaluated with concrete numbers, or traced, for all runs of a batch in one c
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.arrays import as_rule_array
 from diffabs.core.types import PyTree, Scalar
 from diffabs.core.units import Units, insert_unit
 
@@ -34,17 +33,6 @@ class Rule(NamedTuple):
     def under(self, prefix: str, units: Units | None = None) -> "Rule":
         """Return the same rule for a part at the path `prefix`, in a loop with these `units`."""
         return Rule(self.holds, prefix + self.broken, lambda: prefix + insert_unit(self.says(), units))
-
-
-def as_rule_array(x: Scalar) -> Scalar:
-    """Return x as an array: JAX arrays and tracers in their own type, other numbers as NumPy float64.
-
-    Args:
-        x: Number, array, or list of numbers.
-    """
-    if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(x)):
-        return jnp.asarray(x)
-    return np.asarray(x, float)
 
 
 def order_rule(low: tuple[str, PyTree], high: tuple[str, PyTree], unit: str, *, equal: bool = True) -> Rule:
@@ -81,4 +69,20 @@ def increase_rule(name: str, values: PyTree, broken: str, unit: str) -> Rule:
         lambda: (
             f"{name} = {np.asarray(x).tolist()} {unit} {broken}" if len(x) <= MAX_SHOWN_NUMBERS else f"{name} {broken}"
         ),
+    )
+
+
+def whole_steps(name: str, period: Scalar, step: float) -> Rule:
+    """Return the rule that a period is a whole multiple of the step, to a relative tolerance of 1e-6.
+
+    Args:
+        name: Name of the period.
+        period: Period [s].
+        step: Step [s].
+    """
+    count = as_rule_array(period) / step
+    return Rule(
+        (count >= 0.5) & (abs(count - count.round()) <= 1e-6 * count),
+        f"{name} is not a multiple of solver.step = {step:g} s",
+        lambda: f"{name} = {float(period):g} s is not a multiple of solver.step = {step:g} s",
     )

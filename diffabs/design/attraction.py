@@ -23,7 +23,8 @@ from diffabs.controllers.balance import state_of
 from diffabs.core.loop import Loop
 from diffabs.core.types import Matrix, Params, Part, PyTree, Scalar
 from diffabs.design.capture import capture_ellipsoids
-from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.batch import Batch
+from diffabs.simulate.ensemble import run_batch
 from diffabs.simulate.types import Solver
 
 # Search for the largest multiple: relative width of the last interval; runs of one batch.

@@ -17,7 +17,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.pytree import Scalar, canonical_dtypes, param, part, pytree
+from diffabs.core.pytree import canonical_dtypes, param, part, pytree
+from diffabs.core.types import Scalar
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.slip_model import Sampling, SlipModel
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from diffabs.core.types import JsonObject, PyTree
-from diffabs.explore.curves import Curves, Fan, Panel
+from diffabs.explore.panels import Curves, Fan, Panel
 from diffabs.explore.stability import Stability
 
 BLUE, RED, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#767676", "#1F2933"

@@ -9,8 +9,8 @@ from typing import Any
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.core.types import JsonObject, Scalar
-from diffabs.explore.curves import Fan
 from diffabs.explore.knobs import SLIDER_STEPS, Knob, unit_words
+from diffabs.explore.panels import Fan
 from diffabs.explore.session import AS_GIVEN, EXCHANGEABLE_FAMILIES, Session
 from diffabs.scenario.scenario import names
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -11,11 +10,13 @@ from diffabs.core.pytree import get, parameters
 from diffabs.core.types import Part
 from diffabs.explore.friction import FACTOR_PATH
 from diffabs.explore.knobs import is_vehicle, mass_path
+from diffabs.explore.panels import Curve, Curves, Fan, Panel, Spread
 from diffabs.linear.robustness import low_discrepancy_points
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.batch import Batch
 from diffabs.simulate.convert import trajectory_columns
+from diffabs.simulate.ensemble import run_batch
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Adaptive, FixedStep, Run, Solver
 
@@ -28,69 +29,6 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 SETTLED_SHARE = 0.05  # settled: the distance from the target stays below this share of its largest value
 TRANSIENT_MULTIPLE = 1.5  # length of a fitted time axis in transients
 MIN_TRANSIENT_SHARE = 0.1  # a fan is drawn while this share of its runs goes on
-
-
-class Curve(NamedTuple):
-    """A curve: its name, and its values in the displayed unit, NaN for missing ones."""
-
-    name: str
-    values: np.ndarray
-
-
-class Panel(NamedTuple):
-    """Curves of one unit; the fan belongs to the first curve."""
-
-    unit: str
-    lines: tuple[Curve, ...]
-
-
-class Curves(NamedTuple):
-    """The curves of a run.
-
-    Attributes:
-        t: Instants [s].
-        panels: Panels of the chart.
-        metrics: Metrics by name.
-        end: Sentence about the end of the run.
-        draft: True for a quick run by another solver than the scenario's.
-    """
-
-    t: np.ndarray
-    panels: tuple[Panel, ...]
-    metrics: dict[str, float]
-    end: str
-    draft: bool
-
-
-class Fan(NamedTuple):
-    """Quantiles of many runs.
-
-    Attributes:
-        t: Instants [s].
-        bands: Quantiles of the first curve of each panel, shape (QUANTILES, instants).
-        members: Number of runs.
-        diverged: Number of diverged runs.
-        words: Parameters that differ between the runs, with their spread.
-    """
-
-    t: np.ndarray
-    bands: tuple[np.ndarray, ...]
-    members: int
-    diverged: int
-    words: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Spread:
-    """Relative half widths of the uniform spread of a fan's members around the current values.
-
-    Attributes:
-        mass: Half width of the mass [1].
-        road: Half width of the friction factor [1].
-    """
-
-    mass: float = 0.1
-    road: float = 0.2
 
 
 def drawing_solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:

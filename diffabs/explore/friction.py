@@ -6,16 +6,19 @@ the scenario become one level deeper. A factor that stays at 1 is removed again 
 
 import dataclasses
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from diffabs.core.types import JsonObject, Part, Table
 from diffabs.roads import Scaled
-from diffabs.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from diffabs.scenario.scenario import Scenario
 
 ROAD, INNER = "plant.road.", "plant.road.road."
 FACTOR_PATH = "plant.road.scale"
 
 
-def with_factor(chosen: Scenario) -> Scenario:
+def with_factor(chosen: "Scenario") -> "Scenario":
     """Return the scenario with a friction factor at `plant.road.scale`.
 
     A scenario without a road, or whose road has a factor already, is returned unchanged.
@@ -31,7 +34,7 @@ def with_factor(chosen: Scenario) -> Scenario:
     return _rename_paths(chosen, plant, lambda path: INNER + path[len(ROAD) :] if path.startswith(ROAD) else path)
 
 
-def without_factor(chosen: Scenario, given: Scenario) -> Scenario:
+def without_factor(chosen: "Scenario", given: "Scenario") -> "Scenario":
     """Return the scenario without the factor that `with_factor` added, if the factor is still 1.
 
     Args:
@@ -47,7 +50,7 @@ def without_factor(chosen: Scenario, given: Scenario) -> Scenario:
     return _rename_paths(chosen, plant, lambda path: ROAD + path[len(INNER) :] if path.startswith(INNER) else path)
 
 
-def _rename_paths(chosen: Scenario, plant: Part, name: Callable[[str], str]) -> Scenario:
+def _rename_paths(chosen: "Scenario", plant: Part, name: Callable[[str], str]) -> "Scenario":
     def keys(table: Table) -> JsonObject:
         return {name(path): value for path, value in table.items()}
 

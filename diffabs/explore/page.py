@@ -17,6 +17,7 @@ from diffabs.explore.canvas import Canvas, encode_change
 from diffabs.explore.controls import Controls
 from diffabs.explore.header import add_header
 from diffabs.explore.look import SCRIPT, STYLE
+from diffabs.explore.panels import Curves, Fan
 from diffabs.explore.results import ResultsPanel
 from diffabs.explore.saver import Saver
 from diffabs.explore.session import NOT_PROVED, ProofVerdict, Session, Tools, objections
@@ -44,7 +45,7 @@ class Page:
         self.version, self.turned_at = 0, 0.0
         self.since = 0  # first version of this scenario; results of earlier ones are dropped
         self.costs: dict[str, float] = {}
-        self.shown: curves.Curves | None = None
+        self.shown: Curves | None = None
         self.objected = 0  # version after a refusal, whose message stays
         self.drawn = 0  # newest version with a curve or a refusal
         self.around: stability.CornerLoops | None = None  # corners computed last
@@ -108,7 +109,7 @@ class Page:
         # The page's elements may be changed in the server's thread only.
         self.server.call_soon_threadsafe(do)
 
-    def pin(self, found: curves.Curves | None) -> None:
+    def pin(self, found: Curves | None) -> None:
         """Show the run `found` as the dashed curve to compare with; None removes it."""
         if self.chart is not None:
             change = charts.change_curves(found, "before") if found else charts.clear_curves("before")
@@ -181,7 +182,7 @@ class Page:
             self.controls.rebuild()
             self.begin()
 
-    def _show_curves(self, found: curves.Curves, now: Scenario, change: str, version: int, edit: int) -> None:
+    def _show_curves(self, found: Curves, now: Scenario, change: str, version: int, edit: int) -> None:
         if version < self.since:
             return
         self.session.accept(now.loop)
@@ -203,7 +204,7 @@ class Page:
         if self.shown is None:
             self.end_line.set_text("no run")
 
-    def _show_fan(self, found: curves.Fan | None, change: str) -> None:
+    def _show_fan(self, found: Fan | None, change: str) -> None:
         if self.chart is not None:
             self.chart.send(change)
         self.controls.fan(found)
@@ -232,7 +233,7 @@ class Page:
             # Also after an error: `_think` waits for this version.
             self.drawn = version
 
-    def _send(self, found: curves.Curves, now: Scenario, version: int, edit: int = 0) -> None:
+    def _send(self, found: Curves, now: Scenario, version: int, edit: int = 0) -> None:
         self.later(self._show_curves, found, now, encode_change(charts.change_curves(found)), version, edit)
 
     def _think(self, now: Scenario, version: int) -> None:

@@ -1,13 +1,12 @@
 """The right column: verdict, map of poles, margins, and metrics of the run."""
 
-import math
-
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.core.types import JsonObject, PyTree
 from diffabs.explore import charts
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words
+from diffabs.explore.panels import NO_VALUE, format_metric
 from diffabs.explore.session import CERTIFIED, REFUTED, UNDECIDED, ProofVerdict
 from diffabs.explore.stability import Stability, format_margin
 from diffabs.scenario.registry import unit_of
@@ -25,19 +24,6 @@ MARGINS = {
     "delay": "delay margin",
     "modulus": "modulus margin 1/Ms",
 }
-
-
-NO_VALUE = "-"
-DISPLAY_ROUNDING = 1e-12  # smaller magnitudes are shown as 0
-
-
-def format_metric(value: float) -> str:
-    """Return a metric as text, without digits that are rounding errors.
-
-    Args:
-        value: Metric; NaN is shown as "-".
-    """
-    return NO_VALUE if math.isnan(value) else "0" if abs(value) < DISPLAY_ROUNDING else f"{value:.5g}"
 
 
 class ResultsPanel:

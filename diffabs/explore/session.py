@@ -16,8 +16,8 @@ from diffabs.core.pytree import ParameterSpec, get, replace
 from diffabs.core.types import PyTree, Scalar
 from diffabs.core.validity import find_problems
 from diffabs.explore import friction, knobs, tuning
-from diffabs.explore.curves import Spread
 from diffabs.explore.knobs import Knob
+from diffabs.explore.panels import Spread
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import Scenario, load
 from diffabs.simulate.admissible import find_mismatches, find_unstable_step

@@ -10,7 +10,7 @@ from diffabs.core.types import PyTree, Scalar
 from diffabs.explore import curves, tuning
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words
-from diffabs.explore.results import format_metric
+from diffabs.explore.panels import Curves, format_metric
 from diffabs.explore.work import NewestJobThread
 from diffabs.scenario.scenario import Scenario
 
@@ -177,9 +177,7 @@ class Tuner:
         self.card.set_visibility(False)
         self.page.show_refusal(error)
 
-    def _show_result(
-        self, chosen: Scenario, found: tuning.TuningFound, before: curves.Curves, after: curves.Curves
-    ) -> None:
+    def _show_result(self, chosen: Scenario, found: tuning.TuningFound, before: Curves, after: Curves) -> None:
         self.running = False
         if self.origin is None:
             return
@@ -190,7 +188,7 @@ class Tuner:
         self.page.pin(before)
         self.page.redraw()
 
-    def _table(self, chosen: Scenario, found: tuning.TuningFound, before: curves.Curves, after: curves.Curves) -> None:
+    def _table(self, chosen: Scenario, found: tuning.TuningFound, before: Curves, after: Curves) -> None:
         """Show the free parameters and the metrics before and after the tuning."""
         knobs = self.page.session.knobs
         self.card.clear()

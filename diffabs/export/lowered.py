@@ -1,6 +1,6 @@
 """A controller as operations on single numbers, in a form that every target language can write.
 
-The operations come from the jaxprs of the loop's own functions, by the rules of package `kernel`. So a part needs no
+The operations come from the jaxprs of the loop's own functions, by the rules of package `compiler`. So a part needs no
 code for any language.
 """
 

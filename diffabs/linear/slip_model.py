@@ -14,8 +14,8 @@ from jax.flatten_util import ravel_pytree
 from diffabs.actuators import Lag
 from diffabs.core.blocks import Direct
 from diffabs.core.protocols import Plant
-from diffabs.core.pytree import Scalar, canonical_dtypes, param, part, pytree, static
-from diffabs.core.types import AnyArray, PyTree
+from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
+from diffabs.core.types import AnyArray, PyTree, Scalar
 from diffabs.linear.linearization import (
     REMAINING_STATE_ITERATIONS,
     StateSpace,

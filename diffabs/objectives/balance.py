@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp, larger, later_of_larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
-from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.core.types import PyTree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import PyTree, Scalar, Vector
 from diffabs.objectives.tracking import FinalError, held_value, integral_value, keep_memory, no_integral
 
 RATE_NAMES = ("theta_rate", "psi_rate", "phi_rate")

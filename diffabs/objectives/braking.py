@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import larger
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 from diffabs.objectives.tracking import (
     FinalError,
     held_value,

@@ -15,9 +15,9 @@ import numpy as np
 from diffabs.core.cubic import Cubic
 from diffabs.core.numerics import larger, later_of_larger, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
-from diffabs.core.pytree import Scalar, Vector, param, parts, pytree
+from diffabs.core.pytree import param, parts, pytree
 from diffabs.core.rules import Rule, order_rule
-from diffabs.core.types import Part, PyTree
+from diffabs.core.types import Part, PyTree, Scalar, Vector
 
 MIN_SETPOINT = 0.01  # least denominator of an overshoot, in the unit of the first signal
 

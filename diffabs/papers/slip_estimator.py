@@ -26,7 +26,8 @@ from diffabs.references import FixedSlip, PeakLatch, PeakLiteral
 from diffabs.roads import MagicFormula, peak
 from diffabs.runtime import provenance
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import run_batch, stack_loops
+from diffabs.simulate.batch import stack_loops
+from diffabs.simulate.ensemble import run_batch
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import FixedStep, Run
 

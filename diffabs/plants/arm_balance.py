@@ -33,8 +33,8 @@ from diffabs.actuators import VoltageLimit
 from diffabs.controllers import BalanceFeedback
 from diffabs.core.numerics import clamp, quotient
 from diffabs.core.protocols import BalanceOutput
-from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.core.types import AnyArray, PyTree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import AnyArray, PyTree, Scalar
 from diffabs.objectives import BALANCE
 from diffabs.plants.audit import BalanceAudit
 from diffabs.references import Upright

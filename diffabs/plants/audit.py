@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample, Segment
-from diffabs.core.pytree import Scalar, param, part, pytree, static
-from diffabs.core.types import Part
+from diffabs.core.pytree import param, part, pytree, static
+from diffabs.core.types import Part, Scalar
 from diffabs.objectives.tracking import no_integral
 
 FORGIVEN = 0.01  # tolerance for a whole run, as a fraction of the energy scale

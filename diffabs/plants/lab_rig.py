@@ -28,11 +28,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
+from diffabs.core.arrays import as_rule_array
 from diffabs.core.numerics import clamp, larger, quotient, smaller
 from diffabs.core.protocols import BrakeOutput, Road
-from diffabs.core.pytree import Scalar, param, part, pytree
-from diffabs.core.rules import Rule, as_rule_array
-from diffabs.core.types import PyTree
+from diffabs.core.pytree import param, part, pytree
+from diffabs.core.rules import Rule
+from diffabs.core.types import PyTree, Scalar
 from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import (
     FROZEN_OUTPUTS,

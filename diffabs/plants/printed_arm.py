@@ -13,7 +13,8 @@ Source: Fumita, eqs. (8)-(10), for small angles.
 
 from diffabs.core.numerics import quotient
 from diffabs.core.protocols import BalanceOutput
-from diffabs.core.pytree import Scalar, part, pytree
+from diffabs.core.pytree import part, pytree
+from diffabs.core.types import Scalar
 from diffabs.plants.arm_balance import ArmBalance, ArmState, BalanceStart, usual_objectives, usual_parts
 
 

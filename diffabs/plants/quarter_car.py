@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 from diffabs.core.numerics import quotient
 from diffabs.core.protocols import BrakeOutput, Road
-from diffabs.core.pytree import Scalar, param, part, pytree
+from diffabs.core.pytree import param, part, pytree
+from diffabs.core.types import Scalar
 from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import (
     FROZEN_OUTPUTS,

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from diffabs.controllers import PID
 from diffabs.core.numerics import larger, quotient
-from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.core.types import Part, PyTree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.objectives import BRAKING
 from diffabs.references import FixedSlip
 from diffabs.stops import Standstill

@@ -13,9 +13,9 @@ import numpy as np
 from diffabs.core.types import Scalar, Table
 from diffabs.plot.style import COLOURS, GREY, Axes, Figure, label_axes, make_logarithmic, save_figure, sheet
 from diffabs.plot.sweep_view import AxisVariable, SweepView, assign_cells
-from diffabs.sweep.engines import describe_wrong_end
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail
+from diffabs.sweep.study import describe_wrong_end
 
 # In distances between the outer quantiles. Values further outside are left out, or they would compress the histogram.
 MAX_BOUND_DISTANCE = 2.0

@@ -15,8 +15,9 @@ import numpy as np
 
 from diffabs.core.numerics import interpolate_shares, interval_shares
 from diffabs.core.protocols import BrakeOutput, Memory
-from diffabs.core.pytree import Scalar, Vector, param, pytree
+from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule, increase_rule
+from diffabs.core.types import Scalar, Vector
 
 
 @pytree

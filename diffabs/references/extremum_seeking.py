@@ -23,9 +23,9 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp, larger
 from diffabs.core.protocols import BrakeOutput, Memory
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule, order_rule
-from diffabs.core.types import PyTree
+from diffabs.core.types import PyTree, Scalar
 
 
 class SeekingMemory(NamedTuple):

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import smaller
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
-from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.core.rules import Rule
-from diffabs.core.timing import whole_steps
+from diffabs.core.pytree import param, pytree
+from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.types import Scalar
 
 
 @pytree

@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
-from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.core.types import PyTree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import PyTree, Scalar
 
 # A later maximum counts only if it exceeds the greatest by this fraction. A controller that holds the best slip keeps
 # the deceleration equal to its maximum up to rounding; comparisons of equal numbers would then decide the derivatives.

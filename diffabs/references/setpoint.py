@@ -1,8 +1,8 @@
 """References with a known target: a constant for the plant's first signal, or a slip, fixed or filtered."""
 
 from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_memory
-from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.core.types import PyTree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import PyTree, Scalar
 
 
 @pytree

@@ -1,7 +1,8 @@
 """The reference of a balance: the upright position."""
 
 from diffabs.core.protocols import BalanceOutput, Memory, no_flow
-from diffabs.core.pytree import Scalar, pytree
+from diffabs.core.pytree import pytree
+from diffabs.core.types import Scalar
 
 
 @pytree

@@ -25,9 +25,10 @@ from diffabs.core.types import Params, PyTree, Scalar, Table
 from diffabs.reliability.importance_sampling import DESIGN_POINT_STARTS, Gradient
 from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
 from diffabs.simulate.admissible import batch_admissibility
-from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import describe_engine, log_kernel, log_xla_reason, resolve_request
 from diffabs.simulate.drive.sharding import describe_placement
+from diffabs.simulate.ensemble import run_batch
 from diffabs.sweep.study import Study, noise_key, precision
 
 DIFFERENCE_STEP = 1e-4  # step in z: relative errors of 1e-9 (truncation) and 1e-12 (rounding)

@@ -17,7 +17,8 @@ import numpy as np
 
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Road
-from diffabs.core.pytree import Scalar, Vector, param, part, pytree
+from diffabs.core.pytree import param, part, pytree
+from diffabs.core.types import Scalar, Vector
 from diffabs.roads.burckhardt import DRY_ASPHALT
 
 FIRST_NODE, LAST = 2, 1  # intervals before 0 and beyond the last factor after which the spline is constant

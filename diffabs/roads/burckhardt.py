@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from diffabs.core.numerics import odd
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule
+from diffabs.core.types import Scalar
 from diffabs.roads.sign import opposes
 
 

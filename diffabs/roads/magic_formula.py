@@ -7,7 +7,8 @@ Source: H. B. Pacejka, Tire and Vehicle Dynamics, 3rd ed., eq. (4.49), without s
 
 import jax.numpy as jnp
 
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 
 
 @pytree

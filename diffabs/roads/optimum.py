@@ -7,8 +7,7 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp, ratio
 from diffabs.core.protocols import Road
-from diffabs.core.pytree import Scalar
-from diffabs.core.types import PyTree
+from diffabs.core.types import PyTree, Scalar
 
 GRID = 1024  # intervals of (0, 1]: resolves the peak of every road with a peak slip above 0.001
 BISECTIONS = 50  # 2^-50 of an interval is below the resolution of float64

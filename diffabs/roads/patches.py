@@ -8,8 +8,9 @@ import numpy as np
 
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Road
-from diffabs.core.pytree import Scalar, Vector, param, part, pytree
+from diffabs.core.pytree import param, part, pytree
 from diffabs.core.rules import Rule, increase_rule
+from diffabs.core.types import Scalar, Vector
 from diffabs.roads.burckhardt import DRY_ASPHALT, SNOW
 
 

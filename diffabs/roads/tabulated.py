@@ -16,9 +16,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.arrays import as_rule_array
 from diffabs.core.numerics import odd, ratio, searchsorted
-from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.core.rules import Rule, as_rule_array, increase_rule
+from diffabs.core.pytree import param, pytree
+from diffabs.core.rules import Rule, increase_rule
+from diffabs.core.types import Scalar, Vector
 
 KNOTS = (  # slip and friction at the knots of the identified spline
     (0, 0.02108, 0.04215, 0.06323, 0.08431, 0.09696, 0.10539, 0.12039, 0.14539,

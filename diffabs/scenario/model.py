@@ -1,7 +1,7 @@
 """The contents of a scenario as JSON values, for the documents of the commands and for their readers."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -9,11 +9,13 @@ from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Scalar
 from diffabs.core.units import units_of
 from diffabs.scenario import registry
-from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.types import describe_solver
 
+if TYPE_CHECKING:
+    from diffabs.scenario.scenario import Scenario
 
-def describe_model(chosen: Scenario) -> JsonObject:
+
+def describe_model(chosen: "Scenario") -> JsonObject:
     """Return a scenario as JSON values.
 
     They are title, description, parts, parameters with units, solver, and units of the metrics.
@@ -31,7 +33,7 @@ def describe_model(chosen: Scenario) -> JsonObject:
     }
 
 
-def describe_parts(chosen: Scenario) -> dict[str, JsonObject]:
+def describe_parts(chosen: "Scenario") -> dict[str, JsonObject]:
     """Return every part, objectives included, by its path: its type, and its fields that are not parameters.
 
     Args:
@@ -43,7 +45,7 @@ def describe_parts(chosen: Scenario) -> dict[str, JsonObject]:
     return found
 
 
-def describe_numbers(chosen: Scenario) -> dict[str, JsonObject]:
+def describe_numbers(chosen: "Scenario") -> dict[str, JsonObject]:
     """Return value (in SI) and unit of every parameter, those of objectives included, by its path.
 
     JSON has no infinity and no NaN: these become texts, which an override accepts.

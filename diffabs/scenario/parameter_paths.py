@@ -10,20 +10,25 @@ This module reads paths and units. Each table gives its values another meaning, 
 
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from diffabs.config.values import (
     FORMER_FIELDS,
+    Reader,
     ScenarioError,
+    dotted_path,
     format_given,
+    read_as_given,
     read_number,
     read_number_in_range,
+    table_reader,
     unknown_name_error,
     wrong_kind_error,
 )
+from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
 from diffabs.scenario.registry import KMH, MAX_DEPTH, in_kmh
@@ -266,3 +271,28 @@ def parameters_of(loop: Part) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]
 def _where(section: str, path: str) -> str:
     path = path if re.fullmatch(r"[a-zA-Z0-9_.-]{1,60}", path) else format_given(path)
     return f"{section}{' ' if section.startswith('-') else '.'}{path}"
+
+
+def metric_reader(
+    objectives: Mapping[str, Objective], what: str, unit: Callable[[Objective], str] = lambda _: "1"
+) -> Reader:
+    """Return the reader (given, path) -> {metric: number} of a table, which raises ScenarioError for a wrong one.
+
+    Args:
+        objectives: Objectives by name, whose names are the allowed keys.
+        what: Contents of the table, for messages.
+        unit: Function from an objective to the unit of its number.
+    """
+
+    def read(given: PyTree, path: str) -> dict[str, float]:
+        for name in table_reader(read_as_given, what)(given, path):
+            if name not in objectives:
+                raise unknown_name_error(
+                    f"{dotted_path(path, name)} is not a metric of this scenario", name, objectives
+                )
+        return {
+            name: read_number_in_range(x, ParameterSpec(unit(objectives[name])), dotted_path(path, name))
+            for name, x in given.items()
+        }
+
+    return read

@@ -46,9 +46,8 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get
 from diffabs.core.types import JsonObject, Params, PyTree, Table
-from diffabs.scenario.parameter_paths import ParameterEntry, canonical_path, flatten_table, read_entries
+from diffabs.scenario.parameter_paths import ParameterEntry, canonical_path, flatten_table, metric_reader, read_entries
 from diffabs.scenario.registry import FAMILIES, build_part, family_of, unit_of
-from diffabs.scenario.section_tune import metric_reader
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.variables import Correlation, Space, read_correlation
 

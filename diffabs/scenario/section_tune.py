@@ -25,23 +25,19 @@ Paths are those of `parameter_paths`. Reading the section needs no extra; tuning
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from diffabs.config.values import (
-    Reader,
     ScenarioError,
     as_plain,
-    dotted_path,
     plain_fields,
     range_reader,
     read_as_given,
-    read_number_in_range,
     read_one,
     table_field,
     table_reader,
-    unknown_name_error,
     whole_reader,
 )
 from diffabs.config.values import read_table as read_table
@@ -49,7 +45,14 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, PyTree, Table
-from diffabs.scenario.parameter_paths import Ends, ParameterEntry, canonical_path, parameters_of, read_entries
+from diffabs.scenario.parameter_paths import (
+    Ends,
+    ParameterEntry,
+    canonical_path,
+    metric_reader,
+    parameters_of,
+    read_entries,
+)
 from diffabs.scenario.registry import unit_of
 from diffabs.simulate.batch import Batch, grid, latin
 from diffabs.tune import risk
@@ -163,31 +166,6 @@ def read_tune_section(table: PyTree, loop: Loop, objectives: Mapping[str, Object
     if lanes > MOST_LANES and not goal.samples:
         raise ScenarioError(f"tune.over has {lanes} combinations, outside [1, {MOST_LANES}]; set tune.samples")
     return goal
-
-
-def metric_reader(
-    objectives: Mapping[str, Objective], what: str, unit: Callable[[Objective], str] = lambda _: "1"
-) -> Reader:
-    """Return the reader (given, path) -> {metric: number} of a table, which raises ScenarioError for a wrong one.
-
-    Args:
-        objectives: Objectives by name, whose names are the allowed keys.
-        what: Contents of the table, for messages.
-        unit: Function from an objective to the unit of its number.
-    """
-
-    def read(given: PyTree, path: str) -> dict[str, float]:
-        for name in table_reader(read_as_given, what)(given, path):
-            if name not in objectives:
-                raise unknown_name_error(
-                    f"{dotted_path(path, name)} is not a metric of this scenario", name, objectives
-                )
-        return {
-            name: read_number_in_range(x, ParameterSpec(unit(objectives[name])), dotted_path(path, name))
-            for name, x in given.items()
-        }
-
-    return read
 
 
 def _entries(table: JsonObject, section: str, loop: Loop) -> Iterable[ParameterEntry]:

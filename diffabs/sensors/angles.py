@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, no_flow
-from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.core.rules import Rule
-from diffabs.core.timing import whole_steps
+from diffabs.core.pytree import param, pytree
+from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.types import Scalar
 from diffabs.sensors.noise import draw_noise
 
 

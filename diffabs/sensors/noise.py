@@ -10,10 +10,9 @@ from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow, no_memory
-from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.core.rules import Rule
-from diffabs.core.timing import whole_steps
-from diffabs.core.types import Key, PyTree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.types import Key, PyTree, Scalar, Vector
 
 
 @pytree

@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 
 from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_memory
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 
 
 @pytree

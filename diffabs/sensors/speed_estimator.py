@@ -42,7 +42,8 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp, larger
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 from diffabs.sensors.noise import Noise
 
 BRAKED = 9.81  # m/s^2, recent deceleration f that the filter assumes at its start

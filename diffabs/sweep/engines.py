@@ -3,18 +3,18 @@
 import itertools
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import numpy as np
 
-from diffabs.core.types import Bool, PyTree
+from diffabs.core.types import PyTree
 from diffabs.runtime.process import core_count
 from diffabs.sweep.manifest import DECISIVE_PACKAGES as DECISIVE_PACKAGES
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.runner import Columns, Runner
 from diffabs.sweep.seal import Seal, encode_chunk
-from diffabs.sweep.study import Study
+from diffabs.sweep.study import Study, has_failed, is_accepted
 
 
 class ComputedChunk(NamedTuple):
@@ -111,52 +111,6 @@ def encode_computed_chunk(study: Study, seal: Seal, columns: Columns) -> Compute
         int(np.sum(~is_accepted(columns["refused"]))),
     )
     return ComputedChunk(seal.chunk, encode_chunk(columns, seal, study.units()), *counts)
-
-
-def is_accepted(refused: Bool) -> np.ndarray:
-    """Return which samples were run, shape (samples,).
-
-    Args:
-        refused: Reason why a sample was not run, or an empty text, shape (samples,).
-    """
-    return np.asarray(refused).astype(str) == ""
-
-
-def has_failed(study: Study, columns: Any) -> np.ndarray:
-    """Return which runs diverged, had a wrong end, or exceeded one of `Study.failure_bounds`, shape (samples,).
-
-    A sample that was not run has not failed.
-
-    Args:
-        study: Study of the sweep.
-        columns: Columns of the table, by name.
-    """
-    failed = np.asarray(columns["diverged"]) | has_wrong_end(columns["stopped"], study.success)
-    failed = np.any(
-        [failed, *(np.asarray(columns[name]) > bound for name, bound in study.failure_bounds.items())], axis=0
-    )
-    return failed & is_accepted(columns["refused"])
-
-
-def has_wrong_end(stopped: Bool, success: bool) -> np.ndarray:
-    """Return which runs had a wrong end, shape (samples,).
-
-    The end is wrong if a run misses a stop that is a success, or reaches a stop that is not.
-
-    Args:
-        stopped: Whether each run reached its stop, shape (samples,).
-        success: Whether reaching the stop is a success.
-    """
-    return np.asarray(stopped) != success
-
-
-def describe_wrong_end(success: bool) -> str:
-    """Return the name of a wrong end: "not stopped" if the stop is a success, else "stopped".
-
-    Args:
-        success: Whether reaching the stop is a success.
-    """
-    return "not stopped" if success else "stopped"
 
 
 def group_items(items: Sequence[int], size: int) -> Iterator[list[int]]:

@@ -13,11 +13,10 @@ from diffabs.core.types import JsonObject, Matrix, PyTree, Scalar
 from diffabs.runtime import files
 from diffabs.runtime.summary import Summary
 from diffabs.sweep import seal
-from diffabs.sweep.engines import describe_wrong_end, has_wrong_end, is_accepted
 from diffabs.sweep.manifest import Seals, read_manifest
 from diffabs.sweep.seal import SweepError
 from diffabs.sweep.store import list_chunks, read_chunk
-from diffabs.sweep.study import FLAG_COLUMNS
+from diffabs.sweep.study import FLAG_COLUMNS, describe_wrong_end, has_wrong_end, is_accepted
 
 
 class Results:

@@ -24,8 +24,9 @@ import numpy as np
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.types import Bool, JsonObject, Params, Part, PyTree
 from diffabs.simulate.admissible import batch_admissibility
-from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import EngineError
+from diffabs.simulate.ensemble import run_batch
 from diffabs.sweep.study import FLAG_COLUMNS, Study, noise_key, numeric_values, precision
 
 BLOCKS_PER_CHUNK = 8

@@ -19,7 +19,7 @@ from diffabs.config.values import as_plain, unknown_name_error
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, parameters, replace
-from diffabs.core.types import Int, JsonObject, Params, Table
+from diffabs.core.types import Bool, Int, JsonObject, Params, Table
 from diffabs.core.units import resolve_unit, units_of
 from diffabs.core.validity import find_problems
 from diffabs.objectives import default_objectives
@@ -242,3 +242,49 @@ def noise_key(seed: Any, i: Int) -> jax.Array:
         i: Number of the sample.
     """
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), NOISE_STREAM), i)
+
+
+def is_accepted(refused: Bool) -> np.ndarray:
+    """Return which samples were run, shape (samples,).
+
+    Args:
+        refused: Reason why a sample was not run, or an empty text, shape (samples,).
+    """
+    return np.asarray(refused).astype(str) == ""
+
+
+def has_failed(study: Study, columns: Any) -> np.ndarray:
+    """Return which runs diverged, had a wrong end, or exceeded one of `Study.failure_bounds`, shape (samples,).
+
+    A sample that was not run has not failed.
+
+    Args:
+        study: Study of the sweep.
+        columns: Columns of the table, by name.
+    """
+    failed = np.asarray(columns["diverged"]) | has_wrong_end(columns["stopped"], study.success)
+    failed = np.any(
+        [failed, *(np.asarray(columns[name]) > bound for name, bound in study.failure_bounds.items())], axis=0
+    )
+    return failed & is_accepted(columns["refused"])
+
+
+def has_wrong_end(stopped: Bool, success: bool) -> np.ndarray:
+    """Return which runs had a wrong end, shape (samples,).
+
+    The end is wrong if a run misses a stop that is a success, or reaches a stop that is not.
+
+    Args:
+        stopped: Whether each run reached its stop, shape (samples,).
+        success: Whether reaching the stop is a success.
+    """
+    return np.asarray(stopped) != success
+
+
+def describe_wrong_end(success: bool) -> str:
+    """Return the name of a wrong end: "not stopped" if the stop is a success, else "stopped".
+
+    Args:
+        success: Whether reaching the stop is a success.
+    """
+    return "not stopped" if success else "stopped"

@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from diffabs.tune.constraints import AtMost as AtMost
     from diffabs.tune.constraints import CertifiedDecay as CertifiedDecay
     from diffabs.tune.constraints import Poles as Poles
-    from diffabs.tune.descent import DescentPoint as DescentPoint
-    from diffabs.tune.descent import Stopping as Stopping
-    from diffabs.tune.problem import DerivativeMode as DerivativeMode
-    from diffabs.tune.result import Method as Method
+    from diffabs.tune.method import DerivativeMode as DerivativeMode
+    from diffabs.tune.method import Method as Method
+    from diffabs.tune.method import Stopping as Stopping
+    from diffabs.tune.result import DescentPoint as DescentPoint
     from diffabs.tune.result import StartError as StartError
     from diffabs.tune.result import Tuned as Tuned
     from diffabs.tune.result import TuningProgress as TuningProgress

@@ -22,9 +22,10 @@ import optax
 from diffabs.core.reason import Reason
 from diffabs.core.types import PyTree
 from diffabs.simulate.drive.engine import describe_engine
-from diffabs.tune.descent import Descent, DescentPoint, DescentState, Optimiser, lbfgs, slice_start
+from diffabs.tune.descent import Descent, DescentState, Optimiser, lbfgs, slice_start
+from diffabs.tune.method import Method
 from diffabs.tune.problem import Multipliers, ObjectiveEvaluation, Problem
-from diffabs.tune.result import Method, StartError, StartResult, Tuned, TuningProgress
+from diffabs.tune.result import DescentPoint, StartError, StartResult, Tuned, TuningProgress
 
 FIRST_PENALTY = 10.0  # penalty of the first round; the scaled loss is of the order of one
 PENALTY_GROWTH = 4.0  # factor of the penalty if the violation does not shrink enough

@@ -22,7 +22,9 @@ import optax
 
 from diffabs.core.reason import Reason
 from diffabs.core.types import Matrix, PyTree, Scalar
+from diffabs.tune.method import Stopping
 from diffabs.tune.problem import LossEvaluation, Multipliers
+from diffabs.tune.result import DescentPoint
 
 ARMIJO_FRACTION, WOLFE_FRACTION = 1e-4, 0.9
 MIN_STEP_FACTOR = 1e-10  # least t of a line search
@@ -33,41 +35,6 @@ MAX_TRIALS = 12  # of a line search that holds a point with sufficient decrease,
 MAX_JUMPS = 2
 MAX_UPDATE_COMPONENT = 2.0  # greatest |u_i|, in units of z: about half of a finite range
 MAX_IDLE_STEPS = 3  # consecutive accepted steps without a significant change of the loss
-
-
-@dataclasses.dataclass(frozen=True)
-class Stopping:
-    """The conditions that end a descent; one of them is enough.
-
-    Attributes:
-        gradient: Tolerance of the greatest |component| of the gradient of L; at the start it is of order one.
-        change: Relative change of L; the descent ends after three consecutive steps that change L by no more.
-        iterations: Greatest number of accepted steps.
-    """
-
-    gradient: float = 1e-6
-    change: float = 1e-7
-    iterations: int = 100
-
-
-class DescentPoint(NamedTuple):
-    """One line of the history of a descent: the point after an accepted step.
-
-    Attributes:
-        iteration: Number of accepted steps so far; 0 at the start.
-        objective: Objective J, not scaled.
-        loss: Loss L.
-        gradient: Greatest |component| of the gradient of L.
-        violation: Greatest excess over all constraints, in units of their scales, at least 0.
-        evaluations: Number of gradients so far, including rejected trials.
-    """
-
-    iteration: int
-    objective: float
-    loss: float
-    gradient: float
-    violation: float
-    evaluations: int
 
 
 class FeasiblePoint(NamedTuple):

@@ -15,7 +15,7 @@ from diffabs.core.pytree import as_arrays, replace
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.types import FixedStep, Solver
-from diffabs.tune.problem import build_subject_loop
+from diffabs.tune.result import build_subject_loop
 
 EQUAL_ROUNDING_STEPS = 64.0  # tolerance of equality, in units of the relative precision
 ADVICE = "a search may end there without a minimum: start it from other values, or hold one of these parameters"

@@ -10,7 +10,6 @@ reach it. With the margin, g <= 0 holds at the end of a search.
 """
 
 import dataclasses
-import enum
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -27,24 +26,20 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar, Vector
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
-from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import EngineError, log_kernel, log_own_choice, log_xla_reason, resolve_request
 from diffabs.simulate.drive.sharding import describe_placement
+from diffabs.simulate.ensemble import run_batch
 from diffabs.simulate.types import Run, Solver
 from diffabs.tune.constraints import Constraint
+from diffabs.tune.method import DerivativeMode
+from diffabs.tune.result import build_subject_loop
 from diffabs.tune.risk import Aggregate
 
 MAX_QUICK_COMPILE_RUNS = 64  # above this number of runs, a fully optimised compilation pays for itself
 NO_REVERSE_MESSAGE = "a kernel has no reverse mode; forward mode, or engine = 'xla'"
 MAX_KERNEL_PARAMETERS = 64  # parameters up to which a kernel's forward mode is cheaper than XLA (docs/performance.md)
 MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is cheaper (benchmarks/bench_gradient.py)
-
-
-class DerivativeMode(enum.Enum):
-    """How a gradient is computed: one rollout with a tangent per parameter, or a checkpointed backward pass."""
-
-    FORWARD = "forward"
-    REVERSE = "reverse"
 
 
 class ObjectiveEvaluation(NamedTuple):
@@ -70,15 +65,6 @@ class Multipliers(NamedTuple):
     values: PyTree
     penalty: Scalar
     margin: Scalar = None
-
-
-def build_subject_loop(subject: Part) -> Loop:
-    """Return the closed loop of `subject`: the subject itself, or the result of its method `closed_loop()`.
-
-    Args:
-        subject: Loop, or a part with a method `closed_loop()`.
-    """
-    return subject if isinstance(subject, Loop) else subject.closed_loop()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,46 +1,39 @@
-"""Settings and results of a tuning search."""
+"""The results of a tuning search."""
 
 import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-import optax
 
+from diffabs.core.loop import Loop
 from diffabs.core.reason import Reason
 from diffabs.core.types import Part, PyTree
 from diffabs.runtime.summary import Summary
-from diffabs.tune.descent import DescentPoint, Stopping
-from diffabs.tune.problem import DerivativeMode, build_subject_loop
+from diffabs.tune.method import DerivativeMode
 
 
 class StartError(ValueError):
     """No start is usable: the runs diverge there, or the integration step is not stable."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Method:
-    """The settings of a tuning search.
+class DescentPoint(NamedTuple):
+    """One line of the history of a descent: the point after an accepted step.
 
     Attributes:
-        optimiser: Any optimiser of optax; None is L-BFGS with a line search that rejects diverging runs.
-        starts: Number of starts: the first is the part itself, the others are drawn from the ranges.
-        seed: Seed of the drawn starts.
-        mode: Forward or reverse mode; None decides by the number of parameters.
-        stopping: Conditions that end a descent. With constraints each round has a descent of its own.
-        rounds: Greatest number of rounds of the augmented Lagrangian, after a first descent without multipliers.
-        margin: Distance inside each constraint at which the search aims, in units of the constraint's scale (relative
-            to the bound). The result then meets the constraints without a tolerance.
-        memory: Number of steps that L-BFGS stores; a number greater than the number of parameters is of little use.
+        iteration: Number of accepted steps so far; 0 at the start.
+        objective: Objective J, not scaled.
+        loss: Loss L.
+        gradient: Greatest |component| of the gradient of L.
+        violation: Greatest excess over all constraints, in units of their scales, at least 0.
+        evaluations: Number of gradients so far, including rejected trials.
     """
 
-    optimiser: optax.GradientTransformation | None = None
-    starts: int = 1
-    seed: int = 0
-    mode: DerivativeMode | None = None
-    stopping: Stopping = dataclasses.field(default_factory=Stopping)
-    rounds: int = 12
-    margin: float = 1e-3
-    memory: int = 10
+    iteration: int
+    objective: float
+    loss: float
+    gradient: float
+    violation: float
+    evaluations: int
 
 
 class TuningProgress(NamedTuple):
@@ -142,6 +135,15 @@ class Tuned:
     def evaluations(self) -> int:
         """Number of gradients computed for the best start, including rejected trials."""
         return self.history[-1].evaluations
+
+
+def build_subject_loop(subject: Part) -> Loop:
+    """Return the closed loop of `subject`: the subject itself, or the result of its method `closed_loop()`.
+
+    Args:
+        subject: Loop, or a part with a method `closed_loop()`.
+    """
+    return subject if isinstance(subject, Loop) else subject.closed_loop()
 
 
 def _finite_mean(values: PyTree) -> float:

@@ -6,7 +6,8 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.pytree import Scalar, Vector, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar, Vector
 
 
 class Aggregate(Protocol):

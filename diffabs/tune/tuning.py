@@ -18,8 +18,9 @@ from diffabs.simulate.types import Solver
 from diffabs.tune import one_sided
 from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch
 from diffabs.tune.constraints import Constraint
-from diffabs.tune.problem import DerivativeMode, Problem, build_subject_loop, choose_gradient_mode
-from diffabs.tune.result import Method, Tuned, TuningProgress
+from diffabs.tune.method import DerivativeMode, Method
+from diffabs.tune.problem import Problem, choose_gradient_mode
+from diffabs.tune.result import Tuned, TuningProgress, build_subject_loop
 from diffabs.tune.risk import Aggregate, Mean
 
 

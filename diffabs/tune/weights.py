@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import Scalar, Vector, param, part, pytree, replace, static
-from diffabs.core.types import AnyArray, Part, PyTree
+from diffabs.core.pytree import param, part, pytree, replace, static
+from diffabs.core.types import AnyArray, Part, PyTree, Scalar, Vector
 from diffabs.design.interior.differentiable import robust_gain
 from diffabs.design.polytopes import Polytope
 from diffabs.linear.regulator import dlqr, lqr

@@ -26,11 +26,13 @@ from diffabs.core.types import Part, PyTree
 from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import first_refusal
-from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import describe_engine
+from diffabs.simulate.ensemble import run_batch
 from diffabs.simulate.types import Solver
-from diffabs.tune.descent import Descent, DescentState, Stopping, lbfgs
-from diffabs.tune.problem import DerivativeMode, Multipliers, Problem, choose_gradient_mode
+from diffabs.tune.descent import Descent, DescentState, lbfgs
+from diffabs.tune.method import DerivativeMode, Stopping
+from diffabs.tune.problem import Multipliers, Problem, choose_gradient_mode
 from diffabs.tune.risk import Mean
 
 MAX_CORNERS = 64

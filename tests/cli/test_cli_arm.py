@@ -14,7 +14,7 @@ from diffabs.objectives import BALANCE
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import load
 from diffabs.sweep import Space, Study, Uniform
-from diffabs.sweep.engines import has_wrong_end
+from diffabs.sweep.study import has_wrong_end
 from diffabs.tune import worst_case
 from diffabs.tune.tuning import build_problem
 

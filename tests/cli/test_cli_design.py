@@ -13,7 +13,8 @@ from mutants import killed_by
 from project import ROOT
 from seams import replace_seam
 
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 from diffabs.design import Certificate, DesignError
 from diffabs.design.frozen import analyse_frozen_loops
 from diffabs.design.sdp import solver

@@ -17,7 +17,8 @@ from sweeping import described
 
 from diffabs.reliability.failure import failure_probability
 from diffabs.scenario.scenario import load
-from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.batch import Batch
+from diffabs.simulate.ensemble import run_batch
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 

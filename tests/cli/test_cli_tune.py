@@ -329,7 +329,7 @@ def test_packaged_scenarios_can_be_tuned(name, invented):
 # What could not be done
 
 
-@killed_by("cli/tune_document.py", '"met": beyond <= 0', '"met": True')
+@killed_by("cli/tuning_task.py", '"met": beyond <= 0', '"met": True')
 def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_path):
     (tmp_path / "old.toml").write_text("old")
     out = ("--out", tmp_path / "old.toml", "--plot", tmp_path / "a.png")
@@ -347,7 +347,7 @@ def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_pat
     assert (tmp_path / "old.toml").read_text() == "old"
 
 
-@killed_by("cli/tune_document.py", '"met": beyond <= 0', '"met": beyond <= 1e-3 * abs(bound)')
+@killed_by("cli/tuning_task.py", '"met": beyond <= 0', '"met": beyond <= 1e-3 * abs(bound)')
 @pytest.mark.parametrize(("bound", "met"), [("0.2", True), ("0.19999999999999998", False), ("0.1999001", False)])
 def test_met_is_met_without_a_tolerance(small, invented, bound, met):
     """0.2 was reached. The float below it is not met, and the table says by how much."""

@@ -91,7 +91,7 @@ class TestRuns:
         assert len(np.unique(expected.metrics["iae"])) == LANES - 1  # NaN once
         same(found, expected, rtol=1e-13, atol=1e-15)
 
-    @killed_by("simulate/batch.py", 'engine: str = "auto",', 'engine: str = "xla",')
+    @killed_by("simulate/ensemble.py", 'engine: str = "auto",', 'engine: str = "xla",')
     @killed_by("simulate/drive/engine.py", "            log_kernel()\n", "")
     def test_are_made_by_default(self, runs, users_engine, caplog):
         log_kernel.cache_clear()
@@ -189,7 +189,7 @@ class TestObjections:
             d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="gpu")
 
     @killed_by(
-        "simulate/batch.py",
+        "simulate/ensemble.py",
         "why_not = TOGETHER_REASON if trajectories or together else",
         "why_not = TOGETHER_REASON if False else",
     )

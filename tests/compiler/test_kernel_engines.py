@@ -36,7 +36,7 @@ from diffabs.simulate.drive.engine import (
     log_xla_reason,
     resolve_request,
 )
-from diffabs.tune.problem import DerivativeMode
+from diffabs.tune.method import DerivativeMode
 
 pytestmark = pytest.mark.xdist_group("kernel engines")
 

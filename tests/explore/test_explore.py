@@ -20,9 +20,9 @@ from diffabs.cli import console
 from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get, parameters, replace
 from diffabs.explore import charts, curves, friction, saving, stability, tuning
-from diffabs.explore.curves import Curve, Curves, Fan, Panel, Spread
 from diffabs.explore.guard import STRANGER, Guard
 from diffabs.explore.knobs import SLIDER_STEPS, is_vehicle
+from diffabs.explore.panels import Curve, Curves, Fan, Panel, Spread
 from diffabs.explore.session import AS_GIVEN, Session
 from diffabs.explore.work import NewestJobThread
 from diffabs.linear import margins, open_loop

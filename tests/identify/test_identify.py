@@ -11,8 +11,9 @@ from scipy.optimize import curve_fit
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, references, roads, stops
-from diffabs.core.pytree import Scalar, param, pytree, replace
+from diffabs.core.pytree import param, pytree, replace
 from diffabs.core.reason import Reason
+from diffabs.core.types import Scalar
 from diffabs.identify.fit import Tolerances, fit
 from diffabs.identify.identification import identify
 from diffabs.identify.residuals import gaussian

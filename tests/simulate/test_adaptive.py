@@ -20,8 +20,8 @@ from diffabs.core.pytree import as_arrays, canonical_dtypes, get, prepare_parts,
 from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
-from diffabs.simulate.run import prepare_arguments
-from diffabs.simulate.step import step_size, system
+from diffabs.simulate.arguments import prepare_arguments
+from diffabs.simulate.step import step_size, surfaces
 from diffabs.simulate.step.adaptive import StateSpan
 from diffabs.simulate.step.replay import BASE_LOG_CAPACITY, log_capacity, states_between
 from diffabs.tune import worst_case
@@ -419,14 +419,14 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = [0, 1, 33, np.array([2, 3])]
     values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]
     rates = [jnp.asarray(-1.0), jnp.asarray(1.0), jnp.asarray(4.0), jnp.array([1.0, -40.0])]
-    margins = [system.SwitchingFunction(*one) for one in zip(numbers, values, rates, strict=True)]
+    margins = [surfaces.SwitchingFunction(*one) for one in zip(numbers, values, rates, strict=True)]
     words = (jnp.uint32(0b1100), jnp.uint32(0b10))
-    np.testing.assert_array_equal(step_size.read_bits(words, np.array([2, 3, 33, 1])), [True, True, True, False])
+    np.testing.assert_array_equal(surfaces.read_bits(words, np.array([2, 3, 33, 1])), [True, True, True, False])
     length = jnp.asarray(1.0)
-    assert step_size.forecast_crossing(margins, length, 0.0) == pytest.approx(0.1)  # 4 falls by 40/s
+    assert surfaces.forecast_crossing(margins, length, 0.0) == pytest.approx(0.1)  # 4 falls by 40/s
     # Bits 2 and 33 changed 0.5 s and 0.25 s ago.
-    assert step_size.time_since_crossing(margins, words, length) == pytest.approx(0.5)
-    assert step_size.time_since_crossing(margins, (jnp.uint32(0),) * 2, length) == 0
+    assert surfaces.time_since_crossing(margins, words, length) == pytest.approx(0.5)
+    assert surfaces.time_since_crossing(margins, (jnp.uint32(0),) * 2, length) == 0
 
 
 @killed_by(

@@ -162,7 +162,9 @@ class TestLanes:
         found = driven(QUIET, Batch(), SOLVER, MEASURED)
         same(found, jax.tree.map(lambda x: x[None], jax.device_get(d.measure(QUIET, SOLVER, MEASURED))))
 
-    @killed_by("simulate/batch.py", "    if accepted is True:\n        return run", "    return run", case="together")
+    @killed_by(
+        "simulate/ensemble.py", "    if accepted is True:\n        return run", "    return run", case="together"
+    )
     @killed_by(
         "simulate/drive/packed.py",
         "jnp.where(run & (number < count), carry.status",
@@ -186,7 +188,7 @@ class TestLanes:
             Batch({"initial.speed": SPEEDS}).check(LOOP, SOLVER)
         assert d.run_batch(QUIET, Batch(), d.FixedStep(0.3, 0.6), MEASURED).diverged.tolist() == [True]
 
-    @killed_by("simulate/batch.py", "jnp.concatenate(x)[order]", "jnp.concatenate(x)")
+    @killed_by("simulate/ensemble.py", "jnp.concatenate(x)[order]", "jnp.concatenate(x)")
     @pytest.mark.slow
     def test_in_order_when_those_of_similar_length_run_together(self, keys, expected):
         times = np.maximum(expected.ending.sample.t + 0.02, 0.13)

@@ -14,8 +14,9 @@ from diffabs import controllers, plants, references, roads
 from diffabs.actuators import Lag
 from diffabs.objectives import BRAKING, Effort, MaxSlip, TorqueRate, Variation
 from diffabs.scenario.defaults import braking
+from diffabs.simulate.arguments import prepare_arguments
 from diffabs.simulate.result import finish_run, prepare
-from diffabs.simulate.run import _run, prepare_arguments
+from diffabs.simulate.run import _run
 from diffabs.simulate.stability import stable_step
 from diffabs.stops import SpeedReached, Standstill
 

@@ -1,8 +1,8 @@
 """Batches in a compiled program of this machine: a run stays in the processor's registers from start to stop.
 
-XLA computes the starts and the results, as for every other run. The package `kernel` translates the step of `FixedStep`
-or `Adaptive` from its jaxpr, with everything that the parts contribute to it. A run that has ended makes room for the
-next one, as in `packed`. The kernel deals the runs to threads of its own, on all cores of the processor.
+XLA computes the starts and the results, as for every other run. The package `compiler` translates the step of
+`FixedStep` or `Adaptive` from its jaxpr, with everything that the parts contribute to it. A run that has ended makes
+room for the next one, as in `packed`. The kernel deals the runs to threads of its own, on all cores of the processor.
 """
 
 import operator
@@ -24,11 +24,11 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero, read_leaves
 from diffabs.core.types import Params, PyTree, Scalar
+from diffabs.simulate.arguments import forbid_derivatives, prepare_arguments, refuse_derivative
 from diffabs.simulate.drive.engine import check_process
 from diffabs.simulate.drive.loops import STEPS_PER_BLOCK
 from diffabs.simulate.drive.packed import STEPS_PER_EXCHANGE, EarlyEnd, split_by_lane
 from diffabs.simulate.result import finish_run
-from diffabs.simulate.run import forbid_derivatives, prepare_arguments, refuse_derivative
 from diffabs.simulate.step.adaptive import AdaptiveStepping
 from diffabs.simulate.step.replay import LaggedReplay, LaggedReplayStepping
 from diffabs.simulate.step.status import RunStatus

@@ -16,9 +16,9 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.tracing import split_batched
 from diffabs.core.types import Array, Params, PyTree, Scalar
+from diffabs.simulate.arguments import forbid_derivatives, prepare_arguments
 from diffabs.simulate.drive.loops import STEPS_PER_BLOCK, Carry
 from diffabs.simulate.result import finish_run, prepare
-from diffabs.simulate.run import forbid_derivatives, prepare_arguments
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.types import Run, Solver
 

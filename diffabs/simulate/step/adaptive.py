@@ -52,12 +52,11 @@ from diffabs.simulate.step.step_size import (
     MIN_STEP_RATIO,
     error_norm,
     error_scales,
-    forecast_crossing,
     plan_step,
     propose_length,
     spectral_step_limit,
-    time_since_crossing,
 )
+from diffabs.simulate.step.surfaces import forecast_crossing, time_since_crossing
 from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import Trajectory
 

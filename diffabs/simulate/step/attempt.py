@@ -23,7 +23,7 @@ from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
 from diffabs.core.types import Bool, Int, PyTree, Scalar
 from diffabs.simulate.step.modes import Mode, ModeBits, single_bit
 from diffabs.simulate.step.runge_kutta import Tableau, runge_kutta_step
-from diffabs.simulate.step.step_size import valid_end_rates
+from diffabs.simulate.step.surfaces import valid_end_rates
 from diffabs.simulate.step.system import (
     Accumulators,
     Evaluation,

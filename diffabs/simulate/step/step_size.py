@@ -1,10 +1,8 @@
 """Length of an adaptive step: limits by its error, by stability, by switching surfaces and by clocks.
 
-Near a point of the run the margin x - y of a comparison moves along a line. It is zero at a time |x - y|/|d(x - y)/dt|
-ahead or in the past. A step that ends there has its kink at its end, where the kink costs no accuracy.
+`surfaces` says when the run crosses the next switching surface.
 """
 
-from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
@@ -16,9 +14,7 @@ from jax.flatten_util import ravel_pytree
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Sample
-from diffabs.core.types import Array, Int, PyTree, Scalar
-from diffabs.simulate.step.modes import WORD_BITS, ModeBits
-from diffabs.simulate.step.system import SwitchingFunction
+from diffabs.core.types import Int, PyTree, Scalar
 
 INITIAL_STEP_S = 1e-4  # s, the first step
 SAFETY, MIN_ERROR = 0.85, 1e-6  # fraction of the optimal length; offset that keeps the length finite for an error of 0
@@ -28,13 +24,7 @@ TWO_STEP_RATIO = 1.2  # ratio to the present length: a nearer switching surface 
 CLOCK_REACH_FRACTION = 0.99  # fraction of the time to a clock's instant: a longer step ends on the instant
 STABILITY_RADIUS = 3.0  # the longest step is this number divided by the spectral radius
 POWER_ITERATIONS, MIN_NORM = 12, 1e-20
-NEVER_S = 1e9  # s; time to the next crossing if no crossing is predicted
-
-
-# Tolerances of steps that end on switching surfaces. The first two are fractions of the length that the error allows: a
-# crossing nearer than the first has happened, and the second is the shortest step that ends on a crossing. The last two
-# are fractions of a step: a crossing outside of this range lies at one end of the step.
-IMMEDIATE_FRACTION, MIN_CROSSING_STEP_FRACTION, STEP_START_FRACTION, STEP_END_FRACTION = 2e-4, 4e-3, 0.02, 0.95
+MIN_CROSSING_STEP_FRACTION = 4e-3  # fraction of the length that the error allows: the shortest step to a crossing
 
 
 def error_scales(state: LoopState, sample: Sample) -> PyTree:
@@ -139,78 +129,3 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
     # Logarithms: a product of the norms of a stiff loop would overflow single precision.
     vector, log = jax.lax.scan(multiply, (list(jnp.ones_like(size)), 0.0 * t), later)[0]
     return STABILITY_RADIUS * jnp.exp(-(log + jnp.log(longest(vector))) / half)
-
-
-def forecast_crossing(surfaces: Sequence[SwitchingFunction], natural: Scalar, shortest: Scalar) -> Scalar:
-    """Return the time [s] to the first predicted crossing of a switching surface; `NEVER_S` without one.
-
-    A crossing nearer than `shortest`, or than `IMMEDIATE_FRACTION` of `natural`, is not counted.
-
-    Args:
-        surfaces: Margins of the comparisons and their rates, at an instant.
-        natural: Length that the error allows [s].
-        shortest: Shortest length of any step [s].
-    """
-    # A crossing nearer than this has happened.
-    least, next = jnp.maximum(IMMEDIATE_FRACTION * natural, shortest), jnp.full_like(natural, -NEVER_S)
-    for one in surfaces:
-        for since in _times_since_crossing(one):
-            next = jnp.where((since < -least) & (since > next), since, next)
-    return -next
-
-
-def time_since_crossing(surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> Scalar:
-    """Return the time [s] between the first crossing inside a step and the end of the step; 0 without one.
-
-    A crossing counts as inside between `STEP_START_FRACTION` and `STEP_END_FRACTION` of the step.
-
-    Args:
-        surfaces: Margins of the comparisons and their rates, at the end of the step.
-        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
-        length: Length of the step [s].
-    """
-    # Crossings outside of these fractions of the step lie at its ends.
-    low, high = (1 - STEP_END_FRACTION) * length, (1 - STEP_START_FRACTION) * length
-    first = low
-    for one in surfaces:
-        for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
-            first = jnp.where(on & (since < high) & (since > first), since, first)
-    return jnp.where(first > low, first, 0.0)
-
-
-def _times_since_crossing(surface: SwitchingFunction) -> Array:
-    """Return the times since the crossings of these surfaces, shape (n,) [s]; negative for a crossing ahead.
-
-    A rate of 0 gives an infinite time or NaN: no comparison with such a time is true.
-    """
-    return jnp.ravel(jnp.asarray(surface.value / surface.rate))
-
-
-def valid_end_rates(surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> tuple[PyTree, PyTree]:
-    """Return two flags, for the start and the end of a step: True if the rate there is also the rate inside the step.
-
-    The start's flag is False if a comparison changes at the start. The end's flag is False if one changes later.
-
-    Args:
-        surfaces: Margins of the comparisons at the end of the step, and their rates.
-        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
-        length: Length of the step [s].
-    """
-    start = end = jnp.asarray(True)
-    for one in surfaces:
-        for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
-            early = since >= (1 - STEP_START_FRACTION) * length
-            start, end = start & ~(on & early), end & ~(on & ~early)
-    return start, end
-
-
-def read_bits(words: ModeBits, numbers: PyTree) -> Scalar:
-    """Return the bits with these numbers, bool.
-
-    Args:
-        words: Packed bits.
-        numbers: Numbers of the bits.
-    """
-    numbers = jnp.asarray(numbers)
-    word = sum(jnp.where(numbers // WORD_BITS == i, one, jnp.uint32(0)) for i, one in enumerate(words))
-    return word & (jnp.uint32(1) << (numbers % WORD_BITS).astype(jnp.uint32)) != 0

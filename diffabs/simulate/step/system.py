@@ -15,6 +15,7 @@ from diffabs.core.protocols import Memory, Objective, Sample, Segment, Shown
 from diffabs.core.types import PyTree, Scalar
 from diffabs.simulate.step.comparisons import SwitchedProgram
 from diffabs.simulate.step.modes import ComparisonAnswers, Mode, ModeBits
+from diffabs.simulate.step.surfaces import SwitchingFunction
 
 Objectives = dict[str, Objective]
 Accumulators = dict[str, Memory]
@@ -38,20 +39,6 @@ class LoopEvaluation(NamedTuple):
     accumulator_rates: dict[str, PyTree]
     signals: Signals
     margins: Margins
-
-
-class SwitchingFunction(NamedTuple):
-    """Margins of comparisons, and their rates.
-
-    Attributes:
-        numbers: Numbers of the comparisons' bits.
-        value: Margins x - y.
-        rate: Rates of the margins [1/s]; None if they were not evaluated.
-    """
-
-    numbers: PyTree
-    value: Scalar
-    rate: Scalar = None
 
 
 class Evaluation(NamedTuple):

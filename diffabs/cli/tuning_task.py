@@ -1,20 +1,25 @@
-"""The JSON document of a tuning: free parameters, metrics and constraints before and after, certificate."""
+"""The task of a tuning, the certificate of its result, and the JSON document of both."""
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from diffabs.cli import certificates, console
+from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import JsonObject, Part, Scalar
 from diffabs.runtime import provenance
 from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.admissible import first_refusal
 
 if TYPE_CHECKING:
     from diffabs.tune import Batch, Tuned
 
 WHEN = ("before", "after")
+OF_THE_COMMAND = ("scenario", "model", "made", "versions", "files")  # keys of a certificate that the tuning has too
+BOUND_ROUNDING = 1e-9  # relative; rounding of a decay rate that is proved as a factor per period is smaller
 
 
 class Work(NamedTuple):
@@ -47,6 +52,70 @@ class Proved(NamedTuple):
     sentence: str
     task: certificates.ProofTask | None = None
     certified: bool = False
+
+
+def build_work(chosen: Scenario) -> Work:
+    """Return the runs and constraints of a tuning.
+
+    Args:
+        chosen: Scenario with a section `[tune]`.
+
+    Raises:
+        ScenarioError: The section does not fit the loop.
+        ModuleNotFoundError: An extra is not installed.
+    """
+    from diffabs.tune import AtMost, CertifiedDecay, Poles
+
+    goal = chosen.tune.check(chosen.loop)
+    batch = goal.batch(chosen.seed).check(chosen.loop)
+    if line := first_refusal(chosen.loop, batch.values, chosen.solver):
+        raise ScenarioError(f"tune.over: {line}")
+    constraints: JsonObject = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
+    task = certificates.build_proof_task(chosen) if goal.decay or goal.damping else None
+    if task and goal.decay:
+        constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
+    if task and goal.damping:
+        constraints["damping"] = Poles(task.polytope, damping=goal.damping)
+    return Work(chosen, batch, constraints, task)
+
+
+def certify_result(after: Scenario) -> Proved:
+    """Return the outcome of a proof for the tuned loop over the ranges of [design].
+
+    The certificate has the fastest decay rate that is found. If [tune] requires a faster one, it has that one if it can
+    be proved. Without a certificate the outcome gives the reason; no error is raised.
+
+    Args:
+        after: Scenario with the tuned loop.
+    """
+    decay = after.tune.decay
+    try:
+        task = certificates.build_proof_task(after)
+        found = certificates.certify_gain(task)
+        if (found.decay_rate or 0.0) < decay:  # the search for the fastest decay ends slightly below the optimum
+            asked = certificates.certify_gain(
+                task._replace(spec=dataclasses.replace(task.spec, decay=decay * (1 + BOUND_ROUNDING)))
+            )
+            found = asked if (asked.decay_rate or 0.0) >= decay else found
+    except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
+        return without_certificate(" ".join(str(error).split()))
+    known = certificates.find_further(task, found)
+    reason = certificates.describe_unproved(found, task.spec, known) or None
+    document = certificates.proof_document(task, found, reason=reason, known=known)
+    document = {key: value for key, value in document.items() if key not in OF_THE_COMMAND}
+    rate = document["decay_rate"]
+    over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
+    said = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"
+    return Proved(document, f"certificate: {said}", task, certified=True)
+
+
+def without_certificate(why: str) -> Proved:
+    """Return the outcome of a proof that gave no certificate.
+
+    Args:
+        why: The reason.
+    """
+    return Proved({**dict.fromkeys(certificates.FROM_PROOF), "reason": why}, f"no certificate: {why}")
 
 
 def tuning_document(work: Work, found: "Tuned", proved: Proved) -> JsonObject:

@@ -1,0 +1,164 @@
+"""Arguments of a run: what is refused, and their preparation for a compiled program."""
+
+import math
+from collections.abc import Iterator, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+
+from diffabs.core import kinds
+from diffabs.core.arrays import as_array
+from diffabs.core.compiling import is_traced
+from diffabs.core.first_order import without_derivative
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import as_arrays, canonical_dtypes, parameters, replace
+from diffabs.core.types import Params, PyTree
+from diffabs.core.validity import find_broken, find_misshapen, part_rules
+from diffabs.objectives import Variation
+from diffabs.simulate.admissible import find_impossible_values
+from diffabs.simulate.step.adaptive import AdaptiveStepping, clip_rtol
+from diffabs.simulate.step.fixed import FixedStepping
+from diffabs.simulate.types import Adaptive, Solver
+
+OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
+MAX_COUNTED_STEPS = 2**31 - 8  # greatest number of steps that a 32-bit counter holds, including the landing
+
+
+def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, PyTree, PyTree]:
+    """Return loop, objectives and stepping method of one data type.
+
+    In a traced loop the derivative by a parameter that is not tunable raises an error (`forbid_derivatives`).
+
+    Args:
+        loop: Closed loop with every part and parameter.
+        solver: Solver of the run.
+        objectives: Objectives by the names of their metrics.
+
+    Raises:
+        ValueError: An argument is invalid, apart from the values of parameters.
+    """
+    refuse(loop, solver, objectives)
+    loop, objectives = canonical_dtypes((as_arrays(loop), {name: as_arrays(part) for name, part in objectives.items()}))
+    if is_traced(loop):
+        # Only traced values can be differentiated.
+        loop = replace(loop, forbid_derivatives(loop, {path: value for path, _, value in parameters(loop)}))
+    return loop, objectives, build_stepping(solver, jax.tree.leaves(loop)[0].dtype)
+
+
+def build_stepping(solver: Solver, dtype: DTypeLike) -> FixedStepping | AdaptiveStepping:
+    """Return the stepping method of a solver, with numbers of one data type: a pytree, for compiled programs.
+
+    Args:
+        solver: Solver of the run.
+        dtype: Floating-point type.
+    """
+    number = jnp.asarray if is_traced() else as_array
+    # `device_put` instead of `jnp.asarray`, which would compile a program.
+    h, steps = number(float(solver.step), dtype), jax.device_put(solver.steps)
+    if isinstance(solver, Adaptive):
+        return AdaptiveStepping(h, steps, number(float(clip_rtol(np.asarray(solver.rtol, dtype))), dtype))
+    return FixedStepping(h, steps, solver.kinks)
+
+
+def forbid_derivatives(loop: Loop, values: Params) -> dict[str, PyTree]:
+    """Return the values of all parameters that are not tunable, wrapped so that their derivative raises a ValueError.
+
+    A run does not depend smoothly on these parameters. Other values are left out.
+
+    Args:
+        loop: Closed loop that specifies the parameters.
+        values: Values by dotted path.
+    """
+    coarse = {path for path, spec, _ in parameters(loop) if not spec.tunable}
+    return {path: without_derivative(path, value) for path, value in values.items() if path in coarse}
+
+
+def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
+    """Check solver, shapes and objectives of a run, independent of the parameters' values.
+
+    Args:
+        loop: Closed loop.
+        solver: Solver of the run.
+        objectives: Objectives by the names of their metrics.
+
+    Raises:
+        ValueError: A field of the solver is invalid, a parameter has a wrong shape, or a part is not an objective.
+    """
+    lines = [*_find_solver_faults(solver), *find_misshapen(loop)]
+    for name, part in objectives.items():
+        if all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
+            lines += find_misshapen(part, f"objectives.{name}.")
+        else:
+            needed = ", ".join(OBJECTIVE_METHODS)
+            lines.append(f"objectives.{name} = {kinds.format_value(part)} is no objective: it needs {needed}")
+    if lines:
+        raise ValueError("; ".join(lines))
+
+
+def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
+    """Check a run as `refuse` does and, if all parameters are concrete, their values.
+
+    Args:
+        loop: Closed loop.
+        solver: Solver of the run.
+        objectives: Objectives by the names of their metrics.
+
+    Raises:
+        ValueError: An argument is invalid, or a concrete parameter has a value that no run may have.
+    """
+    refuse(loop, solver, objectives)
+    if is_traced(loop, dict(objectives)):
+        return
+    lines = find_impossible_values(loop, solver.step)
+    lines += [
+        line for name, part in objectives.items() for line in find_broken(part_rules(part, f"objectives.{name}."))
+    ]
+    if lines:
+        raise ValueError("; ".join(lines))
+
+
+def _find_solver_faults(solver: Solver) -> Iterator[str]:
+    """Yield one line for each invalid field of the solver."""
+    names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
+    lines = [f"solver.{name} {line}" for name in names if (line := _find_number_fault(solver, name))]
+    if lines:
+        yield from lines
+    elif solver.step > solver.duration:
+        yield f"solver.step = {solver.step} s is longer than solver.duration = {solver.duration} s"
+    elif solver.duration / solver.step > MAX_COUNTED_STEPS:
+        yield f"solver.step = {solver.step} s takes more than {MAX_COUNTED_STEPS} steps of {solver.duration} s"
+
+
+def _find_number_fault(solver: Solver, name: str) -> str:
+    value = getattr(solver, name)
+    if line := kinds.find_value_objection(value) or (
+        kinds.value_shape(value) and f"has shape {kinds.value_shape(value)}"
+    ):
+        return f"= {kinds.format_value(value)} {line}; a number is needed"
+    if not 0 < value < math.inf:
+        return f"= {value} is not positive and finite"
+    return f"= {value} is no whole number" if name == "every" and value != int(value) else ""
+
+
+def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: PyTree) -> None:
+    """Check that the derivatives of a run are right.
+
+    Args:
+        loop: Closed loop.
+        objectives: Objectives by the names of their metrics.
+        method: Stepping method.
+
+    Raises:
+        ValueError: The derivatives of an objective would be wrong.
+    """
+    if isinstance(method, AdaptiveStepping) and loop.recorders:
+        # Rounding moves the kinks of the delayed command between the logged run and its replay.
+        names = [name for name, one in objectives.items() if isinstance(one, Variation)]
+        if names:
+            raise ValueError(
+                f"{', '.join(names)}: Variation has no derivative behind a pure delay with adaptive steps. Leave it"
+                " out, or use d.FixedStep"
+            )

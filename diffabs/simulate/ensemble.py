@@ -1,0 +1,195 @@
+"""The runs of a batch: by a kernel or by XLA, on all cores, together or packed."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.compiling import is_traced
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import replace
+from diffabs.core.types import Array, Bool, Key, PyTree
+from diffabs.simulate.admissible import batch_admissibility, first_refusal
+from diffabs.simulate.arguments import refuse
+from diffabs.simulate.batch import Batch
+from diffabs.simulate.drive.engine import check_process, resolve_request, run_with_engine
+from diffabs.simulate.drive.packed import EarlyEnd, run_packed
+from diffabs.simulate.drive.sharding import describe_placement, run_on_all_cores, run_on_auto_mesh
+from diffabs.simulate.run import run_unchecked
+from diffabs.simulate.types import Run, Solver
+
+# Part of a message: why a batch cannot run in a kernel.
+TOGETHER_REASON = "lanes run together, for trajectories or for derivatives in either mode"
+TRACED_REASON = "the call is traced (jit, grad, vmap)"
+
+
+def run_batch(
+    loop: Loop,
+    batch: Batch,
+    solver: Solver,
+    objectives: Mapping[str, Objective] | None = None,
+    *,
+    trajectories: bool = False,
+    together: bool | None = None,
+    accepted: Bool | None = None,
+    enough: EarlyEnd | None = None,
+    engine: str = "auto",
+) -> Run:
+    """Simulate every run of a batch and return a `Run` with a leading axis (runs,), in the order of the batch.
+
+    Each element is the result of `measure` for that run. The function is compiled once for a structure and a number of
+    runs, not for new values, keys or durations. Runs whose arrays lie on several devices are computed there. The axes
+    of the mesh may have any type, but Explicit axes do not work within jit.
+
+    Args:
+        loop: Loop that the runs have in common.
+        batch: Parameters that differ between the runs. An empty batch is one run.
+        solver: Step and duration [s] of every run.
+        objectives: Objectives by the names of the metrics, each with shape (runs,); None for no metrics.
+        trajectories: True keeps trajectories, shape (runs, instants, ...), with every `solver.every`-th instant.
+        together: True is `jax.vmap` of `measure`: all runs step until the last has ended, and derivatives exist in both
+            modes, with respect to the loop and the batch's values. False has no reverse mode, but a run that has ended
+            makes room for the next, so that a few long runs do not delay the rest. Both agree to rounding. None is True
+            if loop, values or objectives are traced (inside jit, grad, vmap). Trajectories always use True. An empty
+            batch uses True under XLA. Runs of a kernel never step together.
+        accepted: Runs to execute, shape (runs,), or True for all. The others have `diverged`, and their metrics are
+            NaN, also where they step together with the rest. None means the runs that `batch_admissibility` accepts, or
+            all if the call is traced.
+        enough: Condition that ends runs early. Such a run has neither stopped, timed out nor diverged. Not
+            for runs that step together.
+        engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine, which needs a
+            C++ compiler. It returns the same numbers to rounding and has forward derivatives (`jax.jvp`, `jax.jacfwd`),
+            but no reverse mode and no trajectories. "auto" uses a kernel for values on a processor where possible. It
+            uses XLA if the call is traced or the runs step together. It also does so on a GPU or on several devices,
+            and if a kernel is impossible; only then the log has a warning. The environment variable `DIFFABS_ENGINE`
+            replaces "auto" by "xla" or "kernel".
+
+    Examples:
+        >>> import diffabs as d
+        >>> from diffabs.objectives import StopDistance
+        >>> masses = d.Batch({"plant.mass": [12.0, 18.0]})
+        >>> run = d.run_batch(d.braking(), masses, d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
+        >>> print(*(f"{distance:.1f}" for distance in run.metrics["distance"]))
+        43.9 43.8
+
+    Raises:
+        ValueError: Columns have different lengths, `measure` rejects the arguments, or `enough` is given for runs that
+            step together. Also if engine "kernel" is impossible; `simulate.drive.kernel.kernel_objection` returns
+            the reason without a run.
+        KeyError: A path does not exist.
+        RuntimeError: The engine is "auto" or "kernel", in a process that was forked after JAX had started.
+    """
+    engine = resolve_request(engine)
+    if engine != "xla":
+        check_process()
+
+    # Everything that may lie on devices is an argument, so that `run_on_auto_mesh` sees it.
+    def run(loop: Loop, values: PyTree, keys: Key, objectives: Any, accepted: Bool, enough: Any) -> Run:
+        lanes = dataclasses.replace(batch, values=values, keys=keys)
+        return _dispatch_batch(loop, lanes, solver, objectives, trajectories, together, accepted, enough, engine)
+
+    return run_on_auto_mesh(run, (loop, dict(batch.values), batch.keys, dict(objectives or {}), accepted, enough))
+
+
+def _dispatch_batch(
+    loop: Loop,
+    batch: Batch,
+    solver: Solver,
+    objectives: dict[str, Objective],
+    trajectories: bool,
+    together: bool | None,
+    accepted: Bool,
+    enough: EarlyEnd | None,
+    engine: str,
+) -> Run:
+    """Return the result of `run_batch`, whose arguments these are; `engine` is resolved (`resolve_request`).
+
+    Under XLA the runs step together (`_run_vmapped`) or make room for each other (`run_packed`, on all cores).
+    """
+    count = batch.size
+    columns = {path: jnp.asarray(x) if isinstance(x, list | tuple) else x for path, x in batch.values.items()}
+    batch = dataclasses.replace(batch, values=columns)
+    refuse(replace(loop, {path: _first_member(column) for path, column in batch.values.items()}), solver, objectives)
+    # Traced values cannot be checked. A traced batch runs every member, also an impossible one.
+    live = is_traced(loop, dict(batch.values), dict(objectives))
+    if accepted is None:
+        asked = bool(batch.values) and not live
+        accepted = (
+            batch_admissibility(loop, batch.values, solver).accepted
+            if asked
+            else live or not first_refusal(loop, {}, solver)
+        )
+    given = (
+        loop,
+        batch.values,
+        batch._keys(),
+        solver,
+        objectives,
+        jnp.broadcast_to(jnp.asarray(accepted, bool), count),
+    )
+    as_one = trajectories or (live if together is None else together) or (not batch.values and batch.keys is None)
+    if as_one and enough is not None:
+        raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
+
+    def by_kernel() -> Run:
+        from diffabs.simulate.drive.kernel import run_native
+
+        return run_native(*given, enough)
+
+    def by_xla() -> Run:
+        if not as_one:
+            everything = given[1], given[2], given[-1]  # values, keys, accepted
+
+            def run(columns: PyTree, numbers: Array) -> Run:
+                values, keys, accepted = columns
+                return run_packed(loop, values, keys, solver, objectives, accepted, enough, numbers)
+
+            if traced:
+                return run(everything, jnp.arange(count))
+            return run_on_all_cores(run, everything, count)
+        return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories), accepted)
+
+    why_not = TOGETHER_REASON if trajectories or together else ""
+    traced = live or is_traced(given, enough)  # such as by keys, under vmap
+    why_xla = TRACED_REASON if traced else TOGETHER_REASON if as_one else describe_placement(given)
+    return run_with_engine(engine, by_kernel, by_xla, (given, enough), why_not, why_xla)
+
+
+def _first_member(column: PyTree) -> Any:
+    """Return column[0]; for a column on the processor by NumPy, since JAX's indexing costs as much as 20 runs."""
+    on_processor = isinstance(column, jax.Array) and not is_traced(column) and column.platform() == "cpu"
+    return (np.asarray(column) if on_processor and column.is_fully_addressable else column)[0]
+
+
+def _run_vmapped(
+    loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], trajectories: bool
+) -> Run:
+    """Run the batch with `jax.vmap`, in groups of similar duration. With trajectories there is one group, since all
+    share their instants.
+    """
+    every = solver.every if trajectories else 0
+
+    def run_group(lanes: Any, duration: float) -> Run:
+        like = dataclasses.replace(solver, duration=duration)
+        return batch.each(loop, lambda one, key: run_unchecked(one, like, objectives, key, every), lanes)
+
+    if trajectories or batch.durations is None:
+        return run_group(None, solver.duration)
+    groups = batch.groups(solver.duration)
+    # The inverse permutation restores the order of the batch after the groups are joined.
+    order = np.argsort(np.concatenate([lanes for lanes, _ in groups]))
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *(run_group(*group) for group in groups))
+
+
+def _mark_refused(run: Run, accepted: Bool) -> Run:
+    """Return the runs with the results of refused runs replaced as in a packed batch: diverged, with NaN metrics."""
+    if accepted is True:
+        return run
+    accepted = jnp.asarray(accepted, bool)
+    metrics = {name: jnp.where(accepted, value, jnp.nan) for name, value in run.metrics.items()}
+    flags = {"stopped": run.stopped & accepted, "timed_out": run.timed_out & accepted}
+    return run._replace(metrics=metrics, diverged=run.diverged | ~accepted, **flags)

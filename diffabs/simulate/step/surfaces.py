@@ -1,0 +1,108 @@
+"""Switching surfaces: where the margin of a comparison is zero, and when a run crosses it.
+
+Near a point of the run the margin x - y of a comparison moves along a line. It is zero at a time |x - y|/|d(x - y)/dt|
+ahead or in the past. A step that ends there has its kink at its end, where the kink costs no accuracy.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from diffabs.core.types import Array, PyTree, Scalar
+from diffabs.simulate.step.modes import WORD_BITS, ModeBits
+
+NEVER_S = 1e9  # s; time to the next crossing if no crossing is predicted
+# A crossing nearer than this fraction of the length that the error allows has happened.
+IMMEDIATE_FRACTION = 2e-4
+# A crossing outside of these fractions of a step lies at one end of the step.
+STEP_START_FRACTION, STEP_END_FRACTION = 0.02, 0.95
+
+
+class SwitchingFunction(NamedTuple):
+    """Margins of comparisons, and their rates.
+
+    Attributes:
+        numbers: Numbers of the comparisons' bits.
+        value: Margins x - y.
+        rate: Rates of the margins [1/s]; None if they were not evaluated.
+    """
+
+    numbers: PyTree
+    value: Scalar
+    rate: Scalar = None
+
+
+def forecast_crossing(surfaces: Sequence[SwitchingFunction], natural: Scalar, shortest: Scalar) -> Scalar:
+    """Return the time [s] to the first predicted crossing of a switching surface; `NEVER_S` without one.
+
+    A crossing nearer than `shortest`, or than `IMMEDIATE_FRACTION` of `natural`, is not counted.
+
+    Args:
+        surfaces: Margins of the comparisons and their rates, at an instant.
+        natural: Length that the error allows [s].
+        shortest: Shortest length of any step [s].
+    """
+    # A crossing nearer than this has happened.
+    least, next = jnp.maximum(IMMEDIATE_FRACTION * natural, shortest), jnp.full_like(natural, -NEVER_S)
+    for one in surfaces:
+        for since in _times_since_crossing(one):
+            next = jnp.where((since < -least) & (since > next), since, next)
+    return -next
+
+
+def time_since_crossing(surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> Scalar:
+    """Return the time [s] between the first crossing inside a step and the end of the step; 0 without one.
+
+    A crossing counts as inside between `STEP_START_FRACTION` and `STEP_END_FRACTION` of the step.
+
+    Args:
+        surfaces: Margins of the comparisons and their rates, at the end of the step.
+        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
+        length: Length of the step [s].
+    """
+    # Crossings outside of these fractions of the step lie at its ends.
+    low, high = (1 - STEP_END_FRACTION) * length, (1 - STEP_START_FRACTION) * length
+    first = low
+    for one in surfaces:
+        for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
+            first = jnp.where(on & (since < high) & (since > first), since, first)
+    return jnp.where(first > low, first, 0.0)
+
+
+def _times_since_crossing(surface: SwitchingFunction) -> Array:
+    """Return the times since the crossings of these surfaces, shape (n,) [s]; negative for a crossing ahead.
+
+    A rate of 0 gives an infinite time or NaN: no comparison with such a time is true.
+    """
+    return jnp.ravel(jnp.asarray(surface.value / surface.rate))
+
+
+def valid_end_rates(surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> tuple[PyTree, PyTree]:
+    """Return two flags, for the start and the end of a step: True if the rate there is also the rate inside the step.
+
+    The start's flag is False if a comparison changes at the start. The end's flag is False if one changes later.
+
+    Args:
+        surfaces: Margins of the comparisons at the end of the step, and their rates.
+        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
+        length: Length of the step [s].
+    """
+    start = end = jnp.asarray(True)
+    for one in surfaces:
+        for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
+            early = since >= (1 - STEP_START_FRACTION) * length
+            start, end = start & ~(on & early), end & ~(on & ~early)
+    return start, end
+
+
+def read_bits(words: ModeBits, numbers: PyTree) -> Scalar:
+    """Return the bits with these numbers, bool.
+
+    Args:
+        words: Packed bits.
+        numbers: Numbers of the bits.
+    """
+    numbers = jnp.asarray(numbers)
+    word = sum(jnp.where(numbers // WORD_BITS == i, one, jnp.uint32(0)) for i, one in enumerate(words))
+    return word & (jnp.uint32(1) << (numbers % WORD_BITS).astype(jnp.uint32)) != 0
