@@ -13,7 +13,8 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
 
 
 class ServoOutput(NamedTuple):
