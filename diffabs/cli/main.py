@@ -25,6 +25,7 @@ from diffabs import __version__
 from diffabs.cli import (
     catalogue,
     compare,
+    compile,
     compiled,
     console,
     design,
@@ -263,6 +264,7 @@ usage.add_command(app, design.verify, "verify gain.json")
 usage.add_command(app, explore.explore, "explore slip-cured --port 8342")
 usage.add_command(app, margins.margins, "margins slip-cured --at speed=5 --plot loop.png")
 usage.add_command(app, export.export, "export slip-cured --to c -o controller.c")
+usage.add_command(app, compile.compile_scenario, "compile slip-lmi --show eliminate --by plant.mass", "compile")
 usage.add_command(app, tune.tune, "tune slip-cured --set reference.time_constant=0.03 --out tuned.toml")
 usage.add_command(app, identify.identify, "identify slip-lmi --data run.csv --free plant.mass=4:8")
 usage.add_command(app, sweep.sweep, "sweep slip-lmi --samples 10000 --set solver.step=1e-3 --figures")

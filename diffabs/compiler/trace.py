@@ -33,11 +33,13 @@ class TracedFunctions(NamedTuple):
         each: Functions by name.
         types: Shapes and types of the arrays of each level: uniform, lane, carry.
         uniform: The uniform arrays, which may be tracers.
+        names: Paths of the arrays of lane and carry in their pytrees, for a reader; uniform arrays have none.
     """
 
     each: dict[str, TracedFunction]
     types: dict[UpdateLevel, list[PyTree]]
     uniform: list[PyTree]
+    names: dict[UpdateLevel, list[str]]
 
 
 def trace_functions(
@@ -66,7 +68,20 @@ def trace_functions(
         UpdateLevel.LANE: jax.tree.leaves(lane),
         UpdateLevel.STEP: jax.tree.leaves(carry),
     }
-    return TracedFunctions(each, {level: [_type(x) for x in xs] for level, xs in types.items()}, uniform)
+    names = {
+        UpdateLevel.UNIFORM: [""] * len(uniform),
+        UpdateLevel.LANE: _leaf_names(lane),
+        UpdateLevel.STEP: _leaf_names(carry),
+    }
+    return TracedFunctions(each, {level: [_type(x) for x in xs] for level, xs in types.items()}, uniform, names)
+
+
+def _leaf_names(tree: PyTree) -> list[str]:
+    """Return the path of each leaf, such as point.state.plant.speed."""
+    return [
+        ".".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)
+        for path, _ in jax.tree_util.tree_leaves_with_path(tree)
+    ]
 
 
 def _type(x: Scalar) -> Scalar:

@@ -35,6 +35,16 @@ REFUSALS = [
     ("design", 2, ["missing argument"]),
     ("simulat", 2, ["Did you mean 'simulate'?"]),
     ("simulate a 'b\nc'", 2, ["unexpected extra argument"]),
+    # compile
+    ("compile slip-lmi --show jpv", 2, ["--show jpv is unknown; did you mean jvp?"]),
+    (
+        "compile slip-lmi --by plant.mas",
+        2,
+        ["--by plant.mas is no tunable number of this loop; did you mean plant.mass?"],
+    ),
+    ("compile slip-lmi --by plant.mass --by plant.mass", 2, ["a parameter is given twice"]),
+    ("compile slip-lmi --show c --json", 2, ["--json is for the numbers of operations"]),
+    ("compile slip-lmi --out c.txt", 2, ["--out is for the text of --show"]),
     # simulate
     ("simulate slip-lim", 2, ["did you mean slip-lmi?"]),
     ("simulate none.toml", 2, ["No such file"]),

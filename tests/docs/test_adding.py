@@ -32,6 +32,7 @@ def project(tmp_path_factory):
 
 def run(project, *command):
     environment = os.environ | {"PYTHONPATH": str(project), "DIFFABS_JAX_CACHE": str(ROOT / ".jax_cache")}
+    environment.pop("DIFFABS_TEST_PART", None)  # this process may run a part of the tests, the inner one all
     return subprocess.run(
         [sys.executable, "-m", *command], cwd=project, env=environment, capture_output=True, text=True
     )

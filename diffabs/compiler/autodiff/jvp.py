@@ -244,7 +244,7 @@ def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) ->
         # The uniform inputs become constvars, as in a traced function: `lower_functions` passes them by number.
         jaxpr = closed.jaxpr.replace(constvars=[*shared, *closed.jaxpr.constvars], invars=rest)
         each[name] = TracedFunction(jaxpr, tuple(range(uniform)), tuple(closed.consts))
-    return TracedFunctions(each, types, functions.uniform)
+    return TracedFunctions(each, types, functions.uniform, functions.names)
 
 
 def _jvp_function(

@@ -1,0 +1,122 @@
+"""The command `compile`: the program of a kernel after each pass of the compiler."""
+
+import pathlib
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+from rich.table import Table
+
+from diffabs.cli import console, show, targets
+from diffabs.compiler.listing import count_by_level
+from diffabs.compiler.lower.rules import Unsupported
+from diffabs.compiler.passes import PASSES, LaneCall, find_lane_calls, list_pass
+from diffabs.compiler.runtime.toolchain import NoCompiler
+from diffabs.config.values import ScenarioError, unknown_name_error
+from diffabs.core.pytree import get, parameters
+from diffabs.core.types import Array, JsonObject
+from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.batch import Batch
+from diffabs.simulate.drive.engine import EngineError
+from diffabs.simulate.ensemble import run_batch
+
+MAX_DIRECTIONS = 8  # tangents of one launch
+
+
+def compile_scenario(
+    scenario: console.ScenarioName,
+    name: Annotated[
+        str | None, typer.Option("--show", metavar="PASS", help=f"Print the program after a pass: {', '.join(PASSES)}.")
+    ] = None,
+    by: Annotated[
+        list[str] | None,
+        typer.Option("--by", metavar="PATH", help="Differentiate by this parameter; may be repeated."),
+    ] = None,
+    changes: console.Changes = None,
+    out: Annotated[
+        pathlib.Path | None, typer.Option("--out", "-o", metavar="FILE", help="File to write; default: stdout.")
+    ] = None,
+    as_json: console.Json = False,
+) -> None:
+    """Show the program of a kernel after each pass.
+
+    Without --show it shows the number of operations after each pass. Without --by, passes on derivatives take the first
+    tunable parameter of the plant."""
+    with console.end_on_errors():
+        if name is not None and name not in PASSES:
+            raise unknown_name_error(f"--show {name} is unknown", name, PASSES)
+        if name and as_json:
+            console.fail("--json is for the numbers of operations; --show prints text")
+        if out and not name:
+            console.fail("--out is for the text of --show")
+        with targets.new_target_file(out, "--out") as file:
+            chosen = console.load_scenario(scenario, changes)
+            paths = _differentiated_paths(chosen, by or [])
+            values, derivative = console.run_with_progress(lambda: _trace(chosen, paths), f"tracing {chosen.name}")
+            if name:
+                # With --by every pass shows the derivative's program; without, only those that exist for derivatives.
+                call = derivative if by or name == "jvp" else values
+                text = console.run_with_progress(lambda: list_pass(call, name), f"pass {name}")
+                file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
+                return
+            result = console.run_with_progress(lambda: _count(chosen, paths, values, derivative), "counting")
+        show.as_json(result) if as_json else _show(result, chosen)
+
+
+def _differentiated_paths(chosen: Scenario, by: list[str]) -> list[str]:
+    """Return the paths of the tangents. Raises ScenarioError."""
+    tunable = {
+        path: spec for path, spec, value in parameters(chosen.loop) if spec.tunable and np.ndim(np.asarray(value)) == 0
+    }
+    if by:
+        for path in by:
+            if path not in tunable:
+                raise unknown_name_error(f"--by {path} is no tunable number of this loop", path, tunable)
+        if len(set(by)) != len(by):
+            raise ScenarioError(f"--by {', '.join(by)}: a parameter is given twice")
+        if len(by) > MAX_DIRECTIONS:
+            raise ScenarioError(f"--by is given {len(by)} times, outside [1, {MAX_DIRECTIONS}]")
+        return by
+    return [next(path for path in tunable if path.startswith("plant."))]
+
+
+def _trace(chosen: Scenario, paths: list[str]) -> tuple[LaneCall, LaneCall]:
+    """Return the kernel calls for values and for derivatives of all metrics. Raises ScenarioError."""
+
+    def run(x: Array) -> dict[str, Array]:
+        values = {path: x[i][None] for i, path in enumerate(paths)}
+        lanes = Batch(values, jnp.zeros(1, int))
+        return run_batch(chosen.loop, lanes, chosen.solver, chosen.objectives, engine="kernel").metrics
+
+    x = jnp.asarray([float(get(chosen.loop, path)) for path in paths])
+    try:
+        jaxprs = [jax.make_jaxpr(function)(x) for function in (run, jax.jacfwd(run))]
+        values, derivative = (next(find_lane_calls(jaxpr)) for jaxpr in jaxprs)
+    except (EngineError, NoCompiler, Unsupported) as error:
+        raise ScenarioError(f"{chosen.name} has no kernel: {error}") from None
+    return values, derivative
+
+
+def _count(chosen: Scenario, paths: list[str], values: LaneCall, derivative: LaneCall) -> JsonObject:
+    programs = {
+        "lower": values.lanes.derivative(None).program,
+        "eliminate": values.program(),
+        "lower, for derivatives": derivative.lanes.derivative(None).program,
+        "jvp": derivative.lanes.derivative(derivative.begins).program,
+        "eliminate, with tangents": derivative.program(),
+    }
+    return {
+        **console.describe_source(chosen),
+        "by": paths,
+        "operations": {name: count_by_level(program) for name, program in programs.items()},
+    }
+
+
+def _show(result: JsonObject, chosen: Scenario) -> None:
+    table = Table("after pass", "once a launch", "once a run", "in each step")
+    for name, counts in result["operations"].items():
+        table.add_row(name, *(str(counts[level]) for level in ("uniform", "lane", "step")))
+    by = ", ".join(result["by"])
+    show.show_titled_table(f"{chosen.title or chosen.name}: operations of its kernel; tangents by {by}", table)
