@@ -68,13 +68,10 @@ app = typer.Typer(
 AT_LIMIT = "at a limit"  # key among a run's objectives; the space keeps it apart from a scenario's metrics
 WARNED_LIMIT_SHARE = 0.5  # share of time at a limit, above which a run gets a warning
 MAX_CSV_ROWS = 20_000  # of a trajectory
-YOUNG = 50_000  # new objects between two collections (default 700): tracing makes many lasting objects
 
 
 def main() -> NoReturn:
     """Run the command line, and exit. This is the executable `diffabs`."""
-    gc.freeze()  # imported objects stay: collections skip them
-    gc.set_threshold(YOUNG)
     interrupt.begin_hearing()
     try:
         app()

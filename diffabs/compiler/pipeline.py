@@ -116,7 +116,8 @@ def describe_kernel_build() -> dict[str, str]:
     Raises:
         NoCompiler: There is no compiler for the processor or GPU.
     """
-    return gpu.describe_gpu_compiler() if gpu.find_gpu() else toolchain.describe_compiler()
+    device = gpu.find_gpu()
+    return device.describe() if device else toolchain.describe_compiler()
 
 
 def _lane_type(x: Scalar) -> Scalar:

@@ -29,6 +29,14 @@ _lock = threading.Lock()
 class GpuDevice(Protocol):
     """A GPU that compiles and starts kernels."""
 
+    def describe(self) -> dict[str, str]:
+        """Return "compiler", "flags" and "processor": with a program's text they determine its numbers to the last bit.
+
+        Raises:
+            NoCompiler: There is no compiler.
+        """
+        ...
+
     def compile(self, text: str) -> pathlib.Path:
         """Return the file with the machine code of a CUDA C++ `text`.
 
@@ -94,21 +102,6 @@ def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[PyTree],
     return buffer_callback(start, whole)(*given)[:-1]
 
 
-def describe_gpu_compiler() -> dict[str, str]:
-    """Return a dictionary with "compiler", "flags" and "processor" (the architecture, such as sm_90) of the GPU back
-    end.
-
-    With a program's text, they determine a kernel's numbers to the last bit. JAX must run on a GPU.
-
-    Raises:
-        NoCompiler: There is no CUDA compiler.
-    """
-    on = find_gpu()
-    assert isinstance(on, CudaDevice)
-    major, minor = nvrtc.nvrtc_version()
-    return {"compiler": f"NVRTC {major}.{minor}", "flags": " ".join(nvrtc.NVRTC_FLAGS), "processor": on.architecture}
-
-
 def _pack_addresses(addresses: list[int], sizes: list[int]) -> PyTree:
     """Return the struct `Arrays` of `threads.h`: each group of addresses ends with one more entry, a null pointer."""
     rest, found = iter(addresses), []
@@ -152,6 +145,15 @@ class CudaDevice:
         """Store the architecture; the driver is loaded at the first launch."""
         self.architecture = architecture
         self._loaded: dict[tuple[pathlib.Path, int], _LoadedCode] = {}
+
+    def describe(self) -> dict[str, str]:
+        """Return "compiler", "flags" and "processor" (the architecture); see `GpuDevice.describe`."""
+        major, minor = nvrtc.nvrtc_version()
+        return {
+            "compiler": f"NVRTC {major}.{minor}",
+            "flags": " ".join(nvrtc.NVRTC_FLAGS),
+            "processor": self.architecture,
+        }
 
     def compile(self, text: str) -> pathlib.Path:
         """Return the file with the machine code of a CUDA C++ `text`; see `GpuDevice.compile`."""
