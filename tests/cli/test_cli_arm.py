@@ -112,7 +112,7 @@ def test_certify_disproves_the_gain_for_one_rider():
     assert "quadratic stability is disproved" in result.stderr
 
 
-@killed_by("sweep/engines.py", "return np.asarray(stopped) != success", "return ~np.asarray(stopped)")
+@killed_by("sweep/study.py", "return np.asarray(stopped) != success", "return ~np.asarray(stopped)")
 def test_a_stop_that_is_a_fall_is_not_missed():
     stopped = np.array([True, False])
     np.testing.assert_array_equal(has_wrong_end(stopped, stops.Fallen.success), [True, False])

@@ -27,12 +27,14 @@ exported, parameters = loaded("exported"), loaded("parameters")
 
 INNER = {
     "cli",
+    "compiler",
+    "config",
     "core",
     "explore",
-    "kernel",
     "papers",
     "plot",
     "report",
+    "runtime",
     "scenario",
     "simulate",
 }  # not for import by their names, or figures

@@ -413,7 +413,7 @@ def test_steps_that_find_themselves_are_never_unstable():
 
 
 @killed_by(
-    "simulate/step/step_size.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least"
+    "simulate/step/surfaces.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least"
 )
 def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = [0, 1, 33, np.array([2, 3])]
