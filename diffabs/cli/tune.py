@@ -23,7 +23,7 @@ from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Trajectory
 
 if TYPE_CHECKING:
-    from diffabs.tune import Tuned, TuningProgress
+    from diffabs.tune import Problem, Tuned, TuningProgress
 
 
 def tune(
@@ -129,27 +129,29 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     goal, told = work.chosen.tune, list["TuningProgress"]()
     ending = console.InterruptibleEnd("the evaluation in hand", nothing=lambda: not told)
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
-    posed: JsonObject = {
-        "free": goal.free,
-        "objective": goal.objective,
-        "over": work.batch,
-        "solver": work.chosen.solver,
-        "measured": work.chosen.objectives,
-        "aggregate": goal.read_aggregate(),
-        "constraints": list(work.constraints.values()),
-    }
-    loop = work.chosen.loop
     most = None if work.constraints else goal.iterations  # with constraints the number of rounds is unknown
 
+    def build_problem(engine: str) -> "Problem":
+        return tune.build_problem(
+            work.chosen.loop,
+            free=goal.free,
+            objective=goal.objective,
+            over=work.batch,
+            solver=work.chosen.solver,
+            measured=work.chosen.objectives,
+            aggregate=goal.read_aggregate(),
+            constraints=list(work.constraints.values()),
+            engine=engine,
+        )
+
     def objection() -> str | None:
-        problem = tune.build_problem(loop, **posed, engine="kernel")
+        problem = build_problem("kernel")
         return problem.choose_xla() or problem.objection()
 
     engine = engines.choose_engine(engine, objection)
 
     def run_tuning() -> "Tuned":
-        told_to = {"method": method, "progress": told.append, "stopping": ending}
-        return tune.tune(loop, **posed, **told_to, engine=engine)
+        return tune.tune(build_problem(engine), method=method, progress=told.append, stopping=ending)
 
     try:
         return console.run_with_progress(
@@ -175,7 +177,6 @@ def _format_progress(told: "list[TuningProgress]", most: int | None = None) -> p
 
 def _draw(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     """Draw the history, and the run that is worst after the tuning, before and after it."""
-    from diffabs.plot.style import write_figure
     from diffabs.plot.tuning import draw_tuning
 
     chosen, metrics = work.chosen, found.metrics[1]
@@ -190,5 +191,4 @@ def _draw(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     runs = {"before": roll_out(chosen.loop), "after": roll_out(found.loop)}
     where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
     title = chosen.title or chosen.name
-    figure = draw_tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit)
-    write_figure(figure, path, path.suffix.lstrip("."))
+    draw_tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit).savefig(path)

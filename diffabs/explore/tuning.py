@@ -141,10 +141,10 @@ def tune_scenario(
         ValueError: The descent cannot leave its start.
         ModuleNotFoundError: The extra `tune` is missing.
     """
-    from diffabs.tune import Method, Stopping, tune
+    from diffabs.tune import Method, Stopping, build_problem, tune
 
     task = chosen.tune
-    found = tune(
+    problem = build_problem(
         chosen.loop,
         free=task.free,
         objective=task.objective,
@@ -153,6 +153,9 @@ def tune_scenario(
         measured=chosen.objectives,
         aggregate=task.read_aggregate(),
         constraints=posed.constraints,
+    )
+    found = tune(
+        problem,
         method=Method(starts=1, seed=task.seed, stopping=Stopping(iterations=task.iterations)),
         progress=lambda progress: told(progress.point.iteration, progress.point.loss),
         stopping=stopping,

@@ -144,7 +144,7 @@ def experiment(config: Any, results: Params, figures: Params) -> JsonObject:
     """Write an experiment's figures and `results.json` with config and versions, and return the contents of this file.
 
     Args:
-        config: Dataclass of the experiment's settings; the configured folder is the folder.
+        config: Dataclass of the experiment's settings; its field `out` is the folder.
         results: Results, as for JSON.
         figures: Figures by file name without suffix.
     """

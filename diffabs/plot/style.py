@@ -6,7 +6,6 @@ close to each other differ in their dashes as well.
 Source: M. Okabe and K. Ito, Color Universal Design (2008).
 """
 
-import json
 import os
 import pathlib
 import textwrap
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.types import PyTree, Scalar
-from diffabs.runtime import files, pictures
+from diffabs.runtime import files
 
 try:
     from matplotlib.axes import Axes
@@ -140,7 +139,7 @@ class _Powers(Formatter):
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
     """Write a figure to a file atomically, and return its path.
 
-    Readers see the old file or the whole new one. A PNG contains the numbers that it shows (`plot.shown`).
+    Readers see the old file or the whole new one.
 
     Args:
         figure: Figure to write.
@@ -148,25 +147,8 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
     """
     path = pathlib.Path(path)
     with files.new_file(path) as temporary:
-        write_figure(figure, temporary, path.suffix.lstrip(".") or "png")
+        figure.savefig(temporary, format=path.suffix.lstrip(".") or "png", dpi=DPI)
     return path
-
-
-def write_figure(figure: Figure, path: pathlib.Path, kind: str) -> None:
-    """Write a figure in a given format; a PNG also gets the numbers that it shows.
-
-    Args:
-        figure: Figure to write.
-        path: Path of the file.
-        kind: Format, such as "png" or "svg".
-    """
-    from diffabs.plot import shown
-
-    figure.savefig(path, format=kind, dpi=DPI)
-    # Only after savefig: drawing sets the final places of the axes.
-    if kind == "png":
-        text = json.dumps(shown.describe_axes(figure), separators=(",", ":"), allow_nan=False)
-        path.write_bytes(pictures.with_text(path.read_bytes(), pictures.AXES_KEY, text))
 
 
 def control_label(unit: str) -> str:

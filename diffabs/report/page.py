@@ -2,20 +2,17 @@
 
 import base64
 import dataclasses
-import json
 import math
 import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from diffabs.core.types import Params, PyTree, Scalar, Table
-from diffabs.runtime import files, pictures
+from diffabs.runtime import files
 from diffabs.runtime.summary import round_for_table
 
 IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 LARGEST_IMAGE = 2**25  # bytes
-LARGEST_AXES = 2**21  # characters of JSON with the numbers of a picture
-ENDS = ("box", "x", "y", "log")  # lists of numbers of each axes
 MAX_SHOWN_ENTRIES = 8  # of a list in a cell
 UNKNOWN_ORIGIN = "not known: the document does not say"
 VERDICT_NAMES = {True: "proved", False: "disproved", None: "undecided"}
@@ -44,13 +41,11 @@ class Figure(NamedTuple):
         caption: Caption.
         address: Image as a data URL; empty for a drawn one.
         drawn: SVG that this package drew; empty for an embedded image.
-        axes: Numbers of the picture's axes, as JSON of `diffabs.plot.shown`; empty if the file has none.
     """
 
     caption: str
     address: str = ""
     drawn: str = ""
-    axes: str = ""
 
 
 class ReportVerdict(NamedTuple):
@@ -133,29 +128,8 @@ def embed_image(path: pathlib.Path, caption: str = "") -> Figure | None:
         return None
     if not data or len(data) > LARGEST_IMAGE:
         return None
-    data, axes = pictures.without_text(data, pictures.AXES_KEY)
     text = base64.b64encode(data).decode()
-    return Figure(caption or path.stem.replace("_", " "), f"data:{kind};base64,{text}", axes=_axes(axes))
-
-
-def _axes(text: str) -> str:
-    """Return the numbers of a picture's axes as JSON; empty for numbers that a page cannot show."""
-    if len(text) > LARGEST_AXES:
-        return ""
-    try:
-        given = json.loads(text or "[]")
-        good = [one for one in given if all(map(_is_series, one["series"])) and all(map(_finite, map(one.get, ENDS)))]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return ""
-    return json.dumps(good, separators=(",", ":")) if good else ""
-
-
-def _is_series(one: PyTree) -> bool:
-    return _finite(one["x"]) and _finite(one["y"]) and len(one["x"]) == len(one["y"]) > 0
-
-
-def _finite(values: PyTree) -> bool:
-    return isinstance(values, list) and all(isinstance(x, int | float) and math.isfinite(x) for x in values)
+    return Figure(caption or path.stem.replace("_", " "), f"data:{kind};base64,{text}")
 
 
 def model_tables(model: Table | None) -> list[ReportTable]:

@@ -1,10 +1,5 @@
-"""Sections as one HTML file.
+"""Sections as one HTML file, which fetches nothing and contains no script."""
 
-The file fetches nothing. The only script is the package's own: the content security policy allows it by its checksum.
-"""
-
-import base64
-import hashlib
 import importlib.resources
 import pathlib
 from collections.abc import Callable, Sequence
@@ -40,30 +35,13 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
     import jinja2
 
     sections = [_section(one) for one in found]
-    folder = importlib.resources.files("diffabs.report")
-    text, script = ((folder / name).read_text(encoding="utf-8") for name in ("report.html.j2", "closer.js"))
+    text = (importlib.resources.files("diffabs.report") / "report.html.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     environment.filters["numbers"] = shown_numbers
     whole = title or (sections[0].title if len(sections) == 1 else f"{len(sections)} results")
-    looked = any(figure.axes for section in sections for figure in section.figures)
-    return environment.from_string(text).render(
-        title=whole,
-        sections=sections,
-        version=__version__,
-        script=script if looked else "",
-        checksum=script_checksum(script),
-    )
-
-
-def script_checksum(script: str) -> str:
-    """Return "sha256-" with the checksum of a script, by which a content security policy allows it.
-
-    Args:
-        script: Text of the script.
-    """
-    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
+    return environment.from_string(text).render(title=whole, sections=sections, version=__version__)
 
 
 def _section(document: Document) -> Section:

@@ -55,7 +55,7 @@ class Local:
     """An engine that runs one chunk at a time on each device of this process.
 
     XLA computes a chunk on one core, so a processor then gets as many chunks at a time as it has cores. A kernel uses
-    all cores for one chunk. With P processes (`jax.distributed`), each process takes every P-th chunk.
+    all cores for one chunk.
     """
 
     def __init__(self, devices: Sequence[PyTree] | None = None):
@@ -83,7 +83,7 @@ class Local:
         """
         places = self.places(study)
         runner, seals = Runner(study, places), Seals(describe_owner(study))
-        rest = group_items(chunks[jax.process_index() :: jax.process_count()], len(places))
+        rest = group_items(chunks, len(places))
         with ThreadPoolExecutor(1) as beside:
             together = next(rest, None)
             coming = beside.submit(runner.run, together) if together else None

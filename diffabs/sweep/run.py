@@ -7,10 +7,8 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
-from jax.experimental import multihost_utils
 
-from diffabs.core.types import PyTree, Scalar, Table
+from diffabs.core.types import Table
 from diffabs.runtime import provenance, stopwatch
 from diffabs.simulate.drive.engine import log_xla_reason
 from diffabs.sweep.engines import Engine, Local
@@ -18,10 +16,8 @@ from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.results import Results
 from diffabs.sweep.runner import find_study_objection
 from diffabs.sweep.selection import choose_study_engine
-from diffabs.sweep.store import Store, SweepError
+from diffabs.sweep.store import Store
 from diffabs.sweep.study import Study
-
-CHUNK_PRESENT, CHUNK_MISSING, CHUNK_UNKNOWN = 0, 1, 2  # states of a chunk
 
 
 class SweepProgress(NamedTuple):
@@ -65,9 +61,7 @@ def sweep(
 ) -> Results:
     """Compute every chunk of a study that the folder lacks, and return the results.
 
-    Several processes (`jax.distributed.initialize`) may call this with the same study and a folder on a common disk.
-    The first process holds the lock and writes the manifest. Each computes and writes its share, and all return the
-    whole table. A process that fails raises its error after the others have finished their shares.
+    One process sweeps into a folder, and holds its lock. Several machines compute the chunks with `on=Dask(...)`.
 
     Args:
         study: Study to run. For its engine "auto", the log says once why XLA makes the runs, if it does.
@@ -79,10 +73,12 @@ def sweep(
         source: Notes for the manifest, such as name and text of the scenario.
 
     Raises:
-        ValueError: The study cannot be run, or not by its engine.
-        SweepError: The folder contains something else, is in use, or cannot be written; or another process died.
+        ValueError: The study cannot be run, or not by its engine; or JAX runs in several processes.
+        SweepError: The folder contains something else, is in use, or cannot be written.
         OSError: The disk is full. Finished chunks stay, and `resume` continues.
     """
+    if jax.process_count() > 1:
+        raise ValueError("sweep runs in one process; several machines: on=Dask(...)")
     study, why_xla = choose_study_engine(study.check(), out, resume=resume, remote=getattr(on, "remote", False))
     if why_xla:
         log_xla_reason(why_xla)
@@ -101,44 +97,13 @@ def sweep(
 
 @contextlib.contextmanager
 def _begin_sweep(store: Store, study: Study, resume: bool, source: Table) -> Iterator[tuple[list[int], list[int]]]:
-    """Yield the missing chunks, and the damaged ones among them.
-
-    The first process holds the folder's lock until every process is done.
-    """
-    found, damaged = np.full(study.chunks, CHUNK_UNKNOWN, np.int8), []
-    with contextlib.ExitStack() as held:
-        try:
-            if jax.process_index() == 0:
-                held.enter_context(store.lock())
-                notes = {**provenance.source_commit(), "source": dict(source), "units": study.units()}
-                manifest = {**describe_owner(study), **notes}
-                store.begin(manifest, resume=resume)
-                whole, damaged = store.scan(Seals(manifest))
-                found[:] = np.where(np.isin(np.arange(study.chunks), list(whole)), CHUNK_PRESENT, CHUNK_MISSING)
-        finally:  # also after an error, because the other processes wait for this broadcast
-            found = _synchronise(multihost_utils.broadcast_one_to_all, found)
-        if CHUNK_UNKNOWN in found:
-            raise SweepError(f"{store.folder}: the first process could not begin, and says why")
-        try:
-            yield np.flatnonzero(found == CHUNK_MISSING).tolist(), damaged
-        except Exception:  # leaving at once would abort the processes that still compute
-            _synchronise(multihost_utils.sync_global_devices, "chunks")
-            raise
-        _synchronise(multihost_utils.sync_global_devices, "chunks")
-
-
-def _synchronise(meet: Callable[[PyTree], PyTree], what: Any) -> Scalar:
-    """Meet all other processes and return the result; a single process returns `what`.
-
-    Raises:
-        SweepError: A process has died.
-    """
-    if jax.process_count() == 1:
-        return what
-    try:
-        return meet(what)
-    except jax.errors.JaxRuntimeError as error:
-        raise SweepError("another process died; finished chunks stay; --resume continues the sweep") from error
+    """Hold the folder's lock, and yield the missing chunks, and the damaged ones among them."""
+    with store.lock():
+        notes = {**provenance.source_commit(), "source": dict(source), "units": study.units()}
+        manifest = {**describe_owner(study), **notes}
+        store.begin(manifest, resume=resume)
+        whole, damaged = store.scan(Seals(manifest))
+        yield [chunk for chunk in range(study.chunks) if chunk not in whole], damaged
 
 
 class _ProgressCounter:

@@ -49,7 +49,7 @@ class Study:
         seed: Seed of parameters and noise.
         chunk: Number of runs that are computed and stored together. Results are equal to the bit for equal `chunk`.
         dtype: "float32" or "float64".
-        engine: "xla", "kernel" or "auto" (`simulate.batch.run_batch`). `sweep` replaces "auto" by one of the others,
+        engine: "xla", "kernel" or "auto" (`simulate.ensemble.run_batch`). `sweep` replaces "auto" by one of the others,
             and a resumed sweep by the one that its manifest records. Results of the two differ in the last bits. Those
             of a kernel also depend on the compiler and the processor, which are part of the sweep's identity.
         parts: For a path drawn by a `Categorical` of names, the part that each name stands for.

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from diffabs.tune.method import DerivativeMode as DerivativeMode
     from diffabs.tune.method import Method as Method
     from diffabs.tune.method import Stopping as Stopping
+    from diffabs.tune.problem import Problem as Problem
     from diffabs.tune.result import DescentPoint as DescentPoint
     from diffabs.tune.result import StartError as StartError
     from diffabs.tune.result import Tuned as Tuned

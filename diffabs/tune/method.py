@@ -36,7 +36,6 @@ class Method:
         optimiser: Any optimiser of optax; None is L-BFGS with a line search that rejects diverging runs.
         starts: Number of starts: the first is the part itself, the others are drawn from the ranges.
         seed: Seed of the drawn starts.
-        mode: Forward or reverse mode; None decides by the number of parameters.
         stopping: Conditions that end a descent. With constraints each round has a descent of its own.
         rounds: Greatest number of rounds of the augmented Lagrangian, after a first descent without multipliers.
         margin: Distance inside each constraint at which the search aims, in units of the constraint's scale (relative
@@ -47,7 +46,6 @@ class Method:
     optimiser: optax.GradientTransformation | None = None
     starts: int = 1
     seed: int = 0
-    mode: DerivativeMode | None = None
     stopping: Stopping = dataclasses.field(default_factory=Stopping)
     rounds: int = 12
     margin: float = 1e-3

@@ -25,77 +25,35 @@ from diffabs.tune.risk import Aggregate, Mean
 
 
 def tune(
-    subject: Part,
+    problem: Problem,
     *,
-    free: Sequence[str] | Mapping[str, Range | None],
-    objective: Mapping[str, float],
-    over: Batch | None = None,
-    solver: Solver,
-    measured: Mapping[str, Objective] | None = None,
-    aggregate: Aggregate | None = None,
-    constraints: Sequence[Constraint] = (),
     method: Method | None = None,
     progress: Callable[[TuningProgress], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
-    engine: str = "auto",
 ) -> Tuned:
-    """Minimise an aggregate, over a batch of runs, of a weighted sum of metrics, and return the best part found.
+    """Solve a tuning problem by gradients, and return the best part found.
 
     The function warns if a derivative by a free parameter is one-sided (`docs/gradients.md`) in a run of the start or
     the result. A search may end at such a point without a minimum.
 
     Args:
-        subject: A Loop, or a part with a method `closed_loop()`.
-        free: Dotted paths of the free parameters. A mapping gives the range that bounds each; None is the declared
-            range.
-        objective: Weight of each metric of `measured` in the objective, `{"stop_distance": 1.0, "effort": 1e-4}`.
-        over: The runs, as parameters of the loop by path; None is one run of the loop itself.
-        solver: Solver of every run.
-        measured: Objectives by metric; None takes the default objectives of the plant.
-        aggregate: Map from one number for each run to one number: Mean (also for None), SmoothWorst, CVaR, Quantile.
-        constraints: Constraints: AtMost of a metric in every run, Poles, CertifiedDecay.
+        problem: The problem, from `build_problem`.
         method: Optimiser, starts, iterations; None is L-BFGS from the subject's own values.
         progress: Called after every evaluation, with the best of the last points of all starts.
         stopping: Called after every evaluation; True ends the search with the best point so far.
-        engine: Engine of the runs and their derivatives, "xla", "kernel" or "auto". A kernel computes forward
-            derivatives for any number of parameters. "auto" takes a kernel where one is possible and the parameters
-            are few (`Problem.choose_xla`). `Tuned.engine` names the engine.
 
     Raises:
-        ValueError: A path, range, metric or batch does not fit, or a run is inadmissible for every choice of
-            parameters.
-        EngineError: The engine is "kernel", and a kernel cannot make the runs.
+        EngineError: The engine of the problem is "kernel", and a kernel cannot make the runs.
         StartError: At every start a run diverges or is inadmissible, or the objective or its gradient is not finite.
-
-    >>> import diffabs as d
-    >>> from diffabs import controllers, objectives, plants, roads, stops, tune
-    >>> parts = {"plant": plants.QuarterCar(road=roads.DRY_ASPHALT), "stop": stops.SpeedReached(speed=5.0)}
-    >>> loop = d.braking(controller=controllers.ConstantTorque(torque=20.0), **parts)
-    >>> free, measured = {"controller.torque": (10.0, 100.0)}, {"iae": objectives.IAE()}
-    >>> solver = d.FixedStep(1e-3, 6.0)
-    >>> found = tune.tune(loop, free=free, objective={"iae": 1.0}, measured=measured, solver=solver)
-    >>> print(f"{found.values['controller.torque']:.1f} N m, {found.objective[0]:.2f} to {found.objective[1]:.2f} s")
-    85.6 N m, 1.14 to 0.18 s
     """
-    method = method or Method()
-    problem = build_problem(
-        subject,
-        free=free,
-        objective=objective,
-        over=over,
-        solver=solver,
-        measured=measured,
-        aggregate=aggregate,
-        constraints=constraints,
-        mode=method.mode,
-        engine=engine,
-    )
-    one_sided.warn(subject, {path: get(subject, path) for path in free}, problem.batch, solver, "start")
+    subject, paths = problem.subject, [entry.path for entry in problem.space.entries]
+    own = {path: get(subject, path) for path in paths}
+    one_sided.warn(subject, own, problem.batch, problem.solver, "start")
     try:
-        found = AugmentedLagrangianSearch(problem, method, progress, stopping).result()
+        found = AugmentedLagrangianSearch(problem, method or Method(), progress, stopping).result()
     except NoCompiler as error:
         raise EngineError.of(error) from None
-    one_sided.warn(subject, found.values, problem.batch, solver, "result")
+    one_sided.warn(subject, found.values, problem.batch, problem.solver, "result")
     return found
 
 
@@ -112,15 +70,39 @@ def build_problem(
     mode: DerivativeMode | None = None,
     engine: str = "auto",
 ) -> Problem:
-    """Return the problem that `tune` solves, for use with another search.
+    """Return the problem to minimise an aggregate, over a batch of runs, of a weighted sum of metrics.
+
+    `tune` solves the problem. Another search can use its functions (`Problem.evaluator`, `Problem.steady`).
 
     Args:
-        subject, free, objective, over, solver, measured, aggregate, constraints, engine: As in `tune`.
+        subject: A Loop, or a part with a method `closed_loop()`.
+        free: Dotted paths of the free parameters. A mapping gives the range that bounds each; None is the declared
+            range.
+        objective: Weight of each metric of `measured` in the objective, `{"stop_distance": 1.0, "effort": 1e-4}`.
+        over: The runs, as parameters of the loop by path; None is one run of the loop itself.
+        solver: Solver of every run.
+        measured: Objectives by metric; None takes the default objectives of the plant.
+        aggregate: Map from one number for each run to one number: Mean (also for None), SmoothWorst, CVaR, Quantile.
+        constraints: Constraints: AtMost of a metric in every run, Poles, CertifiedDecay.
         mode: Forward or reverse mode of differentiation; None decides by the number of free parameters and the engine.
+        engine: Engine of the runs and their derivatives, "xla", "kernel" or "auto". A kernel computes forward
+            derivatives for any number of parameters. "auto" takes a kernel where one is possible and the parameters
+            are few (`Problem.choose_xla`). `Problem.engine` and `Tuned.engine` name the engine.
 
     Raises:
         ValueError: A path, range, metric or batch does not fit, or a parameter is out of range.
         EngineError: The engine is "kernel" and the mode is reverse.
+
+    >>> import diffabs as d
+    >>> from diffabs import controllers, objectives, plants, roads, stops, tune
+    >>> parts = {"plant": plants.QuarterCar(road=roads.DRY_ASPHALT), "stop": stops.SpeedReached(speed=5.0)}
+    >>> loop = d.braking(controller=controllers.ConstantTorque(torque=20.0), **parts)
+    >>> free, measured = {"controller.torque": (10.0, 100.0)}, {"iae": objectives.IAE()}
+    >>> solver = d.FixedStep(1e-3, 6.0)
+    >>> problem = tune.build_problem(loop, free=free, objective={"iae": 1.0}, measured=measured, solver=solver)
+    >>> found = tune.tune(problem)
+    >>> print(f"{found.values['controller.torque']:.1f} N m, {found.objective[0]:.2f} to {found.objective[1]:.2f} s")
+    85.6 N m, 1.14 to 0.18 s
     """
     check_part(subject)
     loop = build_subject_loop(subject)

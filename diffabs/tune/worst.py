@@ -146,7 +146,7 @@ def worst_case(
         seed_of_noise: Seed of noisy sensors, the same in every run; or None.
         price: Cost of a gradient in rollouts. None is 6 in reverse mode and 1 + 1.5 p in forward mode, for p numbers in
             the box.
-        engine: Engine of the runs and their derivatives, as in `tune`.
+        engine: Engine of the runs and their derivatives, as in `build_problem`.
 
     Raises:
         ValueError: A path or range does not fit, the metric is unknown, a screened point cannot be run, or a requested

@@ -109,7 +109,7 @@ def test_every_argument_is_described(path):
 
 
 SHOWN = {
-    *("core.pytree.replace", "simulate.run.rollout", "simulate.run.measure", "simulate.batch.run_batch"),
+    *("core.pytree.replace", "simulate.run.rollout", "simulate.run.measure", "simulate.ensemble.run_batch"),
     *("linear.linearization.linearize", "linear.regulator.lqr", "linear.regulator.dlqr"),
     *("design.parameter_box.polytope", "design.synthesis.design", "design.analysis.certify"),
     *("tune.tuning.tune", "reliability.failure.failure_probability", "roads.optimum.peak"),
@@ -130,7 +130,7 @@ def test_what_is_used_most_has_an_example():
 
 DEAR = (  # some seconds of compiling
     *("diffabs.tune.tuning.tune", "diffabs.reliability.failure.failure_probability"),
-    "diffabs.simulate.batch.run_batch",
+    "diffabs.simulate.ensemble.run_batch",
 )
 
 

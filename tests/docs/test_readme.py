@@ -76,7 +76,7 @@ def test_the_tuning_runs():
 
 @pytest.mark.slow
 def test_the_sweep_of_the_page_on_sweeps_runs(tmp_path, monkeypatch):
-    code, _ = re.findall(r"```python\n(.*?)```", SWEEPS, re.DOTALL)  # the other: test_sweep_processes.py
+    (code,) = re.findall(r"```python\n(.*?)```", SWEEPS, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(compile(code.replace("256", "64").replace("128", "32"), "sweeps.md", "exec"), names)

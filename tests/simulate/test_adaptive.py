@@ -412,9 +412,7 @@ def test_steps_that_find_themselves_are_never_unstable():
     d.check(loop, d.Adaptive(1e-5, 4.0, 1e-2))
 
 
-@killed_by(
-    "simulate/step/surfaces.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least"
-)
+@killed_by("simulate/step/surfaces.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least")
 def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = [0, 1, 33, np.array([2, 3])]
     values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]

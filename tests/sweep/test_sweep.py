@@ -460,6 +460,15 @@ def test_a_study_that_cannot_be(study, tmp_path, changes, needed):
     assert left_in(tmp_path) == set()
 
 
+@killed_by("sweep/run.py", "    if jax.process_count() > 1:", "    if False:")
+def test_several_processes_of_jax_are_refused(study, tmp_path, monkeypatch):
+    """Before anything is written."""
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    with pytest.raises(ValueError, match=re.escape("sweep runs in one process; several machines: on=Dask(...)")):
+        sweep(study, tmp_path / "out")
+    assert left_in(tmp_path) == set()
+
+
 def test_a_study_has_a_table_of_plain_values(study):
     failures = {"overshoot": np.float32(0.5)}
     table = dataclasses.replace(study, failures=failures).check().table()
