@@ -143,7 +143,7 @@ def test_control_c_at_any_moment(folder, measured, tmp_path, command, moment):
     assert "interrupted" in text
     if moment == "working" and command == "sweep":
         assert chunks(tmp_path / "sweep")
-        again = re.split(r"go\s+on\s+with:\n", text)[1].replace("\\\n", " ")  # folded where the folder's name has it
+        again = re.split(r"continue\s+with:\n", text)[1].replace("\\\n", " ")  # folded where the folder's name has it
         assert shlex.split(again)[1:] == [*map(str, args), *longer["sweep"], "--resume"]
     if moment == "working" and command == "tune":
         assert "this is the best so far, not a minimum" in text
