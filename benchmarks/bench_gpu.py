@@ -33,9 +33,9 @@ import diffabs
 from diffabs import scenario
 from diffabs.compiler import pipeline
 from diffabs.compiler.emit import cuda
-from diffabs.compiler.ir import UpdateLevel, is_real
+from diffabs.compiler.ir import UpdateLevel, is_real, live_nodes
+from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import gpu, nvrtc
-from diffabs.compiler.trace import ScalarProgram, live_nodes
 from diffabs.core.pytree import get
 from diffabs.simulate.drive import kernel as native
 

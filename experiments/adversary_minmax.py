@@ -20,7 +20,7 @@ from real_rig_judge import Judging, runs
 from real_rig_loops import loop as loop_of_box
 
 from diffabs import Batch, Loop
-from diffabs.tune import CVaR, DerivativeMode, Method, Stopping, tune
+from diffabs.tune import CVaR, DerivativeMode, Method, Stopping, build_problem, tune
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,14 +74,17 @@ def hardened(
 def _tuned(loop: Loop, bounds: Bounds, config: Rounds, attack: Attack, lanes: np.ndarray) -> Loop:
     names = tuple(config.weights)
     found = tune(
-        loop,
-        free=config.free,
-        objective=config.weights,
-        over=Batch(parameters(bounds, lanes)),
-        solver=attack.solver(),
-        measured={name: MEASURED[name] for name in names},
-        aggregate=CVaR(level=config.level),
-        method=Method(mode=DerivativeMode.FORWARD, stopping=Stopping(change=1e-4, iterations=config.iterations)),
+        build_problem(
+            loop,
+            free=config.free,
+            objective=config.weights,
+            over=Batch(parameters(bounds, lanes)),
+            solver=attack.solver(),
+            measured={name: MEASURED[name] for name in names},
+            aggregate=CVaR(level=config.level),
+            mode=DerivativeMode.FORWARD,
+        ),
+        method=Method(stopping=Stopping(change=1e-4, iterations=config.iterations)),
     )
     return found.part
 

@@ -41,7 +41,7 @@ from diffabs.objectives import BALANCE, SoftLoss
 from diffabs.papers import record
 from diffabs.scenario.scenario import load
 from diffabs.simulate.run import rollout
-from diffabs.tune import Method, Stopping, tune
+from diffabs.tune import Method, Stopping, build_problem, tune
 
 START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])
 SHARP = 40.0  # of the smooth minimum over riders
@@ -154,14 +154,16 @@ def tuned(config: Config, machine: Machine, shape: str) -> Machine:
         riders, multiples = (x.ravel() for x in np.meshgrid(config.riders, multiples, indexing="ij"))
         over = {"plant.rider_mass": riders, "initial.theta": START[0] * multiples, "initial.phi": START[2] * multiples}
         machine = tune(
-            machine,
-            free={**ranges, "rider": config.designed_for, **WEIGHTS},
-            objective={"loss": 1.0},
-            over=Batch(over),
-            solver=FixedStep(step=config.step, duration=config.duration),
-            measured={
-                "loss": SoftLoss(weight=np.array(config.counted), radius=config.radius, softness=config.softness)
-            },
+            build_problem(
+                machine,
+                free={**ranges, "rider": config.designed_for, **WEIGHTS},
+                objective={"loss": 1.0},
+                over=Batch(over),
+                solver=FixedStep(step=config.step, duration=config.duration),
+                measured={
+                    "loss": SoftLoss(weight=np.array(config.counted), radius=config.radius, softness=config.softness)
+                },
+            ),
             method=Method(stopping=Stopping(iterations=config.iterations)),
         ).part
         now = worst_of(counted(config, machine.closed_loop(), config.riders, most))

@@ -27,7 +27,7 @@ from diffabs.linear.recoverable import mode_bounds
 from diffabs.objectives import SoftLoss
 from diffabs.papers import record
 from diffabs.scenario.scenario import load
-from diffabs.tune import Method, Stopping, grid, tune
+from diffabs.tune import Method, Stopping, build_problem, grid, tune
 from diffabs.tune.weights import lq_weights, lqr_gain_design
 
 PAPER_START = {"initial.theta": 0.5, "initial.phi": 0.2}
@@ -63,12 +63,14 @@ def tuned(config: Config) -> Any:
     first, second = config.tuned_starts
     axes = {"initial.theta": np.linspace(0, config.box, first), "initial.phi": np.linspace(-1, 1, second) * config.box}
     return tune(
-        lq_weights(loop, np.ones(6), config.effort, design),
-        free={"log_diagonal": config.q_range, "log_effort": config.effort_range},
-        objective={"loss": 1.0},
-        over=grid(axes),
-        solver=FixedStep(step=config.tuned_step, duration=config.tuned_duration),
-        measured={"loss": SoftLoss(radius=config.radius, softness=config.softness)},
+        build_problem(
+            lq_weights(loop, np.ones(6), config.effort, design),
+            free={"log_diagonal": config.q_range, "log_effort": config.effort_range},
+            objective={"loss": 1.0},
+            over=grid(axes),
+            solver=FixedStep(step=config.tuned_step, duration=config.tuned_duration),
+            measured={"loss": SoftLoss(radius=config.radius, softness=config.softness)},
+        ),
         method=Method(stopping=Stopping(iterations=config.iterations)),
     )
 

@@ -80,7 +80,13 @@ def tuned(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges)
 
     def descend(one: Any, count: int, starts: int, iterations: int) -> Tuned:
         how = Method(starts=starts, seed=search.seed, stopping=Stopping(change=1e-6, iterations=iterations))
-        return tune(one, **task(search, fixed, sensors, rule, ranges, lanes(fixed, count, seed)), method=how)
+        return tune(
+            build_problem(
+                one,
+                **task(search, fixed, sensors, rule, ranges, lanes(fixed, count, seed)),
+            ),
+            method=how,
+        )
 
     tried = descend(start(ranges, fixed, sensors, rule), search.few, search.starts, search.tried)
     found = descend(tried.part, search.roads, 1, search.iterations)

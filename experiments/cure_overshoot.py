@@ -39,7 +39,7 @@ from diffabs.references import FilteredSlip, FixedSlip
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import load
 from diffabs.stops import SpeedReached
-from diffabs.tune import AtMost, CertifiedDecay, Method, Stopping, Tuned, grid, tune
+from diffabs.tune import AtMost, CertifiedDecay, Method, Stopping, Tuned, build_problem, grid, tune
 
 KMH = 3.6
 
@@ -127,12 +127,14 @@ def systems(config: Config) -> dict[str, Polytope]:
 def tuned(config: Config, system: Polytope, subject: Loop, progress: Any = None) -> Tuned:
     """Gain and filter by gradients."""
     return tune(
-        subject,
-        free={"controller.controller.gain": config.gain_range, "reference.time_constant": config.filter_range},
-        objective={"iae": 1.0},
-        over=grid({"plant.mass": config.tuned_masses, "initial.speed": [v / KMH for v in config.tuned_speeds]}),
-        solver=FixedStep(step=config.tuning_step, duration=config.duration),
-        constraints=[AtMost("overshoot", config.overshoot), CertifiedDecay(system, config.decay)],
+        build_problem(
+            subject,
+            free={"controller.controller.gain": config.gain_range, "reference.time_constant": config.filter_range},
+            objective={"iae": 1.0},
+            over=grid({"plant.mass": config.tuned_masses, "initial.speed": [v / KMH for v in config.tuned_speeds]}),
+            solver=FixedStep(step=config.tuning_step, duration=config.duration),
+            constraints=[AtMost("overshoot", config.overshoot), CertifiedDecay(system, config.decay)],
+        ),
         method=Method(stopping=Stopping(iterations=config.iterations)),
         progress=progress,
     )

@@ -59,7 +59,7 @@ def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
     mode = min(prices, key=lambda mode: prices[mode])
     most = config.iterations[large]
     stopping = Stopping(gradient=1e-9, change=1e-11, iterations=most)
-    found = pose(tune, method=Method(mode=mode, memory=searches.MEMORY, stopping=stopping))
+    found = tune(pose(build_problem, mode=mode), method=Method(memory=searches.MEMORY, stopping=stopping))
     print(f"{name}: tune {found.objective[1]:.9g}, {found.evaluations} gradients; {found.reason.value}", flush=True)
     budget = allowed(config, problem.space.size)
     asked: dict[str, Callable[[], searches.Trace]] = {

@@ -25,7 +25,7 @@ from diffabs.references import FixedSlip
 from diffabs.roads import MagicFormula
 from diffabs.scenario.defaults import braking
 from diffabs.stops import Standstill
-from diffabs.tune import Method, Stopping, latin, tune
+from diffabs.tune import Method, Stopping, build_problem, latin, tune
 
 MEASURED = {**BRAKING, "effort": Effort()}
 
@@ -63,11 +63,13 @@ def front(config: Config) -> list[dict[str, Any]]:
     one, rows = car(config), []
     for weight in config.weights:
         found = tune(
-            one,
-            free={path: (low, high) for path, low, high in config.ranges},
-            objective={"stop_distance": 1.0, "effort": weight},
-            solver=FixedStep(step=config.step, duration=config.duration),
-            measured=MEASURED,
+            build_problem(
+                one,
+                free={path: (low, high) for path, low, high in config.ranges},
+                objective={"stop_distance": 1.0, "effort": weight},
+                solver=FixedStep(step=config.step, duration=config.duration),
+                measured=MEASURED,
+            ),
             method=Method(stopping=Stopping(iterations=config.iterations, change=1e-6)),
         )
         one, metrics = found.loop, found.metrics[1]

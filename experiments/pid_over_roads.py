@@ -32,7 +32,7 @@ from diffabs.roads import MagicFormula, Patches
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import Noise
 from diffabs.stops import Standstill
-from diffabs.tune import Method, Stopping, Tuned, tune
+from diffabs.tune import Method, Stopping, Tuned, build_problem, tune
 
 MEASURED = {**BRAKING, "effort": Effort()}
 
@@ -153,11 +153,13 @@ def loops(config: Config) -> dict[str, Loop]:
 def tuned(config: Config, known: Family, one: Loop, progress: Any = None) -> Tuned:
     """kp, ki, the tracking time of an anti-windup and the (first) target slip; of the estimator its filter, too."""
     return tune(
-        screened(config, one) if isinstance(one.reference, PeakRobust) else wound(config, one),
-        free=free(config, one),
-        objective={"stop_distance": 1.0},
-        over=known.with_paper(config.own_share),
-        solver=FixedStep(step=config.step, duration=config.longest),
+        build_problem(
+            screened(config, one) if isinstance(one.reference, PeakRobust) else wound(config, one),
+            free=free(config, one),
+            objective={"stop_distance": 1.0},
+            over=known.with_paper(config.own_share),
+            solver=FixedStep(step=config.step, duration=config.longest),
+        ),
         method=Method(stopping=Stopping(iterations=config.iterations, change=1e-5)),
         progress=progress,
     )

@@ -14,7 +14,7 @@ from diffabs.controllers import BackCalculation, ProportionalFeedback
 from diffabs.objectives import IAE, Overshoot
 from diffabs.references import LimitedSlip
 from diffabs.sensors import SpeedEstimator
-from diffabs.tune import CVaR, DerivativeMode, Method, SmoothWorst, Stopping, Tuned, tune
+from diffabs.tune import CVaR, DerivativeMode, Method, SmoothWorst, Stopping, Tuned, build_problem, tune
 
 MEASURED = {"overshoot": Overshoot(), "iae": IAE(), "deviation": Deviation()}
 ONE_SIDED: Mapping[str, float] = {"overshoot": 1.0, "iae": 1.0}  # 1, 1/s
@@ -110,15 +110,18 @@ def searched(
     over, floors = lanes(config, box, fixed, speed, stage.lanes, stage.weights)
     stopping = Stopping(change=1e-4, iterations=stage.iterations)
     return tune(
-        subject,
-        free={**config.free, **({} if speed == KNOWN else config.of_estimator)},
-        objective=stage.weights,
-        over=over,
-        solver=FixedStep(step=config.step, duration=float(np.max(over.durations)), kinks=False),
-        measured={name: MEASURED[name] for name in stage.weights},
-        aggregate=Above(stage.aggregate, floors),
-        method=Method(starts=stage.starts, seed=config.seed, mode=DerivativeMode.FORWARD, stopping=stopping),
-        engine=config.engine,
+        build_problem(
+            subject,
+            free={**config.free, **({} if speed == KNOWN else config.of_estimator)},
+            objective=stage.weights,
+            over=over,
+            solver=FixedStep(step=config.step, duration=float(np.max(over.durations)), kinks=False),
+            measured={name: MEASURED[name] for name in stage.weights},
+            aggregate=Above(stage.aggregate, floors),
+            mode=DerivativeMode.FORWARD,
+            engine=config.engine,
+        ),
+        method=Method(starts=stage.starts, seed=config.seed, stopping=stopping),
         progress=lambda p: progress(f"{speed}, {stage.name}: {p.point.evaluations} gradients, {p.point.objective:.5g}"),
     )
 

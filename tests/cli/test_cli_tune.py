@@ -22,7 +22,7 @@ from seams import replace_seam
 from small_scenarios import TUNE as SMALL
 
 import diffabs.tune as library
-from diffabs.cli import certificates, console, progress, tune_document
+from diffabs.cli import certificates, console, progress, tuning_task
 from diffabs.cli import tune as commands_tune
 from diffabs.core.pytree import parameters, replace
 from diffabs.design.sdp import solver
@@ -100,9 +100,9 @@ def invented(monkeypatch, unproved):
     """A tuning that has found something, at once; returns what it was asked."""
     asked = {}
 
-    def tune(loop, **what):
-        asked.update(what, loop=loop)
-        return invention(loop, **what)
+    def tune(problem, **how):
+        asked.update(how, problem=problem)
+        return invention(problem, **how)
 
     replace_seam(monkeypatch, "tune_tune", tune)
     return asked
@@ -126,7 +126,7 @@ def tuned(tmp_path_factory):
     (folder / "small.toml").write_text(SMALL)
     with pytest.MonkeyPatch.context() as patch:
         replace_seam(patch, "build_proof_task", lambda chosen: pytest.fail("asked for a proof too early"))
-        replace_seam(patch, "certify_result", lambda after: commands_tune.Proved({"decay_rate": None}, "no proof"))
+        replace_seam(patch, "certify_result", lambda after: tuning_task.Proved({"decay_rate": None}, "no proof"))
         out = ("--out", folder / "out.toml", "--plot", folder / "a.png")
         result = run("tune", folder / "small.toml", "--json", *out)
     return folder, json.loads(result.stdout), result.stderr
@@ -195,13 +195,15 @@ def test_the_section_reaches_the_tuning(small, invented):
     changes = ("tune.aggregate=cvar", "tune.aggregate.level=0.75", "tune.seed=7", "tune.limits.iae=0.5")
     sets = [word for change in changes for word in ("--set", change)]
     document = json.loads(run("tune", small, "--json", "--starts", "4", *sets).stdout)
-    assert invented["free"] == {"controller.gain": ((-1e4, -60.0), (-100.0, -20.0))}
-    assert invented["objective"] == {"iae": 1.0}
-    assert invented["over"].values["plant.mass"].tolist() == [5.3, 6.2]
-    assert tuple(invented["over"].keys) == (3, 3)
-    assert isinstance(invented["aggregate"], library.CVaR)
-    assert invented["aggregate"].level == 0.75
-    assert [(c.metric, c.bound) for c in invented["constraints"]] == [("overshoot", 0.5), ("iae", 0.5)]
+    problem = invented["problem"]
+    (entry,) = problem.space.entries
+    assert (entry.path, entry.ranges) == ("controller.gain", ((-1e4, -100.0), (-60.0, -20.0)))
+    assert problem.weights == {"iae": 1.0}
+    assert problem.batch.values["plant.mass"].tolist() == [5.3, 6.2]
+    assert tuple(problem.batch.keys) == (3, 3)
+    assert isinstance(problem.aggregate, library.CVaR)
+    assert problem.aggregate.level == 0.75
+    assert [(c.metric, c.bound) for c in problem.constraints] == [("overshoot", 0.5), ("iae", 0.5)]
     assert (invented["method"].starts, invented["method"].seed) == (4, 7)
     assert invented["method"].stopping.iterations == 2
     assert document["history"] == [point._asdict() for point in HISTORY]
@@ -209,7 +211,7 @@ def test_the_section_reaches_the_tuning(small, invented):
 
 def test_a_latin_hypercube_of_lanes(small, invented):
     run("tune", small, "--set", "tune.samples=9", "--set", "tune.over.initial.speed_kmh=49,50")
-    lanes = invented["over"].values
+    lanes = invented["problem"].batch.values
     assert {len(column) for column in lanes.values()} == {9}
     assert 5.3 <= lanes["plant.mass"].min() < 5.5 < 6.0 < lanes["plant.mass"].max() <= 6.2
     assert 49 / 3.6 <= lanes["initial.speed"].min() <= lanes["initial.speed"].max() <= 50 / 3.6
@@ -261,7 +263,7 @@ def test_progress_is_told_again_when_it_changes(monkeypatch, capsys):
 def test_without_the_design_extra_there_is_no_certificate(small, invented, monkeypatch):
     monkeypatch.undo()
     with pytest.MonkeyPatch.context() as patch:
-        replace_seam(patch, "tune_tune", lambda loop, **what: fake(loop, what))
+        replace_seam(patch, "tune_tune", lambda problem, **how: fake(problem))
         patch.setitem(sys.modules, "cvxpy", None)
         solver.solvers.cache_clear()
         result = run("tune", small, "--json")
@@ -271,11 +273,11 @@ def test_without_the_design_extra_there_is_no_certificate(small, invented, monke
     assert result.stderr == f"no certificate: {document['certificate']['reason']}\n"
 
 
-def fake(loop, what):
-    metrics = {name: np.zeros(what["over"].size) for name in what["measured"]}
+def fake(problem):
+    metrics = {name: np.zeros(problem.batch.size) for name in problem.measured}
     return Tuned(
         *(
-            loop,
+            problem.subject,
             {},
             (1.0, 1.0),
             (0.0, 0.0),
@@ -291,7 +293,7 @@ def fake(loop, what):
 
 
 def test_a_loop_that_is_not_linear_has_no_certificate(small, monkeypatch):
-    replace_seam(monkeypatch, "tune_tune", lambda loop, **what: fake(loop, what))
+    replace_seam(monkeypatch, "tune_tune", lambda problem, **how: fake(problem))
     changes = ("controller=relay", "tune.free.reference.slip=0.1,0.3")
     result = run("tune", small, *(word for change in changes for word in ("--set", change)))
     assert result.stderr == ("no certificate: controller relay is not linear: it cannot be brought to state feedback\n")
@@ -317,11 +319,9 @@ def test_a_decay_that_is_asked_for_is_certified(tmp_path):
 
 @pytest.mark.parametrize("name", ["slip-lmi", "slip-estimator", "slip-cured"])
 def test_packaged_scenarios_can_be_tuned(name, invented):
-    """The library is asked something that fits."""
+    """The library is asked something that fits: it has checked the problem that it built."""
     run("tune", name, "--set", "tune.decay=0", "--set", "tune.damping=0", "--set", "tune.limits={}")
-    loop = invented["loop"]
-    names = ("free", "objective", "over", "solver", "measured", "aggregate", "constraints")
-    library.build_problem(loop, **{name: invented[name] for name in names})
+    assert invented["problem"].space.size > 0
 
 
 # What could not be done
@@ -359,9 +359,9 @@ def test_met_is_met_without_a_tolerance(small, invented, bound, met):
 
 
 def test_a_limit_on_what_is_no_number_is_not_met():
-    judged = tune_document._constraint_row("overshoot", 0.2, 0.3, math.nan, at_most=True)
+    judged = tuning_task._constraint_row("overshoot", 0.2, 0.3, math.nan, at_most=True)
     assert (judged["met"], judged["missed"]) == (False, None)
-    judged = tune_document._constraint_row("certified decay", 5.0, None, None, at_most=False)
+    judged = tuning_task._constraint_row("certified decay", 5.0, None, None, at_most=False)
     assert (judged["met"], judged["missed"]) == (False, None)
 
 

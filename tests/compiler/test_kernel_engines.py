@@ -136,7 +136,7 @@ class TestDefault:
     @killed_by("design/attraction.py", 'engine: str = "auto",', 'engine: str = "xla",')
     @killed_by("sweep/study.py", 'engine: str = "auto"', 'engine: str = "xla"')
     def test_is_the_same_everywhere(self):
-        functions = [d.run_batch, tune.tune, tune.build_problem, tune.worst_case, sweep.Study]
+        functions = [d.run_batch, tune.build_problem, tune.worst_case, sweep.Study]
         functions += [getattr(attraction, name) for name in STARTS]
         assert {inspect.signature(function).parameters["engine"].default for function in functions} == {"auto"}
 
@@ -183,7 +183,9 @@ class TestTune:
     def test_is_that_of_xla(self):
         """Two starts, each with its lanes, in one launch; the values of what is tuned to the last digits."""
         method = tune.Method(starts=2)
-        found, expected = (tune.tune(LOOP, **TUNED, method=method, engine=e) for e in ("kernel", "xla"))
+        found, expected = (
+            tune.tune(tune.build_problem(LOOP, **TUNED, engine=e), method=method) for e in ("kernel", "xla")
+        )
         assert found.engine == {"name": "kernel", **toolchain.describe_compiler()}
         assert expected.engine == {"name": "xla"}
         np.testing.assert_allclose(found.objective, expected.objective, rtol=1e-9)
@@ -213,21 +215,20 @@ class TestTune:
         "            if False:\n                raise",
     )
     def test_in_reverse_mode_is_refused(self):
-        method = tune.Method(mode=DerivativeMode.REVERSE)
         with pytest.raises(EngineError, match="engine = 'kernel' is not possible: a kernel has no reverse mode"):
-            tune.tune(LOOP, **TUNED, method=method, engine="kernel")
+            tune.build_problem(LOOP, **TUNED, engine="kernel", mode=DerivativeMode.REVERSE)
 
     @killed_by("simulate/drive/engine.py", "    if engine not in REQUESTABLE_ENGINES:", "    if False:")
     def test_of_another_name(self):
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
-            tune.tune(LOOP, **TUNED, engine="gpu")
+            tune.tune(tune.build_problem(LOOP, **TUNED, engine="gpu"))
 
     @killed_by("tune/problem.py", "if line := found.objection():", "if line := None:")
     @killed_by("tune/problem.py", "together=together, engine=self.engine)", "together=True)")
     @pytest.mark.slow
     def test_without_a_compiler(self, users_engine, no_compiler, caplog):
         with pytest.raises(EngineError, match=NONE):
-            tune.tune(LOOP, **TUNED, engine="kernel")
+            tune.tune(tune.build_problem(LOOP, **TUNED, engine="kernel"))
         with caplog.at_level(logging.WARNING, "diffabs"):
             found = [tune.build_problem(LOOP, **TUNED) for _ in range(2)]
         assert [problem.engine for problem in found] == ["xla", "xla"]

@@ -112,7 +112,7 @@ SHOWN = {
     *("core.pytree.replace", "simulate.run.rollout", "simulate.run.measure", "simulate.ensemble.run_batch"),
     *("linear.linearization.linearize", "linear.regulator.lqr", "linear.regulator.dlqr"),
     *("design.parameter_box.polytope", "design.synthesis.design", "design.analysis.certify"),
-    *("tune.tuning.tune", "reliability.failure.failure_probability", "roads.optimum.peak"),
+    *("tune.tuning.build_problem", "reliability.failure.failure_probability", "roads.optimum.peak"),
     *(f"roads.{part}" for part in ("burckhardt.Burckhardt", "magic_formula.MagicFormula", "tabulated.Tabulated")),
     "roads.patches.Patches",
 }
@@ -129,7 +129,7 @@ def test_what_is_used_most_has_an_example():
 
 
 DEAR = (  # some seconds of compiling
-    *("diffabs.tune.tuning.tune", "diffabs.reliability.failure.failure_probability"),
+    *("diffabs.tune.tuning.build_problem", "diffabs.reliability.failure.failure_probability"),
     "diffabs.simulate.ensemble.run_batch",
 )
 

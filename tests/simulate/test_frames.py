@@ -21,7 +21,7 @@ from diffabs.runtime.summary import Summary, format_cell, round_for_table
 from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached
 from diffabs.sweep import Results, Space, Study, Uniform, sweep
-from diffabs.tune import grid, tune
+from diffabs.tune import build_problem, grid, tune
 
 SOLVER = d.FixedStep(2e-3, 2.0)
 
@@ -155,7 +155,7 @@ def test_a_run_draws_the_figure_of_its_plant(run, tmp_path):
 @pytest.mark.slow
 def test_a_tuning_has_a_table():
     free, over = {"controller.gain": ((-1e4, -300.0), (-200.0, -10.0))}, grid({"plant.mass": [5.3, 6.2]})
-    found = tune(rig(), free=free, objective={"iae": 1.0}, over=over, solver=SOLVER)
+    found = tune(build_problem(rig(), free=free, objective={"iae": 1.0}, over=over, solver=SOLVER))
     table = found.table()
     rows = {row[0]: row[1:] for row in table.rows}
     np.testing.assert_array_equal(rows["controller.gain"][1], found.values["controller.gain"])

@@ -374,7 +374,13 @@ class TestWhoeverRuns:
         over = d.Batch({"initial.speed": [9.0, 1.0]})
         with pytest.raises(StartError, match=r"lane 1: initial.speed = 1 m/s is not above stop.speed"):
             tune(
-                RIG, free={"controller.gain": ((-2e4, -60.0), (-9e3, -30.0))}, objective={"iae": 1.0}, over=over, **ask
+                build_problem(
+                    RIG,
+                    free={"controller.gain": ((-2e4, -60.0), (-9e3, -30.0))},
+                    objective={"iae": 1.0},
+                    over=over,
+                    **ask,
+                )
             )
         t = np.array([0.0, 0.1])
         data = Traces(t=t, columns={"speed": np.ones((2, 2))}, over={"initial.speed": np.array([9.0, 1.0])})

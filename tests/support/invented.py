@@ -9,13 +9,14 @@ from diffabs.tune.result import StartResult
 HISTORY = [DescentPoint(0, 2.0, 1.0, 0.5, 0.1, 1), DescentPoint(1, 1.5, 0.75, 0.01, 0.0, 3)]
 
 
-def tuned(loop, **what):
+def tuned(problem, **how):
     """Every free parameter a tenth larger; the arguments are those of `diffabs.tune.tune`."""
-    n = what["over"].size
+    del how
+    loop, n = problem.subject, problem.batch.size
     before = {path: value for path, _, value in parameters(loop)}
-    metrics = [{name: np.full(n, value) for name in what["measured"]} for value in (0.3, 0.2)]
+    metrics = [{name: np.full(n, value) for name in problem.measured} for value in (0.3, 0.2)]
     return Tuned(
-        replace(loop, {path: 1.1 * np.asarray(before[path]) for path in what["free"]}),
+        replace(loop, {entry.path: 1.1 * np.asarray(before[entry.path]) for entry in problem.space.entries}),
         {},
         (2.0, 1.5),
         (0.1, 0.0),

@@ -80,7 +80,10 @@ def test_gradients_of_both_modes_agree_with_differences():
 @pytest.mark.slow
 def test_it_finds_the_optimum_of_nelder_mead():
     ask = {"objective": {"iae": 1.0, "final_slip_error": 0.1}, "over": TWO, "solver": SOLVER}
-    found = tune(RIG, free=GAINS, method=Method(starts=2, stopping=Stopping(iterations=40)), **ask)
+    found = tune(
+        build_problem(RIG, free=GAINS, **ask),
+        method=Method(starts=2, stopping=Stopping(iterations=40)),
+    )
     problem = build_problem(RIG, free=GAINS, **ask)
     value, steady = problem.objective_evaluator(), problem.steady()
 
@@ -93,7 +96,10 @@ def test_it_finds_the_optimum_of_nelder_mead():
     assert stable_step(found.loop) >= SOLVER.step
     assert found.mode is DerivativeMode.FORWARD
     assert found.history[-1].objective == found.objective[1]
-    again = tune(RIG, free=GAINS, method=Method(starts=2, stopping=Stopping(iterations=40)), **ask)
+    again = tune(
+        build_problem(RIG, free=GAINS, **ask),
+        method=Method(starts=2, stopping=Stopping(iterations=40)),
+    )
     assert again.history == found.history
 
 
@@ -109,9 +115,9 @@ def test_a_gain_that_the_step_cannot_follow_is_not_entered():
     )
     step = 2e-3
     found = tune(
-        car, free={"controller.kp": (500.0, 1e6)}, objective={"iae": 1.0}, solver=d.FixedStep(step, 0.4),
+        build_problem(car, free={"controller.kp": (500.0, 1e6)}, objective={"iae": 1.0}, solver=d.FixedStep(step, 0.4)),
         method=Method(stopping=Stopping(iterations=25)),
-    )  # fmt: skip
+    )
     assert stable_step(found.loop) >= step
     assert stable_step(found.loop) < 4 * step
     assert found.loop.controller.kp > 2000
@@ -119,7 +125,7 @@ def test_a_gain_that_the_step_cannot_follow_is_not_entered():
 
 def test_a_start_that_is_not_stable_is_refused():
     with pytest.raises(ValueError, match=r"the integration step is not stable there: solver.step = 0.1 s"):
-        tune(RIG, free=GAINS, objective={"iae": 1.0}, solver=d.FixedStep(0.1, 0.3))
+        tune(build_problem(RIG, free=GAINS, objective={"iae": 1.0}, solver=d.FixedStep(0.1, 0.3)))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +142,7 @@ def test_a_start_that_is_not_stable_is_refused():
 def test_says_what_does_not_fit(change, message):
     given = {"free": GAINS, "objective": {"iae": 1.0}, "solver": SOLVER}
     with pytest.raises(ValueError, match=message):
-        tune(RIG, **(given | change))
+        tune(build_problem(RIG, **given | change))
 
 
 @pytest.mark.slow
