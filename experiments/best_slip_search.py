@@ -60,7 +60,7 @@ def mean_logarithm(values: Any) -> Any:
 
 
 def task(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, known: Lanes) -> dict[str, Any]:
-    """The arguments of `tune` and of `posed`, but for the loop."""
+    """The arguments of `build_problem`, but for the loop."""
     step = search.exact_step if sensors == EXACT else search.noisy_step
     return {
         "free": ranges.of(rule),
@@ -80,13 +80,8 @@ def tuned(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges)
 
     def descend(one: Any, count: int, starts: int, iterations: int) -> Tuned:
         how = Method(starts=starts, seed=search.seed, stopping=Stopping(change=1e-6, iterations=iterations))
-        return tune(
-            build_problem(
-                one,
-                **task(search, fixed, sensors, rule, ranges, lanes(fixed, count, seed)),
-            ),
-            method=how,
-        )
+        known = lanes(fixed, count, seed)
+        return tune(build_problem(one, **task(search, fixed, sensors, rule, ranges, known)), method=how)
 
     tried = descend(start(ranges, fixed, sensors, rule), search.few, search.starts, search.tried)
     found = descend(tried.part, search.roads, 1, search.iterations)

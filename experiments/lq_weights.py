@@ -32,7 +32,6 @@ from diffabs.design import Spec, certify, design
 from diffabs.papers import record
 from diffabs.tune import Method, Stopping, Tuned, tune
 from diffabs.tune.problem import Problem
-from diffabs.tune.tuning import build_problem
 from diffabs.tune.weights import LQWeights
 
 TUNE, GRADIENTS, DIFFERENCES = "tune", "L-BFGS-B", "L-BFGS-B, differences"
@@ -53,13 +52,13 @@ def allowed(config: Config, parameters: int) -> int:
 def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
     """One problem, all searches. Traces of `TUNE` and `GRADIENTS` count gradients, the others rollouts."""
     pose = problems(config)[name]
-    problem = bare(pose(build_problem))
+    problem = bare(pose())
     large = int(problem.space.size > 2)
     prices = searches.prices(problem, config.repeats)
     mode = min(prices, key=lambda mode: prices[mode])
     most = config.iterations[large]
     stopping = Stopping(gradient=1e-9, change=1e-11, iterations=most)
-    found = tune(pose(build_problem, mode=mode), method=Method(memory=searches.MEMORY, stopping=stopping))
+    found = tune(pose(mode=mode), method=Method(memory=searches.MEMORY, stopping=stopping))
     print(f"{name}: tune {found.objective[1]:.9g}, {found.evaluations} gradients; {found.reason.value}", flush=True)
     budget = allowed(config, problem.space.size)
     asked: dict[str, Callable[[], searches.Trace]] = {

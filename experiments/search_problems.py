@@ -1,4 +1,4 @@
-"""The problems of `lq_weights.py`, each a function that is called with `tune` or `posed`, and all their numbers.
+"""The problems of `lq_weights.py`, each a function that returns one, and all their numbers.
 
 gain       (k1, k2) of the rig, over masses and speeds
 Riccati    Q = L L', R = 1, through the regulator of the rig at 20 km/h
@@ -33,7 +33,7 @@ from diffabs.references import FilteredSlip, PeakRobust
 from diffabs.roads import MagicFormula
 from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached, Standstill
-from diffabs.tune import grid, latin
+from diffabs.tune import Problem, build_problem, grid, latin
 from diffabs.tune.weights import lq_weights, lqr_gain_design, robust_gain_design
 
 NAMES = ("gain", "Riccati", "LMI", "schedule", "table 6", "table 12", "table 24", "together", "eight")
@@ -181,8 +181,8 @@ def together(config: Config) -> Weights:
     return Weights(loop=loop, log_diagonal=np.tile(0.5 * np.log(config.weights), (len(speeds), 1)))
 
 
-def problems(config: Config) -> dict[str, Callable[..., Any]]:
-    """By name, a function that is called with `tune` or `posed`."""
+def problems(config: Config) -> dict[str, Callable[..., Problem]]:
+    """By name, a function that returns the problem; its arguments are further ones of `build_problem`."""
     loop, low_high = rig(config), config.logarithms
     solver = FixedStep(step=config.rig_step, duration=config.rig_duration)
     lanes = grid({"plant.mass": config.masses, "initial.speed": [v / plot.KMH for v in config.speeds]})
@@ -204,24 +204,24 @@ def problems(config: Config) -> dict[str, Callable[..., Any]]:
     measured = {**BRAKING, "effort": Effort()}
     driven = {"objective": {"stop_distance": 1.0, "effort": 1e-7}, "over": roads, "solver": long, "measured": measured}
     return {
-        "gain": lambda f, **k: f(loop, free={"controller.gain": config.gain_range}, **rest, **k),
-        "Riccati": lambda f, **k: f(lq_weights(loop, config.weights, 1.0, at), free=weighed, **rest, **k),
-        "LMI": lambda f, **k: f(
+        "gain": lambda **k: build_problem(loop, free={"controller.gain": config.gain_range}, **rest, **k),
+        "Riccati": lambda **k: build_problem(lq_weights(loop, config.weights, 1.0, at), free=weighed, **rest, **k),
+        "LMI": lambda **k: build_problem(
             lq_weights(loop, config.weights, 1.0, robust_gain_design(box(config))), free=weighed, **rest, **k
         ),
-        "schedule": lambda f, **k: f(thirteen, free=slow, **rest, **k),
+        "schedule": lambda **k: build_problem(thirteen, free=slow, **rest, **k),
         **{f"table {n}": table(config, n, rest) for n in (6, 12, 24)},
-        "together": lambda f, **k: f(together(config), free=ALL_RANGES, **whole(config), **k),
-        "eight": lambda f, **k: f(many, free=CAR_RANGES, **driven, **k),
+        "together": lambda **k: build_problem(together(config), free=ALL_RANGES, **whole(config), **k),
+        "eight": lambda **k: build_problem(many, free=CAR_RANGES, **driven, **k),
     }
 
 
-def table(config: Config, count: int, rest: dict[str, Any]) -> Callable[..., Any]:
+def table(config: Config, count: int, rest: dict[str, Any]) -> Callable[..., Problem]:
     """Gains at `count` speeds, the first of a braking."""
     loop, lanes, _ = larger(config, count)
     free = dict(zip(("controller.integral_gains", "controller.gains"), config.table_range, strict=True))
     rest = rest | {"over": lanes, "solver": FixedStep(step=config.first_step, duration=config.first)}
-    return lambda f, **k: f(loop, free=free, **rest, **k)
+    return lambda **k: build_problem(loop, free=free, **rest, **k)
 
 
 def whole(config: Config) -> dict[str, Any]:

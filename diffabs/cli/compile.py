@@ -104,7 +104,7 @@ def _count(chosen: Scenario, paths: list[str], values: LaneCall, derivative: Lan
         "lower": values.lanes.derivative(None).program,
         "eliminate": values.program(),
         "lower, for derivatives": derivative.lanes.derivative(None).program,
-        "jvp": derivative.lanes.derivative(derivative.begins).program,
+        "jvp": derivative.lanes.derivative(derivative.seeds).program,
         "eliminate, with tangents": derivative.program(),
     }
     return {

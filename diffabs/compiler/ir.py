@@ -19,8 +19,9 @@ Array = Any  # NumPy array of nodes
 
 
 class UpdateLevel(enum.IntEnum):
-    """The rate at which a value changes: KNOWN never, UNIFORM with each launch, LANE with each lane, STEP with each
-    step.
+    """How often a value changes: KNOWN never, UNIFORM with each launch, LANE with each lane, STEP in each step.
+
+    The level of an array in `TracedFunctions` has the same names. There, STEP means the carry.
     """
 
     KNOWN, UNIFORM, LANE, STEP = range(4)
@@ -34,9 +35,9 @@ class Node:
         op: Name of the operation; "const" for a constant, "input" for a number from outside.
         args: Operands.
         dtype: NumPy type of the number.
-        attr: Data of the operation: a constant's value, an input's place, a conditional's `Gate`.
-        level: Rate at which the value changes.
-        label: Variable name in the source, for graphs that record it, else empty.
+        attr: A constant's value, an input's place, or the `Gate` of a conditional; else None.
+        level: How often the value changes.
+        label: Name of a variable or function in the source, if the graph records it, else empty.
     """
 
     __slots__ = ("args", "attr", "dtype", "id", "label", "level", "op")
@@ -52,11 +53,11 @@ class Node:
 
 
 class Gate(NamedTuple):
-    """The identity of a conditional, shared by the selections of all its results.
+    """The identity of a conditional. All nodes "gate" of one conditional have equal ones.
 
     Attributes:
         number: Index of the conditional in its graph.
-        any: True if the condition is a marker of `Graph.any`. A constant result of the branch not taken is then a
+        any: True if the condition is a marker of `Graph.any`. Then a constant result of the false branch is a
             placeholder, which no lane uses.
     """
 
@@ -73,12 +74,16 @@ class Graph:
         self._known: dict[PyTree, Node] = {}
         self._gates = 0
 
-    def begins(self, eqn: JaxprEqn) -> None:
-        """Note that the following nodes come from the JAX equation `eqn`; a subclass may record labels."""
+    def begin_equation(self, eqn: JaxprEqn) -> None:
+        """Do nothing; a subclass may record that the following nodes come from the JAX equation `eqn`."""
 
     def _make(
         self, op: str, args: tuple[Node, ...], dtype: DTypeLike, attr: PyTree = None, level: UpdateLevel | None = None
     ) -> Node:
+        """Return the node with these fields, a new one only if the graph has none.
+
+        Without `level`, the node changes as often as the operand that changes most often.
+        """
         dtype = np.dtype(dtype)
         key = (op, tuple(arg.id for arg in args), dtype, attr)
         if key not in self._known:
@@ -98,13 +103,13 @@ class Graph:
         return self._known[key]
 
     def input(self, dtype: DTypeLike, level: UpdateLevel, place: Scalar) -> Node:
-        """Return a number from outside: type `dtype`, rate of change `level`, origin `place`."""
+        """Return the input node of type `dtype` and level `level`; `place` (hashable) says where its value is from."""
         return self._make("input", (), dtype, place, level)
 
     def op(self, name: str, *args: Node) -> Node:
-        """Return the node of the operation `name` on numbers `args` of one type, folded and simplified where possible.
+        """Return a node for the operation `name` on `args`: new, known, folded to a constant, or simplified.
 
-        `name` is a row of `OPERATIONS`, or "gt" or "ge". A comparison gives a boolean.
+        `name` is a row of `OPERATIONS`, or "gt" or "ge". The operands have one type. A comparison gives a boolean.
         """
         if name in MIRRORED:
             name, args = MIRRORED[name], args[::-1]
@@ -141,7 +146,7 @@ class Graph:
         return self._make("select", (which, no, yes), yes.dtype)
 
     def _select_boolean(self, which: Node, no: Node, yes: Node) -> Node:
-        """Return a selection between truths, as logical operations."""
+        """Return a selection between two booleans, as logical operations."""
         if yes.op == "const":
             return self.op("or", which, no) if yes.attr else self.op("and", self.op("not", which), no)
         if no.op == "const":
@@ -149,10 +154,10 @@ class Graph:
         return self.op("or", self.op("and", which, yes), self.op("and", self.op("not", which), no))
 
     def gate(self, which: Node, no: Iterable[Node], yes: Iterable[Node]) -> list[Node]:
-        """Return selections that a back end may compute as a conditional jump, one for each result.
+        """Return the results of a conditional: nodes "gate", which a back end may compute with a jump.
 
-        `no` and `yes` are the results of the two branches. `which` is a boolean of a lane, or the marker that `any`
-        returns for one.
+        `no` and `yes` are the results of the false and of the true branch, in one order. `which` is a boolean of a
+        lane, or the marker that `any` returns for one.
         """
         pairs = list(zip(no, yes, strict=True))
         asked = which.args[0] if which.op == "any" else which
@@ -162,13 +167,17 @@ class Graph:
         return [b if a is b else self._gate(gate, asked, a, b) for a, b in pairs]
 
     def _gate(self, gate: Gate, which: Node, no: Node, yes: Node) -> Node:
+        """Return one result of the conditional `gate`, whose condition is not constant."""
         # A constant in the other branch is a placeholder: only lanes with a true `which` use the result.
         if gate.any and no.op == "const":
             return yes
         return self._make("gate", (which, no, yes), yes.dtype, gate)
 
     def any(self, which: Node) -> Node:
-        """Return a marker of the condition "`which` is true in some lane"; its value in a lane is `which` itself."""
+        """Return a node for `which` that `gate` takes as the condition "`which` is true in some lane".
+
+        Its value in a lane is `which` itself.
+        """
         return which if which.op in ("const", "any") else self._make("any", (which,), bool)
 
     def convert(self, x: Node, dtype: DTypeLike) -> Node:
@@ -190,7 +199,7 @@ class Graph:
         return self.const(x.attr.view(dtype)) if x.op == "const" else self._make("bits", (x,), dtype)
 
     def table(self, index: Node, column: tuple[Node, ...]) -> Node:
-        """Return the entry of `column` at a valid `index`; the column is the same for all lanes."""
+        """Return the entry of `column` at `index` (in range); all entries are uniform or constant."""
         return self._make("table", (index, *column), column[0].dtype)
 
     def again(self, node: Node, args: list[Node]) -> Node:
@@ -235,6 +244,9 @@ def live_nodes(roots: Sequence[Node]) -> list[Node]:
     return [found[i] for i in sorted(found)]
 
 
+# Each of these returns a simpler node for an operation, or None if the operation stays as it is.
+
+
 # x + 0 becomes x although -0 + 0 is +0.
 def _add(graph: Graph, x: Node, y: Node) -> Node | None:
     return y if x.is_number(0) else x if y.is_number(0) else None
@@ -260,7 +272,7 @@ def _mul(graph: Graph, x: Node, y: Node) -> Node | None:
 
 
 def _div(graph: Graph, x: Node, y: Node) -> Node | None:
-    """Multiply by the inverse of a divisor that is constant over the steps: faster, with one rounding more."""
+    """Return x times the inverse of a divisor that is constant over the steps: faster, with one rounding more."""
     if y.is_number(1):
         return x
     if not is_real(x.dtype) or x.level < UpdateLevel.STEP or y.level == UpdateLevel.STEP:
@@ -309,7 +321,7 @@ def _not(graph: Graph, x: Node) -> Node | None:
 
 
 def _ne(graph: Graph, x: Node, y: Node) -> Node | None:
-    """Simplify x != 0 for a truth that was converted to a number, and comparisons of a truth with a constant."""
+    """Simplify x != 0 for a number converted from a boolean, and a comparison of a boolean with a constant."""
     for a, b in ((x, y), (y, x)):
         if b.is_number(0) and a.op == "convert" and a.args[0].dtype == bool:
             return a.args[0]
@@ -323,7 +335,7 @@ def _eq(graph: Graph, x: Node, y: Node) -> Node | None:
     return None if found is None else graph.op("not", found)
 
 
-def _same_shift(graph: Graph, x: Node, y: Node) -> Node | None:
+def _shift_by_zero(graph: Graph, x: Node, y: Node) -> Node | None:
     return x if y.is_number(0) else None
 
 
@@ -340,6 +352,6 @@ _SIMPLIFICATIONS: dict[str, Callable[..., Node | None]] = {
     "neg": lambda graph, x: x.args[0] if x.op == "neg" else None,
     "ne": _ne,
     "eq": _eq,
-    "shift_left": _same_shift,
-    "shift_right_logical": _same_shift,
+    "shift_left": _shift_by_zero,
+    "shift_right_logical": _shift_by_zero,
 }

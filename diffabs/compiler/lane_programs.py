@@ -1,4 +1,4 @@
-"""The programs of some functions of one lane: their values, and derivatives on demand."""
+"""The programs of a kernel: the values of its functions, and derivatives on demand."""
 
 import functools
 from collections.abc import Callable
@@ -19,11 +19,13 @@ from diffabs.core.types import PyTree
 
 
 class LanePrograms:
-    """Some functions of one lane with their plain program and, on demand, derivatives. Compares equal only to itself.
+    """The functions of a kernel with their program without tangents and, on demand, programs with tangents.
+
+    An object equals only itself.
 
     Attributes:
         functions: The traced functions of one lane.
-        launch: Function (program, arrays before the carry, carry) -> carry that runs a program.
+        launch: Function (program, arrays before the carry, carry) -> carry that builds and runs a program.
         wanted: Indices of the carry's arrays whose tangents matter at the end, None for all.
         read: Indices of the carry's arrays whose values matter at the end, None for all.
     """
@@ -35,11 +37,11 @@ class LanePrograms:
         wanted: tuple[int, ...] | None = None,
         read: tuple[int, ...] | None = None,
     ):
-        """Store the functions and lower them to the plain program, so that an error appears at once.
+        """Store the functions and lower them to the program without tangents, so that an error appears at once.
 
         Args:
             functions: The traced functions of one lane.
-            launch: Function (program, arrays before the carry, carry) -> carry that runs a program.
+            launch: Function (program, arrays before the carry, carry) -> carry that builds and runs a program.
             wanted: Indices of the carry's arrays whose tangents matter at the end, None for all.
             read: Indices of the carry's arrays whose values matter at the end, None for all.
 
@@ -50,37 +52,37 @@ class LanePrograms:
         self._derivatives: dict[PyTree, PyTree] = {}
         self.derivative(None)
 
-    def derivative(self, begins: tuple[tuple[UpdateLevel, int], ...] | None) -> DerivativeProgram:
-        """Return the program with one tangent direction, for tangents that start in the seeded arrays.
+    def derivative(self, seeds: tuple[tuple[UpdateLevel, int], ...] | None) -> DerivativeProgram:
+        """Return the program with one tangent direction, or the program without tangents for `seeds` = None.
 
-        `begins` lists the seeded arrays as (level, index); None means the plain program without tangents. The result is
-        kept for the next call.
+        `seeds` lists as (level, index) the arrays whose initial tangents are given; all other initial tangents are 0.
+        The result is kept for the next call.
 
         Raises:
             Unsupported: As in `lower_functions`, for the derivative.
         """
-        if begins not in self._derivatives:
-            moving = {level: tuple(i for one, i in begins or () if one == level) for level in INPUT_LEVELS}
-            plain = begins is None
-            self._derivatives[begins] = (
+        if seeds not in self._derivatives:
+            moving = {level: tuple(i for one, i in seeds or () if one == level) for level in INPUT_LEVELS}
+            plain = seeds is None
+            self._derivatives[seeds] = (
                 lower_without_tangents(self.functions)
                 if plain
                 else differentiate_functions(self.functions, moving, self.wanted)
             )
-        return self._derivatives[begins]
+        return self._derivatives[seeds]
 
-    def program(self, begins: PyTree, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
-        """Return the program with `many` tangent directions, for tangents that start in the arrays in `begins`.
+    def program(self, seeds: PyTree, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
+        """Return the program to launch: `many` tangent directions, without updates that the arrays in `read` never need.
 
-        `begins` is as in `derivative`. `as_lanes` holds the indices of the uniform arrays that vmap has given a value
+        `seeds` is as in `derivative`. `as_lanes` holds the indices of the uniform arrays that vmap has given a value
         per lane.
 
         Raises:
             Unsupported: As in `lower_functions`.
         """
-        one = self.derivative(begins)
+        one = self.derivative(seeds)
         whole = one.program
-        if begins is not None or as_lanes:
+        if seeds is not None or as_lanes:
             whole = replicate_tangents(self.functions, one, many, as_lanes)
         if self.read is None:
             return whole
@@ -88,22 +90,22 @@ class LanePrograms:
         return keep_read(whole, [i for i, key in enumerate(order) if key.tangent or key.number in self.read])
 
     @functools.cached_property
-    def keys(self) -> list[ArrayKey]:
-        """Keys of the arrays without tangents, in the order of the primitive's arguments."""
+    def value_keys(self) -> list[ArrayKey]:
+        """Keys of the values among the primitive's arguments, in their order: uniform, lane, carry."""
         return [ArrayKey(level, i, False) for level in INPUT_LEVELS for i in range(len(self.functions.types[level]))]
 
-    def slopes(self, begins: PyTree) -> list[ArrayKey]:
-        """Return the keys of the seed tangents of the arrays in `begins`; as arguments they follow the values."""
-        return [ArrayKey(level, i, True) for level, i in begins or ()]
+    def seed_keys(self, seeds: PyTree) -> list[ArrayKey]:
+        """Return the keys of the initial tangents of the arrays in `seeds`; as arguments they follow the values."""
+        return [ArrayKey(level, i, True) for level, i in seeds or ()]
 
-    def ends(self, begins: PyTree) -> list[ArrayKey]:
-        """Return the keys of the results for the seeds in `begins`.
+    def result_keys(self, seeds: PyTree) -> list[ArrayKey]:
+        """Return the keys of the primitive's results, in their order.
 
-        These are all arrays of the carry, and then the tangents that may differ from 0 and influence a wanted array.
+        These are all arrays of the carry, and then the tangents that can be nonzero and influence a wanted array.
         """
         carry = range(len(self.functions.types[UpdateLevel.STEP]))
-        do = self.derivative(begins).moved_arrays[UpdateLevel.STEP]
+        moved = self.derivative(seeds).moved_arrays[UpdateLevel.STEP]
         return [
             *(ArrayKey(UpdateLevel.STEP, i, False) for i in carry),
-            *(ArrayKey(UpdateLevel.STEP, i, True) for i in do),
+            *(ArrayKey(UpdateLevel.STEP, i, True) for i in moved),
         ]

@@ -1,10 +1,11 @@
 """A program as text, one line for each operation: what a pass receives and what it returns.
 
     v7 = mul c0.0, u1.0     f64, step
+    c0.0 <- v7
 
-u1.0, l0.2 and c0.0 are inputs: entry 0 of the uniform array 1, entry 2 of the lane's array 0, entry 0 of the carry's
-array 0. An operation is computed with each launch (uniform), with each lane, or in each step. An arrow says what
-a function writes into the carry.
+u1.0 is entry 0 of the uniform array 1, l0.2 entry 2 of the lane's array 0, and c0.0 entry 0 of the carry's array 0. The
+last word says how often the operation is computed: once a launch (uniform), once a lane, or in each step. An arrow says
+what a function writes into the carry. `select` and `gate` have the operands condition, value if false, value if true.
 """
 
 from collections.abc import Iterator
@@ -39,7 +40,9 @@ def list_program(program: ScalarProgram, paths: ArrayPaths) -> str:
 
 
 def list_schedule(program: ScalarProgram, paths: ArrayPaths) -> str:
-    """Return the text of the operations of each step in their order, inside the conditionals that need them.
+    """Return the text of the operations of level step in their order, inside the conditionals that need them.
+
+    Operations of the other levels have no line, but keep their names.
 
     Args:
         program: Operations and results.
@@ -68,7 +71,7 @@ def count_by_level(program: ScalarProgram) -> dict[str, int]:
 
 
 def _name_nodes(program: ScalarProgram) -> dict[int, str]:
-    """Return the names of inputs, operations and constants, by the id of the node."""
+    """Return the texts for all nodes by id: c0.0 for an input, v7 for an operation, the value of a constant."""
     names = {node.id: f"{INPUT_LETTERS[p.level]}{p.array}.{p.entry}" for p, node in program.inputs.items()}
     count = 0
     for node in live_nodes([node for results in program.results.values() for node in results]):
@@ -81,7 +84,7 @@ def _name_nodes(program: ScalarProgram) -> dict[int, str]:
 
 
 def _inputs(program: ScalarProgram, paths: ArrayPaths, names: dict[int, str]) -> list[str]:
-    """Return the inputs that are read or returned, with the paths of their arrays."""
+    """Return the lines of the inputs that the program reads or returns, with the paths of their arrays."""
     used = {node.id for node in live_nodes([node for results in program.results.values() for node in results])}
     lines = ["inputs:"]
     for place, node in program.inputs.items():
@@ -96,12 +99,13 @@ def _kind(node: Node) -> str:
 
 
 def _operation(node: Node, names: dict[int, str]) -> str:
+    """Return the line of an operation."""
     operands = ", ".join(names[x.id] for x in node.args)
     return f"  {f'{names[node.id]} = {node.op} {operands}':<40} {_kind(node)}, {LEVEL_NAMES[node.level]}"
 
 
 def _arrows(program: ScalarProgram, function: str, names: dict[int, str]) -> Iterator[str]:
-    """Yield what a function returns: the numbers of the carry that it changes, or whether the lane goes on."""
+    """Yield lines for what a function returns: the numbers of the carry that it changes, or whether the lane goes on."""
     results = program.results[function]
     if function == RUNNING_FUNCTION:
         yield f"-> {names[results[0].id]}"
@@ -112,6 +116,7 @@ def _arrows(program: ScalarProgram, function: str, names: dict[int, str]) -> Ite
 
 
 def _block(block: ScheduleBlock, names: dict[int, str], indent: str) -> list[str]:
+    """Return the lines of a block, with its conditionals as if and else."""
     lines: list[str] = []
     for item in block:
         if not isinstance(item, Branch):

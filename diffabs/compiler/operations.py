@@ -4,8 +4,8 @@ A template has the operands {0} and {1}. In C++ and CUDA the functions are those
 `native/lane.h`. In C99, {f} is the suffix of a function's name in single precision, and a template with {f} is for real
 numbers only. In Structured Text, {real} is the type of the real numbers and {most} the largest of them.
 
-An operation without a template in a language has no translation. The back ends translate these themselves, because they
-need more than operands: `const`, `input`, `convert`, `bits`, `select`, `gate`, `any`, `table`.
+An operation without a template in a language has no translation to it. The nodes `const`, `input`, `convert`, `bits`,
+`select`, `gate`, `any` and `table` have no row: they need more than operands, so each back end translates them itself.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ class Operation(NamedTuple):
     """An operation on single numbers of one type.
 
     Attributes:
-        fold: NumPy's function for constant operands; None if constants are left to the back end.
+        fold: Function of constant operands (NumPy) that gives the result; None if constants are not folded.
         cpp: Template in C++ and CUDA C++, for vectors of lanes.
         c99: Template in C99; None without a translation.
         st: Template in Structured Text; None without a translation.
@@ -35,13 +35,16 @@ class Operation(NamedTuple):
     compares: bool = False
 
 
-def _round_down_towards_zero(x: PyTree, y: PyTree) -> PyTree:
-    """Return x / y rounded towards zero as in C, unlike NumPy's //."""
+def _divide_towards_zero(x: PyTree, y: PyTree) -> PyTree:
+    """Return the integer quotient x / y, rounded towards zero as in C; NumPy's // rounds down."""
     return (np.abs(x) // np.abs(y)) * np.sign(x) * np.sign(y)
 
 
 def _function(name: str, st: str | None = None, *, arity: int = 1, fold: PyTree = None) -> Operation:
-    """Return the row of an elementary function, whose name in C is `name`; ... in `st` stands for the operands."""
+    """Return the row of a function that C99 calls `name` and `native/functions.h` k_`name`.
+
+    ... in `st` stands for the operands. Without `fold`, constants are left to the back end.
+    """
     given = ", ".join(f"{{{i}}}" for i in range(arity))
     return Operation(fold, f"k_{name}({given})", f"{name}{{f}}({given})", st and st.replace("...", given))
 
@@ -57,7 +60,7 @@ OPERATIONS: dict[str, Operation] = {
     "sub": Operation(np.subtract, "{0} - {1}", "{0} - {1}", "{0} - {1}"),
     "mul": Operation(np.multiply, "{0} * {1}", "{0} * {1}", "{0} * {1}", symmetric=True),
     "div": Operation(np.divide, "{0} / {1}", "{0} / {1}", "{0} / {1}"),
-    "quotient": Operation(_round_down_towards_zero, "{0} / {1}", "{0} / {1}", "{0} / {1}"),
+    "quotient": Operation(_divide_towards_zero, "{0} / {1}", "{0} / {1}", "{0} / {1}"),
     "rem": Operation(np.fmod, "rest({0}, {1})", "fmod{f}({0}, {1})"),
     "neg": Operation(np.negative, "-{0}", "-{0}", "-{0}"),
     "abs": Operation(np.abs, "size({0})", "fabs{f}({0})", "ABS({0})"),

@@ -1,4 +1,4 @@
-"""The programs of a traced computation after each pass of the compiler, for a reader: `diffabs compile`."""
+"""Texts of a kernel's program after each pass of the compiler, for `diffabs compile`."""
 
 import functools
 from collections.abc import Iterator
@@ -22,33 +22,34 @@ class LaneCall(NamedTuple):
 
     Attributes:
         lanes: The functions and their programs.
-        begins: Arrays with a tangent at the start, as (level, index); None for a call without tangents.
+        seeds: Arrays that have a tangent as argument, as (level, index); None for a call without tangents.
         many: Number of tangent directions.
         as_lanes: Indices of the uniform arrays that vmap has given a value per lane.
     """
 
     lanes: LanePrograms
-    begins: PyTree
+    seeds: PyTree
     many: int
     as_lanes: frozenset[int]
 
     def program(self) -> ScalarProgram:
-        """Return the program that is launched, after all passes on operations."""
-        return self.lanes.program(self.begins, self.many, self.as_lanes)
+        """Return the program that is launched: the one after the pass "eliminate"."""
+        return self.lanes.program(self.seeds, self.many, self.as_lanes)
 
     def paths(self) -> ArrayPaths:
         """Return the names of the launched program's arrays; a tangent has the name of its array after "d "."""
-        functions, one = self.lanes.functions, self.lanes.derivative(self.begins)
+        functions, one = self.lanes.functions, self.lanes.derivative(self.seeds)
         keys = arrange_arrays(functions, one.moved_arrays, self.as_lanes)
         return {level: [_path(functions, *key) for key in some] for level, some in keys.items()}
 
 
 def _path(functions: TracedFunctions, level: UpdateLevel, number: int, tangent: bool) -> str:
+    """Return the name of the array of an `ArrayKey`."""
     return ("d " if tangent else "") + functions.names[level][number]
 
 
 def find_lane_calls(jaxpr: Any) -> Iterator[LaneCall]:
-    """Yield the calls of `run_lanes` in a jaxpr and in the programs that it calls.
+    """Yield the calls of `run_lanes` in a jaxpr and in the jaxprs of its equations, except branches of conditionals.
 
     Args:
         jaxpr: Jaxpr, closed or not.
@@ -65,11 +66,13 @@ def list_pass(call: LaneCall, name: str) -> str:
     """Return the text of a program after a pass.
 
         trace      the jaxprs of renew, step and running
-        lower      operations on single numbers
-        jvp        the same with one tangent
-        eliminate  with all tangents, by the fewest operations; without tangents the numbers that nothing reads are gone
-        schedule   the operations of each step, inside the conditionals that need them
-        c          C++
+        lower      operations on single numbers, of values only
+        jvp        the same with one tangent direction
+        eliminate  the program that is launched: all tangent directions, without updates that nothing reads
+        schedule   its operations of level step, inside the conditionals that need them
+        c          its C++
+
+    A call without tangents has no pass "jvp", and its pass "eliminate" only leaves out updates that nothing reads.
 
     Args:
         call: Call of the primitive.
@@ -84,9 +87,9 @@ def list_pass(call: LaneCall, name: str) -> str:
         case "lower":
             return list_program(call.lanes.derivative(None).program, call.lanes.functions.names)
         case "jvp":
-            if call.begins is None:
+            if call.seeds is None:
                 raise ValueError("a program without tangents has no pass jvp")
-            one, functions = call.lanes.derivative(call.begins), call.lanes.functions
+            one, functions = call.lanes.derivative(call.seeds), call.lanes.functions
             paths = {
                 level: names + [f"d {names[i]}" for i in one.differentiable[level]]
                 for level, names in functions.names.items()

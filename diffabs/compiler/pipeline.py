@@ -1,13 +1,22 @@
-"""JAX functions of one lane as native code for many lanes, each until its own end.
+"""Native code for JAX functions of one lane (one simulation run), which runs many lanes, each until its own end.
 
-    trace      trace.trace_functions                  a jaxpr for each function
-    lower      program.lower_functions                operations on single numbers (`ir`), by the rules of `lower`
-    jvp        autodiff.jvp.differentiate_functions   the same program with one tangent
-    replicate  autodiff.jvp.replicate_tangents        with several tangents, by the fewest operations (`eliminate`)
-    schedule   schedule.schedule_nodes                operations inside the conditionals that need them
-    emit       emit.cpp.emit_cpp, emit.cuda           text
-    build      runtime.cpu.build_target, runtime.gpu  a library
-    bind       runtime.jax_primitive.bind_lanes       a JAX primitive, with rules for jit, vmap and jvp
+A call of `run_lanes` takes these steps:
+
+    trace      trace.trace_functions                 a jaxpr for each function
+    lower      program.lower_functions               operations on single numbers (`ir`), by the rules of `lower`
+    bind       runtime.jax_primitive.bind_lanes      a call of the JAX primitive `run_lanes`
+
+When JAX differentiates this primitive:
+
+    jvp        autodiff.jvp.differentiate_functions  a program with one tangent direction
+
+When JAX compiles it:
+
+    eliminate  autodiff.jvp.replicate_tangents       all tangent directions, with few operations (`autodiff.eliminate`)
+               program.keep_read                     without updates of the carry that nothing reads
+    schedule   schedule.schedule_nodes               operations inside the conditionals that need them
+    emit       emit.cpp.emit_cpp, emit.cuda          text, one function for each of the functions; calls `schedule`
+    build      runtime.cpu.build_target, runtime.gpu a library or GPU code, from the cache if possible
 
 `operations.OPERATIONS` has a row for each operation: its value for constants, and its text in each language.
 `diffabs compile SCENARIO --show PASS` prints a program after a pass.
@@ -83,11 +92,11 @@ def run_lanes(
     given = [unwrap_key(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
     launch = functools.partial(_launch_lanes, shape=LaunchShape(VECTORS_PER_BLOCK, steps, rounds))
 
-    def numbers(which: PyTree) -> tuple[int, ...] | None:
+    def true_leaves(which: PyTree) -> tuple[int, ...] | None:
         return None if which is None else tuple(i for i, on in enumerate(jax.tree.leaves(which)) if on)
 
     # Drop the traced arrays: this object outlives the trace, and a tracer must not leak. They are arguments instead.
-    lanes = LanePrograms(functions._replace(uniform=[]), launch, numbers(wanted), numbers(read))
+    lanes = LanePrograms(functions._replace(uniform=[]), launch, true_leaves(wanted), true_leaves(read))
     found = bind_lanes(lanes, given)
     return tree.unflatten(
         [jax.random.wrap_key_data(x) if is_key(leaf) else x for x, leaf in zip(found, leaves, strict=True)]
@@ -95,7 +104,10 @@ def run_lanes(
 
 
 def _launch_lanes(made: ScalarProgram, before: list[PyTree], carry: list[PyTree], shape: LaunchShape) -> list[PyTree]:
-    """Return the final carry of all lanes; `before` holds the uniform arrays and the arrays of the lanes."""
+    """Build a program and return the carry after all lanes have ended, as an operation of XLA.
+
+    `before` holds the uniform arrays and then the arrays of the lanes.
+    """
     first, results = len(before), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
     if gpu.find_gpu():
         return gpu.call_kernel(made, shape, [*before, *carry], results)
@@ -120,8 +132,8 @@ def describe_kernel_build() -> dict[str, str]:
     return device.describe() if device else toolchain.describe_compiler()
 
 
-def _lane_type(x: Scalar) -> Scalar:
-    """Return shape and type of one lane of an array."""
+def _lane_type(x: Scalar) -> jax.ShapeDtypeStruct:
+    """Return shape and type of an array without its first axis, the axis of lanes."""
     return jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype)
 
 

@@ -17,12 +17,12 @@ MAX_OPERATIONS = 60_000  # nodes of a program; a compiler takes minutes for more
 
 
 class InputPlace(NamedTuple):
-    """The origin of an input.
+    """The array and the entry that an input has its value from.
 
     Attributes:
-        level: Rate of change of the array.
+        level: Level of the array: UNIFORM, LANE, or STEP for the carry.
         array: Index of the array among those of its level.
-        entry: Index of the number within one lane's flat array.
+        entry: Index in the flattened array of one lane.
     """
 
     level: UpdateLevel
@@ -35,10 +35,10 @@ class ScalarProgram:
     """A program of single numbers.
 
     Attributes:
-        inputs: Nodes of the carry, the lanes and the uniform arrays, by place.
-        results: For each function, by name, its outputs as single numbers.
-        uniform: Arrays that all lanes share.
-        sizes: For each level, the sizes of its arrays in one lane.
+        inputs: Input nodes by place; in each level array by array, entry by entry.
+        results: Output nodes by the name of the function. `renew` and `step` have one for each input of the carry.
+        uniform: Values of the uniform arrays; `run_lanes` passes them as arguments and leaves this empty.
+        sizes: For each level, the number of entries of each array in one lane.
         dtype: Type of the real numbers.
         tangents: Number of tangent directions in a program of `replicate_tangents`, else 0.
     """
@@ -69,6 +69,7 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in functions.types}
 
     def take_inputs(aval: Any, level: UpdateLevel) -> Array:
+        """Return the next array of a level as an array of new input nodes."""
         shape, dtype = key_shape(aval)
         array, out = len(sizes[level]), np.empty(shape, object)
         for entry, at in enumerate(np.ndindex(shape)):
@@ -103,9 +104,9 @@ def check_size(program: ScalarProgram, operations: int) -> ScalarProgram:
 
 
 def keep_read(program: ScalarProgram, arrays: Iterable[int]) -> ScalarProgram:
-    """Return the program without the results that never influence `running` or the given arrays of the carry.
+    """Return the program without updates of the carry that never influence `running` or the given arrays.
 
-    These numbers stay as they are in the initial carry.
+    The result of such an update becomes its input, so the number stays as it is in the initial carry.
 
     Args:
         program: Program of functions that update the carry, and `running`.

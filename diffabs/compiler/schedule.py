@@ -1,4 +1,4 @@
-"""The order of a program's operations: each in the innermost branch of a conditional that contains all its readers."""
+"""The nesting of operations in conditionals: each in the innermost branch that contains all its readers."""
 
 from collections.abc import Iterator, Sequence
 
@@ -9,7 +9,7 @@ class Branch:
     """A conditional in a schedule.
 
     Attributes:
-        gates: Selections of the conditional's results.
+        gates: Nodes "gate" of the conditional's results; they lie outside of both branches.
         yes: Operations that only the true branch needs.
         no: Operations that only the false branch needs.
         which: Boolean node of the condition.
@@ -27,7 +27,10 @@ class Branch:
 
 
 class ScheduleBlock:
-    """Operations in their order; a branch stands in the place of its first gate."""
+    """A branch of a conditional, or all operations: nodes and inner conditionals in order.
+
+    An inner conditional stands in the place of its first gate.
+    """
 
     def __init__(self, outer: "ScheduleBlock | None" = None):
         """Create an empty block inside the block `outer`, or an outermost block."""
@@ -54,9 +57,7 @@ class ScheduleBlock:
 
 
 def schedule_nodes(roots: Sequence[Node], level: UpdateLevel) -> ScheduleBlock:
-    """Return a level's operations that the roots need, nested in the branches of conditionals.
-
-    Each operation lies in the innermost branch that contains all its readers.
+    """Return the operations of one level that the roots need, nested in the branches of conditionals.
 
     Args:
         roots: Nodes to compute.
@@ -70,6 +71,7 @@ def schedule_nodes(roots: Sequence[Node], level: UpdateLevel) -> ScheduleBlock:
     outermost, used = ScheduleBlock(), dict[int, ScheduleBlock]()
 
     def use(node: Node, block: ScheduleBlock) -> None:
+        """Record that an operation in `block` reads `node`."""
         used[node.id] = _common(used[node.id], block) if node.id in used else block
 
     for root in roots:

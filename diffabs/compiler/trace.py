@@ -16,9 +16,9 @@ class TracedFunction(NamedTuple):
     """A function of one lane as a jaxpr of the arrays of lane and carry.
 
     Attributes:
-        jaxpr: Jaxpr; its constvars are first the uniform arrays, then constants.
-        closed: Indices of the arrays in `TracedFunctions.uniform` that the function closes over.
-        constants: Further constants that it closes over.
+        jaxpr: Jaxpr; its constvars are the arrays of `closed`, then those of `constants`.
+        closed: Indices in `TracedFunctions.uniform` of the arrays that the function closes over.
+        constants: Values that become constants of the program. Only a derivative has them.
     """
 
     jaxpr: Any
@@ -31,9 +31,9 @@ class TracedFunctions(NamedTuple):
 
     Attributes:
         each: Functions by name.
-        types: Shapes and types of the arrays of each level: uniform, lane, carry.
+        types: Shapes and types of one lane's arrays: UNIFORM closed over, LANE lane's constants, STEP carry.
         uniform: The uniform arrays, which may be tracers.
-        names: Paths of the arrays of lane and carry in their pytrees, for a reader; uniform arrays have none.
+        names: Paths of the arrays of lane and carry in their pytrees, for listings; empty for uniform arrays.
     """
 
     each: dict[str, TracedFunction]
@@ -84,7 +84,7 @@ def _leaf_names(tree: PyTree) -> list[str]:
     ]
 
 
-def _type(x: Scalar) -> Scalar:
+def _type(x: Scalar) -> jax.ShapeDtypeStruct:
     """Return shape and type of an array without its sharding, because the program is for one lane."""
     aval = x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)
     return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=getattr(aval, "weak_type", False))

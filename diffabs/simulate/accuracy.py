@@ -94,10 +94,10 @@ def estimate_accuracy(
         ValueError: `measure` rejects the arguments.
     """
     runs = [measure_finer(loop, solver, objectives, times, key=key) for times in (1, 2, 4)]
-    fine = is_comparable(loop, solver, key)
+    comparable = is_comparable(loop, solver, key)
     coarse, half, quarter = (run.metrics for run in runs)
-    estimates = {name: _estimate(coarse[name], half[name], quarter[name], fine) for name in objectives}
-    return Accuracy(estimates, fine, runs_end_alike(*runs))
+    estimates = {name: _estimate(coarse[name], half[name], quarter[name], comparable) for name in objectives}
+    return Accuracy(estimates, comparable, runs_end_alike(*runs))
 
 
 def measure_finer(
@@ -243,10 +243,10 @@ def _draws(loop: Loop, h: float, times: int, count: int, key: PyTree) -> Scalar:
     return jax.tree.map(lambda x: x[::times], seen)
 
 
-def _estimate(coarse: Scalar, half: Scalar, quarter: Scalar, fine: Bool) -> ErrorEstimate:
+def _estimate(coarse: Scalar, half: Scalar, quarter: Scalar, comparable: Bool) -> ErrorEstimate:
     """Return the error estimate of a metric from its values m(h), m(h/2) and m(h/4).
 
-    `fine` is True if the runs with these steps are comparable.
+    `comparable` is True if the runs with these steps are comparable.
     """
     d1, d2 = half - coarse, quarter - half
     # The inner `where` replaces a zero divisor: the quotient of the branch not taken stays finite.
@@ -256,6 +256,6 @@ def _estimate(coarse: Scalar, half: Scalar, quarter: Scalar, fine: Bool) -> Erro
     order = jnp.where(rounded | (q == 0), jnp.nan, -jnp.log2(jnp.where(q > 0, q, 1.0)))
     # The geometric series |d2| (1 + q + q^2 + ...) is capped at q = MAX_DIFFERENCE_RATIO: then its sum is 4 |d2|.
     error = jnp.abs(d1) + jnp.abs(d2) / (1 - jnp.minimum(q, MAX_DIFFERENCE_RATIO))
-    known = fine & jnp.isfinite(d1) & jnp.isfinite(d2)
+    known = comparable & jnp.isfinite(d1) & jnp.isfinite(d2)
     d1, d2, order, error = (jnp.where(known, x, jnp.nan) for x in (d1, d2, order, error))
     return ErrorEstimate(coarse, d1, d2, order, known & (rounded | (q <= MAX_DIFFERENCE_RATIO)), error)

@@ -33,7 +33,7 @@ T = TypeVar("T")
 
 
 class Admissibility(NamedTuple):
-    """Refused runs of a batch.
+    """Result of the checks of a batch: for each run the reason for its refusal, if any.
 
     Attributes:
         codes: Code of each run, shape (runs,). Code 0 is an accepted run.

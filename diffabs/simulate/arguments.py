@@ -87,7 +87,7 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
     Raises:
         ValueError: A field of the solver is invalid, a parameter has a wrong shape, or a part is not an objective.
     """
-    lines = [*_find_solver_faults(solver), *find_misshapen(loop)]
+    lines = [*_find_invalid_fields(solver), *find_misshapen(loop)]
     for name, part in objectives.items():
         if all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
             lines += find_misshapen(part, f"objectives.{name}.")
@@ -120,7 +120,7 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
         raise ValueError("; ".join(lines))
 
 
-def _find_solver_faults(solver: Solver) -> Iterator[str]:
+def _find_invalid_fields(solver: Solver) -> Iterator[str]:
     """Yield one line for each invalid field of the solver."""
     names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
     lines = [f"solver.{name} {line}" for name in names if (line := _find_number_fault(solver, name))]
@@ -133,6 +133,7 @@ def _find_solver_faults(solver: Solver) -> Iterator[str]:
 
 
 def _find_number_fault(solver: Solver, name: str) -> str:
+    """Return what is wrong with one field of the solver, or an empty string."""
     value = getattr(solver, name)
     if line := kinds.find_value_objection(value) or (
         kinds.value_shape(value) and f"has shape {kinds.value_shape(value)}"
@@ -144,7 +145,9 @@ def _find_number_fault(solver: Solver, name: str) -> str:
 
 
 def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: PyTree) -> None:
-    """Check that the derivatives of a run are right.
+    """Check that the objectives of a run have right derivatives.
+
+    Wrong is only the derivative of a `Variation` behind a pure delay with adaptive steps.
 
     Args:
         loop: Closed loop.
@@ -152,7 +155,7 @@ def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: P
         method: Stepping method.
 
     Raises:
-        ValueError: The derivatives of an objective would be wrong.
+        ValueError: The derivative of an objective would be wrong.
     """
     if isinstance(method, AdaptiveStepping) and loop.recorders:
         # Rounding moves the kinks of the delayed command between the logged run and its replay.

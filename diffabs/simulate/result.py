@@ -1,7 +1,7 @@
 """Results of a run that is over: its metrics, and whether the run is physically possible.
 
-An unstable step may leave every number finite. So a run has also `diverged` in three further cases. Its landing misses
-the zero of the stop's margin, a metric is outside its physical range, or the plant's audit rejects the run.
+An unstable step may leave every number finite. A run with finite numbers has `diverged` in three cases. Its landing
+misses the zero of the stop's margin, a metric is outside its physical range, or the plant's audit rejects the run.
 """
 
 import math

@@ -119,9 +119,9 @@ def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
         log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.capacity(loop, between)
     )
     method = method.with_trajectory() if every else method
-    places = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
+    capacity = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
-    run = _run_differentiable(places, (loop, objectives, method, key))
+    run = _run_differentiable(capacity, (loop, objectives, method, key))
     return run._replace(trajectory=_truncate_trajectory(run.trajectory, count + 1)) if every else run
 
 
@@ -145,19 +145,19 @@ def _truncate_trajectory(trajectory: PyTree, count: int) -> Any:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _run_differentiable(places: RunCapacity, run: PyTree) -> Run:
+def _run_differentiable(capacity: RunCapacity, run: PyTree) -> Run:
     """Return the run of (loop, objectives, method, key)."""
     loop, objectives, method, key = run
-    return _run(loop, objectives, method, key, jax.device_put(places.every), places=places.instants)
+    return _run(loop, objectives, method, key, jax.device_put(capacity.every), instants=capacity.instants)
 
 
-def _rule(places: RunCapacity, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
+def _rule(capacity: RunCapacity, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     loop, objectives, method, _ = primals[0]
     refuse_derivative(loop, objectives, method)
     paths = differentiated_paths(tangents[0][0])
 
     def reversible(run: PyTree) -> Run:
-        return _run_reversible(prepare_derivatives(run[0], paths), *run[1:], places=places)
+        return _run_reversible(prepare_derivatives(run[0], paths), *run[1:], capacity=capacity)
 
     return jvp_nonzero(reversible, primals, tangents, once=_second_derivative_objection(loop, method))
 
@@ -174,31 +174,31 @@ def _second_derivative_objection(loop: Loop, method: PyTree) -> str:
 _run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 
-@compile_once(static=("places",), options=SAME_RESULT_OPTIONS)
-def _run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key, every: Any, *, places: int) -> Run:
-    """Return a run for values, with capacity for `places` instants of a trajectory, 0 without one."""
+@compile_once(static=("instants",), options=SAME_RESULT_OPTIONS)
+def _run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key, every: Any, *, instants: int) -> Run:
+    """Return a run for values, with capacity for `instants` of a trajectory; 0 without one."""
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
     carry = method.start(loop, objectives, key)
-    if not places:
+    if not instants:
         return finish_run(loop, objectives, run_to_end(stepped, partial(method.renew, loop), carry))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     seen = partial(method.observe_at, loop)
     carry, seen = run_with_trajectory(
-        stepped, partial(method.renew, loop), method.is_active, seen, carry, every, count, places
+        stepped, partial(method.renew, loop), method.is_active, seen, carry, every, count, instants
     )
     return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
 
 
-@partial(jax.jit, static_argnames="places")
+@partial(jax.jit, static_argnames="capacity")
 def _run_reversible(
-    loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key, *, places: RunCapacity
+    loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key, *, capacity: RunCapacity
 ) -> Run:
     """Return a run for derivatives in both modes."""
     if isinstance(method, AdaptiveStepping):
-        return _run_by_replay(loop, objectives, method.for_replay(), key, places)
+        return _run_by_replay(loop, objectives, method.for_replay(), key, capacity)
     method = method.for_derivatives()
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
-    carry, (tries, instants, every) = method.start(loop, objectives, key), places
+    carry, (tries, instants, every) = method.start(loop, objectives, key), capacity
     if not every:
         return finish_run(loop, objectives, end_unfinished(scan_to_end(stepped, carry, tries)))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
@@ -209,11 +209,11 @@ def _run_reversible(
 
 
 def _run_by_replay(
-    loop: Loop, objectives: dict[str, Objective], live: AdaptiveStepping, key: Key, places: RunCapacity
+    loop: Loop, objectives: dict[str, Objective], live: AdaptiveStepping, key: Key, capacity: RunCapacity
 ) -> Run:
     """Return a run with adaptive steps for derivatives in both modes: logged for its values, then replayed."""
     loop, audit = prepare(loop)
-    objectives, (tries, instants, every) = objectives | audit, places
+    objectives, (tries, instants, every) = objectives | audit, capacity
     # The log holds values only: derivatives come from the replay.
     still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
     logged = live.without_trajectory()

@@ -45,7 +45,7 @@ def stable_step(loop: Loop) -> float:
     Args:
         loop: Closed loop with concrete parameters.
     """
-    return float(_largest_stable_steps(np.asarray(_jacobian(canonical_dtypes(loop)))[None])[0])
+    return float(_largest_stable_steps(np.asarray(_jacobians_of_one(canonical_dtypes(loop)))[None])[0])
 
 
 def stable_steps(loops: Loop) -> np.ndarray:
@@ -113,10 +113,11 @@ def _is_known_stable(loop: Part, values: PyTree, step: float, squarings: int | N
 
 @jax.jit
 def _build_loops(loop: Part, values: PyTree) -> Loop:
-    return canonical_dtypes(jax.vmap(_lane(loop))(values))
+    return canonical_dtypes(jax.vmap(_lane_builder(loop))(values))
 
 
-def _lane(loop: Part) -> Callable[[PyTree], Loop]:
+def _lane_builder(loop: Part) -> Callable[[PyTree], Loop]:
+    """Return the function from the values of one run to its loop; without a common loop the values are the loop."""
     return lambda values: canonical_dtypes(values if loop is None else replace(loop, values))
 
 
@@ -126,7 +127,7 @@ def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
     count = len(jax.tree.leaves(values)[0])
 
     def matrices(values: PyTree) -> jax.Array:
-        return jnp.reshape(found := _jacobians_of(_lane(loop)(values)), (-1, *found.shape[-2:]))
+        return jnp.reshape(found := _jacobians_of(_lane_builder(loop)(values)), (-1, *found.shape[-2:]))
 
     one = matrices(jax.tree.map(lambda x: x[0], values))
     balance = _balance(one)
@@ -139,7 +140,7 @@ def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
     def bound(values: PyTree) -> jax.Array:
         if squarings or len(one) * count < MIN_ENTRYWISE_MATRICES:
             return _power_norm_bound(matrices(values), balance, squarings)
-        return _norm(_map_over_probes(_entries, _lane(loop)(values)), balance)
+        return _norm_bound(_map_over_probes(_entries, _lane_builder(loop)(values)), balance)
 
     return jax.lax.map(bound, filled, batch_size=min(LANES_PER_CHUNK, count))[:count]
 
@@ -166,8 +167,8 @@ def _power_norm_bound(matrices: jax.Array, balance: jax.Array, squarings: int) -
     return jnp.where(jnp.isfinite(bound), BOUND_SAFETY_FACTOR * bound, jnp.inf)
 
 
-def _norm(entries: list[list[jax.Array]], balance: jax.Array) -> jax.Array:
-    """Return `_power_norm_bound` without squarings, for n rows of n entries of shape (k,)."""
+def _norm_bound(entries: list[list[jax.Array]], balance: jax.Array) -> jax.Array:
+    """Return the result of `_power_norm_bound` without squarings, for matrices as n rows of n entries of shape (k,)."""
     # Scalars: for such small sums XLA on a CPU calls a library, and stores all matrices for it.
     sizes = [[jnp.abs(x * (balance[:, j] / balance[:, i])) for j, x in enumerate(row)] for i, row in enumerate(entries)]
     rows, columns = (reduce(jnp.maximum, map(sum, lines)) for lines in (sizes, zip(*sizes, strict=True)))
@@ -228,9 +229,10 @@ def _jacobians_of(loop: Loop) -> jax.Array:
 def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
     """Return the results of `function` at k points, stacked: leaves (k, ...).
 
-    A point is the loop with another start. The plant says by `probes` where the loop may be stiffest.
+    A point is the loop with another start. The plant's `probes` returns starts where the loop may be stiffest.
 
-    Without `probes` the points are the start and a start of zero, each far from the target and on it.
+    Without `probes` there are four points: the start and a start of zero, each with the loop's reference and with a
+    target equal to the plant's signal (`_AtTarget`).
     """
     probes = getattr(loop.plant, "probes", None)
     if probes:
@@ -245,7 +247,7 @@ def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
     return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
 
-_jacobian = compile_once(options=SAME_RESULT_OPTIONS)(_jacobians_of)
+_jacobians_of_one = compile_once(options=SAME_RESULT_OPTIONS)(_jacobians_of)
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)

@@ -116,9 +116,9 @@ class Trajectory(NamedTuple):
     """
 
     sample: Sample
-    measured: PyTree  # output of the sensor
-    state: PyTree  # state of the plant
-    running: AnyArray  # bool: False after the end of the run
+    measured: PyTree
+    state: PyTree
+    running: AnyArray
 
     def finite(self) -> Scalar:
         """Return True if every number of `sample` is finite; `measured` and `state` are not checked."""
@@ -133,16 +133,17 @@ class Run(NamedTuple):
     Attributes:
         metrics: Values of the objectives by name. All are NaN if the run diverged.
         stopped: True if the run reached its stop within the duration.
-        diverged: True if a number is not finite or not physically possible, or if the start is beyond the stop.
+        diverged: True if a number is not finite or not physically possible, or if the start is beyond the stop. Also
+            True for a missed landing, for too many attempts, and for a run that was not accepted.
         timed_out: True if the duration ended before the stop. Metrics are valid then.
         ending: Last sample, whether the run stopped, and the time and distance that remain.
         trajectory: Signals at the kept instants; None if no trajectory was requested.
     """
 
     metrics: dict[str, PyTree]
-    stopped: Bool  # bool: the run reached its stop in time
-    diverged: Bool  # bool: invalid numbers (one is infinite, NaN or impossible), or a start beyond the stop
-    timed_out: Bool  # bool: the duration ended before the stop. At most one of the three is True; none if ended early
+    stopped: Bool
+    diverged: Bool
+    timed_out: Bool
     ending: Ending
     trajectory: Trajectory | None
 

@@ -173,7 +173,8 @@ def test_arrays_of_double_precision_where_single_is_the_default():
     with jax.enable_x64(False), warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         assert iae(d.replace(RIG, {"plant.mass": np.float64(5.3)})).dtype == jnp.float32
-        assert not told
+        # Other warnings, such as those of files that the garbage collector closes, may come at any time.
+        assert not any("truncated" in str(line.message) for line in told)
         found = iae(d.replace(RIG, {"plant.mass": double}))
     assert found.dtype == jnp.float64 or any("truncated to dtype float32" in str(line.message) for line in told)
 

@@ -210,7 +210,7 @@ class TestLanes:
 
 @killed_by(
     "simulate/drive/packed.py",
-    "free = ~slots.carry.running | _lanes_ended_early(enough, built, slots, numbers)",
+    "free = ~slots.carry.running | _lanes_ended_early(enough, build_lane, slots, numbers)",
     "free = ~slots.carry.running",
 )
 @pytest.mark.parametrize("width", cases(WIDTHS, 4))

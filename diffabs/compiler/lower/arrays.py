@@ -1,4 +1,4 @@
-"""Lowering rules for primitives that move entries of an array (reshape, pad, split) or reduce them (sum, dot)."""
+"""Lowering rules for primitives that move entries of arrays (reshape, pad), make them (iota) or reduce them (sum, dot)."""
 
 import math
 from typing import Any
@@ -99,7 +99,7 @@ NEUTRAL_ELEMENTS = {"sum": 0, "prod": 1, "and": True, "or": False}
 @lowering_rule("reduce_min", "axes out_sharding")
 @lowering_rule("reduce_and reduce_or", "axes")
 def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """Reduce by pairs, as a balanced tree: n entries give a dependency chain of about log2(n) operations."""
+    """Reduce by pairs: the longest dependency chain of n entries has about log2(n) operations."""
     kind, x = eqn.primitive.name.removeprefix("reduce_"), ins[0]
     name: Any = REDUCTION_OPERATIONS.get(kind, kind)
 
@@ -140,6 +140,7 @@ def _first_extreme(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]
     dtype = eqn.params["index_dtype"]
 
     def first(*column: Node) -> Node:
+        """Return the index of the first extreme entry of a column."""
         # x != x detects NaN. A NaN replaces the best entry once, because no later comparison with it is true.
         place, best = graph.const(0, dtype), column[0]
         for i, x in enumerate(column[1:], 1):

@@ -32,16 +32,19 @@ def _call(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("custom_vmap_call", "call rule in_tree out_tree")
 def _custom_vmap_any(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """Lower a call with a custom rule for vmap, if that rule is `any` of a truth; raise Unsupported for other rules."""
+    """Lower the identity of a boolean whose custom rule for vmap is `any` over the batch; refuse other rules.
+
+    `core.lanes.any_lane` is such a call.
+    """
     call = eqn.params["call"].jaxpr
-    truth = len(ins) == 1 and eqn.invars[0].aval.dtype == bool and ins[0].ndim == 0
-    if not truth or call.eqns or call.invars != call.outvars or not _is_any_rule(eqn):
+    scalar = len(ins) == 1 and eqn.invars[0].aval.dtype == bool and ins[0].ndim == 0
+    if not scalar or call.eqns or call.invars != call.outvars or not _is_any_rule(eqn):
         raise Unsupported("custom_vmap_call", "its rule for batches is not `any`")
     return [scalar_array(graph.any(ins[0].item()))]
 
 
 def _is_any_rule(eqn: Any) -> bool:
-    """Return whether a custom rule for vmap computes `any` over the batch, by evaluation of three batches of two."""
+    """Return whether a custom rule for vmap computes `any` over the batch, by a test on three batches of two values."""
     told = jex.DebugInfo("kernel", "any", None, None)
     body = jex.Jaxpr((), list(eqn.invars), list(eqn.outvars), [eqn], eqn.effects, told)
     found = jax.vmap(lambda x: jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))(x)[0])

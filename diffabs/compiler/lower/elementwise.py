@@ -26,23 +26,23 @@ def _elementwise(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 def _integer_quotient(graph: Graph, x: Node, y: Node) -> Node:
-    """Return an integer quotient rounded towards zero, without the cases that stop a process.
+    """Return an integer quotient rounded towards zero, with a value where the processor would stop the process.
 
-    As in XLA, x/0 has all bits set.
+    As in XLA, x/0 has all bits set, and the least integer divided by -1 is itself.
     """
     zero, one = graph.const(0, y.dtype), graph.const(1, y.dtype)
-    nothing, turned = graph.op("eq", y, zero), graph.const(False)
+    by_zero, by_minus_one = graph.op("eq", y, zero), graph.const(False)
     if y.dtype.kind == "i":
         # The least integer divided by -1 overflows, which stops the process on x86. A negation wraps instead.
-        turned = graph.op("eq", y, graph.const(-1, y.dtype))
+        by_minus_one = graph.op("eq", y, graph.const(-1, y.dtype))
     # The divisor is made valid first: both sides of a selection are computed in every lane.
-    found = graph.op("quotient", x, graph.select(graph.op("or", nothing, turned), y, one))
-    found = graph.select(turned, found, graph.op("neg", x) if y.dtype.kind == "i" else x)
-    return graph.select(nothing, found, graph.op("not", zero))
+    found = graph.op("quotient", x, graph.select(graph.op("or", by_zero, by_minus_one), y, one))
+    found = graph.select(by_minus_one, found, graph.op("neg", x) if y.dtype.kind == "i" else x)
+    return graph.select(by_zero, found, graph.op("not", zero))
 
 
 @lowering_rule("add_any")
-def _sum_of_tangents(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _add_any(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return [map_entries(lambda x, y: graph.op("add", x, y), *ins)]
 
 
@@ -64,7 +64,7 @@ def max_or_min(graph: Graph, name: str, x: Node, y: Node) -> Node:
     Args:
         graph: Graph of the result.
         name: "max" or "min".
-        x, y: Numbers of one type; truths count as 0 and 1.
+        x, y: Numbers of one type, or booleans: the larger is their "or".
     """
     if x is y:
         return x
@@ -113,7 +113,7 @@ def _integer_pow(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("rsqrt logistic", "accuracy")
-def _inverse(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _rsqrt_or_logistic(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     if eqn.params["accuracy"] is not None:
         raise Unsupported(eqn.primitive.name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
 
@@ -136,7 +136,10 @@ def _rem(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 def _integer_remainder(graph: Graph, x: Node, y: Node) -> Node:
-    """Return an integer remainder with the sign of x, and x itself for y = 0, without the cases that stop a process."""
+    """Return an integer remainder with the sign of x, with a value where the processor would stop the process.
+
+    The remainder is x for y = 0 as in XLA, and 0 for y = -1.
+    """
     zero, unit = graph.op("eq", y, graph.const(0, y.dtype)), graph.const(False)
     if y.dtype.kind == "i":
         # The least integer divided by -1 overflows, which stops the process on x86. The remainder by 1 is the same.
@@ -209,7 +212,7 @@ def _shift(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("population_count")
-def _population(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _population_count(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Count the bits that are set: sums of pairs, of fours and of eights, then a product that adds the four bytes."""
 
     def count(x: Node) -> Node:
@@ -217,6 +220,7 @@ def _population(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
             raise Unsupported("population_count", f"of {x.dtype}")
 
         def part(y: Node, places: int, mask: int) -> Node:
+            """Return `y`, shifted right by `places` bits, and `mask`."""
             moved = graph.op("shift_right_logical", y, graph.const(places, y.dtype))
             return graph.op("and", moved if places else y, graph.const(mask, y.dtype))
 

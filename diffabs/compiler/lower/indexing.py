@@ -1,6 +1,7 @@
-"""Lowering rules for entries at indices that a lane computes: slices, gather and scatter.
+"""Lowering rules for entries at computed indices: slices, gather and scatter.
 
-A graph of single numbers has no memory, so an index is compared with every candidate. Uniform columns become tables.
+A graph of single numbers has no memory, so an index is compared with every possible index. A read of entries that are
+the same for all lanes becomes a table instead.
 """
 
 import numpy as np
@@ -11,10 +12,11 @@ from diffabs.compiler.lower.elementwise import max_or_min
 from diffabs.compiler.lower.rules import Unsupported, as_node_array, lowering_rule, map_entries
 from diffabs.core.types import PyTree
 
-MAX_COMPARED_ENTRIES = 64  # candidates of one read or write by comparison
+MAX_COMPARED_ENTRIES = 64  # possible indices of one read or write by comparison
 
 
 def _clamp_index(graph: Graph, index: Node, most: int) -> Node:
+    """Return an index clamped to [0, most]."""
     low = max_or_min(graph, "max", index, graph.const(0, index.dtype))
     return max_or_min(graph, "min", low, graph.const(most, index.dtype))
 
@@ -97,7 +99,10 @@ def _dynamic_update(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array
 
 @lowering_rule("scatter", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr")
 def _scatter(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
-    """Return x.at[i].set(value) for one index i along the first axis; an index outside changes nothing."""
+    """Return x.at[i].set(value) for one index i along the first axis.
+
+    An index outside of the array changes nothing, or is clamped in the mode CLIP.
+    """
     x, places, new = ins
     n = eqn.params["dimension_numbers"]
     whole = n.update_window_dims == tuple(range(x.ndim - 1)) and n.inserted_window_dims == (0,)
@@ -119,6 +124,6 @@ def _scatter(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 def _check_writable(eqn: JaxprEqn, count: int) -> None:
-    """Raise Unsupported for a write that compares an index with more than MAX_COMPARED_ENTRIES candidates."""
+    """Raise Unsupported for a write that compares an index with more than MAX_COMPARED_ENTRIES possible ones."""
     if count > MAX_COMPARED_ENTRIES:
         raise Unsupported(eqn.primitive.name, f"into {count} entries; {MAX_COMPARED_ENTRIES} are the most")

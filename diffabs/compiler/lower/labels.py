@@ -1,8 +1,8 @@
 """Names for the numbers of a traced program, taken from the variables of its source.
 
 JAX records with each operation the source lines that it comes from. The innermost line outside JAX and this package's
-helpers decides: if it assigns a variable, that name is used. If it does not, such as a return statement, the function's
-name is used. If the source is not readable, the numbers get the names of their operations.
+helpers decides. If it assigns a variable, the label is the variable's name. If not, as in a return statement, or if the
+source is not readable, the label is the function's name. Without source lines the label is empty.
 """
 
 import ast
@@ -24,10 +24,10 @@ ANONYMOUS = ("<lambda>", "<listcomp>", "<genexpr>", "<module>")
 class Labelled(Graph):
     """A graph whose nodes have labels from the source.
 
-    All nodes of one operation, such as a call, have the label of that operation.
+    A node has the label of the equation in the outermost jaxpr that it comes from, such as a call.
 
     Attributes:
-        labels: Labels of the traced program's operations, by the id of the equation.
+        labels: Labels of the equations of the outermost jaxpr, by `id(eqn)`; the creator fills it.
     """
 
     def __init__(self) -> None:
@@ -36,8 +36,8 @@ class Labelled(Graph):
         self.labels: dict[int, str] = {}
         self._label = ""
 
-    def begins(self, eqn: JaxprEqn) -> None:
-        """Use the label of the operation `eqn` for the following nodes."""
+    def begin_equation(self, eqn: JaxprEqn) -> None:
+        """Use the label of the equation `eqn` for the following nodes."""
         # Equations of an inner program have no label of their own: the one of the call stays.
         self._label = self.labels.get(id(eqn), self._label)
 

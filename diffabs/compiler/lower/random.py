@@ -1,6 +1,6 @@
-"""Lowering rules for random numbers (Threefry and erf_inv), with the same bits as in JAX.
+"""Lowering rules for random numbers: Threefry, with the same bits as in JAX, and erf_inv for normal variates.
 
-JAX's own functions of a key are traced and inlined. Only the hash is written out here.
+For fold_in and bits, JAX's own functions of a key are traced and inlined. Only the hash is written out here.
 """
 
 import math
@@ -64,14 +64,14 @@ def _bits(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("iota_2x32_shape", "shape")
 def _iota_words(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
-    """Return the position of each entry in an array as two words of 32 bits, high word first."""
+    """Return the index of each entry in the flattened array as two arrays of 32-bit words, high words first."""
     places = np.arange(math.prod(eqn.params["shape"]), dtype=np.uint32).reshape(eqn.params["shape"])
     return [constant_array(graph, 0 * places), constant_array(graph, places)]
 
 
 @lowering_rule("threefry2x32")
 def _threefry(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
-    """Return the two words of Threefry-2x32 with 20 rounds.
+    """Return the two words of Threefry-2x32 with 20 rounds, entry by entry.
 
     Source: Salmon, Moraes, Dror and Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011).
     """

@@ -23,16 +23,16 @@ INTERNAL_FOLDERS = [pathlib.Path(__file__).parents[2] / name for name in ("core"
 
 
 class Unsupported(Exception):
-    """An error: an operation cannot be translated.
+    """An error: a JAX primitive cannot be lowered, or an operation cannot be translated to a language.
 
     Attributes:
-        primitive: Name of the primitive.
+        primitive: Name of the primitive or operation; "carry", "step" or "log" for a limit of kernels.
         reason: The reason, as it continues after the primitive's name.
         method: Method of the part that uses the primitive, empty if unknown.
     """
 
     def __init__(self, primitive: str, reason: str):
-        """Store `primitive` and `reason`; the text of `reason` continues after the primitive's name."""
+        """Store `primitive` and `reason`; `reason` is text that continues a line after the primitive's name."""
         super().__init__(primitive, reason)
         self.primitive, self.reason, self.method = primitive, reason, ""
 
@@ -46,7 +46,7 @@ class LoweringRule(NamedTuple):
 
     Attributes:
         apply: Function (graph, eqn, inputs) -> outputs.
-        known: Names of the parameters that the function handles.
+        known: Names of the parameters that the primitive may have; another one is refused.
     """
 
     apply: Callable[[Graph, PyTree, list[Array]], Sequence[Array]]
@@ -61,7 +61,7 @@ def lowering_rule(names: str, known: str = "") -> Callable[[PyTree], PyTree]:
 
     Args:
         names: Names of the primitives, separated by blanks.
-        known: Names of the parameters that the rule handles, separated by blanks.
+        known: Names of the parameters that the primitives may have, separated by blanks.
     """
 
     def decorate(apply: Any) -> Any:
@@ -83,15 +83,15 @@ def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Se
     Raises:
         Unsupported: A primitive has no rule, or its rule does not handle a parameter, a type or a shape.
     """
-    at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
+    arrays = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
     def read(atom: PyTree) -> Array:
         if isinstance(atom, jex.Literal):
             return constant_array(graph, atom.val, atom.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-        return at[atom]
+        return arrays[atom]
 
     for eqn in jaxpr.eqns:
-        graph.begins(eqn)
+        graph.begin_equation(eqn)
         name, ins = eqn.primitive.name, [read(atom) for atom in eqn.invars]
         try:
             if name not in LOWERING_RULES:
@@ -104,12 +104,15 @@ def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Se
             # The innermost equation names the method first. Outer calls keep that name.
             error.method = error.method or _calling_method(eqn)
             raise
-        at.update(zip(eqn.outvars, outs, strict=True))
+        arrays.update(zip(eqn.outvars, outs, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
 def _calling_method(eqn: JaxprEqn) -> str:
-    """Return the innermost method that the equation comes from, JAX and this package's helpers apart; empty if none."""
+    """Return the name of the innermost method that made the equation, without those of JAX and of this package's core.
+
+    It is empty if there is none.
+    """
     traceback = getattr(getattr(eqn, "source_info", None), "traceback", None)
     for frame in getattr(traceback, "frames", ()):
         place = pathlib.Path(frame.file_name)
@@ -120,7 +123,7 @@ def _calling_method(eqn: JaxprEqn) -> str:
 
 
 def constant_array(graph: Graph, x: Scalar, dtype: DTypeLike | None = None) -> Array:
-    """Return an array of constants.
+    """Return an array of constant nodes.
 
     Args:
         graph: Graph that receives the nodes.

@@ -131,26 +131,26 @@ def _run(
     enough: EarlyEnd | None,
 ) -> Run:
     """Return the results of all runs; `method` is the stepping method, and `own` the runs' data for `enough`."""
-    leaves, built = split_by_lane(loop, values, objectives)
+    leaves, build_lane = split_by_lane(loop, values, objectives)
 
     def start(mine: PyTree, key: PyTree, accepted: Scalar) -> Any:
-        return _stop_unaccepted(accepted, method.start(*built(mine), key))
+        return _stop_unaccepted(accepted, method.start(*build_lane(mine), key))
 
     def is_running(lane: PyTree, carry: PyTree) -> Scalar:
         if enough is None:
             return carry.running
-        output = built(lane[0])[0].plant.output(carry.point.state.plant)
+        output = build_lane(lane[0])[0].plant.output(carry.point.state.plant)
         return carry.running & ~enough.has_reached(lane[2], output)
 
     def finish(mine: PyTree, carry: PyTree) -> Run:
-        return finish_run(*built(mine), carry)[0]
+        return finish_run(*build_lane(mine), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)
     _check_logs(loop, begins.point.state)
     # The kernel computes only leaves of the carry that the results depend on, and tangents that move the results.
     carry = run_lanes(
-        lambda lane, carry: method.renew(built(lane[0])[0], carry),
-        lambda lane, carry: method.step(*built(lane[0]), lane[1], carry),
+        lambda lane, carry: method.renew(build_lane(lane[0])[0], carry),
+        lambda lane, carry: method.step(*build_lane(lane[0]), lane[1], carry),
         is_running,
         (leaves, keys, own),
         begins,

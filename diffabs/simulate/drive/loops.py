@@ -83,10 +83,10 @@ def run_with_trajectory(
     def segment(i: Int, at: tuple[Carry, PyTree]) -> tuple[Carry, PyTree]:
         until = (i + 1) * every
 
-        def some(carry: Carry) -> Carry:
+        def attempt(carry: Carry) -> Carry:
             return step(renew(carry), until=until)
 
-        carry = jax.lax.while_loop(lambda carry: any_lane(before(carry, until)), some, at[0])
+        carry = jax.lax.while_loop(lambda carry: any_lane(before(carry, until)), attempt, at[0])
         return carry, jax.tree.map(lambda all, x: all.at[i].set(x), at[1], look(carry, until))
 
     return jax.lax.fori_loop(0, count, segment, (carry, seen))
@@ -138,11 +138,11 @@ def scan_with_trajectory(
         def on(carry: Carry) -> Any:
             return _any_running(before(carry, until))
 
-        def some(carry: Carry) -> Carry:
+        def go_to_sample(carry: Carry) -> Carry:
             return repeat_step(lambda carry: step(carry, until=until), carry, room, on)
 
         # The scan has `instants` rounds, the run only `count`: the rest is skipped, not computed and discarded.
-        carry = jax.lax.cond(i < count, some, lambda carry: carry, carry)
+        carry = jax.lax.cond(i < count, go_to_sample, lambda carry: carry, carry)
         return carry, look(carry, until)
 
     return jax.lax.scan(rematerialise(segment), carry, jnp.arange(instants))
@@ -156,11 +156,10 @@ def _any_running(running: Bool) -> Bool:
 def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X], PyTree]) -> X:
     """Return the carry after at least `capacity` applications of `step`, in nested scans.
 
-    Groups of steps are skipped where `on(carry)` is False. Within a group `on` is not asked, so `step` must then return
-    its argument. In a batch under
-    `jax.vmap` groups are skipped only if `on` returns one value for all runs (`any_lane`). Reverse mode keeps the carry
-    of each step. Beyond `MAX_SAVED_CARRIES` steps it keeps the carry of each group and computes the steps of a group
-    again.
+    Groups of steps are skipped where `on(carry)` is False. Within a group `on` is not asked: `step` must leave a run
+    that is over as it is. In a batch under `jax.vmap` groups are skipped only if `on` returns one value for all runs
+    (`any_lane`). Reverse mode keeps the carry of each step. Beyond `MAX_SAVED_CARRIES` steps it keeps the carry of each
+    group and computes the steps of a group again.
 
     Args:
         step: Function from carry to carry.

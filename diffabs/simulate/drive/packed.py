@@ -48,7 +48,9 @@ def run_packed(
     enough: EarlyEnd | None = None,
     numbers: Array | None = None,
 ) -> Run:
-    """Return the result of `jax.vmap` of `measure` for runs that differ in their values and keys. Not for reverse mode.
+    """Return the results of `measure` for runs that differ in their values and keys. Not for reverse mode.
+
+    A run that is not accepted has diverged. A run that `enough` ends has no end flag.
 
     Args:
         loop: Loop that the runs have in common.
@@ -127,11 +129,11 @@ def _run(
 ) -> Run:
     """Return the results of all runs, in their order; `width` runs step at a time, by the stepping method `method`."""
     count = len(accepted)
-    leaves, built = split_by_lane(loop, values, objectives)
-    step_all = jax.vmap(lambda mine, key, carry: method.step(*built(mine), key, carry))
-    renew_all = jax.vmap(lambda mine, carry: method.renew(built(mine)[0], carry))
-    start = jax.vmap(lambda mine, key: method.start(*built(mine), key))
-    over = jax.vmap(lambda mine, carry: finish_run(*built(mine), carry)[0])
+    leaves, build_lane = split_by_lane(loop, values, objectives)
+    step_all = jax.vmap(lambda mine, key, carry: method.step(*build_lane(mine), key, carry))
+    renew_all = jax.vmap(lambda mine, carry: method.renew(build_lane(mine)[0], carry))
+    start = jax.vmap(lambda mine, key: method.start(*build_lane(mine), key))
+    finish = jax.vmap(lambda mine, carry: finish_run(*build_lane(mine), carry)[0])
 
     def take_lanes(number: Scalar) -> tuple[PyTree, PyTree, Carry]:
         """Return leaves, keys and carries of these runs at t = 0; beyond the last run a copy that does not step."""
@@ -140,47 +142,55 @@ def _run(
         status = jnp.where(run & (number < count), carry.status, RunStatus.DIVERGED)
         return mine, key, carry._replace(status=status.astype(carry.status.dtype))
 
-    def round_(slots: _LaneSlots) -> _LaneSlots:
-        def some(carry: Carry, _: Any) -> tuple[Carry, None]:
+    def step_and_exchange(slots: _LaneSlots) -> _LaneSlots:
+        def step_once(carry: Carry, _: Any) -> tuple[Carry, None]:
             return step_all(slots.leaves, slots.keys, carry), None
 
-        def rounds(carry: PyTree, _: Any) -> tuple[PyTree, None]:
-            return jax.lax.scan(some, renew_all(slots.leaves, carry), length=STEPS_PER_BLOCK)[0], None
+        def renew_and_step(carry: PyTree, _: Any) -> tuple[PyTree, None]:
+            return jax.lax.scan(step_once, renew_all(slots.leaves, carry), length=STEPS_PER_BLOCK)[0], None
 
-        slots = slots._replace(carry=jax.lax.scan(rounds, slots.carry, length=STEPS_PER_EXCHANGE // STEPS_PER_BLOCK)[0])
-        free = ~slots.carry.running | _lanes_ended_early(enough, built, slots, numbers)
-        return _exchange_lanes(slots, free, over, take_lanes, count)
+        slots = slots._replace(
+            carry=jax.lax.scan(renew_and_step, slots.carry, length=STEPS_PER_EXCHANGE // STEPS_PER_BLOCK)[0]
+        )
+        free = ~slots.carry.running | _lanes_ended_early(enough, build_lane, slots, numbers)
+        return _exchange_lanes(slots, free, finish, take_lanes, count)
 
     number = jnp.arange(min(width, count))
     first = take_lanes(number)
-    shapes = jax.eval_shape(over, first[0], first[2])
+    shapes = jax.eval_shape(finish, first[0], first[2])
     ended = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
     slots = _LaneSlots(*first, number, number[-1] + 1, ended)
-    return jax.lax.while_loop(lambda slots: jnp.any(slots.number < count), round_, slots).ended
+    return jax.lax.while_loop(lambda slots: jnp.any(slots.number < count), step_and_exchange, slots).ended
 
 
 def _lanes_ended_early(
-    enough: EarlyEnd | None, built: Callable[[PyTree], PyTree], slots: _LaneSlots, numbers: Array
+    enough: EarlyEnd | None, build_lane: Callable[[PyTree], PyTree], slots: _LaneSlots, numbers: Array
 ) -> PyTree:
-    """Return True for each slot whose run ends early; `built` returns the loop and objectives of one run."""
+    """Return True for each slot whose run ends early; `build_lane` returns the loop and objectives of one run."""
     if enough is None:
         return jnp.zeros_like(slots.carry.running)
-    output = jax.vmap(lambda mine, at: built(mine)[0].plant.output(at.point.state.plant))(slots.leaves, slots.carry)
+    output = jax.vmap(lambda mine, at: build_lane(mine)[0].plant.output(at.point.state.plant))(
+        slots.leaves, slots.carry
+    )
     known = numbers[jnp.minimum(slots.number, len(numbers) - 1)]
     return jax.vmap(lambda number, output: enough.has_reached(enough.own(number), output))(known, output)
 
 
 def _exchange_lanes(
-    slots: _LaneSlots, free: PyTree, over: Callable[[PyTree, Carry], Run], taken: Callable[[PyTree], PyTree], count: int
+    slots: _LaneSlots,
+    free: PyTree,
+    finish: Callable[[PyTree, Carry], Run],
+    take_lanes: Callable[[PyTree], PyTree],
+    count: int,
 ) -> _LaneSlots:
-    """Return the slots with the results (`over`) of free slots stored, and the next runs (`taken`) in their place."""
-    place, runs = jnp.where(free, slots.number, count), over(slots.leaves, slots.carry)
+    """Return the slots with the results of free slots stored (by `finish`) and the next runs in them (`take_lanes`)."""
+    place, runs = jnp.where(free, slots.number, count), finish(slots.leaves, slots.carry)
     # Slots that are not free write to the place `count`, beyond the end: the mode "drop" discards them.
     ended = jax.tree.map(lambda all, x: all.at[place].set(x, mode="drop"), slots.ended, runs)
     # The cumulative sum gives free slots consecutive numbers.
     number = jnp.where(free, slots.next + jnp.cumsum(free) - 1, slots.number)
     old = (slots.leaves, slots.keys, slots.carry)
-    mine, key, carry = jax.tree.map(partial(_select_lanes, free), taken(number), old)
+    mine, key, carry = jax.tree.map(partial(_select_lanes, free), take_lanes(number), old)
     return _LaneSlots(mine, key, carry, jnp.minimum(number, count), slots.next + jnp.sum(free), ended)
 
 

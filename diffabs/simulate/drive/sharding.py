@@ -29,7 +29,7 @@ TRACED_EXPLICIT_AXES = (
 
 
 def describe_placement(given: PyTree) -> str:
-    """Return why the runs of these arrays are not made on one processor, or "" if they are.
+    """Return the reason why XLA places the runs of these arrays by itself, or "" if they run on one processor.
 
     Args:
         given: Data of the runs, a pytree.

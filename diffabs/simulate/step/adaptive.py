@@ -101,7 +101,8 @@ class AdaptiveControl(NamedTuple):
         tries: Number of attempts so far.
         tries_at_renewal: Number of attempts at the last update of the stability limit.
         last_step: Last step, a `StateSpan`; () without a trajectory.
-        turns: Number of consecutive steps that ended on switching surfaces.
+        consecutive_crossings: Number of steps that ended on switching surfaces since the last long regular step
+            (`RESET_STEP_FRACTION`).
         stability_fraction: Fraction of the longest stable step that a step may have after an event.
         taken: True if the last attempt was accepted.
         triggered: Bit mask of the events at its end.
@@ -113,7 +114,7 @@ class AdaptiveControl(NamedTuple):
     tries: Int
     tries_at_renewal: Int
     last_step: PyTree
-    turns: Int
+    consecutive_crossings: Int
     stability_fraction: Scalar
     taken: Bool
     triggered: Int
@@ -125,17 +126,20 @@ class AdaptiveReport(NamedTuple):
     Attributes:
         error: Error as a multiple of the allowed error.
         scale: Largest values of the first signal and of the states so far, as `error_scales` returns them.
-        late: Time from the first change of a comparison inside the step to its end [s], or 0.
+        past_crossing: Time from the first change of a comparison inside the step to the end of the step [s]; 0 without
+            a change.
         surface: Contradicted comparisons; None if steps keep to no mode.
     """
 
     error: Scalar
     scale: PyTree
-    late: Scalar
+    past_crossing: Scalar
     surface: SurfaceCrossing | None
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps", "notes"])
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps_last_step", "is_logged"]
+)
 @dataclasses.dataclass(frozen=True)
 class AdaptiveStepping:
     """Steps of an `Adaptive` solver.
@@ -144,15 +148,15 @@ class AdaptiveStepping:
         h: Step of the grid [s].
         steps: Number of the last instant of the grid.
         rtol: Allowed relative error of a step.
-        keeps: True if the carry keeps the last step, for samples between its ends.
-        notes: True if the run is logged for a replay with derivatives: its steps keep to a mode.
+        keeps_last_step: True if the carry keeps the last step, for samples between its ends.
+        is_logged: True if the run is logged for a replay with derivatives. Its steps then keep to a mode.
     """
 
     h: Scalar
     steps: Int
     rtol: Scalar
-    keeps: bool = False
-    notes: bool = False
+    keeps_last_step: bool = False
+    is_logged: bool = False
     tableau, has_margin_rates, searches, second_order = TSIT5, True, True, False
 
     @property
@@ -171,15 +175,14 @@ class AdaptiveStepping:
         limit = spectral_step_limit(loop, point.t, state, scale)
         left = self._next_strike(loop, zero) * self.h
         length, strikes = plan_step(jnp.minimum(error_limited, limit), point.forecast, left, self.least)
-        last = span_step(point, point) if self.keeps else ()
+        last = span_step(point, point) if self.keeps_last_step else ()
         control = AdaptiveControl(error_limited, limit, scale, zero, zero, last, zero, 1.0 + 0.0 * self.h, no, zero)
         return cast_floats(carry._replace(length=length, base=length, strikes=strikes, control=control), self.h.dtype)
 
     def step(self, loop: Loop, objectives: Objectives, key: Key, carry: Carry, until: Scalar = None) -> Carry:
-        """Return the `carry` after one attempt of a step, unchanged if the run is over or has reached the instant
-        `until`.
+        """Return the `carry` after one attempt of a step, as `advance` does.
 
-        `loop`, `objectives` and `key` are those of `start`.
+        The run pauses at the instant `until` of the grid. `loop`, `objectives` and `key` are those of `start`.
         """
         return advance(self, loop, objectives, key, carry, until)
 
@@ -213,11 +216,11 @@ class AdaptiveStepping:
 
     def with_trajectory(self) -> "AdaptiveStepping":
         """Return the method for a run with a trajectory."""
-        return dataclasses.replace(self, keeps=True)
+        return dataclasses.replace(self, keeps_last_step=True)
 
     def without_trajectory(self) -> "AdaptiveStepping":
         """Return the method for a run without a trajectory."""
-        return dataclasses.replace(self, keeps=False)
+        return dataclasses.replace(self, keeps_last_step=False)
 
     def for_replay(self) -> "AdaptiveStepping":
         """Return the method for a run that is logged and then replayed with derivatives.
@@ -225,7 +228,7 @@ class AdaptiveStepping:
         The derivative changes faster than the run. The allowed error of a step is therefore only
         `DERIVATIVE_RTOL_FRACTION` of that for values.
         """
-        return dataclasses.replace(self, notes=True, rtol=clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol))
+        return dataclasses.replace(self, is_logged=True, rtol=clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol))
 
     def is_switched(self, loop: Loop) -> bool:
         """Return True: the comparisons of the `loop`'s flow are always visible."""
@@ -234,7 +237,7 @@ class AdaptiveStepping:
 
     def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
-        return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.notes)
+        return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.is_logged)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> Scalar:
         """Return the predicted time [s] to the first change of an answer, from `seen`, for the run of `carry`.
@@ -256,7 +259,7 @@ class AdaptiveStepping:
         scale = jax.tree.map(jnp.maximum, carry.control.scale, error_scales(state, sample))
         off = midpoint_error(self.tableau, error[0], seen.rates[0], h)
         relative = error_norm(system.loop, state, off, scale, sample) / self.rtol
-        surface = find_surface_crossing(seen, carry.search.which, h) if self.notes else None
+        surface = find_surface_crossing(seen, carry.search.which, h) if self.is_logged else None
         return AdaptiveReport(relative, scale, time_since_crossing(seen.surfaces, changed, h), surface)
 
     def decide(
@@ -267,14 +270,14 @@ class AdaptiveStepping:
         Its error must be small, and no comparison may change within it, unless its length is the shortest one. `active`
         is False if the run needs no attempt.
         """
-        error, late = attempt.report.error, attempt.report.late
+        error, past_crossing = attempt.report.error, attempt.report.past_crossing
         fine = jnp.isfinite(error)  # the maximum over all states: one NaN makes it NaN
-        exact = fine & (((error <= 1) & (late <= 0)) | (carry.length <= self.least))
+        exact = fine & (((error <= 1) & (past_crossing <= 0)) | (carry.length <= self.least))
         last = request.strikes & (request.strike >= self.steps)
-        return decide_attempt(system, carry, attempt, active, fine, exact, last=last, frozen=self.notes)
+        return decide_attempt(system, carry, attempt, active, fine, exact, last=last, frozen=self.is_logged)
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an `attempt` with the length of the next attempt.
+        """Return the carry `after` an `attempt` with length and status of the next attempt.
 
         `carry` is the run in `system` before the attempt, and `decision` the decision on it.
         """
@@ -282,44 +285,48 @@ class AdaptiveStepping:
         new = carry.status == RunStatus.RUNNING
         error_limited = self._error_limited_length(carry, attempt, decision)
         fraction = control.stability_fraction
-        if self.notes:
+        if self.is_logged:
             grown = jnp.minimum(STABILITY_FRACTION_GROWTH * fraction, 1.0)
             fraction = jnp.where(taken, jnp.where(new, grown, INITIAL_STABILITY_FRACTION), fraction)
         longest = jnp.minimum(error_limited, fraction * control.limit)
         left = (self._next_strike(system.loop, after.k) - after.k) * self.h - after.since
         length, strikes = plan_step(longest, after.point.forecast, left, self.least)
-        # A comparison changed `late` seconds before the end: the next attempt ends there.
-        late = ~taken & (report.late > 0) & decision.fine
-        length = jnp.where(late, jnp.maximum(carry.length - report.late, self.least), length)
-        searches, status, turns, unrestricted = decision.searches, after.status, control.turns, carry.unrestricted
-        if self.notes:
+        # A comparison changed inside the step: the next attempt ends there.
+        ends_on_crossing = ~taken & (report.past_crossing > 0) & decision.fine
+        length = jnp.where(ends_on_crossing, jnp.maximum(carry.length - report.past_crossing, self.least), length)
+        searches, status, unrestricted = decision.searches, after.status, carry.unrestricted
+        crossings = control.consecutive_crossings
+        if self.is_logged:
             calm = taken & new & (carry.length > RESET_STEP_FRACTION * control.error_limited)
-            turns = jnp.where(decision.crosses_surface, turns + 1, jnp.where(calm, 0, turns))
-            tired = searches & (after.search.tries >= MAX_LOCATION_ATTEMPTS)
-            tired &= after.search.which < system.comparisons
-            begins = (tired | (taken & (turns > MAX_CONSECUTIVE_CROSSINGS))) & ~unrestricted
-            unrestricted = (unrestricted | begins) & ~(calm & have_same_answers(carry, attempt))
-            searches &= ~(begins & tired)
-            length = jnp.where(begins & tired, longest, length)
-            status = jnp.where(begins & tired, RunStatus.RUNNING, status)
+            crossings = jnp.where(decision.crosses_surface, crossings + 1, jnp.where(calm, 0, crossings))
+            gave_up = searches & (after.search.tries >= MAX_LOCATION_ATTEMPTS)
+            gave_up &= after.search.which < system.bit_count
+            becomes_unrestricted = (gave_up | (taken & (crossings > MAX_CONSECUTIVE_CROSSINGS))) & ~unrestricted
+            unrestricted = (unrestricted | becomes_unrestricted) & ~(calm & have_same_answers(carry, attempt))
+            searches &= ~(becomes_unrestricted & gave_up)
+            length = jnp.where(becomes_unrestricted & gave_up, longest, length)
+            status = jnp.where(becomes_unrestricted & gave_up, RunStatus.RUNNING, status)
         # A landing with invalid numbers is no landing: the step is attempted again, and its event located again.
         status = jnp.where(~taken & ~searches & (status == RunStatus.LANDING), RunStatus.RUNNING, status)
         refreshes = status == RunStatus.REFRESHING
         length = jnp.where(searches, after.length, jnp.where(refreshes, 0.0, length))
+        last_step = control.last_step
+        if self.keeps_last_step:
+            last_step = select(taken, span_step(carry.point, attempt.point), last_step)
         lost = (~decision.fine & (carry.length <= self.least)) | (
             control.tries > MAX_ATTEMPTS + ATTEMPTS_PER_INSTANT * self.steps
         )
         return after._replace(
             length=length,
             base=jnp.where(status == RunStatus.RUNNING, length, carry.base),
-            strikes=strikes & ~searches & ~late & ~refreshes,
+            strikes=strikes & ~searches & ~ends_on_crossing & ~refreshes,
             unrestricted=unrestricted,
             control=control._replace(
                 error_limited=error_limited,
                 scale=select(taken, report.scale, control.scale),
                 tries=control.tries + 1,
-                last_step=select(taken, span_step(carry.point, attempt.point), control.last_step) if self.keeps else (),
-                turns=turns,
+                last_step=last_step,
+                consecutive_crossings=crossings,
                 stability_fraction=fraction,
                 taken=taken,
                 triggered=_pack_events(decision.triggered),
@@ -333,7 +340,7 @@ class AdaptiveStepping:
 
     def _forecast_crossing(self, error_limited: Scalar, unrestricted: Bool, seen: Evaluation) -> Scalar:
         ahead = forecast_crossing(seen.surfaces, error_limited, self.least)
-        return jnp.where(unrestricted, 1.0, CROSSING_OVERREACH) * ahead if self.notes else ahead
+        return jnp.where(unrestricted, 1.0, CROSSING_OVERREACH) * ahead if self.is_logged else ahead
 
     def _error_limited_length(self, carry: Carry, attempt: Attempt, decision: Decision) -> Scalar:
         """Return the step length that the error allows [s].
@@ -344,7 +351,7 @@ class AdaptiveStepping:
         new = jnp.where(decision.fine, propose_length(carry.length, report.error), MIN_STEP_RATIO * carry.length)
         # A step cut short by a clock or an event has a small error, so it may raise the allowed length only.
         cut = decision.taken & (carry.length < old)
-        wrong = ~decision.fine | ((report.error > 1) & (report.late <= 0))
+        wrong = ~decision.fine | ((report.error > 1) & (report.past_crossing <= 0))
         judged = (carry.status == RunStatus.RUNNING) & (decision.taken | wrong)
         return jnp.maximum(jnp.where(judged, jnp.where(cut, jnp.maximum(new, old), new), old), self.least)
 

@@ -1,10 +1,10 @@
-"""One attempt of a run, and everything that follows from it: the carry of a run, and the interface of stepping methods.
+"""The step of a run: `advance` makes one attempt. The carry of a run, and the interface of stepping methods.
 
     propose    which step to attempt, in which mode
     attempt    `attempt.attempt_step`: the same for every method
     decide     accept the step, search within it, or end the run
     commit     `attempt.commit_step`: the same for every method
-    plan_next  the length of the next attempt
+    plan_next  the length and status of the next attempt
 
 `FixedStepping`, `AdaptiveStepping` and `ReplayStepping` differ in these and in the coefficients of their step.
 """
@@ -57,7 +57,8 @@ class Carry(NamedTuple):
         since: Time since that instant [s]. It is summed, because the difference of two large times would lose digits.
         length: Length of the next attempt [s].
         strikes: True if the next attempt ends where a clock strikes next, or with the run.
-        base: Length of the regular attempt from this point [s], the scale of a search within it.
+        base: Length of the regular attempt [s], the scale of a search within it. Adaptive steps begin it at this point;
+            with fixed steps it is the step of the grid.
         search: Search for an event.
         unrestricted: True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode.
         control: Numbers of the stepping method.
@@ -84,7 +85,7 @@ class Decision(NamedTuple):
     Attributes:
         fine: True if its numbers are finite and plausible.
         taken: True if the attempt is accepted.
-        searches: True if an event or a switching surface lies inside and is to be located.
+        searches: True if the search for an event or a switching surface begins or goes on.
         crosses_surface: True if an accepted attempt ends on a switching surface.
         triggered: True for each event at its end.
         mode: Mode after the changes at its end.
@@ -125,7 +126,7 @@ class Stepping(Protocol):
 
     @property
     def searches(self) -> bool:
-        """True if attempts may search for an event."""
+        """True if the method locates events; False if a log says where they are."""
         ...
 
     @property
@@ -146,7 +147,10 @@ class Stepping(Protocol):
         ...
 
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
-        """Return what the method foresees from the dynamics `seen` at the end of a step, for the run of `carry`."""
+        """Return the predicted time [s] to the next change of a comparison, from the dynamics `seen` at an instant.
+
+        A method without a prediction returns (). `carry` is the run before the step that ends at the instant.
+        """
         ...
 
     def report(
@@ -169,10 +173,10 @@ class Stepping(Protocol):
         ...
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an `attempt` with the next attempt planned.
+        """Return the carry `after` an `attempt` with length and status of the next attempt.
 
-        `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has its new point
-        and, if the run searches for an event, the search.
+        `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has the new point
+        and, from a method that `searches`, the search with its length and status.
         """
         ...
 
@@ -180,7 +184,10 @@ class Stepping(Protocol):
 def advance(
     stepping: Stepping, loop: Loop, objectives: Objectives, key: PyTree, carry: Carry, until: Int | None = None
 ) -> Carry:
-    """Return the carry after one attempt of a step, unchanged if the run is over or has reached the instant `until`.
+    """Return the carry after one attempt of a step.
+
+    Point and status of a run that is over do not change. With `until`, the whole carry does not change if the run is
+    over or has reached that instant.
 
     Args:
         stepping: Stepping method.
@@ -237,14 +244,14 @@ def _search(
     """Return the carry `after` an attempt with the search for an event continued, and with the next status."""
     plan = SearchPlan(carry.search, carry.length, carry.status)
 
-    def look() -> SearchPlan:
+    def next_plan() -> SearchPlan:
         margins = (jax.tree.leaves(point.margins) for point in (carry.point, attempt.point))
-        crossings = find_crossings(carry.search.which, system.comparisons, attempt.report.surface, *margins)
-        found = continue_search(plan, crossings, carry.base, system.comparisons, refines=stepping.second_order)
+        crossings = find_crossings(carry.search.which, system.bit_count, attempt.report.surface, *margins)
+        found = continue_search(plan, crossings, carry.base, system.bit_count, refines=stepping.second_order)
         return select(decision.searches, found, plan)
 
     # Few attempts search, so a batch skips the search unless one of its runs needs it.
-    search, length, status = jax.lax.cond(any_lane(decision.searches), look, lambda: plan)
+    search, length, status = jax.lax.cond(any_lane(decision.searches), next_plan, lambda: plan)
     status = jnp.where(decision.taken, status_after_step(system.loop, carry, attempt, decision), status)
     return after._replace(search=search, length=length, status=status)
 
@@ -265,7 +272,7 @@ def start_carry(
         loop: Closed loop, prepared.
         objectives: Objectives by the names of their metrics.
         key: Random key, or None.
-        forecast: What the stepping method foresees.
+        forecast: Prediction of the stepping method (`Stepping.forecast`).
     """
     none, zero = 0.0 * stepping.h, jnp.asarray(0)
     state, accumulators = start_state(loop, objectives, Clock(none, stepping.h, zero, key))
@@ -283,7 +290,7 @@ def start_carry(
 
 
 def propose_step(stepping: Stepping, system: LoopSystem, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:
-    """Return the attempt that a carry asks for.
+    """Return the step to attempt next, from the length, mode and status in a carry.
 
     Args:
         stepping: Stepping method.
@@ -295,7 +302,7 @@ def propose_step(stepping: Stepping, system: LoopSystem, carry: Carry, strike: I
     refresh, mode = carry.status == RunStatus.REFRESHING, UNCONSTRAINED
     if frozen:
         which, words = carry.search.which, carry.point.words
-        beyond = mode_after_changes(system, words, which, which < system.comparisons)
+        beyond = mode_after_changes(system, words, which, which < system.bit_count)
         mode = select(refresh, beyond, mode_in_step(system, words, carry.unrestricted))
     end = jnp.where(carry.strikes, strike * stepping.h, carry.point.t + carry.length)
     return StepRequest(carry.length, end, stepping.h, mode, refresh, carry.strikes, strike)
@@ -320,25 +327,25 @@ def decide_attempt(
         attempt: The attempt.
         active: True if the run needs an attempt.
         fine: True if the numbers of the attempt are finite and plausible.
-        exact: True if it is also accurate enough.
+        exact: True if the attempt is also accurate enough, or cannot be made shorter.
         last: True if the run ends at the end of the attempt.
         frozen: True if a step keeps to a mode.
     """
     running, landing, refreshing = (
         carry.status == one for one in (RunStatus.RUNNING, RunStatus.LANDING, RunStatus.REFRESHING)
     )
-    surface, count, which = attempt.report.surface, system.comparisons, carry.search.which
+    surface, bit_count, which = attempt.report.surface, system.bit_count, carry.search.which
     crossed = falls_through(jax.tree.leaves(carry.point.margins), jax.tree.leaves(attempt.point.margins))
     crosses = [*crossed, *([] if surface is None else [surface.contradicted, surface.other >= 0])]
     crosses = jnp.any(jnp.stack(crosses))
     taken = active & fine & (landing | refreshing | (running & exact & ~crosses))
     searches = active & ~landing & ~refreshing & (~running | (exact & crosses))
-    triggered = [taken & landing & ((which == count + i) | one) for i, one in enumerate(crossed)]
+    triggered = [taken & landing & ((which == bit_count + i) | one) for i, one in enumerate(crossed)]
     triggered = jax.tree.unflatten(jax.tree.structure(attempt.point.margins), triggered)
     over = triggered["stop"][0] | (taken & last)
     lands, mode = jnp.asarray(False), UNCONSTRAINED
     if frozen:
-        lands = taken & landing & (which < count)
+        lands = taken & landing & (which < bit_count)
         words = flip_answer(system, attempt.point.words, which, lands)
         mode = mode_after_changes(system, words, which, lands)
     return Decision(fine, taken, searches, lands, triggered, mode, over)

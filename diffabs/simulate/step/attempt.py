@@ -47,7 +47,7 @@ class Point(NamedTuple):
         rates: Rates of the loop's flow and of the objectives' integrals.
         margins: Margins of the stop and of the blocks' events.
         words: Answers to the comparisons: the mode of the next step.
-        forecast: What the stepping method foresees from here.
+        forecast: Prediction of the stepping method from here (`Stepping.forecast`).
     """
 
     t: Scalar
@@ -103,7 +103,7 @@ class Attempt(NamedTuple):
     report: PyTree
 
 
-Forecast = Callable[[Evaluation], PyTree]  # of a stepping method, from an instant
+Forecast = Callable[[Evaluation], PyTree]  # `Stepping.forecast`, for a run
 
 
 def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopState, Accumulators]:
@@ -134,7 +134,7 @@ def evaluate_point(
         state: State of the loop, after the changes at this instant.
         accumulators: Accumulators of the objectives.
         mode: Mode in which the dynamics are evaluated.
-        forecast: What the stepping method foresees.
+        forecast: Prediction of the stepping method (`Stepping.forecast`).
     """
     return _build_point(system.evaluate(t, state, accumulators, mode), t, state, accumulators, forecast)
 
@@ -154,7 +154,7 @@ def attempt_step(
         point: Point at the beginning.
         request: Step to attempt.
         tableau: Coefficients of the Runge-Kutta method.
-        forecast: What the stepping method foresees from the end.
+        forecast: Prediction of the stepping method from the end (`Stepping.forecast`).
         report: What the stepping method needs for its decision, from the dynamics at the end, the state there, and the
             shares of the rates in the error.
     """
@@ -221,8 +221,8 @@ def commit_step(
         clock: Instant at the end of the step.
         triggered: True for each event that happens there.
         mode: Mode after the changes.
-        logs: Rows of the blocks' logs, which the state is without (`core.log`).
-        forecast: What the stepping method foresees.
+        logs: Rows of the blocks' logs (`core.log`), which `advance` has taken out of the state.
+        forecast: Prediction of the stepping method (`Stepping.forecast`).
     """
     loop, end = system.loop, attempt.point
     state = end.state
@@ -248,7 +248,7 @@ def mode_in_step(system: LoopSystem, words: ModeBits, free: Bool) -> Mode:
         free: True for a step without a mode: each stage evaluates its comparisons, across switching surfaces.
     """
     all, none = jnp.uint32(0xFFFFFFFF), jnp.uint32(0)
-    return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.words)))
+    return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.word_count)))
 
 
 def mode_after_changes(system: LoopSystem, words: ModeBits, which: Scalar, lands: Bool) -> Mode:
@@ -263,7 +263,7 @@ def mode_after_changes(system: LoopSystem, words: ModeBits, which: Scalar, lands
         which: Number of a comparison.
         lands: True if the step ended on its switching surface.
     """
-    kept = (jnp.where(lands, bit, jnp.uint32(0)) for bit in single_bit(which, system.words))
+    kept = (jnp.where(lands, bit, jnp.uint32(0)) for bit in single_bit(which, system.word_count))
     return Mode(words, ~lands, tuple(~bit for bit in kept))
 
 
@@ -276,7 +276,7 @@ def flip_answer(system: LoopSystem, words: ModeBits, which: Scalar, lands: Bool)
         which: Number of the comparison.
         lands: True if the step ends on its switching surface.
     """
-    bits = single_bit(which, system.words)
+    bits = single_bit(which, system.word_count)
     return tuple(word ^ jnp.where(lands, bit, jnp.uint32(0)) for word, bit in zip(words, bits, strict=True))
 
 

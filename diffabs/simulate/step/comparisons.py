@@ -67,17 +67,17 @@ class SwitchedProgram:
         flat = self._add_jaxpr(closed.jaxpr, self._add_constants(closed.consts), self._inputs)
         self.outputs = jax.tree.unflatten(jax.tree.structure(shape), flat)
         self._number_comparisons(set(jax.tree.leaves(counts(self.outputs))))
-        self._orders: dict[tuple[int, ...], list[_Op]] = {}
+        self._operations: dict[tuple[int, ...], list[_Op]] = {}
 
     @property
-    def answers(self) -> int:
+    def bit_count(self) -> int:
         """Number of bits that hold the answers."""
         return max((first + int(np.prod(shape)) for first, shape in self.places), default=0)
 
     @property
-    def words(self) -> int:
+    def word_count(self) -> int:
         """Number of words that hold the answers; at least one."""
-        return max(1, -(-self.answers // WORD_BITS))
+        return max(1, -(-self.bit_count // WORD_BITS))
 
     def __call__(self, pick: Callable[[PyTree], PyTree], moving: PyTree, fixed: PyTree, mode: Mode) -> Scalar:
         """Return the outputs that `pick` picks at (`moving`, `fixed`) in `mode`."""
@@ -97,19 +97,20 @@ class SwitchedProgram:
         values = dict(self._constants)
         values.update(zip(self._inputs, map(jnp.asarray, jax.tree.leaves((moving, fixed))), strict=True))
         picked, tree = jax.tree.flatten(pick(self.outputs))
-        trace = ComparisonTrace(self.places, self.words, mode, look)
-        for op in self._order(tuple(picked)):
+        trace = ComparisonTrace(self.places, self.word_count, mode, look)
+        for op in self._operations_for(tuple(picked)):
             ins = [values[i] for i in op.ins]
             outs = _RESULT_FROM_ANSWERS[op.name](trace, op, *ins) if op.queries else op.apply(*ins)
             values.update(zip(op.outs, outs, strict=True))
         return tree.unflatten([values[i] for i in picked]), trace.answers() if look else None
 
-    def _order(self, wanted: tuple[int, ...]) -> list[_Op]:
-        if wanted not in self._orders:
-            self._orders[wanted] = [
+    def _operations_for(self, wanted: tuple[int, ...]) -> list[_Op]:
+        """Return the operations that the wanted values depend on, in the order of the program."""
+        if wanted not in self._operations:
+            self._operations[wanted] = [
                 op for op, on in zip(self.ops, self._needed_operations(set(wanted)), strict=True) if on
             ]
-        return self._orders[wanted]
+        return self._operations[wanted]
 
     def _needed_operations(self, values: set[int]) -> list[bool]:
         """Return for each operation whether these values depend on it."""
@@ -188,7 +189,7 @@ class SwitchedProgram:
         key = (y, x, not strict) if turned else (x, y, strict)
         if key not in numbers:
             numbers[key] = len(self.places)
-            first, size = self.answers, int(np.prod(shape))
+            first, size = self.bit_count, int(np.prod(shape))
             # Answers that fit in a word do not straddle two words: `ComparisonTrace.search` reads a single word.
             fits = first % WORD_BITS + size <= WORD_BITS or size > WORD_BITS
             self.places.append((first if fits else -(-first // WORD_BITS) * WORD_BITS, shape))

@@ -20,8 +20,8 @@ a later correction.
     refresh a step of length 0 evaluates the rates after an event, or within the mode beyond a switching surface. In a
             loop with a clock the rates are evaluated after every step, and no step of length 0 is needed
 
-The margins of comparisons have the first numbers; the margins of the stop and of the blocks' events follow. The margin
-of a comparison is known only at the end of an attempt.
+Every margin has a number. That of a comparison is the number of its bit; the stop and the blocks' events have the
+numbers after the last bit. The margin of a comparison is known only at the end of an attempt.
 
 Source: A. Griewank, A. Walther, Evaluating Derivatives, section 15.3 (order of the refinement).
 """
@@ -198,29 +198,29 @@ def find_surface_crossing(seen: Evaluation, which: Scalar, like: Scalar) -> Surf
 
 
 def find_crossings(
-    which: Scalar, comparisons: int, surface: SurfaceCrossing | None, before: list[PyTree], after: list[PyTree]
+    which: Scalar, bit_count: int, surface: SurfaceCrossing | None, before: list[PyTree], after: list[PyTree]
 ) -> AttemptCrossings:
-    """Return the crossings of switching surfaces and events within an attempt; comparisons have the first numbers.
+    """Return the crossings of switching surfaces and events within an attempt.
 
     Args:
         which: Number of the sought margin.
-        comparisons: Number of comparisons.
+        bit_count: Number of bits of the comparisons. Events have the numbers after them.
         surface: Contradicted comparisons at the end of the attempt; None if switching surfaces are not located.
         before: Margins of events at the beginning.
         after: Margins of events at the end.
     """
-    events = find_event_crossings(which, comparisons, before, after)
+    events = find_event_crossings(which, bit_count, before, after)
     if surface is None:
         return events
     unknown, bends = jnp.full_like(surface.margin, jnp.inf), surface.other >= 0
     at = [jnp.where(surface.chosen == one, surface.margin, jnp.inf) for one in (which, surface.other)]
-    sought = select(which < comparisons, EventCrossing(which, at[0], unknown), events.sought)
+    sought = select(which < bit_count, EventCrossing(which, at[0], unknown), events.sought)
     other = select(bends, EventCrossing(surface.other, at[1], unknown), events.other)
     return AttemptCrossings(sought, surface.contradicted | events.falls, other, bends | events.another)
 
 
 def continue_search(
-    plan: SearchPlan, crossings: AttemptCrossings, base: Scalar, comparisons: int, *, refines: bool
+    plan: SearchPlan, crossings: AttemptCrossings, base: Scalar, bit_count: int, *, refines: bool
 ) -> SearchPlan:
     """Return the search after an attempt that contains an event or a switching surface.
 
@@ -228,14 +228,14 @@ def continue_search(
         plan: The search before the attempt, the length of the attempt, and the status of the run.
         crossings: Crossings within the attempt.
         base: Length of a regular step [s], the scale of the tolerances.
-        comparisons: Number of comparisons whose switching surfaces are located.
+        bit_count: Number of bits of the comparisons; 0 if switching surfaces are not located.
         refines: True if the event's time has second derivatives.
     """
     old, length, status = plan
     search, next, near = bracket_event(old, length, status == RunStatus.RUNNING, crossings, base)
     seeking = SearchPlan(search, next, jnp.where(near, RunStatus.PROBING, RunStatus.SEEKING))
     # A step ends sqrt(eps) steps beyond a switching surface, so that the comparison has surely changed there.
-    beyond = jnp.where(old.which < comparisons, base * jnp.finfo(base.dtype).eps ** OVERSHOOT_EXPONENT, 0.0)
+    beyond = jnp.where(old.which < bit_count, base * jnp.finfo(base.dtype).eps ** OVERSHOOT_EXPONENT, 0.0)
     search, next = locate_event(old, length, crossings, beyond)
     next, missed = accept_location(search, length, next)
     located = jnp.where(missed, RunStatus.SEEKING, RunStatus.REFINING if refines else RunStatus.LANDING)
@@ -247,7 +247,7 @@ def continue_search(
 
 
 def bracket_event(
-    search: EventSearch, x: Scalar, new: PyTree, tells: AttemptCrossings, h: Scalar
+    search: EventSearch, x: Scalar, new: PyTree, crossings: AttemptCrossings, h: Scalar
 ) -> tuple[EventSearch, PyTree, PyTree]:
     """Return three values after an attempt: the search for the earliest event, the next length [s], and a flag.
 
@@ -257,13 +257,13 @@ def bracket_event(
         search: Search before the attempt.
         x: Length of the attempt [s].
         new: True if no search was active.
-        tells: Crossings within the attempt.
+        crossings: Crossings within the attempt.
         h: Length of a regular step [s], the scale of the tolerances.
     """
     # The search works on values only: the derivative of the event's time comes from the final Newton step.
     x = jax.lax.stop_gradient(x)
-    changes = tells.another & ~tells.falls
-    fresh, sought = new | changes, select(changes, tells.other, tells.sought)
+    changes = crossings.another & ~crossings.falls
+    fresh, sought = new | changes, select(changes, crossings.other, crossings.sought)
     search, slope = _narrow_bracket(search, x, fresh, sought)
     search = search._replace(tries=jnp.where(new, 0, search.tries) + 1)
     falls = slope < 0
@@ -286,14 +286,18 @@ def bracket_event(
     found = near | at_once
     search = search._replace(place=x, margin=jnp.where(found, sought.end, 0.0), found=found, at_once=at_once)
     # The attempt ends just beyond the sought zero. If another margin falls through zero in it, its zero is earlier.
-    earlier = enough & ~at_once & tells.another & ~changes & tells.falls & (search.tries < MAX_LOCATION_ATTEMPTS)
-    search = select(earlier, _bracket(search, x, tells.other), search)
+    earlier = (
+        enough & ~at_once & crossings.another & ~changes & crossings.falls & (search.tries < MAX_LOCATION_ATTEMPTS)
+    )
+    search = select(earlier, _bracket(search, x, crossings.other), search)
     # The next attempt is just before this zero, because two margins often fall at the same time.
     before = jnp.where(x > 4 * NEWTON_RADIUS_STEPS * h, x - 2 * NEWTON_RADIUS_STEPS * h, 0.5 * x)
     return search, jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier
 
 
-def locate_event(search: EventSearch, x: Scalar, tells: AttemptCrossings, beyond: Scalar) -> tuple[EventSearch, PyTree]:
+def locate_event(
+    search: EventSearch, x: Scalar, crossings: AttemptCrossings, beyond: Scalar
+) -> tuple[EventSearch, PyTree]:
     """Return the search with the margin's slope, and the length of the step that ends on the zero, after the probe.
 
     The slope is that of the parabola through the place, the probe, and one end of the first attempt. This is the end on
@@ -302,37 +306,37 @@ def locate_event(search: EventSearch, x: Scalar, tells: AttemptCrossings, beyond
     Args:
         search: Search before the probe.
         x: Length of the probe [s].
-        tells: Crossings within the probe.
+        crossings: Crossings within the probe.
         beyond: Time [s] to add to the length, so that the margin surely changes its sign.
     """
     x = jax.lax.stop_gradient(x)
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
     # The margin is unknown if another comparison changes at the probe and the sought one does not.
-    told = jnp.isfinite(tells.sought.end)
-    probe = tells.sought._replace(end=jnp.where(told, tells.sought.end, margin))
+    told = jnp.isfinite(crossings.sought.end)
+    probe = crossings.sought._replace(end=jnp.where(told, crossings.sought.end, margin))
     g, start = jax.lax.stop_gradient(probe[1:])
     ends = (search.full, search.at_full), (0.0 * x, start)
     side, other = select(margin < 0, ends, ends[::-1])
-    near = _shows_curvature(side, place, x)
-    end, at_end = third = select(near, side, other)
+    same_side = _shows_curvature(side, place, x)
+    end, at_end = third = select(same_side, side, other)
     fall = (g - margin) / (x - place)
     changes = ratio(at_end - g, end - x) - fall
-    far = near | (_shows_curvature(third, place, x) & (jnp.abs(changes) <= MAX_SLOPE_CHANGE * jnp.abs(fall)))
+    curved = same_side | (_shows_curvature(third, place, x) & (jnp.abs(changes) <= MAX_SLOPE_CHANGE * jnp.abs(fall)))
     # Newton's divided differences: `fall` is the first, `bend` the second.
-    bend = jnp.where(far, ratio(changes, end - place), 0.0)
+    bend = jnp.where(curved, ratio(changes, end - place), 0.0)
     at_place = jnp.where(told, fall + (place - x) * bend, 0.0)
     # Division by -inf instead of a slope that is not negative: the length stays at the place.
     length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)
     slope = at_place + 2.0 * (length - place) * bend
-    last, at_last = select(near & _shows_curvature(other, place, x), other, third)
+    last, at_last = select(same_side & _shows_curvature(other, place, x), other, third)
     # The third divided difference improves the slope unless it is large: then a kink lies between the points.
     more = ratio(ratio(ratio(at_last - g, last - x) - fall, last - place) - bend, last - end)
     more *= (length - place) * (length - x) + (length - place + length - x) * (length - end)
     slope += jnp.where(jnp.abs(more) <= MAX_CUBIC_CORRECTION * jnp.abs(slope), more, 0.0)
-    far = jnp.abs(length - place) > jnp.abs(x - place)
-    length = jnp.where(far, jnp.maximum(jnp.minimum(length, search.far), search.near), length)
-    known = search.found & (slope < 0) & ~far
-    moved = length + jnp.where(far, 0.0, _length_tangent(search, x, probe.end, length, slope))
+    beyond_probe = jnp.abs(length - place) > jnp.abs(x - place)
+    length = jnp.where(beyond_probe, jnp.maximum(jnp.minimum(length, search.far), search.near), length)
+    known = search.found & (slope < 0) & ~beyond_probe
+    moved = length + jnp.where(beyond_probe, 0.0, _length_tangent(search, x, probe.end, length, slope))
     steep = _falls_from_start(search, at_place, start)
     known &= ~search.at_once | steep
     # For an event at the beginning of the step the length is clipped at 0 in value, but not in its derivative.
@@ -340,7 +344,7 @@ def locate_event(search: EventSearch, x: Scalar, tells: AttemptCrossings, beyond
     return search._replace(fall=jnp.where(known, slope, 0.0)), jnp.where(search.at_once, at_once, moved) + beyond
 
 
-def refine(search: EventSearch, x: Scalar, tells: AttemptCrossings) -> Scalar:
+def refine(search: EventSearch, x: Scalar, crossings: AttemptCrossings) -> Scalar:
     """Return x with the second derivatives of the event's time.
 
     The value is unchanged. The derivatives come from a Newton step on the margin at the end of an attempt of length x.
@@ -348,9 +352,9 @@ def refine(search: EventSearch, x: Scalar, tells: AttemptCrossings) -> Scalar:
     Args:
         search: Search with the slope of the margin.
         x: Length of the step that ends on the event [s].
-        tells: Crossings within an attempt of this length.
+        crossings: Crossings within an attempt of this length.
     """
-    left = jnp.where((search.fall < 0) & jnp.isfinite(tells.sought.end), tells.sought.end, 0.0)
+    left = jnp.where((search.fall < 0) & jnp.isfinite(crossings.sought.end), crossings.sought.end, 0.0)
     return x - (left - jax.lax.stop_gradient(left)) / jnp.where(search.fall < 0, search.fall, -1.0)
 
 

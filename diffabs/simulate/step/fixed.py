@@ -88,10 +88,9 @@ class FixedStepping:
         return cast_floats(carry._replace(control=FixedStepControl(carry.k, carry.k)), self.h.dtype)
 
     def step(self, loop: Loop, objectives: Objectives, key: Key, carry: Carry, until: Scalar = None) -> Carry:
-        """Return the `carry` after one attempt of a step, unchanged if the run is over or has reached the instant
-        `until`.
+        """Return the `carry` after one attempt of a step, as `advance` does.
 
-        `loop`, `objectives` and `key` are those of `start`.
+        The run pauses at the instant `until` of the grid. `loop`, `objectives` and `key` are those of `start`.
         """
         return advance(self, loop, objectives, key, carry, until)
 
@@ -121,9 +120,9 @@ class FixedStepping:
         return dataclasses.replace(self, kinks=self.kinks is not False, second_order=True)
 
     def capacity(self, loop: Loop, steps: int) -> int:
-        """Return the greatest number of attempts in a number of `steps` of this `loop`: the capacity of a scan.
+        """Return the capacity of a scan for a number of `steps` of this `loop`: the greatest usual number of attempts.
 
-        At least four attempts belong to an event, and REFINING repeats one of them.
+        An event takes at least four attempts. One of them is REFINING, which `FixedStepControl.extra` does not count.
         """
         crossings = CROSSING_ATTEMPTS_PER_STEP if self.kinks is not False else 0
         about = (crossings + (EVENT_ATTEMPTS_PER_STEP if loop.eventful else 0)) * steps + SPARE_ATTEMPTS
@@ -165,7 +164,7 @@ class FixedStepping:
         return decide_attempt(system, carry, attempt, active, fine, fine, last=last, frozen=system.program is not None)
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an `attempt` with the next attempt planned: to the grid, or as the search asks.
+        """Return the carry `after` an `attempt` with length and status of the next one: to the grid, or for the search.
 
         `carry` is the run in `system` before the attempt, and `decision` the decision on it.
         """
@@ -174,15 +173,15 @@ class FixedStepping:
         here = jnp.where(on_grid, 0, control.here + extra - control.extra)
         unrestricted, status = carry.unrestricted, after.status
         if system.program:
-            tired = (
+            gave_up = (
                 (after.search.tries >= MAX_LOCATION_ATTEMPTS)
                 | (control.here >= MAX_ATTEMPTS_PER_STEP)
                 | (control.extra > CROSSING_ATTEMPTS_PER_STEP * carry.k + SPARE_ATTEMPTS)
             )
-            tired &= decision.searches & (after.search.which < system.comparisons)
-            begins = ~decision.taken & ~unrestricted & (~decision.fine | tired)
-            unrestricted = (unrestricted | begins) & ~(on_grid & have_same_answers(carry, attempt))
-            status = jnp.where(begins, RunStatus.RUNNING, status)
+            gave_up &= decision.searches & (after.search.which < system.bit_count)
+            becomes_unrestricted = ~decision.taken & ~unrestricted & (~decision.fine | gave_up)
+            unrestricted = (unrestricted | becomes_unrestricted) & ~(on_grid & have_same_answers(carry, attempt))
+            status = jnp.where(becomes_unrestricted, RunStatus.RUNNING, status)
         most = (EVENT_ATTEMPTS_PER_STEP + CROSSING_ATTEMPTS_PER_STEP) * self.steps + SPARE_ATTEMPTS
         lost = (~decision.fine & (carry.unrestricted if system.program else True)) | (extra > most)
         strikes = status == RunStatus.RUNNING

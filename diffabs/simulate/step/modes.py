@@ -22,8 +22,9 @@ class Mode(NamedTuple):
 
     Attributes:
         words: The answers; None takes the answers of the numbers.
-        free: True overrides the frozen answers by the answers of the numbers.
-        released: Answers that give way where the numbers contradict them, in an evaluation with `look`.
+        free: True overrides the frozen answers by the answers of the numbers. An evaluation with `look` ignores it,
+            except for a search in knots.
+        released: Answers that give way where the numbers contradict them. Only an evaluation with `look` reads them.
     """
 
     words: ModeBits | None

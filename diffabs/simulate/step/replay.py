@@ -76,11 +76,11 @@ class ReplayControl(NamedTuple):
     """Numbers of `ReplayStepping` in a carry.
 
     Attributes:
-        late: Difference between the time of the replay and the logged time [s].
+        delay: Time of the replay minus the logged time [s].
         last_step: Last step, a `StateSpan`; () without a trajectory.
     """
 
-    late: Scalar
+    delay: Scalar
     last_step: PyTree
 
 
@@ -121,7 +121,7 @@ class ReplayStepping:
     def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a replay at t = 0, from `loop`, `objectives` and random `key`."""
         carry = start_carry(self, loop, objectives, key)
-        last = span_step(carry.point, carry.point) if self.live.keeps else ()
+        last = span_step(carry.point, carry.point) if self.live.keeps_last_step else ()
         control = ReplayControl(jnp.zeros_like(self.h), last)
         # A run whose start is over has no logged attempt.
         running = jnp.asarray(RunStatus.RUNNING.value)
@@ -150,7 +150,7 @@ class ReplayStepping:
         If the last step ended late, this one is shorter: it ends at the logged time.
         """
         one, k = self.logged, carry.k
-        h = jnp.where(one.refresh, 0.0, one.length - carry.control.late)
+        h = jnp.where(one.refresh, 0.0, one.length - carry.control.delay)
         end = jnp.where(one.refresh, carry.point.t, one.t)
         words = select(one.refresh, one.next_words, one.words)
         mode = mode_in_step(system, words, one.unrestricted)
@@ -188,11 +188,11 @@ class ReplayStepping:
 
         `carry` is the replay in `system` before the attempt, and `decision` the decision on it.
         """
-        late, last = carry.control
-        late = jnp.where(decision.taken & ~self.logged.refresh, attempt.shift, late)
-        if self.live.keeps:
+        delay, last = carry.control
+        delay = jnp.where(decision.taken & ~self.logged.refresh, attempt.shift, delay)
+        if self.live.keeps_last_step:
             last = select(decision.taken, span_step(carry.point, attempt.point), last)
-        return after._replace(control=ReplayControl(late, last))
+        return after._replace(control=ReplayControl(delay, last))
 
 
 class ReplayedRun(NamedTuple):
@@ -344,7 +344,7 @@ def _time_to_event(one: StepLog, strikes: Bool, end: Evaluation) -> Scalar:
 
 
 def _time_to_zero(on: Bool, margin: Scalar, fall: Scalar, most: Scalar) -> tuple[Bool, Scalar]:
-    """Return True if a margin is zero within `most` seconds and is `on`, and the time to its zero [s]."""
+    """Return True if the margin is sought (`on`) and zero within `most` seconds, and the time to its zero [s]."""
     close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(most) * fall))
     # The fall may be frozen: its derivative is multiplied by the margin, which is 0 except for rounding.
     return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))

@@ -28,7 +28,7 @@ MIN_CROSSING_STEP_FRACTION = 4e-3  # fraction of the length that the error allow
 
 
 def error_scales(state: LoopState, sample: Sample) -> PyTree:
-    """Return the scales of the error: the size of the first signal or of its setpoint, and the size of every state.
+    """Return the scales of the error: the greater of |first signal| and |setpoint|, and the size of every state.
 
     Args:
         state: State of the loop.

@@ -24,7 +24,7 @@ class SwitchingFunction(NamedTuple):
 
     Attributes:
         numbers: Numbers of the comparisons' bits.
-        value: Margins x - y.
+        value: Margins x - y; within a mode, negative where the numbers contradict the answer.
         rate: Rates of the margins [1/s]; None if they were not evaluated.
     """
 

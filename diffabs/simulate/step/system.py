@@ -1,8 +1,8 @@
 """The dynamics of the loop and its objectives, as one function of time and state.
 
-Fixed steps for values evaluate the parts directly, unless switching surfaces are located. All other runs trace a
-program whose comparisons are visible (`comparisons`). Steps that locate switching surfaces, and logged steps, freeze a
-mode. Without a mode, the derivative of a step places a kink up to one step too early or too late.
+Fixed steps evaluate the parts directly, unless switching surfaces are located. All other runs trace a program whose
+comparisons are visible (`comparisons`). Fixed steps on this program freeze a mode, and so do adaptive steps that are
+logged or replayed. Without a mode, the derivative of a step places a kink up to one step too early or too late.
 """
 
 from typing import NamedTuple
@@ -85,14 +85,14 @@ class LoopSystem(NamedTuple):
     has_margin_rates: bool
 
     @property
-    def words(self) -> int:
+    def word_count(self) -> int:
         """Number of words that hold the answers to the comparisons."""
-        return self.program.words if self.program else 0
+        return self.program.word_count if self.program else 0
 
     @property
-    def comparisons(self) -> int:
+    def bit_count(self) -> int:
         """Number of bits that hold the answers to the comparisons; margins of events have the numbers after them."""
-        return self.program.answers if self.program else 0
+        return self.program.bit_count if self.program else 0
 
     def rates(self, t: Scalar, z: PyTree, held: PyTree, mode: Mode) -> PyTree:
         """Return dz/dt at time `t` within a `mode`, with z and `held` as `split_flow_and_held` returns them."""
