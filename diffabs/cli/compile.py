@@ -42,8 +42,9 @@ def compile_scenario(
 ) -> None:
     """Show the program of a kernel after each pass.
 
-    Without --show it shows the number of operations after each pass. Without --by, passes on derivatives take the first
-    tunable parameter of the plant."""
+    Without --show it shows the number of operations after each pass, of values and of tangents. --show prints the
+    program of values; with --by, the one with tangents. Only the pass jvp always has tangents. Without --by, the
+    tangents are by the first tunable parameter of the plant."""
     with console.end_on_errors():
         if name is not None and name not in PASSES:
             raise unknown_name_error(f"--show {name} is unknown", name, PASSES)
@@ -56,7 +57,7 @@ def compile_scenario(
             paths = _differentiated_paths(chosen, by or [])
             values, derivative = console.run_with_progress(lambda: _trace(chosen, paths), f"tracing {chosen.name}")
             if name:
-                # With --by every pass shows the derivative's program; without, only those that exist for derivatives.
+                # With --by every pass shows the program with tangents; without it only jvp, which values do not have.
                 call = derivative if by or name == "jvp" else values
                 text = console.run_with_progress(lambda: list_pass(call, name), f"pass {name}")
                 file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
@@ -66,7 +67,7 @@ def compile_scenario(
 
 
 def _differentiated_paths(chosen: Scenario, by: list[str]) -> list[str]:
-    """Return the paths of the tangents. Raises ScenarioError."""
+    """Return the parameters to differentiate by: `by`, else the plant's first tunable number. Raises ScenarioError."""
     tunable = {
         path: spec for path, spec, value in parameters(chosen.loop) if spec.tunable and np.ndim(np.asarray(value)) == 0
     }
@@ -83,7 +84,7 @@ def _differentiated_paths(chosen: Scenario, by: list[str]) -> list[str]:
 
 
 def _trace(chosen: Scenario, paths: list[str]) -> tuple[LaneCall, LaneCall]:
-    """Return the kernel calls for values and for derivatives of all metrics. Raises ScenarioError."""
+    """Return the kernel calls of one run: of its metrics, and of their derivatives by `paths`. Raises ScenarioError."""
 
     def run(x: Array) -> dict[str, Array]:
         values = {path: x[i][None] for i, path in enumerate(paths)}
@@ -100,6 +101,7 @@ def _trace(chosen: Scenario, paths: list[str]) -> tuple[LaneCall, LaneCall]:
 
 
 def _count(chosen: Scenario, paths: list[str], values: LaneCall, derivative: LaneCall) -> JsonObject:
+    """Return the numbers of operations by pass and level, for --json; `paths` are those of the tangents."""
     programs = {
         "lower": values.lanes.derivative(None).program,
         "eliminate": values.program(),
@@ -115,6 +117,7 @@ def _count(chosen: Scenario, paths: list[str], values: LaneCall, derivative: Lan
 
 
 def _show(result: JsonObject, chosen: Scenario) -> None:
+    """Print the numbers of operations as a table."""
     table = Table("after pass", "once a launch", "once a run", "in each step")
     for name, counts in result["operations"].items():
         table.add_row(name, *(str(counts[level]) for level in ("uniform", "lane", "step")))

@@ -72,7 +72,7 @@ class LanePrograms:
         return self._derivatives[seeds]
 
     def program(self, seeds: PyTree, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
-        """Return the program to launch: `many` tangent directions, without updates that the arrays in `read` never need.
+        """Return the program to launch, with `many` tangent directions and without updates that nothing reads.
 
         `seeds` is as in `derivative`. `as_lanes` holds the indices of the uniform arrays that vmap has given a value
         per lane.
@@ -99,7 +99,7 @@ class LanePrograms:
         return [ArrayKey(level, i, True) for level, i in seeds or ()]
 
     def result_keys(self, seeds: PyTree) -> list[ArrayKey]:
-        """Return the keys of the primitive's results, in their order.
+        """Return the keys of the primitive's results for the initial tangents in `seeds`, in their order.
 
         These are all arrays of the carry, and then the tangents that can be nonzero and influence a wanted array.
         """

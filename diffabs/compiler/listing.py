@@ -105,7 +105,7 @@ def _operation(node: Node, names: dict[int, str]) -> str:
 
 
 def _arrows(program: ScalarProgram, function: str, names: dict[int, str]) -> Iterator[str]:
-    """Yield lines for what a function returns: the numbers of the carry that it changes, or whether the lane goes on."""
+    """Yield the lines for what a function returns: numbers of the carry that it changes, or if the lane goes on."""
     results = program.results[function]
     if function == RUNNING_FUNCTION:
         yield f"-> {names[results[0].id]}"

@@ -214,7 +214,7 @@ class TestLaunch:
             reverse(lambda g: jnp.sum(chain(g, RATES)))
 
     @killed_by(
-        "compiler/runtime/jax_primitive.py", "    if begins is not None:\n        raise", "    if False:\n        raise"
+        "compiler/runtime/jax_primitive.py", "    if seeds is not None:\n        raise", "    if False:\n        raise"
     )
     def test_second_derivatives_are_refused(self):
         with pytest.raises(ValueError, match="a kernel has no second derivatives"):

@@ -128,7 +128,7 @@ def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
             if any(contrary):
                 assert int(contrary[int(chosen) // 32]) >> (int(chosen) % 32) & 1
                 assert margin < 0
-        gives_way = regime._replace(released=(~jnp.uint32(0),) * one.words, free=jnp.asarray(True))
+        gives_way = regime._replace(released=(~jnp.uint32(0),) * one.word_count, free=jnp.asarray(True))
         value, answers = one.look(same, 2.2, 0.6, gives_way)
         np.testing.assert_array_equal(value, f(jnp.asarray(2.2), jnp.asarray(0.6)))
         assert answers.words == held(one, 2.2).words
@@ -162,7 +162,7 @@ def test_a_product_that_has_become_0_is_held_by_nobody():
     """(x - min(x, p)) x > 0 above p, and 0 > 0 below, which contradicts nobody: it gives way all the same."""
     one = program(lambda x, p: jnp.where((x - jnp.minimum(x, p)) * x > 0, 1.0, 0.0))
     above = held(one, 2.0)
-    gives_way = above._replace(released=(~jnp.uint32(0),) * one.words)
+    gives_way = above._replace(released=(~jnp.uint32(0),) * one.word_count)
     assert one.look(same, 2.1, 0.6, gives_way)[0] == 1
     value, answers = one.look(same, 0.5, 0.6, gives_way)
     assert value == 0

@@ -1,15 +1,15 @@
-"""A choice of the tangents that a program computes: vertex elimination for the fewest operations.
+"""Vertex elimination: the tangents that a program computes, chosen for few operations.
 
-A chain of linear operations on a tangent equals one product with the product of the factors, which is the same for all
-tangents. So a vertex is eliminated from the graph of one tangent if the given number of tangents then needs no more
-operations than before.
+A chain of linear operations on a tangent equals one product with the product of the factors, which is the same in all
+tangent directions. A vertex is eliminated if all directions together then need no more operations than before. The
+search is greedy: it need not find the fewest operations.
 """
 
 from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from diffabs.compiler.autodiff.linear import FACTOR_ONE, Algebra, Factor, Sum, Vertex, changes_in_step, count_terms
+from diffabs.compiler.autodiff.linear import FACTOR_ONE, Algebra, Factor, Sum, Vertex, changes_in_step, sum_cost
 from diffabs.compiler.ir import Graph, Node, UpdateLevel
 
 
@@ -20,11 +20,11 @@ class Elimination:
         graph: Graph of the factors.
         many: Number of tangent directions.
         algebra: Operations on sums of tangents.
-        vertices: Computed tangents by node id.
-        readers: For each tangent, the ids of the vertices that read it.
-        kept: Ids of tangents that nonlinear operations or results read, which must remain.
-        levels: For each tangent, how often its value changes.
-        any_factor: Placeholder for a factor whose value does not matter for a count of operations.
+        vertices: Tangents to compute, by the id of their node; without those that are inputs.
+        readers: For each tangent, inputs included, the ids of the vertices that read it.
+        kept: Ids of the tangents that must remain: nonlinear operations read them, or they are results.
+        levels: For each tangent, inputs included, how often its value changes.
+        any_factor: Placeholder in counts of operations, for a factor whose value does not matter.
     """
 
     def __init__(self, graph: Graph, many: int, dtype: np.dtype):
@@ -42,18 +42,18 @@ class Elimination:
         self.levels: dict[int, UpdateLevel] = {}
         self.any_factor = graph.input(dtype, UpdateLevel.STEP, "any factor")
 
-    def begin(self, node: int, level: UpdateLevel) -> None:
-        """Add a seeded tangent: `node` is its id, `level` tells how often its value changes."""
+    def add_input(self, node: int, level: UpdateLevel) -> None:
+        """Add a tangent that is an input: `node` is its id, `level` tells how often its value changes."""
         self.levels[node] = level
         self.readers[node] = set()
 
-    def add(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> None:
-        """Add an operation on tangents; its operands must be there already.
+    def add_operation(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> None:
+        """Add the tangent that an operation computes; its operands must be there already.
 
         Args:
             node: Operation in the graph of one tangent.
-            moves: Function that returns True if a node is a nonzero tangent.
-            value: Function that returns the factor graph's node for any other number.
+            moves: Function that returns True for a tangent that can be nonzero.
+            value: Function that returns the factor graph's node for any other node.
         """
         new = self.vertices[node.id] = self.algebra.vertex(node, moves, value)
         self.readers[node.id] = set()
@@ -71,25 +71,26 @@ class Elimination:
     # costs ------------------------------------------------------------------------------------------------------------
 
     def _cost(self, vertex: Vertex) -> int:
-        """Return the operations of a vertex for all tangents, by the cheaper of selecting tangents and selecting
-        factors.
-        """
-        cost = self.many * (sum(map(count_terms, vertex.sums())) + (vertex.which is not None))
-        return min(cost, self._factor_choice_cost(vertex)) if self._can_choose_factors(vertex) else cost
+        """Return the number of operations of a vertex in all directions.
 
-    def _can_choose_factors(self, vertex: Vertex) -> bool:
-        """Return whether a selection between tangents may become a selection between factors.
+        A selection selects between tangents or between factors, whichever is cheaper and possible.
+        """
+        cost = self.many * (sum(map(sum_cost, vertex.sums())) + (vertex.which is not None))
+        return min(cost, self._factor_selection_cost(vertex)) if self._can_select_factors(vertex) else cost
+
+    def _can_select_factors(self, vertex: Vertex) -> bool:
+        """Return whether a vertex is a selection that may select between factors instead of tangents.
 
         The factor 0 does not remove a NaN or infinity in the branch not taken. So a tangent in one branch only must be
-        an input that is constant over the steps: an iterate of a step may diverge.
+        an input that is constant over the steps. Other tangents may diverge within a step.
         """
         once = set(vertex.sum) ^ set(vertex.others)
         return vertex.which is not None and all(
             x not in self.vertices and self.levels[x] < UpdateLevel.STEP for x in once
         )
 
-    def _factor_choice_cost(self, vertex: Vertex) -> int:
-        """Return the operations of a vertex for all tangents with a selection between factors."""
+    def _factor_selection_cost(self, vertex: Vertex) -> int:
+        """Return the number of operations of a selection in all directions if it selects between factors."""
         keys = set(vertex.sum) | set(vertex.others)
         chosen = [x for x in keys if vertex.sum.get(x) != vertex.others.get(x)]
         # One term with the factor 1 starts the sum and needs no operation.
@@ -97,8 +98,11 @@ class Elimination:
         return self.many * (len(keys) - units) + len(chosen)
 
     def _saving_without(self, key: int, inner: Sum) -> int:
-        """Return the number of operations saved if the readers of a vertex use its sum `inner` instead."""
-        spared = self.many * count_terms(inner)
+        """Return the operations saved in all directions if the readers of a vertex use its sum `inner` instead.
+
+        Operations that compute new factors count against it.
+        """
+        spared = self.many * sum_cost(inner)
         for reader in self.readers[key]:
             old = self.vertices[reader]
             new, more = [], 0
@@ -110,9 +114,9 @@ class Elimination:
         return spared
 
     def _substituted_sum(self, outer: Sum, key: int, inner: Sum) -> tuple[Sum, int]:
-        """Return `outer` with `inner` in place of a vertex, and the extra operations on factors.
+        """Return `outer` with `inner` in place of the tangent `key`, and the number of extra operations on factors.
 
-        The factors of the result are placeholders: only their number matters here.
+        New factors of the result are placeholders: only their number matters here.
         """
         factor, more = outer[key], 0
         found = {x: one for x, one in outer.items() if x != key}
@@ -142,10 +146,11 @@ class Elimination:
             before = len(self.vertices)
             # From the results back: an eliminated vertex passes its sum to readers that are already reduced.
             for key in sorted(self.vertices, reverse=True):
-                self._try(key)
+                self._try_to_eliminate(key)
             left = len(self.vertices) < before
 
-    def _try(self, key: int) -> None:
+    def _try_to_eliminate(self, key: int) -> None:
+        """Eliminate a vertex or turn its selection into a sum, if this does not raise the number of operations."""
         vertex = self.vertices[key]
         # Nonlinear operations stay. Work outside the steps is not worth a reduction.
         if vertex.reads or self.levels[key] < UpdateLevel.STEP:
@@ -154,22 +159,25 @@ class Elimination:
             self._replace_by_sum(key, {})
             self._eliminate(key)
             return
-        if key not in self.kept and self._join_choices(key):
+        if key not in self.kept and self._merge_selection(key):
             return
-        decided, before = vertex.sum, self._cost(vertex)
+        new_sum, before = vertex.sum, self._cost(vertex)
         if vertex.which is not None:
-            if not self._can_choose_factors(vertex):
+            if not self._can_select_factors(vertex):
                 return
-            decided = self.algebra.decide(vertex)
-        spared = before - (self._factor_choice_cost(vertex) if vertex.which is not None else before)
-        if key not in self.kept and spared + self._saving_without(key, decided) >= 0:
-            self._replace_by_sum(key, decided)
+            new_sum = self.algebra.select_factors(vertex)
+        spared = before - (self._factor_selection_cost(vertex) if vertex.which is not None else before)
+        if key not in self.kept and spared + self._saving_without(key, new_sum) >= 0:
+            self._replace_by_sum(key, new_sum)
             self._eliminate(key)
         elif vertex.which is not None and spared >= 0:
-            self._replace_by_sum(key, decided)
+            self._replace_by_sum(key, new_sum)
 
-    def _join_choices(self, key: int) -> bool:
-        """Merge a selection of one tangent or zero into its readers if all are such selections; return success."""
+    def _merge_selection(self, key: int) -> bool:
+        """Merge a selection between one tangent and 0 into its readers, and return whether that was possible.
+
+        All readers must be selections between that tangent, this vertex and 0.
+        """
         vertex = self.vertices[key]
         one = vertex.sum or vertex.others
         if vertex.which is None or len(one) != 1 or (vertex.sum and vertex.others):
@@ -178,7 +186,7 @@ class Elimination:
         readers = [self.vertices[reader] for reader in self.readers[key]]
         if any(r.which is None or any(side and side not in (one, whole) for side in r.sums()) for r in readers):
             return False
-        # Both selections pick the same tangent or zero, so one truth, the nested selection, describes each reader.
+        # A reader then is this tangent or 0, so one condition, made of both selections, is enough for it.
         sides = (self.graph.const(bool(side)) for side in vertex.sums())
         taken = self.graph.select(vertex.which, *sides)
         for reader in readers:
@@ -191,22 +199,22 @@ class Elimination:
         del self.vertices[key]
         return True
 
-    def _replace_by_sum(self, key: int, decided: Sum) -> None:
-        """Replace a vertex by a plain sum and update the readers of its former operands."""
+    def _replace_by_sum(self, key: int, new_sum: Sum) -> None:
+        """Make a vertex the sum `new_sum`, and remove it from the readers of operands that it no longer has."""
         old = self.vertices[key]
-        self.vertices[key] = Vertex(decided)
-        for x in {x for sum in old.sums() for x in sum} - set(decided):
+        self.vertices[key] = Vertex(new_sum)
+        for x in {x for sum in old.sums() for x in sum} - set(new_sum):
             self.readers[x].discard(key)
 
     def _eliminate(self, key: int) -> None:
-        """Remove a vertex: substitute its sum into each reader."""
+        """Remove a vertex that is a sum: substitute it into each reader."""
         inner = self.vertices[key]
         for reader in self.readers.pop(key):
             vertex = self.vertices[reader]
             if key in vertex.sum:
-                vertex.sum = self.algebra.within(vertex.sum, key, inner.sum)
+                vertex.sum = self.algebra.substitute(vertex.sum, key, inner.sum)
             if key in vertex.others:
-                vertex.others = self.algebra.within(vertex.others, key, inner.sum)
+                vertex.others = self.algebra.substitute(vertex.others, key, inner.sum)
             # Terms may cancel in the merged sum, so operands are added to or removed from the reader lists.
             now = {x for sum in vertex.sums() for x in sum}
             for x in inner.sum:

@@ -1,8 +1,8 @@
-"""Forward-mode derivatives of functions of one lane: one program of the values and several tangents of each number.
+"""Forward-mode derivatives of functions of one lane: a program of the values and of several tangent directions.
 
-The program comes from `jax.jvp`, traced with one tangent for every array that could have one. Reachability in its graph
-then shows which arrays have nonzero tangents: the seeded ones, and everything they reach from step to step. Only these
-tangents are repeated, as often as requested. All other tangents are zero, and so are their results.
+`differentiate_functions` lowers `jax.jvp` of the functions, with one tangent for each seeded array and each real array
+of the carry. Reachability in its graph then shows which arrays of the carry have a tangent that can be nonzero and that
+influences a wanted result. `replicate_tangents` writes these tangents once for each direction. All others are zero.
 """
 
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ from diffabs.compiler.trace import TracedFunction, TracedFunctions
 from diffabs.core.types import PyTree
 
 INPUT_LEVELS = (UpdateLevel.UNIFORM, UpdateLevel.LANE, UpdateLevel.STEP)
-TangentArrays = dict[UpdateLevel, tuple[int, ...]]  # numbers of the arrays with tangents, by level
+TangentArrays = dict[UpdateLevel, tuple[int, ...]]  # indices of arrays that have a tangent, by level
 
 
 class ArrayKey(NamedTuple):
@@ -27,7 +27,7 @@ class ArrayKey(NamedTuple):
     Attributes:
         level: Level of the array when the functions were traced.
         number: Index of the array in that level.
-        tangent: True if the key means the array's tangents.
+        tangent: True for the tangents of the array, False for its values.
     """
 
     level: UpdateLevel
@@ -36,13 +36,13 @@ class ArrayKey(NamedTuple):
 
 
 class DerivativeProgram(NamedTuple):
-    """A program with one tangent direction. In each level, the tangents of the arrays follow the arrays.
+    """A program with one tangent direction. In each level, its arrays are all values and then the tangents.
 
     Attributes:
         program: Operations and results.
-        differentiable: Indices of the arrays that have a tangent in the program, by level.
-        moved_arrays: Indices of the arrays whose tangents are repeated, by level. In the carry these can be nonzero and
-            influence an output that is needed. In the other levels they are the seeded ones.
+        differentiable: Indices of the arrays that have a tangent in `program`, by level.
+        moved_arrays: Indices of the arrays whose tangents the launched program keeps, by level: in the carry those that
+            can be nonzero and influence a wanted array, in the other levels the seeded ones.
     """
 
     program: ScalarProgram
@@ -57,7 +57,7 @@ def differentiate_functions(
 
     Args:
         functions: Traced functions.
-        seeded: Indices of the arrays that have nonzero tangents at the start, by level.
+        seeded: Indices of the arrays whose initial tangents can be nonzero, by level.
         outputs_needed: Indices of the carry's arrays whose tangents matter at the end, None for all.
 
     Raises:
@@ -70,7 +70,7 @@ def differentiate_functions(
     reached = _reached_arrays(program, functions, differentiable, seeded)
     if outputs_needed is not None:
         needed = _needed_arrays(program, functions, differentiable, set(outputs_needed))
-        # A tangent that no requested result needs is set to zero and costs nothing.
+        # A tangent that no wanted result needs counts as zero: the launched program has no operation for it.
         reached = tuple(i for i in reached if i in needed)
     return DerivativeProgram(program, differentiable, seeded | {UpdateLevel.STEP: reached})
 
@@ -91,13 +91,13 @@ def lower_without_tangents(functions: TracedFunctions) -> DerivativeProgram:
 def arrange_arrays(
     functions: TracedFunctions, moved_arrays: TangentArrays, per_lane_uniforms: frozenset[int]
 ) -> dict[UpdateLevel, list[ArrayKey]]:
-    """Return the keys of a program's arrays by level, in the order of its arguments: values, then tangents.
+    """Return the keys of the launched program's arrays by level, in their order: values, then tangents.
 
-    A uniform array with a value per lane stands in the level of the lanes.
+    A uniform array that vmap has given a value per lane belongs to the level LANE, and so do its tangents.
 
     Args:
         functions: Traced functions.
-        moved_arrays: Indices of the arrays that have tangents, by level.
+        moved_arrays: Indices of the arrays whose tangents the program has, by level.
         per_lane_uniforms: Indices of the uniform arrays that vmap has given a value per lane.
     """
     found: dict[UpdateLevel, list[ArrayKey]] = {level: [] for level in INPUT_LEVELS}
@@ -112,11 +112,13 @@ def arrange_arrays(
 def replicate_tangents(
     functions: TracedFunctions, one: DerivativeProgram, many: int, per_lane_uniforms: frozenset[int] = frozenset()
 ) -> ScalarProgram:
-    """Return the program with several tangent directions; an array's tangents have the shape (many, ...).
+    """Return the program with `many` tangent directions; the tangents of an array have the shape (many, ...).
+
+    `replicate_nodes` eliminates tangents, so that the program has few operations.
 
     Args:
         functions: Traced functions.
-        one: Program with one tangent direction.
+        one: Program with one tangent direction, or with none.
         many: Number of tangent directions.
         per_lane_uniforms: Indices of the uniform arrays that vmap has given a value per lane.
 
@@ -129,7 +131,7 @@ def replicate_tangents(
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in INPUT_LEVELS}
     for level, keys in arrange_arrays(functions, one.moved_arrays, per_lane_uniforms).items():
         for array, key in enumerate(keys):
-            number = _number(functions, one, key)
+            number = _array_index(functions, one, key)
             size, copies = old.sizes[key.level][number], many if key.tangent else 1
             for k in range(copies):
                 for entry in range(size):
@@ -149,9 +151,10 @@ def replicate_tangents(
         if name == RUNNING_FUNCTION:
             ends[name] = [(nodes, False)]
             continue
-        arrays = _arrays(functions, one, name)
+        arrays = _results_by_array(functions, one, name)
         moving = [
-            _number(functions, one, ArrayKey(UpdateLevel.STEP, i, True)) for i in one.moved_arrays[UpdateLevel.STEP]
+            _array_index(functions, one, ArrayKey(UpdateLevel.STEP, i, True))
+            for i in one.moved_arrays[UpdateLevel.STEP]
         ]
         values = arrays[: len(functions.types[UpdateLevel.STEP])]
         ends[name] = [(x, False) for x in values] + [(arrays[i], True) for i in moving]
@@ -166,14 +169,14 @@ def replicate_tangents(
     return check_size(ScalarProgram(inputs, results, functions.uniform, sizes, old.dtype, many), len(graph.nodes))
 
 
-def _number(functions: TracedFunctions, one: DerivativeProgram, key: ArrayKey) -> int:
-    """Return the number of an array in the program with one tangent."""
+def _array_index(functions: TracedFunctions, one: DerivativeProgram, key: ArrayKey) -> int:
+    """Return the index of an array among those of its level in the program with one tangent."""
     first = len(functions.types[key.level])
     return first + one.differentiable[key.level].index(key.number) if key.tangent else key.number
 
 
-def _arrays(functions: TracedFunctions, one: DerivativeProgram, name: str) -> list[list[Node]]:
-    """Return the results of a function that updates the carry, array by array."""
+def _results_by_array(functions: TracedFunctions, one: DerivativeProgram, name: str) -> list[list[Node]]:
+    """Return the results of `renew` or `step` (`name`), grouped by array of the carry."""
     rest = iter(one.program.results[name])
     return [[next(rest) for _ in range(size)] for size in one.program.sizes[UpdateLevel.STEP]]
 
@@ -181,7 +184,7 @@ def _arrays(functions: TracedFunctions, one: DerivativeProgram, name: str) -> li
 def _reached_arrays(
     program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays, seeded: TangentArrays
 ) -> tuple[int, ...]:
-    """Return the arrays of the carry whose tangents can be nonzero after any number of steps."""
+    """Return the indices of the carry's arrays whose tangents can be nonzero at the start or after some step."""
     one, ends = (
         DerivativeProgram(program, differentiable, differentiable),
         _tangent_results(program, functions, differentiable),
@@ -191,7 +194,7 @@ def _reached_arrays(
     moved_arrays = seeded
     while True:
         starts = {
-            (level, _number(functions, one, ArrayKey(level, i, True)))
+            (level, _array_index(functions, one, ArrayKey(level, i, True)))
             for level in INPUT_LEVELS
             for i in moved_arrays[level]
         }
@@ -207,7 +210,7 @@ def _reached_arrays(
 def _needed_arrays(
     program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays, outputs_needed: set[int]
 ) -> set[int]:
-    """Return the arrays of the carry whose tangents influence the requested ones after any number of steps."""
+    """Return the indices of the carry's arrays whose tangents influence one of `outputs_needed` in any later step."""
     ends, found = _tangent_results(program, functions, differentiable), set(outputs_needed)
     first = len(functions.types[UpdateLevel.STEP])
     numbers = {first + at: i for at, i in enumerate(differentiable[UpdateLevel.STEP])}
@@ -223,23 +226,26 @@ def _needed_arrays(
 def _tangent_results(
     program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays
 ) -> dict[int, list[Node]]:
-    """Return, for each differentiable array of the carry, the tangents that all functions assign to it."""
+    """Return the tangents that `renew` and `step` assign to each differentiable array of the carry, by its index."""
     one = DerivativeProgram(program, differentiable, differentiable)
-    arrays = [_arrays(functions, one, name) for name in program.results if name != RUNNING_FUNCTION]
+    arrays = [_results_by_array(functions, one, name) for name in program.results if name != RUNNING_FUNCTION]
     return {
-        i: [node for each in arrays for node in each[_number(functions, one, ArrayKey(UpdateLevel.STEP, i, True))]]
+        i: [node for each in arrays for node in each[_array_index(functions, one, ArrayKey(UpdateLevel.STEP, i, True))]]
         for i in differentiable[UpdateLevel.STEP]
     }
 
 
 def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) -> TracedFunctions:
-    """Return the functions of values and tangents; each level has its arrays, then tangents of differentiable ones."""
+    """Return the functions of values and one tangent direction.
+
+    In each level, the tangents of the differentiable arrays follow all values. `running` returns its value alone.
+    """
     types = {level: [*all, *(all[i] for i in differentiable[level])] for level, all in functions.types.items()}
     uniform = len(types[UpdateLevel.UNIFORM])
     each: dict[str, TracedFunction] = {}
     for name, function in functions.each.items():
-        push = _jvp_function(functions, function, differentiable, name != RUNNING_FUNCTION)
-        closed = jax.make_jaxpr(push)(*(x for level in INPUT_LEVELS for x in types[level]))
+        derivative = _jvp_function(functions, function, differentiable, name != RUNNING_FUNCTION)
+        closed = jax.make_jaxpr(derivative)(*(x for level in INPUT_LEVELS for x in types[level]))
         shared, rest = closed.jaxpr.invars[:uniform], closed.jaxpr.invars[uniform:]
         # The uniform inputs become constvars, as in a traced function: `lower_functions` passes them by number.
         jaxpr = closed.jaxpr.replace(constvars=[*shared, *closed.jaxpr.constvars], invars=rest)
@@ -248,32 +254,35 @@ def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) ->
 
 
 def _jvp_function(
-    functions: TracedFunctions, function: TracedFunction, differentiable: TangentArrays, moves: bool
+    functions: TracedFunctions, function: TracedFunction, differentiable: TangentArrays, with_tangents: bool
 ) -> PyTree:
-    """Return a function of values and tangents that computes values and tangents; without `moves`, values alone."""
+    """Return a function of all values and tangents that returns values and, if `with_tangents`, their tangents.
 
-    def call(arrays: dict[UpdateLevel, list[PyTree]]) -> list[PyTree]:
+    Its arguments are, for each level, all values and then the tangents of the differentiable arrays.
+    """
+
+    def evaluate(arrays: dict[UpdateLevel, list[PyTree]]) -> list[PyTree]:
         shared = [*(arrays[UpdateLevel.UNIFORM][i] for i in function.closed), *function.constants]
         closed = jex.ClosedJaxpr(function.jaxpr, shared)
         return jex.jaxpr_as_fun(closed)(*arrays[UpdateLevel.LANE], *arrays[UpdateLevel.STEP])
 
-    def push(*given: PyTree) -> list[PyTree]:
+    def compute(*given: PyTree) -> list[PyTree]:
         rest, arrays, slopes = iter(given), {}, {}
         for level in INPUT_LEVELS:
             arrays[level] = [next(rest) for _ in functions.types[level]]
             slopes[level] = [next(rest) for _ in differentiable[level]]
-        if not moves:
-            return call(arrays)
+        if not with_tangents:
+            return evaluate(arrays)
 
-        def call_at(moving: dict[UpdateLevel, list[PyTree]]) -> list[PyTree]:
+        def evaluate_at(moving: dict[UpdateLevel, list[PyTree]]) -> list[PyTree]:
             now = {level: list(xs) for level, xs in arrays.items()}
             for level in INPUT_LEVELS:
                 for i, x in zip(differentiable[level], moving[level], strict=True):
                     now[level][i] = x
-            return call(now)
+            return evaluate(now)
 
         moving = {level: [arrays[level][i] for i in differentiable[level]] for level in INPUT_LEVELS}
-        values, tangents = jax.jvp(call_at, (moving,), (slopes,))
+        values, tangents = jax.jvp(evaluate_at, (moving,), (slopes,))
         return [*values, *(tangents[i] for i in differentiable[UpdateLevel.STEP])]
 
-    return push
+    return compute

@@ -1,6 +1,6 @@
-"""Tangents as linear combinations of other tangents, with factors that are the same for all tangents.
+"""Tangents as linear combinations of other tangents, with factors that are the same in all tangent directions.
 
-A factor is a number of the program, such as a partial derivative. It is computed once for all tangents.
+A factor is a value of the program, such as a partial derivative. It is computed once for all directions.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import numpy as np
 
 from diffabs.compiler.ir import Graph, Node, UpdateLevel
 
-TANGENT_OPERANDS = {"add": (0, 1), "sub": (0, 1), "select": (1, 2)}  # operands that must be tangents or zero
+TANGENT_OPERANDS = {"add": (0, 1), "sub": (0, 1), "select": (1, 2)}  # operands that must be tangents or 0
 
 
 class Factor(NamedTuple):
@@ -18,7 +18,7 @@ class Factor(NamedTuple):
 
     Attributes:
         negative: True if the factor is -`number`.
-        number: Node of the factor, None for 1.
+        number: Node of the factor's graph, None for 1.
     """
 
     negative: bool
@@ -26,15 +26,15 @@ class Factor(NamedTuple):
 
 
 FACTOR_ONE = Factor(False, None)
-Sum = dict[int, Factor]  # factors by the id of their tangents
+Sum = dict[int, Factor]  # a linear combination: the factor of each tangent, by the tangent's id
 
 
 class Vertex:
     """A tangent: a sum of other tangents, a selection between two sums, or a nonlinear operation.
 
     Attributes:
-        sum: Factors by the id of their tangents; in a selection, the sum where `which` is false.
-        which: Boolean node that selects; None without a selection.
+        sum: The linear combination; in a selection, the one where `which` is false.
+        which: Boolean node of the factor graph that selects; None without a selection.
         others: The sum where `which` is true.
         reads: Ids of the tangents that a nonlinear operation reads; empty for a sum or a selection.
     """
@@ -45,8 +45,8 @@ class Vertex:
         """Store a tangent.
 
         Args:
-            sum: Factors by the id of their tangents.
-            which: Truth of a selection, None without one.
+            sum: The linear combination; in a selection, the one where `which` is false.
+            which: Boolean node that selects; None without a selection.
             others: The sum where `which` is true.
             reads: Ids of the tangents that a nonlinear operation reads.
         """
@@ -58,7 +58,7 @@ class Vertex:
 
 
 class Algebra:
-    """Operations on sums of tangents.
+    """Operations on sums of tangents, which add the factors of their results to a graph.
 
     Attributes:
         graph: Graph that the factors are nodes of.
@@ -75,37 +75,41 @@ class Algebra:
         self.graph, self.dtype = graph, dtype
 
     def vertex(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> Vertex:
-        """Return an operation on tangents as a sum or selection of its operands, or as a nonlinear operation.
+        """Return the vertex of an operation on tangents: a sum, a selection between two sums, or a nonlinear one.
+
+        A `gate` is nonlinear here, so that it stays a conditional.
 
         Args:
             node: Operation in the graph of one tangent.
-            moves: Function that returns True if a node is a nonzero tangent.
-            value: Function that returns the factor graph's node for any other number.
+            moves: Function that returns True for a tangent that can be nonzero.
+            value: Function that returns the factor graph's node for any other node.
         """
         on, args = [moves(x) for x in node.args], node.args
 
-        def alone(i: int, negative: bool = False) -> Sum:
+        def operand(i: int, negative: bool = False) -> Sum:
+            """Return operand i as a sum: one term, or none if it is 0."""
             return {args[i].id: Factor(negative, None)} if on[i] else {}
 
         # A tangent plus a number other than 0 is no linear combination, so it remains as an operation of its own.
         linear = all(on[i] or _is_zero_tangent(value(args[i])) for i in TANGENT_OPERANDS.get(node.op, ()))
         match node.op:
             case "add" | "sub" if linear:
-                return Vertex(self._plus(alone(0), alone(1, node.op == "sub")))
+                return Vertex(self._plus(operand(0), operand(1, node.op == "sub")))
             case "neg":
-                return Vertex(alone(0, True))
+                return Vertex(operand(0, True))
             case "mul" if not all(on):
                 x, y = args if on[0] else args[::-1]
-                return Vertex({x.id: _factor(value(y))})
+                return Vertex({x.id: _as_factor(value(y))})
             # A division by a factor becomes a product: the inverse is computed once for all tangents.
             case "div" if on == [True, False]:
                 inverse = self.graph.op("div", self.graph.const(1, node.dtype), value(args[1]))
-                return Vertex({args[0].id: _factor(inverse)})
+                return Vertex({args[0].id: _as_factor(inverse)})
             case "select" if linear and not on[0]:
-                return Vertex(alone(1), value(args[0]), alone(2))
+                return Vertex(operand(1), value(args[0]), operand(2))
         return Vertex({}, reads=tuple(x.id for x, on in zip(args, on, strict=True) if on))
 
-    def _number(self, factor: Factor) -> Node:
+    def _as_node(self, factor: Factor) -> Node:
+        """Return the node of a factor without its sign."""
         return self.graph.const(1, self.dtype) if factor.number is None else factor.number
 
     def _times(self, x: Factor, y: Factor) -> Factor:
@@ -127,21 +131,21 @@ class Algebra:
             if old is None:
                 found[key] = new
             elif old.negative == new.negative:
-                found[key] = Factor(old.negative, self.graph.op("add", self._number(old), self._number(new)))
+                found[key] = Factor(old.negative, self.graph.op("add", self._as_node(old), self._as_node(new)))
             # Equal terms of opposite sign cancel: the tangent leaves the sum.
             elif old.number is not new.number:
                 first, second = (new, old) if old.negative else (old, new)
-                found[key] = Factor(False, self.graph.op("sub", self._number(first), self._number(second)))
+                found[key] = Factor(False, self.graph.op("sub", self._as_node(first), self._as_node(second)))
         return found
 
-    def within(self, sum: Sum, key: int, inner: Sum) -> Sum:
-        """Return `sum` with the tangent `key` replaced by the sum `inner`, times its factor."""
+    def substitute(self, sum: Sum, key: int, inner: Sum) -> Sum:
+        """Return `sum` with the sum `inner` in place of the tangent `key`, times the factor of `key`."""
         factor = sum[key]
         more = {x: self._times(factor, one) for x, one in inner.items()}
         return self._plus({x: one for x, one in sum.items() if x != key}, more)
 
-    def decide(self, vertex: Vertex) -> Sum:
-        """Return the selection of `vertex` as one sum whose factors are selections."""
+    def select_factors(self, vertex: Vertex) -> Sum:
+        """Return the selection of `vertex` between two sums as one sum, whose factors are selections."""
         assert vertex.which is not None
         found = {}
         for x in [*vertex.sum, *(x for x in vertex.others if x not in vertex.sum)]:
@@ -153,21 +157,22 @@ class Algebra:
             signs = {one.negative for one in (no, yes) if one is not None}
             sides = []
             for one in (no, yes):
-                number = self.graph.const(0, self.dtype) if one is None else self._number(one)
+                number = self.graph.const(0, self.dtype) if one is None else self._as_node(one)
                 turned = one is not None and len(signs) > 1 and one.negative
                 sides.append(self.graph.op("neg", number) if turned else number)
             found[x] = Factor(len(signs) == 1 and signs.pop(), self.graph.select(vertex.which, *sides))
         return found
 
 
-def _factor(node: Node) -> Factor:
+def _as_factor(node: Node) -> Factor:
+    """Return a node as a factor, with its sign apart."""
     if node.op == "neg":
         return Factor(True, node.args[0])
     return Factor(node.is_number(-1), None) if node.is_number(1) or node.is_number(-1) else Factor(False, node)
 
 
 def _is_zero_tangent(node: Node) -> bool:
-    """Return whether a number is a zero tangent: the constant 0, a product with it, or a sum of zeros."""
+    """Return whether a node is a zero tangent: the constant 0, a product with or quotient of it, or a sum of such."""
     if node.op in ("mul", "neg", "div"):
         return any(_is_zero_tangent(x) for x in node.args[: 1 if node.op == "div" else None])
     return node.is_number(0) or (node.op in ("add", "sub") and all(map(_is_zero_tangent, node.args)))
@@ -182,10 +187,10 @@ def changes_in_step(factor: Factor) -> bool:
     return factor.number is not None and factor.number.level == UpdateLevel.STEP
 
 
-def count_terms(sum: Sum) -> int:
-    """Return the operations that a sum needs in each tangent direction.
+def sum_cost(sum: Sum) -> int:
+    """Return the number of operations that a sum needs in each tangent direction.
 
-    A product with the following addition counts as one (FMA). A copy or an empty sum counts as 0.
+    A product and the addition of it count as one (FMA). A copy or an empty sum counts as 0.
 
     Args:
         sum: Sum of tangents.

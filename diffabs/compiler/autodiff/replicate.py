@@ -1,4 +1,4 @@
-"""The step from a program with one tangent to a program with several: values stay single, tangents are repeated."""
+"""From one tangent direction to several: values and factors stay single, eliminated tangents are repeated."""
 
 from collections.abc import Iterable
 
@@ -22,7 +22,7 @@ def dependents(nodes: Iterable[Node], first: set[int]) -> set[int]:
 
 
 def tangent_copy(nodes: list[Node], k: int) -> Node:
-    """Return the node of a number in tangent direction k, or its only node if it is the same in all directions.
+    """Return the node for tangent direction k, or the only node of a number that is the same in all directions.
 
     Args:
         nodes: One node, or one for each tangent direction.
@@ -38,24 +38,24 @@ def replicate_nodes(
     slopes: set[int],
     size: tuple[int, np.dtype],
 ) -> dict[int, list[Node]]:
-    """Return, for each node id that the roots need, its nodes in a program of several tangent directions.
+    """Write a program of several tangent directions; return its nodes by the id of the old node.
 
-    A value has one node, a nonzero tangent one for each direction, a zero tangent the constant 0. A node that the
-    elimination has removed has no entry.
+    A value has one node, a tangent that can be nonzero one for each direction, and a zero tangent the constant 0. A
+    tangent that the elimination has removed has no entry.
 
     Args:
         graph: Graph that receives the nodes.
-        roots: Results of the program of one tangent.
-        given: Inputs of the new program by node id of the old one.
-        slopes: Ids of the inputs that are tangents; a tangent without an entry in `given` is zero.
-        size: Number of the tangent directions, and the type of the tangents.
+        roots: Results of the program with one tangent direction.
+        given: Inputs of the new program, by the id of the old input.
+        slopes: Ids of the old inputs that are tangents; one without an entry in `given` is zero.
+        size: Number of tangent directions, and the type of the tangents.
     """
     nodes = live_nodes(roots)
     moving = dependents(nodes, {i for i in slopes if i in given})
-    # Nodes that depend only on tangents without a seed are in `slopes` but not in `moving`: they are zero.
+    # A node that depends on tangents, but only on zero ones, is in `slopes` and not in `moving`: it is zero.
     slopes = dependents(nodes, slopes)
     factors = Graph()
-    # Everything but nonzero tangents becomes a node of the factor graph; every result of zero tangents is 0.
+    # All nodes outside of `moving` become nodes of the factor graph, zero tangents as the constant 0.
     values: dict[int, Node] = {}
     for node in nodes:
         if node.id in moving:
@@ -72,15 +72,23 @@ def replicate_nodes(
         if node.id not in moving:
             continue
         if node.op == "input":
-            plan.begin(node.id, given[node.id][0].level)
+            plan.add_input(node.id, given[node.id][0].level)
         else:
-            plan.add(node, lambda x: x.id in moving, lambda x: values[x.id])
+            plan.add_operation(node, lambda x: x.id in moving, lambda x: values[x.id])
     plan.reduce({node.id for node in roots if node.id in plan.vertices})
     return _ReplicaWriter(graph, plan, values, given).write(nodes)
 
 
 class _ReplicaWriter:
-    """A writer of an eliminated program as nodes: values in their order, tangents after their operands."""
+    """A writer of an eliminated program as nodes of a new graph.
+
+    Attributes:
+        graph: New graph.
+        plan: Tangents to compute.
+        values: Nodes of the factor graph, by the id of the old node.
+        numbers: Nodes of the new graph, by the id of the node of the factor graph.
+        tangents: Nodes of the new graph for each direction, by the id of the old node.
+    """
 
     def __init__(self, graph: Graph, plan: Elimination, values: dict[int, Node], given: dict[int, list[Node]]):
         self.graph, self.plan, self.values = graph, plan, values
@@ -88,16 +96,17 @@ class _ReplicaWriter:
         self.tangents = {i: nodes for i, nodes in given.items() if i in plan.readers}
 
     def write(self, nodes: list[Node]) -> dict[int, list[Node]]:
+        """Write the values and tangents of the old `nodes`; return their new nodes by the id of the old node."""
         found: dict[int, list[Node]] = {}
         for node in nodes:
             if node.id in self.values:
-                found[node.id] = [self._number(self.values[node.id])]
+                found[node.id] = [self._write_value(self.values[node.id])]
             elif node.id in self.plan.vertices:
-                self.tangents[node.id] = self._vertex(node, self.plan.vertices[node.id])
+                self.tangents[node.id] = self._write_tangent(node, self.plan.vertices[node.id])
         return found | self.tangents
 
-    def _number(self, node: Node) -> Node:
-        """Return a number of the factor graph as a node of the new program."""
+    def _write_value(self, node: Node) -> Node:
+        """Write a node of the factor graph and its operands; return its node of the new graph."""
         # A stack instead of recursion: a chain of operations may be longer than Python's limit.
         left = [node]
         while left:
@@ -113,20 +122,25 @@ class _ReplicaWriter:
                 )
         return self.numbers[node.id]
 
-    def _vertex(self, node: Node, vertex: Vertex) -> list[Node]:
+    def _write_tangent(self, node: Node, vertex: Vertex) -> list[Node]:
+        """Write the tangent `vertex`, whose old node is `node`; return a node for each direction, or one constant 0."""
         if vertex.reads:
             args = [
-                self.tangents[x.id] if x.id in self.tangents else [self._number(self.values[x.id])] for x in node.args
+                self.tangents[x.id] if x.id in self.tangents else [self._write_value(self.values[x.id])]
+                for x in node.args
             ]
             return [self.graph.again(node, [tangent_copy(x, k) for x in args]) for k in range(self.plan.many)]
-        sums = [self._sum(sum, node) for sum in vertex.sums()]
+        sums = [self._write_sum(sum, node) for sum in vertex.sums()]
         if vertex.which is None:
             return sums[0]
-        which = self._number(vertex.which)
+        which = self._write_value(vertex.which)
         return [self.graph.select(which, *(tangent_copy(x, k) for x in sums)) for k in range(self.plan.many)]
 
-    def _sum(self, sum: Sum, node: Node) -> list[Node]:
-        """Return a sum for each tangent; terms with the factor 1 and positive terms come first."""
+    def _write_sum(self, sum: Sum, node: Node) -> list[Node]:
+        """Write a sum; return a node for each direction, or one constant 0.
+
+        Terms with the factor 1 and positive terms come first.
+        """
         if not sum:
             return [self.graph.const(0, node.dtype)]
         # The first term needs no addition. A positive one saves the negation.
@@ -134,7 +148,7 @@ class _ReplicaWriter:
         found: list[Node] = []
         for i, x in enumerate(ordered):
             factor, slopes = sum[x], self.tangents[x]
-            number = None if factor.number is None else self._number(factor.number)
+            number = None if factor.number is None else self._write_value(factor.number)
             terms = [slope if number is None else self.graph.op("mul", slope, number) for slope in slopes]
             if not i:
                 found = [self.graph.op("neg", term) for term in terms] if factor.negative else terms

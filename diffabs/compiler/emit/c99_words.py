@@ -30,7 +30,7 @@ class Words:
 
     Attributes:
         real: C type of the real numbers.
-        place: Function (where, path) -> C expression of an input of the graph.
+        place: Function (where, path), the two parts of an input's `attr`, -> C expression of the input.
         single: Whether real numbers have single precision.
     """
 
@@ -67,7 +67,10 @@ class Words:
         return self.real if is_real(node.dtype) else C_TYPES[node.dtype.name]
 
     def name(self, node: Node) -> str:
-        """Return the C expression of `node`: a literal, a variable, or the place of an input."""
+        """Return the C expression of `node`: a literal, a variable, or the place of an input.
+
+        A variable has the label of its node, or the name of its operation, with a number if that name is taken.
+        """
         if node.op == "const":
             return self._literal(node)
         if node.op == "input":
@@ -96,6 +99,7 @@ class Words:
         return f"({text})" if np.signbit(x) else text
 
     def _expression(self, node: Node) -> str:
+        """Return the C expression of an operation. Raises Unsupported."""
         args, real = [self.name(x) for x in node.args], is_real(node.dtype)
         template = OPERATIONS[node.op].c99 if node.op in OPERATIONS else None
         match node.op:
@@ -120,7 +124,7 @@ class Words:
 
 
 def is_name(name: str) -> bool:
-    """Return whether a text can name a function in C: an ASCII letter, then letters, digits and _, and no keyword.
+    """Return whether a text can name an exported C function: an ASCII letter, then letters, digits and _; no keyword.
 
     Args:
         name: Text to test.

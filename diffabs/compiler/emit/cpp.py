@@ -1,8 +1,8 @@
-"""A scalar program as C++ text: each thread runs a block of a few SIMD vectors of lanes.
+"""A program as C++ text: each thread runs a block of a few SIMD vectors of lanes.
 
-A program's operation becomes one line per vector of the block, one after the other. The processor overlaps these
-independent lines, which hides the latency of each result. Between rounds, a lane that has ended hands its place to the
-next lane.
+An operation becomes one line for each vector of the block, one after the other. The processor overlaps these
+independent lines, which hides the latency of each result. Between rounds, the next lane takes the place of a lane that
+has ended.
 """
 
 import re
@@ -18,7 +18,7 @@ from diffabs.compiler.program import InputPlace, ScalarProgram
 from diffabs.compiler.schedule import Branch, ScheduleBlock, schedule_nodes
 
 ONE_VECTOR = range(1)
-MIN_BRANCH_OPERATIONS = 24  # a jump around fewer operations costs more than it saves
+MIN_BRANCH_OPERATIONS = 24  # of both branches; a jump in a smaller conditional costs more than it saves
 
 
 class LaunchShape(NamedTuple):
@@ -27,8 +27,7 @@ class LaunchShape(NamedTuple):
     Attributes:
         vectors: SIMD vectors in a block.
         steps: Calls of `step` after each call of `renew`.
-        rounds: Rounds between two checks for lanes that have ended. A round is one call of `renew` and `steps` calls of
-            `step`.
+        rounds: Rounds between two calls of `running`. A round is one call of `renew` and `steps` calls of `step`.
     """
 
     vectors: int
@@ -58,13 +57,13 @@ def operands_by_name(node: Node) -> tuple[Node, ...]:
 
 
 class RareNumbers(NamedTuple):
-    """Numbers of the carry that a function touches only within a conditional with a jump.
+    """Numbers of the carry that a function reads or changes only in the true branch of one conditional with a jump.
 
-    A vector without the jump leaves them in memory, instead of a load and a store of the same number.
+    A vector that does not compute this branch neither loads nor stores them.
 
     Attributes:
-        stored: Numbers that only the conditional changes, by the id of the gate that returns the new number.
-        loaded: Numbers that only the conditional reads, by the id of its first gate.
+        stored: Inputs that only the branch changes, by the id of the gate that returns the new number.
+        loaded: Inputs that only the branch reads, by the id of the conditional's first gate.
     """
 
     stored: dict[int, Node]
@@ -72,7 +71,7 @@ class RareNumbers(NamedTuple):
 
 
 def find_rare_numbers(block: ScheduleBlock, nodes: Sequence[Node], changed: Sequence[tuple[Node, Node]]) -> RareNumbers:
-    """Return the numbers that only one of the outermost conditionals touches.
+    """Return the numbers that only the true branch of one outermost conditional with a jump reads or changes.
 
     Args:
         block: Operations of a function.
@@ -102,7 +101,7 @@ def find_rare_numbers(block: ScheduleBlock, nodes: Sequence[Node], changed: Sequ
 
 
 def branch_jumps(branch: Branch) -> bool:
-    """Return whether a conditional is long enough for a jump.
+    """Return whether a conditional becomes a jump: both branches together have at least MIN_BRANCH_OPERATIONS.
 
     Args:
         branch: Conditional.
@@ -112,7 +111,7 @@ def branch_jumps(branch: Branch) -> bool:
 
 
 class Text:
-    """A writer of the text's parts.
+    """A writer of a program as C++, part by part.
 
     A subclass for another back end replaces HEAD and DRIVER. HEAD defines the types and functions that the parts use.
     DRIVER comes after the parts and calls them.
@@ -121,7 +120,9 @@ class Text:
     HEAD, DRIVER = '#include "functions.h"', '#include "drive.h"'
 
     def __init__(self, program: ScalarProgram, shape: LaunchShape):
-        """Sort the program's nodes by the place that computes them: once for all lanes, once a lane, or in every step.
+        """Find the values that are computed before the steps: `shared` once a launch, `lanes` once a lane.
+
+        `columns` has the name and a node of each table. The other operations are computed in every step.
 
         Args:
             program: Operations and results.
@@ -137,15 +138,15 @@ class Text:
             if node.op == "table":
                 key = tuple(x.id for x in node.args[1:])
                 self.columns.setdefault(key, (f"t{len(self.columns)}", node))
-        lanes = self._read([node for node in nodes if node.level == UpdateLevel.STEP], self.roots, UpdateLevel.LANE)
+        lanes = self._ids_read([node for node in nodes if node.level == UpdateLevel.STEP], self.roots, UpdateLevel.LANE)
         self.lanes = [node for node in nodes if node.id in lanes]
         below = [node for node in nodes if node.level >= UpdateLevel.LANE]
-        shared = self._read(below, self.roots, UpdateLevel.UNIFORM)
+        shared = self._ids_read(below, self.roots, UpdateLevel.UNIFORM)
         self.shared = [node for node in nodes if node.id in shared and node.op != "const"]
 
     @staticmethod
-    def _read(readers: list[Node], roots: list[Node], level: UpdateLevel) -> set[int]:
-        """Return the ids of a level's nodes that faster levels or the results read."""
+    def _ids_read(readers: list[Node], roots: list[Node], level: UpdateLevel) -> set[int]:
+        """Return the ids of the nodes of `level` that results are, or that `readers` of a faster level read."""
         read = {
             arg.id for node in readers if node.level > level for arg in operands_by_name(node) if arg.level == level
         }
@@ -168,11 +169,12 @@ class Text:
         for name in ("renew", "step"):
             yield from self._function(name)
         yield from self._running_function()
-        yield from self._moves()
+        yield from self._put_and_take()
         yield f"enum {{ STEPS = {self.shape.steps}, ROUNDS = {self.shape.rounds} }};"
         yield self.DRIVER
 
     def _given_inputs(self, level: UpdateLevel) -> list[tuple[InputPlace, Node]]:
+        """Return the inputs of a level that the results depend on; for STEP all inputs of the carry."""
         return [
             (p, n)
             for p, n in self.program.inputs.items()
@@ -180,9 +182,7 @@ class Text:
         ]
 
     def _structures(self) -> Iterator[str]:
-        """Yield the structs: `Shared` for all lanes, `Block` for the carry, the inputs of its lanes and their derived
-        values.
-        """
+        """Yield the structs `Shared`, with values of all lanes, and `Block`, with the carry and values of each lane."""
         shared = [f"{scalar_type(node.dtype)} v{node.id};" for node in self.shared]
         tables = [f"{scalar_type(n.args[1].dtype)} {name}[{len(n.args) - 1}];" for name, n in self.columns.values()]
         yield "struct Shared { " + " ".join([*shared, *tables]) + " int none; };"
@@ -208,11 +208,9 @@ class Text:
         yield "}"
 
     def _begin(self) -> Iterator[str]:
-        """Yield static void begin(Block&, const Shared&, int q), which computes the derived values of the lanes of
-        vector q.
-        """
+        """Yield static void begin(Block&, const Shared&, int q), which computes vector q's values of level LANE."""
         yield "PART void begin(Block& b, const Shared& s, int q) { (void)b; (void)s; (void)q;"
-        yield from self._uniform([node for node in live_nodes(self.lanes) if node.level == UpdateLevel.LANE])
+        yield from self._load_uniforms([node for node in live_nodes(self.lanes) if node.level == UpdateLevel.LANE])
         for _, node in self._given_inputs(UpdateLevel.LANE):
             yield f"  const {vector_type(node.dtype)} v{node.id}_0 = b.l{node.id}[q];"
         yield from self._lines(schedule_nodes(self.lanes, UpdateLevel.LANE), ONE_VECTOR, "  ")
@@ -244,12 +242,13 @@ class Text:
         yield "}"
 
     def _body(self, roots: list[Node], changed: Sequence[tuple[Node, Node]] = ()) -> Iterator[str]:
+        """Yield the loads and operations that compute `roots` for all vectors; set `self.rare`."""
         nodes, block = live_nodes(roots), schedule_nodes(roots, UpdateLevel.STEP)
         self.rare = find_rare_numbers(block, nodes, changed)
         loaded_later = {node.id for numbers in self.rare.loaded.values() for node in numbers}
         own = {node.id for node in nodes}
         steps = [node for node in nodes if node.level == UpdateLevel.STEP]
-        yield from self._uniform([*steps, *roots])
+        yield from self._load_uniforms([*steps, *roots])
         read = [*roots, *(x for node in steps for x in operands_by_name(node))]
         lanes = {x.id: x for x in read if x.level == UpdateLevel.LANE}
         for q in range(self.shape.vectors):
@@ -261,18 +260,18 @@ class Text:
         yield from self._lines(block, range(self.shape.vectors), "  ")
 
     def _load(self, node: Node, q: int, indent: str) -> str:
-        """Return the declaration of a number of the carry."""
+        """Return the line that loads a number of the carry for vector q."""
         return f"{indent}const {vector_type(node.dtype)} {self._name(node, q)} = b.c{node.id}[{q}];"
 
-    def _uniform(self, readers: list[Node]) -> Iterator[str]:
+    def _load_uniforms(self, readers: list[Node]) -> Iterator[str]:
         """Yield declarations of the shared values that these nodes read."""
         shared = {node.id for node in self.shared}
         read = {x.id: x for node in readers for x in (node, *operands_by_name(node)) if x.id in shared}
         for node in read.values():
             yield "  " + _declare_uniform(node, f"s.v{node.id}")
 
-    def _moves(self) -> Iterator[str]:
-        """Yield functions that put a lane into a place of the block and that take its carry out."""
+    def _put_and_take(self) -> Iterator[str]:
+        """Yield the functions `put`, from the arrays to a place of the block, and `take`, back to the arrays."""
         yield "PART void put(Block& b, int p, i64 j, const Array* lanes, const Array* carry) {"
         yield "  const int i = p/LANES, q = p%LANES; (void)lanes;"
         for places, name, array in ((UpdateLevel.LANE, "l", "lanes"), (UpdateLevel.STEP, "c", "carry")):
@@ -292,7 +291,7 @@ class Text:
     # operations -------------------------------------------------------------------------------------------------------
 
     def _lines(self, block: ScheduleBlock, vectors: range, indent: str) -> Iterator[str]:
-        """Yield the lines of a schedule block for these vectors."""
+        """Yield the lines of the operations of a schedule block, for each of `vectors`."""
         for item in block:
             if isinstance(item, Branch):
                 yield from self._branch(item, vectors, indent)
@@ -302,9 +301,10 @@ class Text:
                     yield f"{declared} = {self._expression(item, q)};"
 
     def _branch(self, branch: Branch, vectors: range, indent: str) -> Iterator[str]:
-        """Yield a conditional, as a jump for each vector if it is long enough, else without a jump.
+        """Yield a conditional: the false branch, then the true branch, within a jump if `branch_jumps`.
 
-        A vector takes the jump if any of its lanes does. The gates then discard the results of its other lanes.
+        A vector computes the true branch if the condition is true in any of its lanes. The gates then select for each
+        lane. All vectors compute the false branch.
         """
         yield from self._lines(branch.no, vectors, indent)
         if not branch_jumps(branch):
@@ -324,6 +324,7 @@ class Text:
             yield indent + "}"
 
     def _gates(self, branch: Branch, vectors: range, indent: str, declared: bool = False) -> Iterator[str]:
+        """Yield the selections of a conditional's results; `declared` says that their variables exist."""
         for gate in branch.gates:
             for q in vectors:
                 which, no, yes = (self._name(x, q) for x in gate.args)
@@ -334,11 +335,13 @@ class Text:
                 yield f"{indent}{left} = sel({which}, {yes}, {no});"
 
     def _name(self, node: Node, q: int) -> str:
+        """Return the C++ variable of a node for vector q, or the literal of a constant."""
         if node.op == "const":
             return literal(node)
         return f"v{node.id}" if node.level == UpdateLevel.UNIFORM else f"v{node.id}_{q}"
 
     def _expression(self, node: Node, q: int) -> str:
+        """Return the C++ expression of an operation for vector q."""
         args = [self._name(x, q) for x in node.args]
         if node.op in OPERATIONS:
             return OPERATIONS[node.op].cpp.format(*args)
@@ -355,7 +358,7 @@ class Text:
 
 
 def _declare_uniform(node: Node, value: str) -> str:
-    """Return a declaration that copies a shared number into every lane."""
+    """Return the declaration of a vector with the number `value` in every lane."""
     return f"const {vector_type(node.dtype)} v{node.id} = all({'(bool)' if is_boolean(node.dtype) else ''}{value});"
 
 

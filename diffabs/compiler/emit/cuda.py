@@ -1,4 +1,4 @@
-"""A scalar program as CUDA C++, one lane for each thread.
+"""A program as CUDA C++, one lane at a time for each thread.
 
 The program's lines are the same as in the processor's text (`cpp`). Before them, `lane.h` defines their names for
 single numbers; after them, `threads.h` contains the kernels to launch.
@@ -19,7 +19,7 @@ class CudaSource(NamedTuple):
 
     Attributes:
         text: CUDA C++.
-        room: Bytes of device memory that the kernels need beyond the arrays.
+        room: Bytes of device memory that the kernels need in addition to the arrays.
     """
 
     text: str
@@ -27,13 +27,13 @@ class CudaSource(NamedTuple):
 
 
 def emit_cuda(program: ScalarProgram, shape: LaunchShape) -> CudaSource:
-    """Return the CUDA C++ of a program, with the kernels to launch and their need of memory.
+    """Return the CUDA C++ of a program, with the kernels to launch, and their need of memory.
 
     The text contains the functions `renew` and `step` (carry to carry) and `running` (carry to boolean).
 
     Args:
         program: Operations and results.
-        shape: Loop structure of the launch; a thread has one lane, so `vectors` has no effect.
+        shape: Loop structure of the launch; a thread has one lane at a time, so `vectors` has no effect.
     """
     made = _Text(program, shape._replace(vectors=1))
     columns = sum(len(node.args) for _, node in made.columns.values())
@@ -42,5 +42,7 @@ def emit_cuda(program: ScalarProgram, shape: LaunchShape) -> CudaSource:
 
 
 class _Text(Text):
+    """A writer of a program as CUDA C++."""
+
     HEAD = '#include "lane.h"'
     DRIVER = f'enum {{ THREADS = {THREADS_PER_BLOCK} }};\n#include "threads.h"'

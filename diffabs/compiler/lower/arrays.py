@@ -1,4 +1,4 @@
-"""Lowering rules for primitives that move entries of arrays (reshape, pad), make them (iota) or reduce them (sum, dot)."""
+"""Lowering rules for primitives that move entries of an array (reshape, pad) or reduce them (sum, dot), and iota."""
 
 import math
 from typing import Any

@@ -12,14 +12,14 @@ from diffabs.compiler.runtime import toolchain
 from diffabs.core.types import PyTree
 from diffabs.runtime.process import core_count
 
-MAX_STEP_LINES = 10_000  # lines of a step; a larger program gets fewer vectors a block, or compiling takes too long
+MAX_STEP_LINES = 10_000  # operations times vectors; a larger program gets fewer vectors, or compiling takes too long
 LIBRARY_NAME_PREFIX = "diffabs_kernel_"
 _lock = threading.Lock()
 _loaded: dict[str, PyTree] = {}
 
 
 def build_target(made: ScalarProgram, shape: cpp.LaunchShape) -> str:
-    """Compile a program for the processor, if necessary, and return its name as an FFI target of XLA.
+    """Return the name of a program's FFI target of XLA; compile and register the program if necessary.
 
     Args:
         made: Operations and results.
@@ -38,7 +38,7 @@ def build_target(made: ScalarProgram, shape: cpp.LaunchShape) -> str:
 
 
 def register_library(path: pathlib.Path) -> str:
-    """Register a library with XLA and return its name there.
+    """Return the name of a library's FFI target of XLA; load and register it if this process has not.
 
     Args:
         path: File of the library.
@@ -60,6 +60,6 @@ def register_library(path: pathlib.Path) -> str:
 
 
 def thread_count() -> int:
-    """Return the number of threads for a launch: all cores, whatever the number of JAX's CPU devices."""
+    """Return the number of threads of a launch: one for each core, for any number of JAX's CPU devices."""
     # Launches on several devices at once share the cores: a thread takes its next lane when it has time.
     return core_count()

@@ -1,4 +1,4 @@
-"""Launches on an NVIDIA GPU: machine code from `nvrtc`, started through the CUDA driver on XLA's stream.
+"""Launches on an NVIDIA GPU: machine code of `nvrtc`, started through the CUDA driver on XLA's stream.
 
 Only this module uses the driver and `jax.experimental.buffer_callback`, which makes a launch an operation of XLA.
 """
@@ -74,7 +74,7 @@ def find_gpu() -> GpuDevice | None:
 
 
 def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[PyTree], results: list[PyTree]) -> list[PyTree]:
-    """Return the carry's arrays after all lanes have ended, as an operation of XLA on the GPU.
+    """Compile a program and return the carry's arrays after all lanes have ended, as an operation of XLA on the GPU.
 
     Args:
         program: Operations and results.
@@ -103,7 +103,7 @@ def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[PyTree],
 
 
 def _pack_addresses(addresses: list[int], sizes: list[int]) -> PyTree:
-    """Return the struct `Arrays` of `threads.h`: each group of addresses ends with one more entry, a null pointer."""
+    """Return the struct `Arrays` of `threads.h`: groups of `sizes` addresses, each with one null pointer at its end."""
     rest, found = iter(addresses), []
     for size in sizes:
         # C++ has no arrays of length 0, so every group has one more entry.
@@ -116,6 +116,7 @@ def _pack_addresses(addresses: list[int], sizes: list[int]) -> PyTree:
 
 @functools.cache
 def _find_cuda_device(platform: str) -> "CudaDevice":
+    """Return the NVIDIA GPUs of a platform of JAX; raise NoCompiler if its devices are others."""
     capability = getattr(jax.devices(platform)[0], "compute_capability", "")
     if not capability.replace(".", "").isdigit():
         raise NoCompiler(f"kernels are for processors and NVIDIA's GPUs, not for {platform} {capability}".strip())
@@ -142,7 +143,7 @@ class CudaDevice:
     """The NVIDIA GPUs of this process, all of one architecture such as sm_90."""
 
     def __init__(self, architecture: str):
-        """Store the architecture; the driver is loaded at the first launch."""
+        """Store the architecture, such as sm_90; the first launch loads the driver."""
         self.architecture = architecture
         self._loaded: dict[tuple[pathlib.Path, int], _LoadedCode] = {}
 
@@ -189,7 +190,7 @@ class CudaDevice:
 
 
 def _load(code: pathlib.Path, ordinal: int) -> _LoadedCode:
-    """Load machine code into the primary context of a device, which XLA uses too."""
+    """Load machine code into the primary context of device `ordinal`, which XLA uses too, and return its kernels."""
     context, module, number = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
     begin, run = ctypes.c_void_p(), ctypes.c_void_p()
     _call_driver("cuDevicePrimaryCtxRetain", ctypes.byref(context), ordinal)
@@ -213,6 +214,7 @@ def _load(code: pathlib.Path, ordinal: int) -> _LoadedCode:
 
 
 def _launch(kernel: Any, blocks: int, threads: int, stream: int, *args: PyTree) -> None:
+    """Start a kernel on a stream with `blocks` blocks of `threads` threads; `args` are values of ctypes."""
     # cuLaunchKernel takes an array with the address of each argument.
     given = (ctypes.c_void_p * len(args))(*(ctypes.addressof(x) for x in args))
     nothing = ctypes.c_void_p()
@@ -229,6 +231,7 @@ def _call_driver(name: str, *args: PyTree) -> None:
 
 @functools.cache
 def _load_driver() -> Any:
+    """Return the CUDA driver, initialized."""
     driver = ctypes.CDLL("libcuda.so.1")
     driver.cuInit(0)
     return driver

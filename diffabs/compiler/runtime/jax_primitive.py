@@ -1,14 +1,18 @@
 """The JAX primitive `run_lanes`: rules for jit, vmap and forward-mode derivatives of a kernel launch.
 
+The primitive's parameters are `lanes` (the programs), `seeds` (arrays with an initial tangent), `many` (tangent
+directions) and `as_lanes` (uniform arrays with a value per lane). Its arguments are the values and then the initial
+tangents, its results those of `LanePrograms.result_keys`.
+
 vmap adds lanes: a uniform array that differs within the batch becomes an array of each lane. If only tangents are
-batched, as in `jax.jacfwd`, the batch stays one launch with more tangents. Only this module uses JAX's interfaces for
-new primitives.
+batched, as in `jax.jacfwd`, the lanes stay and the batch becomes more tangent directions. Only this module uses JAX's
+interfaces for new primitives.
 """
 
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import jax.extend.core as jex
@@ -21,7 +25,7 @@ from diffabs.compiler.ir import UpdateLevel, is_real
 from diffabs.compiler.lane_programs import LanePrograms
 from diffabs.core.types import PyTree, Scalar
 
-MAX_TANGENTS_PER_LAUNCH = 8  # more tangents take several launches
+MAX_TANGENTS_PER_LAUNCH = 8  # directions; more take several launches
 NO_REVERSE_MODE = (
     "a kernel has no reverse mode: forward mode (jax.jvp, jax.jacfwd) has its derivatives, engine = 'xla' both"
 )
@@ -32,13 +36,13 @@ run_lanes_primitive.multiple_results = True
 
 
 def bind_lanes(lanes: LanePrograms, arrays: Sequence[PyTree]) -> list[PyTree]:
-    """Return the carry's arrays after all lanes have ended, in the order of its leaves.
+    """Call the primitive without tangents; return the carry's arrays after all lanes have ended, in leaf order.
 
     Args:
         lanes: The functions and their programs.
         arrays: Uniform arrays, then arrays of the lanes, then the carry; random keys as their words (uint32).
     """
-    return run_lanes_primitive.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=frozenset())
+    return run_lanes_primitive.bind(*arrays, lanes=lanes, seeds=None, many=0, as_lanes=frozenset())
 
 
 @run_lanes_primitive.def_impl
@@ -48,30 +52,36 @@ def _run(*arrays: PyTree, **how: Any) -> list[PyTree]:
 
 
 @run_lanes_primitive.def_abstract_eval
-def _shapes(*arrays: PyTree, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: frozenset[int]) -> list[PyTree]:
-    carry = arrays[len(lanes.keys) - len(lanes.functions.types[UpdateLevel.STEP]) : len(lanes.keys)]
+def _shapes(*arrays: PyTree, lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: frozenset[int]) -> list[PyTree]:
+    """Return the shapes and types of the results: (lanes, ...) of values, (lanes, many, ...) of tangents."""
+    carry = arrays[len(lanes.value_keys) - len(lanes.functions.types[UpdateLevel.STEP]) : len(lanes.value_keys)]
 
     def shape(key: ArrayKey) -> Any:
         x = carry[key.number]
         # Results have fixed types, also where the initial carry is weakly typed.
         return x.update(shape=(x.shape[0], many, *x.shape[1:])) if key.tangent else x.update(weak_type=False)
 
-    return [shape(key) for key in lanes.ends(begins)]
+    return [shape(key) for key in lanes.result_keys(seeds)]
 
 
 def _launch_in_parts(
-    *arrays: PyTree, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: frozenset[int]
+    *arrays: PyTree, lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: frozenset[int]
 ) -> list[PyTree]:
-    """Launch the tangents in groups of equal size <= MAX_TANGENTS_PER_LAUNCH; zeros fill the last group."""
-    keys = [*lanes.keys, *lanes.slopes(begins)]
+    """Return the primitive's results from as few launches as MAX_TANGENTS_PER_LAUNCH allows.
+
+    All launches have the same number of directions; zero tangents fill the last one.
+    """
+    keys = [*lanes.value_keys, *lanes.seed_keys(seeds)]
     launches = max(1, math.ceil(many / MAX_TANGENTS_PER_LAUNCH))
     # Groups of one size share one compiled program. The padding tangents are zero and are cut off at the end.
     each = math.ceil(many / launches)
     given = dict(zip(keys, arrays, strict=True))
     if not many:
-        return _launch_once(lanes, begins, 0, as_lanes, given)
+        return _launch_once(lanes, seeds, 0, as_lanes, given)
 
     def part(first: int) -> list[PyTree]:
+        """Return the results of the launch for `each` directions from `first` on."""
+
         def cut(key: ArrayKey, x: Scalar) -> Any:
             # Tangents of arrays of lanes are (lanes, tangents, ...), of uniform arrays (tangents, ...).
             axis = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
@@ -80,12 +90,12 @@ def _launch_in_parts(
             return jax.lax.slice_in_dim(jnp.pad(x, wide), first, first + each, axis=axis)
 
         some = {key: cut(key, x) if key.tangent else x for key, x in given.items()}
-        return _launch_once(lanes, begins, each, as_lanes, some)
+        return _launch_once(lanes, seeds, each, as_lanes, some)
 
     parts = [part(first) for first in range(0, each * launches, each)]
     return [
         jnp.concatenate([one[i] for one in parts], 1)[:, :many] if key.tangent else parts[0][i]
-        for i, key in enumerate(lanes.ends(begins))
+        for i, key in enumerate(lanes.result_keys(seeds))
     ]
 
 
@@ -93,9 +103,9 @@ mlir.register_lowering(run_lanes_primitive, mlir.lower_fun(_launch_in_parts, mul
 
 
 def _launch_once(
-    lanes: LanePrograms, begins: PyTree, many: int, as_lanes: frozenset[int], given: dict[ArrayKey, PyTree]
+    lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: frozenset[int], given: dict[ArrayKey, PyTree]
 ) -> list[PyTree]:
-    """Return the results of one launch; arrays that need tangents but have no seed get zeros."""
+    """Return the results of one launch; initial tangents of the carry that are not in `given` are zero."""
 
     def array(key: ArrayKey) -> Any:
         if key in given:
@@ -103,36 +113,36 @@ def _launch_once(
         x = given[key._replace(tangent=False)]
         return jnp.zeros((x.shape[0], many, *x.shape[1:]), x.dtype)
 
-    order = arrange_arrays(lanes.functions, lanes.derivative(begins).moved_arrays, as_lanes)
+    order = arrange_arrays(lanes.functions, lanes.derivative(seeds).moved_arrays, as_lanes)
     carry = [array(key) for key in order[UpdateLevel.STEP]]
     before = [array(key) for level in (UpdateLevel.UNIFORM, UpdateLevel.LANE) for key in order[level]]
-    return lanes.launch(lanes.program(begins, many, as_lanes), before, carry)
+    return lanes.launch(lanes.program(seeds, many, as_lanes), before, carry)
 
 
 def _jvp_rule(
-    arrays: Sequence[PyTree], slopes: Sequence[PyTree], *, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: Any
+    arrays: Sequence[PyTree], slopes: Sequence[PyTree], *, lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: Any
 ) -> PyTree:
     """Return values and tangents of a kernel for `jax.jvp`."""
-    if begins is not None:
+    if seeds is not None:
         raise ValueError("a kernel has no second derivatives; engine = 'xla' has")
     # Integers and truths have tangents of type float0 in JAX. They carry no derivative.
     moving = [type(x) is not ad.Zero and is_real(jax.typeof(x).dtype) for x in slopes]
-    begins = tuple((key.level, key.number) for key, on in zip(lanes.keys, moving, strict=True) if on)
-    if not begins:
-        found = run_lanes_primitive.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=as_lanes)
+    seeds = tuple((key.level, key.number) for key, on in zip(lanes.value_keys, moving, strict=True) if on)
+    if not seeds:
+        found = run_lanes_primitive.bind(*arrays, lanes=lanes, seeds=None, many=0, as_lanes=as_lanes)
         return found, [_zero_tangent(x) for x in found]
 
-    # Build the derivative here: JAX 0.12 forbids tracing inside the abstract evaluation, where `ends` needs it.
-    lanes.derivative(begins)
+    # Build the derivative here: JAX 0.12 forbids tracing inside the abstract evaluation, where `result_keys` needs it.
+    lanes.derivative(seeds)
 
-    def alone(key: ArrayKey, x: Scalar) -> Any:
+    def add_direction_axis(key: ArrayKey, x: Scalar) -> Any:
         return jnp.expand_dims(x, 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1)
 
-    given = [alone(key, x) for key, x, on in zip(lanes.keys, slopes, moving, strict=True) if on]
-    found = run_lanes_primitive.bind(*arrays, *given, lanes=lanes, begins=begins, many=1, as_lanes=as_lanes)
+    given = [add_direction_axis(key, x) for key, x, on in zip(lanes.value_keys, slopes, moving, strict=True) if on]
+    found = run_lanes_primitive.bind(*arrays, *given, lanes=lanes, seeds=seeds, many=1, as_lanes=as_lanes)
     values = found[: len(lanes.functions.types[UpdateLevel.STEP])]
     results = [_zero_tangent(x) for x in values]
-    for key, x in zip(lanes.ends(begins)[len(values) :], found[len(values) :], strict=True):
+    for key, x in zip(lanes.result_keys(seeds)[len(values) :], found[len(values) :], strict=True):
         results[key.number] = x[:, 0]
     return values, results
 
@@ -141,21 +151,25 @@ ad.primitive_jvps[run_lanes_primitive] = _jvp_rule
 
 
 def _zero_tangent(x: Scalar) -> Any:
+    """Return JAX's symbolic zero tangent of a value."""
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
 def _batching_rule(
-    arrays: Sequence[PyTree], axes: Sequence[PyTree], *, lanes: LanePrograms, begins: PyTree, many: int, as_lanes: Any
+    arrays: Sequence[PyTree], axes: Sequence[PyTree], *, lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: Any
 ) -> PyTree:
-    """Apply vmap: merge the batch axis into the tangent axis if only tangents are batched, else into the lane axis."""
-    values = len(lanes.keys)
+    """Return the results for a batch, and their batch axes.
+
+    The batch axis is merged into the axis of directions if only tangents are batched, else into the axis of lanes.
+    """
+    values = len(lanes.value_keys)
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
-    how = {"lanes": lanes, "begins": begins}
+    how = {"lanes": lanes, "seeds": seeds}
     # Only the seed tangents are batched, as in `jax.jacfwd`: the values run once, with size*many tangents.
     if all(axis is None for axis in axes[:values]):
         more = []
         # Merge the batch axis in front of the tangent axis, which stands behind the lane axis if there is one.
-        for key, x, axis in zip(lanes.slopes(begins), arrays[values:], axes[values:], strict=True):
+        for key, x, axis in zip(lanes.seed_keys(seeds), arrays[values:], axes[values:], strict=True):
             at = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
             x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
             x = jnp.moveaxis(x, 0, at)
@@ -163,11 +177,11 @@ def _batching_rule(
         found = run_lanes_primitive.bind(*arrays[:values], *more, **how, many=size * many, as_lanes=as_lanes)
         results = [
             x.reshape(x.shape[0], size, many, *x.shape[2:]) if key.tangent else x
-            for key, x in zip(lanes.ends(begins), found, strict=True)
+            for key, x in zip(lanes.result_keys(seeds), found, strict=True)
         ]
-        return results, [1 if key.tangent else None for key in lanes.ends(begins)]
+        return results, [1 if key.tangent else None for key in lanes.result_keys(seeds)]
 
-    keys = [*lanes.keys, *lanes.slopes(begins)]
+    keys = [*lanes.value_keys, *lanes.seed_keys(seeds)]
     own = {k.number for k, axis in zip(keys, axes, strict=True) if k.level == UpdateLevel.UNIFORM and axis is not None}
     # The last of the values is an array of the carry, so it always has a lane axis.
     count = arrays[values - 1].shape[1 if axes[values - 1] == 0 else 0]
@@ -189,13 +203,14 @@ def _batching_rule(
 batching.primitive_batchers[run_lanes_primitive] = _batching_rule
 
 
-def _refuse_partial_evaluation(trace: Any, *tracers: Any, **how: Any) -> Scalar:
+def _refuse_partial_evaluation(trace: Any, *tracers: Any, **how: Any) -> NoReturn:
     """Raise ValueError: JAX linearizes the kernel (`jax.grad`, `jax.linearize`), and no reverse mode exists."""
     del trace, tracers, how
     raise ValueError(NO_REVERSE_MODE)
 
 
-def _refuse_transpose(*args: PyTree, **how: Any) -> Any:
+def _refuse_transpose(*args: PyTree, **how: Any) -> NoReturn:
+    """Raise ValueError: JAX transposes the kernel, and no reverse mode exists."""
     del args, how
     raise ValueError(NO_REVERSE_MODE)
 

@@ -1,8 +1,8 @@
-"""A cache of compiled libraries in the user's cache folder, with a check for damage before a library is loaded.
+"""A cache of compiled libraries and GPU code in the user's cache folder, with a check for damage.
 
-A file name holds two digests: one of every input of the compilation, and one of the file's content. If the content does
-not match its digest (empty, truncated, changed, or another library), the file is removed and the library is compiled
-again.
+A file name holds two digests: one of every input of the compilation, and one of the file's content. A library is
+compiled again if no file has its first digest: it was never made, an input changed, or it was removed to make room. A
+file whose content does not match the second digest (empty, truncated or changed) is removed, and compiled again too.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ import sys
 from diffabs.runtime import files
 
 CACHE = "DIFFABS_KERNEL_CACHE"  # environment variable: folder of the compiled libraries
-MAX_CACHE_BYTES = 1 << 28  # about 800 libraries; a larger cache loses its least recently used half
+MAX_CACHE_BYTES = 1 << 28  # about 800 libraries; a larger cache loses its less recently used half
 CONTENT = 32  # hexadecimal digits of the content digest in a file name
 log = logging.getLogger("diffabs")
 
@@ -56,10 +56,10 @@ def make_cache_folder() -> pathlib.Path:
 def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
     """Return the file of a library, or None if the cache does not hold it.
 
-    A damaged file is removed, with one line in the log.
+    The content of the file is checked. A damaged file is removed, with one line in the log.
 
     Args:
-        made_of: Digest of every input that decides the library.
+        made_of: Digest of every input of the compilation.
         suffix: End of the file's name, such as ".so".
 
     Raises:
@@ -83,11 +83,11 @@ def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
 def write_library(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
     """Write a library to the cache and return its file.
 
-    The write is atomic: a file with a library's name is always complete. A cache above MAX_CACHE_BYTES first loses its
-    least recently used files.
+    The write is atomic: a file with a library's name is always complete. If the files with this suffix have more than
+    MAX_CACHE_BYTES, the less recently used half of them is removed first.
 
     Args:
-        made_of: Digest of every input that decides the library.
+        made_of: Digest of every input of the compilation.
         suffix: End of the file's name, such as ".so".
         content: Bytes of the library.
 
@@ -100,4 +100,5 @@ def write_library(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
 
 
 def _file_name(made_of: str, content: bytes, suffix: str) -> str:
+    """Return the name of a library's file: both digests and the suffix."""
     return f"{made_of}-{hashlib.sha256(content).hexdigest()[:CONTENT]}{suffix}"

@@ -1,7 +1,7 @@
 """Compilation of CUDA C++ to machine code of a given architecture by NVRTC, NVIDIA's runtime compiler.
 
-NVRTC comes with JAX for GPUs. It needs neither a GPU nor a driver. The user's cache folder keeps the machine code, like
-the libraries of `compilers`.
+NVRTC comes with JAX for GPUs. It needs neither a GPU nor a driver. The cache of `library_cache` keeps the machine code;
+the digest of text, headers, flags, NVRTC's version and architecture identifies it.
 """
 
 import ctypes
@@ -14,7 +14,6 @@ from typing import Any
 
 from diffabs.compiler.runtime import library_cache
 from diffabs.compiler.runtime.toolchain import NATIVE_FOLDER, NoCompiler
-from diffabs.core.types import Scalar
 from diffabs.runtime import files
 
 HEADERS = ("lane.h", "threads.h")
@@ -26,7 +25,7 @@ NVRTC_FLAGS = (
 
 
 def build_cubin(text: str, architecture: str) -> pathlib.Path:
-    """Compile a CUDA C++ text, unless the cache holds its machine code, and return the file.
+    """Return the file with the machine code (cubin) of a CUDA C++ text; compile it unless the cache holds it.
 
     A file `.log` beside it holds the assembler's messages on register usage.
 
@@ -81,8 +80,8 @@ def nvrtc_version() -> tuple[int, int]:
 
 
 @functools.cache
-def _load_nvrtc() -> Scalar:
-    """Load NVRTC from the package nvidia-cuda-nvrtc (CUDA 13) or nvidia-cuda-nvrtc-cu12, or from the system."""
+def _load_nvrtc() -> ctypes.CDLL:
+    """Return NVRTC of the package nvidia-cuda-nvrtc (CUDA 13) or nvidia-cuda-nvrtc-cu12, or of the system."""
     found = importlib.util.find_spec("nvidia")
     folders = [*(found.submodule_search_locations or ())] if found else []
     paths = [
@@ -97,6 +96,7 @@ def _load_nvrtc() -> Scalar:
 
 
 def _compile_cubin(text: str, architecture: str, headers: list[bytes]) -> tuple[bytes, str]:
+    """Return the machine code of a CUDA C++ text and NVRTC's messages; raise NoCompiler if it does not compile."""
     nvrtc, program = _load_nvrtc(), ctypes.c_void_p()
     names = (ctypes.c_char_p * len(HEADERS))(*(name.encode() for name in HEADERS))
     contents = (ctypes.c_char_p * len(headers))(*headers)
@@ -114,7 +114,7 @@ def _compile_cubin(text: str, architecture: str, headers: list[bytes]) -> tuple[
 
 
 def _part(nvrtc: Any, name: str, program: ctypes.c_void_p) -> bytes:
-    """Return an output of NVRTC, such as the log or the machine code."""
+    """Return an output of an NVRTC program: "ProgramLog" or "CUBIN" (`name`)."""
     size = ctypes.c_size_t()
     getattr(nvrtc, f"nvrtcGet{name}Size")(program, ctypes.byref(size))
     out = ctypes.create_string_buffer(size.value)

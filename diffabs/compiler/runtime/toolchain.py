@@ -1,6 +1,6 @@
-"""Compilation of C++ to a shared library by a compiler of this machine, with the cache of `binaries`.
+"""Compilation of C++ to a shared library by a compiler of this machine, with the cache of `library_cache`.
 
-The digest of text, headers, compiler, flags and processor identifies a library.
+The digest of text, headers (ours and XLA's `c_api.h`), compiler, flags and processor identifies a library.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ class NoCompiler(Exception):
 
 
 class Compiler(NamedTuple):
-    """A compiler command that works, with the first line of its version output."""
+    """A compiler command that works, and the first line of its version output."""
 
     command: tuple[str, ...]
     version: str
@@ -52,8 +52,8 @@ class Compiler(NamedTuple):
 def _probe_compiler(command: tuple[str, ...]) -> Compiler | str:
     """Return the compiler of a command, or a text that says why it does not work.
 
-    A compiler works if it makes a library that this process can load. A note in the cache folder records the success,
-    so that later processes skip the trial.
+    A compiler works if it makes a library that this process can load. After a success, an empty file in the cache
+    folder lets later processes skip the trial.
     """
     try:
         version = _run_command([*command, "--version"], PROBE_TIMEOUT_S)
@@ -140,6 +140,7 @@ def describe_compiler() -> dict[str, str]:
 
 
 def _compile(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path, longest: float) -> None:
+    """Compile a C++ file to the library `result` in at most `longest` seconds; raise NoCompiler if that fails."""
     include = [f"-I{NATIVE_FOLDER}", f"-I{jax.ffi.include_dir()}"]
     done = _run_command([*command, *CPP_FLAGS, *include, "-o", str(result), str(source), "-lm"], longest)
     if done.returncode or not result.is_file():
@@ -149,7 +150,10 @@ def _compile(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Pat
 
 
 def _run_command(words: list[str], longest: float) -> subprocess.CompletedProcess[str]:
-    """Run a command for at most `longest` seconds; raise NoCompiler on timeout, OSError if there is no such command."""
+    """Run a command for at most `longest` seconds and return its exit status and output.
+
+    Raises NoCompiler on timeout, OSError if there is no such command.
+    """
     told = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(words, **told, start_new_session=True) as process:
         try:
@@ -165,6 +169,7 @@ def _run_command(words: list[str], longest: float) -> subprocess.CompletedProces
 
 
 def _digest(text: str, made: Compiler) -> str:
+    """Return the digest of every input of the compilation of `text` (64 hexadecimal digits)."""
     # The FFI header belongs to the digest: a new jaxlib may change the layout of the call frame.
     interface = pathlib.Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     headers = [path.read_bytes() for path in (*sorted(NATIVE_FOLDER.glob("*.h")), interface)]
