@@ -13,6 +13,7 @@ from diffabs.cli import console, show, targets
 from diffabs.compiler.listing import count_by_level
 from diffabs.compiler.lower.rules import Unsupported
 from diffabs.compiler.passes import PASSES, LaneCall, find_lane_calls, list_pass
+from diffabs.compiler.runtime.jax_primitive import MAX_TANGENTS_PER_LAUNCH
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.pytree import get, parameters
@@ -21,8 +22,6 @@ from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.ensemble import run_batch
-
-MAX_DIRECTIONS = 8  # tangents of one launch
 
 
 def compile_scenario(
@@ -77,10 +76,13 @@ def _differentiated_paths(chosen: Scenario, by: list[str]) -> list[str]:
                 raise unknown_name_error(f"--by {path} is no tunable number of this loop", path, tunable)
         if len(set(by)) != len(by):
             raise ScenarioError(f"--by {', '.join(by)}: a parameter is given twice")
-        if len(by) > MAX_DIRECTIONS:
-            raise ScenarioError(f"--by is given {len(by)} times, outside [1, {MAX_DIRECTIONS}]")
+        if len(by) > MAX_TANGENTS_PER_LAUNCH:
+            raise ScenarioError(f"--by is given {len(by)} times, outside [1, {MAX_TANGENTS_PER_LAUNCH}]")
         return by
-    return [next(path for path in tunable if path.startswith("plant."))]
+    first = [path for path in tunable if path.startswith("plant.")] or list(tunable)
+    if not first:
+        raise ScenarioError(f"{chosen.name} has no tunable number, by which a kernel could be differentiated")
+    return first[:1]
 
 
 def _trace(chosen: Scenario, paths: list[str]) -> tuple[LaneCall, LaneCall]:

@@ -214,7 +214,9 @@ class Graph:
             case "select" | "any":
                 return self.select(*args) if node.op == "select" else self.any(args[0])
             case "gate":
-                return self._gate(node.attr, *args) if args[0].op != "const" and args[1] is not args[2] else args[2]
+                if args[0].op == "const":
+                    return args[2] if args[0].attr else args[1]
+                return args[2] if args[1] is args[2] else self._gate(node.attr, *args)
         return self.op(node.op, *args)
 
 

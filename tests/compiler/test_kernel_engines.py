@@ -264,7 +264,7 @@ class TestTune:
         assert "--engine gpu is unknown" in run(*command, "--engine", "gpu", status=2).stderr
 
 
-@killed_by("tune/worst.py", "accepted=True, engine=engine)", "accepted=True)")
+@killed_by("tune/worst.py", "accepted=True, engine=engine)", "accepted=True, engine='xla')")
 @killed_by("tune/worst.py", "    problem = problem.with_engine(engine)\n", "")
 @pytest.mark.slow
 def test_the_worst_case_is_that_of_xla(users_engine, monkeypatch):
