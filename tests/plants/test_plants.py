@@ -320,6 +320,7 @@ def test_a_stopped_wheel_stays_stopped_until_released(name):
     assert 0 < wheel_rate(0.999 * asked) < 0.01 * released
 
 
+@killed_by("plants/wheel.py", "return jnp.where(jnp.greater(speed, 0), speed, 0.0)", "return speed", case="plant0")
 @pytest.mark.parametrize("plant", [QuarterCar(road=SNOW), MirroredRig(road=DRY_ASPHALT), LabRig()])
 def test_projection(plant):
     """Speeds below zero become zero, the rest stays."""

@@ -197,11 +197,6 @@ def on_limits(solver):
 
 @killed_by(
     "simulate/step/adaptive.py",
-    "exact = fine & (((error <= 1) & (past_crossing <= 0)) | (carry.length <= self.least))",
-    "exact = fine & ((error <= 1) | (carry.length <= self.least))",
-)
-@killed_by(
-    "simulate/step/adaptive.py",
     "surface = find_surface_crossing(seen, carry.search.which, h) if self.is_logged else None",
     "surface = None",
 )

@@ -77,12 +77,6 @@ def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
 
 
 @killed_by("controllers/sampled.py", "output, self._until(clock.t), jnp", "output, clock.t + self.delay, jnp")
-@killed_by(
-    "simulate/step/event_location.py",
-    "jnp.where(steep, moved -",
-    "jnp.where(steep & False, moved -",
-    case="fixed-0.002",
-)
 @pytest.mark.parametrize("late", cases([2e-3, 4e-3, 2.3e-3, 5e-3], 2e-3, 4e-3, 5e-3))
 @pytest.mark.parametrize(
     "solver", [pytest.param(d.FixedStep(H, 0.03), id="fixed"), pytest.param(d.Adaptive(1e-5, 0.03, H), id="adaptive")]
@@ -104,12 +98,6 @@ def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
     close(slope * 0.03, -levels[-1], rtol=1e-7)
 
 
-@killed_by(
-    "simulate/step/event_location.py",
-    "share = ratio(zero - search.place, x - search.place)",
-    "share = 0.0 * zero",
-    case="jacfwd",
-)
 @pytest.mark.parametrize("derivative", cases([jax.jacfwd, jax.jacrev], jax.jacrev))
 def test_derivatives_of_a_moment_are_those_at_the_zero(derivative):
     """x' = -k x comes down to a level, at steps of 0.4/k: against differences of the runs themselves. The last try

@@ -284,7 +284,6 @@ PASSIVE = {
 }
 
 
-@killed_by("plants/wheel.py", "return jnp.where(jnp.greater(speed, 0), speed, 0.0)", "return speed", case="car")
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ["car", *(pytest.param(name, marks=pytest.mark.slow) for name in ("rig", "lab"))])
 def test_energy_never_increases_down_to_standstill(plant):

@@ -75,6 +75,7 @@ def curvature(loop, path, solver, metrics=METRICS, outer=jax.jacfwd, inner=jax.j
     return found, np.moveaxis((up - down) / (2 * np.array(WIDTHS)[:, None, None, None]), 1, -1)
 
 
+@killed_by("simulate/step/event_location.py", "return -rises / jnp", "return 0.0 * rises / jnp", case="a stop")
 @pytest.mark.parametrize("name", ["a stop", *(pytest.param(n, marks=pytest.mark.slow) for n in list(LOOPS)[1:])])
 @pytest.mark.slow
 def test_second_derivatives_are_those_of_differences(name):
