@@ -172,7 +172,7 @@ print(describe_placement(jax.device_put(np.zeros(4), jax.NamedSharding(mesh, jax
 @killed_by("simulate/drive/sharding.py", "if any(len(devices) > 1 for devices in places):", "if False:")
 def test_several_devices_of_one_processor():
     """A kernel uses all cores. Runs that lie on several devices are left to XLA."""
-    flags = os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=2"
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
     words = [sys.executable, "-c", SEVERAL]
     done = subprocess.run(words, env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == ["True", "''", "the runs lie on several devices"]
