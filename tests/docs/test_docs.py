@@ -110,6 +110,7 @@ def test_a_class_shows_how_it_is_called():
 
 def test_a_line_about_a_parameter_keeps_its_name():
     """A line `name: ...` that Google's style would read as the head of a section."""
+    pytest.importorskip("griffe", reason="griffe is in the group `docs`")
     doctests = loaded("doctests")
     text = "What it is.\n\nrtol: the error\n    of a step\nstep, h: a length\nNote: no field."
     assert doctests.listed(text, {"rtol", "step", "h"}).splitlines() == [
