@@ -1,6 +1,8 @@
 """Actuators: blocks that map the controller's command to the plant's control."""
 
+from diffabs.actuators.dead_time import DeadTime as DeadTime
 from diffabs.actuators.delay import Delay as Delay
+from diffabs.actuators.lag import AsymmetricLag as AsymmetricLag
 from diffabs.actuators.lag import Lag as Lag
 from diffabs.actuators.lag import Limits as Limits
 from diffabs.actuators.lag import RateLimit as RateLimit

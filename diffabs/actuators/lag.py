@@ -1,7 +1,8 @@
-"""Actuators without a dead time: limits, lag and rate limit."""
+"""Actuators without a dead time: limits, lags and rate limit."""
 
 from collections.abc import Iterator
 
+import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.numerics import clamp, quotient
@@ -55,6 +56,30 @@ class Lag:
         """Return the control, for a brake its torque [N m]."""
         del t, signal
         return memory.flow
+
+
+@pytree
+class AsymmetricLag:
+    """T control' = command - control, control(0) = 0, with T = rise where the command is greater, else T = fall.
+
+    A hydraulic brake builds its pressure up slower, or faster, than it releases it.
+
+    Attributes:
+        rise: Time constant towards a greater command [s], > 0.
+        fall: Time constant towards a smaller command [s], > 0.
+    """
+
+    rise: Scalar = param(default=0.02, unit="s", above=0.0)
+    fall: Scalar = param(default=0.01, unit="s", above=0.0)
+
+    start = Lag.start
+    output = Lag.output
+
+    def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """Return control', in the control's unit per second."""
+        del t
+        excess = signal - memory.flow
+        return quotient(excess, jnp.where(excess > 0, self.rise, self.fall))
 
 
 @pytree

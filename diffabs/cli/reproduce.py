@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 
 def reproduce(
-    name: Annotated[str, typer.Argument(help="Paper: slip-lmi, slip-estimator, arm-balance, or all.")] = "all",
+    name: Annotated[
+        str,
+        typer.Argument(help="A paper: slip-lmi, slip-estimator, arm-balance, or all. Or lab-rig: the rig, measured."),
+    ] = "all",
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
         "out"
     ),
@@ -27,15 +30,16 @@ def reproduce(
     with console.end_on_errors():
         console.need_matplotlib()
         console.need_extra("report")
-        from diffabs.papers import PAPERS, compact
+        from diffabs.papers import PAPERS, REPRODUCTIONS, compact
 
-        if name != "all" and name not in PAPERS:
-            raise values.unknown_name_error(f"there is no paper {values.format_given(name)}", name, (*PAPERS, "all"))
+        if name != "all" and name not in REPRODUCTIONS:
+            known = (*REPRODUCTIONS, "all")
+            raise values.unknown_name_error(f"there is no paper {values.format_given(name)}", name, known)
         results: JsonObject = {}
         try:
             for paper in PAPERS if name == "all" else (name,):
                 with targets.new_target_folder(out / paper) as folder:
-                    results[paper] = _reproduce_with_progress(paper, PAPERS[paper], folder)
+                    results[paper] = _reproduce_with_progress(paper, REPRODUCTIONS[paper], folder)
                     report.write_report_file([folder], folder / report.DEFAULT_NAME)
                 if not as_json:
                     show.show_paper(compact(results[paper]), out / paper)

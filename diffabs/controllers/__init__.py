@@ -11,6 +11,7 @@ from diffabs.controllers.feedforward import HoldingInput as HoldingInput
 from diffabs.controllers.gain_schedule import ProportionalFeedback as ProportionalFeedback
 from diffabs.controllers.gain_schedule import ScheduledFeedback as ScheduledFeedback
 from diffabs.controllers.pid import PID as PID
+from diffabs.controllers.playback import PlayedCommand as PlayedCommand
 from diffabs.controllers.sampled import Sampled as Sampled
 from diffabs.controllers.sampled_on_grid import SampledOnGrid as SampledOnGrid
 from diffabs.controllers.switching import ConstantTorque as ConstantTorque

@@ -1,4 +1,6 @@
-"""Reproductions of the papers: every figure as PNG, every number with its published value and the difference.
+"""Reproductions: every figure as PNG, every number with its published or measured value and the difference.
+
+`PAPERS` are the three papers. `lab-rig` compares with the measured rig, `literature` with other people's programs.
 
 `compact` returns the short form of a summary that the command line prints.
 
@@ -21,7 +23,7 @@ Progress = Callable[[str], None]
 Reproduction = Callable[[pathlib.Path, Progress], dict[str, Any]]
 
 
-def _paper(module: str) -> Reproduction:
+def _reproduction(module: str) -> Reproduction:
     def reproduce(folder: pathlib.Path, progress: Progress) -> JsonObject:
         """Write figures and `summary.json` into the folder, and return the summary."""
         return importlib.import_module(f"diffabs.papers.{module}").reproduce(folder, progress)
@@ -29,8 +31,9 @@ def _paper(module: str) -> Reproduction:
     return reproduce
 
 
-MODULES = {"slip-lmi": "slip_lmi", "slip-estimator": "slip_estimator", "arm-balance": "arm_balance"}
-PAPERS: dict[str, Reproduction] = {name: _paper(module) for name, module in MODULES.items()}
+PAPERS = ("slip-lmi", "slip-estimator", "arm-balance")
+MODULES = {name: name.replace("-", "_") for name in (*PAPERS, "lab-rig")}
+REPRODUCTIONS: dict[str, Reproduction] = {name: _reproduction(module) for name, module in MODULES.items()}
 
 
 def compact(summary: Table) -> "Digest":

@@ -37,15 +37,15 @@ def paper_section(document: Document) -> Section:
     name = content["paper"]
     if name not in MODULES:
         raise KeyError(f"paper {name}")
-    found = compact(content)
+    found, scenario = compact(content), content.get("scenario", name)
     return Section(
         title=content["title"],
         question="Are the numbers, figures and claims of this paper true? Its experiments are computed again, and"
         " compared with its printed values and with independent solutions.",
         answer=list(found.agreement),
         verdicts=[ReportVerdict(*verdict) for verdict in found.verdicts],
-        model=model_tables(describe_model(load(name, integrated=False))),
-        model_note=f"The packaged scenario {name}; the first column of the tables names the change of each row.",
+        model=model_tables(describe_model(load(scenario, integrated=False))),
+        model_note=f"The packaged scenario {scenario}; the first column of the tables names the change of each row.",
         figures=existing_figures(content["figures"], document.folder),
         tables=[ReportTable("In short", found.headings, found.lines), *_tables(content)],
         certificate=_certificates(content.get("design")),

@@ -1,6 +1,7 @@
 """Sensors: blocks that map the plant's output to the measured output."""
 
 from diffabs.sensors.angles import AngleSensor as AngleSensor
+from diffabs.sensors.encoder import EncoderSlip as EncoderSlip
 from diffabs.sensors.noise import Bias as Bias
 from diffabs.sensors.noise import Noise as Noise
 from diffabs.sensors.noise import PlayedWheelNoise as PlayedWheelNoise

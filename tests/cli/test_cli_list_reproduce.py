@@ -86,7 +86,9 @@ def papers(monkeypatch):
         "write_report_file",
         lambda sources, target, title="": target.write_text(f"report of {len(sources)}"),
     )
-    monkeypatch.setitem(sys.modules, "diffabs.papers", types.SimpleNamespace(PAPERS=found, compact=compact))
+    monkeypatch.setitem(
+        sys.modules, "diffabs.papers", types.SimpleNamespace(PAPERS=found, REPRODUCTIONS=found, compact=compact)
+    )
     return found, interrupted
 
 

@@ -9,7 +9,7 @@ import typer
 from project import ROOT
 
 from diffabs.cli.main import app
-from diffabs.papers import PAPERS
+from diffabs.papers import REPRODUCTIONS
 from diffabs.scenario.scenario import names
 
 PAGE = (ROOT / "docs" / "papers.md").read_text(encoding="utf-8")
@@ -77,7 +77,7 @@ def test_every_command_that_is_named_exists():
             assert words[0] in known, command
             options = {name for parameter in known[words[0]].params for name in parameter.opts}
             assert {w.partition("=")[0] for w in words if w.startswith("--")} <= options, command
-            assert words[1] in ((*PAPERS, "all") if words[0] == "reproduce" else names()), command
+            assert words[1] in ((*REPRODUCTIONS, "all") if words[0] == "reproduce" else names()), command
 
 
 def test_every_verdict_computed_for_this_page_is_on_it():

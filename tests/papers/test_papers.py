@@ -19,7 +19,7 @@ from rich.console import Console
 from diffabs import FixedStep, plot, rollout
 from diffabs.cli import show
 from diffabs.objectives import BRAKING
-from diffabs.papers import PAPERS, arm_balance, compact, lmi_design, record, slip_estimator, slip_lmi
+from diffabs.papers import PAPERS, REPRODUCTIONS, arm_balance, compact, lmi_design, record, slip_estimator, slip_lmi
 from diffabs.references import FixedSlip
 from diffabs.report import build_report, find_documents
 from diffabs.scenario.defaults import braking
@@ -36,7 +36,7 @@ class Reproduced(dict):
 
 def _reproduced(name: str, folder: Any) -> Reproduced:
     said: list[str] = []
-    summary = Reproduced(PAPERS[name](folder, said.append))
+    summary = Reproduced(REPRODUCTIONS[name](folder, said.append))
     summary.folder, summary.said = folder, said
     return summary
 

@@ -111,6 +111,7 @@ CONTROLLERS: dict[str, Any] = {
         correction=np.linspace(0.05, 0.6, 12).reshape(6, 2),
         voltage_max=60.0,
     ),
+    "played command": controllers.PlayedCommand(commands=np.array([0.0, 30.0, 12.0]), period=2e-3),
     "sampled relay": controllers.Sampled(controller=controllers.Relay(), delay=3e-4),
     "sampled on the grid": controllers.SampledOnGrid(controller=_PID, sampling_period=2e-3, delay=1.3e-3),
 }
@@ -133,6 +134,8 @@ ACTUATORS: dict[str, Any] = {
     "limits": actuators.Limits(low=5.0, high=60.0),
     "voltage": actuators.VoltageLimit(voltage_max=40.0),
     "lag": actuators.Lag(),
+    "asymmetric lag": actuators.AsymmetricLag(rise=0.012, fall=0.004),
+    "dead time": actuators.DeadTime(rise=2.3e-3, fall=1.6e-3),
     "rate limit": actuators.RateLimit(),
     "delay": actuators.Delay(time=2.3e-3, capacity=8),
     "series": blocks.Series(
@@ -152,6 +155,7 @@ SENSORS: dict[str, Any] = {
     "wheel noise": sensors.WheelNoise(slip=0.01, period=2e-3),
     "played wheel noise": sensors.PlayedWheelNoise(noise=np.array([0.01, -0.02, 0.005]), period=2e-3),
     "drifting speed": sensors.DriftingSpeed(first=0.03, last=-0.05, time_constant=0.01),
+    "encoder slip": sensors.EncoderSlip(period=2e-3),
     "estimated speed": sensors.SpeedEstimator(gate=0.2, growth=0.3, period=2e-3),
     "series": blocks.Series(blocks=(sensors.Noise(deceleration=0.05), sensors.WheelSpeed())),
 }

@@ -1,0 +1,53 @@
+"""A recorded command, played to the plant: runs under the commands of an experiment, without its controller."""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.protocols import Clock, Memory, Tracking, no_flow
+from diffabs.core.pytree import param, pytree
+from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.types import Scalar, Vector
+
+
+@pytree
+class PlayedCommand:
+    """Entry k of `commands` from k period on; the last entry stays. Target and measured signal have no effect.
+
+    Attributes:
+        commands: Recorded commands, shape (length,) [control].
+        period: Time for which an entry is held [s], a whole multiple of the integration step.
+    """
+
+    commands: Vector = param(default=(0.0,), unit="control", free=True)
+    period: Scalar = param(default=0.01, unit="s", above=0.0, tunable=False)
+
+    flow = no_flow
+
+    def start(self, signal: Tracking) -> Memory:
+        """Return the memory with the first entry."""
+        return Memory(held=jnp.asarray(self.commands)[0] + 0.0 * signal.target)
+
+    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
+        """Return the present entry [control]."""
+        del t, signal
+        return memory.held
+
+    def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
+        """Return the memory with the next entry if a period begins, else the old memory."""
+        del signal
+        now, played = clock.ticks(self.period)
+        commands = jnp.asarray(self.commands)
+        entry = jax.lax.dynamic_index_in_dim(commands, jnp.minimum(played, commands.size - 1), keepdims=False)
+        return Memory(held=jnp.where(now, entry, memory.held))
+
+    def problems(self) -> Iterator[str]:
+        """Yield a message if `commands` is not a vector of at least one entry."""
+        if np.ndim(self.commands) != 1 or np.size(self.commands) < 1:
+            yield f"commands has shape {np.shape(self.commands)}; it needs (n,), n at least 1"
+
+    def grid_rules(self, step: float) -> Iterator[Rule]:
+        """Yield the rule that the period is a multiple of the integration step."""
+        yield whole_steps("period", self.period, step)

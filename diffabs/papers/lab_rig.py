@@ -1,0 +1,333 @@
+"""INTECO's laboratory rig: measured against simulated.
+
+Bearing friction is identified from four coasting curves, all else from experiment 1. Experiment 2 judges the result.
+`experiments/measured_rig.py` shows how the model was chosen, and what the identified rig means for the controllers.
+"""
+
+import dataclasses
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from diffabs.core.pytree import get, param, pytree
+from diffabs.core.types import JsonObject, Params, Scalar, Table
+from diffabs.identify import Identified, fit
+from diffabs.papers import record
+from diffabs.papers.digest import Digest
+from diffabs.papers.measured_rig import (
+    BRAKING_SPEED,
+    EXPERIMENTS,
+    FULL_SCALE,
+    HARDLY_TURNS,
+    MASK,
+    Comparison,
+    Record,
+    RecordedRun,
+    build_loop,
+    compare,
+    fit_record,
+    measured_comparison,
+    read_curves,
+    read_record,
+    simulate_readings,
+    solver_for,
+    with_values,
+)
+from diffabs.plants import BrakeStart, LabRig
+from diffabs.runtime import provenance
+from diffabs.simulate.run import rollout
+
+TITLE = "INTECO's laboratory rig: measured against simulated (relay at slip 0.1 and 0.7, from 1,700 rpm)"
+WHEEL_RADIUS, DRUM_RADIUS = 0.6004 / (2 * np.pi), 0.619 / (2 * np.pi)  # m, the perimeters in the driver
+PIXEL = {"wheel": 0.35, "drum": 0.5}  # rad/s, of the coasting curves
+READING_SHARE = 0.29  # rms error of a reading, uniform in its pixel
+
+# Each free parameter of experiment 1: unit, and what it is.
+FREE = {
+    "loop.plant.road.w4": ("1", "friction of the tyre"),
+    "loop.plant.brake_gain": ("N m", "slope of the brake's torque over the command"),
+    "loop.plant.brake_rate": ("1/s", "rate of the brake's lag"),
+    "loop.plant.wheel_inertia": ("kg m^2", "inertia of the braked wheel"),
+    "loop.actuator.rise": ("s", "dead time before the brake grips"),
+    "loop.actuator.fall": ("s", "dead time before the brake releases"),
+    "counter_lag": ("s", "age of the wheel speed in the record"),
+}
+RANGES: Params = {
+    "loop.plant.road.w4": (0.02, 0.8),
+    "loop.plant.brake_gain": (8.0, 80.0),
+    "loop.plant.brake_rate": (10.0, 1500.0),
+    "loop.plant.wheel_inertia": (2e-3, 2e-2),
+    "loop.actuator.rise": (2e-3, 0.05),
+    "loop.actuator.fall": (2e-3, 0.05),
+    "counter_lag": (0.0, 0.03),
+}
+START: Params = {
+    "loop.plant.road.w4": 0.22,
+    "loop.plant.brake_gain": 30.0,
+    "loop.plant.brake_rate": 300.0,
+    "loop.actuator.rise": 0.015,
+    "loop.actuator.fall": 0.008,
+}
+
+NOTES = [
+    "The readings come from the figures of the manual, so a pixel limits them: 10 ms, 5.3 rpm and 0.004 of slip.",
+    "The radii are those of the driver's perimeters, 0.0956 and 0.0985 m. With the radii of the manual's table a rolling "
+    "wheel would slip by -2.5 %.",
+    "A run starts at the sample of the first command, with the drum at 1,700 rpm and the wheel rolling. The relay reads "
+    "the slip of the encoders every 10 ms.",
+    "The standard deviations come from the model linearised at the fit. The residuals estimate their scale. They do not "
+    "cover errors of the model.",
+]
+
+
+@pytree
+class Coasting:
+    """A wheel that only its bearing brakes: J w' = -(d w + M), so w(t) = (w0 + M/d) exp(-d t/J) - M/d.
+
+    Attributes:
+        speed: Speed w0 at t = 0 [rad/s].
+        friction: Viscous friction d [N m s].
+        stiction: Dry friction M [N m].
+        inertia: Inertia J [kg m^2], known.
+    """
+
+    speed: Scalar = param(default=100.0, unit="rad/s", above=0.0)
+    friction: Scalar = param(default=1e-4, unit="N m s", above=0.0)
+    stiction: Scalar = param(default=1e-2, unit="N m", above=0.0)
+    inertia: Scalar = param(default=7.5281e-3, unit="kg m^2", above=0.0)
+
+    def at(self, t: Any) -> Any:
+        """Return the speed [rad/s] at instants `t` [s]."""
+        dry = self.stiction / self.friction
+        return (self.speed + dry) * jnp.exp(-self.friction * t / self.inertia) - dry
+
+
+def _coasting_residuals(wheel: Coasting, t: Any, speed: Any) -> Any:
+    return wheel.at(t) - speed
+
+
+def fit_coasting() -> dict[str, Identified]:
+    """Return the bearing friction of wheel and drum from the four coasting curves, by name of the curve."""
+    found = {}
+    for name, curve in read_curves().items():
+        if name.startswith("coasting-"):
+            body = name.split("-")[1]
+            inertia = MASK.wheel_inertia if body == "wheel" else MASK.drum_inertia
+            start = Coasting(speed=float(curve[0, 1]), inertia=inertia)
+            data = (jnp.asarray(curve[:, 0]), jnp.asarray(curve[:, 1]))
+            found[name] = fit(start, ["speed", "friction", "stiction"], _coasting_residuals, data=data,
+                              sigma=READING_SHARE * PIXEL[body], absolute=False)  # fmt: skip
+    return found
+
+
+def build_rig(coasting: Params) -> LabRig:
+    """Return the rig before the fit of experiment 1: the driver's radii, and the bearing friction of the coasting curves.
+
+    Args:
+        coasting: Fits by name of the curve, from `fit_coasting`.
+    """
+    means = {
+        f"{body}_{kind}": float(np.mean([found.values[kind] for name, found in coasting.items() if body in name]))
+        for body in ("wheel", "drum")
+        for kind in ("friction", "stiction")
+    }
+    return dataclasses.replace(MASK, wheel_radius=WHEEL_RADIUS, drum_radius=DRUM_RADIUS, **means)
+
+
+def build_run(record: Record, given: bool, rig: LabRig) -> RecordedRun:
+    """Return a run of the measured rig from 1,700 rpm.
+
+    Args:
+        record: Record of the experiment.
+        given: True plays the recorded commands; False lets the loop's relay switch.
+        rig: Plant.
+    """
+    loop = build_loop(record, given, rig)
+    return RecordedRun(loop=dataclasses.replace(loop, initial=BrakeStart(speed=BRAKING_SPEED * rig.drum_radius)))
+
+
+def judge(record: Record, rig: LabRig, values: Params) -> JsonObject:
+    """Return how far the loop is from a record, under given commands and under its own relay.
+
+    Args:
+        record: Record of the experiment.
+        rig: Plant before the fit.
+        values: Identified values by path.
+    """
+    given, own = (compare(with_values(build_run(record, mode, rig), values), record) for mode in (True, False))
+    measured = measured_comparison(record)
+    return {
+        "wheel_rms_percent_given": given.wheel_rms_percent,
+        "slip_rms_given": given.slip_rms,
+        "wheel_rms_percent_own": own.wheel_rms_percent,
+        "slip_rms_own": own.slip_rms,
+        **{name: getattr(own, name) for name in ("cycles", "stop_time", "stop_distance")},
+        "given": _ends(given),
+        "measured": {**_ends(measured), "printed_distance": record.printed_distance},
+    }
+
+
+def _ends(seen: Comparison) -> JsonObject:
+    return {"cycles": seen.cycles, "stop_time": seen.stop_time, "stop_distance": seen.stop_distance}
+
+
+def parameter_rows(found: Identified, coasting: Params) -> list[JsonObject]:
+    """Return each identified parameter with the value of the model's mask, unit and standard deviation.
+
+    Args:
+        found: Fit of experiment 1.
+        coasting: Fits of the coasting curves by name.
+    """
+    rows = [
+        {"name": f"{name}: {kind}", "value": float(one.values[kind]), "unit": unit, "mask": float(mask),
+         "standard_deviation": float(one.uncertainty.deviations[kind]), "what": f"bearing's {kind}, from its curve"}
+        for name, one in coasting.items()
+        for kind, unit in (("friction", "N m s"), ("stiction", "N m"))
+        for mask in [getattr(MASK, f"{name.split('-')[1]}_{kind}")]
+    ]  # fmt: skip
+    for path, (unit, what) in FREE.items():
+        head, _, field = path.partition("loop.plant.")
+        mask = None if head else float(get(MASK, field))
+        rows.append(
+            {"name": path, "value": float(found.values[path]), "unit": unit, "mask": mask,
+             "standard_deviation": float(found.uncertainty.deviations[path]), "what": what}
+        )  # fmt: skip
+    return rows
+
+
+def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathlib.Path | None = None) -> JsonObject:
+    """Write figures and `summary.json` into the folder, and return the summary.
+
+    Args:
+        folder: Existing folder.
+        progress: Function that receives a sentence before each long computation.
+        data: Folder with finer readings of both experiments; None takes the packaged ones.
+    """
+    first, second = (read_record(one, data) for one in EXPERIMENTS)
+    progress("lab-rig: bearing friction from four coasting curves")
+    coasting = fit_coasting()
+    rig = build_rig(coasting)
+    progress("lab-rig: fitting experiment 1")
+    start = with_values(build_run(first, True, rig), START)
+    found = fit_record(start, {path: RANGES[path] for path in FREE}, first)
+    progress("lab-rig: judging by experiment 2")
+    judged = {name: judge(one, rig, found.values) for name, one in (("fitted", first), ("judged", second))}
+    before = {name: judge(one, MASK, MASK_VALUES) for name, one in (("fitted", first), ("judged", second))}
+    parameters = parameter_rows(found, coasting)
+    progress("lab-rig: figures")
+    names = record.save_figures(draw_figures((first, second), rig, found.values, coasting), folder)
+    open_directions = [
+        {"spread": one.spread, "direction": one.describe()} for one in found.uncertainty.undetermined_directions(0.1)
+    ]
+    summary = {
+        "paper": "lab-rig",
+        "scenario": "lab-rig-measured",
+        "title": TITLE,
+        "rows": _rows(judged),
+        **judged,
+        "before": before,
+        "parameters": parameters,
+        "correlation": {"names": list(found.uncertainty.names), "matrix": found.uncertainty.correlation.tolist()},
+        "hardly_determined": open_directions,
+        "readings": "of the manual's figures, thinned to 80 a curve" if data is None else "finer, from a folder",
+        "figures": names,
+        "notes": NOTES,
+        "solver": record.solver_settings(solver_for(second), sampling_period=0.01),
+        "made": provenance.describe_making(("reproduce", "lab-rig")),
+        "versions": record.origin_of_numbers(),
+    }
+    return record.write_summary(folder, summary)
+
+
+MASK_VALUES: Params = {"loop.actuator.rise": 1e-3, "loop.actuator.fall": 1e-3}  # the mask has no dead time: one step
+
+
+def _rows(judged: Table) -> list[JsonObject]:
+    """Return the rows of `record.computed_row`: the loop's own run beside the measured one."""
+    rows = []
+    for name, title in (("fitted", "experiment 1 (fitted)"), ("judged", "experiment 2 (judged)")):
+        of = judged[name]
+        for quantity, unit in (("cycles", "1"), ("stop_time", "s"), ("stop_distance", "m")):
+            rows.append(record.computed_row(title, quantity, unit, of[quantity], reference=of["measured"][quantity]))
+        for quantity, unit in (("wheel_rms_percent_given", "%"), ("wheel_rms_percent_own", "%"),
+                               ("slip_rms_given", "1"), ("slip_rms_own", "1")):  # fmt: skip
+            rows.append(record.computed_row(title, quantity, unit, of[quantity]))
+    return rows
+
+
+def draw_figures(records: tuple[Record, Record], rig: LabRig, values: Params, coasting: Params) -> JsonObject:
+    """Return the figures by file name: both experiments, and the coasting curves.
+
+    Args:
+        records: Records of both experiments.
+        rig: Plant before the fit.
+        values: Identified values by path.
+        coasting: Fits of the coasting curves by name.
+    """
+    titles = ("Experiment 1: relay at slip 0.1 (fitted)", "Experiment 2: relay at slip 0.7 (judged)")
+    drawn = {
+        f"experiment_{i + 1}": _draw_experiment(one, rig, values, title)
+        for i, (one, title) in enumerate(zip(records, titles, strict=True))
+    }
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
+    for axis, body in zip(axes, ("wheel", "drum"), strict=True):
+        for name, found in coasting.items():
+            if body in name:
+                t, speed = read_curves()[name].T
+                axis.plot(t, speed, ".", ms=3, label=f"measured, {name[-1]}")
+                axis.plot(t, np.asarray(found.part.at(t)), lw=1, color="black")
+        axis.set(title=f"Coasting {body}", xlabel="time [s]", ylabel="speed [rad/s]")
+        axis.legend()
+    return {**drawn, "coasting": figure}
+
+
+def _draw_experiment(one: Record, rig: LabRig, values: Params, title: str) -> Figure:
+    figure, axes = plt.subplots(4, 1, figsize=(9, 10), sharex=True, layout="constrained")
+    for row, (mode, name) in enumerate(((True, "measured commands"), (False, "its own relay"))):
+        recorded = with_values(build_run(one, mode, rig), values)
+        run = jax.jit(rollout, static_argnums=1)(recorded.loop, solver_for(one))
+        wheel, slip = (np.asarray(x) for x in simulate_readings(run, recorded, solver_for(one), one.t))
+        turns = one.wheel > HARDLY_TURNS / 4
+        for axis, measured, ours, label in (
+            (axes[2 * row], one.wheel, wheel, "wheel [rad/s]"),
+            (axes[2 * row + 1], np.where(turns, one.slip, np.nan), np.where(turns, slip, np.nan), "slip [1]"),
+        ):
+            axis.plot(one.t, measured, ".", ms=3, color="tab:blue", label="measured")
+            axis.plot(one.t, ours, lw=1, color="tab:red", label=f"simulated, {name}")
+            axis.set(ylabel=label)
+            axis.legend(loc="upper right")
+    axes[0].set(title=title, ylim=(0, 1.05 * FULL_SCALE))
+    axes[-1].set(xlabel="time from the first command [s]")
+    return figure
+
+
+def compact(summary: Table) -> Digest:
+    """Return the digest: both experiments measured and simulated, and the identified parameters.
+
+    Args:
+        summary: Contents of `summary.json`.
+    """
+    headings = ("", "wheel rms [%], given", "own", "cycles", "time [s]", "distance [m]")
+    lines = []
+    for key, title in (("fitted", "1, fitted"), ("judged", "2, judged")):
+        measured = summary[key]["measured"]
+        lines.append((f"experiment {title}: measured", "", "", *_cells(measured)))
+        for state, of in (("mask", summary["before"][key]), ("identified", summary[key])):
+            rms = (f"{of[f'wheel_rms_percent_{mode}']:.1f}" for mode in ("given", "own"))
+            lines.append((f"  simulated, {state}", *rms, *_cells(of)))
+    values = [
+        f"{row['name']} = {row['value']:.4g} +- {row['standard_deviation']:.1g} {row['unit']}"
+        for row in summary["parameters"]
+        if ":" not in row["name"]
+    ]
+    return Digest(summary["title"].split(" (")[0], headings, lines, values, (), len(summary["figures"]))
+
+
+def _cells(of: Table) -> tuple[str, str, str]:
+    return f"{of['cycles']}", f"{of['stop_time']:.2f}", f"{of['stop_distance']:.1f}"

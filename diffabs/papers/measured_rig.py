@@ -1,0 +1,327 @@
+"""The laboratory rig as INTECO measured it: its records, the loop that models them, and the fit of its parameters.
+
+    experiment 1   relay at slip 0.1: the parameters are fitted to it
+    experiment 2   relay at slip 0.7: it judges the fitted loop, and nothing is fitted to it
+
+A loop runs in two ways. *Given*: the brake receives the commands that the relay had from the measured slip. *Own*: the
+loop's relay reads the slip that the loop's encoders measure, every 10 ms.
+
+Source: INTECO, ABS, The laboratory Anti-lock Braking System, user's manual (2014), Fig. 3.11, 3.13, 5.5 and 5.6. The
+readings of `measured_rig.csv` were taken from its figures. A curve has at most 80 of them; straight lines between them
+follow the curve. A folder of finer readings replaces them (`read_records`).
+"""
+
+import csv
+import dataclasses
+import pathlib
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.actuators import DeadTime
+from diffabs.controllers import PlayedCommand, Relay, Sampled
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import param, part, pytree, replace
+from diffabs.core.types import Params, Part, Scalar
+from diffabs.identify import Identified, Tolerances, fit
+from diffabs.plants import BrakeStart, LabRig
+from diffabs.references import FixedSlip
+from diffabs.roads import RIG_UNROUNDED
+from diffabs.runtime import files
+from diffabs.scenario.defaults import braking
+from diffabs.sensors import EncoderSlip
+from diffabs.simulate.run import rollout
+from diffabs.simulate.types import FixedStep, Run
+from diffabs.stops import Standstill
+
+PERIOD = 0.01  # s, sampling of the rig's computer
+RPM = 2 * np.pi / 60  # rad/s
+FULL_SCALE = 1800 * RPM  # rad/s, to which the manual accelerates the wheel: 100 % of an error
+BRAKING_SPEED = 1700 * RPM  # rad/s of the drum, at which the motor stops and the relay starts
+SIGMA_SPEED, SIGMA_SLIP = 3.0, 0.03  # rad/s and 1: weights of the fit, ten pixels of the record and seven
+HARDLY_TURNS = 20.0  # rad/s; below it a slip counts less in the fit, in proportion to the wheel's speed
+MASK = LabRig(
+    wheel_inertia=7.5281e-3, drum_inertia=25.603e-3, wheel_friction=1.2e-4, drum_friction=2.25e-4, drum_stiction=0.093,
+    brake_rate=1 / 0.048, brake_threshold=6.21 / 15.24, road=RIG_UNROUNDED,
+)  # fmt: skip
+
+
+class Record(NamedTuple):
+    """One braking experiment, from the start of the brake to standstill.
+
+    Attributes:
+        threshold: Slip at which the relay switches [1].
+        t: Instants [s] from the start of the brake, shape (n,), every 10 ms.
+        wheel: Speed of the braked wheel [rad/s], shape (n,), as a counter shows it.
+        slip: Slip [1], shape (n,), as the computer measures it.
+        commands: Commands of the relay [1], shape (n,): 1 where the slip is below the threshold.
+        printed_distance: Braking distance that the manual prints [m].
+    """
+
+    threshold: float
+    t: np.ndarray
+    wheel: np.ndarray
+    slip: np.ndarray
+    commands: np.ndarray
+    printed_distance: float
+
+    @property
+    def stop_time(self) -> float:
+        """Time from the start of the brake to the last sample with a speed or a slip [s]."""
+        moves = (self.wheel > 0) | (np.abs(self.slip) > 0.01)
+        return float(self.t[np.flatnonzero(moves)[-1]] + PERIOD)
+
+    @property
+    def stop_distance(self) -> float:
+        """Braking distance from wheel speed and slip [m]; where the slip is near 1, the speed is interpolated."""
+        known = self.slip < 0.6
+        speed = self.wheel[known] * MASK.wheel_radius / (1 - self.slip[known])
+        return float(np.trapezoid(np.interp(self.t, self.t[known], speed), self.t))
+
+
+class Experiment(NamedTuple):
+    """Where a record is, and what the manual prints about it."""
+
+    name: str
+    threshold: float
+    start: float  # s of the drawing, at which the first command of the brake is sent
+    printed_distance: float  # m
+
+
+EXPERIMENTS = (Experiment("relay-slip-0.1", 0.1, 6.46, 26.5), Experiment("relay-slip-0.7", 0.7, 6.12, 22.8))
+
+
+@pytree
+class RecordedRun:
+    """A loop, and the age of the wheel speed that the counter of its record shows.
+
+    Attributes:
+        loop: Loop of the experiment.
+        counter_lag: Age of the wheel speed in the record [s].
+    """
+
+    loop: Loop = part()
+    counter_lag: Scalar = param(default=0.013, unit="s", low=0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """How far a simulated run is from a record.
+
+    Attributes:
+        wheel_rms_percent: Rms difference of the wheel speeds, in per cent of 1,800 rpm.
+        slip_rms: Rms difference of the slips, while the wheel turns faster than 20 rad/s.
+        cycles: Number of brake applications.
+        stop_time: Time to standstill [s].
+        stop_distance: Distance to standstill [m].
+    """
+
+    wheel_rms_percent: float
+    slip_rms: float
+    cycles: int
+    stop_time: float
+    stop_distance: float
+
+
+def read_curves(folder: pathlib.Path | None = None) -> dict[str, np.ndarray]:
+    """Return the packaged readings by name of the curve, each of shape (n, 2): abscissa and value.
+
+    Args:
+        folder: Folder with `measured_rig.csv`; by default that of the package.
+    """
+    path = (folder or pathlib.Path(__file__).parent) / "measured_rig.csv"
+    curves: dict[str, list[tuple[float, float]]] = {}
+    with path.open(encoding="utf-8") as lines:
+        for name, x, y in list(csv.reader(line for line in lines if not line.startswith("#")))[1:]:
+            curves.setdefault(name, []).append((float(x), float(y)))
+    return {name: np.array(rows) for name, rows in curves.items()}
+
+
+def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Record:
+    """Return the record of an experiment at every sample of its computer.
+
+    Args:
+        experiment: Experiment.
+        data: Folder with finer readings, `relay-slip-0.1.csv` and `relay-slip-0.7.csv`, with the columns time_s,
+            wheel_speed_rad_per_s and slip_1. None takes the packaged readings.
+
+    Raises:
+        ValueError: A file lacks a column or a number.
+    """
+    if data is None:
+        curves = read_curves()
+        last = curves[f"{experiment.name} slip"][-1, 0]
+        times = np.arange(round((last - experiment.start) / PERIOD) + 1) * PERIOD
+        at = times + experiment.start
+        wheel, slip = (np.interp(at, *curves[f"{experiment.name} {column}"].T) for column in ("wheel", "slip"))
+        changes = curves[f"{experiment.name} commands"]
+        commands = changes[np.searchsorted(changes[:, 0], at + 0.5 * PERIOD) - 1, 1]
+    else:
+        table = _read_table(data / f"{experiment.name}.csv", ("time_s", "wheel_speed_rad_per_s", "slip_1"))
+        t, wheel, slip = table[table[:, 0] > experiment.start - 0.5 * PERIOD].T
+        times, commands = np.arange(len(t)) * PERIOD, np.where(slip < experiment.threshold, 1.0, 0.0)
+    return Record(experiment.threshold, times, wheel, slip, commands, experiment.printed_distance)
+
+
+def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> np.ndarray:
+    """Return these columns of a CSV file with a header, shape (n, columns)."""
+    rows = list(csv.DictReader(files.read_text(path).splitlines()))
+    try:
+        return np.array([[float(row[name]) for name in columns] for row in rows])
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"{path}: needs the columns {', '.join(columns)}, with a number in every row") from None
+
+
+def build_loop(record: Record, given: bool, rig: LabRig = MASK, actuator: Part | None = None) -> Loop:
+    """Return the loop of an experiment.
+
+    Args:
+        record: Record of the experiment.
+        given: True plays the recorded commands; False lets the loop's relay switch.
+        rig: Plant.
+        actuator: Actuator in front of the plant's brake; by default a dead time.
+    """
+    relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
+    return braking(
+        plant=rig,
+        initial=BrakeStart(speed=BRAKING_SPEED * MASK.drum_radius),
+        sensor=EncoderSlip(period=PERIOD),
+        reference=FixedSlip(slip=record.threshold),
+        controller=PlayedCommand(commands=record.commands, period=PERIOD) if given else relay,
+        actuator=DeadTime() if actuator is None else actuator,
+        stop=Standstill(speed=0.05),
+    )
+
+
+def solver_for(record: Record, step: float = 1e-3) -> FixedStep:
+    """Return the solver of runs as long as a record.
+
+    Args:
+        record: Record of an experiment.
+        step: Step [s], a divisor of 10 ms.
+    """
+    return FixedStep(step=step, duration=round(float(record.t[-1]) + 1.0, 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordResiduals:
+    """Residuals of a fit to a record: wheel speed and slip at its samples, in standard deviations.
+
+    Attributes:
+        solver: Solver of the run.
+    """
+
+    solver: FixedStep
+
+    def __call__(self, recorded: RecordedRun, t: Any, wheel: Any, slip: Any, weight: Any) -> Any:
+        """Return the residuals, shape (2 n,).
+
+        Args:
+            recorded: Loop under the commands of the record, and the counter's lag.
+            t: Instants of the record [s], shape (n,).
+            wheel: Measured wheel speed [rad/s], shape (n,).
+            slip: Measured slip [1], shape (n,).
+            weight: Weights of the slips [1], shape (n,).
+        """
+        run = rollout(recorded.loop, self.solver)
+        turns, slips = simulate_readings(run, recorded, self.solver, t)
+        return jnp.concatenate([(turns - wheel) / SIGMA_SPEED, weight * (slips - slip) / SIGMA_SLIP])
+
+
+def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Any) -> tuple[Any, Any]:
+    """Return the wheel speed [rad/s] and the slip [1] that the rig's computer shows at instants of a run, shape (n,).
+
+    The wheel speed is the true one, older by the counter's lag. The slip is that of the encoders.
+
+    Args:
+        run: Run with a trajectory of every step.
+        recorded: Loop of the run, and the counter's lag.
+        solver: Solver of the run.
+        t: Instants [s], shape (n,).
+    """
+    assert run.trajectory is not None
+    output, measured = run.trajectory.sample.output, run.trajectory.measured
+    turns = output.wheel_speed / recorded.loop.plant.wheel_radius
+    late = jnp.clip((t - recorded.counter_lag) / solver.step, 0.0, len(turns) - 1.0)
+    i = jnp.clip(jnp.floor(jax.lax.stop_gradient(late)).astype(int), 0, len(turns) - 2)
+    wheel = turns[i] + (late - i) * (turns[i + 1] - turns[i])
+    # A sample is held: half a period later it is the same, and no rounding of the time decides.
+    held = jnp.clip(jnp.round((t + 0.5 * PERIOD) / solver.step).astype(int), 0, len(turns) - 1)
+    return wheel, measured.slip[held]
+
+
+def fit_record(
+    recorded: RecordedRun,
+    free: Mapping[str, Any],
+    record: Record,
+    until: float = np.inf,
+    progress: Callable[[int, float], None] | None = None,
+) -> Identified:
+    """Return the free parameters that bring a loop under given commands nearest to a record.
+
+    The standard deviations of the residuals are only relative: the residuals estimate their scale.
+
+    Args:
+        recorded: Loop under the commands of the record, and the counter's lag.
+        free: Paths of the free parameters, each with a range or None.
+        record: Record of the experiment.
+        until: Last instant that counts [s].
+        progress: As in `diffabs.identify.fit`.
+    """
+    kept = record.t <= until
+    weight = np.clip(record.wheel / HARDLY_TURNS, 0.1, 1.0)
+    data = tuple(jnp.asarray(x[kept]) for x in (record.t, record.wheel, record.slip, weight))
+    return fit(
+        recorded, free, RecordResiduals(solver_for(record)), data=data, sigma=1.0, absolute=False,
+        tolerances=Tolerances(cost=1e-5, step=1e-6, gradient=1e-6, evaluations=40), progress=progress,
+    )  # fmt: skip
+
+
+def compare(recorded: RecordedRun, record: Record, first: float = 0.0, last: float = np.inf) -> Comparison:
+    """Return how far a run of the loop is from a record.
+
+    Args:
+        recorded: Loop and the counter's lag.
+        record: Record of the experiment.
+        first: First instant that counts for the differences [s].
+        last: Last instant that counts for the differences [s].
+    """
+    solver = solver_for(record)
+    run = jax.tree.map(np.asarray, jax.jit(rollout, static_argnums=1)(recorded.loop, solver))
+    wheel, slip = (np.asarray(x) for x in simulate_readings(run, recorded, solver, record.t))
+    counts = (record.t >= first) & (record.t <= last)
+    turns = counts & (record.wheel > HARDLY_TURNS)
+    assert run.trajectory is not None
+    sample, moves = run.trajectory.sample, run.trajectory.measured.speed > 0
+    rises = np.diff(sample.command, prepend=0.0) > 0.5
+    return Comparison(
+        wheel_rms_percent=float(100 / FULL_SCALE * np.sqrt(np.mean((wheel - record.wheel)[counts] ** 2))),
+        slip_rms=float(np.sqrt(np.mean((slip - record.slip)[turns] ** 2))),
+        cycles=int(np.sum(rises & moves)),
+        stop_time=float(sample.t[np.flatnonzero(moves)[-1]] + solver.step),
+        stop_distance=float(sample.output.distance[-1]),
+    )
+
+
+def measured_comparison(record: Record) -> Comparison:
+    """Return the measured numbers of a record beside those of `compare`: no difference, cycles, time, distance.
+
+    Args:
+        record: Record of an experiment.
+    """
+    rises = np.diff(record.commands, prepend=0.0) > 0.5
+    return Comparison(0.0, 0.0, int(np.sum(rises & (record.t < record.stop_time))), record.stop_time,
+                      record.stop_distance)  # fmt: skip
+
+
+def with_values(recorded: RecordedRun, values: Params) -> RecordedRun:
+    """Return the run with parameters replaced, by path; a path that it lacks is left out.
+
+    Args:
+        recorded: Loop and the counter's lag.
+        values: Values by path.
+    """
+    return replace(recorded, dict(values))
