@@ -1,6 +1,7 @@
 """The command `reproduce`: all results of a paper. It draws figures, and needs the extras `plot` and `report`."""
 
 import pathlib
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -22,6 +23,10 @@ def reproduce(
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
         "out"
     ),
+    data: Annotated[
+        pathlib.Path | None,
+        typer.Option(metavar="FOLDER", help="For lab-rig: finer readings of both experiments than the packaged ones."),
+    ] = None,
     as_json: console.Json = False,
 ) -> None:
     """Reproduce a paper's results.
@@ -35,11 +40,16 @@ def reproduce(
         if name != "all" and name not in REPRODUCTIONS:
             known = (*REPRODUCTIONS, "all")
             raise values.unknown_name_error(f"there is no paper {values.format_given(name)}", name, known)
+        if data is not None and name != "lab-rig":
+            console.fail(f"--data {data}: only lab-rig reads measurements")
+        if data is not None and not data.is_dir():
+            console.fail(f"--data {data}: there is no such folder")
         results: JsonObject = {}
         try:
             for paper in PAPERS if name == "all" else (name,):
                 with targets.new_target_folder(out / paper) as folder:
-                    results[paper] = _reproduce_with_progress(paper, REPRODUCTIONS[paper], folder)
+                    reproduction = REPRODUCTIONS[paper] if data is None else partial(REPRODUCTIONS[paper], data=data)
+                    results[paper] = _reproduce_with_progress(paper, reproduction, folder)
                     report.write_report_file([folder], folder / report.DEFAULT_NAME)
                 if not as_json:
                     show.show_paper(compact(results[paper]), out / paper)

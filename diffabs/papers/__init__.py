@@ -4,9 +4,9 @@
 
 `compact` returns the short form of a summary that the command line prints.
 
-A reproduction is a function (folder, progress) -> summary. It writes its figures and `summary.json` into the existing
-folder. It calls progress(sentence) before each long computation. It needs float64 and matplotlib, so its module is
-imported only on use.
+A reproduction is a function (folder, progress) -> summary; `lab-rig` also takes `data`. It writes its figures and
+`summary.json` into the existing folder. It calls progress(sentence) before each long computation. It needs float64 and
+matplotlib, so its module is imported only on use.
 """
 
 import importlib
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from diffabs.papers.digest import Digest
 
 Progress = Callable[[str], None]
-Reproduction = Callable[[pathlib.Path, Progress], dict[str, Any]]
+Reproduction = Callable[..., dict[str, Any]]
 
 
 def _reproduction(module: str) -> Reproduction:
-    def reproduce(folder: pathlib.Path, progress: Progress) -> JsonObject:
+    def reproduce(folder: pathlib.Path, progress: Progress, **options: Any) -> JsonObject:
         """Write figures and `summary.json` into the folder, and return the summary."""
-        return importlib.import_module(f"diffabs.papers.{module}").reproduce(folder, progress)
+        return importlib.import_module(f"diffabs.papers.{module}").reproduce(folder, progress, **options)
 
     return reproduce
 

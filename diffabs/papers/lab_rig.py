@@ -22,15 +22,18 @@ from diffabs.papers import record
 from diffabs.papers.digest import Digest
 from diffabs.papers.measured_rig import (
     BRAKING_SPEED,
+    DRUM_RADIUS,
     EXPERIMENTS,
     FULL_SCALE,
     HARDLY_TURNS,
     MASK,
+    WHEEL_RADIUS,
     Comparison,
     Record,
     RecordedRun,
     build_loop,
     compare,
+    compare_with_maker,
     fit_record,
     measured_comparison,
     read_curves,
@@ -44,14 +47,13 @@ from diffabs.runtime import provenance
 from diffabs.simulate.run import rollout
 
 TITLE = "INTECO's laboratory rig: measured against simulated (relay at slip 0.1 and 0.7, from 1,700 rpm)"
-WHEEL_RADIUS, DRUM_RADIUS = 0.6004 / (2 * np.pi), 0.619 / (2 * np.pi)  # m, the perimeters in the driver
 PIXEL = {"wheel": 0.35, "drum": 0.5}  # rad/s, of the coasting curves
 READING_SHARE = 0.29  # rms error of a reading, uniform in its pixel
 
 # Each free parameter of experiment 1: unit, and what it is.
 FREE = {
     "loop.plant.road.w4": ("1", "friction of the tyre"),
-    "loop.plant.brake_gain": ("N m", "slope of the brake's torque over the command"),
+    "loop.plant.brake_gain": ("N m", "torque of the brake at full command"),
     "loop.plant.brake_rate": ("1/s", "rate of the brake's lag"),
     "loop.plant.wheel_inertia": ("kg m^2", "inertia of the braked wheel"),
     "loop.actuator.rise": ("s", "dead time before the brake grips"),
@@ -60,7 +62,7 @@ FREE = {
 }
 RANGES: Params = {
     "loop.plant.road.w4": (0.02, 0.8),
-    "loop.plant.brake_gain": (8.0, 80.0),
+    "loop.plant.brake_gain": (2.0, 80.0),
     "loop.plant.brake_rate": (10.0, 1500.0),
     "loop.plant.wheel_inertia": (2e-3, 2e-2),
     "loop.actuator.rise": (2e-3, 0.05),
@@ -69,7 +71,7 @@ RANGES: Params = {
 }
 START: Params = {
     "loop.plant.road.w4": 0.22,
-    "loop.plant.brake_gain": 30.0,
+    "loop.plant.brake_gain": 20.0,
     "loop.plant.brake_rate": 300.0,
     "loop.actuator.rise": 0.015,
     "loop.actuator.fall": 0.008,
@@ -77,12 +79,12 @@ START: Params = {
 
 NOTES = [
     "The readings come from the figures of the manual, so a pixel limits them: 10 ms, 5.3 rpm and 0.004 of slip.",
-    "The radii are those of the driver's perimeters, 0.0956 and 0.0985 m. With the radii of the manual's table a rolling "
-    "wheel would slip by -2.5 %.",
-    "A run starts at the sample of the first command, with the drum at 1,700 rpm and the wheel rolling. The relay reads "
-    "the slip of the encoders every 10 ms.",
-    "The standard deviations come from the model linearised at the fit. The residuals estimate their scale. They do not "
-    "cover errors of the model.",
+    "The radii are those of the driver's perimeters, 0.0956 and 0.0985 m. With the radii of the manual's table a "
+    "rolling wheel would slip by -2.5 %.",
+    "A run starts at the sample of the first command, with the drum at 1,700 rpm and the wheel rolling. The relay "
+    "reads the slip of the encoders every 10 ms.",
+    "The standard deviations come from the model linearised at the fit. The residuals estimate their scale. They do "
+    "not cover errors of the model.",
 ]
 
 
@@ -127,7 +129,9 @@ def fit_coasting() -> dict[str, Identified]:
 
 
 def build_rig(coasting: Params) -> LabRig:
-    """Return the rig before the fit of experiment 1: the driver's radii, and the bearing friction of the coasting curves.
+    """Return the rig before the fit of experiment 1: the driver's radii, and the bearing friction of the coasting fits.
+
+    The relay commands 0 or 1 only, so its brake has one torque: `brake_gain` at full command, with `brake_offset` 0.
 
     Args:
         coasting: Fits by name of the curve, from `fit_coasting`.
@@ -137,7 +141,17 @@ def build_rig(coasting: Params) -> LabRig:
         for body in ("wheel", "drum")
         for kind in ("friction", "stiction")
     }
-    return dataclasses.replace(MASK, wheel_radius=WHEEL_RADIUS, drum_radius=DRUM_RADIUS, **means)
+    return dataclasses.replace(MASK, wheel_radius=WHEEL_RADIUS, drum_radius=DRUM_RADIUS, brake_offset=0.0, **means)
+
+
+def with_scaled_brake(rig: LabRig) -> LabRig:
+    """Return a rig whose brake has the manual's shape b(u) = b1 (u - u0), scaled to its torque at full command.
+
+    Args:
+        rig: Rig whose `brake_gain` is that torque, and whose `brake_offset` is 0.
+    """
+    slope = rig.brake_gain / (1 - rig.brake_threshold)
+    return dataclasses.replace(rig, brake_gain=slope, brake_offset=-rig.brake_threshold * slope)
 
 
 def build_run(record: Record, given: bool, rig: LabRig) -> RecordedRun:
@@ -194,6 +208,8 @@ def parameter_rows(found: Identified, coasting: Params) -> list[JsonObject]:
     for path, (unit, what) in FREE.items():
         head, _, field = path.partition("loop.plant.")
         mask = None if head else float(get(MASK, field))
+        if field == "brake_gain":
+            mask = float(MASK.brake_gain + MASK.brake_offset)
         rows.append(
             {"name": path, "value": float(found.values[path]), "unit": unit, "mask": mask,
              "standard_deviation": float(found.uncertainty.deviations[path]), "what": what}
@@ -210,6 +226,8 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
         data: Folder with finer readings of both experiments; None takes the packaged ones.
     """
     first, second = (read_record(one, data) for one in EXPERIMENTS)
+    progress("lab-rig: the maker's own simulations")
+    maker = compare_with_maker()
     progress("lab-rig: bearing friction from four coasting curves")
     coasting = fit_coasting()
     rig = build_rig(coasting)
@@ -232,6 +250,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
         "rows": _rows(judged),
         **judged,
         "before": before,
+        "maker": maker,
         "parameters": parameters,
         "correlation": {"names": list(found.uncertainty.names), "matrix": found.uncertainty.correlation.tolist()},
         "hardly_determined": open_directions,

@@ -22,10 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.actuators import DeadTime
-from diffabs.controllers import PlayedCommand, Relay, Sampled
+from diffabs.controllers import ConstantTorque, PlayedCommand, Relay, Sampled
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import param, part, pytree, replace
-from diffabs.core.types import Params, Part, Scalar
+from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.identify import Identified, Tolerances, fit
 from diffabs.plants import BrakeStart, LabRig
 from diffabs.references import FixedSlip
@@ -38,10 +38,13 @@ from diffabs.simulate.types import FixedStep, Run
 from diffabs.stops import Standstill
 
 PERIOD = 0.01  # s, sampling of the rig's computer
+RUN_STEP = 1.25e-4  # s, stable down to standstill
+FIT_STEP = 1e-3  # s; against RUN_STEP it changes the wheel's error by 0.005 % of full scale, the stop by 3 ms
 RPM = 2 * np.pi / 60  # rad/s
 FULL_SCALE = 1800 * RPM  # rad/s, to which the manual accelerates the wheel: 100 % of an error
 BRAKING_SPEED = 1700 * RPM  # rad/s of the drum, at which the motor stops and the relay starts
-SIGMA_SPEED, SIGMA_SLIP = 3.0, 0.03  # rad/s and 1: weights of the fit, ten pixels of the record and seven
+SIGMA_SPEED, SIGMA_SLIP = 3.0, 0.01  # rad/s and 1: weights of the fit. The slip, within two pixels, moves the relay.
+WHEEL_RADIUS, DRUM_RADIUS = 0.6004 / (2 * np.pi), 0.619 / (2 * np.pi)  # m, the perimeters in the driver
 HARDLY_TURNS = 20.0  # rad/s; below it a slip counts less in the fit, in proportion to the wheel's speed
 MASK = LabRig(
     wheel_inertia=7.5281e-3, drum_inertia=25.603e-3, wheel_friction=1.2e-4, drum_friction=2.25e-4, drum_stiction=0.093,
@@ -78,7 +81,7 @@ class Record(NamedTuple):
     def stop_distance(self) -> float:
         """Braking distance from wheel speed and slip [m]; where the slip is near 1, the speed is interpolated."""
         known = self.slip < 0.6
-        speed = self.wheel[known] * MASK.wheel_radius / (1 - self.slip[known])
+        speed = self.wheel[known] * WHEEL_RADIUS / (1 - self.slip[known])
         return float(np.trapezoid(np.interp(self.t, self.t[known], speed), self.t))
 
 
@@ -92,6 +95,14 @@ class Experiment(NamedTuple):
 
 
 EXPERIMENTS = (Experiment("relay-slip-0.1", 0.1, 6.46, 26.5), Experiment("relay-slip-0.7", 0.7, 6.12, 22.8))
+
+
+@pytree
+class DrivenStart:
+    """Speed and slip at the start of braking; the wheel may be faster than the vehicle, unlike in a `BrakeStart`."""
+
+    speed: Scalar = param(default=17.82, unit="m/s", above=0.0)
+    slip: Scalar = param(default=0.0, unit="1", above=-1.0, high=1.0)
 
 
 @pytree
@@ -168,7 +179,7 @@ def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Rec
 
 def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> np.ndarray:
     """Return these columns of a CSV file with a header, shape (n, columns)."""
-    rows = list(csv.DictReader(files.read_text(path).splitlines()))
+    rows = list(csv.DictReader(files.read_content(path).decode().splitlines()))
     try:
         return np.array([[float(row[name]) for name in columns] for row in rows])
     except (KeyError, TypeError, ValueError):
@@ -196,7 +207,7 @@ def build_loop(record: Record, given: bool, rig: LabRig = MASK, actuator: Part |
     )
 
 
-def solver_for(record: Record, step: float = 1e-3) -> FixedStep:
+def solver_for(record: Record, step: float = RUN_STEP) -> FixedStep:
     """Return the solver of runs as long as a record.
 
     Args:
@@ -253,6 +264,15 @@ def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Any
     return wheel, measured.slip[held]
 
 
+def slip_weight(wheel: np.ndarray) -> np.ndarray:
+    """Return the weights of slips at wheel speeds [rad/s]: 1, and less where the wheel hardly turns.
+
+    Args:
+        wheel: Wheel speeds [rad/s], shape (n,).
+    """
+    return np.clip(wheel / HARDLY_TURNS, 0.1, 1.0)
+
+
 def fit_record(
     recorded: RecordedRun,
     free: Mapping[str, Any],
@@ -272,10 +292,10 @@ def fit_record(
         progress: As in `diffabs.identify.fit`.
     """
     kept = record.t <= until
-    weight = np.clip(record.wheel / HARDLY_TURNS, 0.1, 1.0)
-    data = tuple(jnp.asarray(x[kept]) for x in (record.t, record.wheel, record.slip, weight))
+    columns = (record.t, record.wheel, record.slip, slip_weight(record.wheel))
+    data = tuple(jnp.asarray(x[kept]) for x in columns)
     return fit(
-        recorded, free, RecordResiduals(solver_for(record)), data=data, sigma=1.0, absolute=False,
+        recorded, free, RecordResiduals(solver_for(record, FIT_STEP)), data=data, sigma=1.0, absolute=False,
         tolerances=Tolerances(cost=1e-5, step=1e-6, gradient=1e-6, evaluations=40), progress=progress,
     )  # fmt: skip
 
@@ -304,6 +324,50 @@ def compare(recorded: RecordedRun, record: Record, first: float = 0.0, last: flo
         stop_time=float(sample.t[np.flatnonzero(moves)[-1]] + solver.step),
         stop_distance=float(sample.output.distance[-1]),
     )
+
+
+def compare_with_maker(until: float = 1.2) -> list[JsonObject]:
+    """Return the largest differences of `LabRig` with the mask's numbers from the maker's own simulations.
+
+    Both wheels start at 180 rad/s. The relay reads the true slip every 10 ms. Below 1 m/s the maker's model smooths
+    friction, so the comparison ends before.
+
+    Args:
+        until: Last instant that counts [s].
+
+    Returns:
+        A row for each simulation: its name, `wheel_rpm` (not for the open loop) and `slip`.
+    """
+    curves, start = (
+        read_curves(),
+        DrivenStart(speed=180 * MASK.drum_radius, slip=1 - MASK.wheel_radius / MASK.drum_radius),
+    )
+
+    def simulate(controller: Part, name: str, end: float) -> tuple[Callable[[str], np.ndarray], JsonObject]:
+        loop = braking(plant=MASK, initial=start, controller=controller, stop=Standstill(speed=0.05),
+                       reference=FixedSlip(slip=0.7 if name.endswith("0.7") else 0.1))  # fmt: skip
+        run = jax.jit(rollout, static_argnums=1)(loop, FixedStep(step=RUN_STEP, duration=end))
+        assert run.trajectory is not None
+        sample = jax.tree.map(np.asarray, run.trajectory.sample)
+        values = {"wheel": sample.output.wheel_speed / MASK.wheel_radius, "slip": np.abs(sample.output.slip)}
+
+        def difference(column: str) -> np.ndarray:
+            t, x = curves[f"{name} {column}" if f"{name} {column}" in curves else name].T
+            counts = t <= end
+            return np.abs(np.interp(t[counts], sample.t, values[column]) - x[counts])
+
+        return difference, {"simulation": name}
+
+    rows = []
+    relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
+    for threshold in ("0.1", "0.7"):
+        difference, row = simulate(relay, f"maker-simulation-slip-{threshold}", until)
+        rows.append(
+            {**row, "wheel_rpm": float(difference("wheel").max() / RPM), "slip": float(difference("slip").max())}
+        )
+    # After 0.31 s the wheel is nearly locked, and the solver of the maker's model chatters.
+    difference, row = simulate(ConstantTorque(torque=1.0), "slip-open-loop", 0.31)
+    return [*rows, {**row, "wheel_rpm": None, "slip": float(difference("slip").max())}]
 
 
 def measured_comparison(record: Record) -> Comparison:

@@ -7,8 +7,19 @@
 
 The braked upper wheel hangs on a lever of length L and presses on the lower wheel, the "road", at the angle phi. Its
 brake torque adds to the normal force. mu is odd in the slip and so contains the manual's sign s of the slip. This is
-eq. (1) of Maeda and Sugiura with tau_b + tau_1 = Mg + M1 + M10 + d1 omega1. That paper confirms the radii, J1 and the
-friction curve. The other constants are as commonly published and were not verified against the manual.
+eq. (1) of Maeda and Sugiura with tau_b + tau_1 = Mg + M1 + M10 + d1 omega1.
+
+The defaults are the numbers of the manual (INTECO, ABS, user's manual, 2014); "mask" is the maker's Simulink model:
+
+    r1, r2, L, phi    Table 2, p. 31 (mask: the same; the driver's perimeters give 0.0956 and 0.0985 m)
+    J1, J2            Table 3, p. 33 (mask 7.5281e-3, 25.603e-3)
+    d1, d2, M20       Table 4, means, p. 33 (mask 1.2e-4, 2.25e-4, 0.093); M10 that of the mask (Table 4: 0.0032)
+    Mg                p. 32, with the digits of the mask
+    c31               pp. 31 and 36 (p. 35 prints 10.37; mask 1/0.048 = 20.83)
+    b1, b2, u0        pp. 31 and 36 (mask u0 = 6.21/15.24 = 0.4075, where b is 0; p. 36 has b = 0.12 below u0)
+    road              p. 36, rounded as in Maeda and Sugiura
+
+`papers/measured_rig.py` has the mask's rig. The rig that was measured is in another state: `lab-rig-measured`.
 
 A stopped wheel sticks while the road's torque T is below M1 + M10; the brake then carries exactly T. Where r1 mu
 exceeds L (sin phi - mu cos phi), no torque holds the wheel.

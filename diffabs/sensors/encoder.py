@@ -2,8 +2,8 @@
 
     V = (position - position one period ago)/period, 0 below the dead zone,   slip = (V2 - V1)/(V2 + floor)
 
-V1 is the speed of the wheel's rim, V2 that of the vehicle. Each is the mean over the last period, so slip and speeds lag
-the true ones by half a period, and more at the end of the period that follows.
+V1 is the speed of the wheel's rim, V2 that of the vehicle. Each is the mean over the last period. At a sample, slip and
+speeds therefore lag the true ones by half a period, and at the end of the next period by one and a half.
 
 Source: the driver of INTECO's laboratory anti-lock brake system, class `cabs`: 10 ms, 0.05 m/s, 0.01 m/s.
 """
