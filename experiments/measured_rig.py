@@ -184,6 +184,27 @@ def effects(first: Record, second: Record, rig: Any) -> tuple[list[dict[str, Any
     return rows, kept
 
 
+def diagnosis(first: Record, second: Record, rig: LabRig, found: Any) -> list[dict[str, Any]]:
+    """What experiment 2 asks for, after it has judged: its own friction, or one curve that falls with slip for both.
+
+    A diagnosis only: no number of the identified rig comes from here."""
+    runs = [with_values(lab_rig.build_run(one, True, rig), found.values) for one in (first, second)]
+    rows = []
+    for name, free in (
+        ("friction of experiment 2 alone", {"loop.plant.road.w4": (0.02, 0.8)}),
+        ("friction and its slope over slip, of experiment 2 alone",
+         {"loop.plant.road.w4": (0.02, 0.8), "loop.plant.road.w1": (-0.4, 0.2)}),
+    ):  # fmt: skip
+        own = fit_record(runs[1], free, second)
+        values = {**found.values, **own.values}
+        errors = [compare(with_values(run, values), one) for run, one in zip(runs, (first, second), strict=True)]
+        at = {s: float(own.part.loop.plant.road.friction(s)) for s in (0.2, 0.8)}
+        rows.append({"fitted after judging": name, "mu(0.2)": at[0.2], "mu(0.8)": at[0.8],
+                     "experiment 1 [%]": errors[0].wheel_rms_percent, "experiment 2 [%]": errors[1].wheel_rms_percent,
+                     "stop 2 [s]": errors[1].stop_time})  # fmt: skip
+    return rows
+
+
 def torque_controllers() -> dict[str, dict[str, Any]]:
     """The parts of three controllers of docs/results.md and docs/real-rig.md, for a plant whose input is a torque."""
     tuned = json.loads((pathlib.Path("docs") / "controllers" / "known-tuned-cvar.json").read_text())["parameters"]
@@ -330,16 +351,18 @@ def main(config: Config | None = None) -> dict[str, Any]:
     rig = lab_rig.build_rig(lab_rig.fit_coasting())
     rows, kept = effects(first, second, rig)
     record.print_rows("Effects, added one at a time (wheel rms in per cent of 1,800 rpm)", rows)
-    found = fit_record(with_values(lab_rig.build_run(first, True, rig), lab_rig.START),
-                       {path: lab_rig.RANGES[path] for path in lab_rig.FREE}, first)  # fmt: skip
+    free = {path: lab_rig.RANGES[path] for path in lab_rig.FREE}
+    found = fit_record(lab_rig.build_run(first, True, rig), free, first, starts=lab_rig.STARTS)
     print(found.table())
+    after = diagnosis(first, second, rig, found)
+    record.print_rows("What experiment 2 asks for (fitted after it has judged)", after)
     identified = lab_rig.with_scaled_brake(found.part.loop.plant)
     rise, fall = (float(found.values[f"loop.actuator.{side}"]) for side in ("rise", "fall"))
     old = old_controllers(config, identified, rise, fall)
     record.print_rows("Controllers of the earlier pages", old)
     new = new_controllers(config, identified, found)
     record.print_rows("A PI at 10 ms, tuned on three rigs and judged on draws of the identified one", new)
-    results = {"effects": rows, "kept": kept, "controllers": old, "tuned": new}
+    results = {"effects": rows, "kept": kept, "diagnosis": after, "controllers": old, "tuned": new}
     return record.experiment(config, results, {})
 
 

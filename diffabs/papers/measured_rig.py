@@ -14,7 +14,7 @@ follow the curve. A folder of finer readings replaces them (`read_records`).
 import csv
 import dataclasses
 import pathlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -278,7 +278,7 @@ def fit_record(
     free: Mapping[str, Any],
     record: Record,
     until: float = np.inf,
-    progress: Callable[[int, float], None] | None = None,
+    starts: Sequence[Params] = (),
 ) -> Identified:
     """Return the free parameters that bring a loop under given commands nearest to a record.
 
@@ -289,14 +289,14 @@ def fit_record(
         free: Paths of the free parameters, each with a range or None.
         record: Record of the experiment.
         until: Last instant that counts [s].
-        progress: As in `diffabs.identify.fit`.
+        starts: Values by path of each start; without any, the run's own. The best fit is returned.
     """
     kept = record.t <= until
     columns = (record.t, record.wheel, record.slip, slip_weight(record.wheel))
     data = tuple(jnp.asarray(x[kept]) for x in columns)
     return fit(
         recorded, free, RecordResiduals(solver_for(record, FIT_STEP)), data=data, sigma=1.0, absolute=False,
-        tolerances=Tolerances(cost=1e-5, step=1e-6, gradient=1e-6, evaluations=40), progress=progress,
+        tolerances=Tolerances(cost=1e-5, step=1e-6, gradient=1e-6, evaluations=40), starts=starts,
     )  # fmt: skip
 
 

@@ -73,7 +73,7 @@ def _tables(content: Table) -> list[ReportTable]:
     return [
         ReportTable(title, tuple(COLUMNS.values()), [[row.get(key) for key in COLUMNS] for row in content[part]])
         for part, title in titles.items()
-        if content.get(part)
+        if isinstance(content.get(part), list) and content[part]
     ]
 
 
