@@ -9,7 +9,6 @@ import pathlib
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -38,13 +37,13 @@ from diffabs.papers.measured_rig import (
     measured_comparison,
     read_curves,
     read_record,
+    simulate,
     simulate_readings,
     solver_for,
     with_values,
 )
 from diffabs.plants import BrakeStart, LabRig
 from diffabs.runtime import provenance
-from diffabs.simulate.run import rollout
 
 TITLE = "INTECO's laboratory rig: measured against simulated (relay at slip 0.1 and 0.7, from 1,700 rpm)"
 PIXEL = {"wheel": 0.35, "drum": 0.5}  # rad/s, of the coasting curves
@@ -69,7 +68,7 @@ RANGES: Params = {
     "loop.actuator.fall": (2e-3, 0.05),
     "counter_lag": (0.0, 0.03),
 }
-# The fit has many minima: a command that reaches the brake a sample earlier moves a whole cycle. The best of these counts.
+# The fit has many minima: a brake that grips a sample earlier moves a whole cycle. The best of these starts counts.
 STARTS: tuple[Params, ...] = tuple(
     {
         "loop.plant.road.w4": 0.22,
@@ -129,7 +128,7 @@ def fit_coasting() -> dict[str, Identified]:
             start = Coasting(speed=float(curve[0, 1]), inertia=inertia)
             data = (jnp.asarray(curve[:, 0]), jnp.asarray(curve[:, 1]))
             found[name] = fit(start, ["speed", "friction", "stiction"], _coasting_residuals, data=data,
-                              sigma=READING_SHARE * PIXEL[body], absolute=False)  # fmt: skip
+                              sigma=np.array(READING_SHARE * PIXEL[body]), absolute=False)  # fmt: skip
     return found
 
 
@@ -314,7 +313,7 @@ def _draw_experiment(one: Record, rig: LabRig, values: Params, title: str) -> Fi
     figure, axes = plt.subplots(4, 1, figsize=(9, 10), sharex=True, layout="constrained")
     for row, (mode, name) in enumerate(((True, "measured commands"), (False, "its own relay"))):
         recorded = with_values(build_run(one, mode, rig), values)
-        run = jax.jit(rollout, static_argnums=1)(recorded.loop, solver_for(one))
+        run = simulate(recorded.loop, solver_for(one))
         wheel, slip = (np.asarray(x) for x in simulate_readings(run, recorded, solver_for(one), one.t))
         turns = one.wheel > HARDLY_TURNS / 4
         for axis, measured, ours, label in (

@@ -23,6 +23,7 @@ import numpy as np
 
 from diffabs.actuators import DeadTime
 from diffabs.controllers import ConstantTorque, PlayedCommand, Relay, Sampled
+from diffabs.config.values import ScenarioError
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import param, part, pytree, replace
 from diffabs.core.types import JsonObject, Params, Part, Scalar
@@ -94,6 +95,7 @@ class Experiment(NamedTuple):
     printed_distance: float  # m
 
 
+simulate = jax.jit(rollout, static_argnums=1)  # one function, so that runs of one structure compile once
 EXPERIMENTS = (Experiment("relay-slip-0.1", 0.1, 6.46, 26.5), Experiment("relay-slip-0.7", 0.7, 6.12, 22.8))
 
 
@@ -160,7 +162,7 @@ def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Rec
             wheel_speed_rad_per_s and slip_1. None takes the packaged readings.
 
     Raises:
-        ValueError: A file lacks a column or a number.
+        ScenarioError: A file lacks a column or a number.
     """
     if data is None:
         curves = read_curves()
@@ -183,7 +185,7 @@ def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> np.ndarray:
     try:
         return np.array([[float(row[name]) for name in columns] for row in rows])
     except (KeyError, TypeError, ValueError):
-        raise ValueError(f"{path}: needs the columns {', '.join(columns)}, with a number in every row") from None
+        raise ScenarioError(f"{path}: needs the columns {', '.join(columns)}, with a number in every row") from None
 
 
 def build_loop(record: Record, given: bool, rig: LabRig = MASK, actuator: Part | None = None) -> Loop:
@@ -255,7 +257,8 @@ def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Any
     """
     assert run.trajectory is not None
     output, measured = run.trajectory.sample.output, run.trajectory.measured
-    turns = output.wheel_speed / recorded.loop.plant.wheel_radius
+    rig: Any = recorded.loop.plant
+    turns = output.wheel_speed / rig.wheel_radius
     late = jnp.clip((t - recorded.counter_lag) / solver.step, 0.0, len(turns) - 1.0)
     i = jnp.clip(jnp.floor(jax.lax.stop_gradient(late)).astype(int), 0, len(turns) - 2)
     wheel = turns[i] + (late - i) * (turns[i + 1] - turns[i])
@@ -279,6 +282,7 @@ def fit_record(
     record: Record,
     until: float = np.inf,
     starts: Sequence[Params] = (),
+    tolerance: float = 1e-4,
 ) -> Identified:
     """Return the free parameters that bring a loop under given commands nearest to a record.
 
@@ -290,13 +294,14 @@ def fit_record(
         record: Record of the experiment.
         until: Last instant that counts [s].
         starts: Values by path of each start; without any, the run's own. The best fit is returned.
+        tolerance: Relative change of the cost at which a fit ends.
     """
     kept = record.t <= until
     columns = (record.t, record.wheel, record.slip, slip_weight(record.wheel))
     data = tuple(jnp.asarray(x[kept]) for x in columns)
     return fit(
-        recorded, free, RecordResiduals(solver_for(record, FIT_STEP)), data=data, sigma=1.0, absolute=False,
-        tolerances=Tolerances(cost=1e-5, step=1e-6, gradient=1e-6, evaluations=40), starts=starts,
+        recorded, free, RecordResiduals(solver_for(record, FIT_STEP)), data=data, sigma=np.array(1.0), absolute=False,
+        tolerances=Tolerances(cost=tolerance, step=1e-6, gradient=1e-6, evaluations=40), starts=starts,
     )  # fmt: skip
 
 
@@ -310,7 +315,7 @@ def compare(recorded: RecordedRun, record: Record, first: float = 0.0, last: flo
         last: Last instant that counts for the differences [s].
     """
     solver = solver_for(record)
-    run = jax.tree.map(np.asarray, jax.jit(rollout, static_argnums=1)(recorded.loop, solver))
+    run = jax.tree.map(np.asarray, simulate(recorded.loop, solver))
     wheel, slip = (np.asarray(x) for x in simulate_readings(run, recorded, solver, record.t))
     counts = (record.t >= first) & (record.t <= last)
     turns = counts & (record.wheel > HARDLY_TURNS)
@@ -343,10 +348,10 @@ def compare_with_maker(until: float = 1.2) -> list[JsonObject]:
         DrivenStart(speed=180 * MASK.drum_radius, slip=1 - MASK.wheel_radius / MASK.drum_radius),
     )
 
-    def simulate(controller: Part, name: str, end: float) -> tuple[Callable[[str], np.ndarray], JsonObject]:
+    def run_of(controller: Part, name: str, end: float) -> tuple[Callable[[str], np.ndarray], JsonObject]:
         loop = braking(plant=MASK, initial=start, controller=controller, stop=Standstill(speed=0.05),
                        reference=FixedSlip(slip=0.7 if name.endswith("0.7") else 0.1))  # fmt: skip
-        run = jax.jit(rollout, static_argnums=1)(loop, FixedStep(step=RUN_STEP, duration=end))
+        run = simulate(loop, FixedStep(step=RUN_STEP, duration=end))
         assert run.trajectory is not None
         sample = jax.tree.map(np.asarray, run.trajectory.sample)
         values = {"wheel": sample.output.wheel_speed / MASK.wheel_radius, "slip": np.abs(sample.output.slip)}
@@ -361,12 +366,12 @@ def compare_with_maker(until: float = 1.2) -> list[JsonObject]:
     rows = []
     relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
     for threshold in ("0.1", "0.7"):
-        difference, row = simulate(relay, f"maker-simulation-slip-{threshold}", until)
+        difference, row = run_of(relay, f"maker-simulation-slip-{threshold}", until)
         rows.append(
             {**row, "wheel_rpm": float(difference("wheel").max() / RPM), "slip": float(difference("slip").max())}
         )
     # After 0.31 s the wheel is nearly locked, and the solver of the maker's model chatters.
-    difference, row = simulate(ConstantTorque(torque=1.0), "slip-open-loop", 0.31)
+    difference, row = run_of(ConstantTorque(torque=1.0), "slip-open-loop", 0.31)
     return [*rows, {**row, "wheel_rpm": None, "slip": float(difference("slip").max())}]
 
 

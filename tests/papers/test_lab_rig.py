@@ -1,0 +1,138 @@
+"""The measured rig: its readings, the maker's own simulations, the fit of experiment 1, the verdict of experiment 2."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import run
+from mutants import killed_by
+
+from diffabs.core.pytree import get, replace
+from diffabs.papers import REPRODUCTIONS, compact, lab_rig
+from diffabs.papers import measured_rig as rig
+from diffabs.scenario.scenario import load
+
+TABLE_4 = {  # d [N m s] and M0 [N m] that the manual fits to its coasting curves, p. 33
+    "coasting-wheel-1": (1.3436e-4, 0.0022),
+    "coasting-wheel-2": (1.1978e-4, 0.0025),
+    "coasting-drum-1": (2.1528e-4, 0.0920),
+    "coasting-drum-2": (2.1354e-4, 0.0935),
+}
+
+
+def test_a_curve_has_at_most_80_readings():
+    curves = rig.read_curves()
+    assert len(curves) == 23
+    assert all(len(points) <= 80 for points in curves.values())
+    assert all((np.diff(points[:, 0]) >= 0).all() for name, points in curves.items() if name != "brake-torque")
+
+
+def test_the_makers_simulations_are_those_of_the_mask():
+    """A pixel of the drawings is 5.3 rpm, and 0.001 (0.7: 0.003) of slip."""
+    with jax.enable_x64(True):
+        first, second, open_loop = rig.compare_with_maker()
+    assert max(first["wheel_rpm"], second["wheel_rpm"]) < 5.3
+    assert max(first["slip"], open_loop["slip"]) < 0.001
+    assert second["slip"] < 0.0015
+
+
+@killed_by(
+    "papers/lab_rig.py",
+    "jnp.exp(-self.friction * t / self.inertia) - dry",
+    "jnp.exp(-self.friction * t / self.inertia)",
+)
+def test_coasting_gives_the_bearings_of_table_4():
+    with jax.enable_x64(True):
+        found = lab_rig.fit_coasting()
+    for name, printed in TABLE_4.items():
+        values = [float(found[name].values[kind]) for kind in ("friction", "stiction")]
+        np.testing.assert_allclose(values, printed, rtol=0.04)
+
+
+def test_the_records():
+    first, second = (rig.read_record(one) for one in rig.EXPERIMENTS)
+    assert (first.threshold, second.threshold) == (0.1, 0.7)
+    assert first.stop_time == pytest.approx(3.0, abs=0.02)  # 6.47 to 9.47 s of the drawing
+    assert second.stop_time == pytest.approx(3.35, abs=0.03)
+    assert 25.8 < first.stop_distance < 27.4
+    assert set(first.commands) == {0.0, 1.0}
+    assert rig.measured_comparison(first).cycles == 15
+
+
+def recorded_by(name):
+    """A run of the packaged scenario under the commands of experiment 1."""
+    record = rig.read_record(rig.EXPERIMENTS[0])
+    loop = load(name).loop
+    given = replace(loop, {"controller": rig.build_loop(record, True).controller})
+    return record, *(rig.RecordedRun(loop=one, counter_lag=0.01309) for one in (loop, given))
+
+
+def test_the_packaged_scenario_follows_experiment_1():
+    with jax.enable_x64(True):
+        record, own, given = recorded_by("lab-rig-measured")
+        assert rig.compare(given, record).wheel_rms_percent < 1.5
+        seen = rig.compare(own, record)
+    assert seen.wheel_rms_percent < 6
+    assert abs(seen.cycles - 15) <= 1
+    assert seen.stop_time == pytest.approx(record.stop_time, rel=0.03)
+
+
+@killed_by("papers/measured_rig.py", "t - recorded.counter_lag", "t")
+@pytest.mark.parametrize("path", ["loop.actuator.rise", "loop.actuator.fall", "loop.plant.brake_rate", "counter_lag"])
+def test_derivatives_of_the_readings_agree_with_differences(path):
+    """Through the events of the dead time, at three widths; the readings are those of the first 0.3 s."""
+    with jax.enable_x64(True):
+        record, _, given = recorded_by("lab-rig-measured")
+        solver, t = rig.FixedStep(step=rig.FIT_STEP, duration=0.4), jnp.asarray(record.t[:30])
+
+        @jax.jit
+        def total(x):
+            moved = replace(given, {path: x})
+            wheel, slip = rig.simulate_readings(rig.rollout(moved.loop, solver), moved, solver, t)
+            return jnp.sum(wheel) + 100 * jnp.sum(slip)
+
+        x = jnp.asarray(float(get(given, path)))
+        slope = float(jax.jvp(total, (x,), (jnp.ones_like(x),))[1])
+        widths = [float(x) * w for w in (1e-3, 3e-4, 1e-4)]
+        differences = [float(total(x + w) - total(x - w)) / (2 * w) for w in widths]
+    assert abs(slope - differences[-1]) < 2e-3 * abs(slope)
+    assert abs(slope - differences[-1]) <= abs(slope - differences[0]) + 1e-5 * abs(slope)
+
+
+def test_a_folder_without_numbers_is_refused(tmp_path):
+    (tmp_path / "relay-slip-0.1.csv").write_text("time_s,slip_1\n0,0\n")
+    result = run("reproduce", "lab-rig", "--data", tmp_path, "--out", tmp_path / "out", status=2)
+    assert "needs the columns time_s, wheel_speed_rad_per_s, slip_1, with a number in every row" in result.stderr
+    assert not (tmp_path / "out" / "lab-rig").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("slip-lmi", "--data", "."), "only lab-rig reads measurements"),
+        (("lab-rig", "--data", "nowhere"), "there is no such folder"),
+    ],
+)
+def test_data_in_the_wrong_place(tmp_path, arguments, message):
+    assert message in run("reproduce", *arguments, "--out", tmp_path / "out", status=2).stderr
+
+
+@pytest.mark.slow
+def test_the_reproduction_has_every_number_that_the_page_prints(tmp_path):
+    with jax.enable_x64(True):
+        summary = REPRODUCTIONS["lab-rig"](tmp_path, lambda sentence: None)
+    assert json.loads((tmp_path / "summary.json").read_text()) == summary
+    assert {name for name in summary["figures"]} == {"experiment_1.png", "experiment_2.png", "coasting.png"}
+    for key, given, own in (("fitted", 1.5, 6.0), ("judged", 3.0, 8.5)):
+        assert summary[key]["wheel_rms_percent_given"] < given
+        assert summary[key]["wheel_rms_percent_own"] < own
+        assert summary["before"][key]["wheel_rms_percent_given"] > 30
+    for row in summary["parameters"]:
+        assert 0 < row["standard_deviation"] < 0.3 * row["value"], row
+    scenario = load("lab-rig-measured").loop
+    for path, digits in (("plant.wheel_inertia", 2e-3), ("plant.road.w4", 2e-3), ("actuator.rise", 2e-3)):
+        value = next(row["value"] for row in summary["parameters"] if row["name"] == f"loop.{path}")
+        assert float(get(scenario, path)) == pytest.approx(value, rel=digits)
+    assert len(compact(summary).lines) == 6
