@@ -40,7 +40,7 @@ from diffabs.core.types import Scalar
 from diffabs.identify import Identified
 from diffabs.objectives import BRAKING
 from diffabs.papers import lab_rig, measured_rig, record
-from diffabs.papers.measured_rig import MASK, Record, RecordedRun, compare, fit_record, with_values
+from diffabs.papers.measured_rig import MASK, Record, RecordedRun, compare_with_record, fit_record, with_values
 from diffabs.plants import BrakeStart, LabRig, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip, LimitedSlip
 from diffabs.roads import Burckhardt
@@ -94,7 +94,7 @@ class Effect:
 
 def of(*names: str) -> dict[str, tuple[float, float]]:
     """The ranges of `lab_rig` of parameters by the end of their path."""
-    return {path: range_ for path, range_ in lab_rig.RANGES.items() if path.rpartition(".")[2] in names}
+    return {path: range_ for path, range_ in lab_rig.PARAMETER_RANGES.items() if path.rpartition(".")[2] in names}
 
 
 BASE = Effect(
@@ -154,10 +154,10 @@ def effects(first: Record, second: Record, rig: Any) -> tuple[list[dict[str, Any
     rows: list[dict[str, Any]] = []
 
     def row(name: str, recorded: RecordedRun, count: int, stays: bool | None) -> dict[str, Any]:
-        fitted, rest = compare(recorded, first, last=HALF), compare(recorded, first, first=HALF)
+        fitted, rest = compare_with_record(recorded, first, last=HALF), compare_with_record(recorded, first, first=HALF)
         other = replace(recorded, {"loop": dataclasses.replace(
             recorded.loop, controller=lab_rig.build_run(second, True, rig).loop.controller)})  # fmt: skip
-        judged = compare(other, second)
+        judged = compare_with_record(other, second)
         line = {"effect": name, "parameters": count, "first half [%]": fitted.wheel_rms_percent,
                 "second half [%]": rest.wheel_rms_percent, "its slip [1]": rest.slip_rms,
                 "determined": None, "stays": stays,
@@ -203,13 +203,13 @@ def diagnosis(first: Record, second: Record, rig: LabRig, found: Identified) -> 
     each set follows both experiments under their commands.
 
     A diagnosis only: no number of the identified rig comes from here."""
-    free = {path: lab_rig.RANGES[path] for path in lab_rig.FREE}
+    free = {path: lab_rig.PARAMETER_RANGES[path] for path in lab_rig.FREE}
     other = fit_record(
-        lab_rig.build_run(second, True, rig), free, second, starts=[dict(found.values), lab_rig.STARTS[3]]
+        lab_rig.build_run(second, True, rig), free, second, starts=[dict(found.values), *lab_rig.STARTS[2:]]
     )
     rows = []
     for name, one in (("experiment 1", found), ("experiment 2", other)):
-        errors = [compare(with_values(lab_rig.build_run(record, True, rig), one.values), record)
+        errors = [compare_with_record(with_values(lab_rig.build_run(record, True, rig), one.values), record)
                   for record in (first, second)]  # fmt: skip
         deviations = one.uncertainty.deviations
         rows.append({
@@ -367,7 +367,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
     first, second = (measured_rig.read_record(one, data) for one in measured_rig.EXPERIMENTS)
     coasting = lab_rig.fit_coasting()
     rig = lab_rig.build_rig(coasting)
-    free = {path: lab_rig.RANGES[path] for path in lab_rig.FREE}
+    free = {path: lab_rig.PARAMETER_RANGES[path] for path in lab_rig.FREE}
     with ThreadPoolExecutor(1) as other:  # beside the fit: XLA compiles and computes without Python's lock
         ladder = other.submit(effects, first, second, rig)
         found = fit_record(lab_rig.build_run(first, True, rig), free, first, starts=lab_rig.STARTS)

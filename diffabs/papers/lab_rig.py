@@ -10,10 +10,9 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
+from diffabs import plot
 from diffabs.core.pytree import get, param, pytree
 from diffabs.core.types import JsonObject, Params, Scalar, Table
 from diffabs.identify import Identified, fit
@@ -23,18 +22,17 @@ from diffabs.papers.measured_rig import (
     BRAKING_SPEED,
     DRUM_RADIUS,
     EXPERIMENTS,
-    FULL_SCALE,
     HARDLY_TURNS,
     MASK,
     WHEEL_RADIUS,
-    Comparison,
     Record,
     RecordedRun,
-    build_loop,
-    compare,
+    RecordMatch,
+    build_record_loop,
     compare_with_maker,
+    compare_with_record,
+    describe_record,
     fit_record,
-    measured_comparison,
     read_curves,
     read_record,
     simulate,
@@ -59,7 +57,7 @@ FREE = {
     "loop.actuator.fall": ("s", "dead time before the brake releases"),
     "counter_lag": ("s", "age of the wheel speed in the record"),
 }
-RANGES: Params = {
+PARAMETER_RANGES: Params = {
     "loop.plant.road.w4": (0.02, 0.8),
     "loop.plant.brake_gain": (2.0, 80.0),
     "loop.plant.brake_rate": (10.0, 1500.0),
@@ -166,7 +164,7 @@ def build_run(record: Record, given: bool, rig: LabRig) -> RecordedRun:
         given: True plays the recorded commands; False lets the loop's relay switch.
         rig: Plant.
     """
-    loop = build_loop(record, given, rig)
+    loop = build_record_loop(record, given, rig)
     return RecordedRun(loop=dataclasses.replace(loop, initial=BrakeStart(speed=BRAKING_SPEED * rig.drum_radius)))
 
 
@@ -178,8 +176,10 @@ def judge(record: Record, rig: LabRig, values: Params) -> JsonObject:
         rig: Plant before the fit.
         values: Identified values by path.
     """
-    given, own = (compare(with_values(build_run(record, mode, rig), values), record) for mode in (True, False))
-    measured = measured_comparison(record)
+    given, own = (
+        compare_with_record(with_values(build_run(record, mode, rig), values), record) for mode in (True, False)
+    )
+    measured = describe_record(record)
     return {
         "wheel_rms_percent_given": given.wheel_rms_percent,
         "slip_rms_given": given.slip_rms,
@@ -191,7 +191,7 @@ def judge(record: Record, rig: LabRig, values: Params) -> JsonObject:
     }
 
 
-def _ends(seen: Comparison) -> JsonObject:
+def _ends(seen: RecordMatch) -> JsonObject:
     return {"cycles": seen.cycles, "stop_time": seen.stop_time, "stop_distance": seen.stop_distance}
 
 
@@ -236,7 +236,9 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
     coasting = fit_coasting()
     rig = build_rig(coasting)
     progress("lab-rig: fitting experiment 1")
-    found = fit_record(build_run(first, True, rig), {path: RANGES[path] for path in FREE}, first, starts=STARTS)
+    found = fit_record(
+        build_run(first, True, rig), {path: PARAMETER_RANGES[path] for path in FREE}, first, starts=STARTS
+    )
     progress("lab-rig: judging by experiment 2")
     judged = {name: judge(one, rig, found.values) for name, one in (("fitted", first), ("judged", second))}
     before = {name: judge(one, MASK, MASK_VALUES) for name, one in (("fitted", first), ("judged", second))}
@@ -297,36 +299,23 @@ def draw_figures(records: tuple[Record, Record], rig: LabRig, values: Params, co
         f"experiment_{i + 1}": _draw_experiment(one, rig, values, title)
         for i, (one, title) in enumerate(zip(records, titles, strict=True))
     }
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
-    for axis, body in zip(axes, ("wheel", "drum"), strict=True):
-        for name, found in coasting.items():
-            if body in name:
-                t, speed = read_curves()[name].T
-                axis.plot(t, speed, ".", ms=3, label=f"measured, {name[-1]}")
-                axis.plot(t, np.asarray(found.part.at(t)), lw=1, color="black")
-        axis.set(title=f"Coasting {body}", xlabel="time [s]", ylabel="speed [rad/s]")
-        axis.legend()
-    return {**drawn, "coasting": figure}
+    panels = [
+        plot.MeasuredPanel(f"{name.split('-')[1]} [rad/s]", t, speed, np.asarray(found.part.at(t)), "bearing friction")
+        for name, found in coasting.items()
+        for t, speed in [read_curves()[name].T]
+    ]
+    return {**drawn, "coasting": plot.draw_measured(panels, title="Coasting: a wheel that only its bearing brakes")}
 
 
-def _draw_experiment(one: Record, rig: LabRig, values: Params, title: str) -> Figure:
-    figure, axes = plt.subplots(4, 1, figsize=(9, 10), sharex=True, layout="constrained")
-    for row, (mode, name) in enumerate(((True, "measured commands"), (False, "its own relay"))):
-        recorded = with_values(build_run(one, mode, rig), values)
-        run = simulate(recorded.loop, solver_for(one))
-        wheel, slip = (np.asarray(x) for x in simulate_readings(run, recorded, solver_for(one), one.t))
-        turns = one.wheel > HARDLY_TURNS / 4
-        for axis, measured, ours, label in (
-            (axes[2 * row], one.wheel, wheel, "wheel [rad/s]"),
-            (axes[2 * row + 1], np.where(turns, one.slip, np.nan), np.where(turns, slip, np.nan), "slip [1]"),
-        ):
-            axis.plot(one.t, measured, ".", ms=3, color="tab:blue", label="measured")
-            axis.plot(one.t, ours, lw=1, color="tab:red", label=f"simulated, {name}")
-            axis.set(ylabel=label)
-            axis.legend(loc="upper right")
-    axes[0].set(title=title, ylim=(0, 1.05 * FULL_SCALE))
-    axes[-1].set(xlabel="time from the first command [s]")
-    return figure
+def _draw_experiment(one: Record, rig: LabRig, values: Params, title: str) -> Any:
+    panels, turns = [], one.wheel > HARDLY_TURNS / 4
+    for given, name in ((True, "simulated, measured commands"), (False, "simulated, its own relay")):
+        recorded = with_values(build_run(one, given, rig), values)
+        wheel, slip = simulate_readings(simulate(recorded.loop, solver_for(one)), recorded, solver_for(one), one.t)
+        measured, ours = (np.where(turns, x, np.nan) for x in (one.slip, np.asarray(slip)))
+        panels.append(plot.MeasuredPanel("wheel [rad/s]", one.t, one.wheel, np.asarray(wheel), name))
+        panels.append(plot.MeasuredPanel("slip [1]", one.t, measured, ours, name))
+    return plot.draw_measured(panels, title=title)
 
 
 def compact(summary: Table) -> Digest:
@@ -335,20 +324,21 @@ def compact(summary: Table) -> Digest:
     Args:
         summary: Contents of `summary.json`.
     """
-    headings = ("", "wheel rms [%], given", "own", "cycles", "time [s]", "distance [m]")
+    headings = ("experiment", "given [%]", "own [%]", "cycles", "time [s]", "distance [m]")
     lines = []
-    for key, title in (("fitted", "1, fitted"), ("judged", "2, judged")):
+    for number, key in (("1", "fitted"), ("2", "judged")):
         measured = summary[key]["measured"]
-        lines.append((f"experiment {title}: measured", "", "", *_cells(measured)))
-        for state, of in (("mask", summary["before"][key]), ("identified", summary[key])):
+        lines.append((f"{number}, measured", "", "", *_cells(measured)))
+        for state, of in (("mask", summary["before"][key]), (f"identified ({key})", summary[key])):
             rms = (f"{of[f'wheel_rms_percent_{mode}']:.1f}" for mode in ("given", "own"))
-            lines.append((f"  simulated, {state}", *rms, *_cells(of)))
+            lines.append((f"{number}, {state}", *rms, *_cells(of)))
     values = [
         f"{row['name']} = {row['value']:.4g} +- {row['standard_deviation']:.1g} {row['unit']}"
         for row in summary["parameters"]
         if ":" not in row["name"]
     ]
-    return Digest(summary["title"].split(" (")[0], headings, lines, values, (), len(summary["figures"]))
+    rule = "Given, own: rms error of the wheel's speed under the measured commands and under its own relay."
+    return Digest(summary["title"].split(" (")[0], headings, lines, [rule, *values], (), len(summary["figures"]))
 
 
 def _cells(of: Table) -> tuple[str, str, str]:

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.actuators import DeadTime
-from diffabs.controllers import ConstantTorque, PlayedCommand, Relay, Sampled
 from diffabs.config.values import ScenarioError
+from diffabs.controllers import ConstantTorque, PlayedCommand, Relay, Sampled
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import param, part, pytree, replace
 from diffabs.core.types import JsonObject, Params, Part, Scalar
@@ -80,10 +80,15 @@ class Record(NamedTuple):
 
     @property
     def stop_distance(self) -> float:
-        """Braking distance from wheel speed and slip [m]; where the slip is near 1, the speed is interpolated."""
-        known = self.slip < 0.6
-        speed = self.wheel[known] * WHEEL_RADIUS / (1 - self.slip[known])
-        return float(np.trapezoid(np.interp(self.t, self.t[known], speed), self.t))
+        """Braking distance [m]: the integral of a cubic through the vehicle speeds that wheel speed and slip give.
+
+        Near slip 1 they say little about the vehicle: each reading has the weight 1 - slip.
+        """
+        known = (self.slip < 0.9) & (self.t < self.stop_time)
+        left = 1 - self.slip[known]
+        cubic = np.polyfit(self.t[known], self.wheel[known] * WHEEL_RADIUS / left, 3, w=left)
+        t = np.linspace(0.0, self.stop_time, 400)
+        return float(np.trapezoid(np.maximum(np.polyval(cubic, t), 0.0), t))
 
 
 class Experiment(NamedTuple):
@@ -121,7 +126,7 @@ class RecordedRun:
 
 
 @dataclasses.dataclass(frozen=True)
-class Comparison:
+class RecordMatch:
     """How far a simulated run is from a record.
 
     Attributes:
@@ -188,7 +193,7 @@ def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> np.ndarray:
         raise ScenarioError(f"{path}: needs the columns {', '.join(columns)}, with a number in every row") from None
 
 
-def build_loop(record: Record, given: bool, rig: LabRig = MASK, actuator: Part | None = None) -> Loop:
+def build_record_loop(record: Record, given: bool, rig: LabRig = MASK, actuator: Part | None = None) -> Loop:
     """Return the loop of an experiment.
 
     Args:
@@ -305,7 +310,7 @@ def fit_record(
     )  # fmt: skip
 
 
-def compare(recorded: RecordedRun, record: Record, first: float = 0.0, last: float = np.inf) -> Comparison:
+def compare_with_record(recorded: RecordedRun, record: Record, first: float = 0.0, last: float = np.inf) -> RecordMatch:
     """Return how far a run of the loop is from a record.
 
     Args:
@@ -322,7 +327,7 @@ def compare(recorded: RecordedRun, record: Record, first: float = 0.0, last: flo
     assert run.trajectory is not None
     sample, moves = run.trajectory.sample, run.trajectory.measured.speed > 0
     rises = np.diff(sample.command, prepend=0.0) > 0.5
-    return Comparison(
+    return RecordMatch(
         wheel_rms_percent=float(100 / FULL_SCALE * np.sqrt(np.mean((wheel - record.wheel)[counts] ** 2))),
         slip_rms=float(np.sqrt(np.mean((slip - record.slip)[turns] ** 2))),
         cycles=int(np.sum(rises & moves)),
@@ -375,14 +380,14 @@ def compare_with_maker(until: float = 1.2) -> list[JsonObject]:
     return [*rows, {**row, "wheel_rpm": None, "slip": float(difference("slip").max())}]
 
 
-def measured_comparison(record: Record) -> Comparison:
-    """Return the measured numbers of a record beside those of `compare`: no difference, cycles, time, distance.
+def describe_record(record: Record) -> RecordMatch:
+    """Return the measured cycles, stopping time and distance, in the form of `compare_with_record`.
 
     Args:
         record: Record of an experiment.
     """
     rises = np.diff(record.commands, prepend=0.0) > 0.5
-    return Comparison(0.0, 0.0, int(np.sum(rises & (record.t < record.stop_time))), record.stop_time,
+    return RecordMatch(0.0, 0.0, int(np.sum(rises & (record.t < record.stop_time))), record.stop_time,
                       record.stop_distance)  # fmt: skip
 
 

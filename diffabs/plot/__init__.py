@@ -1,5 +1,7 @@
 """Figures of runs, sweeps and tunings. Only this package imports matplotlib (the extra `plot`)."""
 
+from diffabs.plot.measured import MeasuredPanel as MeasuredPanel
+from diffabs.plot.measured import draw_measured as draw_measured
 from diffabs.plot.runs import draw_angle_lines as draw_angle_lines
 from diffabs.plot.runs import draw_balance as draw_balance
 from diffabs.plot.runs import draw_braking as draw_braking

@@ -58,27 +58,28 @@ def test_the_records():
     assert second.stop_time == pytest.approx(3.35, abs=0.03)
     assert 25.8 < first.stop_distance < 27.4
     assert set(first.commands) == {0.0, 1.0}
-    assert rig.measured_comparison(first).cycles == 15
+    assert rig.describe_record(first).cycles == 15
 
 
 def recorded_by(name):
     """A run of the packaged scenario under the commands of experiment 1."""
     record = rig.read_record(rig.EXPERIMENTS[0])
     loop = load(name).loop
-    given = replace(loop, {"controller": rig.build_loop(record, True).controller})
+    given = replace(loop, {"controller": rig.build_record_loop(record, True).controller})
     return record, *(rig.RecordedRun(loop=one, counter_lag=0.01309) for one in (loop, given))
 
 
 def test_the_packaged_scenario_follows_experiment_1():
     with jax.enable_x64(True):
         record, own, given = recorded_by("lab-rig-measured")
-        assert rig.compare(given, record).wheel_rms_percent < 1.5
-        seen = rig.compare(own, record)
+        assert rig.compare_with_record(given, record).wheel_rms_percent < 1.5
+        seen = rig.compare_with_record(own, record)
     assert seen.wheel_rms_percent < 6
     assert abs(seen.cycles - 15) <= 1
     assert seen.stop_time == pytest.approx(record.stop_time, rel=0.03)
 
 
+@pytest.mark.slow
 @killed_by("papers/measured_rig.py", "t - recorded.counter_lag", "t")
 @pytest.mark.parametrize("path", ["loop.actuator.rise", "loop.actuator.fall", "loop.plant.brake_rate", "counter_lag"])
 def test_derivatives_of_the_readings_agree_with_differences(path):
