@@ -3,7 +3,8 @@
     control(t) = value of the latest switch whose due time has passed,   due = instant of the switch + rise or fall
 
 A valve, a clutch or the slack of a brake cable answers a rise of the command later, or earlier, than a fall. A switch
-that would be due before an earlier one cancels it: a pulse shorter than rise - fall never reaches the plant.
+that would be due before an earlier one cancels it. So a pulse shorter than rise - fall never reaches the plant, nor a
+gap shorter than fall - rise.
 
 `Delay` is for a command that changes smoothly; its rise and fall are delayed equally.
 """
@@ -38,8 +39,9 @@ class DeadTimeMemory(NamedTuple):
 class DeadTime:
     """A command that switches between values arrives `rise` after an increase and `fall` after a decrease.
 
-    The command is read at every instant of the grid and at every event, and is held in between. At most `capacity`
-    switches may be on their way. With more of them the run has diverged: its control becomes NaN.
+    The command is read at every instant of the grid and at every event, where `tick` runs, and is held in between. At
+    most `capacity` switches may be on their way. With one more the control becomes NaN, and so the plant's state: the
+    run has diverged.
 
     Attributes:
         rise: Dead time of an increase [s], > 0.
@@ -80,14 +82,14 @@ class DeadTime:
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(changed, a, b), sent, m))
 
     def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: PyTree) -> tuple[PyTree]:
-        """Return the time [s] until the next switch arrives, and 1 s if none is on its way."""
+        """Return the time until the next switch arrives [s], or 1 s if no switch is on its way."""
         del signal, rate
         due = memory.held.due[0]
         on_its_way = due < jnp.inf
         return (jnp.where(on_its_way, jnp.where(on_its_way, due, 0.0) - t, 1.0),)
 
     def event(self, t: Scalar, memory: Memory, signal: Scalar, fired: tuple[PyTree]) -> Memory:
-        """Return the memory after a switch has arrived."""
+        """Return the memory with the first switch applied if its event has fired, else the old memory."""
         del t, signal
         m: DeadTimeMemory = memory.held
         due = jnp.concatenate([m.due[1:], jnp.full_like(m.due[:1], jnp.inf)])

@@ -1,4 +1,4 @@
-"""A recorded command, played to the plant: runs under the commands of an experiment, without its controller."""
+"""Open loop: a recorded sequence of commands, such as that of an experiment, drives the plant."""
 
 from collections.abc import Iterator
 
@@ -14,7 +14,7 @@ from diffabs.core.types import Scalar, Vector
 
 @pytree
 class PlayedCommand:
-    """Entry k of `commands` from k period on; the last entry stays. Target and measured signal have no effect.
+    """From time k period on, the output is entry k of `commands`; after the last one it stays. Signals have no effect.
 
     Attributes:
         commands: Recorded commands, shape (length,) [control].
@@ -36,7 +36,7 @@ class PlayedCommand:
         return memory.held
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """Return the memory with the next entry if a period begins, else the old memory."""
+        """Return the memory with the entry of the period that begins, or the old memory between two periods."""
         del signal
         now, played = clock.ticks(self.period)
         commands = jnp.asarray(self.commands)

@@ -1,7 +1,8 @@
 """INTECO's laboratory rig: measured against simulated.
 
-Bearing friction is identified from four coasting curves, all else from experiment 1. Experiment 2 judges the result.
-`experiments/measured_rig.py` shows how the model was chosen, and what the identified rig means for the controllers.
+Bearing friction is identified from four coasting curves, the seven parameters of `FREE` from experiment 1. Experiment 2
+judges the result. `experiments/measured_rig.py` shows how the model was chosen, and what the identified rig means for
+the controllers.
 """
 
 import dataclasses
@@ -19,7 +20,6 @@ from diffabs.identify import Identified, fit
 from diffabs.papers import record
 from diffabs.papers.digest import Digest
 from diffabs.papers.measured_rig import (
-    BRAKING_SPEED,
     DRUM_RADIUS,
     EXPERIMENTS,
     HARDLY_TURNS,
@@ -40,7 +40,7 @@ from diffabs.papers.measured_rig import (
     solver_for,
     with_values,
 )
-from diffabs.plants import BrakeStart, LabRig
+from diffabs.plants import LabRig
 from diffabs.runtime import provenance
 
 TITLE = "INTECO's laboratory rig: measured against simulated (relay at slip 0.1 and 0.7, from 1,700 rpm)"
@@ -66,7 +66,7 @@ PARAMETER_RANGES: Params = {
     "loop.actuator.fall": (2e-3, 0.05),
     "counter_lag": (0.0, 0.03),
 }
-# The fit has many minima: a brake that grips a sample earlier moves a whole cycle. The best of these starts counts.
+# The cost has many minima: a brake that grips a sample earlier shifts a whole cycle. The best of these starts counts.
 STARTS: tuple[Params, ...] = tuple(
     {
         "loop.plant.road.w4": 0.22,
@@ -117,7 +117,7 @@ def _coasting_residuals(wheel: Coasting, t: Any, speed: Any) -> Any:
 
 
 def fit_coasting() -> dict[str, Identified]:
-    """Return the bearing friction of wheel and drum from the four coasting curves, by name of the curve."""
+    """Return a fit of speed, viscous and dry friction to each of the four coasting curves, by name of the curve."""
     found = {}
     for name, curve in read_curves().items():
         if name.startswith("coasting-"):
@@ -131,7 +131,7 @@ def fit_coasting() -> dict[str, Identified]:
 
 
 def build_rig(coasting: Params) -> LabRig:
-    """Return the rig before the fit of experiment 1: the driver's radii, and the bearing friction of the coasting fits.
+    """Return the rig before the fit of experiment 1: the driver's radii, and each bearing's mean over its two curves.
 
     The relay commands 0 or 1 only, so its brake has one torque: `brake_gain` at full command, with `brake_offset` 0.
 
@@ -143,7 +143,14 @@ def build_rig(coasting: Params) -> LabRig:
         for body in ("wheel", "drum")
         for kind in ("friction", "stiction")
     }
-    return dataclasses.replace(MASK, wheel_radius=WHEEL_RADIUS, drum_radius=DRUM_RADIUS, brake_offset=0.0, **means)
+    return dataclasses.replace(
+        MASK,
+        wheel_radius=WHEEL_RADIUS,
+        drum_radius=DRUM_RADIUS,
+        brake_offset=0.0,
+        brake_gain=MASK.brake_gain + MASK.brake_offset,
+        **means,
+    )
 
 
 def with_scaled_brake(rig: LabRig) -> LabRig:
@@ -164,12 +171,11 @@ def build_run(record: Record, given: bool, rig: LabRig) -> RecordedRun:
         given: True plays the recorded commands; False lets the loop's relay switch.
         rig: Plant.
     """
-    loop = build_record_loop(record, given, rig)
-    return RecordedRun(loop=dataclasses.replace(loop, initial=BrakeStart(speed=BRAKING_SPEED * rig.drum_radius)))
+    return RecordedRun(loop=build_record_loop(record, given, rig))
 
 
 def judge(record: Record, rig: LabRig, values: Params) -> JsonObject:
-    """Return how far the loop is from a record, under given commands and under its own relay.
+    """Return how far the loop is from a record under given commands and under its own relay, and the measured numbers.
 
     Args:
         record: Record of the experiment.

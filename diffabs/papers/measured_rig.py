@@ -3,12 +3,12 @@
     experiment 1   relay at slip 0.1: the parameters are fitted to it
     experiment 2   relay at slip 0.7: it judges the fitted loop, and nothing is fitted to it
 
-A loop runs in two ways. *Given*: the brake receives the commands that the relay had from the measured slip. *Own*: the
+A loop runs in two ways. *Given*: the brake receives the commands that the relay of the experiment sent. *Own*: the
 loop's relay reads the slip that the loop's encoders measure, every 10 ms.
 
 Source: INTECO, ABS, The laboratory Anti-lock Braking System, user's manual (2014), Fig. 3.11, 3.13, 5.5 and 5.6. The
 readings of `measured_rig.csv` were taken from its figures. A curve has at most 80 of them; straight lines between them
-follow the curve. A folder of finer readings replaces them (`read_records`).
+follow the curve. A folder of finer readings replaces them (`read_record`).
 """
 
 import csv
@@ -44,9 +44,10 @@ FIT_STEP = 1e-3  # s; against RUN_STEP it changes the wheel's error by 0.005 % o
 RPM = 2 * np.pi / 60  # rad/s
 FULL_SCALE = 1800 * RPM  # rad/s, to which the manual accelerates the wheel: 100 % of an error
 BRAKING_SPEED = 1700 * RPM  # rad/s of the drum, at which the motor stops and the relay starts
-SIGMA_SPEED, SIGMA_SLIP = 3.0, 0.01  # rad/s and 1: weights of the fit. The slip, within two pixels, moves the relay.
+SIGMA_SPEED, SIGMA_SLIP = 3.0, 0.01  # rad/s and 1: scales of the residuals; only their ratio counts
 WHEEL_RADIUS, DRUM_RADIUS = 0.6004 / (2 * np.pi), 0.619 / (2 * np.pi)  # m, the perimeters in the driver
-HARDLY_TURNS = 20.0  # rad/s; below it a slip counts less in the fit, in proportion to the wheel's speed
+HARDLY_TURNS = 20.0  # rad/s; below it a slip counts less in the fit
+# the rig with the numbers in the mask of the maker's Simulink model
 MASK = LabRig(
     wheel_inertia=7.5281e-3, drum_inertia=25.603e-3, wheel_friction=1.2e-4, drum_friction=2.25e-4, drum_stiction=0.093,
     brake_rate=1 / 0.048, brake_threshold=6.21 / 15.24, road=RIG_UNROUNDED,
@@ -61,7 +62,7 @@ class Record(NamedTuple):
         t: Instants [s] from the start of the brake, shape (n,), every 10 ms.
         wheel: Speed of the braked wheel [rad/s], shape (n,), as a counter shows it.
         slip: Slip [1], shape (n,), as the computer measures it.
-        commands: Commands of the relay [1], shape (n,): 1 where the slip is below the threshold.
+        commands: Commands of the relay [1], shape (n,), 0 or 1, as the slip of the finest readings gives them.
         printed_distance: Braking distance that the manual prints [m].
     """
 
@@ -74,7 +75,7 @@ class Record(NamedTuple):
 
     @property
     def stop_time(self) -> float:
-        """Time from the start of the brake to the last sample with a speed or a slip [s]."""
+        """Time of the last sample with a wheel speed above 0 or a slip beyond 0.01, and one period more [s]."""
         moves = (self.wheel > 0) | (np.abs(self.slip) > 0.01)
         return float(self.t[np.flatnonzero(moves)[-1]] + PERIOD)
 
@@ -96,7 +97,7 @@ class Experiment(NamedTuple):
 
     name: str
     threshold: float
-    start: float  # s of the drawing, at which the first command of the brake is sent
+    start: float  # time of the first command on the axis of the figure [s]
     printed_distance: float  # m
 
 
@@ -127,13 +128,13 @@ class RecordedRun:
 
 @dataclasses.dataclass(frozen=True)
 class RecordMatch:
-    """How far a simulated run is from a record.
+    """Differences of a run from a record, and the run's own cycles, stopping time and distance.
 
     Attributes:
         wheel_rms_percent: Rms difference of the wheel speeds, in per cent of 1,800 rpm.
         slip_rms: Rms difference of the slips, while the wheel turns faster than 20 rad/s.
         cycles: Number of brake applications.
-        stop_time: Time to standstill [s].
+        stop_time: Time until the encoders show no speed [s]; infinite if the run does not stop.
         stop_distance: Distance to standstill [m].
     """
 
@@ -145,7 +146,7 @@ class RecordMatch:
 
 
 def read_curves(folder: pathlib.Path | None = None) -> dict[str, np.ndarray]:
-    """Return the packaged readings by name of the curve, each of shape (n, 2): abscissa and value.
+    """Return the readings by name of the curve, each of shape (n, 2): abscissa and value.
 
     Args:
         folder: Folder with `measured_rig.csv`; by default that of the package.
@@ -164,7 +165,7 @@ def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Rec
     Args:
         experiment: Experiment.
         data: Folder with finer readings, `relay-slip-0.1.csv` and `relay-slip-0.7.csv`, with the columns time_s,
-            wheel_speed_rad_per_s and slip_1. None takes the packaged readings.
+            wheel_speed_rad_per_s and slip_1, every 10 ms on the axis of the figure. None takes the packaged readings.
 
     Raises:
         ScenarioError: A file lacks a column or a number.
@@ -180,6 +181,10 @@ def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Rec
     else:
         table = _read_table(data / f"{experiment.name}.csv", ("time_s", "wheel_speed_rad_per_s", "slip_1"))
         t, wheel, slip = table[table[:, 0] > experiment.start - 0.5 * PERIOD].T
+        if len(t) < 2 or not np.allclose(np.diff(t), PERIOD, atol=1e-4):
+            raise ScenarioError(
+                f"{data}: {experiment.name}.csv needs a row every {PERIOD:g} s from {experiment.start} s on"
+            )
         times, commands = np.arange(len(t)) * PERIOD, np.where(slip < experiment.threshold, 1.0, 0.0)
     return Record(experiment.threshold, times, wheel, slip, commands, experiment.printed_distance)
 
@@ -188,9 +193,12 @@ def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> np.ndarray:
     """Return these columns of a CSV file with a header, shape (n, columns)."""
     rows = list(csv.DictReader(files.read_content(path).decode().splitlines()))
     try:
-        return np.array([[float(row[name]) for name in columns] for row in rows])
+        table = np.array([[float(row[name]) for name in columns] for row in rows]).reshape(-1, len(columns))
+        if np.isfinite(table).all():
+            return table
     except (KeyError, TypeError, ValueError):
-        raise ScenarioError(f"{path}: needs the columns {', '.join(columns)}, with a number in every row") from None
+        pass
+    raise ScenarioError(f"{path}: needs the columns {', '.join(columns)}, with a number in every row")
 
 
 def build_record_loop(record: Record, given: bool, rig: LabRig = MASK, actuator: Part | None = None) -> Loop:
@@ -205,7 +213,7 @@ def build_record_loop(record: Record, given: bool, rig: LabRig = MASK, actuator:
     relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
     return braking(
         plant=rig,
-        initial=BrakeStart(speed=BRAKING_SPEED * MASK.drum_radius),
+        initial=BrakeStart(speed=BRAKING_SPEED * rig.drum_radius),
         sensor=EncoderSlip(period=PERIOD),
         reference=FixedSlip(slip=record.threshold),
         controller=PlayedCommand(commands=record.commands, period=PERIOD) if given else relay,
@@ -215,7 +223,7 @@ def build_record_loop(record: Record, given: bool, rig: LabRig = MASK, actuator:
 
 
 def solver_for(record: Record, step: float = RUN_STEP) -> FixedStep:
-    """Return the solver of runs as long as a record.
+    """Return the solver of runs that last 1 s longer than a record.
 
     Args:
         record: Record of an experiment.
@@ -250,7 +258,7 @@ class RecordResiduals:
 
 
 def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Any) -> tuple[Any, Any]:
-    """Return the wheel speed [rad/s] and the slip [1] that the rig's computer shows at instants of a run, shape (n,).
+    """Return the counter's wheel speed [rad/s] and the computer's slip [1] at instants of a run, shape (n,) each.
 
     The wheel speed is the true one, older by the counter's lag. The slip is that of the encoders.
 
@@ -273,7 +281,7 @@ def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Any
 
 
 def slip_weight(wheel: np.ndarray) -> np.ndarray:
-    """Return the weights of slips at wheel speeds [rad/s]: 1, and less where the wheel hardly turns.
+    """Return the weights of slips: the wheel speed over 20 rad/s, clipped to 0.1 and 1.
 
     Args:
         wheel: Wheel speeds [rad/s], shape (n,).
@@ -331,19 +339,19 @@ def compare_with_record(recorded: RecordedRun, record: Record, first: float = 0.
         wheel_rms_percent=float(100 / FULL_SCALE * np.sqrt(np.mean((wheel - record.wheel)[counts] ** 2))),
         slip_rms=float(np.sqrt(np.mean((slip - record.slip)[turns] ** 2))),
         cycles=int(np.sum(rises & moves)),
-        stop_time=float(sample.t[np.flatnonzero(moves)[-1]] + solver.step),
+        stop_time=float(sample.t[np.flatnonzero(moves)[-1]] + solver.step) if run.stopped else float(np.inf),
         stop_distance=float(sample.output.distance[-1]),
     )
 
 
 def compare_with_maker(until: float = 1.2) -> list[JsonObject]:
-    """Return the largest differences of `LabRig` with the mask's numbers from the maker's own simulations.
+    """Return the largest differences of `MASK` from the maker's own simulations.
 
     Both wheels start at 180 rad/s. The relay reads the true slip every 10 ms. Below 1 m/s the maker's model smooths
     friction, so the comparison ends before.
 
     Args:
-        until: Last instant that counts [s].
+        until: Last instant of the relay's runs that counts [s]; the open loop counts until 0.31 s.
 
     Returns:
         A row for each simulation: its name, `wheel_rpm` (not for the open loop) and `slip`.

@@ -2,8 +2,8 @@
 
     V = (position - position one period ago)/period, 0 below the dead zone,   slip = (V2 - V1)/(V2 + floor)
 
-V1 is the speed of the wheel's rim, V2 that of the vehicle. Each is the mean over the last period. At a sample, slip and
-speeds therefore lag the true ones by half a period, and at the end of the next period by one and a half.
+V1 is the speed of the wheel's rim, V2 that of the vehicle. Each is the mean over the last period. The shown values lag
+by half a period at a sample, and by one and a half just before the next one.
 
 Source: the driver of INTECO's laboratory anti-lock brake system, class `cabs`: 10 ms, 0.05 m/s, 0.01 m/s.
 """
@@ -25,8 +25,8 @@ class EncoderMemory(NamedTuple):
     Attributes:
         wheel: Path of the wheel's rim [m].
         vehicle: Path of the vehicle [m].
-        wheel_speed: V1 [m/s].
-        speed: V2 [m/s].
+        wheel_speed: Mean speed of the rim over the last period, before the dead zone [m/s].
+        speed: Mean speed of the vehicle over the last period, before the dead zone [m/s].
     """
 
     wheel: Scalar
@@ -54,7 +54,7 @@ class EncoderSlip:
     grid_rules = Noise.grid_rules
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Return the memory at rest in position 0, with the true speeds over the period before."""
+        """Return the memory with the rim's path 0, the true distance, and the true speeds for the period before."""
         zero = 0.0 * signal.speed
         return Memory(zero, EncoderMemory(zero, signal.distance, signal.wheel_speed, signal.speed))
 

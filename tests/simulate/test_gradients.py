@@ -173,6 +173,24 @@ LOOPS = {
         actuator=actuators.VoltageLimit(),
         stop=Fallen(),
     ),
+    "given commands": braking(
+        **CAR,
+        controller=controllers.PlayedCommand(commands=np.array([90.0, 150.0, 40.0, 110.0, 70.0]), period=0.05),
+        actuator=blocks.Series(
+            blocks=(
+                actuators.DeadTime(rise=0.0123, fall=0.0071),
+                actuators.AsymmetricLag(rise=0.013, fall=0.0061),
+            )
+        ),
+    ),
+    "encoders": braking(
+        **CAR,
+        controller=controllers.Sampled(
+            controller=controllers.PID(kp=250.0, ki=900.0, high=150.0, low=0.0), period=1e-2, delay=1.3e-3
+        ),
+        sensor=sensors.EncoderSlip(period=1e-2),
+        actuator=actuators.DeadTime(rise=0.0063, fall=0.0052),
+    ),
     "delay": braking(
         **CAR,
         controller=controllers.PID(kp=300.0, kd=1.0, high=250.0, low=0.0),
@@ -201,7 +219,7 @@ ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {
 # The largest programs to compile, and a wheel that locks, of which test_kinks.py has closed forms.
 SLOW = (
     *("estimated speed", "filtered reference", "arm, observed", "proportional", "computer", "noisy", "relay", "delay"),
-    *("lock", "arm", "speed that drifts", "feedback", "latch", "extremum seeking", "by deceleration"),
+    *("lock", "arm", "speed that drifts", "feedback", "latch", "extremum seeking", "by deceleration", "encoders"),
 )
 
 

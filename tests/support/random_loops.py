@@ -392,6 +392,32 @@ def by_deceleration(r: Draw) -> d.Loop:
     return along(r, references.SlipByDeceleration(slips=slips, time_constant=r.near(0.05)))
 
 
+def given_commands(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.WET_ASPHALT, rolling=True),
+        controller=controllers.PlayedCommand(commands=[r.within(20.0, 60.0) for _ in range(12)], period=0.05),
+        actuator=Series(
+            blocks=(
+                actuators.DeadTime(rise=r.near(0.012), fall=r.near(0.007)),
+                actuators.AsymmetricLag(rise=r.near(0.01), fall=r.near(0.005)),
+            )
+        ),
+    )
+
+
+def encoders(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.DRY_CONCRETE, rolling=True),
+        controller=controllers.Sampled(
+            controller=controllers.PID(kp=r.near(150.0), ki=r.near(400.0), low=r.within(1.0, 4.0), high=r.near(110.0)),
+            period=1e-2,
+        ),
+        reference=references.FixedSlip(slip=r.near(0.1)),
+        sensor=sensors.EncoderSlip(period=1e-2),
+        actuator=actuators.DeadTime(rise=r.near(0.006), fall=r.near(0.004)),
+    )
+
+
 def arm(r: Draw) -> d.Loop:
     return braking(
         plant=plants.ArmBalance(gear=1.1, rotor_inertia=0.3, current_max=r.near(40.0)),
@@ -457,6 +483,8 @@ STRUCTURES = {
     "rig, limited, clamped": Structure(rig_clamped),
     "rig, speed that drifts": Structure(rig_drifting),
     "rig, estimated speed": Structure(rig_estimated),
+    "given commands, dead times": Structure(given_commands),
+    "encoders, dead times": Structure(encoders),
     "extremum seeking": Structure(seeking),
     "slip by deceleration": Structure(by_deceleration),
     "lab rig, relay": Structure(lab_rig),
