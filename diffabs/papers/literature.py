@@ -9,6 +9,7 @@ bound is the stop with the friction at its peak from start to end.
 """
 
 import csv
+import functools
 import io
 import json
 import math
@@ -34,12 +35,10 @@ from diffabs.runtime import files, provenance
 from diffabs.scenario.scenario import load
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Run
+from diffabs.stops import Standstill
 
 TITLE = "Printed numbers of published anti-lock simulations, computed again"
 SHOWN = "literature-mathworks"  # scenario that stands for all in the report
-SOURCE_KEYS = ("title", "place", "rows")
-ROW_KEYS = ("source", "quantity", "unit", "printed", "ours", "tolerance", "verdict", "cause", "bound", "scheme",
-            "scenario", "command", "place")  # fmt: skip
 SLIP_GRID = 20001  # points on [0, 1]; the knots of all tables are among them
 DIGITS = 5  # significant digits of our numbers in the benchmark table
 NOTES = [
@@ -187,7 +186,10 @@ def bound_of_loop(loop: Loop, row: Table) -> float:
         c = float(plant.drag / plant.mass)
     if row["bound"] == "time_between":
         return bound_of_stop("time", a, c, *row["speeds"])
-    last = 0.0 if type(loop.stop).__name__ == "Standstill" else float(loop.stop.speed)
+    # A fitted distance is that to standstill, wherever the run ends.
+    last = (
+        0.0 if isinstance(loop.stop, Standstill) or row.get("measure") == "fitted_distance" else float(loop.stop.speed)
+    )
     return bound_of_stop(row["bound"], a, c, speed, last)
 
 
@@ -204,8 +206,9 @@ def _bound(row: Table, overrides: list[str]) -> float | None:
 _rollout = jax.jit(rollout, static_argnums=1)
 
 
-def simulate_row(scenario: str, overrides: list[str]) -> Run:
-    """Return the run of a scenario with overrides.
+@functools.cache
+def simulate_row(scenario: str, overrides: tuple[str, ...]) -> Run:
+    """Return the run of a scenario with overrides. Several rows read the same run.
 
     Args:
         scenario: Name of a packaged scenario.
@@ -232,7 +235,7 @@ def our_value(row: Table) -> float | None:
         return None
     values = []
     for overrides in (row.get("set", []), *([row["against"]] if "against" in row else [])):
-        run = simulate_row(row["scenario"], overrides)
+        run = simulate_row(row["scenario"], tuple(overrides))
         if bool(run.diverged):
             raise RuntimeError(f"the run of {row['source']}, {row['quantity']}, has diverged")
         values.append(MEASURES[measure](run, row))
@@ -283,10 +286,9 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
         progress: Function that receives a sentence before each long computation.
     """
     rows = []
-    for name, group in _by_source(read_rows()):
+    for group in _by_source(read_rows()):
         progress(f"literature: {group[0]['title']}")
         rows += [judge_row(row) for row in group]
-        del name
     progress("literature: figure and tables")
     files.write_file(folder / "table.json", write_json(rows).encode())
     files.write_file(folder / "table.csv", write_csv(rows).encode())
@@ -306,9 +308,9 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
     return record.write_summary(folder, summary)
 
 
-def _by_source(rows: list[JsonObject]) -> Iterator[tuple[str, list[JsonObject]]]:
+def _by_source(rows: list[JsonObject]) -> Iterator[list[JsonObject]]:
     for name in dict.fromkeys(row["source"] for row in rows):
-        yield name, [row for row in rows if row["source"] == name]
+        yield [row for row in rows if row["source"] == name]
 
 
 # Benchmark table
@@ -322,7 +324,7 @@ def write_json(rows: list[JsonObject]) -> str:
     """
     names = dict.fromkeys(row["scenario"] for row in rows if row["scenario"])
     content = {
-        "scenarios": {name: _parameters(name) for name in names},
+        "scenarios": {name: scenario_parameters(name) for name in names},
         "sources": {row["source"]: row["place"] for row in rows},
         "rows": [_rounded(row) for row in rows],
     }
@@ -348,7 +350,12 @@ def _rounded(row: JsonObject) -> JsonObject:
     return row | numbers | tolerance
 
 
-def _parameters(name: str) -> JsonObject:
+def scenario_parameters(name: str) -> JsonObject:
+    """Return the parameters of a scenario by path, each with value and unit.
+
+    Args:
+        name: Name of a packaged scenario.
+    """
     scenario = load(name, integrated=False)
     units = units_of(scenario.loop.plant)
     found: JsonObject = {
