@@ -17,13 +17,12 @@ import pathlib
 import shlex
 import tomllib
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import jax
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 
+from diffabs import plot
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Table
@@ -69,6 +68,7 @@ def read_rows() -> list[JsonObject]:
 
 def _until_end(run: Run) -> tuple[Any, ...]:
     """Return time, slip, vehicle speed, wheel speed, distance and control of a run up to its end."""
+    assert run.trajectory is not None
     sample, running = run.trajectory.sample, np.asarray(run.trajectory.running)
     kept = np.concatenate([[True], running[:-1]])
     y = sample.output
@@ -177,7 +177,7 @@ def bound_of_loop(loop: Loop, row: Table) -> float:
         loop: Closed loop of a quarter car or a road vehicle.
         row: Row with a `bound`.
     """
-    plant: Any = loop.plant
+    plant, stop = cast(Any, loop.plant), cast(Any, loop.stop)
     speed, slip = float(loop.initial.speed), np.linspace(0, 1, SLIP_GRID)
     mu = float(np.max(jax.vmap(lambda s: plant.road.friction(s, speed, 0.0))(slip)))
     a, c = mu * GRAVITY, 0.0
@@ -187,9 +187,7 @@ def bound_of_loop(loop: Loop, row: Table) -> float:
     if row["bound"] == "time_between":
         return bound_of_stop("time", a, c, *row["speeds"])
     # A fitted distance is that to standstill, wherever the run ends.
-    last = (
-        0.0 if isinstance(loop.stop, Standstill) or row.get("measure") == "fitted_distance" else float(loop.stop.speed)
-    )
+    last = 0.0 if isinstance(stop, Standstill) or row.get("measure") == "fitted_distance" else float(stop.speed)
     return bound_of_stop(row["bound"], a, c, speed, last)
 
 
@@ -273,7 +271,7 @@ def judge_row(row: Table) -> JsonObject:
         "bound": _bound(row, overrides),
         "scheme": row.get("scheme"),
         "scenario": scenario if has_run else None,
-        "command": shlex.join(["diffabs", "simulate", scenario, *texts]) if has_run else None,
+        "command": shlex.join(["diffabs", "simulate", str(scenario), *texts]) if has_run else None,
         "place": row["place"],
     }
 
@@ -326,7 +324,7 @@ def write_json(rows: list[JsonObject]) -> str:
     content = {
         "scenarios": {name: scenario_parameters(name) for name in names},
         "sources": {row["source"]: row["place"] for row in rows},
-        "rows": [_rounded(row) for row in rows],
+        "rows": [_round_row(row) for row in rows],
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
@@ -340,11 +338,11 @@ def write_csv(rows: list[JsonObject]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(_rounded(row) for row in rows)
+    writer.writerows(_round_row(row) for row in rows)
     return text.getvalue()
 
 
-def _rounded(row: JsonObject) -> JsonObject:
+def _round_row(row: JsonObject) -> JsonObject:
     numbers = {key: float(f"{row[key]:.{DIGITS}g}") for key in ("ours", "bound") if row[key] is not None}
     tolerance = {} if row["tolerance"] is None else {"tolerance": float(f"{row['tolerance']:.3g}")}
     return row | numbers | tolerance
@@ -368,7 +366,7 @@ def scenario_parameters(name: str) -> JsonObject:
 # Figure and digest
 
 
-def draw_rows(rows: list[JsonObject]) -> Figure:
+def draw_rows(rows: list[JsonObject]) -> Any:
     """Return the figure of all stops: the printed number and ours, each as a multiple of the bound.
 
     Args:
@@ -376,17 +374,13 @@ def draw_rows(rows: list[JsonObject]) -> Figure:
     """
     stops = [row for row in rows if row["bound"] and row["printed"] and row["unit"] in ("s", "m")]
     places = np.arange(len(stops))[::-1]
-    figure, axis = plt.subplots(figsize=(9, 0.26 * len(stops) + 1.2), layout="constrained")
+    figure, (axis,) = plot.sheet(size=(9.0, 0.26 * len(stops) + 1.2), title="Stops: printed and ours")
     axis.axvline(1.0, color="black", lw=1, label="bound: friction at its peak")
-    for key, marker, face, colour in (("printed", "o", "none", "tab:blue"), ("ours", "x", "tab:red", "tab:red")):
+    for key, marker, colour in (("printed", "+", plot.COLOURS[0]), ("ours", "x", plot.COLOURS[1])):
         shown = [(row[key] / row["bound"], at) for row, at in zip(stops, places, strict=True) if row[key] is not None]
-        x, y = zip(*shown, strict=True)
-        axis.scatter(x, y, s=28, marker=marker, facecolors=face, edgecolors=colour if marker == "o" else None,
-                     color=None if marker == "o" else colour, label=key)  # fmt: skip
+        axis.scatter(*np.transpose(shown), s=36, marker=marker, color=colour, label=key)
     axis.set_yticks(places, [f"{row['source']}: {row['quantity']}" for row in stops], fontsize=7)
-    axis.set(xlabel="time or distance, relative to the bound [1]", title="Stops: printed and ours")
-    axis.grid(axis="x", lw=0.3)
-    axis.legend(loc="lower right")
+    plot.label_axes(axis, "time or distance, relative to the bound [1]", "")
     return figure
 
 
@@ -399,7 +393,7 @@ def compact(summary: Table) -> Digest:
     headings = ("source", "quantity", "unit", "printed", "ours", "bound", "verdict")
     rows = summary["rows"]
     lines = [
-        (row["source"], row["quantity"], row["unit"], _printed(row), _number(row["ours"]), _number(row["bound"]),
+        (row["source"], row["quantity"], row["unit"], _format_printed(row), _number(row["ours"]), _number(row["bound"]),
          row["verdict"])
         for row in rows
     ]  # fmt: skip
@@ -416,7 +410,7 @@ def _names(rows: list[JsonObject], source: str, cause: str) -> str:
     return named[0] if len(named) == 1 else f"{len(named)} numbers"
 
 
-def _printed(row: Table) -> str:
+def _format_printed(row: Table) -> str:
     return f"{'<= ' if row['at_most'] else ''}{_number(row['printed'])}"
 
 

@@ -319,7 +319,7 @@ def test_a_stopped_wheel_stays_stopped_until_released(name):
         asked = mu * load * (plant.wheel_radius if isinstance(plant, MirroredRig) else plant.radius)
     for brake in (1.001 * asked, 5 * asked):
         np.testing.assert_allclose(wheel_rate(brake), 0.0, rtol=0, atol=1e-11)
-    inertia = plant.inertia if isinstance(plant, QuarterCar) else plant.wheel_inertia
+    inertia = plant.inertia if isinstance(plant, QuarterCar | RoadVehicle) else plant.wheel_inertia
     released = wheel_rate(0.0)
     # the brake of the lab rig also loads the contact, so its released wheel is slower than this
     low, high = (0.5, 1.0) if isinstance(plant, LabRig) else (1 - 1e-12, 1 + 1e-12)
