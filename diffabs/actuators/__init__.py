@@ -7,3 +7,4 @@ from diffabs.actuators.lag import Lag as Lag
 from diffabs.actuators.lag import Limits as Limits
 from diffabs.actuators.lag import RateLimit as RateLimit
 from diffabs.actuators.motor import VoltageLimit as VoltageLimit
+from diffabs.actuators.valve import IntegratingValve as IntegratingValve

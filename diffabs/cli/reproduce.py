@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 def reproduce(
     name: Annotated[
         str,
-        typer.Argument(help="A paper: slip-lmi, slip-estimator, arm-balance, or all. Or lab-rig: the rig, measured."),
+        typer.Argument(
+            help="A paper: slip-lmi, slip-estimator, arm-balance, or all. Or lab-rig: the rig, measured. Or literature:"
+            " other people's programs."
+        ),
     ] = "all",
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
         "out"

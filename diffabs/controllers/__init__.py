@@ -17,4 +17,6 @@ from diffabs.controllers.sampled_on_grid import SampledOnGrid as SampledOnGrid
 from diffabs.controllers.switching import ConstantTorque as ConstantTorque
 from diffabs.controllers.switching import Relay as Relay
 from diffabs.controllers.switching import SlidingMode as SlidingMode
+from diffabs.controllers.torque_logic import BandLogic as BandLogic
+from diffabs.controllers.torque_logic import FourPhase as FourPhase
 from diffabs.core.blocks import NoFeedforward as NoFeedforward

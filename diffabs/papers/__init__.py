@@ -32,7 +32,7 @@ def _reproduction(module: str) -> Reproduction:
 
 
 PAPERS = ("slip-lmi", "slip-estimator", "arm-balance")
-MODULES = {name: name.replace("-", "_") for name in (*PAPERS, "lab-rig")}
+MODULES = {name: name.replace("-", "_") for name in (*PAPERS, "lab-rig", "literature")}
 REPRODUCTIONS: dict[str, Reproduction] = {name: _reproduction(module) for name, module in MODULES.items()}
 
 

@@ -22,6 +22,9 @@ from diffabs.scenario.scenario import load
 
 COLUMNS = {"name": "what", "quantity": "quantity", "unit": "unit", "ours": "ours", "published": "published",
            "reference": "independent", "difference": "difference"}  # fmt: skip
+JUDGED_COLUMNS = {"source": "source", "quantity": "quantity", "unit": "unit", "printed": "printed", "ours": "ours",
+                  "tolerance": "tolerance", "bound": "bound", "scheme": "source's scheme", "verdict": "verdict",
+                  "cause": "cause", "command": "command"}  # fmt: skip
 
 
 def paper_section(document: Document) -> Section:
@@ -70,8 +73,9 @@ def existing_figures(names: Any, folder: pathlib.Path) -> list[Figure]:
 
 def _tables(content: Table) -> list[ReportTable]:
     titles = {"rows": "Every number", "judged": "What the paper prints of its machine"}
+    columns = JUDGED_COLUMNS if any("verdict" in row for row in content["rows"]) else COLUMNS
     return [
-        ReportTable(title, tuple(COLUMNS.values()), [[row.get(key) for key in COLUMNS] for row in content[part]])
+        ReportTable(title, tuple(columns.values()), [[row.get(key) for key in columns] for row in content[part]])
         for part, title in titles.items()
         if isinstance(content.get(part), list) and content[part]
     ]

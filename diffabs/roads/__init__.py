@@ -14,6 +14,7 @@ from diffabs.roads.optimum import Peak as Peak
 from diffabs.roads.optimum import peak as peak
 from diffabs.roads.patches import Patches as Patches
 from diffabs.roads.patches import Scaled as Scaled
+from diffabs.roads.piecewise_linear import PiecewiseLinear as PiecewiseLinear
 from diffabs.roads.rational import RIG as RIG
 from diffabs.roads.rational import RIG_UNROUNDED as RIG_UNROUNDED
 from diffabs.roads.rational import RationalCurve as RationalCurve

@@ -9,11 +9,14 @@ import pytest
 from mutants import killed_by
 from parts import PLANTS
 
-from diffabs import check
+from diffabs import FixedStep, braking, check, rollout
+from diffabs.controllers import ConstantTorque
 from diffabs.core.protocols import BrakeOutput
-from diffabs.plants import GRAVITY, BrakeStart, LabRig, MirroredRig, QuarterCar
+from diffabs.objectives import BRAKING
+from diffabs.plants import GRAVITY, BrakeStart, LabRig, MirroredRig, QuarterCar, RoadVehicle
 from diffabs.plants.lab_rig import LabRigState
 from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt, Patches, RationalCurve, Tabulated
+from diffabs.stops import SpeedReached
 
 NO_FRICTION = Burckhardt(c1=0.0, c3=0.0)
 MU = 0.39575220833898  # of the rig's curve at slip 0.2
@@ -255,6 +258,9 @@ def test_energy_only_goes_into_friction(name):
         arm = plant.lever * (np.sin(plant.lever_angle) - mu * np.cos(plant.lever_angle))
         load = (plant.weight_torque + torque) / arm
         bearing = torque * x.wheel + (plant.drum_stiction + plant.drum_friction * x.drum) * x.drum
+    elif isinstance(plant, RoadVehicle):
+        load = plant.wheel_load
+        bearing = plant.bearing * x.spin**2 + plant.drag * speed**3 + plant.rolling * plant.mass * GRAVITY * speed
     else:
         load = plant.mass * GRAVITY
     expected = -load * mu * (speed - rim) - bearing
@@ -298,7 +304,7 @@ def test_a_stopped_wheel_stays_stopped_until_released(name):
     plant = PLANTS[name]
     state = plant.start(BrakeStart(speed=10.0, slip=1.0))
     mu = float(plant.road.friction(1.0, 10.0, 0.0))
-    spin = "spin" if isinstance(plant, QuarterCar) else "wheel"
+    spin = "spin" if isinstance(plant, QuarterCar | RoadVehicle) else "wheel"
 
     def wheel_rate(brake):
         if isinstance(plant, LabRig):  # its control is a command, its torque a state
@@ -309,10 +315,11 @@ def test_a_stopped_wheel_stays_stopped_until_released(name):
         arm = plant.lever * (np.sin(plant.lever_angle) - mu * np.cos(plant.lever_angle))
         asked = plant.wheel_radius * mu * plant.weight_torque / (arm - plant.wheel_radius * mu) - plant.wheel_stiction
     else:
-        asked = mu * plant.mass * GRAVITY * (plant.radius if isinstance(plant, QuarterCar) else plant.wheel_radius)
+        load = plant.wheel_load if isinstance(plant, RoadVehicle) else plant.mass * GRAVITY
+        asked = mu * load * (plant.wheel_radius if isinstance(plant, MirroredRig) else plant.radius)
     for brake in (1.001 * asked, 5 * asked):
         np.testing.assert_allclose(wheel_rate(brake), 0.0, rtol=0, atol=1e-11)
-    inertia = plant.inertia if isinstance(plant, QuarterCar) else plant.wheel_inertia
+    inertia = plant.inertia if isinstance(plant, QuarterCar | RoadVehicle) else plant.wheel_inertia
     released = wheel_rate(0.0)
     # the brake of the lab rig also loads the contact, so its released wheel is slower than this
     low, high = (0.5, 1.0) if isinstance(plant, LabRig) else (1 - 1e-12, 1 + 1e-12)
@@ -336,3 +343,23 @@ def test_load_does_not_change_a_cars_deceleration():
     heavy = dataclasses.replace(QuarterCar(), mass=1500.0)
     decelerations = [c.output(c.start(BrakeStart(slip=0.2))).deceleration for c in (QuarterCar(), heavy)]
     np.testing.assert_allclose(decelerations[0], decelerations[1], rtol=1e-15, atol=0)
+
+
+@killed_by("plants/road_vehicle.py", "self.drag * v * v + self.rolling", "self.drag * v + self.rolling")
+@killed_by("plants/road_vehicle.py", "return self.wheel_load * self.road", "return self.mass * GRAVITY * self.road")
+def test_a_locked_road_vehicle_stops_in_closed_form():
+    """v' = -(a + c v^2/m) with a = (Fz mu + f m g)/m: time and distance from 30 to 3 m/s."""
+    ice = Tabulated(slip=(0.0, 0.1, 0.5, 1.0), mu=(0.0, 0.3, 0.3, 0.3))
+    car = RoadVehicle(road=ice, wheel_load=6000.0, drag=2.0, rolling=0.02)
+    with jax.enable_x64(True):
+        loop = braking(
+            plant=car,
+            initial=BrakeStart(speed=30.0, slip=1.0),
+            controller=ConstantTorque(torque=5000.0),
+            stop=SpeedReached(speed=3.0),
+        )
+        run = rollout(loop, FixedStep(1e-2, 20.0), BRAKING)
+    a, c = (6000.0 * 0.3 + 0.02 * 440.0 * GRAVITY) / 440.0, 2.0 / 440.0
+    k = np.sqrt(c / a)
+    time, way = (np.arctan(30 * k) - np.arctan(3 * k)) / np.sqrt(a * c), np.log((a + 900 * c) / (a + 9 * c)) / (2 * c)
+    np.testing.assert_allclose([run.metrics["stop_time"], run.metrics["stop_distance"]], [time, way], rtol=1e-7)

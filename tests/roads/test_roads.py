@@ -22,6 +22,7 @@ from diffabs.roads import (
     Burckhardt,
     MagicFormula,
     Patches,
+    PiecewiseLinear,
     RationalCurve,
     Scaled,
     ScaledAlong,
@@ -169,6 +170,16 @@ def test_tabulated_is_pchip(slip, mu):
     np.testing.assert_allclose(curve(road, s), oracle(s), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(curve(road, -s), -oracle(s), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(curve(road, slip), mu, rtol=1e-15, atol=1e-15)
+
+
+@killed_by("roads/piecewise_linear.py", "jnp.diff(y) / jnp.diff(x)", "jnp.diff(y)")
+def test_piecewise_linear_is_numpys_interpolation():
+    """Odd, exact at the knots, and constant beyond the last one."""
+    slip, mu = np.array([0.0, 0.07, 0.12, 0.15, 1.0]), np.array([0.0, 0.7, 0.85, 0.88, 0.6675])
+    road = check_part(PiecewiseLinear(slip=slip, mu=mu))
+    s = np.linspace(0.0, 1.2, 481)
+    np.testing.assert_allclose(curve(road, s), np.interp(s, slip, mu), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(curve(road, -s), -np.interp(s, slip, mu), rtol=1e-12, atol=1e-14)
 
 
 @killed_by("roads/along.py", "4 + 3 * t * t * (t - 2)", "4 + 3 * t * t * (t - 1)")

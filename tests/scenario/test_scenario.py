@@ -151,6 +151,7 @@ def test_members_are_told_by_shape():
     assert set(registry.family_types("plant")) == {
         "quarter-car",
         "mirrored-rig",
+        "road-vehicle",
         "lab-rig",
         "arm-balance",
         "acrobot",

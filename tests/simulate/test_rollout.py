@@ -281,11 +281,14 @@ PASSIVE = {
     "car": (plants.QuarterCar(), 60.0),
     "rig": (plants.MirroredRig(), 5.0),
     "lab": (plants.LabRig(), 0.8),
+    "road vehicle": (plants.RoadVehicle(), 2500.0),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plant", ["car", *(pytest.param(name, marks=pytest.mark.slow) for name in ("rig", "lab"))])
+@pytest.mark.parametrize(
+    "plant", ["car", *(pytest.param(name, marks=pytest.mark.slow) for name in ("rig", "lab", "road vehicle"))]
+)
 def test_energy_never_increases_down_to_standstill(plant):
     """Brakes and friction only take energy, on every road, while the wheel rolls, locks, sticks and stands."""
     part, torque = PASSIVE[plant]

@@ -50,6 +50,9 @@ ROADS: dict[str, Any] = {
     "scaled along": roads.ScaledAlong(road=roads.RIG, factors=np.array([1.0, 0.8, 1.1, 0.9, 1.2]), spacing=3.0),
     "scaled along, once": roads.ScaledAlong(road=roads.WET_ASPHALT, factors=np.array([0.9])),
     "tabulated": roads.Tabulated(slip=np.array([0.0, 0.1, 0.3, 0.6, 1.0]), mu=np.array([0.0, 0.8, 0.6, 0.65, 0.5])),
+    "piecewise linear": roads.PiecewiseLinear(
+        slip=np.array([0.0, 0.1, 0.3, 0.6, 1.0]), mu=np.array([0.0, 0.8, 0.6, 0.65, 0.5])
+    ),
 }
 
 PLANTS: dict[str, Any] = {
@@ -62,6 +65,7 @@ PLANTS: dict[str, Any] = {
     "mirrored rig, a body": plants.MirroredRig(mass=6.2, inertia_factor=1.0),
     "lab rig": plants.LabRig(),
     "lab rig, unrounded": plants.LabRig(road=roads.RIG_UNROUNDED),
+    "road vehicle": plants.RoadVehicle(wheel_load=5000.0),
 }
 
 BALANCES: dict[str, Any] = {
@@ -114,6 +118,10 @@ CONTROLLERS: dict[str, Any] = {
     "played command": controllers.PlayedCommand(commands=np.array([0.0, 30.0, 12.0]), period=2e-3),
     "sampled relay": controllers.Sampled(controller=controllers.Relay(), delay=3e-4),
     "sampled on the grid": controllers.SampledOnGrid(controller=_PID, sampling_period=2e-3, delay=1.3e-3),
+    "four phase": controllers.FourPhase(torque_low=10.0, torque_high=20.0, slip_low=0.11, slip_high=0.15, rate=6000.0),
+    "band logic": controllers.BandLogic(
+        slip_low=0.12, slip_high=0.17, growth=20.0, decay=30.0, torque=30.0, torque_max=35.0
+    ),
 }
 
 REFERENCES: dict[str, Any] = {
@@ -136,6 +144,7 @@ ACTUATORS: dict[str, Any] = {
     "lag": actuators.Lag(),
     "asymmetric lag": actuators.AsymmetricLag(rise=0.012, fall=0.004),
     "dead time": actuators.DeadTime(rise=2.3e-3, fall=1.6e-3),
+    "integrating valve": actuators.IntegratingValve(gain=200.0, low=-5.0, high=20.0),
     "rate limit": actuators.RateLimit(),
     "delay": actuators.Delay(time=2.3e-3, capacity=8),
     "series": blocks.Series(

@@ -1,0 +1,101 @@
+"""Quarter car with its own wheel load, air drag, rolling resistance and bearing friction.
+
+    m v' = -Fz mu(slip) - c v^2 - f m g,   J omega' = r Fz mu(slip) - B omega - u,   x' = v
+
+The slip is (v - r omega)/v. `QuarterCar` is the case Fz = m g, c = f = B = 0. A published model may give the wheel a
+load that is not the weight of its share of the car.
+
+Source: J. Pedro, O. Nyandoro and S. John, Neural network based feedback linearisation slip control of an anti-lock
+braking system, Proc. 7th Asian Control Conference (2009), pp. 1251-1257 (c and B); U. Kiencke and L. Nielsen,
+Automotive Control Systems, 2nd ed., sec. 9.1 (f).
+"""
+
+import jax.numpy as jnp
+
+from diffabs.core.numerics import quotient
+from diffabs.core.protocols import BrakeOutput, Road
+from diffabs.core.pytree import param, part, pytree
+from diffabs.core.types import Scalar
+from diffabs.plants.audit import BrakeAudit
+from diffabs.plants.quarter_car import QuarterCar, QuarterCarState
+from diffabs.plants.wheel import (
+    FROZEN_OUTPUTS,
+    GRAVITY,
+    BrakeStart,
+    halt_at_zero,
+    probes,
+    slip_ratio,
+    usual_objectives,
+    usual_parts,
+)
+from diffabs.roads import DRY_ASPHALT
+
+
+@pytree
+class RoadVehicle:
+    """m v' = -Fz mu - c v^2 - f m g, J omega' = r Fz mu - B omega - u.
+
+    Attributes:
+        mass: Mass m of the wheel's share of the car [kg].
+        radius: Radius r of the wheel [m].
+        inertia: Inertia J of the wheel [kg m^2].
+        wheel_load: Load Fz of the wheel on the road [N].
+        drag: Air drag c at 1 m/s [kg/m], half of density, drag coefficient and area.
+        rolling: Coefficient f of rolling resistance [1].
+        bearing: Viscous friction B of the wheel's bearing [N m s].
+        crawl_speed: Least denominator of the slip [m/s].
+        road: Friction curve.
+    """
+
+    mass: Scalar = param(default=440.0, unit="kg", above=0.0)
+    radius: Scalar = param(default=0.3, unit="m", above=0.0)
+    inertia: Scalar = param(default=1.6, unit="kg m^2", above=0.0)
+    wheel_load: Scalar = param(default=4316.4, unit="N", above=0.0)
+    drag: Scalar = param(default=0.856, unit="kg/m", low=0.0)
+    rolling: Scalar = param(default=0.01, unit="1", low=0.0)
+    bearing: Scalar = param(default=0.08, unit="N m s", low=0.0)
+    crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
+    road: Road = part(default=DRY_ASPHALT)
+
+    shows = BrakeOutput
+    control_unit = "N m"
+    frozen = FROZEN_OUTPUTS
+
+    usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
+    start, project, energy = QuarterCar.start, QuarterCar.project, QuarterCar.energy
+
+    def derivative(self, t: Scalar, state: QuarterCarState, control: Scalar) -> QuarterCarState:
+        """Return dx/dt under the brake torque `control` [N m]."""
+        del t
+        y = self.output(state)
+        grip = self._grip(y.slip, y.speed, y.distance)
+        spin = quotient(self.radius * grip - self.bearing * state.spin - control, self.inertia)
+        return QuarterCarState(halt_at_zero(state.speed, -y.deceleration), halt_at_zero(state.spin, spin), y.speed)
+
+    def output(self, state: QuarterCarState) -> BrakeOutput:
+        """Return slip [1], speeds of car and wheel rim [m/s], deceleration [m/s^2], and distance [m].
+
+        The rolling resistance counts only while the car moves.
+        """
+        v, w = state.speed, self.radius * state.spin
+        slip = slip_ratio(v, w, self.crawl_speed)
+        resistance = self.drag * v * v + self.rolling * self.mass * GRAVITY * jnp.where(jnp.greater(v, 0), 1.0, 0.0)
+        deceleration = quotient(self._grip(slip, v, state.distance) + resistance, self.mass)
+        return BrakeOutput(slip, v, w, deceleration, state.distance)
+
+    def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
+        """Return tau* = r Fz mu - B omega + (1 - slip) J a/r [N m] at the deceleration a, for a constant slip."""
+        v = output.speed
+        grip = self._grip(target, v, output.distance)
+        a = quotient(grip + self.drag * v * v, self.mass) + self.rolling * GRAVITY
+        return self.radius * grip + (1 - target) * (self.inertia * a - self.bearing * v) / self.radius
+
+    def audit(self, initial: BrakeStart) -> BrakeAudit:
+        """Return the audit of runs from `initial`; only a negative torque, which drives the wheel, explains a gain of
+        energy.
+        """
+        wheel, scale = self.inertia / self.radius**2, self.energy(self.start(initial))
+        return BrakeAudit(car=self.mass, wheel=wheel, radius=self.radius, scale=scale)
+
+    def _grip(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
+        return self.wheel_load * self.road.friction(slip, speed, distance)

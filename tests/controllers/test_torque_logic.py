@@ -1,0 +1,54 @@
+"""The four-phase and the band logic against closed forms, and the limit cycle of a hybrid brake."""
+
+import jax
+import numpy as np
+from delays import loop
+from mutants import killed_by
+from signals import Mean, Script, seen
+
+import diffabs as d
+from diffabs.actuators import Lag
+from diffabs.controllers import BandLogic, FourPhase, Sampled
+from diffabs.core.blocks import Direct
+
+RISING = Script(read=lambda t: seen(0.4 * t))  # slip 0.4 t
+LENGTH = 0.5
+
+
+def mean(controller, plant=RISING, length=LENGTH):
+    with jax.enable_x64(True):
+        run = d.rollout(loop(controller, Direct(), plant), d.FixedStep(1e-3, length), {"mean": Mean()})
+    assert not run.diverged
+    return float(run.metrics["mean"][1])
+
+
+@killed_by("controllers/torque_logic.py", "phase == 2, 1.0, 0.0", "phase == 2, 2.0, 0.0")
+@killed_by("controllers/torque_logic.py", "self.slip_high - slip, slip - self.slip_low", "1.0, slip - self.slip_low")
+def test_four_phases():
+    """Raise for 0.1 s, hold until slip 0.1 at 0.25 s, lower for 0.05 s, and hold for good: the slip stays high."""
+    logic = FourPhase(torque_low=5.0, torque_high=10.0, slip_low=0.02, slip_high=0.1, rate=100.0)
+    area = 0.5 * 10 * 0.1 + 10 * 0.15 + 7.5 * 0.05 + 5 * 0.2
+    np.testing.assert_allclose(mean(logic), area / LENGTH, rtol=1e-9)
+
+
+@killed_by("controllers/torque_logic.py", "slip > self.slip_high, -self.decay", "slip > self.slip_high, self.decay")
+def test_a_band_logic_is_three_exponentials():
+    logic = BandLogic(slip_low=0.08, slip_high=0.12, growth=3.0, decay=5.0, torque=10.0)
+    top = 10 * np.exp(3.0 * 0.2)  # slip 0.08 at 0.2 s, 0.12 at 0.3 s
+    area = (top - 10) / 3.0 + top * 0.1 + top * (1 - np.exp(-5.0 * 0.2)) / 5.0
+    np.testing.assert_allclose(mean(logic), area / LENGTH, rtol=1e-8)
+
+
+def test_a_sampled_band_logic_multiplies():
+    """10 (1 + 3/50)^k while the slip is below the band, sampled every 20 ms."""
+    logic = Sampled(controller=BandLogic(slip_low=0.9, slip_high=0.95, growth=3.0, torque=10.0), period=0.02)
+    expected = np.mean(10 * 1.06 ** np.arange(25))
+    np.testing.assert_allclose(mean(logic), expected, rtol=1e-9)
+
+
+def test_a_lag_follows_the_torque():
+    """The mean of a lag's output is that of its input, less the last value times the lag's time constant."""
+    logic = FourPhase(torque_low=5.0, torque_high=10.0, slip_low=0.02, slip_high=0.9, rate=100.0)
+    with jax.enable_x64(True):
+        run = d.rollout(loop(logic, Lag(time_constant=5e-3), RISING), d.FixedStep(1e-3, LENGTH), {"mean": Mean()})
+    np.testing.assert_allclose(run.metrics["mean"][1], (0.5 + 10 * 0.4 - 10 * 5e-3) / LENGTH, rtol=1e-6)

@@ -1,0 +1,142 @@
+"""The leader table of the literature: its data, bounds in closed form, verdicts, and the committed benchmark."""
+
+import csv
+import importlib.util
+import json
+import math
+
+import jax
+import numpy as np
+import pytest
+from mutants import killed_by
+from project import ROOT
+from scipy.integrate import solve_ivp
+
+from diffabs.papers import literature
+from diffabs.papers.literature import bound_of_loop, bound_of_stop, judge_row, read_rows, read_sources
+from diffabs.scenario.scenario import load, names
+
+FOLDER = ROOT / "benchmarks" / "literature"
+VERDICTS = {"reproduced", "refuted", "undecidable"}
+
+
+def test_every_row_names_what_it_needs():
+    for row in read_rows():
+        assert row["source"] in read_sources()
+        assert {"quantity", "unit", "place", "title"} <= row.keys()
+        if row.get("measure"):
+            assert row["measure"] in {*literature.MEASURES, "saving"}
+            assert "tolerance" in row or "relative" in row
+        if "scenario" in row:
+            load(row["scenario"], row.get("set", []), integrated=False)
+        if "printed" not in row or not row.get("measure"):
+            assert row["cause"]
+
+
+def test_every_scenario_of_the_literature_has_a_row():
+    assert {name for name in names() if name.startswith("literature-")} == {
+        row["scenario"] for row in read_rows() if "scenario" in row
+    }
+
+
+@killed_by("papers/literature.py", "math.sqrt(a * c) if c", "math.sqrt(c / a) if c")
+@pytest.mark.parametrize("c", [0.0, 2e-3])
+def test_bounds_are_those_of_the_ordinary_differential_equation(c):
+    a, first, last = 8.8, 30.0, 0.3
+
+    def slow(t, y):
+        return [-(a + c * y[0] ** 2), y[0]]
+
+    slow_enough = [lambda t, y: y[0] - last]
+    slow_enough[0].terminal = True
+    found = solve_ivp(slow, (0, 10), [first, 0.0], events=slow_enough, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(bound_of_stop("time", a, c, first, last), found.t[-1], rtol=1e-8)
+    np.testing.assert_allclose(bound_of_stop("distance", a, c, first, last), found.y[1, -1], rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "kind", "bound"),
+    [
+        ("literature-mathworks", "time", 10.9385),
+        ("literature-park", "time", 17.94),
+        ("literature-pagawali", "time", 3.2051),
+        ("literature-pagawali", "distance", 51.821),
+        ("literature-pedro", "time", 3.1627),
+        ("literature-pedro", "distance", 46.492),
+    ],
+)
+def test_bounds_of_an_independent_program(scenario, kind, bound):
+    with jax.enable_x64(True):
+        row = {"bound": kind}
+        np.testing.assert_allclose(bound_of_loop(load(scenario, integrated=False).loop, row), bound, rtol=2e-4)
+
+
+def test_arithmetic_of_a_source():
+    rows = {row["quantity"]: judge_row(row) for row in read_rows() if row.get("measure") == "saving"}
+    assert rows["distance saved, panic stop from 90 km/h"]["verdict"] == "refuted"
+    assert rows["distance saved, split road, fuzzy logic"]["verdict"] == "reproduced"
+
+
+def test_a_row_without_a_printed_number_is_undecidable():
+    with jax.enable_x64(True):
+        row = next(judge_row(row) for row in read_rows() if row["source"] == "dyad")
+    assert (row["verdict"], row["ours"], row["command"]) == ("undecidable", None, None)
+    np.testing.assert_allclose(row["bound"], 28.542, rtol=1e-4)
+
+
+def test_the_limit_cycle_and_the_three_broken_conditions():
+    with jax.enable_x64(True):
+        rows = [judge_row(row) for row in read_rows() if row["source"] == "four-phase"]
+    assert [row["ours"] for row in rows] == [1.0, 0.0, 0.0, 0.0]
+    assert {row["verdict"] for row in rows} == {"reproduced"}
+
+
+def committed():
+    return json.loads((FOLDER / "table.json").read_text(encoding="utf-8"))
+
+
+def test_the_committed_table_has_the_rows_of_the_data():
+    table = committed()
+    assert [(row["source"], row["quantity"], row.get("printed")) for row in table["rows"]] == [
+        (row["source"], row["quantity"], row.get("printed")) for row in read_rows()
+    ]
+    assert {row["verdict"] for row in table["rows"]} == VERDICTS
+    assert all(row["ours"] is None or math.isfinite(row["ours"]) for row in table["rows"])
+    with (FOLDER / "table.csv").open(encoding="utf-8", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [line["quantity"] for line in lines] == [row["quantity"] for row in table["rows"]]
+    assert [line["ours"] for line in lines] == [
+        "" if row["ours"] is None else str(row["ours"]) for row in table["rows"]
+    ]
+
+
+def test_the_parameters_of_the_committed_table_are_those_of_the_scenarios():
+    with jax.enable_x64(True):
+        for name, known in committed()["scenarios"].items():
+            assert literature.scenario_parameters(name) == known
+
+
+def test_the_reader_needs_nothing_of_ours():
+    path = FOLDER / "read_table.py"
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 30
+    assert "diffabs" not in text
+    spec = importlib.util.spec_from_file_location("read_table", path)
+    reader = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(reader)
+    row = committed()["rows"][0]
+    lines = reader.compare({f"{row['source']}: {row['quantity']}": row["ours"]})
+    assert len(lines) == len(read_rows())
+    assert lines[0][-2:] == (row["ours"], True)
+    assert lines[1][-2:] == (None, None)
+
+
+@pytest.mark.slow
+def test_the_committed_table_is_the_generated_one(tmp_path):
+    with jax.enable_x64(True):
+        summary = literature.reproduce(tmp_path, lambda sentence: None)
+    for name in ("table.json", "table.csv"):
+        assert (tmp_path / name).read_text(encoding="utf-8") == (FOLDER / name).read_text(encoding="utf-8")
+    digest = literature.compact(summary)
+    assert len(digest.lines) == len(summary["rows"])
+    assert (tmp_path / summary["figures"][0]).stat().st_size > 10_000
