@@ -289,7 +289,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
         rows += [judge_row(row) for row in group]
     progress("literature: figure and tables")
     files.write_file(folder / "table.json", write_json(rows).encode())
-    files.write_file(folder / "table.csv", write_csv(rows).encode())
+    files.write_file(folder / "table.csv", write_table_csv(rows).encode())
     solver = load(SHOWN, integrated=False).solver
     summary = {
         "paper": "literature",
@@ -329,7 +329,7 @@ def write_json(rows: list[JsonObject]) -> str:
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def write_csv(rows: list[JsonObject]) -> str:
+def write_table_csv(rows: list[JsonObject]) -> str:
     """Return the rows of the benchmark table as CSV.
 
     Args:

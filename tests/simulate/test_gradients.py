@@ -191,6 +191,28 @@ LOOPS = {
         sensor=sensors.EncoderSlip(period=1e-2),
         actuator=actuators.DeadTime(rise=0.0063, fall=0.0052),
     ),
+    "four phases": braking(
+        **CAR | {"plant": plants.RoadVehicle(mass=440.0, road=roads.PiecewiseLinear())},
+        controller=controllers.FourPhase(
+            torque_low=500.0, torque_high=1500.0, slip_low=0.08, slip_high=0.313, rate=2e4
+        ),
+    ),
+    "band": braking(
+        **CAR,
+        controller=controllers.Sampled(
+            controller=controllers.BandLogic(slip_low=0.1, slip_high=0.14, growth=9.0, decay=14.0, torque=40.0),
+            period=5e-3,
+            delay=1.3e-3,
+        ),
+    ),
+    "valve": braking(
+        **CAR,
+        controller=controllers.Relay(band=0.02, torque_min=-1.0, torque_max=1.3),
+        reference=references.Setpoint(value=0.15),
+        actuator=blocks.Series(
+            blocks=(actuators.Lag(time_constant=0.004), actuators.IntegratingValve(gain=2100.0, low=3.0, high=130.0))
+        ),
+    ),
     "delay": braking(
         **CAR,
         controller=controllers.PID(kp=300.0, kd=1.0, high=250.0, low=0.0),
@@ -219,7 +241,19 @@ ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {
 # The largest programs to compile, and a wheel that locks, of which test_kinks.py has closed forms.
 SLOW = (
     *("estimated speed", "filtered reference", "arm, observed", "proportional", "computer", "noisy", "relay", "delay"),
-    *("lock", "arm", "speed that drifts", "feedback", "latch", "extremum seeking", "by deceleration", "encoders"),
+    *(
+        "lock",
+        "arm",
+        "speed that drifts",
+        "feedback",
+        "latch",
+        "extremum seeking",
+        "by deceleration",
+        "encoders",
+        "four phases",
+        "band",
+        "valve",
+    ),
 )
 
 

@@ -418,6 +418,54 @@ def encoders(r: Draw) -> d.Loop:
     )
 
 
+def four_phases(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(
+            roads.DRY_ASPHALT,
+            rolling=True,
+            plant=plants.RoadVehicle(mass=r.near(440.0), drag=r.near(0.8), road=roads.PiecewiseLinear()),
+        ),
+        controller=controllers.FourPhase(
+            torque_low=r.near(500.0),
+            torque_high=r.near(1500.0, 0.1),
+            slip_low=r.near(0.08),
+            slip_high=r.near(0.3, 0.1),
+            rate=r.near(2e4),
+        ),
+    )
+
+
+def band(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.DRY_ASPHALT, rolling=True),
+        controller=controllers.Sampled(
+            controller=controllers.BandLogic(
+                slip_low=r.near(0.1, 0.1),
+                slip_high=r.near(0.14, 0.1),
+                growth=r.near(9.0),
+                decay=r.near(14.0),
+                torque=r.near(40.0),
+            ),
+            period=5e-3,
+            delay=r.within(0.6e-3, 4e-3),
+        ),
+    )
+
+
+def valve(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.MagicFormula(), rolling=True),
+        controller=controllers.Relay(band=r.near(0.02), torque_min=-r.near(1.0), torque_max=r.near(1.0)),
+        reference=references.FixedSlip(slip=r.near(0.12)),
+        actuator=Series(
+            blocks=(
+                actuators.Lag(time_constant=r.near(0.004)),
+                actuators.IntegratingValve(gain=r.near(2000.0), low=r.within(1.0, 4.0), high=r.near(110.0, 0.1)),
+            )
+        ),
+    )
+
+
 def arm(r: Draw) -> d.Loop:
     return braking(
         plant=plants.ArmBalance(gear=1.1, rotor_inertia=0.3, current_max=r.near(40.0)),
@@ -485,6 +533,9 @@ STRUCTURES = {
     "rig, estimated speed": Structure(rig_estimated),
     "given commands, dead times": Structure(given_commands),
     "encoders, dead times": Structure(encoders),
+    "four phases, road vehicle": Structure(four_phases),
+    "band": Structure(band),
+    "valve": Structure(valve),
     "extremum seeking": Structure(seeking),
     "slip by deceleration": Structure(by_deceleration),
     "lab rig, relay": Structure(lab_rig),
