@@ -52,18 +52,16 @@ def test_more_switches_than_its_capacity_are_a_run_that_diverged():
     assert not run_of(DeadTime(rise=0.095, fall=0.095, capacity=10), commands).diverged
 
 
-@pytest.mark.parametrize("name", ["rise", "fall"])
+@pytest.mark.parametrize("name", ["rise", pytest.param("fall", marks=pytest.mark.slow)])
 def test_derivatives_are_those_of_the_closed_form(name):
     with jax.enable_x64(True):
-        for value in (0.0131, 0.0142):
-            part = DeadTime(rise=value, fall=0.0137) if name == "rise" else DeadTime(rise=0.0137, fall=value)
 
-            def mean(x, part=part):
-                return run_of(d.replace(part, {name: x})).metrics["mean"][1]
+        def mean(x):
+            return run_of(d.replace(DeadTime(rise=0.0131, fall=0.0137), {name: x})).metrics["mean"][1]
 
-            expected = -3.0 / LENGTH if name == "rise" else 3.0 / LENGTH
-            np.testing.assert_allclose(jax.jacfwd(mean)(jnp.asarray(value)), expected, rtol=1e-9)
-            np.testing.assert_allclose(jax.grad(mean)(jnp.asarray(value)), expected, rtol=1e-9)
+        expected = -3.0 / LENGTH if name == "rise" else 3.0 / LENGTH
+        np.testing.assert_allclose(jax.jacfwd(mean)(jnp.asarray(0.0142)), expected, rtol=1e-9)
+        np.testing.assert_allclose(jax.grad(mean)(jnp.asarray(0.0142)), expected, rtol=1e-9)
 
 
 def test_adaptive_steps_and_a_lag_behind_it():

@@ -180,6 +180,7 @@ def test_a_road_peak_has_closed_form_second_derivatives():
         assert found == pytest.approx(factor * 2 / 5.0**3, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_rest_has_the_second_derivatives_of_its_closed_form():
     """x^3 = p has x'' = -2/9 p^(-5/3)."""
     found = jax.jacfwd(jax.jacfwd(lambda p: find_root(lambda x: x**3 - p, jnp.array([1.5]))[0]))(3.0)

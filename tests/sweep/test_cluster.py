@@ -284,6 +284,7 @@ def listening():
     return {(c.laddr.ip, c.laddr.port) for c in inside if c.status == psutil.CONN_LISTEN}
 
 
+@pytest.mark.slow
 @killed_by("sweep/cluster.py", 'worker_dashboard_address=f"{LOOPBACK_ADDRESS}:0"', 'worker_dashboard_address=":0"')
 def test_nobody_else_reaches_scheduler_workers_and_their_pages():
     before = listening()
