@@ -68,7 +68,7 @@ def quiet(rig, speed, case):
     "error = self.last + 0.0 * t",
     case="all wrong-known",
 )
-@pytest.mark.parametrize("speed", ["known", "estimated"])
+@pytest.mark.parametrize("speed", ["known", pytest.param("estimated", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("case", CASES)
 def test_a_document_runs_elsewhere(rig, speed, case):
     """To rounding, until the wheel's speed is rounded the other way: that is, until the end."""

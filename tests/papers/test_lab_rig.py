@@ -69,6 +69,7 @@ def recorded_by(name):
     return record, *(rig.RecordedRun(loop=one, counter_lag=0.01309) for one in (loop, given))
 
 
+@pytest.mark.slow
 def test_the_packaged_scenario_follows_experiment_1():
     with jax.enable_x64(True):
         record, own, given = recorded_by("lab-rig-measured")

@@ -253,6 +253,7 @@ SLOW = (
         "four phases",
         "band",
         "valve",
+        "given commands",
     ),
 )
 

@@ -169,7 +169,8 @@ def written_out(tableau, f, t, x, rate, h, given):
     "rounds = (jnp.arange(1, count - 1), jnp.asarray(tableau.nodes[:-1], dtype), jnp.asarray(rows[:-1], dtype))",
 )
 @pytest.mark.parametrize(
-    "tableau", [pytest.param(RK4, marks=pytest.mark.slow, id="rk4"), pytest.param(TSIT5, id="tsit5")]
+    "tableau",
+    [pytest.param(RK4, marks=pytest.mark.slow, id="rk4"), pytest.param(TSIT5, marks=pytest.mark.slow, id="tsit5")],
 )
 def test_a_loop_over_stages_has_the_unrolled_derivatives(tableau):
     end, at = moved(lambda *step: runge_kutta_step(tableau, *step)[0])
