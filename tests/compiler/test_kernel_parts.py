@@ -29,8 +29,8 @@ SOLVERS = {"fixed": d.FixedStep(1e-3, 0.12), "adaptive": d.Adaptive(rtol=1e-6, d
 CLOSE = {"fixed": {"rtol": 1e-13, "atol": 1e-14}, "adaptive": {"rtol": 1e-7, "atol": 1e-9}}
 
 # In XLA a last digit of the initial speed changes the final slip error by 8e-12 of slip-real, and of extremum seeking,
-# which waits for a peak to have passed, by 8e-8 and the IAE by 9e-9. Relays that chatter at a valve pass a last digit on
-# to the slip at the end of a run.
+# which waits for a peak to have passed, by 8e-8 and the IAE by 9e-9. Relays that chatter at a valve pass a last digit
+# on to the slip at the end of a run.
 LAST_DIGIT = {
     **{
         (f"literature-{source}", "fixed"): {"rtol": 1e-10, "atol": 2e-11}
