@@ -191,7 +191,9 @@ LOOPS = {
     "pass",
     case="sampled, half a period late",
 )
-@pytest.mark.parametrize("name", cases(LOOPS, "sampled", "lag", "state feedback", "PID", "sampled, half a period late"))
+@pytest.mark.parametrize(
+    "name", cases(LOOPS, "sampled PID, lag", "sampled", "lag", "state feedback", "PID", "sampled, half a period late")
+)
 def test_closed_is_the_loop_of_the_certificates(name):
     """Its poles are those of A + B K, which the linear slip model has from elsewhere."""
     loop = rig(**LOOPS[name])

@@ -148,6 +148,7 @@ def test_the_other_runs_of_a_batch_change_no_number():
     np.testing.assert_array_equal(np.isnan(others.metrics["iae"]), np.arange(36) < 2)
 
 
+@pytest.mark.slow
 @killed_by("simulate/step/adaptive.py", "return jnp.where(due, new, control.limit)", "return new")
 def test_the_stability_limit_of_a_run_does_not_depend_on_its_neighbours():
     """Runs that wait for an instant of a trajectory have made different numbers of attempts."""

@@ -107,6 +107,7 @@ class TestLanes:
         same(jax.device_get(run), expected)
 
     @killed_by("simulate/drive/sharding.py", "reshape(cores, each).T.ravel()[:count]", "ravel()[:count]")
+    @pytest.mark.slow
     @killed_by(
         "simulate/drive/packed.py",
         "known = numbers[jnp.minimum(slots",

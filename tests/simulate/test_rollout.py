@@ -134,6 +134,7 @@ def test_streamed_and_stored_runs_agree():
         np.testing.assert_allclose(streamed.metrics[name], stored.metrics[name], rtol=1e-13, atol=1e-15, err_msg=name)
 
 
+@pytest.mark.slow
 def test_vmap_over_masses_and_roads_equals_single_runs():
     solver = d.FixedStep(1e-3, 2.0)
 
