@@ -201,6 +201,32 @@ def _ends(seen: RecordMatch) -> JsonObject:
     return {"cycles": seen.cycles, "stop_time": seen.stop_time, "stop_distance": seen.stop_distance}
 
 
+def compare_tables(rig: LabRig) -> list[JsonObject]:
+    """Return the rms distance of two rigs from the manual's readings of brake torque and friction, Fig. 5.6 b and c.
+
+    The brake torque is b(u), 0 below the threshold.
+
+    Args:
+        rig: Identified rig, its brake scaled (`with_scaled_brake`).
+
+    Returns:
+        For each table its name, its unit, and the rms distance of the `mask` and of the `identified` rig.
+    """
+
+    def torque(one: LabRig, u: np.ndarray) -> np.ndarray:
+        return np.where(u >= one.brake_threshold, np.maximum(one.brake_gain * u + one.brake_offset, 0.0), 0.0)
+
+    def friction(one: LabRig, slip: np.ndarray) -> np.ndarray:
+        return np.asarray(one.road.friction(jnp.asarray(slip), 0.0, 0.0))
+
+    rows = []
+    for name, unit, ours in (("brake-torque", "N m", torque), ("friction", "1", friction)):
+        x, measured = read_curves()[name].T
+        mask, identified = (float(np.sqrt(np.mean((ours(one, x) - measured) ** 2))) for one in (MASK, rig))
+        rows.append({"table": name, "unit": unit, "mask": mask, "identified": identified})
+    return rows
+
+
 def parameter_rows(found: Identified, coasting: Params) -> list[JsonObject]:
     """Return each identified parameter with the value of the model's mask, unit and standard deviation.
 
@@ -254,6 +280,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
     open_directions = [
         {"spread": one.spread, "direction": one.describe()} for one in found.uncertainty.undetermined_directions(0.1)
     ]
+    identified: Any = with_values(build_run(first, True, rig), found.values).loop.plant
     summary = {
         "paper": "lab-rig",
         "scenario": "lab-rig-measured",
@@ -262,6 +289,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
         **judged,
         "before": before,
         "maker": maker,
+        "tables": compare_tables(with_scaled_brake(identified)),
         "parameters": parameters,
         "correlation": {"names": list(found.uncertainty.names), "matrix": found.uncertainty.correlation.tolist()},
         "hardly_determined": open_directions,

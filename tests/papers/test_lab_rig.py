@@ -51,6 +51,16 @@ def test_coasting_gives_the_bearings_of_table_4():
         np.testing.assert_allclose(values, printed, rtol=0.04)
 
 
+def test_the_tables_of_the_manual_are_those_of_the_mask():
+    """And not of the rig that braked: its brake is 2.6 times as strong, its friction about half."""
+    with jax.enable_x64(True):
+        torque, friction = lab_rig.compare_tables(load("lab-rig-measured").loop.plant)
+    assert torque["mask"] < 0.5
+    assert torque["identified"] > 5
+    assert friction["mask"] < 0.05
+    assert 0.15 < friction["identified"] < 0.25
+
+
 def test_the_records():
     first, second = (rig.read_record(one) for one in rig.EXPERIMENTS)
     assert (first.threshold, second.threshold) == (0.1, 0.7)
