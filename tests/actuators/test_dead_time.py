@@ -52,7 +52,8 @@ def test_more_switches_than_its_capacity_are_a_run_that_diverged():
     assert not run_of(DeadTime(rise=0.095, fall=0.095, capacity=10), commands).diverged
 
 
-@pytest.mark.parametrize("name", ["rise", pytest.param("fall", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rise", "fall"])
 def test_derivatives_are_those_of_the_closed_form(name):
     with jax.enable_x64(True):
 

@@ -10,7 +10,7 @@ from scipy.stats import t
 from diffabs.sweep import Results
 
 # one worker makes what these share
-pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("any_step_is_stable", "without_load")]
 
 SMALL = ("--samples", "24", "--set", "sweep.chunk=16", "--set", "initial.speed_kmh=30", "--set", "stop.speed_kmh=25")
 SMALL += ("--set", "solver.step=1e-3", "--set", "solver.duration=1.0", "--set", "sweep.over.initial.speed_kmh=[28,32]")

@@ -259,7 +259,10 @@ def clockwork(rate: Any, place: Any) -> Loop:
     "dataclasses.replace(self, kinks=False,",
     case="a jump",
 )
-@pytest.mark.parametrize("name", cases(CLOSED, "two in a step"))
+@pytest.mark.parametrize(
+    "name",
+    cases(CLOSED, "a corner", "two at once", "two in a step", "a table", "of time", "of a place where a number ends"),
+)
 def test_a_derivative_through_a_kink_is_that_of_the_closed_form(name):
     """However long the step: 10 ms here, and a derivative that misses a jump is 0."""
     rate, exact = CLOSED[name]

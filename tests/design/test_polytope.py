@@ -74,6 +74,7 @@ BOXES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOXES)
 def test_random_points_are_covered(name):
     model, over, count = BOXES[name]

@@ -24,6 +24,8 @@ from diffabs.references import FixedSlip
 from diffabs.report import build_report, find_documents
 from diffabs.scenario.defaults import braking
 
+pytestmark = pytest.mark.slow  # each reproduces a paper; `make demo` does, too
+
 SMALLEST_FIGURE = 10_000  # bytes: an empty sheet takes less than 6,000
 
 

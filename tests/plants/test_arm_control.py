@@ -150,6 +150,7 @@ def test_regulator_and_filter_are_those_of_the_weights():
     np.testing.assert_allclose(found.entry, b[:, 0], rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_poles_of_the_loop_are_those_of_regulator_and_filter(observer):
     """The loop's map is differentiated from the controller's own code; e^(AT), G(T)B are SciPy's."""
     a, b = (np.asarray(x) for x in model(HANGING))

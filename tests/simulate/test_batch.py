@@ -163,6 +163,7 @@ class TestLanes:
         found = driven(QUIET, Batch(), SOLVER, MEASURED)
         same(found, jax.tree.map(lambda x: x[None], jax.device_get(d.measure(QUIET, SOLVER, MEASURED))))
 
+    @pytest.mark.slow
     @killed_by(
         "simulate/ensemble.py", "    if accepted is True:\n        return run", "    return run", case="together"
     )
@@ -181,6 +182,7 @@ class TestLanes:
         assert not (found.stopped | found.timed_out)[out].any()
         assert all(np.isnan(column[out]).all() for column in found.metrics.values())
 
+    @pytest.mark.slow
     def test_are_refused_before_they_run(self, driven, keys):
         slow = Batch({**VALUES, "controller.gain.1": np.full(len(SPEEDS), -40.0)}, keys)
         found = driven(LOOP, slow, SOLVER, MEASURED)
