@@ -204,9 +204,8 @@ def diagnosis(first: Record, second: Record, rig: LabRig, found: Identified) -> 
 
     A diagnosis only: no number of the identified rig comes from here."""
     free = {path: lab_rig.PARAMETER_RANGES[path] for path in lab_rig.FREE}
-    other = fit_record(
-        lab_rig.build_run(second, True, rig), free, second, starts=[dict(found.values), *lab_rig.STARTS[2:]]
-    )
+    start = with_values(lab_rig.build_run(second, True, rig), found.values)
+    other = fit_record(start, free, second, starts=[{}, *lab_rig.STARTS[2:]])
     rows = []
     for name, one in (("experiment 1", found), ("experiment 2", other)):
         errors = [compare_with_record(with_values(lab_rig.build_run(record, True, rig), one.values), record)
