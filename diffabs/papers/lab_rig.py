@@ -1,29 +1,35 @@
 """INTECO's laboratory rig: measured against simulated.
 
 Bearing friction is identified from four coasting curves, the seven parameters of `FREE` from experiment 1. Experiment 2
-judges the result. `experiments/measured_rig.py` shows how the model was chosen, and what the identified rig means for
-the controllers.
+judges the result. Three braking runs with one step of the command each (Fig. 5.6 a) judge both rigs once more.
+`experiments/measured_rig.py` shows how the model was chosen, and what the identified rig means for the controllers.
 """
 
 import dataclasses
 import pathlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from diffabs import plot
-from diffabs.core.pytree import get, param, pytree
+from diffabs.controllers import ConstantTorque
+from diffabs.core.blocks import Direct
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import get, param, part, pytree
 from diffabs.core.types import JsonObject, Params, Scalar, Table
-from diffabs.identify import Identified, fit
+from diffabs.identify import Identified, Tolerances, fit
 from diffabs.papers import record
 from diffabs.papers.digest import Digest
 from diffabs.papers.measured_rig import (
     DRUM_RADIUS,
     EXPERIMENTS,
+    FIT_STEP,
     HARDLY_TURNS,
     MASK,
+    RUN_STEP,
     WHEEL_RADIUS,
     Record,
     RecordedRun,
@@ -40,8 +46,12 @@ from diffabs.papers.measured_rig import (
     solver_for,
     with_values,
 )
-from diffabs.plants import LabRig
+from diffabs.plants import BrakeStart, LabRig
 from diffabs.runtime import provenance
+from diffabs.scenario.defaults import braking
+from diffabs.simulate.run import rollout
+from diffabs.simulate.types import FixedStep, Run
+from diffabs.stops import Standstill
 
 TITLE = "INTECO's laboratory rig: measured against simulated (relay at slip 0.1 and 0.7, from 1,700 rpm)"
 PIXEL = {"wheel": 0.35, "drum": 0.5}  # rad/s, of the coasting curves
@@ -77,6 +87,18 @@ STARTS: tuple[Params, ...] = tuple(
     }
     for rise, fall in ((0.013, 0.007), (0.016, 0.010))
     for torque, rate in ((20.0, 400.0), (24.0, 200.0))
+)
+
+STEP_COMMANDS = (0.65, 0.7, 0.75)  # of the step-braking curves, Fig. 5.6 a
+STEP_DURATION = 1.5  # s
+STEP_FREE: Params = {
+    "loop.plant.road.w4": (0.02, 0.8),
+    "loop.plant.brake_gain": (2.0, 80.0),
+    "loop.plant.brake_rate": (5.0, 1500.0),
+    "instant": (-0.2, 0.5),
+}
+STEP_STARTS: tuple[Params, ...] = tuple(
+    {"loop.plant.road.w4": 0.35, "loop.plant.brake_gain": 11.0, "loop.plant.brake_rate": rate} for rate in (30.0, 300.0)
 )
 
 NOTES = [
@@ -227,6 +249,161 @@ def compare_tables(rig: LabRig) -> list[JsonObject]:
     return rows
 
 
+@pytree
+class StepRun:
+    """A loop that brakes with one step of the command, and the instant of this step on the axis of the drawing.
+
+    Attributes:
+        loop: Loop whose brake receives the command at t = 0.
+        instant: Instant of the step on the axis of the drawing [s].
+    """
+
+    loop: Loop = part()
+    instant: Scalar = param(default=0.14, unit="s")
+
+
+class StepCurves(NamedTuple):
+    """The curves of one step-braking run. A rim speed is a fraction of its value before the step.
+
+    Attributes:
+        command: Command after the step [1].
+        speed: Rim speed of the drum before the step [m/s].
+        t: Instants of the wheel's readings [s], shape (n,), on the axis of the drawing.
+        wheel: Rim speed of the wheel [1], shape (n,).
+        drum_t: Instants of the drum's readings [s], shape (m,).
+        drum: Rim speed of the drum [1], shape (m,).
+    """
+
+    command: float
+    speed: float
+    t: np.ndarray
+    wheel: np.ndarray
+    drum_t: np.ndarray
+    drum: np.ndarray
+
+
+def read_step(command: float) -> StepCurves:
+    """Return the step-braking curves of a command, from Fig. 5.6 a of the manual.
+
+    Before the step the drawn rim of the wheel is 1.8 % faster than that of the drum, because the radii of the manual
+    are not those of the rig. Each curve is therefore divided by its own first reading.
+
+    Args:
+        command: One of `STEP_COMMANDS`.
+    """
+    (t, wheel), (drum_t, drum) = (read_curves()[f"step-braking {command:g} {one}"].T for one in ("wheel", "drum"))
+    return StepCurves(command, float(drum[0]), t, wheel / wheel[0], drum_t, drum / drum[0])
+
+
+def build_step(curves: StepCurves, rig: LabRig) -> Loop:
+    """Return the loop of a step-braking run: both wheels roll, and the brake receives its command at t = 0.
+
+    The drawing does not show the instant of the step, so a dead time has no effect on a comparison and is left out.
+
+    Args:
+        curves: Measured curves.
+        rig: Plant.
+    """
+    return braking(
+        plant=rig, initial=BrakeStart(speed=curves.speed), controller=ConstantTorque(torque=curves.command),
+        actuator=Direct(), stop=Standstill(speed=0.05),
+    )  # fmt: skip
+
+
+def _rims(run: Run, speed: Any) -> tuple[Any, Any, Any]:
+    """Return time [s] and the rim speeds of wheel and drum as fractions of the first speed."""
+    assert run.trajectory is not None
+    sample = run.trajectory.sample
+    return sample.t, sample.output.wheel_speed / speed, sample.output.speed / speed
+
+
+def _step_residuals(step: StepRun, t: Any, wheel: Any, drum_t: Any, drum: Any) -> Any:
+    run = rollout(step.loop, FixedStep(step=FIT_STEP, duration=STEP_DURATION))
+    at, ours, ours_drum = _rims(run, step.loop.initial.speed)
+    return jnp.concatenate(
+        [jnp.interp(t - step.instant, at, ours) - wheel, jnp.interp(drum_t - step.instant, at, ours_drum) - drum]
+    )
+
+
+def match_step(curves: StepCurves, rig: LabRig) -> JsonObject:
+    """Return how far a simulated step-braking run is from the measured one.
+
+    Both are aligned where the wheel has lost 10 % of its rim speed.
+
+    Args:
+        curves: Measured curves.
+        rig: Plant.
+
+    Returns:
+        Rms errors of both rim speeds in per cent of the speed before the step, and the `fall_time` in which the wheel's
+        falls from 80 to 20 % [s].
+    """
+    run = jax.tree.map(np.asarray, simulate(build_step(curves, rig), FixedStep(step=RUN_STEP, duration=STEP_DURATION)))
+    t, wheel, drum = _rims(run, curves.speed)
+    shift = _time_at(0.9, t, wheel) - _time_at(0.9, curves.t, curves.wheel)
+    errors = (
+        np.interp(curves.t + shift, t, wheel) - curves.wheel,
+        np.interp(curves.drum_t + shift, t, drum) - curves.drum,
+    )
+    wheel_rms, drum_rms = (float(100 * np.sqrt(np.mean(error**2))) for error in errors)
+    return {"wheel_rms_percent": wheel_rms, "drum_rms_percent": drum_rms, "fall_time": _fall_time(t, wheel)}
+
+
+def _time_at(level: float, t: np.ndarray, falling: np.ndarray) -> float:
+    return float(np.interp(-level, -falling, t))
+
+
+def _fall_time(t: np.ndarray, wheel: np.ndarray) -> float:
+    return _time_at(0.2, t, wheel) - _time_at(0.8, t, wheel)
+
+
+def fit_step(curves: StepCurves, rig: LabRig) -> Identified:
+    """Return the friction, brake torque, lag and instant of the step with which a rig follows step-braking curves.
+
+    Args:
+        curves: Measured curves.
+        rig: Identified rig; its brake torque is `brake_gain` times the command, with `brake_offset` 0.
+    """
+    data = tuple(jnp.asarray(x) for x in (curves.t, curves.wheel, curves.drum_t, curves.drum))
+    return fit(
+        StepRun(loop=build_step(curves, rig)), STEP_FREE, _step_residuals, data=data, sigma=np.array(1.0),
+        absolute=False, starts=STEP_STARTS, tolerances=Tolerances(cost=1e-4, step=1e-6, gradient=1e-6, evaluations=40),
+    )  # fmt: skip
+
+
+def compare_steps(rig: LabRig, fitted: bool = True) -> list[JsonObject]:
+    """Return how far the mask's and the identified rig are from the three step-braking curves.
+
+    Args:
+        rig: Identified rig; its brake torque is `brake_gain` at full command, with `brake_offset` 0.
+        fitted: Also fit friction, brake torque and lag of this rig to each curve alone. No other number depends on it.
+
+    Returns:
+        For each command: `measured`, with the `fall_time` [s]; `mask` and `identified`, from `match_step`. `fitted` is
+        the same for the fit, with `friction` [1], `brake_torque` [N m], `brake_rate` [1/s] and their deviations.
+    """
+    rows = []
+    for command in STEP_COMMANDS:
+        curves = read_step(command)
+        row = {
+            "command": command,
+            "measured": {"fall_time": _fall_time(curves.t, curves.wheel)},
+            "mask": match_step(curves, MASK),
+            "identified": match_step(curves, with_scaled_brake(rig)),
+        }
+        if fitted:
+            found = fit_step(curves, rig)
+            values, deviations = found.values, found.uncertainty.deviations
+            row["fitted"] = match_step(curves, found.part.loop.plant) | {
+                name + suffix: factor * float(of[f"loop.plant.{path}"])
+                for name, path, factor in (("friction", "road.w4", 1.0), ("brake_torque", "brake_gain", command),
+                                           ("brake_rate", "brake_rate", 1.0))
+                for suffix, of in (("", values), ("_deviation", deviations))
+            }  # fmt: skip
+        rows.append(row)
+    return rows
+
+
 def parameter_rows(found: Identified, coasting: Params) -> list[JsonObject]:
     """Return each identified parameter with the value of the model's mask, unit and standard deviation.
 
@@ -275,21 +452,24 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
     judged = {name: judge(one, rig, found.values) for name, one in (("fitted", first), ("judged", second))}
     before = {name: judge(one, MASK, MASK_VALUES) for name, one in (("fitted", first), ("judged", second))}
     parameters = parameter_rows(found, coasting)
+    progress("lab-rig: step braking")
+    plant: Any = with_values(build_run(first, True, rig), found.values).loop.plant
+    steps = compare_steps(plant)
     progress("lab-rig: figures")
     names = record.save_figures(draw_figures((first, second), rig, found.values, coasting), folder)
     open_directions = [
         {"spread": one.spread, "direction": one.describe()} for one in found.uncertainty.undetermined_directions(0.1)
     ]
-    identified: Any = with_values(build_run(first, True, rig), found.values).loop.plant
     summary = {
         "paper": "lab-rig",
         "scenario": "lab-rig-measured",
         "title": TITLE,
-        "rows": _rows(judged),
+        "rows": [*_rows(judged), *_step_rows(steps)],
         **judged,
         "before": before,
         "maker": maker,
-        "tables": compare_tables(with_scaled_brake(identified)),
+        "tables": compare_tables(with_scaled_brake(plant)),
+        "steps": steps,
         "parameters": parameters,
         "correlation": {"names": list(found.uncertainty.names), "matrix": found.uncertainty.correlation.tolist()},
         "hardly_determined": open_directions,
@@ -316,6 +496,19 @@ def _rows(judged: Table) -> list[JsonObject]:
         for quantity, unit in (("wheel_rms_percent_given", "%"), ("wheel_rms_percent_own", "%"),
                                ("slip_rms_given", "1"), ("slip_rms_own", "1")):  # fmt: skip
             rows.append(record.computed_row(title, quantity, unit, of[quantity]))
+    return rows
+
+
+def _step_rows(steps: list[JsonObject]) -> list[JsonObject]:
+    """Return the rows of `record.computed_row` for the step-braking runs."""
+    rows = []
+    for one in steps:
+        for state in ("mask", "identified", "fitted"):
+            name = f"step braking with {one['command']:g} ({state})"
+            for quantity, unit in (("wheel_rms_percent", "%"), ("drum_rms_percent", "%")):
+                rows.append(record.computed_row(name, quantity, unit, one[state][quantity]))
+            rows.append(record.computed_row(name, "fall_time", "s", one[state]["fall_time"],
+                                            reference=one["measured"]["fall_time"]))  # fmt: skip
     return rows
 
 
@@ -372,7 +565,14 @@ def compact(summary: Table) -> Digest:
         if ":" not in row["name"]
     ]
     rule = "Given, own: rms error of the wheel's speed under the measured commands and under its own relay."
-    return Digest(summary["title"].split(" (")[0], headings, lines, [rule, *values], (), len(summary["figures"]))
+    steps = [
+        f"Step braking with {one['command']:g}: wheel's rms error {one['mask']['wheel_rms_percent']:.1f} % (mask), "
+        f"{one['identified']['wheel_rms_percent']:.1f} % (identified), {one['fitted']['wheel_rms_percent']:.1f} % "
+        f"(fitted to it: {one['fitted']['brake_torque']:.1f} N m, friction w4 = {one['fitted']['friction']:.3f})."
+        for one in summary["steps"]
+    ]
+    sentences = [rule, *values, *steps]
+    return Digest(summary["title"].split(" (")[0], headings, lines, sentences, (), len(summary["figures"]))
 
 
 def _cells(of: Table) -> tuple[str, str, str]:
