@@ -34,6 +34,8 @@ def test_a_pulse_is_longer_or_shorter_by_the_difference(rise, fall):
 @killed_by("actuators/dead_time.py", "jnp.where(before, m.due, jnp.inf)", "m.due")
 def test_a_fall_that_would_come_first_cancels_the_pulse():
     assert run_of(DeadTime(rise=0.035, fall=0.01)).metrics["mean"][1] == 0
+    two = run_of(DeadTime(rise=0.035, fall=0.01), [0.0, 1.0, 2.0, 0.0, 0.0, 0.0])  # the fall cancels both rises
+    assert two.metrics["mean"][1] == 0
     run = run_of(DeadTime(rise=0.035, fall=0.01), [0.0, 3.0, 3.0, 0.0, 0.0, 5.0, 5.0, 5.0, 5.0, 0.0])
     np.testing.assert_allclose(run.metrics["mean"][1], 5.0 * (0.04 - 0.025) / LENGTH, rtol=1e-5)
 
