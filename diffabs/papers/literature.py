@@ -1,7 +1,8 @@
 """Leader table of other people's anti-lock simulations: each printed number, ours, and the verdict.
 
 `literature.toml` holds the printed numbers with tolerances and causes. Ours come from runs of packaged scenarios. The
-bound is the stop with the friction at its peak from start to end.
+bound is the stop with the friction at its peak from start to end. A scenario `examples/NAME.toml` is not packaged: its
+plant is a user's own, in `examples/NAME.py`.
 
     reproduced     ours is within the tolerance of the printed number, or below a printed upper bound
     refuted        it is not; the cause says why
@@ -16,7 +17,7 @@ import math
 import pathlib
 import shlex
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
 import jax
@@ -31,7 +32,8 @@ from diffabs.papers import record
 from diffabs.papers.digest import Digest
 from diffabs.plants import GRAVITY, RoadVehicle
 from diffabs.runtime import files, provenance
-from diffabs.scenario.scenario import load
+from diffabs.scenario import outside
+from diffabs.scenario.scenario import Scenario, load
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Run
 from diffabs.stops import Standstill
@@ -39,7 +41,7 @@ from diffabs.stops import Standstill
 TITLE = "Printed numbers of published anti-lock simulations, computed again"
 SHOWN = "literature-mathworks"  # scenario that stands for all in the report
 SLIP_GRID = 20001  # points on [0, 1]; the knots of all tables are among them
-DIGITS = 5  # significant digits of our numbers in the benchmark table
+DIGITS = 5  # significant digits of our numbers in the benchmark table, unless a row sets `digits`
 NOTES = [
     "Facts and figures of the sources only; the programs were written anew, and no text of theirs is used.",
     "Ours is the converged value of the model. `scheme` is what the source's own integration gives, by an independent "
@@ -61,6 +63,21 @@ def read_rows() -> list[JsonObject]:
         for name, source in read_sources().items()
         for row in source["rows"]
     ]
+
+
+def load_scenario(name: str, overrides: Sequence[str] = ()) -> Scenario:
+    """Return the scenario of a row: a packaged one, or a file of the project's examples with parts of its own.
+
+    Args:
+        name: Name of a packaged scenario, or `examples/NAME.toml`.
+        overrides: Texts `path=value`.
+    """
+    if not name.startswith("examples/"):
+        return load(name, overrides, integrated=False)
+    here = pathlib.Path(__file__).parent  # an installed package has copies of the examples here
+    path = (here if (here / name).exists() else here.parents[1]) / name
+    with outside.lend_modules(path.parent, [path.stem]):
+        return load(path, overrides, integrated=False)
 
 
 # Measures of a run: functions (run, row) -> number in SI units.
@@ -134,6 +151,13 @@ def _signal_at(index: int) -> Callable[[Run, Table], float]:
     return read
 
 
+def _output_at(run: Run, row: Table) -> float:
+    """Return the signal `signal` of the output at the instant `at`."""
+    assert run.trajectory is not None
+    sample = run.trajectory.sample
+    return float(np.interp(row["at"], np.asarray(sample.t), np.asarray(getattr(sample.output, row["signal"]))))
+
+
 MEASURES: dict[str, Callable[[Run, Table], float]] = {
     "stop_time": _stop_time,
     "stop_distance": _stop_distance,
@@ -147,6 +171,7 @@ MEASURES: dict[str, Callable[[Run, Table], float]] = {
     "speed_at": _signal_at(2),
     "distance_at": _signal_at(4),
     "control_at": _signal_at(5),
+    "output_at": _output_at,
 }
 
 # Bounds
@@ -196,7 +221,7 @@ def _bound(row: Table, overrides: list[str]) -> float | None:
         return None
     if "friction_peak" in row:
         return bound_of_stop(row["bound"], row["friction_peak"] * GRAVITY, 0.0, row["speed"], 0.0)
-    return bound_of_loop(load(row["scenario"], overrides, integrated=False).loop, row)
+    return bound_of_loop(load_scenario(row["scenario"], overrides).loop, row)
 
 
 # Rows
@@ -209,10 +234,10 @@ def simulate_row(scenario: str, overrides: tuple[str, ...]) -> Run:
     """Return the run of a scenario with overrides. Several rows read the same run.
 
     Args:
-        scenario: Name of a packaged scenario.
+        scenario: Name of a scenario, as in `load_scenario`.
         overrides: Texts `path=value`.
     """
-    given = load(scenario, overrides, integrated=False)
+    given = load_scenario(scenario, overrides)
     return _rollout(given.loop, given.solver, dict(given.objectives))
 
 
@@ -257,6 +282,8 @@ def judge_row(row: Table) -> JsonObject:
         verdict = "reproduced" if abs(ours - printed) <= tolerance else "refuted"
     scenario = row.get("scenario")
     texts = [text for override in overrides for text in ("--set", override)]
+    if scenario is not None and scenario.startswith("examples/"):
+        texts += ["--parts", scenario.removesuffix(".toml").replace("/", ".")]  # from the folder of the project
     has_run = scenario is not None and ours is not None and row.get("measure") != "saving"
     return {
         "source": row["source"],
@@ -273,6 +300,7 @@ def judge_row(row: Table) -> JsonObject:
         "scenario": scenario if has_run else None,
         "command": shlex.join(["diffabs", "simulate", str(scenario), *texts]) if has_run else None,
         "place": row["place"],
+        "digits": row.get("digits", DIGITS),
     }
 
 
@@ -336,25 +364,26 @@ def write_table_csv(rows: list[JsonObject]) -> str:
         rows: Rows of `judge_row`.
     """
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    rounded = [_round_row(row) for row in rows]
+    writer = csv.DictWriter(text, list(rounded[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(_round_row(row) for row in rows)
+    writer.writerows(rounded)
     return text.getvalue()
 
 
 def _round_row(row: JsonObject) -> JsonObject:
-    numbers = {key: float(f"{row[key]:.{DIGITS}g}") for key in ("ours", "bound") if row[key] is not None}
+    numbers = {key: float(f"{row[key]:.{row['digits']}g}") for key in ("ours", "bound") if row[key] is not None}
     tolerance = {} if row["tolerance"] is None else {"tolerance": float(f"{row['tolerance']:.3g}")}
-    return row | numbers | tolerance
+    return {key: value for key, value in (row | numbers | tolerance).items() if key != "digits"}
 
 
 def scenario_parameters(name: str) -> JsonObject:
     """Return the parameters of a scenario by path, each with value and unit.
 
     Args:
-        name: Name of a packaged scenario.
+        name: Name of a scenario, as in `load_scenario`.
     """
-    scenario = load(name, integrated=False)
+    scenario = load_scenario(name)
     units = units_of(scenario.loop.plant)
     found: JsonObject = {
         path: {"value": np.asarray(value).tolist(), "unit": resolve_unit(spec.unit, units)}

@@ -9,6 +9,7 @@ import dataclasses
 import importlib
 import importlib.metadata
 import os
+import pathlib
 import sys
 import traceback
 from collections.abc import Iterable, Iterator
@@ -41,6 +42,28 @@ def register_modules(names: Iterable[str]) -> None:
         if here not in sys.path:
             sys.path.append(here)  # at the end, so that no file here hides a module of the standard library
         _named[name] = _import_module(name, f"--parts {name}")
+
+
+@contextlib.contextmanager
+def lend_modules(folder: pathlib.Path, names: Iterable[str]) -> Iterator[None]:
+    """Return a context in which `registered_modules` also returns modules of a folder.
+
+    Args:
+        folder: Folder of the modules.
+        names: Names of the modules.
+
+    Raises:
+        ValueError: A module cannot be imported.
+    """
+    before = dict(_named)
+    sys.path.append(str(folder))
+    try:
+        _named.update({name: _import_module(name, f"{folder}") for name in names})
+        yield
+    finally:
+        sys.path.remove(str(folder))
+        _named.clear()
+        _named.update(before)
 
 
 @cache
