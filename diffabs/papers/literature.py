@@ -65,7 +65,7 @@ def read_rows() -> list[JsonObject]:
     ]
 
 
-def load_scenario(name: str, overrides: Sequence[str] = ()) -> Scenario:
+def load_row_scenario(name: str, overrides: Sequence[str] = ()) -> Scenario:
     """Return the scenario of a row: a packaged one, or a file of the project's examples with parts of its own.
 
     Args:
@@ -221,7 +221,7 @@ def _bound(row: Table, overrides: list[str]) -> float | None:
         return None
     if "friction_peak" in row:
         return bound_of_stop(row["bound"], row["friction_peak"] * GRAVITY, 0.0, row["speed"], 0.0)
-    return bound_of_loop(load_scenario(row["scenario"], overrides).loop, row)
+    return bound_of_loop(load_row_scenario(row["scenario"], overrides).loop, row)
 
 
 # Rows
@@ -234,10 +234,10 @@ def simulate_row(scenario: str, overrides: tuple[str, ...]) -> Run:
     """Return the run of a scenario with overrides. Several rows read the same run.
 
     Args:
-        scenario: Name of a scenario, as in `load_scenario`.
+        scenario: Name of a scenario, as in `load_row_scenario`.
         overrides: Texts `path=value`.
     """
-    given = load_scenario(scenario, overrides)
+    given = load_row_scenario(scenario, overrides)
     return _rollout(given.loop, given.solver, dict(given.objectives))
 
 
@@ -381,9 +381,9 @@ def scenario_parameters(name: str) -> JsonObject:
     """Return the parameters of a scenario by path, each with value and unit.
 
     Args:
-        name: Name of a scenario, as in `load_scenario`.
+        name: Name of a scenario, as in `load_row_scenario`.
     """
-    scenario = load_scenario(name)
+    scenario = load_row_scenario(name)
     units = units_of(scenario.loop.plant)
     found: JsonObject = {
         path: {"value": np.asarray(value).tolist(), "unit": resolve_unit(spec.unit, units)}

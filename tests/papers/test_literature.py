@@ -30,7 +30,7 @@ def test_every_row_names_what_it_needs():
             assert row["measure"] in {*literature.MEASURES, "saving"}
             assert "tolerance" in row or "relative" in row
         if "scenario" in row:
-            literature.load_scenario(row["scenario"], row.get("set", []))
+            literature.load_row_scenario(row["scenario"], row.get("set", []))
         if "printed" not in row or not row.get("measure"):
             assert row["cause"]
 
@@ -111,7 +111,7 @@ def test_the_electro_mechanical_brake_has_the_printed_digits():
     """The scenario's step of a tenth of the period has an error of 2e-15 m."""
     with jax.enable_x64(True):
         rows = [judge_row(row) for row in read_rows() if row["source"] == "embrake"]
-        plant = literature.load_scenario("examples/embrake.toml").loop.plant
+        plant = literature.load_row_scenario("examples/embrake.toml").loop.plant
     exact = position_by_matrix_exponential(plant, 1e4, 1e3, 0.05, 1e-4, 1000)[[99, 199, 499, 999]]
     np.testing.assert_allclose([row["ours"] for row in rows], exact, rtol=0, atol=2e-14)
     np.testing.assert_allclose([row["ours"] for row in rows], [row["printed"] for row in rows], rtol=0, atol=2e-14)
