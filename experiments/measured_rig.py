@@ -15,9 +15,9 @@ import dataclasses
 import json
 import math
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -42,6 +42,7 @@ from diffabs.objectives import BRAKING
 from diffabs.papers import lab_rig, measured_rig, record
 from diffabs.papers.measured_rig import MASK, Record, RecordedRun, compare_with_record, fit_record, with_values
 from diffabs.plants import BrakeStart, LabRig, MirroredRig
+from diffabs.plants.lab_rig import LabRigState
 from diffabs.references import FilteredSlip, FixedSlip, LimitedSlip
 from diffabs.roads import Burckhardt
 from diffabs.scenario.defaults import braking
@@ -82,14 +83,75 @@ class ContactSurplus:
         return (signal + self.surplus * (signal - memory.flow)) / (1 + self.surplus)
 
 
+@pytree
+class HeldFriction:
+    """A road with one friction for every slip."""
+
+    mu: Scalar = param(default=0.0, unit="1")
+
+    def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
+        """Return mu [1]."""
+        return self.mu + 0.0 * slip
+
+
+class CompliantRigState(NamedTuple):
+    """State of a `LabRig`, and the friction coefficient m that the deflected tyre transmits [1]."""
+
+    wheel: Scalar
+    drum: Scalar
+    brake: Scalar
+    distance: Scalar
+    deflected: Scalar
+
+
+@pytree
+class CompliantRig(LabRig):
+    """A `LabRig` whose tyre yields along the belt: the friction m follows mu(slip) over a rolled length L.
+
+        L m' = v (mu(slip) - m),   v = speed of the drum's rim
+
+    Source: H. B. Pacejka, Tire and Vehicle Dynamics, 3rd ed., ch. 7: a relaxation length stands for the compliance.
+    """
+
+    relaxation: Scalar = param(default=0.03, unit="m", above=0.0)
+
+    def start(self, initial: BrakeStart) -> Any:
+        """Return the state of a rolling tyre without deflection."""
+        state = LabRig.start(self, initial)
+        return CompliantRigState(*state, 0.0 * initial.speed)
+
+    def derivative(self, t: Scalar, state: Any, control: Scalar) -> Any:
+        """Return dx/dt under the brake command `control` [1]."""
+        rigid = LabRigState(*state[:4])
+        settled, _, _ = LabRig.contact(self, rigid)
+        rate = self.drum_radius * state.drum / self.relaxation * (settled - state.deflected)
+        return CompliantRigState(*LabRig.derivative(self, t, state, control), rate)
+
+    def contact(self, state: Any) -> tuple[Any, Any, Any]:
+        """Return friction coefficient [1], normal force [N], and braking torque [N m], as `LabRig` does."""
+        return LabRig.contact(dataclasses.replace(self, road=HeldFriction(mu=state.deflected)), state)
+
+    def project(self, state: Any) -> Any:
+        """Return the state with neither wheel turning backwards."""
+        return CompliantRigState(*LabRig.project(self, state), state.deflected)
+
+
+def as_compliant(rig: LabRig) -> CompliantRig:
+    """The rig with a tyre that yields."""
+    return CompliantRig(**{field.name: getattr(rig, field.name) for field in dataclasses.fields(rig)})
+
+
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """A change of the model: other parts, and free parameters with their ranges and starting values."""
+    """A change of the model: other parts, and free parameters with their ranges and starting values.
+
+    `plant` makes another plant from the rig."""
 
     name: str
     parts: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     free: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     start: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    plant: Callable[[LabRig], LabRig] | None = None
 
 
 def of(*names: str) -> dict[str, tuple[float, float]]:
@@ -128,11 +190,16 @@ SINGLE = (
         {"loop.actuator.blocks.0.rise": (1e-3, 0.05), "loop.actuator.blocks.0.fall": (1e-3, 0.05),
          "loop.actuator.blocks.1.surplus": (1e-3, 3.0)},
     ),
+    Effect(
+        "compliance of tyre and belt", {}, {"loop.plant.relaxation": (8e-3, 0.5)}, plant=as_compliant
+    ),
 )  # fmt: skip
 
 
 def changed(recorded: RecordedRun, effect: Effect) -> RecordedRun:
     """The run with the parts and starting values of an effect. The lag starts anew: a fit may end at its limit."""
+    if effect.plant is not None:
+        recorded = replace(recorded, {"loop.plant": effect.plant(recorded.loop.plant)})
     return replace(recorded, {"loop.plant.brake_rate": 300.0, **effect.parts, **effect.start})
 
 

@@ -53,6 +53,22 @@ def test_noise_blinds_the_bare_latch_and_not_the_robust_one():
     np.testing.assert_allclose(means["robust"], 42.9, rtol=0, atol=0.3)  # 42.87 +- .11 elsewhere
 
 
+def test_a_compliant_tyre_follows_the_rigid_one_over_its_relaxation_length():
+    """With the friction of its slip it moves as the rigid rig; otherwise L m' = v (mu - m), in closed form."""
+    module = experiment("measured_rig")
+    rig = load("lab-rig-measured").loop.plant
+    yielding = replace(module.as_compliant(rig), {"relaxation": 0.12})
+    rigid = module.LabRigState(wheel=120.0, drum=150.0, brake=6.0, distance=1.0)
+    mu, normal, torque = rig.contact(rigid)
+    settled = module.CompliantRigState(*rigid, mu)
+    np.testing.assert_allclose(yielding.contact(settled), (mu, normal, torque), rtol=1e-6)
+    rate = yielding.derivative(0.0, settled, 0.7)
+    np.testing.assert_allclose(rate[:4], rig.derivative(0.0, rigid, 0.7), rtol=1e-6)
+    np.testing.assert_allclose(rate.deflected, 0.0, atol=1e-6)
+    half = yielding.derivative(0.0, settled._replace(deflected=0.5 * mu), 0.7)
+    np.testing.assert_allclose(half.deflected, 0.5 * mu * float(rig.drum_radius) * 150.0 / 0.12, rtol=1e-5)
+
+
 def test_the_laboratory_rig_locks_with_the_published_gain():
     module = experiment("lab_rig")
     config = module.Config()
