@@ -1,0 +1,595 @@
+"""The equations of a closed loop as a list of operations on real numbers, from the programs of its own parts.
+
+    z(0) = start(p),   z := tick(z) every period,   dz/dt = flow(z) between ticks,   p: the parameters of a box
+
+Nobody writes these equations: `jax.make_jaxpr` traces `Loop.start`, `Loop.change` and `Loop.flow`, and the lowering rules
+of `compiler` reduce them to single numbers. The operations mean real numbers: nothing is folded unless it is exact, and a
+constant stands for the double and for the decimal that its shortest text shows. Three forms are recognised, because
+their floating-point form says less than their meaning: powers, limits, and the slip of a braked wheel.
+
+A braked wheel is described by slip and speed instead of two angular speeds. In a set of runs both speeds vary together,
+and only with the slip as a state does an enclosure keep that. `check_slip_chart` proves the change of coordinates.
+"""
+
+import dataclasses
+import random
+from collections.abc import Callable, Iterable
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel
+from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr, scalar_array
+from diffabs.controllers.sampled import Sampled
+from diffabs.core.blocks import offers
+from diffabs.core.loop import BLOCKS, Loop, LoopState
+from diffabs.core.messages import Clock
+from diffabs.core.protocols import BrakeOutput
+from diffabs.core.pytree import parameters, replace
+from diffabs.core.types import PyTree
+from diffabs.plants import BrakeStart
+
+LEAVES, STATE, TIME = "leaf", "state", "t"
+FUNCTIONS = ("exp", "log", "sin", "cos", "atan", "power")
+COMPARISONS = ("lt", "le", "eq", "ne")
+LOGIC = ("and", "or", "not")
+CHART_TRIALS = 20  # random rational points; a rational function that is not the identity passes none, nearly surely
+
+
+class NoRule(ValueError):
+    """An error: the proof has no sound rule for a part, an operation or a number of the loop."""
+
+
+class Operation(NamedTuple):
+    """One number: an operation on earlier ones.
+
+    Attributes:
+        name: `const`, `param`, `state`, `add`, `sub`, `mul`, `inv`, `clamp`, `select`, a comparison, logic, or a function.
+        args: Indices of the operands. `select` has (condition, if false, if true). A function y of u has (u, g) with
+            dy = g du, where g is another operation.
+        value: Of `const` the number, of `param` and `state` its index, of `clamp` its limits, of `power` its exponent.
+    """
+
+    name: str
+    args: tuple[int, ...]
+    value: Any = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Equations:
+    """A closed loop as operations on real numbers.
+
+    Attributes:
+        operations: Operations, operands first.
+        params: Paths of the parameters of the box.
+        states: Names of the states.
+        start: Operation of each state at t = 0, a function of the parameters alone.
+        flow: Operation of each state's rate of change.
+        tick: Operation of each state after a tick; empty for a continuous loop.
+        period: Time between two ticks [s]; None for a continuous loop.
+        signals: Operation of each signal, by name.
+        margin: Operation of the stop's margin, which is positive until the run ends.
+        nonnegative: Indices of the states that are never negative, which the proof verifies.
+        travelled: Index of the state that is the distance, or -1.
+        speed: Index of the state that is the speed, or -1.
+        clock: Index of the state that is the time.
+        paced: True if the independent variable is eta with d eta = dt/v, so that rates are multiplied by the speed v.
+    """
+
+    operations: tuple[Operation, ...]
+    params: tuple[str, ...]
+    states: tuple[str, ...]
+    start: tuple[int, ...]
+    flow: tuple[int, ...]
+    tick: tuple[int, ...]
+    period: float | None
+    signals: dict[str, int]
+    margin: int
+    nonnegative: tuple[int, ...]
+    travelled: int
+    speed: int
+    clock: int
+    paced: bool
+
+
+class RealGraph(Graph):
+    """A graph that means real numbers: it folds and simplifies only what is exact."""
+
+    def op(self, name: str, *args: Node) -> Node:
+        """Return a node for the operation `name` on `args`; see `Graph.op`."""
+        if name in ("ne", "eq") and args[0] is args[1]:
+            return self.const(name == "eq")  # a real number equals itself
+        if name == "is_finite":
+            return self.const(True)
+        real = all(np.issubdtype(arg.dtype, np.floating) for arg in args)
+        if not real or name in ("lt", "le", "gt", "ge", "eq", "ne"):
+            return super().op(name, *args)
+        if all(arg.op == "const" and np.isfinite(arg.attr) for arg in args) and name in ("add", "sub", "mul", "neg"):
+            exact = {"add": lambda x, y: x + y, "sub": lambda x, y: x - y, "mul": lambda x, y: x * y, "neg": lambda x: -x}
+            value = exact[name](*(Fraction(float(arg.attr)) for arg in args))
+            if abs(value) < 2**1000 and Fraction(float(value)) == value:
+                return self.const(float(value), args[0].dtype)
+        found = _simplify(self, name, args)
+        return self._make(name, args, args[0].dtype) if found is None else found
+
+
+def _simplify(graph: Graph, name: str, args: tuple[Node, ...]) -> Node | None:
+    """Return an equal, simpler node for an operation on real numbers, or None."""
+    x, y = args if len(args) == 2 else (args[0], args[0])
+    zero = lambda node: node.is_number(0)
+    match name:
+        case "add":
+            return y if zero(x) else x if zero(y) else None
+        case "sub":
+            return x if zero(y) else graph.const(0.0, x.dtype) if x is y else graph.op("neg", y) if zero(x) else None
+        case "mul":
+            if zero(x) or zero(y):
+                return graph.const(0.0, x.dtype)
+            return y if x.is_number(1) else x if y.is_number(1) else None
+        case "div":
+            return graph.const(0.0, x.dtype) if zero(x) else x if y.is_number(1) else None
+        case "neg":
+            return x.args[0] if x.op == "neg" else None
+    return None
+
+
+class _Tick(Clock):
+    """The clock at a tick of every block."""
+
+    def ticks(self, period: PyTree = None) -> tuple[PyTree, PyTree]:
+        """Return that the block ticks now, and the number of the tick."""
+        return jnp.asarray(True), self.k
+
+
+def derive_equations(loop: Loop, over: Iterable[str]) -> Equations:
+    """Return the equations of a loop, with the parameters at the paths `over` as variables.
+
+    Args:
+        loop: Closed loop with concrete parameters.
+        over: Paths of the parameters of the box.
+
+    Raises:
+        NoRule: A part has events or noise, two blocks have different clocks, or an operation has no sound rule.
+    """
+    paths = tuple(over)
+    with jax.enable_x64(True):
+        return _Derivation(loop, paths).equations()
+
+
+class _Derivation:
+    """The derivation of the equations of one loop: a graph, and the operations that it becomes."""
+
+    def __init__(self, loop: Loop, paths: tuple[str, ...]):
+        self.loop = jax.tree.map(lambda x: np.asarray(x, float) if np.asarray(x).dtype.kind == "f" else x, loop)
+        self.paths, self.graph = paths, RealGraph()
+        known = {path for path, _, _ in parameters(self.loop)}
+        for path in paths:
+            if path not in known:
+                raise NoRule(f"{path} is not a parameter of the loop")
+        self.period = _clock_of(self.loop)
+        self.given = [self.graph.input(np.float64, UpdateLevel.UNIFORM, (LEAVES, i)) for i in range(len(paths))]
+        self.charted = isinstance(loop.initial, BrakeStart) and loop.plant.shows is BrakeOutput
+        self.operations: list[Operation] = []
+        self.known: dict[Any, int] = {}
+
+    def with_params(self, values: Any) -> Loop:
+        return replace(self.loop, dict(zip(self.paths, values, strict=True)))
+
+    def lower(self, function: Callable[..., Any], *groups: list[Node]) -> list[Node]:
+        """Return the results of a function of lists of numbers as nodes, one for each number."""
+        shapes = [[jax.ShapeDtypeStruct((), np.float64)] * len(group) for group in groups]
+        closed = jax.make_jaxpr(function)(*shapes)
+        constants = [constant_array(self.graph, np.asarray(x)) for x in closed.consts]
+        inputs: list[Array] = [scalar_array(node) for group in groups for node in group]
+        try:
+            return [x for array in lower_jaxpr(self.graph, closed.jaxpr, constants, inputs) for x in array.flat]
+        except Unsupported as error:
+            raise NoRule(str(error)) from None
+
+    def equations(self) -> Equations:
+        """Return the equations; the states are those of the loop's memory, in its order, then the time."""
+        start, rates, after, seen = self.programs()
+        first = jax.eval_shape(lambda values: self.chart(self.with_params(values)), [0.0] * len(self.paths))
+        shown, made = jax.tree_util.tree_leaves_with_path(first), jax.tree.structure(first)
+        names: list[str] = []
+        for path, leaf in shown:
+            if not np.issubdtype(leaf.dtype, np.floating):
+                raise NoRule(f"{_text(path)}: a memory that is not a real number (a counter or a random key)")
+            names += [_text(path) + (f".{i}" if leaf.ndim else "") for i in range(int(np.prod(leaf.shape)))]
+        n = len(names)
+        nodes = [self.graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(n + 1)]
+
+        def state_of(numbers: Any) -> Any:
+            leaves, at = [], 0
+            for _, leaf in shown:
+                size = int(np.prod(leaf.shape))
+                leaves.append(jnp.stack(numbers[at : at + size]).reshape(leaf.shape) if leaf.ndim else numbers[at])
+                at += size
+            return jax.tree.unflatten(made, leaves)
+
+        def flat(tree: Any) -> list[Any]:
+            return [jnp.asarray(x, float) for leaf in jax.tree.leaves(tree) for x in jnp.ravel(leaf)]
+
+        begun = self.lower(lambda values: flat(start(self.with_params(values))), self.given)
+        moved = self.lower(lambda values, z: flat(rates(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes)
+        shows = self.lower(lambda values, z: flat(seen(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes)
+        slip, speed, travelled = (names.index(f"plant.{x}") if self.charted else -1 for x in _Chart._fields)
+        # The slip and the speed that the plant computes from its own states are the states of the chart.
+        same = {shows[0].id: ("state", slip), shows[1].id: ("state", speed)} if self.charted else {}
+        initial = {name: self.initial_node(name) for name in ("slip", "speed")} if self.charted else {}
+        at_start = {begun[i].id: initial[name] for i, name in ((slip, "slip"), (speed, "speed"))} if self.charted else {}
+        starts = [self.convert(self.at_once(x, at_start), {}) for x in begun]
+        names = [*names, TIME]
+        signal_names = [*self.loop.plant.shows._fields, "target", "command", "control", "setpoint"]
+        ticked: list[int] = []
+        if self.period is not None:
+            ticks = self.lower(lambda values, z: flat(after(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes)
+            ticked = [self.convert(x, same) for x in ticks] + [self.make("state", (), n)]
+            for i in (slip, speed, travelled) if self.charted else ():
+                ticked[i] = self.make("state", (), i)  # a tick does not move the plant
+        flow = [self.convert(x, same) for x in moved] + [self.make("const", (), 1.0)]
+        # Slip and wheel move at rates that go with 1/v. With d eta = dt/v they no longer do, and one step suits all speeds.
+        paced = self.charted and self.period is None
+        if paced:
+            flow = [self.paced(x, speed) for x in flow]
+        signals = {name: self.convert(x, same) for name, x in zip(signal_names, shows, strict=False)}
+        margin = self.convert(shows[len(signal_names)], same)
+        if self.charted:
+            check_slip_chart(self.loop)
+        return Equations(
+            operations=tuple(self.operations), params=self.paths, states=tuple(names),
+            start=(*starts, self.make("const", (), 0.0)), flow=tuple(flow), tick=tuple(ticked), period=self.period,
+            signals=signals, margin=margin, nonnegative=(slip,) if self.charted else (), travelled=travelled, speed=speed,
+            clock=n, paced=paced,
+        )  # fmt: skip
+
+    def programs(self) -> tuple[Any, Any, Any, Any]:
+        """Return the functions start(loop), rates(loop, state, t), after(loop, state, t) and seen(loop, state, t)."""
+
+        def loop_state(loop: Loop, state: Any) -> LoopState:
+            if not self.charted:
+                return state
+            x = loop.plant.start(BrakeStart(speed=state.plant.speed, slip=state.plant.slip))
+            return state._replace(plant=x._replace(distance=state.plant.distance))
+
+        def rates(loop: Loop, state: Any, t: Any) -> Any:
+            whole = loop_state(loop, state)
+            flow = loop.flow(t, whole, loop.signals(t, whole))
+            moved = jax.tree.map(jnp.zeros_like, whole).with_flow(flow)
+            if not self.charted:
+                return moved
+
+            def speeds(x: Any) -> tuple[Any, Any]:
+                y = loop.plant.output(x)
+                return y.speed, y.wheel_speed
+
+            _, (dv, dw) = jax.jvp(speeds, (whole.plant,), (moved.plant,))
+            slip, speed, _ = state.plant
+            return moved._replace(plant=_Chart(((1 - slip) * dv - dw) / speed, dv, moved.plant.distance))
+
+        def after(loop: Loop, state: Any, t: Any) -> Any:
+            whole = loop_state(loop, state)
+            clock = _Tick(t, jnp.asarray(self.period), 0, None)
+            return loop.change(clock, whole, loop.signals(t, whole), {}, {}, None)._replace(plant=state.plant)
+
+        def seen(loop: Loop, state: Any, t: Any) -> Any:
+            whole = loop_state(loop, state)
+            sample = loop.signals(t, whole).sample
+            return [*sample.output, sample.target, sample.command, sample.control, sample.setpoint, loop.stop.margin(sample.output)]
+
+        return self.chart, rates, after, seen
+
+    def chart(self, loop: Loop) -> Any:
+        """Return the start of the loop in the coordinates of the proof."""
+        state = loop.start()
+        if not self.charted:
+            return state
+        y = loop.plant.output(state.plant)
+        return state._replace(plant=_Chart(y.slip, y.speed, state.plant.distance))
+
+    def initial_node(self, name: str) -> Node:
+        """Return the node of a parameter of the start."""
+        path = f"initial.{name}"
+        if path in self.paths:
+            return self.given[self.paths.index(path)]
+        return self.graph.const(float(getattr(self.loop.initial, name)))
+
+    def at_once(self, node: Node, same: dict[int, Node]) -> Node:
+        """Return the node with the nodes in `same` replaced."""
+        if node.id in same:
+            return same[node.id]
+        if not node.args:
+            return node
+        return self.graph.again(node, [self.at_once(arg, same) for arg in node.args])
+
+    def make(self, name: str, args: tuple[int, ...], value: Any = None) -> int:
+        """Return the index of an operation, a new one only if there is none."""
+        key = (name, args, value)
+        if key not in self.known:
+            self.operations.append(Operation(*key))
+            self.known[key] = len(self.operations) - 1
+        return self.known[key]
+
+    def number(self, value: float) -> int:
+        """Return the index of a constant."""
+        return self.make("const", (), float(value))
+
+    def paced(self, rate: int, speed: int) -> int:
+        """Return a rate times the speed."""
+        v = self.make("state", (), speed)
+        inverse = self.make("inv", (v,))
+        operation = self.operations[rate]
+        if operation.name == "mul" and inverse in operation.args:
+            return operation.args[0] if operation.args[1] == inverse else operation.args[1]
+        return v if operation == Operation("const", (), 1.0) else self.make("mul", (rate, v))
+
+    def function(self, name: str, u: int) -> int:
+        """Return a function of an operation; its second operand is the factor g of its derivative, dy = g du."""
+        key = (name, u)
+        if key in self.known:
+            return self.known[key]
+        at = len(self.operations)
+        match name:
+            case "exp":
+                self.operations.append(Operation(name, (u, at)))
+            case "sin" | "cos":
+                self.operations += [Operation("sin", (u, at + 1)), Operation("cos", (u, at + 2))]
+                self.operations.append(Operation("neg", (at,)))
+                self.known[("sin", u)], self.known[("cos", u)] = at, at + 1
+                return self.known[key]
+            case "log":
+                inverse = self.make("inv", (u,))
+                at = self.make(name, (u, inverse))
+            case "atan":
+                inverse = self.make("inv", (self.make("add", (self.number(1.0), self.make("mul", (u, u)))),))
+                at = self.make(name, (u, inverse))
+        self.known[key] = at
+        return at
+
+    def power(self, u: int, exponent: int, value: float) -> int:
+        """Return u^e of u >= 0. The factor of its derivative is e u^(e-1), as long as that is finite at u = 0."""
+        if value < 1:
+            key = ("power", u, exponent)
+            if key not in self.known:
+                at = len(self.operations)
+                # g = e u^e / u needs the result itself, so the three are made together
+                self.operations.append(Operation("power", (u, at + 3, exponent)))
+                self.operations += [Operation("inv", (u,)), Operation("mul", (at, at + 1)), Operation("mul", (exponent, at + 2))]
+                self.known[key] = at
+            return self.known[key]
+        less = self.power(u, self.make("sub", (exponent, self.number(1.0))), value - 1)
+        return self.make("power", (u, self.make("mul", (exponent, less)), exponent))
+
+    def convert(self, node: Node, same: dict[int, tuple[str, int]], done: dict[int, int] | None = None) -> int:
+        """Return the index of a node's operation; `same` has the nodes that are a state of the chart."""
+        memory = self.__dict__.setdefault("converted", {}).setdefault(tuple(sorted(same.items())), {})
+        stack = [node]
+        while stack:
+            top = stack[-1]
+            if top.id in memory:
+                stack.pop()
+                continue
+            if top.id in same:
+                memory[top.id] = self.make(same[top.id][0], (), same[top.id][1])
+                continue
+            pattern = _power_of(top)
+            needed = pattern if pattern else top.args
+            waiting = [arg for arg in needed if arg.id not in memory]
+            if waiting:
+                stack += waiting
+                continue
+            if pattern:
+                base, exponent = pattern
+                if exponent.op != "const":
+                    raise NoRule("a power whose exponent is not a number")
+                memory[top.id] = self.power(memory[base.id], memory[exponent.id], float(exponent.attr))
+            else:
+                memory[top.id] = self.operation(top, [memory[arg.id] for arg in top.args])
+        return memory[node.id]
+
+    def operation(self, node: Node, args: list[int]) -> int:
+        """Return the operation of a node whose operands are converted."""
+        make, number = self.make, self.number
+        match node.op:
+            case "const":
+                return make("truth", (), bool(node.attr)) if node.dtype == bool else number(node.attr)
+            case "input":
+                kind, index = node.attr
+                return make("param" if kind == LEAVES else "state", (), index)
+            case "add" | "sub" | "mul":
+                return make(node.op, tuple(args))
+            case "neg":
+                return make("neg", (args[0],))
+            case "div":
+                return self.division(*args)
+            case "min" | "lower" | "max" | "higher":
+                return self.extreme(node.op in ("min", "lower"), *args)
+            case "abs":
+                return make("select", (make("lt", (args[0], number(0.0))), args[0], make("neg", (args[0],))))
+            case "select" | "gate":
+                return self.selection(*args)
+            case "any":
+                return args[0]
+            case "convert" if node.args[0].dtype == bool:
+                return make("select", (args[0], number(0.0), number(1.0)))
+            case "convert" if node.args[0].op == "const":
+                return number(float(node.args[0].attr))
+            case "lt" | "le" | "eq" | "ne" | "and" | "or" | "not":
+                return make(node.op, tuple(args))
+            case "sqrt":
+                return self.power(args[0], number(0.5), 0.5)
+            case "exp" | "log" | "sin" | "cos" | "atan":
+                return self.function(node.op, args[0])
+            case "tan":
+                return make("mul", (self.function("sin", args[0]), make("inv", (self.function("cos", args[0]),))))
+            case "tanh":
+                growth = self.function("exp", make("mul", (number(2.0), args[0])))
+                part = make("mul", (number(2.0), make("inv", (make("add", (growth, number(1.0))),))))
+                return make("sub", (number(1.0), part))
+            case "log1p":
+                return self.function("log", make("add", (number(1.0), args[0])))
+            case "expm1":
+                return make("sub", (self.function("exp", args[0]), number(1.0)))
+        raise NoRule(f"{node.op}: the proof has no sound rule for this operation")
+
+    def division(self, x: int, y: int) -> int:
+        """Return x/y; k u/(u + c) becomes k (1 - c/(u + c)), in which u occurs once: the slopes then do not cancel."""
+        inverse, below = self.make("inv", (y,)), self.operations[y]
+        above = self.operations[x]
+        if below.name == "add":
+            for u, c in (below.args, below.args[::-1]):
+                if self.operations[c].name not in ("const", "param"):
+                    continue
+                if x == u or (above.name == "mul" and u in above.args):
+                    share = self.make("sub", (self.number(1.0), self.make("mul", (c, inverse))))
+                    other = None if x == u else above.args[0] if above.args[1] == u else above.args[1]
+                    made = share if other is None else self.make("mul", (other, share))
+                    return self.make("meet", (made, self.make("mul", (x, inverse))))  # the second is exactly 0 at u = 0
+        return self.make("mul", (x, inverse))
+
+    def extreme(self, least: bool, x: int, y: int) -> int:
+        """Return min(x, y) or max(x, y)."""
+        if self.operations[x].name == "const":
+            x, y = y, x
+        if self.operations[y].name == "const":
+            if np.isinf(self.operations[y].value):
+                return x if (self.operations[y].value > 0) == least else y
+            low, high = (-1, y) if least else (y, -1)
+            return self.make("clamp", (x, low, high))
+        # min(x, y) = y + min(x - y, 0)
+        gap, zero = self.make("sub", (x, y)), self.number(0.0)
+        return self.make("add", (y, self.make("clamp", (gap, -1, zero) if least else (gap, zero, -1))))
+
+    def selection(self, which: int, no: int, yes: int) -> int:
+        """Return a selection; the form x < low ? low : min(x, high) is a limit."""
+        if no == yes:
+            return no
+        asked, other = self.operations[which], self.operations[no]
+        if asked.name == "lt" and asked.args[1] == yes and self.operations[yes].name == "const":
+            x, low = asked.args
+            if other.name == "clamp" and other.args[0] == x and other.args[1] == -1:
+                if self.operations[low].value <= self.operations[other.args[2]].value:
+                    return self.make("clamp", (x, low, other.args[2]))
+            if no == x:
+                return self.make("clamp", (x, low, -1))
+        return self.make("select", (which, no, yes))
+
+
+class _Chart(NamedTuple):
+    """The states of a braked wheel in a proof: slip [1], speed [m/s], distance [m]."""
+
+    slip: Any
+    speed: Any
+    distance: Any
+
+
+def _power_of(node: Node) -> tuple[Node, Node] | None:
+    """Return base and exponent of a power as `core.numerics.power` writes it, for base >= 0; else None.
+
+    The form is base > 0 ? (base^2 != 0 ? exp(e (0.5 log(base^2 != 0 ? base^2 : 1))) : 0) : 0.
+    """
+    if node.op != "select" or node.args[0].op != "lt" or not node.args[0].args[0].is_number(0) or not node.args[1].is_number(0):
+        return None
+    base, inner = node.args[0].args[1], node.args[2]
+    if inner.op == "select" and inner.args[0].op == "ne" and inner.args[1].is_number(0):
+        inner = inner.args[2]
+    if inner.op != "exp" or inner.args[0].op != "mul":
+        return None
+    for exponent, rest in (inner.args[0].args, inner.args[0].args[::-1]):
+        if rest.op == "mul" and any(x.is_number(0.5) for x in rest.args):
+            log = next(x for x in rest.args if not x.is_number(0.5))
+            square = log.args[0] if log.op == "log" else log
+            if square.op == "select" and square.args[1].is_number(1):
+                square = square.args[2]
+            if log.op == "log" and square.op == "mul" and square.args == (base, base):
+                return base, exponent
+    return None
+
+
+def _clock_of(loop: Loop) -> float | None:
+    """Return the period of the loop's clock [s], or None; raise NoRule for events and for a second clock."""
+    periods = set()
+    for name in BLOCKS:
+        block = getattr(loop, name)
+        if isinstance(block, Sampled):
+            if float(block.delay) not in (0.0, float(block.period)):
+                raise NoRule(f"{name}.delay = {float(block.delay):g} s: only 0 and the whole period have a rule")
+        elif offers(block, "margins"):
+            raise NoRule(f"{name} of type {type(block).__name__} has events; a proof has no rule for events")
+        elif offers(block, "record"):
+            raise NoRule(f"{name} of type {type(block).__name__} records a signal; a proof has no rule for that")
+        if offers(block, "tick"):
+            period = getattr(block, "period", None)
+            if period is None:
+                raise NoRule(f"{name} of type {type(block).__name__} ticks with the integration grid, which a proof has not")
+            periods.add(float(period))
+    if len(periods) > 1:
+        raise NoRule(f"clocks of different periods: {', '.join(f'{x:g} s' for x in sorted(periods))}")
+    return next(iter(periods), None)
+
+
+def _text(path: Any) -> str:
+    """Return a path of a pytree as dotted text, without the words flow and held."""
+    words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
+    return ".".join(word for word in words if word not in ("flow", "held"))
+
+
+def check_slip_chart(loop: Loop) -> None:
+    """Check that the plant's slip is 1 - w/v and its start has the slip and the speed asked for, in exact arithmetic.
+
+    Both are rational functions of slip and speed for 0 <= slip < 1 and a speed above 1 cm/s. They are evaluated in
+    fractions at random points; a rational function that differs somewhere would agree there with probability 0.
+
+    Raises:
+        NoRule: They differ.
+    """
+    graph = RealGraph()
+    inputs = [graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(2)]
+
+    def seen(speed: Any, slip: Any) -> Any:
+        y = loop.plant.output(loop.plant.start(BrakeStart(speed=speed, slip=slip)))
+        return y.slip, y.speed, y.wheel_speed
+
+    closed = jax.make_jaxpr(seen)(*[jax.ShapeDtypeStruct((), np.float64)] * 2)
+    constants = [constant_array(graph, np.asarray(x)) for x in closed.consts]
+    roots = [x.item() for x in lower_jaxpr(graph, closed.jaxpr, constants, [scalar_array(x) for x in inputs])]
+    draw = random.Random(0)
+    for _ in range(CHART_TRIALS):
+        speed, slip = Fraction(draw.randint(2, 10**6), 100), Fraction(draw.randint(0, 10**6 - 1), 10**6)
+        values = _exact_values(roots, [speed, slip])
+        if values != [slip, speed, (1 - slip) * speed]:
+            raise NoRule(f"plant {type(loop.plant).__name__}: its slip is not 1 - w/v of its start")
+
+
+def _exact_values(roots: list[Node], given: list[Fraction]) -> list[Any]:
+    """Return the values of nodes in fractions."""
+    known: dict[int, Any] = {}
+
+    def value(node: Node) -> Any:
+        if node.id not in known:
+            known[node.id] = compute(node)
+        return known[node.id]
+
+    def compute(node: Node) -> Any:
+        if node.op == "const":
+            return bool(node.attr) if node.dtype == bool else Fraction(float(node.attr))
+        if node.op == "input":
+            return given[node.attr[1]]
+        x = [value(arg) for arg in node.args]
+        match node.op:
+            case "add": return x[0] + x[1]
+            case "sub": return x[0] - x[1]
+            case "mul": return x[0] * x[1]
+            case "div": return x[0] / x[1]
+            case "neg": return -x[0]
+            case "lt": return x[0] < x[1]
+            case "le": return x[0] <= x[1]
+            case "min" | "lower": return min(x)
+            case "max" | "higher": return max(x)
+            case "select": return x[2] if x[0] else x[1]
+        raise NoRule(f"{node.op} in the slip of the plant")
+
+    return [value(root) for root in roots]
