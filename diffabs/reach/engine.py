@@ -4,6 +4,7 @@ import concurrent.futures
 import ctypes
 import functools
 import pathlib
+import re
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -14,8 +15,7 @@ from diffabs.reach.equations import Equations, Operation
 from diffabs.runtime.process import core_count
 
 NATIVE_FOLDER = pathlib.Path(__file__).parent / "native"
-import os
-FLAGS = (*(["-DTRACE"] if os.environ.get("TRACE") else []), "-std=c++17", "-O2", "-march=native", "-frounding-math", "-ffp-contract=off", "-shared", "-fPIC", "-w")
+FLAGS = ("-std=c++17", "-O2", "-march=native", "-frounding-math", "-ffp-contract=off", "-shared", "-fPIC", "-w")
 CODES = ("const", "truth", "param", "state", "add", "sub", "neg", "mul", "inv", "clamp", "select", "meet", "lt", "le", "eq", "ne",
          "and", "or", "not", "exp", "log", "sin", "cos", "atan", "power")  # fmt: skip
 TABLES = 400  # parts of the horizon with weights of their own
@@ -52,25 +52,36 @@ def decimal_ends(value: float) -> tuple[float, float]:
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """Return the compiled prover.
+    """Return the compiled prover, after a test that its compiler keeps the rounding mode.
 
     Raises:
-        NoCompiler: No C++ compiler of this machine works.
+        NoCompiler: No C++ compiler of this machine works, or it ignores the rounding mode.
     """
-    text = f'#include "{NATIVE_FOLDER / "prove.cpp"}"\n'
     sources = [(NATIVE_FOLDER / name).read_text() for name in ("interval.h", "series.h", "prove.cpp")]
-    joined = "\n".join(part for part in sources)
-    del text
-    import re
-    joined = re.sub(r'#include "[a-z.]*"|#pragma once', "", joined)
-    import hashlib, os, subprocess, tempfile
-    path = pathlib.Path(tempfile.gettempdir()) / f"prove-{os.environ.get('TRACE')}{hashlib.sha256(joined.encode()).hexdigest()[:12]}.so"
-    if not path.exists():
-        src = path.with_suffix(".cpp"); src.write_text(joined)
-        subprocess.run(["g++", *FLAGS, str(src), "-o", str(path)], check=True)
-    lib = ctypes.CDLL(str(path))
-    lib.prove.restype = ctypes.c_long
-    return lib
+    text = "\n".join(re.sub(r'#include "[a-z.]*"|#pragma once', "", source) for source in sources)
+    try:
+        found = ctypes.CDLL(str(toolchain.build_library(text, FLAGS)))
+    except OSError as error:
+        raise toolchain.NoCompiler(str(error)) from None
+    found.prove.restype = ctypes.c_long
+    if found.rounds_upward() != 1:
+        raise toolchain.NoCompiler(f"{toolchain.find_compiler().version} ignores the rounding mode")
+    return found
+
+
+def apply_operation(name: str, a: np.ndarray, b: np.ndarray | None = None) -> np.ndarray:
+    """Return an operation of the prover on intervals, shape (count, 2); an interval without a value is infinite.
+
+    Args:
+        name: add, sub, mul, inv, exp, log, sin, cos, atan or power.
+        a: First operands, shape (count, 2).
+        b: Second operands, shape (count, 2); the exponents of power.
+    """
+    a = np.ascontiguousarray(a, float)
+    b = np.ascontiguousarray(a if b is None else b, float)
+    out = np.empty_like(a)
+    library().apply(CODES.index(name), ctypes.c_long(len(a)), *(x.ctypes.data_as(ctypes.c_void_p) for x in (a, b, out)))
+    return out
 
 
 class Cells(NamedTuple):
@@ -82,6 +93,8 @@ class Cells(NamedTuple):
         distance: Stop distance, low and high [m].
         least: Lower bounds of the signals.
         greatest: Upper bounds of the signals.
+        below: Values that the signals of every run of the cell fall below, or reach.
+        above: Values that the signals of every run of the cell rise above, or reach.
         reach: Greatest half width of the first signal that each parameter causes.
         reached: Time up to which the cell was proved [s].
         steps: Steps of the cell's group.
@@ -93,6 +106,8 @@ class Cells(NamedTuple):
     distance: np.ndarray
     least: np.ndarray
     greatest: np.ndarray
+    below: np.ndarray
+    above: np.ndarray
     reach: np.ndarray
     reached: np.ndarray
     steps: np.ndarray
@@ -111,6 +126,7 @@ class Prover:
         place = {state: i for i, state in enumerate(order_of)}
         self.states = tuple(e.states[i] for i in order_of)
         self.kept = len(kept)
+        self.clockwork = [place[i] for i in clockwork_states(e, kept) if place[i] < len(kept)]
         ops = e.operations
         arrays = {name: np.full(len(ops), -1, np.int32) for name in ("code", "a", "b", "c", "index")}
         low, high = np.zeros(len(ops)), np.zeros(len(ops))
@@ -149,7 +165,7 @@ class Prover:
         """Return the bounds of cells, shape (cells, parameters, 2)."""
         cells = np.ascontiguousarray(cells, float)
         count, np_, ns = len(cells), len(self.equations.params), len(self.signals)
-        out = np.zeros((count, 8 + 2 * ns + np_))
+        out = np.zeros((count, 8 + 4 * ns + np_))
         groups = [(i, min(i + LANES, count)) for i in range(0, count, LANES)]
         lib = library()
 
@@ -161,17 +177,18 @@ class Prover:
         with concurrent.futures.ThreadPoolExecutor(threads or core_count()) as pool:
             list(pool.map(one, groups))
         return Cells(out[:, 0].astype(int), out[:, 1:3], out[:, 3:5], out[:, 8 : 8 + 2 * ns : 2], out[:, 9 : 9 + 2 * ns : 2],
-                     out[:, 8 + 2 * ns :], out[:, 5], out[:, 6], out[:, 7])
+                     out[:, 8 + 2 * ns : 8 + 4 * ns : 2], out[:, 9 + 2 * ns : 9 + 4 * ns : 2], out[:, 8 + 4 * ns :], out[:, 5], out[:, 6], out[:, 7])
 
     def balance(self, centre: np.ndarray, scouts: int = 20000) -> None:
         """Choose the weights of Lohner's step along the run of the middle of the box."""
         nb = self.kept
         found = np.zeros((scouts, 2 + nb * nb))
         cell = np.ascontiguousarray(np.repeat(np.asarray(centre, float)[:, None], 2, 1))[None]
-        out = np.zeros((1, 8 + 2 * len(self.signals) + len(self.equations.params)))
+        out = np.zeros((1, 8 + 4 * len(self.signals) + len(self.equations.params)))
         count = library().prove(ctypes.byref(self.task), ctypes.c_long(1), np.ascontiguousarray(cell).ctypes.data_as(ctypes.c_void_p), out.ctypes.data_as(ctypes.c_void_p), found.ctypes.data_as(ctypes.c_void_p), ctypes.c_long(scouts))
-        self.scout = found[:count], out
-        keys = found[:count, 0]
+        self.scout = found[:count].copy(), out
+        found = found[:count][np.isfinite(found[:count]).all(1)]  # the first has no axes yet
+        count, keys = len(found), found[:, 0]
         if self.task.speed >= 0:
             keys = np.log(np.maximum(keys, 1e-3))
         self.task.keys_low, self.task.keys_high = min(keys[0], keys[-1]), max(keys[0], keys[-1])
@@ -180,8 +197,38 @@ class Prover:
         for k in range(TABLES):
             key = self.task.keys_low + (k + 0.5) / TABLES * (self.task.keys_high - self.task.keys_low)
             self.weights[k] = balance_weights(jacobians[np.abs(keys - key) < window].max(0))
+            for state in self.clockwork:
+                self.weights[k, state] = 2.0**20
             if self.task.speed >= 0:  # the speed drifts: an error in it matters less than the couplings of a period say
                 self.weights[k, self.task.speed] = self.weights[k, self.task.nonnegative] / 8
+
+
+def clockwork_states(e: Equations, states: list[int]) -> list[int]:
+    """Return the states that nothing but the time and such states move: they are the same in all runs."""
+    alone = set(states)
+    while True:
+        ends = [root for i in alone for root in (e.start[i], e.flow[i], *((e.tick[i],) if e.tick else ()))]
+        read = {i: _reads(e, [e.start[i], e.flow[i], *([e.tick[i]] if e.tick else [])]) for i in alone}
+        fewer = {i for i in alone if read[i][0] <= alone and not read[i][1]}
+        del ends
+        if fewer == alone:
+            return sorted(alone)
+        alone = fewer
+
+
+def _reads(e: Equations, roots: list[int]) -> tuple[set[int], bool]:
+    """Return the states that operations read, and whether they read a parameter."""
+    found, left, seen, varies = set(), list(roots), set(), False
+    while left:
+        i = left.pop()
+        if i in seen or i < 0:
+            continue
+        seen.add(i)
+        if e.operations[i].name == "state":
+            found.add(e.operations[i].value)
+        varies |= e.operations[i].name == "param"
+        left += list(e.operations[i].args)
+    return found, varies
 
 
 def balance_weights(matrix: np.ndarray) -> np.ndarray:
@@ -203,16 +250,7 @@ def balance_weights(matrix: np.ndarray) -> np.ndarray:
 def arrange_states(e: Equations, signals: tuple[str, ...]) -> tuple[list[int], list[int], list[int]]:
     """Return the states that a proof needs: those kept over a tick, those that a tick sets anew, and quadratures."""
     def reads(root: int) -> set[int]:
-        found, left, seen = set(), [root], set()
-        while left:
-            i = left.pop()
-            if i in seen or i < 0:
-                continue
-            seen.add(i)
-            if e.operations[i].name == "state":
-                found.add(e.operations[i].value)
-            left += list(e.operations[i].args)
-        return found
+        return _reads(e, [root])[0]
 
     live: set[int] = reads(e.margin).union(*(reads(e.signals[s]) for s in signals))
     while True:

@@ -61,18 +61,24 @@ inline I inverse(I a, M& none) {
   return {fill(-1.0) / high, fill(1.0) / low};
 }
 inline I inverse(I a) { M none{}; return inverse(a, none); }  // of an interval known to have no 0
-inline I over(int k) { return inverse(I((double)k)); }
 inline I clamped(I x, I low, I high) {
   return {vmin(low.n, vmax(x.n, high.n)), vmin(high.h, vmax(x.h, low.h))};
 }
 
+inline const I* inverses() {
+  static thread_local I table[32];
+  static thread_local bool made = false;
+  if (!made) { for (int k = 1; k < 32; k++) table[k] = inverse(I((double)k)); made = true; }  // in upward rounding
+  return table;
+}
+inline I over(int k) { return k < 32 ? inverses()[k] : inverse(I((double)k)); }
 // exp of points, |x| < 700: exp(x) = 2^n exp(y), |y| < 0.4, by a Taylor sum with its remainder.
 inline I exp_at(V x) {
   const double ln2 = 0x1.62e42fefa39efp-1;  // log(2) is in ln2 + [2.3190e-17, 2.3191e-17]
   V n, two;
   for (int i = 0; i < LANES; i++) n[i] = std::floor(x[i] / ln2 + 0.5), two[i] = std::ldexp(1.0, (int)n[i]);
   I y = point(x) - point(n) * (I(ln2) + span(fill(2.3190e-17), fill(2.3191e-17))), sum(1.0), term(1.0);
-  for (int k = 1; k <= 16; k++) term = term * y * over(k), sum = sum + term;
+  for (int k = 1; k <= 14; k++) term = term * y * inverses()[k], sum = sum + term;
   sum = sum + symmetric(term.mag());  // |y| < 0.7 even if n is off by rounding: the rest is below the last term
   return {sum.n * two, sum.h * two};
 }
@@ -170,6 +176,7 @@ inline I power_of(I x, I e, M& none) {
   I a = exp_of(log_of(point(low0 ? fill(1.0) : low), bad) * e, bad), b = exp_of(log_of(point(high0 ? fill(1.0) : high), bad) * e, bad);
   none |= bad;
   // below 1e-290 the power is at most that of 1e-290
-  V tiny = exp_at(vmax((log_of(I(1e-290), bad) * e).h, fill(-690.0))).h;
+  V tiny = fill(0.0);
+  if (any(high0 & (high > 0))) tiny = exp_at(vmax((log_of(I(1e-290), bad) * e).h, fill(-690.0))).h;
   return {low0 ? fill(0.0) : a.n, high0 ? (high == 0 ? fill(0.0) : tiny) : b.h};
 }

@@ -7,11 +7,6 @@
 // A limit is the chord lambda x + c with a disturbance |w| <= delta, which is 0 unless the set lies across the limit. At
 // a tick, w is one more direction. Within a step, w(t) is measurable, and Alekseev's formula bounds its effect.
 #include <cstdio>
-#ifdef TRACE
-#define SAY(...) fprintf(stderr, __VA_ARGS__)
-#else
-#define SAY(...)
-#endif
 #include <cstring>
 
 #include "series.h"
@@ -130,6 +125,7 @@ struct Group {
   std::vector<Row> rows;
   std::vector<I> C, J, X, B, f, push, low_high;
   std::vector<V> top, bottom;   // of signals
+  std::vector<V> above, below;  // every run of the cell goes above, and below, these values of the signals (low, -high)
   std::vector<V> reach;         // greatest |G| of signal 0 by each parameter: where a cell is split
   V pmid[16], phalf[16];
   M dead{}, done{};
@@ -152,7 +148,7 @@ struct Group {
         mid(t.tape, K, 0), whole(t.tape, K, nd), rest(t.tape, K + 1, 0), box(t.tape, 1, 0), jac(t.tape, 0, n + MAX_CLAMPS),
         at_tick(t.tape, 0, nd), at_tick_mid(t.tape, 0, 0), law(t.tape.count), tick_law(t.tape.count),
         set(nb, np), rows(t.quadratures), C(n), J(n * nd), X(n), B(n), f(n), push(n),
-        top(t.signals), bottom(t.signals), reach(np) {
+        top(t.signals), bottom(t.signals), above(t.signals), below(t.signals), reach(np) {
     for (int i : flow.list) if (t.tape.code[i] == CLAMP) clamps.push_back(i);
     for (int i : tick.list) if (t.tape.code[i] == CLAMP) tick_clamps.push_back(i);
     limited = !clamps.empty();
@@ -242,6 +238,11 @@ struct Group {
     lost |= bad & alive;
     alive &= ~lost;
     if (!any(alive)) return true;
+    for (int q = 0; q < task.signals; q++) {
+      I now_ = whole.value(task.signal[q], 0);
+      M seen_ = alive & ~whole.none[task.signal[q]];
+      above[q] = seen_ ? vmax(above[q], now_.low()) : above[q], below[q] = seen_ ? vmax(below[q], -now_.h) : below[q];
+    }
     std::vector<I> R0, R;
     for (int i : clamps) R0.push_back(whole.value(t.a[i], 0));
     R = R0;
@@ -287,7 +288,7 @@ struct Group {
       }
       if (all(ok | ~alive)) { found = true; break; }
     }
-    if (!found) { SAY("NOBOX h %g\n", h); for (int i = 0; i < n; i++) SAY("   X %.12g w %g B w %g next w %g f [%g %g]\n", X[i].h[0], X[i].width()[0], B[i].width()[0], (HH*f[i]).width()[0], -f[i].n[0], f[i].h[0]); for (size_t q=0;q<clamps.size();q++) SAY("   R0 w %g R w %g rate w %g none %lld\n", R0[q].width()[0], R[q].width()[0], (HH*box.value(t.a[clamps[q]],1)).width()[0], none[0]); return false; }
+    if (!found) return false;
     // X + [0, h] f(B) holds the runs as well, and is narrower.
     for (int again = 0; again < 2; again++) {
       rates(B);
@@ -311,7 +312,7 @@ struct Group {
     for (int i : clamps) crossing |= law[i].delta > 0;
     if (any(crossing & alive)) {
       across++;
-      if (h > 1.01 * near_step) { SAY("NEAR h %g near %g\n", h, near_step); return false; }
+      if (h > 1.01 * near_step) return false;  // up to a limit first, then across it in short steps
     }
     // 3. Taylor series.
     mid.natural = whole.natural = rest.natural = jac.natural = false;
@@ -389,7 +390,6 @@ struct Group {
     }
     // 7. The set at the end.
     excess = 1e-30;
-    for (int i = 0; i < n; i++) if (at[i] >= 0) SAY("state %d: C %g mid x1 [%g %g] rest x2 [%g %g] push %g B [%g %g]\n", i, C[i].h[0], -mid.value(at[i],1).n[0], mid.value(at[i],1).h[0], -rest.value(at[i],order+1).n[0], rest.value(at[i],order+1).h[0], push[i].h[0], -B[i].n[0], B[i].h[0]);
     for (int i = 0; i < n; i++) {
       if (at[i] < 0) continue;
       int a = at[i];
@@ -463,7 +463,6 @@ struct Group {
       for (int j = np + nb; j < nd; j++) E[i] = E[i] + symmetric(J[i * nd + j].mag());
       for (int j = 0; j < nb; j++) A[i * nb + j] = weight[i] * J[i * nd + np + j].mid();
     }
-    for (int i = 0; i < nb; i++) { double wp = 0, wr = 0, cp = 0, cr = 0; for (int j = 0; j < np + nb; j++) { I g = J[i * nd + j]; double w = 0.5 * g.width()[0], m = std::fabs(g.mid()[0]); if (j < np) wp += w, cp += m; else wr += w, cr += m; } SAY("ROW %d E %g C width %g Jp %g +- %g Jr %g +- %g\n", i, E[i].width()[0] / 2, C[i].width()[0] / 2, cp, wp, cr, wr); }
     orthonormal(A, nb);
     M broken{};
     inverted(A, inv, nb, broken);
@@ -549,12 +548,51 @@ struct Ending {
 
 extern "C" {
 
+// Whether sums, products and quotients are rounded upward as compiled, also those of numbers known at compile time.
+int rounds_upward() {
+  round_upward();
+  volatile double third = 3.0, tenth = 0.1;
+  V a = fill(1.0) / fill(third), b = fill(tenth) * fill(tenth), c = fill(1.0) + fill(1e-30), d = fill(1.0) / fill(3.0);
+  bool up = a[0] > 0x1.5555555555555p-2 && b[0] > 0x1.47ae147ae147bp-7 && c[0] > 1.0 && d[0] == a[0] && -(fill(-1.0) / fill(third))[0] < a[0];
+  std::fesetround(FE_TONEAREST);
+  return up;
+}
+
+// One operation on `count` pairs of intervals, for tests. codes: those of `Code`; out: low and high.
+void apply(int code, long count, const double* a, const double* b, double* out) {
+  round_upward();
+  for (long first = 0; first < count; first += LANES) {
+    I x(1.0), y(1.0), r(0.0), other;
+    for (int l = 0; l < LANES; l++) {
+      long i = first + l < count ? first + l : count - 1;
+      x.n[l] = -a[2 * i], x.h[l] = a[2 * i + 1], y.n[l] = -b[2 * i], y.h[l] = b[2 * i + 1];
+    }
+    M none{};
+    switch (code) {
+      case ADD: r = x + y; break;
+      case SUB: r = x - y; break;
+      case MUL: r = x * y; break;
+      case INV: r = inverse(x, none); break;
+      case EXP: r = exp_of(x, none); break;
+      case LOG: r = log_of(x, none); break;
+      case SIN: sin_cos(x, r, other, none); break;
+      case COS: sin_cos(x, other, r, none); break;
+      case ATAN: r = atan_of(x, none); break;
+      case POWER: r = power_of(x, y, none); break;
+    }
+    for (int l = 0; l < LANES && first + l < count; l++) {
+      out[2 * (first + l)] = none[l] ? -INFINITY : -r.n[l], out[2 * (first + l) + 1] = none[l] ? INFINITY : r.h[l];
+    }
+  }
+  std::fesetround(FE_TONEAREST);
+}
+
 // cells: params x (low, high) for each cell. out for each cell: status (1 ended, 2 horizon, 0 not proved), stop time low,
 // high, distance low, high, time reached, steps, ticks or steps across a limit, then (bottom, top) of signals, then reach.
 // scout: if not null, the Jacobian of every period (or step) of the first cell's centre, with its time; returns how many.
 long prove(const Task* task, long count, const double* cells, double* out, double* scout, long scouts) {
   round_upward();
-  const int np = (int)task->tape.params, nb = (int)task->kept, n = (int)task->states, ns = (int)task->signals, width = 8 + 2 * ns + np;
+  const int np = (int)task->tape.params, nb = (int)task->kept, n = (int)task->states, ns = (int)task->signals, width = 8 + 4 * ns + np;
   long scouted = 0;
   Group g(*task);
   const std::vector<int> at = g.state_op();
@@ -593,7 +631,7 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
     }
     for (auto& q : g.rows) { q.c = I(0.0), q.R = fill(0.0); q.G.assign(np, fill(0.0)); }
     for (int q = 0; q < task->quadratures; q++) g.rows[q].c = g.at_tick_mid.value(task->start[n + q], 0);
-    for (auto& x : g.top) x = fill(-1e300);
+    for (auto* every : {&g.top, &g.above, &g.below}) for (auto& x : *every) x = fill(-1e300);
     for (auto& x : g.bottom) x = fill(-1e300);
     for (auto& x : g.reach) x = fill(0.0);
     Ending end;
@@ -680,8 +718,6 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
           h *= 0.5, H = I(h), last = false;
         }
         begun = true;
-        SAY("excess %g h %g next %g near %g\n", g.excess, h, g.h_next, g.near_step);
-        SAY("step %ld ok %d lost %lld h %g order %d now %g X0 [%g %g] r %g f %g\n", g.steps, ok, lost_now[0], h, order, g.now, -g.X[0].n[0], g.X[0].h[0], g.set.r[0][0], g.f[0].h[0]);
         if (!ok) lost_now |= active;
         if (order == 1) {
           M singular{};
@@ -726,7 +762,6 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
       for (int i = 0; i < nb; i++) lost |= ~((vabs(g.set.c[i]) < 1e200) & (g.set.r[i] < 1e200)) & active;
       elapsed = sampled ? period * I((double)(tick + 1)) : elapsed + gone;
       g.now += at_time;
-      { double rr[8], gg[8]; for (int i = 0; i < nb; i++) { rr[i] = gg[i] = 0; for (int j = 0; j < nb; j++) rr[i] += std::fabs(g.set.B[i*nb+j][0]) * g.set.r[j][0]; for (int j = 0; j < np; j++) gg[i] += std::fabs(g.set.G[i*np+j][0]); } SAY("AFTER %g h %g c %g G %g r %g | v G %g r %g | z %g G %g r %g delta %g\n", g.now, at_time, g.set.c[0][0], gg[0], rr[0], gg[1], rr[1], g.set.c[2][0], gg[2], rr[2], g.limited ? g.law[g.clamps[0]].delta[0] : g.tick_law[g.tick_clamps[0]].delta[0]); }
       g.dead |= lost, active &= ~lost;
       reached = active ? (task->clock >= n ? g.rows[task->clock - n].c.low() : -elapsed.n) : reached;
       for (int p = 0; p < np; p++) g.reach[p] = active ? vmax(g.reach[p], vabs(g.set.G[(task->nonnegative >= 0 ? task->nonnegative : 0) * np + p])) : g.reach[p];
@@ -810,7 +845,8 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
       o[1] = stopped ? -T.n[l] : 0, o[2] = stopped ? T.h[l] : INFINITY, o[3] = stopped ? -X.n[l] : 0, o[4] = stopped ? X.h[l] : INFINITY;
       o[5] = reached[l], o[6] = (double)g.steps, o[7] = (double)g.across;
       for (int s = 0; s < ns; s++) o[8 + 2 * s] = -g.bottom[s][l], o[9 + 2 * s] = g.top[s][l];
-      for (int p = 0; p < np; p++) o[8 + 2 * ns + p] = g.reach[p][l];
+      for (int s = 0; s < ns; s++) o[8 + 2 * ns + 2 * s] = -g.below[s][l], o[9 + 2 * ns + 2 * s] = g.above[s][l];
+      for (int p = 0; p < np; p++) o[8 + 4 * ns + p] = g.reach[p][l];
     }
   }
   std::fesetround(FE_TONEAREST);

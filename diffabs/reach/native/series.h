@@ -85,7 +85,7 @@ struct Series {
   bool use_forced = false;
 
   Series(const Tape& t, int orders, int nd)
-      : tape(&t), orders(orders), nd(nd), v(t.count * (orders + 2)), d(t.count * (orders + 2) * (nd ? nd : 1)), none(t.count), yes(t.count), no(t.count), kind(t.count), forced(t.count) {
+      : tape(&t), orders(orders), nd(nd), v(t.count * (orders + 2)), d(t.count * (orders + 2) * (nd ? nd : 1)), none(t.count), yes(t.count), no(t.count), kind(t.count), forced(t.count), round(t.count, -1) {
     forget();
     for (int i = 0; i < t.count; i++) {
       auto of = [&](int j) { return j < 0 ? 0 : (int)kind[j]; };
@@ -113,11 +113,12 @@ struct Series {
 
   // The coefficients of order `k` of all operations of a program (of those with a lag: of an earlier order).
   void advance(const Program& p, int k) {
-    if (k == 0) for (int i : p.list) if (kind[i] == 2) none[i] = M{};
+    if (k == 0) { rounds++; for (int i : p.list) if (kind[i] == 2) none[i] = M{}; }
     for (int i : p.order) if (k >= p.lag[i]) once(i, k - p.lag[i], has_value, &Series::values);
     if (nd == 0) return;
     for (int i : p.dorder) if (k >= p.dlag[i]) once(i, k - p.dlag[i], has_slope, &Series::slopes);
     // Once more, operands first: each value is also within the mean value form, and so are the values made from it.
+    if (k == 0 && centre) rounds++;
     if (k == 0 && centre) for (int i : p.list) {
       if (p.lag[i] || kind[i] < 2) continue;
       values(i, 0);
@@ -210,7 +211,18 @@ struct Series {
             case EXP: y = exp_of(x, bad); break;
             case LOG: y = log_of(x, bad); break;
             case ATAN: y = atan_of(x, bad); break;
-            case POWER: y = power_of(x, value(c, 0), bad); break;
+            case POWER: {
+              if (tape->b[i] >= 0 && round[i] == rounds) return;
+              round[i] = rounds;
+              // u^e = u u^(e-1), whose factor g = e u^(e-1) is the second operand
+              int less = e_above_one(i) ? t.b[b] : -1;
+              if (less < 0) { y = power_of(x, value(c, 0), bad); break; }
+              once(t.c[less], 0, has_value, &Series::values);
+              values(less, 0);
+              bad |= none[less];
+              y = x * value(less, 0);
+              break;
+            }
             default: sin_cos(x, s, co, bad); y = t.code[i] == SIN ? s : co;
           }
           none[i] = none[a] | bad;
@@ -285,6 +297,9 @@ struct Series {
       }
     }
   }
+  bool e_above_one(int i) const { int b = tape->b[i]; return tape->code[b] == MUL && tape->code[tape->b[b]] == POWER && tape->b[b] != i; }
+  std::vector<long> round;  // when a power was computed
+  long rounds = 0;
   int own = -1;            // first direction of the clamps' own disturbances
   std::vector<int> seeds;  // the clamps that have one
   std::vector<V> widths, seed_scale;  // of the clamps of a tick: the disturbance over the set, and along its direction

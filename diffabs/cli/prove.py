@@ -1,0 +1,207 @@
+"""The command `prove`: bounds of all runs of a box of parameters, of the nonlinear loop with its limits."""
+
+import json
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from diffabs.cli import console, show_proofs, targets
+from diffabs.cli import show as views
+from diffabs.config.values import ScenarioError, format_given, unknown_name_error
+from diffabs.core.types import JsonObject
+from diffabs.runtime import provenance
+from diffabs.scenario.parameter_paths import parameters_of, read_entries
+from diffabs.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from diffabs.reach import BoxProof, Claim
+
+GRID = (9, 17)  # runs along the first and the other parameters, among which the worst is looked for
+NO_LOCK, OVERSHOOT, TIMES = "no_lock", "overshoot", ("stop_time", "stop_distance")
+
+
+def prove(
+    scenario: console.ScenarioName,
+    over: Annotated[
+        list[str], typer.Option("--over", metavar="PATH=LOW:HIGH", help="Range of a parameter; may be repeated.")
+    ],
+    claim: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--claim",
+            metavar="NAME[=BOUND]",
+            help="max_SIGNAL, min_SIGNAL, overshoot, stop_time, stop_distance or no_lock; may be repeated.",
+        ),
+    ] = None,
+    changes: console.Changes = None,
+    budget: Annotated[float, typer.Option(help="Computing time of the proof [s].")] = 60.0,
+    out: Annotated[pathlib.Path | None, typer.Option(help="Write the certificate to this file.")] = None,
+    as_json: console.Json = False,
+) -> None:
+    """Prove bounds of every run of a box of parameters, with torque limits, lag and sampling.
+
+    Without a claim: the best bounds within the budget.
+    Exit status: 0 proved, 1 refuted or undecided, 2 wrong input."""
+    with console.end_on_errors():
+        if not 0 < budget < math.inf:
+            console.fail(f"--budget = {budget:g} is outside (0, inf) s")
+        from diffabs.compiler.runtime.toolchain import NoCompiler
+        from diffabs.reach import NoRule, prove_box
+
+        chosen = console.load_scenario(scenario, changes or (), integrated=False)
+        box = _read_box(over, chosen)
+        claims = [_read_claim(text, chosen) for text in claim or ()]
+        if "slip" not in chosen.loop.plant.shows._fields and not claims:
+            raise ScenarioError(f"--claim is needed: the plant has no slip; it has {', '.join(chosen.loop.plant.shows._fields)}")
+        signals = ("slip",) if "slip" in chosen.loop.plant.shows._fields else ()
+        far = [""]
+        with targets.new_target_file(out, "--out") as file:
+            try:
+                known, suspects = _worst_runs(chosen, box)
+                proof = console.run_with_progress(
+                    lambda: prove_box(
+                        chosen.loop, box, claims, signals=signals, horizon=chosen.solver.duration, budget=budget,
+                        known=known, suspects=suspects, progress=lambda line: far.__setitem__(0, line),
+                    ),
+                    f"proving {chosen.name}",
+                    lambda: far[0],
+                )  # fmt: skip
+            except (NoRule, NoCompiler) as error:
+                raise ScenarioError(str(error)) from None
+            result = _document(proof, chosen, box, claims, known)
+            if file:
+                from diffabs.reach.certificate import certificate_document
+                from diffabs.scenario.scenario import dump
+
+                file.write_text(json.dumps(certificate_document(proof, dump(chosen), box, claims)) + "\n")
+                result["files"] = {"certificate": str(out)}
+        views.as_json(result) if as_json else show_proofs.show_box_proof(result, chosen)
+        if proof.verdict != "proved":
+            console.fail(f"{chosen.name}: {proof.verdict}: {result['reason']}", console.FAILED)
+
+
+def _read_box(given: Sequence[str], chosen: Scenario) -> dict[str, tuple[float, float]]:
+    """Return the range of each parameter in SI, widened by a rounding so that it holds the decimal numbers given."""
+    table: JsonObject = {}
+    for text in given:
+        path, equals, ends = text.partition("=")
+        low, colon, high = ends.partition(":")
+        try:
+            pair = [float(low), float(high)]
+        except ValueError:
+            pair = []
+        if not (equals and colon and pair):
+            raise ScenarioError(f"--over {format_given(text)} is not of the form path=low:high")
+        if path.strip() in table:
+            raise ScenarioError(f"--over {path.strip()} is given twice")
+        table[path.strip()] = pair
+    box = {}
+    for entry in read_entries(table, "--over", parameters_of(chosen.loop), "not a parameter of this loop"):
+        if entry.shape:
+            raise ScenarioError(f"{entry.where} is a list; a proof varies single numbers")
+        low, high = entry.range()
+        box[entry.path] = (float(np.nextafter(low, -np.inf)), float(np.nextafter(high, np.inf)))
+    return box
+
+
+def _read_claim(text: str, chosen: Scenario) -> "Claim":
+    """Return a claim about a signal, the stop time or the stop distance. Raises ScenarioError."""
+    from diffabs.reach import Claim
+
+    name, equals, given = text.partition("=")
+    signals = chosen.loop.plant.shows._fields
+    known = [*(f"{word}_{signal}" for signal in signals for word in ("max", "min")), *TIMES]
+    known += [OVERSHOOT, NO_LOCK] if "slip" in signals else []
+    if name not in known:
+        raise unknown_name_error(f"--claim {name} is not a quantity of this loop", name, known)
+    if name == NO_LOCK:
+        if equals:
+            raise ScenarioError("--claim no_lock has no bound: it says that the slip stays below 1")
+        return Claim("greatest slip", float(np.nextafter(1.0, 0.0)))
+    try:
+        bound = float(given)
+    except ValueError:
+        raise ScenarioError(f"--claim {text} needs a number: {name}=BOUND") from None
+    if name == OVERSHOOT:
+        return Claim("greatest slip", (1 + bound) * _target(chosen))
+    if name in TIMES:
+        return Claim(name, bound)
+    word, _, signal = name.partition("_")
+    return Claim(f"{'greatest' if word == 'max' else 'least'} {signal}", bound)
+
+
+def _target(chosen: Scenario) -> float:
+    """Return the target slip of the reference."""
+    loop = chosen.loop
+    return float(loop.reference.setpoint(loop.start().reference))
+
+
+def _worst_runs(chosen: Scenario, box: dict[str, tuple[float, float]]) -> tuple[dict[str, float], list[list[float]]]:
+    """Return the greatest slip, stop time and stop distance in a grid of runs, and the points of these runs."""
+    import diffabs as d
+    from diffabs.core.protocols import BrakeOutput
+    from diffabs.objectives import Overshoot, StopDistance, StopTime
+
+    if chosen.loop.plant.shows is not BrakeOutput:
+        return {}, []
+    counts = [GRID[min(i, 1)] if len(box) < 3 else 5 for i in range(len(box))]
+    axes = [np.linspace(low, high, n)[:: max(1, (n - 1))] if low == high else np.linspace(low, high, n)
+            for (low, high), n in zip(box.values(), counts, strict=True)]  # fmt: skip
+    points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], 1)
+    metrics = {"overshoot": Overshoot(), "stop_time": StopTime(), "stop_distance": StopDistance()}
+    batch = d.Batch(dict(zip(box, points.T, strict=True)))
+    runs = d.run_batch(chosen.loop, batch, chosen.solver, metrics)
+    found = {name: np.asarray(column) for name, column in runs.metrics.items()}
+    found["greatest slip"] = (1 + found.pop("overshoot")) * _target(chosen)
+    worst = {name: int(np.nanargmax(column)) for name, column in found.items() if np.isfinite(column).any()}
+    return (
+        {name: float(found[name][i]) for name, i in worst.items()},
+        [points[i].tolist() for i in dict.fromkeys(worst.values())],
+    )
+
+
+def _document(
+    proof: "BoxProof", chosen: Scenario, box: dict[str, tuple[float, float]], claims: Sequence["Claim"],
+    known: dict[str, float],
+) -> JsonObject:  # fmt: skip
+    """Return the JSON document; a bound that is not proved is null."""
+    units = {"stop_time": "s", "stop_distance": "m"}
+    shown = chosen.loop.plant.shows.units
+    bounds = {}
+    for name, (low, high) in proof.bounds.items():
+        row = {"low": low, "high": high, "unit": units.get(name) or shown.get(name.split()[-1], "")}
+        bounds[name] = {key: x if isinstance(x, str) or math.isfinite(x) else None for key, x in row.items()}
+        if name in known:
+            bounds[name]["worst_run"] = known[name]
+            bounds[name]["looseness"] = (high - known[name]) / known[name] if math.isfinite(high) else None
+    widths = np.array([high - low for low, high in box.values()])
+    shares = ((proof.left[:, :, 1] - proof.left[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1) if len(proof.left) else np.zeros(0)
+    refuting = None if proof.refuting is None else {path: ends.tolist() for path, ends in zip(box, proof.refuting, strict=True)}
+    if proof.verdict == "refuted":
+        reason = "every run violates the claim where " + ", ".join(
+            f"{path} = {ends[0]:.6g}" if ends[0] == ends[1] else f"{path} in [{ends[0]:.6g}, {ends[1]:.6g}]"
+            for path, ends in (refuting or {}).items()
+        )
+    elif proof.verdict == "undecided":
+        reason = f"{100 * shares.sum():.3g} % of the box is left in {len(proof.left):,} cells; a greater --budget goes on"
+    else:
+        reason = ""
+    return {
+        **console.describe_source(chosen),
+        "verdict": proof.verdict,
+        "reason": reason,
+        "over": {path: list(ends) for path, ends in box.items()},
+        "claims": [claim._asdict() for claim in claims],
+        "bounds": bounds,
+        "refuted_by": refuting,
+        "cells": len(proof.cells),
+        "left": len(proof.left),
+        "share_left": float(shares.sum()),
+        "tried": proof.tried,
+        "seconds": proof.seconds,
+        "versions": provenance.versions("numpy"),
+    }

@@ -1,0 +1,30 @@
+"""The view of a proof over a box."""
+
+from rich.table import Table
+
+from diffabs.cli.console import say
+from diffabs.cli.show import show_titled_table
+from diffabs.core.types import JsonObject
+from diffabs.scenario.scenario import Scenario
+
+
+def show_box_proof(result: JsonObject, chosen: Scenario) -> None:
+    """Show the verdict and the proved bounds of a box.
+
+    Args:
+        result: JSON document of the proof.
+        chosen: Scenario.
+    """
+    box = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in result["over"].items())
+    table = Table("quantity", "proved from", "to", "unit", "worst run found", "looseness")
+    for name, row in result["bounds"].items():
+        ends = ("" if row[key] is None else f"{row[key]:.6g}" for key in ("low", "high"))
+        worst = f"{row['worst_run']:.6g}" if "worst_run" in row else ""
+        loose = f"{100 * row['looseness']:.2g} %" if row.get("looseness") is not None else ""
+        table.add_row(name, *ends, row["unit"], worst, loose)
+    if result["verdict"] == "proved":
+        show_titled_table(f"{chosen.title or chosen.name}: proved for every {box}", table)
+    for claim in result["claims"]:
+        relation = ">=" if claim["quantity"].startswith("least") else "<="
+        say(f"{result['verdict']}: {claim['quantity']} {relation} {claim['bound']:.6g}")
+    say(f"{result['cells']:,} cells proved, {result['tried']:,} tried, {result['seconds']:.1f} s")
