@@ -122,14 +122,14 @@ def prove_box(
         rows.append(_select(found, fine))
         again, reach = now[~fine], found.reach[~fine]
         small = ((again[:, :, 1] - again[:, :, 0]) <= SMALLEST * sides).all(1)
-        left = np.concatenate([left, again[small], _halve(again[~small], reach[~small])])
+        left = np.concatenate([left, again[small], _halve(again[~small], reach[~small], sides)])
         if small.any():
             break
         progress(f"{sum(map(len, done)):,} cells proved, {len(left):,} left")
     cells = np.concatenate(done) if done else np.empty((0, *box.shape))
     merged = Cells(*(np.concatenate(columns) for columns in zip(*rows, strict=True))) if rows else None
     if not claims and not len(left) and merged is not None:
-        cells, merged, more = _refine(prover, quantities, cells, merged, known or {}, began + budget, progress, threads)
+        cells, merged, more = _refine(prover, quantities, cells, merged, sides, known or {}, began + budget, progress, threads)
         tried += more
     covered = not len(left) and merged is not None
     if covered and sum(map(_volume, cells)) != _volume(box):
@@ -196,12 +196,15 @@ def _select(found: Cells, which: np.ndarray) -> Cells:
     return Cells(*(column[which] for column in found))
 
 
-def _halve(cells: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Return the halves of cells, each along the parameter that moves its first signal most."""
+def _halve(cells: np.ndarray, reach: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Return the halves of cells, each along a parameter that moves its first signal much, or has not been halved much."""
     if not len(cells):
         return cells
     widths = cells[:, :, 1] - cells[:, :, 0]
-    side = np.where(np.isfinite(reach) & (widths > 0), reach, -1.0).argmax(1)
+    shares = widths / np.where(sides > 0, sides, 1.0)
+    moves = np.where(np.isfinite(reach), reach, 0.0)
+    score = sum(x / np.maximum(x.max(1, keepdims=True), 1e-300) for x in (shares, moves))
+    side = np.where(widths > 0, score, -1.0).argmax(1)
     rows = np.arange(len(cells))
     middle = 0.5 * (cells[rows, side, 0] + cells[rows, side, 1])
     left, right = cells.copy(), cells.copy()
@@ -216,7 +219,7 @@ def _volume(cell: np.ndarray) -> Fraction:
 
 
 def _refine(
-    prover: Prover, quantities: _Quantities, cells: np.ndarray, rows: Cells, known: Mapping[str, float], until: float,
+    prover: Prover, quantities: _Quantities, cells: np.ndarray, rows: Cells, sides: np.ndarray, known: Mapping[str, float], until: float,
     progress: Callable[[str], None], threads: int | None,
 ) -> tuple[np.ndarray, Cells, int]:  # fmt: skip
     """Halve the cells whose upper bound is far from the worst run found, until the time is over."""
@@ -230,7 +233,7 @@ def _refine(
             worst[order[far[order]]] = True
         if not worst.any():
             break
-        halves = _halve(cells[worst], rows.reach[worst])
+        halves = _halve(cells[worst], rows.reach[worst], sides)
         found = prover.prove(halves, threads)
         tried += len(halves)
         n = int(worst.sum())

@@ -26,6 +26,7 @@ struct Task {
   double keys_low, keys_high;
 };
 
+constexpr long MAX_STEPS = 200000;  // of a group
 constexpr int MAX_CLAMPS = 6;  // disturbances of one tick
 
 struct Row { I c; std::vector<V> G; V R; };  // a quadrature: c + G p + [-R, R]
@@ -653,6 +654,7 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
       I slope_seen(0.0), speed_seen(0.0), pace_seen(0.0);
       M seen{};
       bool over_period = false;
+      int substeps = 0;
       while (!over_period && any(active)) {
         // the length of the step
         double h = std::fmin(g.h_next, longest);
@@ -724,6 +726,9 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
           for (int i = 0; i < n; i++) singular |= g.mid.none[task->flow[i]] | g.whole.none[task->flow[i]] | g.rest.none[task->flow[i]];
           lost_now |= singular & active;
         }
+        // A set that grows without end, or that needs ever shorter steps, proves nothing: a smaller cell may.
+        if (task->nonnegative >= 0) lost_now |= ~(g.X[task->nonnegative].width() < 0.3) & active;
+        if (++substeps > (sampled ? 100 : 1) || g.steps > MAX_STEPS) lost_now |= active;
         for (int i = 0; i < n; i++) lost_now |= ~((g.X[i].n < 1e200) & (g.X[i].h < 1e200)) & active;
         lost |= lost_now, active &= ~lost_now;
         gone = gone + H, at_time += h;
