@@ -56,7 +56,9 @@ def prove(
         box = _read_box(over, chosen)
         claims = [_read_claim(text, chosen) for text in claim or ()]
         if "slip" not in chosen.loop.plant.shows._fields and not claims:
-            raise ScenarioError(f"--claim is needed: the plant has no slip; it has {', '.join(chosen.loop.plant.shows._fields)}")
+            raise ScenarioError(
+                f"--claim is needed: the plant has no slip; it has {', '.join(chosen.loop.plant.shows._fields)}"
+            )
         signals = ("slip",) if "slip" in chosen.loop.plant.shows._fields else ()
         far = [""]
         with targets.new_target_file(out, "--out") as file:
@@ -179,15 +181,25 @@ def _document(
             bounds[name]["worst_run"] = known[name]
             bounds[name]["looseness"] = (high - known[name]) / known[name] if math.isfinite(high) else None
     widths = np.array([high - low for low, high in box.values()])
-    shares = ((proof.left[:, :, 1] - proof.left[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1) if len(proof.left) else np.zeros(0)
-    refuting = None if proof.refuting is None else {path: ends.tolist() for path, ends in zip(box, proof.refuting, strict=True)}
+    shares = (
+        ((proof.left[:, :, 1] - proof.left[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1)
+        if len(proof.left)
+        else np.zeros(0)
+    )
+    refuting = (
+        None
+        if proof.refuting is None
+        else {path: ends.tolist() for path, ends in zip(box, proof.refuting, strict=True)}
+    )
     if proof.verdict == "refuted":
         reason = "every run violates the claim where " + ", ".join(
             f"{path} = {ends[0]:.6g}" if ends[0] == ends[1] else f"{path} in [{ends[0]:.6g}, {ends[1]:.6g}]"
             for path, ends in (refuting or {}).items()
         )
     elif proof.verdict == "undecided":
-        reason = f"{100 * shares.sum():.3g} % of the box is left in {len(proof.left):,} cells; a greater --budget goes on"
+        reason = (
+            f"{100 * shares.sum():.3g} % of the box is left in {len(proof.left):,} cells; a greater --budget goes on"
+        )
     else:
         reason = ""
     return {

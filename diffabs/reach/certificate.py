@@ -28,7 +28,7 @@ def certificate_document(
         "over": {path: list(ends) for path, ends in over.items()},
         "claims": [claim._asdict() for claim in claims],
         "signals": list(proof.prover.signals),
-        "horizon": float(proof.prover.task.horizon),
+        "horizon": proof.prover.horizon,
         "bounds": {name: [x if math.isfinite(x) else None for x in ends] for name, ends in proof.bounds.items()},
         "cells": proof.cells.tolist(),
         "versions": provenance.versions("numpy"),

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,7 +57,7 @@ class BoxProof(NamedTuple):
     verdict: str
     bounds: dict[str, tuple[float, float]]
     cells: np.ndarray
-    rows: Cells
+    rows: Cells | None
     left: np.ndarray
     refuting: np.ndarray | None
     tried: int
@@ -104,7 +104,7 @@ def prove_box(
     prover = Prover(equations, wanted, horizon)
     box = np.array([over[path] for path in paths], float)
     fastest = [high if path == "initial.speed" else (low + high) / 2 for path, (low, high) in over.items()]
-    prover.balance(np.array(fastest))
+    prover.choose_weights(np.array(fastest))
     sides = box[:, 1] - box[:, 0]
     quantities = _Quantities(prover.signals)
     left, done, rows, refuting, tried = box[None], [], [], None, 0
@@ -129,12 +129,14 @@ def prove_box(
     cells = np.concatenate(done) if done else np.empty((0, *box.shape))
     merged = Cells(*(np.concatenate(columns) for columns in zip(*rows, strict=True))) if rows else None
     if not claims and not len(left) and merged is not None:
-        cells, merged, more = _refine(prover, quantities, cells, merged, sides, known or {}, began + budget, progress, threads)
+        cells, merged, more = _refine(
+            prover, quantities, cells, merged, sides, known or {}, began + budget, progress, threads
+        )
         tried += more
     covered = not len(left) and merged is not None
-    if covered and sum(map(_volume, cells)) != _volume(box):
+    if covered and sum((_volume(cell) for cell in cells.tolist()), Fraction(0)) != _volume(box.tolist()):
         raise AssertionError("the cells do not cover the box")
-    bounds = quantities.over_all(merged) if covered else quantities.nothing()
+    bounds = quantities.over_all(merged) if covered and merged is not None else quantities.nothing()
     verdict = "refuted" if refuting is not None else "proved" if covered else "undecided"
     return BoxProof(verdict, bounds, cells, merged, left, refuting, tried, time.monotonic() - began, equations, prover)
 
@@ -146,7 +148,11 @@ class _Quantities:
         self.signals = tuple(signals)
 
     def names(self) -> list[str]:
-        return [*(f"{word} {name}" for name in self.signals for word in ("greatest", "least")), "stop_time", "stop_distance"]
+        return [
+            *(f"{word} {name}" for name in self.signals for word in ("greatest", "least")),
+            "stop_time",
+            "stop_distance",
+        ]
 
     def of_cells(self, found: Cells, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return, for each cell, proved lower and upper bounds of a quantity of all its runs."""
@@ -185,7 +191,7 @@ def _violated(quantities: _Quantities, claims: Sequence[Claim], cells: np.ndarra
     for claim in claims:
         low, high = quantities.of_cells(found, claim.quantity)
         wrong = high < claim.bound if claim.quantity.startswith("least") else low > claim.bound
-        # A stop is proved only for a cell that ended. A signal has gone above its value even if the proof broke off later.
+        # A stop is proved only for a cell that ended. A signal went above its value even if the proof broke off later.
         wrong = wrong & (found.status == 1) if " " not in claim.quantity else wrong
         if wrong.any():
             return cells[np.flatnonzero(wrong)[0]]
@@ -197,7 +203,10 @@ def _select(found: Cells, which: np.ndarray) -> Cells:
 
 
 def _halve(cells: np.ndarray, reach: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Return the halves of cells, each along a parameter that moves its first signal much, or has not been halved much."""
+    """Return the halves of cells.
+
+    A cell is halved along a parameter that moves its first signal much, or that has not been halved often.
+    """
     if not len(cells):
         return cells
     widths = cells[:, :, 1] - cells[:, :, 0]
@@ -212,15 +221,15 @@ def _halve(cells: np.ndarray, reach: np.ndarray, sides: np.ndarray) -> np.ndarra
     return np.concatenate([left, right])
 
 
-def _volume(cell: np.ndarray) -> Fraction:
+def _volume(cell: Any) -> Fraction:
     """Return the product of the widths that are not 0, exactly."""
-    widths = (Fraction(float(high)) - Fraction(float(low)) for low, high in cell)
+    widths = (Fraction(high) - Fraction(low) for low, high in cell)
     return math.prod((w for w in widths if w), start=Fraction(1))
 
 
 def _refine(
-    prover: Prover, quantities: _Quantities, cells: np.ndarray, rows: Cells, sides: np.ndarray, known: Mapping[str, float], until: float,
-    progress: Callable[[str], None], threads: int | None,
+    prover: Prover, quantities: _Quantities, cells: np.ndarray, rows: Cells, sides: np.ndarray,
+    known: Mapping[str, float], until: float, progress: Callable[[str], None], threads: int | None,
 ) -> tuple[np.ndarray, Cells, int]:  # fmt: skip
     """Halve the cells whose upper bound is far from the worst run found, until the time is over."""
     tried = 0

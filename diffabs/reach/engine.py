@@ -5,38 +5,61 @@ import ctypes
 import functools
 import pathlib
 import re
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
 
 from diffabs.compiler.runtime import toolchain
-from diffabs.reach.equations import Equations, Operation
+from diffabs.reach.equations import Equations, NoRule, Operation
 from diffabs.runtime.process import core_count
 
 NATIVE_FOLDER = pathlib.Path(__file__).parent / "native"
-FLAGS = ("-std=c++17", "-O2", "-march=native", "-frounding-math", "-ffp-contract=off", "-shared", "-fPIC", "-w")
-CODES = ("const", "truth", "param", "state", "add", "sub", "neg", "mul", "inv", "clamp", "select", "meet", "lt", "le", "eq", "ne",
-         "and", "or", "not", "exp", "log", "sin", "cos", "atan", "power")  # fmt: skip
-TABLES = 400  # parts of the horizon with weights of their own
-LANES = 8
+# -frounding-math: nothing is folded or moved as if rounding were to nearest. -ffp-contract=off: a product is a product.
+FLAGS = (
+    *("-std=c++17", "-O2", "-march=native", "-frounding-math", "-ffp-contract=off"),
+    *("-shared", "-fPIC", "-w"),
+)
+CODES = (
+    *("const", "truth", "param", "state", "add", "sub", "neg", "mul", "inv", "clamp", "select", "meet"),
+    *("lt", "le", "eq", "ne", "and", "or", "not", "exp", "log", "sin", "cos", "atan", "power"),
+)  # in the order of `Code` in series.h
+TABLES = 400  # parts of the range of speeds, or of the horizon, with weights of their own
+SPEED_SHARE = 8  # weight of the slip over that of the speed, which drifts: the couplings of a period say too much of it
+NEAR = 0.3  # logarithm of the ratio of speeds whose couplings count together
+CLOCKWORK_WEIGHT = 2.0**20  # of states that are the same in all runs: nothing else mixes with them
+SCOUTED = 20_000  # periods, or steps, of the run that the weights are chosen by
+LANES = 8  # cells that are proved at a time
+SETTINGS = {"order": 6, "tolerance": 3e-7, "slowest": 0.02, "first": 1e-5, "shortest": 1e-8}
 
 
 class _Tape(ctypes.Structure):
-    _fields_ = [("count", ctypes.c_long), *((x, ctypes.c_void_p) for x in ("code", "a", "b", "c", "low", "high", "index")),
-                ("params", ctypes.c_long), ("states", ctypes.c_long)]  # fmt: skip
+    """The struct `Tape` of series.h."""
+
+    _fields_ = [
+        ("count", ctypes.c_long),
+        *((name, ctypes.c_void_p) for name in ("code", "a", "b", "c", "low", "high", "index")),
+        *((name, ctypes.c_long) for name in ("params", "states")),
+    ]
 
 
 class _Task(ctypes.Structure):
+    """The struct `Task` of prove.cpp."""
+
     _fields_ = [
-        ("tape", _Tape), ("states", ctypes.c_long), ("kept", ctypes.c_long), ("quadratures", ctypes.c_long),
-        ("start", ctypes.c_void_p), ("flow", ctypes.c_void_p), ("tick", ctypes.c_void_p), ("signals", ctypes.c_long),
-        ("signal", ctypes.c_void_p), ("margin", ctypes.c_long), ("travelled", ctypes.c_long), ("clock", ctypes.c_long),
-        ("nonnegative", ctypes.c_long), ("speed", ctypes.c_long),
-        *((x, ctypes.c_double) for x in ("slowest", "period_low", "period_high", "horizon", "tolerance", "longest", "shortest", "first")),
-        ("order", ctypes.c_long), ("tables", ctypes.c_long), ("weights", ctypes.c_void_p),
-        ("keys_low", ctypes.c_double), ("keys_high", ctypes.c_double),
-    ]  # fmt: skip
+        ("tape", _Tape),
+        *((name, ctypes.c_long) for name in ("states", "kept", "quadratures")),
+        *((name, ctypes.c_void_p) for name in ("start", "flow", "tick")),
+        ("signals", ctypes.c_long),
+        ("signal", ctypes.c_void_p),
+        *((name, ctypes.c_long) for name in ("margin", "travelled", "clock", "nonnegative", "speed")),
+        *((name, ctypes.c_double) for name in ("slowest", "period_low", "period_high", "horizon", "tolerance")),
+        *((name, ctypes.c_double) for name in ("longest", "shortest", "first")),
+        *((name, ctypes.c_long) for name in ("order", "tables")),
+        ("weights", ctypes.c_void_p),
+        *((name, ctypes.c_double) for name in ("keys_low", "keys_high")),
+    ]
 
 
 def decimal_ends(value: float) -> tuple[float, float]:
@@ -115,102 +138,161 @@ class Cells(NamedTuple):
 
 
 class Prover:
-    """A loop's equations, arranged for the native prover."""
+    """A loop's equations, arranged for the native prover.
 
-    def __init__(self, equations: Equations, signals: tuple[str, ...], horizon: float, *, order: int = 7, tolerance: float = 1e-7,
-                 slowest: float = 0.02, longest: float = np.inf, first: float = 1e-5, shortest: float = 1e-8):
+    Attributes:
+        equations: Equations of the loop.
+        signals: Names of the signals whose range is wanted.
+        horizon: Duration after which a run is no longer followed [s].
+        weights: Units of Lohner's step, shape (TABLES, kept states); a choice, no part of the proof.
+    """
+
+    def __init__(self, equations: Equations, signals: Sequence[str], horizon: float, **settings: float):
+        """Arrange the equations.
+
+        Args:
+            equations: Equations of the loop.
+            signals: Names of the signals whose range is wanted.
+            horizon: Duration after which a run is no longer followed [s].
+            settings: Other values of `SETTINGS`: order of the Taylor polynomials, greatest remainder of a step relative
+                to the state, least speed [m/s], length of the first step and of the shortest one.
+        """
         e = self.equations = equations
-        self.signals = signals
-        kept, passing, quadratures = arrange_states(e, signals)
-        order_of = [*kept, *passing, *quadratures]
-        place = {state: i for i, state in enumerate(order_of)}
-        self.states = tuple(e.states[i] for i in order_of)
-        self.kept = len(kept)
-        self.clockwork = [place[i] for i in clockwork_states(e, kept) if place[i] < len(kept)]
-        ops = e.operations
-        arrays = {name: np.full(len(ops), -1, np.int32) for name in ("code", "a", "b", "c", "index")}
-        low, high = np.zeros(len(ops)), np.zeros(len(ops))
-        for i, o in enumerate(ops):
-            arrays["code"][i] = CODES.index(o.name)
-            for key, arg in zip("abc", o.args):
-                arrays[key][i] = arg
-            if o.name == "const":
-                low[i], high[i] = decimal_ends(o.value) if np.isfinite(o.value) else (o.value, o.value)
-            if o.name == "truth":
-                low[i] = float(o.value)
-            if o.name == "param":
-                arrays["index"][i] = o.value
-            if o.name == "state":
-                arrays["index"][i] = place.get(o.value, len(order_of) + o.value)
-        n = len(kept) + len(passing)
+        self.signals, self.horizon = tuple(signals), horizon
+        chosen = SETTINGS | settings
+        kept, passing, quadratures = arrange_states(e, self.signals)
+        order = [*kept, *passing, *quadratures]
+        place = {state: i for i, state in enumerate(order)}
+        self._kept, self._clockwork = len(kept), [place[i] for i in clockwork_states(e, kept)]
+        moving = len(kept) + len(passing)
         roots = {
-            "start": np.array([e.start[i] for i in order_of], np.int32),
-            "flow": np.array([e.flow[i] for i in order_of], np.int32),
-            "tick": np.array([e.tick[i] if e.tick else -1 for i in order_of[:n]], np.int32),
-            "signal": np.array([e.signals[s] for s in signals], np.int32),
+            "start": [e.start[i] for i in order],
+            "flow": [e.flow[i] for i in order],
+            "tick": [e.tick[i] if e.tick else -1 for i in order[:moving]],
+            "signal": [e.signals[name] for name in self.signals],
         }
-        self._keep = [*arrays.values(), low, high, *roots.values()]
-        at = lambda a: a.ctypes.data
-        tape = _Tape(len(ops), *(at(arrays[x]) for x in ("code", "a", "b", "c")), at(low), at(high), at(arrays["index"]), len(e.params), n)
-        period = decimal_ends(e.period) if e.period else (0.0, 0.0)
-        travelled = place.get(e.travelled, -1)
+        self._arrays = {name: np.array(column, np.int32) for name, column in roots.items()}
+        self._arrays |= _tape_arrays(e, place)
         self.weights = np.ones((TABLES, max(1, len(kept))))
+        at = {name: column.ctypes.data for name, column in self._arrays.items()}
+        columns = (at[name] for name in ("code", "a", "b", "c", "low", "high", "index"))
+        low, high = decimal_ends(e.period) if e.period else (0.0, 0.0)
         self.task = _Task(
-            tape, n, len(kept), len(quadratures), at(roots["start"]), at(roots["flow"]), at(roots["tick"]), len(signals),
-            at(roots["signal"]), e.margin, travelled, place.get(e.clock, -1) if e.paced else -1, place.get(e.nonnegative[0], -1) if e.nonnegative else -1, place.get(e.speed, -1),
-            slowest, *period, horizon, tolerance, min(longest, horizon), shortest, first, order, TABLES, at(self.weights), 0.0, horizon,
+            _Tape(len(e.operations), *columns, len(e.params), moving),
+            *(moving, len(kept), len(quadratures)),
+            *(at["start"], at["flow"], at["tick"], len(self.signals), at["signal"]),
+            *(e.margin, place.get(e.travelled, -1), place.get(e.clock, -1) if e.paced else -1),
+            *(place[e.nonnegative[0]] if e.nonnegative else -1, place.get(e.speed, -1)),
+            *(chosen["slowest"], low, high, horizon, chosen["tolerance"]),
+            *(
+                horizon,
+                chosen["shortest"],
+                chosen["first"],
+                int(chosen["order"]),
+                TABLES,
+                self.weights.ctypes.data,
+                0.0,
+                horizon,
+            ),
         )
 
-    def prove(self, cells: np.ndarray, threads: int | None = None) -> Cells:
-        """Return the bounds of cells, shape (cells, parameters, 2)."""
-        cells = np.ascontiguousarray(cells, float)
-        count, np_, ns = len(cells), len(self.equations.params), len(self.signals)
-        out = np.zeros((count, 8 + 4 * ns + np_))
-        groups = [(i, min(i + LANES, count)) for i in range(0, count, LANES)]
-        lib = library()
+    @property
+    def _width(self) -> int:
+        """Number of results of a cell."""
+        return 8 + 4 * len(self.signals) + len(self.equations.params)
 
-        def one(span: tuple[int, int]) -> None:
-            part, result = np.ascontiguousarray(cells[span[0] : span[1]]), np.zeros((span[1] - span[0], out.shape[1]))
-            lib.prove(ctypes.byref(self.task), ctypes.c_long(len(part)), part.ctypes.data_as(ctypes.c_void_p), result.ctypes.data_as(ctypes.c_void_p), None, ctypes.c_long(0))
-            out[span[0] : span[1]] = result
+    def prove(self, cells: np.ndarray, threads: int | None = None) -> Cells:
+        """Return the bounds of cells.
+
+        Args:
+            cells: Ends of each parameter in SI units, shape (cells, parameters, 2).
+            threads: Number of threads; None for one for each core.
+        """
+        cells = np.ascontiguousarray(cells, float)
+        out = np.zeros((len(cells), self._width))
+
+        def prove_group(first: int) -> None:
+            part = np.ascontiguousarray(cells[first : first + LANES])
+            result = np.zeros((len(part), self._width))
+            self._call(part, result, None)
+            out[first : first + LANES] = result
 
         with concurrent.futures.ThreadPoolExecutor(threads or core_count()) as pool:
-            list(pool.map(one, groups))
-        return Cells(out[:, 0].astype(int), out[:, 1:3], out[:, 3:5], out[:, 8 : 8 + 2 * ns : 2], out[:, 9 : 9 + 2 * ns : 2],
-                     out[:, 8 + 2 * ns : 8 + 4 * ns : 2], out[:, 9 + 2 * ns : 9 + 4 * ns : 2], out[:, 8 + 4 * ns :], out[:, 5], out[:, 6], out[:, 7])
+            list(pool.map(prove_group, range(0, len(cells), LANES)))
+        n = len(self.signals)
+        pairs = out[:, 8 : 8 + 4 * n].reshape(len(out), 2, n, 2)
+        return Cells(
+            *(out[:, 0].astype(int), out[:, 1:3], out[:, 3:5]),
+            *(pairs[:, 0, :, 0], pairs[:, 0, :, 1], pairs[:, 1, :, 0], pairs[:, 1, :, 1]),
+            *(out[:, 8 + 4 * n :], out[:, 5], out[:, 6], out[:, 7]),
+        )
 
-    def balance(self, centre: np.ndarray, scouts: int = 20000) -> None:
-        """Choose the weights of Lohner's step along the run of the middle of the box."""
-        nb = self.kept
-        found = np.zeros((scouts, 2 + nb * nb))
-        cell = np.ascontiguousarray(np.repeat(np.asarray(centre, float)[:, None], 2, 1))[None]
-        out = np.zeros((1, 8 + 4 * len(self.signals) + len(self.equations.params)))
-        count = library().prove(ctypes.byref(self.task), ctypes.c_long(1), np.ascontiguousarray(cell).ctypes.data_as(ctypes.c_void_p), out.ctypes.data_as(ctypes.c_void_p), found.ctypes.data_as(ctypes.c_void_p), ctypes.c_long(scouts))
-        self.scout = found[:count].copy(), out
+    def _call(self, cells: np.ndarray, out: np.ndarray, scout: np.ndarray | None) -> int:
+        """Prove cells into `out`; with `scout`, return how many of its rows have a speed or time and a Jacobian."""
+        pointers = [None if x is None else x.ctypes.data_as(ctypes.c_void_p) for x in (cells, out, scout)]
+        rows = 0 if scout is None else len(scout)
+        return library().prove(ctypes.byref(self.task), ctypes.c_long(len(cells)), *pointers, ctypes.c_long(rows))
+
+    def choose_weights(self, point: np.ndarray) -> None:
+        """Choose the units of Lohner's step from the Jacobians along one run.
+
+        Without them a contracting map wraps the set and lets it grow.
+
+        Args:
+            point: Parameters of the run, shape (parameters,).
+        """
+        n = self._kept
+        found = np.zeros((SCOUTED, 2 + n * n))
+        count = self._call(np.repeat(np.asarray(point, float)[None, :, None], 2, 2), np.zeros((1, self._width)), found)
         found = found[:count][np.isfinite(found[:count]).all(1)]  # the first has no axes yet
-        count, keys = len(found), found[:, 0]
+        if not len(found):
+            return
+        keys, jacobians = found[:, 0], np.abs(found[:, 2:]).reshape(len(found), n, n)
         if self.task.speed >= 0:
             keys = np.log(np.maximum(keys, 1e-3))
-        self.task.keys_low, self.task.keys_high = min(keys[0], keys[-1]), max(keys[0], keys[-1])
-        window = 0.3 if self.task.speed >= 0 else 0.1 * (self.task.keys_high - self.task.keys_low)
-        jacobians = np.abs(found[:count, 2:]).reshape(count, nb, nb)
+        self.task.keys_low, self.task.keys_high = low, high = float(keys.min()), float(keys.max())
+        near = NEAR if self.task.speed >= 0 else 0.1 * (high - low)
         for k in range(TABLES):
-            key = self.task.keys_low + (k + 0.5) / TABLES * (self.task.keys_high - self.task.keys_low)
-            self.weights[k] = balance_weights(jacobians[np.abs(keys - key) < window].max(0))
-            for state in self.clockwork:
-                self.weights[k, state] = 2.0**20
-            if self.task.speed >= 0:  # the speed drifts: an error in it matters less than the couplings of a period say
-                self.weights[k, self.task.speed] = self.weights[k, self.task.nonnegative] / 8
+            key = low + (k + 0.5) / TABLES * (high - low)
+            close = np.abs(keys - key) <= max(near, float(np.abs(keys - key).min()))
+            self.weights[k] = balance_weights(jacobians[close].max(0))
+            self.weights[k, self._clockwork] = CLOCKWORK_WEIGHT
+            if self.task.speed >= 0:
+                self.weights[k, self.task.speed] = self.weights[k, self.task.nonnegative] / SPEED_SHARE
+
+
+def _tape_arrays(e: Equations, place: dict[int, int]) -> dict[str, np.ndarray]:
+    """Return the columns of the operations. States have the places that `place` says; the others come after them."""
+    count = len(e.operations)
+    columns: dict[str, np.ndarray] = {name: np.full(count, -1, np.int32) for name in ("code", "a", "b", "c", "index")}
+    columns |= {"low": np.zeros(count), "high": np.zeros(count)}
+    for i, operation in enumerate(e.operations):
+        columns["code"][i] = CODES.index(operation.name)
+        for name, arg in zip("abc", operation.args, strict=False):
+            columns[name][i] = arg
+        match operation.name:
+            case "const" if np.isfinite(operation.value):
+                columns["low"][i], columns["high"][i] = decimal_ends(operation.value)
+            case "const" | "truth":
+                columns["low"][i] = columns["high"][i] = float(operation.value)
+            case "param":
+                columns["index"][i] = operation.value
+            case "state":
+                columns["index"][i] = place.get(operation.value, len(place) + operation.value)
+    return columns
 
 
 def clockwork_states(e: Equations, states: list[int]) -> list[int]:
-    """Return the states that nothing but the time and such states move: they are the same in all runs."""
+    """Return the states that only such states move: they are the same in all runs.
+
+    Args:
+        e: Equations of the loop.
+        states: States among which to look.
+    """
     alone = set(states)
     while True:
-        ends = [root for i in alone for root in (e.start[i], e.flow[i], *((e.tick[i],) if e.tick else ()))]
         read = {i: _reads(e, [e.start[i], e.flow[i], *([e.tick[i]] if e.tick else [])]) for i in alone}
         fewer = {i for i in alone if read[i][0] <= alone and not read[i][1]}
-        del ends
         if fewer == alone:
             return sorted(alone)
         alone = fewer
@@ -232,39 +314,50 @@ def _reads(e: Equations, roots: list[int]) -> tuple[set[int], bool]:
 
 
 def balance_weights(matrix: np.ndarray) -> np.ndarray:
-    """Return powers of two w with which diag(w) matrix diag(1/w) has rows and columns of equal norms."""
-    n = len(matrix)
-    w, a = np.ones(n), np.abs(np.asarray(matrix, float)) - 0.0
+    """Return powers of two w with which diag(w) |matrix| diag(1/w) has rows and columns of equal norms.
+
+    The diagonal counts for nothing. This is Osborne's balancing, row by row.
+
+    Args:
+        matrix: Square matrix.
+    """
+    w, a = np.ones(len(matrix)), np.abs(np.asarray(matrix, float))
     np.fill_diagonal(a, 0.0)
     for _ in range(50):
-        for i in range(n):
+        for i in range(len(a)):
             row, column = np.linalg.norm(a[i]), np.linalg.norm(a[:, i])
             if row > 1e-12 and column > 1e-12:
-                f = 2.0 ** np.round(0.5 * np.log2(column / row))
-                w[i] *= f
-                a[i] *= f
-                a[:, i] /= f
+                factor = 2.0 ** np.round(0.5 * np.log2(column / row))
+                w[i] *= factor
+                a[i] *= factor
+                a[:, i] /= factor
     return w
 
 
-def arrange_states(e: Equations, signals: tuple[str, ...]) -> tuple[list[int], list[int], list[int]]:
-    """Return the states that a proof needs: those kept over a tick, those that a tick sets anew, and quadratures."""
-    def reads(root: int) -> set[int]:
-        return _reads(e, [root])[0]
+def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], list[int], list[int]]:
+    """Return the states that a proof needs: kept over a tick, set anew by a tick, and quadratures.
 
-    live: set[int] = reads(e.margin).union(*(reads(e.signals[s]) for s in signals))
+    A quadrature is a state that nothing reads, such as the distance.
+
+    Args:
+        e: Equations of the loop.
+        signals: Names of the signals whose range is wanted.
+
+    Raises:
+        NoRule: A tick changes a state that the stop reads.
+    """
+    asked = _reads(e, [e.margin])[0]
+    live = _reads(e, [e.margin, *(e.signals[name] for name in signals)])[0]
     while True:
-        more = set(live)
-        for i in live:
-            more |= reads(e.flow[i])
-            if e.tick:
-                more |= reads(e.tick[i])
+        more = live | _reads(e, [root for i in live for root in (e.flow[i], *((e.tick[i],) if e.tick else ()))])[0]
         if more == live:
             break
         live = more
     quadratures = [i for i in (e.travelled, e.clock if e.paced else -1) if i >= 0 and i not in live]
     if not e.tick:
         return sorted(live), [], quadratures
-    kept = set().union(*(reads(e.tick[i]) for i in live))
-    kept |= reads(e.margin)
+    for i in asked:
+        if e.operations[e.tick[i]] != Operation("state", (), i):
+            raise NoRule(f"the stop reads {e.states[i]}, which a tick changes")
+    kept = _reads(e, [e.tick[i] for i in live])[0] | asked
     return sorted(kept), sorted(live - kept), quadratures

@@ -2,10 +2,10 @@
 
     z(0) = start(p),   z := tick(z) every period,   dz/dt = flow(z) between ticks,   p: the parameters of a box
 
-Nobody writes these equations: `jax.make_jaxpr` traces `Loop.start`, `Loop.change` and `Loop.flow`, and the lowering rules
-of `compiler` reduce them to single numbers. The operations mean real numbers: nothing is folded unless it is exact, and a
-constant stands for the double and for the decimal that its shortest text shows. Three forms are recognised, because
-their floating-point form says less than their meaning: powers, limits, and the slip of a braked wheel.
+`jax.make_jaxpr` traces `Loop.start`, `Loop.change` and `Loop.flow`, and the lowering rules of `compiler` reduce them to
+single numbers. The operations mean real numbers. Nothing is folded unless it is exact. A constant stands for the double
+and for the decimal that its shortest text shows. Three forms are recognised, because their floating-point form says
+less than their meaning: powers, limits, and the slip of a braked wheel.
 
 A braked wheel is described by slip and speed instead of two angular speeds. In a set of runs both speeds vary together,
 and only with the slip as a state does an enclosure keep that. `check_slip_chart` proves the change of coordinates.
@@ -47,7 +47,7 @@ class Operation(NamedTuple):
     """One number: an operation on earlier ones.
 
     Attributes:
-        name: `const`, `param`, `state`, `add`, `sub`, `mul`, `inv`, `clamp`, `select`, a comparison, logic, or a function.
+        name: `const`, `truth`, `param`, `state`, arithmetic, `clamp`, `select`, `meet`, comparisons, logic, functions.
         args: Indices of the operands. `select` has (condition, if false, if true). A function y of u has (u, g) with
             dy = g du, where g is another operation.
         value: Of `const` the number, of `param` and `state` its index, of `clamp` its limits, of `power` its exponent.
@@ -108,7 +108,12 @@ class RealGraph(Graph):
         if not real or name in ("lt", "le", "gt", "ge", "eq", "ne"):
             return super().op(name, *args)
         if all(arg.op == "const" and np.isfinite(arg.attr) for arg in args) and name in ("add", "sub", "mul", "neg"):
-            exact = {"add": lambda x, y: x + y, "sub": lambda x, y: x - y, "mul": lambda x, y: x * y, "neg": lambda x: -x}
+            exact = {
+                "add": lambda x, y: x + y,
+                "sub": lambda x, y: x - y,
+                "mul": lambda x, y: x * y,
+                "neg": lambda x: -x,
+            }
             value = exact[name](*(Fraction(float(arg.attr)) for arg in args))
             if abs(value) < 2**1000 and Fraction(float(value)) == value:
                 return self.const(float(value), args[0].dtype)
@@ -119,7 +124,10 @@ class RealGraph(Graph):
 def _simplify(graph: Graph, name: str, args: tuple[Node, ...]) -> Node | None:
     """Return an equal, simpler node for an operation on real numbers, or None."""
     x, y = args if len(args) == 2 else (args[0], args[0])
-    zero = lambda node: node.is_number(0)
+
+    def zero(node):
+        return node.is_number(0)
+
     match name:
         case "add":
             return y if zero(x) else x if zero(y) else None
@@ -171,7 +179,10 @@ class _Derivation:
                 raise NoRule(f"{path} is not a parameter of the loop")
         self.period = _clock_of(self.loop)
         self.given = [self.graph.input(np.float64, UpdateLevel.UNIFORM, (LEAVES, i)) for i in range(len(paths))]
-        self.charted = isinstance(loop.initial, BrakeStart) and loop.plant.shows is BrakeOutput
+        state = loop.start().plant
+        fields = set(getattr(state, "_fields", ()))
+        self.charted = loop.plant.shows is BrakeOutput and isinstance(loop.initial, BrakeStart)
+        self.charted &= "distance" in fields and len(fields) == len(_Chart._fields)
         self.operations: list[Operation] = []
         self.known: dict[Any, int] = {}
 
@@ -214,24 +225,32 @@ class _Derivation:
             return [jnp.asarray(x, float) for leaf in jax.tree.leaves(tree) for x in jnp.ravel(leaf)]
 
         begun = self.lower(lambda values: flat(start(self.with_params(values))), self.given)
-        moved = self.lower(lambda values, z: flat(rates(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes)
-        shows = self.lower(lambda values, z: flat(seen(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes)
+        moved = self.lower(
+            lambda values, z: flat(rates(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes
+        )
+        shows = self.lower(
+            lambda values, z: flat(seen(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes
+        )
         slip, speed, travelled = (names.index(f"plant.{x}") if self.charted else -1 for x in _Chart._fields)
         # The slip and the speed that the plant computes from its own states are the states of the chart.
         same = {shows[0].id: ("state", slip), shows[1].id: ("state", speed)} if self.charted else {}
         initial = {name: self.initial_node(name) for name in ("slip", "speed")} if self.charted else {}
-        at_start = {begun[i].id: initial[name] for i, name in ((slip, "slip"), (speed, "speed"))} if self.charted else {}
+        at_start = (
+            {begun[i].id: initial[name] for i, name in ((slip, "slip"), (speed, "speed"))} if self.charted else {}
+        )
         starts = [self.convert(self.at_once(x, at_start), {}) for x in begun]
         names = [*names, TIME]
         signal_names = [*self.loop.plant.shows._fields, "target", "command", "control", "setpoint"]
         ticked: list[int] = []
         if self.period is not None:
-            ticks = self.lower(lambda values, z: flat(after(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes)
+            ticks = self.lower(
+                lambda values, z: flat(after(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes
+            )
             ticked = [self.convert(x, same) for x in ticks] + [self.make("state", (), n)]
             for i in (slip, speed, travelled) if self.charted else ():
                 ticked[i] = self.make("state", (), i)  # a tick does not move the plant
         flow = [self.convert(x, same) for x in moved] + [self.make("const", (), 1.0)]
-        # Slip and wheel move at rates that go with 1/v. With d eta = dt/v they no longer do, and one step suits all speeds.
+        # The slip moves at a rate that goes with 1/v. With d eta = dt/v it does not, and one step suits all speeds.
         paced = self.charted and self.period is None
         if paced:
             flow = [self.paced(x, speed) for x in flow]
@@ -242,8 +261,8 @@ class _Derivation:
         return Equations(
             operations=tuple(self.operations), params=self.paths, states=tuple(names),
             start=(*starts, self.make("const", (), 0.0)), flow=tuple(flow), tick=tuple(ticked), period=self.period,
-            signals=signals, margin=margin, nonnegative=(slip,) if self.charted else (), travelled=travelled, speed=speed,
-            clock=n, paced=paced,
+            signals=signals, margin=margin, nonnegative=(slip,) if self.charted else (), travelled=travelled,
+            speed=speed, clock=n, paced=paced,
         )  # fmt: skip
 
     def programs(self) -> tuple[Any, Any, Any, Any]:
@@ -278,7 +297,14 @@ class _Derivation:
         def seen(loop: Loop, state: Any, t: Any) -> Any:
             whole = loop_state(loop, state)
             sample = loop.signals(t, whole).sample
-            return [*sample.output, sample.target, sample.command, sample.control, sample.setpoint, loop.stop.margin(sample.output)]
+            return [
+                *sample.output,
+                sample.target,
+                sample.command,
+                sample.control,
+                sample.setpoint,
+                loop.stop.margin(sample.output),
+            ]
 
         return self.chart, rates, after, seen
 
@@ -357,7 +383,11 @@ class _Derivation:
                 at = len(self.operations)
                 # g = e u^e / u needs the result itself, so the three are made together
                 self.operations.append(Operation("power", (u, at + 3, exponent)))
-                self.operations += [Operation("inv", (u,)), Operation("mul", (at, at + 1)), Operation("mul", (exponent, at + 2))]
+                self.operations += [
+                    Operation("inv", (u,)),
+                    Operation("mul", (at, at + 1)),
+                    Operation("mul", (exponent, at + 2)),
+                ]
                 self.known[key] = at
             return self.known[key]
         less = self.power(u, self.make("sub", (exponent, self.number(1.0))), value - 1)
@@ -470,9 +500,9 @@ class _Derivation:
         asked, other = self.operations[which], self.operations[no]
         if asked.name == "lt" and asked.args[1] == yes and self.operations[yes].name == "const":
             x, low = asked.args
-            if other.name == "clamp" and other.args[0] == x and other.args[1] == -1:
-                if self.operations[low].value <= self.operations[other.args[2]].value:
-                    return self.make("clamp", (x, low, other.args[2]))
+            limited = other.name == "clamp" and other.args[:2] == (x, -1)
+            if limited and self.operations[low].value <= self.operations[other.args[2]].value:
+                return self.make("clamp", (x, low, other.args[2]))
             if no == x:
                 return self.make("clamp", (x, low, -1))
         return self.make("select", (which, no, yes))
@@ -491,7 +521,12 @@ def _power_of(node: Node) -> tuple[Node, Node] | None:
 
     The form is base > 0 ? (base^2 != 0 ? exp(e (0.5 log(base^2 != 0 ? base^2 : 1))) : 0) : 0.
     """
-    if node.op != "select" or node.args[0].op != "lt" or not node.args[0].args[0].is_number(0) or not node.args[1].is_number(0):
+    if (
+        node.op != "select"
+        or node.args[0].op != "lt"
+        or not node.args[0].args[0].is_number(0)
+        or not node.args[1].is_number(0)
+    ):
         return None
     base, inner = node.args[0].args[1], node.args[2]
     if inner.op == "select" and inner.args[0].op == "ne" and inner.args[1].is_number(0):
@@ -524,7 +559,9 @@ def _clock_of(loop: Loop) -> float | None:
         if offers(block, "tick"):
             period = getattr(block, "period", None)
             if period is None:
-                raise NoRule(f"{name} of type {type(block).__name__} ticks with the integration grid, which a proof has not")
+                raise NoRule(
+                    f"{name} of type {type(block).__name__} ticks with the integration grid, which a proof has not"
+                )
             periods.add(float(period))
     if len(periods) > 1:
         raise NoRule(f"clocks of different periods: {', '.join(f'{x:g} s' for x in sorted(periods))}")
@@ -580,16 +617,26 @@ def _exact_values(roots: list[Node], given: list[Fraction]) -> list[Any]:
             return given[node.attr[1]]
         x = [value(arg) for arg in node.args]
         match node.op:
-            case "add": return x[0] + x[1]
-            case "sub": return x[0] - x[1]
-            case "mul": return x[0] * x[1]
-            case "div": return x[0] / x[1]
-            case "neg": return -x[0]
-            case "lt": return x[0] < x[1]
-            case "le": return x[0] <= x[1]
-            case "min" | "lower": return min(x)
-            case "max" | "higher": return max(x)
-            case "select": return x[2] if x[0] else x[1]
+            case "add":
+                return x[0] + x[1]
+            case "sub":
+                return x[0] - x[1]
+            case "mul":
+                return x[0] * x[1]
+            case "div":
+                return x[0] / x[1]
+            case "neg":
+                return -x[0]
+            case "lt":
+                return x[0] < x[1]
+            case "le":
+                return x[0] <= x[1]
+            case "min" | "lower":
+                return min(x)
+            case "max" | "higher":
+                return max(x)
+            case "select":
+                return x[2] if x[0] else x[1]
         raise NoRule(f"{node.op} in the slip of the plant")
 
     return [value(root) for root in roots]

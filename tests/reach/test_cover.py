@@ -24,7 +24,8 @@ def oscillator(period: float | None = None) -> Equations:
     """x' = v, v' = -x from (p, 0): x = p cos t. With a period, a tick halves both."""
     operations = [
         Operation("param", (), 0), Operation("state", (), 0), Operation("state", (), 1), Operation("neg", (1,)),
-        Operation("const", (), 0.0), Operation("const", (), 1.0), Operation("state", (), 2), Operation("const", (), 0.5),
+        Operation("const", (), 0.0), Operation("const", (), 1.0), Operation("state", (), 2),
+        Operation("const", (), 0.5),
         Operation("mul", (1, 7)), Operation("mul", (2, 7)),
     ]  # fmt: skip
     return Equations(
@@ -34,17 +35,24 @@ def oscillator(period: float | None = None) -> Equations:
 
 
 @killed_by("reach/native/prove.cpp", "I remainder = rest.value(a, order + 1) * power;", "I remainder = I(0.0) * power;")
-@killed_by("reach/native/prove.cpp", "C[i] = sum + remainder + push[i];", "C[i] = point((sum + remainder + push[i]).mid());")
+@killed_by(
+    "reach/native/prove.cpp", "C[i] = sum + remainder + push[i];", "C[i] = point((sum + remainder + push[i]).mid());"
+)
 def test_oscillator_against_its_closed_form() -> None:
     prover = Prover(oscillator(), ("x", "v"), 2.0, order=3, tolerance=1e-6)
     found = prover.prove(np.array([[[1.0, 1.001]]]), 1)
     assert found.status[0] == 2
     low, high = found.least[0], found.greatest[0]
-    assert low[0] <= 1.0 * math.cos(2.0) * 1.001 and high[0] >= 1.001
-    assert low[1] <= -1.001 and high[1] >= 0.0
-    assert low[0] > 1.001 * math.cos(2.0) - 1e-3 and high[0] < 1.002 and low[1] > -1.003
+    assert low[0] <= 1.0 * math.cos(2.0) * 1.001
+    assert high[0] >= 1.001
+    assert low[1] <= -1.001
+    assert high[1] >= 0.0
+    assert low[0] > 1.001 * math.cos(2.0) - 1e-3
+    assert high[0] < 1.002
+    assert low[1] > -1.003
     # The bound that every run reaches is one that the run with the least amplitude reaches.
-    assert 1.0 - 1e-3 < found.above[0, 0] <= 1.0 and -1.0 <= found.below[0, 1] < -1.0 + 1e-2
+    assert 1.0 - 1e-3 < found.above[0, 0] <= 1.0
+    assert -1.0 <= found.below[0, 1] < -1.0 + 1e-2
 
 
 def test_ticks_against_their_closed_form() -> None:
@@ -63,7 +71,10 @@ def test_ticks_against_their_closed_form() -> None:
 def rig_run(mass: float, speed: float, high: float = 9.03) -> tuple[float, float, float]:
     """Greatest slip, stop time and distance of the rig under the published gain, by SciPy and the paper's equations."""
     r1, r2, J1, g, c = 0.0995, 0.099, 7.53e-3, 9.81, 0.5
-    mu = lambda s: 0.407 * s**2.1 / (2.57e-4 + s**2.1) + s * (-4.24e-2 + s * (2.94e-10 + s * 3.51e-2))
+
+    def mu(s):
+        return 0.407 * s**2.1 / (2.57e-4 + s**2.1) + s * (-4.24e-2 + s * (2.94e-10 + s * 3.51e-2))
+
     holding = mu(0.2) * g * (mass * r1 + 0.8 * J1 / (c * r1))
 
     def rates(t: float, z: np.ndarray) -> list[float]:
@@ -72,21 +83,35 @@ def rig_run(mass: float, speed: float, high: float = 9.03) -> tuple[float, float
         torque = min(max(holding - 11753 * integral - 48 * (s - 0.2), 0.0), high)
         return [(mass * g * r1 * mu(s) - torque) / J1, -g * mu(s) / (c * r2), s - 0.2, r2 * w2]
 
-    end = lambda t, z: r2 * z[1] - 5 / 3.6
+    def end(t, z):
+        return r2 * z[1] - 5 / 3.6
+
     end.terminal = True
-    found = solve_ivp(rates, (0, 3), [speed / r1, speed / r2, 0, 0], "LSODA", rtol=1e-10, atol=1e-12, events=end, max_step=1e-4)
+    found = solve_ivp(
+        rates, (0, 3), [speed / r1, speed / r2, 0, 0], "LSODA", rtol=1e-10, atol=1e-12, events=end, max_step=1e-4
+    )
     return float(np.max(1 - r1 * found.y[0] / (r2 * found.y[1]))), float(found.t[-1]), float(found.y[3, -1])
 
 
 @killed_by("reach/native/prove.cpp", "r.delta = pure ? zero : dev;", "r.delta = zero;")
-@killed_by("reach/native/prove.cpp", "push[i] = push[i] + Y[i] * symmetric(delta) * HH;", "push[i] = push[i] + Y[i] * I(0.0);")
+@killed_by(
+    "reach/native/prove.cpp", "push[i] = push[i] + Y[i] * symmetric(delta) * HH;", "push[i] = push[i] + Y[i] * I(0.0);"
+)
 def test_published_gain_within_its_limits() -> None:
-    proof = prove_box(load("slip-lmi", LIMITED).loop, SMALL, [Claim("greatest slip", 0.34)], signals=("slip",), horizon=2.0, budget=100)
+    proof = prove_box(
+        load("slip-lmi", LIMITED).loop,
+        SMALL,
+        [Claim("greatest slip", 0.34)],
+        signals=("slip",),
+        horizon=2.0,
+        budget=100,
+    )
     assert proof.verdict == "proved"
     slip, time, distance = (proof.bounds[name] for name in ("greatest slip", "stop_time", "stop_distance"))
     runs = np.array([rig_run(m, v) for m in SMALL["plant.mass"] for v in SMALL["initial.speed"]])
     for column, (low, high) in zip(runs.T, (slip, time, distance), strict=True):
-        assert low <= column.min() and column.max() <= high
+        assert low <= column.min()
+        assert column.max() <= high
         assert high - column.max() < 2e-3 * column.max()
 
 
@@ -99,7 +124,10 @@ def test_false_claims_are_refuted(quantity: str) -> None:
     claim = Claim(quantity, values[worst] * 0.999)
     loop = load("slip-lmi", LIMITED).loop
     assert prove_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=3).verdict != "proved"
-    assert prove_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=20, suspects=[corners[worst]]).verdict == "refuted"
+    assert (
+        prove_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=20, suspects=[corners[worst]]).verdict
+        == "refuted"
+    )
 
 
 def test_without_time_nothing_is_decided() -> None:
@@ -110,9 +138,20 @@ def test_without_time_nothing_is_decided() -> None:
 
 def test_cells_cover_the_box() -> None:
     worst = max(rig_run(m, v)[0] for m in SMALL["plant.mass"] for v in SMALL["initial.speed"])
-    proof = prove_box(load("slip-lmi", LIMITED).loop, SMALL, [Claim("greatest slip", worst * 1.0002)], signals=("slip",), horizon=2.0, budget=60)
-    assert proof.verdict == "proved" and len(proof.cells) > 1
-    volume = lambda cell: math.prod(Fraction(b) - Fraction(a) for a, b in cell)
+    proof = prove_box(
+        load("slip-lmi", LIMITED).loop,
+        SMALL,
+        [Claim("greatest slip", worst * 1.0002)],
+        signals=("slip",),
+        horizon=2.0,
+        budget=60,
+    )
+    assert proof.verdict == "proved"
+    assert len(proof.cells) > 1
+
+    def volume(cell):
+        return math.prod(Fraction(b) - Fraction(a) for a, b in cell)
+
     assert sum(volume(cell) for cell in proof.cells.tolist()) == volume(list(SMALL.values()))
 
 
@@ -138,6 +177,6 @@ def test_random_runs_lie_within_their_cells(name: str, changes: list[str], claim
 
 def test_parts_without_a_rule_are_refused_by_name() -> None:
     with pytest.raises(NoRule, match="events"):
-        derive_equations(load("slip-real").loop if False else d.braking(controller=d.controllers.Relay()), ["plant.mass"])
-    with pytest.raises(NoRule, match="plant.weight is not a parameter"):
+        derive_equations(d.braking(controller=d.controllers.Relay()), ["plant.mass"])
+    with pytest.raises(NoRule, match=r"plant\.weight is not a parameter"):
         derive_equations(load("slip-lmi").loop, ["plant.weight"])

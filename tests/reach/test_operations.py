@@ -21,8 +21,14 @@ def intervals(rng: np.random.Generator, count: int, low: float = -8, high: float
 
 
 @pytest.mark.parametrize("name", ["add", "sub", "mul", "inv"])
-@killed_by("reach/native/interval.h", "inline void round_upward() { std::fesetround(FE_UPWARD); }", "inline void round_upward() {}")
-@killed_by("reach/native/interval.h", "return {a.n + b.n, a.h + b.h};", "return {a.n + b.n, -(-a.h - b.h)};", case="add")
+@killed_by(
+    "reach/native/interval.h",
+    "inline void round_upward() { std::fesetround(FE_UPWARD); }",
+    "inline void round_upward() {}",
+)
+@killed_by(
+    "reach/native/interval.h", "return {a.n + b.n, a.h + b.h};", "return {a.n + b.n, -(-a.h - b.h)};", case="add"
+)
 def test_operations_contain_the_exact_results(name: str) -> None:
     rng = np.random.default_rng(1)
     a, b = intervals(rng, 50_000), intervals(rng, 50_000)
@@ -35,12 +41,15 @@ def test_operations_contain_the_exact_results(name: str) -> None:
     }[name]
     for (a_low, a_high), (b_low, b_high), (low, high) in zip(a.tolist(), b.tolist(), found.tolist(), strict=True):
         if name == "inv" and a_low <= 0 <= a_high:
-            assert low == -np.inf and high == np.inf
+            assert low == -np.inf
+            assert high == np.inf
             continue
         corners = [exact(Fraction(x), Fraction(y)) for x in (a_low, a_high) for y in (b_low, b_high)]
-        assert Fraction(low) <= min(corners) and max(corners) <= Fraction(high)
+        assert Fraction(low) <= min(corners)
+        assert max(corners) <= Fraction(high)
         # The bounds are the next doubles, and no wider.
-        assert low >= np.nextafter(float(min(corners)), -np.inf) and high <= np.nextafter(float(max(corners)), np.inf)
+        assert low >= np.nextafter(float(min(corners)), -np.inf)
+        assert high <= np.nextafter(float(max(corners)), np.inf)
 
 
 def exact_value(name: str, x: float, y: float) -> decimal.Decimal:
@@ -72,10 +81,24 @@ def exact_value(name: str, x: float, y: float) -> decimal.Decimal:
 
 @pytest.mark.parametrize(
     ("name", "low", "high"),
-    [("exp", -600, 600), ("log", 1e-12, 1e12), ("power", 1e-9, 10), ("sin", -60, 60), ("cos", -60, 60), ("atan", -1e4, 1e4)],
+    [
+        ("exp", -600, 600),
+        ("log", 1e-12, 1e12),
+        ("power", 1e-9, 10),
+        ("sin", -60, 60),
+        ("cos", -60, 60),
+        ("atan", -1e4, 1e4),
+    ],
 )
-@killed_by("reach/native/interval.h", "sum = sum + symmetric(term.mag());  // |y| < 0.7", "// |y| < 0.7", case="exp-series")
-@killed_by("reach/native/interval.h", "for (int k = 1; k <= 22; k++) {", "for (int k = 1; k <= 6; k++) {", case="atan--10000.0-10000.0")
+@killed_by(
+    "reach/native/interval.h", "sum = sum + symmetric(term.mag());  // |y| < 0.7", "// |y| < 0.7", case="exp-series"
+)
+@killed_by(
+    "reach/native/interval.h",
+    "for (int k = 1; k <= 22; k++) {",
+    "for (int k = 1; k <= 6; k++) {",
+    case="atan--10000.0-10000.0",
+)
 def test_functions_contain_the_exact_values(name: str, low: float, high: float) -> None:
     rng = np.random.default_rng(2)
     x = rng.uniform(low, high, 2000) if low < 0 else np.exp(rng.uniform(np.log(low), np.log(high), 2000))
@@ -84,7 +107,11 @@ def test_functions_contain_the_exact_values(name: str, low: float, high: float) 
     for at, e, (lowest, highest) in zip(x.tolist(), y.tolist(), found.tolist(), strict=True):
         truth = exact_value(name, at, e)
         assert decimal.Decimal(lowest) <= truth <= decimal.Decimal(highest), (name, at)
-        assert highest - lowest <= 1e-13 * max(1.0, abs(highest)) if name not in ("exp", "power") else highest / lowest - 1 < 1e-12
+        assert (
+            highest - lowest <= 1e-13 * max(1.0, abs(highest))
+            if name not in ("exp", "power")
+            else highest / lowest - 1 < 1e-12
+        )
 
 
 @pytest.mark.parametrize("name", ["exp", "log", "power", "sin", "cos", "atan"])
@@ -96,13 +123,15 @@ def test_functions_of_intervals_contain_those_of_their_points(name: str) -> None
     for share in np.linspace(0, 1, 7):
         x = a[:, 0] + share * (a[:, 1] - a[:, 0])
         inner = apply_operation(name, np.stack([x, x], 1), e)
-        assert (found[:, 0] <= inner[:, 1]).all() and (inner[:, 0] <= found[:, 1]).all()
+        assert (found[:, 0] <= inner[:, 1]).all()
+        assert (inner[:, 0] <= found[:, 1]).all()
 
 
 def test_a_power_of_zero_is_zero() -> None:
     found = apply_operation("power", np.array([[0.0, 0.0], [0.0, 0.5]]), np.full((2, 2), 2.1))
     assert found[0].tolist() == [0.0, 0.0]
-    assert found[1, 0] == 0.0 and 0.5**2.1 <= found[1, 1] < 0.5**2.1 * (1 + 1e-12)
+    assert found[1, 0] == 0.0
+    assert 0.5**2.1 <= found[1, 1] < 0.5**2.1 * (1 + 1e-12)
 
 
 def test_a_constant_stands_for_its_decimal() -> None:

@@ -141,7 +141,11 @@ def describe_compiler() -> dict[str, str]:
 
 
 def _compile(
-    command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path, longest: float, flags: tuple[str, ...] = CPP_FLAGS
+    command: tuple[str, ...],
+    source: pathlib.Path,
+    result: pathlib.Path,
+    longest: float,
+    flags: tuple[str, ...] = CPP_FLAGS,
 ) -> None:
     """Compile a C++ file to the library `result` in at most `longest` seconds; raise NoCompiler if that fails."""
     include = [f"-I{NATIVE_FOLDER}", f"-I{jax.ffi.include_dir()}"]

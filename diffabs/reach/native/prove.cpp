@@ -289,7 +289,7 @@ struct Group {
       }
       if (all(ok | ~alive)) { found = true; break; }
     }
-    if (!found) return false;
+    if (!found) { box_limit = 0.6 * h; return false; }
     // X + [0, h] f(B) holds the runs as well, and is narrower.
     for (int again = 0; again < 2; again++) {
       rates(B);
@@ -413,6 +413,7 @@ struct Group {
     return true;
   }
   double near_step = 1e300;
+  double box_limit = 1e9;  // longer steps had no box; it is forgotten slowly
   double excess = 0;  // the greatest remainder of the last step, in tolerances
 
   // The values of an operation within a step.
@@ -431,12 +432,14 @@ struct Group {
       for (int j = 0; j < nd; j++) w += whole.slope(g, k)[j].mag();
       coefs[k] = mid.value(g, k) + symmetric(w);
     }
+    // On a piece of the step: the value at its middle, plus the slope over the piece times the distance.
     auto pieces = [&](int count) {
       for (int p = 0; p < count; p++) {
-        I place = scaled(span(fill(p), fill(p + 1)) * I(H.h, H.h), 1.0 / count);
-        place = scaled(span(fill(p), fill(p + 1)) * point(H.h), 1.0 / count);
-        I one = coefs[order];
-        for (int k = order; k-- > 0;) one = one * place + coefs[k];
+        I place = scaled(span(fill(p), fill(p + 1)) * point(H.h), 1.0 / count), middle = point(place.mid());
+        I value = coefs[order], slope = scaled(coefs[order], order);
+        for (int k = order; k-- > 0;) value = value * middle + coefs[k];
+        for (int k = order; k-- > 1;) slope = slope * place + scaled(coefs[k], k);
+        I one = value + slope * (place - middle);
         range = p ? hull(range, one) : one;
       }
       range = meet(range + extra, B[state]);
@@ -601,7 +604,7 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
   for (long first = 0; first < count; first += LANES) {
     std::feclearexcept(FE_ALL_EXCEPT);
     g.dead = g.done = M{};
-    g.steps = g.across = 0, g.h_next = task->first, g.now = 0;
+    g.steps = g.across = 0, g.h_next = task->first, g.now = 0, g.box_limit = 1e9;
     for (int p = 0; p < np; p++)
       for (int l = 0; l < LANES; l++) {
         const double* c = cells + 2 * np * (first + l < count ? first + l : count - 1) + 2 * p;
@@ -657,7 +660,8 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
       int substeps = 0;
       while (!over_period && any(active)) {
         // the length of the step
-        double h = std::fmin(g.h_next, longest);
+        double h = std::fmin(g.h_next, std::fmin(longest, g.box_limit));
+        g.box_limit = std::fmin(1.01 * g.box_limit, 1e9);
         g.near_step = 1e300;
         if (!begun) h = std::fmin(h, task->first);
         if (g.limited) {
@@ -849,8 +853,8 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
       bool stopped = fine && !timed[l];
       o[1] = stopped ? -T.n[l] : 0, o[2] = stopped ? T.h[l] : INFINITY, o[3] = stopped ? -X.n[l] : 0, o[4] = stopped ? X.h[l] : INFINITY;
       o[5] = reached[l], o[6] = (double)g.steps, o[7] = (double)g.across;
-      for (int s = 0; s < ns; s++) o[8 + 2 * s] = -g.bottom[s][l], o[9 + 2 * s] = g.top[s][l];
-      for (int s = 0; s < ns; s++) o[8 + 2 * ns + 2 * s] = -g.below[s][l], o[9 + 2 * ns + 2 * s] = g.above[s][l];
+      for (int s = 0; s < ns; s++) o[8 + 2 * s] = fine ? -g.bottom[s][l] : -INFINITY, o[9 + 2 * s] = fine ? g.top[s][l] : INFINITY;
+      for (int s = 0; s < ns; s++) o[8 + 2 * ns + 2 * s] = sound ? -g.below[s][l] : INFINITY, o[9 + 2 * ns + 2 * s] = sound ? g.above[s][l] : -INFINITY;
       for (int p = 0; p < np; p++) o[8 + 4 * ns + p] = g.reach[p][l];
     }
   }
