@@ -18,9 +18,9 @@ from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
-    from diffabs.reach import BoxProof, Claim
+    from diffabs.reach import BoxProof, RunClaim
 
-GRID = (9, 17)  # runs along the first and the other parameters, among which the worst is looked for
+SEARCHED = (9, 17)  # runs along the first and the other parameters, among which the worst is looked for
 NO_LOCK, OVERSHOOT, TIMES = "no_lock", "overshoot", ("stop_time", "stop_distance")
 
 
@@ -110,9 +110,9 @@ def _read_box(given: Sequence[str], chosen: Scenario) -> dict[str, tuple[float, 
     return box
 
 
-def _read_claim(text: str, chosen: Scenario) -> "Claim":
+def _read_claim(text: str, chosen: Scenario) -> "RunClaim":
     """Return a claim about a signal, the stop time or the stop distance. Raises ScenarioError."""
-    from diffabs.reach import Claim
+    from diffabs.reach import RunClaim
 
     name, equals, given = text.partition("=")
     signals = chosen.loop.plant.shows._fields
@@ -123,17 +123,17 @@ def _read_claim(text: str, chosen: Scenario) -> "Claim":
     if name == NO_LOCK:
         if equals:
             raise ScenarioError("--claim no_lock has no bound: it says that the slip stays below 1")
-        return Claim("greatest slip", float(np.nextafter(1.0, 0.0)))
+        return RunClaim("greatest slip", float(np.nextafter(1.0, 0.0)))
     try:
         bound = float(given)
     except ValueError:
         raise ScenarioError(f"--claim {text} needs a number: {name}=BOUND") from None
     if name == OVERSHOOT:
-        return Claim("greatest slip", (1 + bound) * _target(chosen))
+        return RunClaim("greatest slip", (1 + bound) * _target(chosen))
     if name in TIMES:
-        return Claim(name, bound)
+        return RunClaim(name, bound)
     word, _, signal = name.partition("_")
-    return Claim(f"{'greatest' if word == 'max' else 'least'} {signal}", bound)
+    return RunClaim(f"{'greatest' if word == 'max' else 'least'} {signal}", bound)
 
 
 def _target(chosen: Scenario) -> float:
@@ -150,7 +150,7 @@ def _worst_runs(chosen: Scenario, box: dict[str, tuple[float, float]]) -> tuple[
 
     if chosen.loop.plant.shows is not BrakeOutput:
         return {}, []
-    counts = [GRID[min(i, 1)] if len(box) < 3 else 5 for i in range(len(box))]
+    counts = [SEARCHED[min(i, 1)] if len(box) < 3 else 5 for i in range(len(box))]
     axes = [np.linspace(low, high, n)[:: max(1, (n - 1))] if low == high else np.linspace(low, high, n)
             for (low, high), n in zip(box.values(), counts, strict=True)]  # fmt: skip
     points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], 1)
@@ -167,7 +167,7 @@ def _worst_runs(chosen: Scenario, box: dict[str, tuple[float, float]]) -> tuple[
 
 
 def _document(
-    proof: "BoxProof", chosen: Scenario, box: dict[str, tuple[float, float]], claims: Sequence["Claim"],
+    proof: "BoxProof", chosen: Scenario, box: dict[str, tuple[float, float]], claims: Sequence["RunClaim"],
     known: dict[str, float],
 ) -> JsonObject:  # fmt: skip
     """Return the JSON document; a bound that is not proved is null."""

@@ -4,14 +4,14 @@ import math
 from collections.abc import Mapping, Sequence
 
 from diffabs.core.types import JsonObject
-from diffabs.reach.cover import BoxProof, Claim
+from diffabs.reach.cover import BoxProof, RunClaim
 from diffabs.runtime import provenance
 
 FORMAT = "diffabs box proof 1"
 
 
 def certificate_document(
-    proof: BoxProof, scenario: str, over: Mapping[str, tuple[float, float]], claims: Sequence[Claim]
+    proof: BoxProof, scenario: str, over: Mapping[str, tuple[float, float]], claims: Sequence[RunClaim]
 ) -> JsonObject:
     """Return the JSON document of a proof's file.
 

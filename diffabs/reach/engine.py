@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.compiler.runtime import toolchain
-from diffabs.reach.equations import Equations, NoRule, Operation
+from diffabs.reach.equations import Equations, NoRule, RealOperation
 from diffabs.runtime.process import core_count
 
-NATIVE_FOLDER = pathlib.Path(__file__).parent / "native"
+PROVER_FOLDER = pathlib.Path(__file__).parent / "native"
 # -frounding-math: nothing is folded or moved as if rounding were to nearest. -ffp-contract=off: a product is a product.
 FLAGS = (
     *("-std=c++17", "-O2", "-march=native", "-frounding-math", "-ffp-contract=off"),
@@ -80,7 +80,7 @@ def library() -> ctypes.CDLL:
     Raises:
         NoCompiler: No C++ compiler of this machine works, or it ignores the rounding mode.
     """
-    sources = [(NATIVE_FOLDER / name).read_text() for name in ("interval.h", "series.h", "prove.cpp")]
+    sources = [(PROVER_FOLDER / name).read_text() for name in ("interval.h", "series.h", "prove.cpp")]
     text = "\n".join(re.sub(r'#include "[a-z.]*"|#pragma once', "", source) for source in sources)
     try:
         found = ctypes.CDLL(str(toolchain.build_library(text, FLAGS)))
@@ -107,7 +107,7 @@ def apply_operation(name: str, a: np.ndarray, b: np.ndarray | None = None) -> np
     return out
 
 
-class Cells(NamedTuple):
+class CellBounds(NamedTuple):
     """Proved bounds of cells of parameters, one row for each.
 
     Attributes:
@@ -201,7 +201,7 @@ class Prover:
         """Number of results of a cell."""
         return 8 + 4 * len(self.signals) + len(self.equations.params)
 
-    def prove(self, cells: np.ndarray, threads: int | None = None) -> Cells:
+    def prove(self, cells: np.ndarray, threads: int | None = None) -> CellBounds:
         """Return the bounds of cells.
 
         Args:
@@ -221,7 +221,7 @@ class Prover:
             list(pool.map(prove_group, range(0, len(cells), LANES)))
         n = len(self.signals)
         pairs = out[:, 8 : 8 + 4 * n].reshape(len(out), 2, n, 2)
-        return Cells(
+        return CellBounds(
             *(out[:, 0].astype(int), out[:, 1:3], out[:, 3:5]),
             *(pairs[:, 0, :, 0], pairs[:, 0, :, 1], pairs[:, 1, :, 0], pairs[:, 1, :, 1]),
             *(out[:, 8 + 4 * n :], out[:, 5], out[:, 6], out[:, 7]),
@@ -357,7 +357,7 @@ def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], lis
     if not e.tick:
         return sorted(live), [], quadratures
     for i in asked:
-        if e.operations[e.tick[i]] != Operation("state", (), i):
+        if e.operations[e.tick[i]] != RealOperation("state", (), i):
             raise NoRule(f"the stop reads {e.states[i]}, which a tick changes")
     kept = _reads(e, [e.tick[i] for i in live])[0] | asked
     return sorted(kept), sorted(live - kept), quadratures

@@ -43,7 +43,7 @@ class NoRule(ValueError):
     """An error: the proof has no sound rule for a part, an operation or a number of the loop."""
 
 
-class Operation(NamedTuple):
+class RealOperation(NamedTuple):
     """One number: an operation on earlier ones.
 
     Attributes:
@@ -79,7 +79,7 @@ class Equations:
         paced: True if the independent variable is eta with d eta = dt/v, so that rates are multiplied by the speed v.
     """
 
-    operations: tuple[Operation, ...]
+    operations: tuple[RealOperation, ...]
     params: tuple[str, ...]
     states: tuple[str, ...]
     start: tuple[int, ...]
@@ -183,7 +183,7 @@ class _Derivation:
         fields = set(getattr(state, "_fields", ()))
         self.charted = loop.plant.shows is BrakeOutput and isinstance(loop.initial, BrakeStart)
         self.charted &= "distance" in fields and len(fields) == len(_Chart._fields)
-        self.operations: list[Operation] = []
+        self.operations: list[RealOperation] = []
         self.known: dict[Any, int] = {}
 
     def with_params(self, values: Any) -> Loop:
@@ -202,7 +202,7 @@ class _Derivation:
 
     def equations(self) -> Equations:
         """Return the equations; the states are those of the loop's memory, in its order, then the time."""
-        start, rates, after, seen = self.programs()
+        start, rates, after, show = self.programs()
         first = jax.eval_shape(lambda values: self.chart(self.with_params(values)), [0.0] * len(self.paths))
         shown, made = jax.tree_util.tree_leaves_with_path(first), jax.tree.structure(first)
         names: list[str] = []
@@ -229,7 +229,7 @@ class _Derivation:
             lambda values, z: flat(rates(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes
         )
         shows = self.lower(
-            lambda values, z: flat(seen(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes
+            lambda values, z: flat(show(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes
         )
         slip, speed, travelled = (names.index(f"plant.{x}") if self.charted else -1 for x in _Chart._fields)
         # The slip and the speed that the plant computes from its own states are the states of the chart.
@@ -253,7 +253,7 @@ class _Derivation:
         # The slip moves at a rate that goes with 1/v. With d eta = dt/v it does not, and one step suits all speeds.
         paced = self.charted and self.period is None
         if paced:
-            flow = [self.paced(x, speed) for x in flow]
+            flow = [self.pace_rate(x, speed) for x in flow]
         signals = {name: self.convert(x, same) for name, x in zip(signal_names, shows, strict=False)}
         margin = self.convert(shows[len(signal_names)], same)
         if self.charted:
@@ -266,7 +266,7 @@ class _Derivation:
         )  # fmt: skip
 
     def programs(self) -> tuple[Any, Any, Any, Any]:
-        """Return the functions start(loop), rates(loop, state, t), after(loop, state, t) and seen(loop, state, t)."""
+        """Return the functions start(loop), rates(loop, state, t), after(loop, state, t) and show(loop, state, t)."""
 
         def loop_state(loop: Loop, state: Any) -> LoopState:
             if not self.charted:
@@ -294,7 +294,7 @@ class _Derivation:
             clock = _Tick(t, jnp.asarray(self.period), 0, None)
             return loop.change(clock, whole, loop.signals(t, whole), {}, {}, None)._replace(plant=state.plant)
 
-        def seen(loop: Loop, state: Any, t: Any) -> Any:
+        def show(loop: Loop, state: Any, t: Any) -> Any:
             whole = loop_state(loop, state)
             sample = loop.signals(t, whole).sample
             return [
@@ -306,7 +306,7 @@ class _Derivation:
                 loop.stop.margin(sample.output),
             ]
 
-        return self.chart, rates, after, seen
+        return self.chart, rates, after, show
 
     def chart(self, loop: Loop) -> Any:
         """Return the start of the loop in the coordinates of the proof."""
@@ -335,7 +335,7 @@ class _Derivation:
         """Return the index of an operation, a new one only if there is none."""
         key = (name, args, value)
         if key not in self.known:
-            self.operations.append(Operation(*key))
+            self.operations.append(RealOperation(*key))
             self.known[key] = len(self.operations) - 1
         return self.known[key]
 
@@ -343,14 +343,14 @@ class _Derivation:
         """Return the index of a constant."""
         return self.make("const", (), float(value))
 
-    def paced(self, rate: int, speed: int) -> int:
+    def pace_rate(self, rate: int, speed: int) -> int:
         """Return a rate times the speed."""
         v = self.make("state", (), speed)
         inverse = self.make("inv", (v,))
         operation = self.operations[rate]
         if operation.name == "mul" and inverse in operation.args:
             return operation.args[0] if operation.args[1] == inverse else operation.args[1]
-        return v if operation == Operation("const", (), 1.0) else self.make("mul", (rate, v))
+        return v if operation == RealOperation("const", (), 1.0) else self.make("mul", (rate, v))
 
     def function(self, name: str, u: int) -> int:
         """Return a function of an operation; its second operand is the factor g of its derivative, dy = g du."""
@@ -360,10 +360,10 @@ class _Derivation:
         at = len(self.operations)
         match name:
             case "exp":
-                self.operations.append(Operation(name, (u, at)))
+                self.operations.append(RealOperation(name, (u, at)))
             case "sin" | "cos":
-                self.operations += [Operation("sin", (u, at + 1)), Operation("cos", (u, at + 2))]
-                self.operations.append(Operation("neg", (at,)))
+                self.operations += [RealOperation("sin", (u, at + 1)), RealOperation("cos", (u, at + 2))]
+                self.operations.append(RealOperation("neg", (at,)))
                 self.known[("sin", u)], self.known[("cos", u)] = at, at + 1
                 return self.known[key]
             case "log":
@@ -382,11 +382,11 @@ class _Derivation:
             if key not in self.known:
                 at = len(self.operations)
                 # g = e u^e / u needs the result itself, so the three are made together
-                self.operations.append(Operation("power", (u, at + 3, exponent)))
+                self.operations.append(RealOperation("power", (u, at + 3, exponent)))
                 self.operations += [
-                    Operation("inv", (u,)),
-                    Operation("mul", (at, at + 1)),
-                    Operation("mul", (exponent, at + 2)),
+                    RealOperation("inv", (u,)),
+                    RealOperation("mul", (at, at + 1)),
+                    RealOperation("mul", (exponent, at + 2)),
                 ]
                 self.known[key] = at
             return self.known[key]
@@ -500,6 +500,8 @@ class _Derivation:
         asked, other = self.operations[which], self.operations[no]
         if asked.name == "lt" and asked.args[1] == yes and self.operations[yes].name == "const":
             x, low = asked.args
+            if self.operations[low].value == -np.inf:
+                return no
             limited = other.name == "clamp" and other.args[:2] == (x, -1)
             if limited and self.operations[low].value <= self.operations[other.args[2]].value:
                 return self.make("clamp", (x, low, other.args[2]))
@@ -580,17 +582,20 @@ def check_slip_chart(loop: Loop) -> None:
     Both are rational functions of slip and speed for 0 <= slip < 1 and a speed above 1 cm/s. They are evaluated in
     fractions at random points; a rational function that differs somewhere would agree there with probability 0.
 
+    Args:
+        loop: Closed loop of a braked wheel.
+
     Raises:
         NoRule: They differ.
     """
     graph = RealGraph()
     inputs = [graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(2)]
 
-    def seen(speed: Any, slip: Any) -> Any:
+    def show(speed: Any, slip: Any) -> Any:
         y = loop.plant.output(loop.plant.start(BrakeStart(speed=speed, slip=slip)))
         return y.slip, y.speed, y.wheel_speed
 
-    closed = jax.make_jaxpr(seen)(*[jax.ShapeDtypeStruct((), np.float64)] * 2)
+    closed = jax.make_jaxpr(show)(*[jax.ShapeDtypeStruct((), np.float64)] * 2)
     constants = [constant_array(graph, np.asarray(x)) for x in closed.consts]
     roots = [x.item() for x in lower_jaxpr(graph, closed.jaxpr, constants, [scalar_array(x) for x in inputs])]
     draw = random.Random(0)

@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 
 import diffabs as d
 from diffabs.objectives import Overshoot, StopDistance, StopTime
-from diffabs.reach import Claim, NoRule, prove_box
+from diffabs.reach import NoRule, RunClaim, prove_box
 from diffabs.reach.engine import Prover
-from diffabs.reach.equations import Equations, Operation, derive_equations
+from diffabs.reach.equations import Equations, RealOperation, derive_equations
 from diffabs.scenario.scenario import load
 
 pytestmark = pytest.mark.usefixtures("native_prover")
@@ -23,10 +23,11 @@ SMALL = {"plant.mass": (5.3, 5.32), "initial.speed": (6.0, 6.05)}  # kg, m/s
 def oscillator(period: float | None = None) -> Equations:
     """x' = v, v' = -x from (p, 0): x = p cos t. With a period, a tick halves both."""
     operations = [
-        Operation("param", (), 0), Operation("state", (), 0), Operation("state", (), 1), Operation("neg", (1,)),
-        Operation("const", (), 0.0), Operation("const", (), 1.0), Operation("state", (), 2),
-        Operation("const", (), 0.5),
-        Operation("mul", (1, 7)), Operation("mul", (2, 7)),
+        RealOperation("param", (), 0), RealOperation("state", (), 0), RealOperation("state", (), 1),
+        RealOperation("neg", (1,)),
+        RealOperation("const", (), 0.0), RealOperation("const", (), 1.0), RealOperation("state", (), 2),
+        RealOperation("const", (), 0.5),
+        RealOperation("mul", (1, 7)), RealOperation("mul", (2, 7)),
     ]  # fmt: skip
     return Equations(
         tuple(operations), ("p",), ("x", "v", "t"), (0, 4, 4), (2, 3, 5), (8, 9, 6) if period else (), period,
@@ -101,7 +102,7 @@ def test_published_gain_within_its_limits() -> None:
     proof = prove_box(
         load("slip-lmi", LIMITED).loop,
         SMALL,
-        [Claim("greatest slip", 0.34)],
+        [RunClaim("greatest slip", 0.34)],
         signals=("slip",),
         horizon=2.0,
         budget=100,
@@ -121,7 +122,7 @@ def test_false_claims_are_refuted(quantity: str) -> None:
     corners = [(m, v) for m in SMALL["plant.mass"] for v in SMALL["initial.speed"]]
     values = [rig_run(*corner)[column] for corner in corners]
     worst = int(np.argmax(values))
-    claim = Claim(quantity, values[worst] * 0.999)
+    claim = RunClaim(quantity, values[worst] * 0.999)
     loop = load("slip-lmi", LIMITED).loop
     assert prove_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=3).verdict != "proved"
     assert (
@@ -131,7 +132,9 @@ def test_false_claims_are_refuted(quantity: str) -> None:
 
 
 def test_without_time_nothing_is_decided() -> None:
-    proof = prove_box(load("slip-lmi", LIMITED).loop, SMALL, [Claim("greatest slip", 0.34)], horizon=2.0, budget=1e-9)
+    proof = prove_box(
+        load("slip-lmi", LIMITED).loop, SMALL, [RunClaim("greatest slip", 0.34)], horizon=2.0, budget=1e-9
+    )
     assert proof.verdict == "undecided"
     assert proof.bounds["stop_time"] == (-math.inf, math.inf)
 
@@ -141,7 +144,7 @@ def test_cells_cover_the_box() -> None:
     proof = prove_box(
         load("slip-lmi", LIMITED).loop,
         SMALL,
-        [Claim("greatest slip", worst * 1.0002)],
+        [RunClaim("greatest slip", worst * 1.0002)],
         signals=("slip",),
         horizon=2.0,
         budget=60,
@@ -160,7 +163,7 @@ def test_cells_cover_the_box() -> None:
 def test_random_runs_lie_within_their_cells(name: str, changes: list[str], claim: float) -> None:
     box = {"plant.mass": (5.3, 5.5), "initial.speed": (6.0, 6.5)}
     chosen = load(name, changes)
-    proof = prove_box(chosen.loop, box, [Claim("greatest slip", claim)], signals=("slip",), horizon=2.0, budget=200)
+    proof = prove_box(chosen.loop, box, [RunClaim("greatest slip", claim)], signals=("slip",), horizon=2.0, budget=200)
     assert proof.verdict == "proved"
     rng = np.random.default_rng(0)
     points = np.stack([rng.uniform(low, high, 2000) for low, high in box.values()], 1)
