@@ -21,7 +21,7 @@ from diffabs.reach.equations import Equations, derive_equations
 
 BATCH = 64  # cells between two looks at the clock
 SMALLEST = 2.0**-40  # of the box's side: a smaller cell is not halved again
-PROBES = (1e-3, 1e-4, 1e-5)  # sizes of the cell that shows how much each parameter matters, in sides of the box
+PROBE_SIZES = (1e-3, 1e-4, 1e-5)  # sizes of the cell that shows how much each parameter matters, in sides of the box
 SPEED_COST = 3.0
 CLOSE = 5e-4  # a bound is refined while it is farther than this from the worst run found, relative
 
@@ -210,7 +210,7 @@ def _measure_influence(prover: Prover, box: np.ndarray, point: np.ndarray, threa
     A cell is halved along the side that moves it most. A wrong choice costs time, and no more.
     """
     sides = box[:, 1] - box[:, 0]
-    for share in PROBES:
+    for share in PROBE_SIZES:
         cell = np.stack([np.maximum(point - share * sides, box[:, 0]), point], 1)
         found = prover.prove(cell[None], threads)
         if found.status[0] and (found.reach[0] > 0).any():

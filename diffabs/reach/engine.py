@@ -25,7 +25,7 @@ CODES = (
     *("const", "truth", "param", "state", "add", "sub", "neg", "mul", "inv", "clamp", "select", "meet"),
     *("lt", "le", "eq", "ne", "and", "or", "not", "exp", "log", "sin", "cos", "atan", "power"),
 )  # in the order of `Code` in series.h
-TABLES = 400  # parts of the range of speeds, or of the horizon, with weights of their own
+WEIGHT_TABLES = 400  # parts of the range of speeds, or of the horizon, with weights of their own
 SPEED_SHARE = 8  # weight of the slip over that of the speed, which drifts: the couplings of a period say too much of it
 NEAR = 0.3  # logarithm of the ratio of speeds whose couplings count together
 CLOCKWORK_WEIGHT = 2.0**20  # of states that are the same in all runs: nothing else mixes with them
@@ -144,7 +144,7 @@ class Prover:
         equations: Equations of the loop.
         signals: Names of the signals whose range is wanted.
         horizon: Duration after which a run is no longer followed [s].
-        weights: Units of Lohner's step, shape (TABLES, kept states); a choice, no part of the proof.
+        weights: Units of Lohner's step, shape (WEIGHT_TABLES, kept states); a choice, no part of the proof.
     """
 
     def __init__(self, equations: Equations, signals: Sequence[str], horizon: float, **settings: float):
@@ -173,7 +173,7 @@ class Prover:
         }
         self._arrays = {name: np.array(column, np.int32) for name, column in roots.items()}
         self._arrays |= _tape_arrays(e, place)
-        self.weights = np.ones((TABLES, max(1, len(kept))))
+        self.weights = np.ones((WEIGHT_TABLES, max(1, len(kept))))
         at = {name: column.ctypes.data for name, column in self._arrays.items()}
         columns = (at[name] for name in ("code", "a", "b", "c", "low", "high", "index"))
         low, high = decimal_ends(e.period) if e.period else (0.0, 0.0)
@@ -189,7 +189,7 @@ class Prover:
                 chosen["shortest"],
                 chosen["first"],
                 int(chosen["order"]),
-                TABLES,
+                WEIGHT_TABLES,
                 self.weights.ctypes.data,
                 0.0,
                 horizon,
@@ -252,8 +252,8 @@ class Prover:
             keys = np.log(np.maximum(keys, 1e-3))
         self.task.keys_low, self.task.keys_high = low, high = float(keys.min()), float(keys.max())
         near = NEAR if self.task.speed >= 0 else 0.1 * (high - low)
-        for k in range(TABLES):
-            key = low + (k + 0.5) / TABLES * (high - low)
+        for k in range(WEIGHT_TABLES):
+            key = low + (k + 0.5) / WEIGHT_TABLES * (high - low)
             close = np.abs(keys - key) <= max(near, float(np.abs(keys - key).min()))
             self.weights[k] = balance_weights(jacobians[close].max(0))
             self.weights[k, self._clockwork] = CLOCKWORK_WEIGHT
