@@ -37,6 +37,7 @@ EXTRAS = {
     "sweep": ("filelock", "pyarrow", "scipy", "zarr"),
     "cluster": ("distributed",),
     "tune": ("optax", "scipy"),
+    "proof": ("flint",),
     "report": ("jinja2",),
     "explore": ("nicegui",),
 }

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from diffabs.cli import certificates, console, show, targets
+from diffabs.cli import certificates, console, prove, show, targets
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
 from diffabs.runtime import provenance
@@ -83,9 +83,12 @@ def verify(
     seconds: Annotated[
         float, typer.Option(help="Limit of the computing time [s]; an undecided file is refused after it.")
     ] = 6.0,
+    share: Annotated[
+        float, typer.Option(help="Of a file of prove: share of its cells to check, drawn at random.")
+    ] = 0.01,
     as_json: console.Json = False,
 ) -> None:
-    """Prove a saved certificate again, in exact fractions.
+    """Prove a saved certificate again: of design and certify in exact fractions, of prove in Arb's balls.
 
     The code is independent of the code that made the certificate.
     Exit status: 0 proved, 1 not proved, 2 no certificate."""
@@ -94,6 +97,11 @@ def verify(
     with console.end_on_errors():
         if not 0 < seconds < math.inf:
             console.fail(f"--seconds = {seconds:g} is outside (0, inf) s")
+        if not 0 < share <= 1:
+            console.fail(f"--share = {share:g} is outside (0, 1]")
+        if document := prove.read_proof_file(file):
+            prove.verify_proof_file(file, document, share, as_json)
+            raise typer.Exit
         try:
             verdicts = console.run_with_progress(lambda: verified(file, seconds), f"verifying {file}")
         except ValueError as error:

@@ -15,7 +15,7 @@ from diffabs.config.values import ScenarioError, format_given, unknown_name_erro
 from diffabs.core.types import JsonObject
 from diffabs.runtime import provenance
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
-from diffabs.scenario.scenario import Scenario
+from diffabs.scenario.scenario import Scenario, dump, loads
 
 if TYPE_CHECKING:
     from diffabs.reach import BoxProof, RunClaim
@@ -51,6 +51,7 @@ def prove(
             console.fail(f"--budget = {budget:g} is outside (0, inf) s")
         from diffabs.compiler.runtime.toolchain import NoCompiler
         from diffabs.reach import NoRule, prove_box
+        from diffabs.reach.equations import derive_equations
 
         chosen = console.load_scenario(scenario, changes or (), integrated=False)
         box = _read_box(over, chosen)
@@ -63,6 +64,7 @@ def prove(
         far = [""]
         with targets.new_target_file(out, "--out") as file:
             try:
+                derive_equations(chosen.loop, box)  # refuses a loop without rules before anything is simulated
                 known, suspects = _worst_runs(chosen, box)
                 proof = console.run_with_progress(
                     lambda: prove_box(
@@ -77,13 +79,65 @@ def prove(
             result = _document(proof, chosen, box, claims, known)
             if file:
                 from diffabs.reach.certificate import certificate_document
-                from diffabs.scenario.scenario import dump
 
                 file.write_text(json.dumps(certificate_document(proof, dump(chosen), box, claims)) + "\n")
                 result["files"] = {"certificate": str(out)}
         views.as_json(result) if as_json else show_proofs.show_box_proof(result, chosen)
         if proof.verdict != "proved":
             console.fail(f"{chosen.name}: {proof.verdict}: {result['reason']}", console.FAILED)
+
+
+def read_proof_file(file: pathlib.Path) -> JsonObject | None:
+    """Return the content of a file that `prove` wrote, None for any other file.
+
+    Args:
+        file: Path of the file.
+    """
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    is_proof = isinstance(document, dict) and str(document.get("format", "")).startswith("diffabs box proof")
+    return document if is_proof else None
+
+
+def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as_json: bool) -> None:
+    """Check a file of `prove` by the checker, show the verdict, and exit with status 1 if it fails.
+
+    Args:
+        file: Path of the file.
+        document: Content of the file.
+        share: Share of the cells to check, in (0, 1].
+        as_json: True for JSON.
+    """
+    console.need_extra("proof")
+    from diffabs.reach import NoRule
+    from diffabs.reach.verification import verify_box
+
+    far = [""]
+    try:
+        chosen = loads(str(document["scenario"]).encode(), file.stem, str(file), integrated=False)
+        found = console.run_with_progress(
+            lambda: verify_box(chosen.loop, document, share, lambda line: far.__setitem__(0, line)),
+            f"verifying {file}",
+            lambda: far[0],
+        )
+    except (KeyError, NoRule, ValueError) as error:
+        console.fail(f"{file}: {' '.join(str(error).split())}")
+    claims = document["claims"] or [{"quantity": "bounds", "bound": None}]
+    views.show_verification({
+        "file": str(file),
+        "proved": not found.reason,
+        "claims": [{
+            "kind": claim["quantity"],
+            "says": f"{found.checked:,} of {found.cells:,} cells proved again",
+            "reason": found.reason,
+            "proved": not found.reason,
+        } for claim in claims],
+        "versions": provenance.versions("numpy"),
+    }, as_json)  # fmt: skip
+    if found.reason:
+        console.fail(f"{file}: not proved: {found.reason}", console.FAILED)
 
 
 def _read_box(given: Sequence[str], chosen: Scenario) -> dict[str, tuple[float, float]]:

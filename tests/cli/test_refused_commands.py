@@ -35,6 +35,18 @@ REFUSALS = [
     ("design", 2, ["missing argument"]),
     ("simulat", 2, ["Did you mean 'simulate'?"]),
     ("simulate a 'b\nc'", 2, ["unexpected extra argument"]),
+    # prove
+    ("prove slip-lmi", 2, ["missing option '--over'"]),
+    ("prove slip-lmi --over plant.mass", 2, ['--over "plant.mass" is not of the form path=low:high']),
+    ("prove slip-lmi --over plant.mas=5:6", 2, ["did you mean plant.mass?"]),
+    ("prove slip-lmi --over plant.mass=6:5", 2, ["is inverted"]),
+    ("prove slip-lmi --over plant.mass=-1:5", 2, ["outside (0, inf) kg"]),
+    ("prove slip-lmi --over plant.mass=5:6 --claim max_slp=1", 2, ["did you mean max_slip?"]),
+    ("prove slip-lmi --over plant.mass=5:6 --claim max_slip=x", 2, ["needs a number: max_slip=BOUND"]),
+    ("prove slip-lmi --over plant.mass=5:6 --claim no_lock=1", 2, ["no_lock has no bound"]),
+    ("prove slip-lmi --over plant.mass=5:6 --budget 0", 2, ["--budget = 0 is outside (0, inf) s"]),
+    ("prove slip-real --over plant.mass=5:6", 2, ["ticks with the integration grid"]),
+    ("prove slip-estimator --over plant.mass=12:13", 2, ["has events"]),
     # compile
     ("compile slip-lmi --show jpv", 2, ["--show jpv is unknown; did you mean jvp?"]),
     (

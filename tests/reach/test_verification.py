@@ -1,0 +1,91 @@
+"""A proof's file, and its verification by the checker; a file with one changed number is not verified."""
+
+import copy
+import json
+import pathlib
+from collections.abc import Callable
+
+import pytest
+from commands import run
+from mutants import killed_by
+
+from diffabs.core.types import JsonObject
+from diffabs.reach.verification import verify_box
+from diffabs.scenario.scenario import loads
+
+pytest.importorskip("flint")
+pytestmark = pytest.mark.usefixtures("native_prover")
+BOX = ["--over", "plant.mass=5.3:5.31", "--over", "initial.speed_kmh=10:10.02"]
+LIMITS = ["--set", "controller.torque_min=0", "--set", "controller.torque_max=9.03"]
+
+
+@pytest.fixture(scope="module")
+def proof(native_prover: None, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """The file of a proof of four cells or more."""
+    del native_prover
+    file = tmp_path_factory.mktemp("proof") / "p.json"
+    run("prove", "slip-lmi", *LIMITS, *BOX, "--budget", "4", "--out", file, "--json")
+    return file
+
+
+def loop_of(document: JsonObject):
+    return loads(document["scenario"].encode(), "p", "p").loop
+
+
+def test_a_file_is_verified(proof: pathlib.Path) -> None:
+    found = json.loads(run("verify", proof, "--share", "1e-6", "--json").stdout)
+    assert found["proved"]
+    document = json.loads(proof.read_text())
+    assert document["verdict"] == "proved"
+    assert len(document["cells"]) >= 1
+
+
+def lower_bound(document: JsonObject) -> None:
+    document["bounds"]["greatest slip"][1] *= 0.99
+
+
+def shorter_stop(document: JsonObject) -> None:
+    document["bounds"]["stop_time"][1] *= 0.99
+
+
+def greater_torque(document: JsonObject) -> None:
+    assert "torque_max = 9.03" in document["scenario"]
+    document["scenario"] = document["scenario"].replace("torque_max = 9.03", "torque_max = 12.0")
+
+
+def missing_cell(document: JsonObject) -> None:
+    document["cells"][0][0][1] = 0.5 * sum(document["cells"][0][0])
+
+
+def wider_box(document: JsonObject) -> None:
+    document["over"]["plant.mass"][1] = 6.2
+
+
+def cell_twice(document: JsonObject) -> None:
+    document["cells"].append(document["cells"][0])
+
+
+def false_claim(document: JsonObject) -> None:
+    document["claims"] = [{"quantity": "greatest slip", "bound": 0.2}]
+
+
+CHANGES = [lower_bound, shorter_stop, greater_torque, missing_cell, wider_box, cell_twice, false_claim]
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
+@killed_by(
+    "reach/verification.py", 'return "the cells do not come from halving the box"', 'return ""', case="missing_cell"
+)
+@killed_by("reach/verification.py", 'return "a cell occurs twice"', "pass", case="cell_twice")
+def test_a_changed_number_is_noticed(proof: pathlib.Path, change: Callable[[JsonObject], None]) -> None:
+    document = copy.deepcopy(json.loads(proof.read_text()))
+    change(document)
+    assert verify_box(loop_of(document), document, share=1e-6).reason
+
+
+def test_a_file_that_is_no_proof_is_refused(tmp_path: pathlib.Path, proof: pathlib.Path) -> None:
+    document = json.loads(proof.read_text())
+    for key in ("cells", "over", "bounds", "scenario"):
+        broken = tmp_path / f"{key}.json"
+        broken.write_text(json.dumps({name: value for name, value in document.items() if name != key}))
+        run("verify", broken, status=2)
