@@ -112,3 +112,15 @@ def file(tmp_path: pathlib.Path):
         return path
 
     return write
+
+
+@pytest.fixture(scope="session")
+def native_prover() -> None:
+    """The native prover; a machine without a compiler skips the test."""
+    from diffabs.compiler.runtime.toolchain import NoCompiler
+    from diffabs.reach import engine
+
+    try:
+        engine.library()
+    except NoCompiler as error:
+        pytest.skip(str(error))

@@ -201,6 +201,7 @@ def _worst_runs(chosen: Scenario, box: dict[str, tuple[float, float]]) -> tuple[
     import diffabs as d
     from diffabs.core.protocols import BrakeOutput
     from diffabs.objectives import Overshoot, StopDistance, StopTime
+    from diffabs.stops import SpeedReached
 
     if chosen.loop.plant.shows is not BrakeOutput:
         return {}, []
@@ -212,7 +213,12 @@ def _worst_runs(chosen: Scenario, box: dict[str, tuple[float, float]]) -> tuple[
     batch = d.Batch(dict(zip(box, points.T, strict=True)))
     runs = d.run_batch(chosen.loop, batch, chosen.solver, metrics)
     found = {name: np.asarray(column) for name, column in runs.metrics.items()}
-    found["greatest slip"] = (1 + found.pop("overshoot")) * _target(chosen)
+    overshoot = found.pop("overshoot")
+    # An overshoot of 0 says only that the slip stays below its target.
+    found["greatest slip"] = np.where(overshoot > 0, (1 + overshoot) * _target(chosen), np.nan)
+    if not isinstance(chosen.loop.stop, SpeedReached):
+        # These metrics extrapolate to rest; the proof is about the stop's own speed.
+        del found["stop_time"], found["stop_distance"]
     worst = {name: int(np.nanargmax(column)) for name, column in found.items() if np.isfinite(column).any()}
     return (
         {name: float(found[name][i]) for name, i in worst.items()},

@@ -13,7 +13,7 @@ from diffabs.reach.equations import Equations, derive_equations
 
 SAMPLED_STEPS = 2  # steps of the checker between two ticks
 PACED_STEP, STEPS = 2e-4, 500  # length in eta [s^2/m]; number of steps of another continuous loop
-HALVINGS = 3  # of a cell whose bounds by the checker are too wide
+CELL_HALVINGS = 3  # of a cell whose bounds by the checker are too wide
 ALLOWED = 1e-3  # a bound of the file may be this much below the checker's, relative: both are upper bounds
 
 
@@ -60,7 +60,7 @@ def verify_box(
     equations = derive_equations(loop, over)
     count = max(1, math.ceil(share * len(cells)))
     for done, i in enumerate(random.SystemRandom().sample(range(len(cells)), count)):
-        reason = _check(equations, document, cells[i], bounds, HALVINGS)
+        reason = _check(equations, document, cells[i], bounds, CELL_HALVINGS)
         if reason:
             ends = ", ".join(
                 f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in zip(over, cells[i], strict=True)
@@ -103,14 +103,14 @@ def _find_gap(over: JsonObject, cells: Sequence[Sequence[Sequence[float]]]) -> s
             return f"the cell {cell} is not in the box"
     if len({tuple(map(tuple, cell)) for cell in cells}) < len(cells):
         return "a cell occurs twice"
-    if not _halved(box, cells):
+    if not _comes_from_halving(box, cells):
         return "the cells do not come from halving the box"
     if sum((volume(cell) for cell in cells), Fraction(0)) != volume(box):
         return "the cells do not cover the box"
     return ""
 
 
-def _halved(box: Sequence[Sequence[float]], cells: Sequence[Sequence[Sequence[float]]]) -> bool:
+def _comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[Sequence[Sequence[float]]]) -> bool:
     """Return whether the cells are the leaves of a tree of halvings of the box, so that no two overlap."""
     if len(cells) == 1:
         return [list(ends) for ends in cells[0]] == [list(ends) for ends in box]
@@ -120,7 +120,7 @@ def _halved(box: Sequence[Sequence[float]], cells: Sequence[Sequence[Sequence[fl
         right = [cell for cell in cells if cell[i][0] >= middle]
         if left and right and len(left) + len(right) == len(cells):
             parts = ([*box[:i], end, *box[i + 1 :]] for end in ((low, middle), (middle, high)))
-            if all(_halved(part, some) for part, some in zip(parts, (left, right), strict=True)):
+            if all(_comes_from_halving(part, some) for part, some in zip(parts, (left, right), strict=True)):
                 return True
     return False
 

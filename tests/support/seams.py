@@ -48,6 +48,8 @@ SEAMS = {
     "replicate_tangents": "diffabs.compiler.lane_programs.replicate_tangents",
     "designed": "diffabs.papers.lmi_design.Designed",
     "save_figure": "diffabs.plot.sweeps.save_figure",
+    "checker_remainder": "diffabs.reach.checker._remainder",
+    "checker_chord": "diffabs.reach.checker._relax",
     "measure_metric": "diffabs.reliability.failure._measure_metric",
     "outside_named": "diffabs.scenario.outside._named",
     "is_step_stable": "diffabs.simulate.admissible.is_step_stable",

@@ -1,0 +1,43 @@
+"""The command `prove`: the yardstick of the ARCH competition from a user's own plant, and roads and controllers."""
+
+import json
+import pathlib
+
+import pytest
+from commands import run
+
+pytestmark = pytest.mark.usefixtures("native_prover")
+EXAMPLES = pathlib.Path(__file__).parents[2] / "examples"
+EXACT_POSITION = 0.04890478782180  # [m] after 0.1 s, the competition's benchmark BRKDC01
+
+
+@pytest.fixture
+def brake(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The words of a proof about the electro-mechanical brake."""
+    monkeypatch.chdir(EXAMPLES)
+    return ["prove", "embrake.toml", "--parts", "embrake", "--over", "reference.value=0.05:0.05", "--json"]
+
+
+def test_the_electro_mechanical_brake_stays_below_its_target(brake: list[str]) -> None:
+    found = json.loads(run(*brake, "--claim", "max_position=0.05").stdout)
+    assert found["verdict"] == "proved"
+    greatest = found["bounds"]["greatest position"]
+    assert greatest["low"] <= EXACT_POSITION <= greatest["high"] < EXACT_POSITION * 1.001
+
+
+def test_a_false_claim_about_the_brake_is_refuted(brake: list[str]) -> None:
+    found = json.loads(run(*brake, "--claim", f"max_position={EXACT_POSITION * 0.999}", status=1).stdout)
+    assert found["verdict"] == "refuted"
+    assert found["refuted_by"] is not None
+
+
+@pytest.mark.parametrize("road", ["burckhardt", "magic-formula"])
+def test_a_pid_quarter_car_on_other_roads(road: str, file) -> None:
+    scenario = file(f'[plant]\ntype = "quarter-car"\n[road]\ntype = "{road}"\n[solver]\nduration = 6.0\nstep = 1e-4\n')
+    words = ["prove", scenario, "--over", "plant.mass=15:15.1", "--claim", "no_lock", "--json"]
+    found = json.loads(run(*words).stdout)
+    assert found["verdict"] == "proved"
+    assert found["bounds"]["greatest slip"]["high"] < 0.2
+    for name in ("stop_time", "stop_distance"):
+        low, high = (found["bounds"][name][end] for end in ("low", "high"))
+        assert 0 < high - low < 2e-3 * high

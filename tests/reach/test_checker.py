@@ -1,0 +1,333 @@
+"""The checker's bounds against closed forms, runs and the native prover, with which it shares no code."""
+
+import math
+import random
+from fractions import Fraction
+
+import jax
+import numpy as np
+import pytest
+from seams import replace_seam
+
+import diffabs as d
+from diffabs.reach.equations import Equations, RealOperation, derive_equations
+from diffabs.scenario.scenario import load
+
+flint = pytest.importorskip("flint")
+checker = pytest.importorskip("diffabs.reach.checker")
+arb, check_cell, NotProved = flint.arb, checker.check_cell, checker.NotProved
+
+LMI = ("slip-lmi", ["controller.torque_min=0", "controller.torque_max=9.03"])
+CURED = ("slip-cured", [])
+BOX = ("plant.mass", "initial.speed")
+FULL = 50 / 3.6
+
+
+class Tape:
+    """Operations of equations that a test writes by hand."""
+
+    def __init__(self):
+        self.operations = []
+
+    def __call__(self, name, *args, value=None):
+        self.operations.append(RealOperation(name, args, value))
+        return len(self.operations) - 1
+
+    def number(self, value):
+        return self("const", value=value)
+
+    def states(self, count):
+        return [self("state", value=i) for i in range(count)]
+
+    def equations(self, start, flow, margin, signals, *, tick=(), period=None, nonnegative=()):
+        """The last two states are the distance and the time."""
+        n = len(start)
+        names = tuple(f"x{i}" for i in range(n))
+        params = tuple(o.value for o in self.operations if o.name == "param")
+        return Equations(
+            tuple(self.operations), params, names, tuple(start), tuple(flow), tuple(tick), period, signals, margin,
+            nonnegative, n - 2, -1, n - 1, False,
+        )  # fmt: skip
+
+
+def oscillator(frequency, until):
+    """x'' = -w^2 x, x(0) = p, x'(0) = 0; the distance is the integral of x; the run ends at a time."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, v, _, time = t.states(4)
+    rate = t("neg", t("mul", t.number(frequency**2), x))
+    margin = t("sub", t.number(until), time)
+    return t.equations((p, zero, zero, zero), (v, rate, x, one), margin, {"x": x, "v": v})
+
+
+def logistic(growth, until):
+    """x' = r x (1 - x), x(0) = p; the run ends at x = `until`."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, *_ = t.states(3)
+    rate = t("mul", t("mul", t.number(growth), x), t("sub", one, x))
+    return t.equations((p, zero, zero), (rate, x, one), t("sub", t.number(until), x), {"x": x})
+
+
+def limited(until):
+    """x' = min(x, 1), x(0) = p; the run ends at x = `until`."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, *_ = t.states(3)
+    rate = t("clamp", x, -1, one)
+    return t.equations((p, zero, zero), (rate, x, one), t("sub", t.number(until), x), {"x": x, "rate": rate})
+
+
+def held(gain, limit, period, until):
+    """x' = -u, u := clamp(gain x, +-limit) every period, x(0) = p; the run ends at a time."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, u, distance, time = t.states(4)
+    after = t("clamp", t("mul", t.number(gain), x), t.number(-limit), t.number(limit))
+    flow, margin = (t("neg", u), zero, x, one), t("sub", t.number(until), time)
+    return t.equations(
+        (p, zero, zero, zero), flow, margin, {"x": x, "u": u}, tick=(x, after, distance, time), period=period
+    )
+
+
+def exact(x):
+    """The fraction that an exact ball is."""
+    mantissa, exponent = x.man_exp()
+    return Fraction(int(mantissa)) * Fraction(2) ** int(exponent)
+
+
+def ends(x):
+    return exact(x.lower()), exact(x.upper())
+
+
+def within(inner, outer):
+    return outer[0] <= min(inner) and max(inner) <= outer[1]
+
+
+def test_the_balls_contain_the_intervals():
+    """Sums of ends are compared in fractions; a limit lies within its chord; signs are kept."""
+    draw = random.Random(1)
+    number = lambda: draw.choice([0.0, draw.uniform(-2, 2), draw.uniform(-1, 1) * 10 ** draw.uniform(-12, 3)])  # noqa: E731
+    for _ in range(2000):
+        a, b = sorted((number(), number()))
+        p, q = sorted((number(), number()))
+        x, y = checker._between(arb(a), arb(b)), checker._between(arb(p), arb(q))
+        assert within((Fraction(a), Fraction(b)), ends(x))
+        assert (a < 0 or ends(x)[0] >= 0) and (b > 0 or ends(x)[1] <= 0)  # noqa: PT018
+        assert within([Fraction(s) * Fraction(t) for s in (a, b) for t in (p, q)], ends(checker._product(x, y)))
+        assert within([0, Fraction(a) * Fraction(0.3), Fraction(b) * Fraction(0.3)], ends(checker._elapse(x, arb(0.3))))
+        assert within([Fraction(s) for s in (a, b, p, q)], ends(checker._hull(x, y)))
+        if max(a, p) <= min(b, q):
+            assert within([Fraction(max(a, p)), Fraction(min(b, q))], ends(checker._common(x, y)))
+        low, high = sorted((number(), number()))
+        low, high = draw.choice([(None, high), (low, None), (low, high)])
+        chord = checker._relax(x, None if low is None else arb(low), None if high is None else arb(high))
+        for argument in (a, b, draw.uniform(a, b)):
+            limited = argument if low is None else max(argument, low)
+            limited = Fraction(limited if high is None else min(limited, high))
+            rest = ends(chord.offset + checker._symmetric(chord.width))
+            assert within([limited - exact(chord.slope) * Fraction(argument)], rest)
+            assert within([limited], ends(chord.limited))
+            assert within([limited], ends(chord.values))
+    for value in (0.1, 2.1, 1e-300, 13.88888888888889):
+        assert within([Fraction(value), Fraction(repr(value))], ends(checker._constant(value)))
+
+
+def assert_encloses(bounds, truths, width):
+    """Assert that bounds contain all truths and exceed them by at most `width`."""
+    low, high = bounds
+    assert min(truths) - width <= low <= min(truths)
+    assert max(truths) <= high <= max(truths) + width
+
+
+@pytest.mark.parametrize(("cell", "width"), [((1.0, 1.0), 1e-10), ((0.9, 1.1), 1e-10)])
+def test_an_oscillator_is_enclosed(cell, width):
+    w, until = 3.0, 1.25
+    bounds = check_cell(oscillator(w, until), ("x", "v"), [cell], [0.05], 10.0)
+    assert_encloses(bounds.stop_time, [until], width)
+    assert_encloses(bounds.distance, [p * math.sin(w * until) / w for p in cell], width)
+    assert cell[1] <= bounds.greatest["x"] <= cell[1] + 1e-9
+    assert -cell[1] >= bounds.least["x"] >= -cell[1] - 1e-3  # within a piece, the rate of all runs is bounded
+    assert -3 * cell[1] >= bounds.least["v"] >= -3 * cell[1] - 3e-3
+
+
+@pytest.mark.parametrize(("cell", "width"), [((0.1, 0.1), 1e-6), ((0.1, 0.101), 1e-4)])
+def test_a_logistic_equation_is_enclosed(cell, width):
+    r, until = 2.0, 0.9
+    bounds = check_cell(logistic(r, until), ("x",), [cell], [0.05] * 43 + [1e-3], 10.0)
+    starts = np.linspace(*cell, 5)
+    assert_encloses(bounds.stop_time, [math.log(until / (1 - until) * (1 - p) / p) / r for p in starts], width)
+    assert_encloses(bounds.distance, [math.log((1 - p) / (1 - until)) / r for p in starts], width)
+    assert bounds.least["x"] <= cell[0]
+
+
+@pytest.mark.parametrize(("cell", "width"), [((0.5, 0.5), 1e-5), ((0.5, 0.51), 1e-3)])
+def test_a_limit_within_a_flow_is_enclosed(cell, width):
+    bounds = check_cell(limited(2.0), ("x", "rate"), [cell], [0.05] * 33 + [1e-3], 10.0)
+    assert_encloses(bounds.stop_time, [1 - math.log(p) for p in np.linspace(*cell, 5)], width)
+    assert_encloses(bounds.distance, [1 - p + 1.5 for p in np.linspace(*cell, 5)], width)
+    assert 1.0 <= bounds.greatest["rate"] <= 1.0 + width
+
+
+def test_a_limit_of_a_limit_is_enclosed():
+    """x' = min(min(x, 1) + 1/4, 1.125), x(0) = p; the run ends at x = 2."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, *_ = t.states(3)
+    inner = t("add", t("clamp", x, -1, one), t.number(0.25))
+    rate = t("clamp", inner, -1, t.number(1.125))
+    e = t.equations((p, zero, zero), (rate, x, one), t("sub", t.number(2.0), x), {"x": x})
+    cell = (0.5, 0.505)
+    bounds = check_cell(e, ("x",), [cell], [0.05] * 20 + [1e-3], 10.0)
+    truths = [math.log(1.125 / (p + 0.25)) + 1.125 / 1.125 for p in cell]
+    assert_encloses(bounds.stop_time, truths, 2e-3)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_limit_at_a_tick_is_enclosed(steps):
+    gain, limit, period, until = 4.0, 0.75, 0.125, 0.95
+
+    def run(x):
+        distance, time, moves = 0.0, 0.0, []
+        while time < until:
+            u, h = min(limit, max(-limit, gain * x)), min(period, until - time)
+            distance, x, time = distance + x * h - u * h * h / 2, x - u * h, time + h
+            moves.append(u)
+        return distance, max(moves)
+
+    cell = (0.35, 0.36)
+    bounds = check_cell(held(gain, limit, period, until), ("x", "u"), [cell], steps, 10.0)
+    truths = [run(p)[0] for p in np.linspace(*cell, 11)]
+    assert_encloses(bounds.stop_time, [until], 1e-12)
+    assert_encloses(bounds.distance, truths, 1e-3)
+    assert limit <= bounds.greatest["u"] <= limit + 0.02
+
+
+def test_a_lost_remainder_shows(monkeypatch):
+    """The closed form leaves the enclosure if Lagrange's remainder is 0."""
+    truth = math.sin(3.0 * 1.25) / 3.0
+    replace_seam(monkeypatch, "checker_remainder", lambda series, rate, order: arb(0))
+    bounds = check_cell(oscillator(3.0, 1.25), ("x",), [(1.0, 1.0)], [0.05], 10.0)
+    assert not bounds.distance[0] <= truth <= bounds.distance[1]
+
+
+def test_a_lost_disturbance_shows(monkeypatch):
+    """The closed form leaves the enclosure if a chord is taken for the limit itself."""
+    relax = checker._relax
+    replace_seam(monkeypatch, "checker_chord", lambda x, low, high: relax(x, low, high)._replace(width=arb(0)))
+    low, high = check_cell(limited(2.0), ("x",), [(0.5, 0.5)], [0.3], 10.0).stop_time
+    assert not low <= 1 + math.log(2.0) <= high
+
+
+def test_what_has_no_proof_is_refused():
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, _, time = t.states(3)
+    inverse = t("inv", t("sub", x, one))
+    pole = t.equations((p, zero, zero), (inverse, x, one), t("sub", t.number(9.0), time), {"x": x})
+    with pytest.raises(NotProved, match="division"):
+        check_cell(pole, ("x",), [(0.5, 1.5)], [0.1], 10.0)
+    switch = t("select", t("lt", x, t.number(0.55)), zero, one)
+    relay = t.equations((p, zero, zero), (switch, x, one), t("sub", t.number(9.0), time), {"x": x})
+    with pytest.raises(NotProved, match="decide"):
+        check_cell(relay, ("x",), [(0.5, 0.6)], [0.1], 10.0)
+    falling = t.equations(
+        (p, zero, zero), (t("neg", one), x, one), t("sub", t.number(9.0), time), {"x": x}, nonnegative=(0,)
+    )
+    with pytest.raises(NotProved, match="negative"):
+        check_cell(falling, ("x",), [(0.5, 0.6)], [0.1], 10.0)
+    with pytest.raises(NotProved, match="at its start"):
+        check_cell(logistic(2.0, 0.9), ("x",), [(0.8, 0.95)], [0.1], 10.0)
+    with pytest.raises(NotProved, match="number of steps"):
+        check_cell(held(4.0, 0.75, 0.125, 1.0), ("x",), [(0.3, 0.3)], [0.1], 10.0)
+
+
+def test_a_horizon_ends_the_proof_early():
+    bounds = check_cell(oscillator(3.0, 5.0), ("x",), [(1.0, 1.0)], [0.05], 0.3)
+    assert 0.3 <= bounds.stop_time[0] < 0.36
+    assert bounds.stop_time[1] == math.inf
+    assert bounds.distance[0] == pytest.approx(math.sin(3 * bounds.stop_time[0]) / 3, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["exp", "log", "sin", "atan", "power"])
+def test_functions_are_enclosed(name):
+    """x' = 1 with x(0) = p, and the distance is the integral of a function of x."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, _, time = t.states(3)
+    at = len(t.operations)
+    match name:
+        case "exp":
+            f, integral = t("exp", x, at), math.exp
+        case "log":
+            inverse = t("inv", x)
+            f, integral = t("log", x, inverse), lambda x: x * math.log(x) - x
+        case "sin":
+            t("sin", x, at + 1), t("cos", x, at + 2), t("neg", at)
+            f, integral = at, lambda x: -math.cos(x)
+        case "atan":
+            inverse = t("inv", t("add", one, t("mul", x, x)))
+            f, integral = t("atan", x, inverse), lambda x: x * math.atan(x) - math.log(1 + x * x) / 2
+        case _:  # power
+            exponent = t.number(0.3)
+            at = t("power", x, at + 4, exponent)
+            t("inv", x), t("mul", at, at + 1), t("mul", exponent, at + 2)
+            f, integral = at, lambda x: x**1.3 / 1.3
+    e = t.equations((p, zero, zero), (one, f, one), t("sub", t.number(1.0), time), {"f": f})
+    bounds = check_cell(e, ("f",), [(0.5, 0.5)], [0.05], 10.0)
+    assert_encloses(bounds.distance, [integral(1.5) - integral(0.5)], 1e-8)
+
+
+def measured(scenario, mass, speed):
+    """Stop time, distance and greatest slip of one run, in small steps."""
+    with jax.enable_x64(True):
+        rig = load(*scenario)
+        solver = d.FixedStep(2e-5 if scenario is LMI else 1e-4, 2.5)
+        found = d.measure(
+            d.replace(rig.loop, {"plant.mass": mass, "initial.speed": speed}), solver, rig.objectives
+        ).metrics
+        return tuple(float(found[name]) for name in ("stop_time", "stop_distance", "max_slip"))
+
+
+def cell_at(mass, speed, mass_side, speed_side):
+    return [(mass - mass_side / 2, mass + mass_side / 2), (speed - speed_side / 2, speed + speed_side / 2)]
+
+
+def proved_by_engine(equations, cell, horizon):
+    """CheckedBounds of the native prover, or None if it has no proof."""
+    engine = pytest.importorskip("diffabs.reach.engine")
+    prover = engine.Prover(equations, ("slip",), horizon, tolerance=1e-8)
+    prover.balance(np.mean(cell, axis=1))
+    found = prover.prove(np.array([cell] * 8), 1)
+    return (found.time[0], found.distance[0], found.greatest[0, 0]) if found.status[0] else None
+
+
+@pytest.mark.slow
+def test_the_published_gain_with_limits():
+    e = derive_equations(load(*LMI).loop, BOX)
+    cell = cell_at(5.3, FULL, 0.002, 0.02 / 3.6)
+    bounds = check_cell(e, ("slip",), cell, [2e-4], 2.5)
+    for mass, speed in ((5.3, FULL), (cell[0][0], cell[1][0]), (cell[0][1], cell[1][1])):
+        time, distance, slip = measured(LMI, mass, speed)
+        assert bounds.stop_time[0] <= time <= bounds.stop_time[1]
+        assert bounds.distance[0] <= distance <= bounds.distance[1]
+        assert slip - 1e-6 <= bounds.greatest["slip"] <= slip + 1e-4
+    assert bounds.stop_time[1] - bounds.stop_time[0] < 1e-3
+    small = cell_at(5.3, FULL, 0.0005, 0.005 / 3.6)  # within the cell, and one that the engine proves
+    if found := proved_by_engine(e, small, 2.5):
+        assert found[0] == pytest.approx(bounds.stop_time, rel=1e-3)
+        assert found[1] == pytest.approx(bounds.distance, rel=1e-3)
+        assert found[2] == pytest.approx(bounds.greatest["slip"], rel=1e-3)
+
+
+@pytest.mark.slow
+def test_the_cured_gain():
+    e = derive_equations(load(*CURED).loop, BOX)
+    cell = cell_at(5.3, FULL, 0.002, 0.02 / 3.6)
+    bounds = check_cell(e, ("slip",), cell, 2, 0.1)
+    _, _, slip = measured(CURED, 5.3, FULL)  # its slip is greatest at 0.05 s
+    assert 0.1 <= bounds.stop_time[0] <= 0.102
+    assert bounds.stop_time[1] == math.inf
+    assert slip - 1e-6 <= bounds.greatest["slip"] <= slip + 1e-4
+    if found := proved_by_engine(e, cell, 0.1):
+        assert found[2] == pytest.approx(bounds.greatest["slip"], rel=1e-3)
