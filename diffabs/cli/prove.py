@@ -13,7 +13,7 @@ from diffabs.cli import console, show_proofs, targets
 from diffabs.cli import show as views
 from diffabs.config.values import ScenarioError, format_given, unknown_name_error
 from diffabs.core.types import JsonObject
-from diffabs.runtime import provenance
+from diffabs.runtime import files, provenance
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.scenario import Scenario, dump, loads
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from diffabs.reach import BoxProof, RunClaim
 
 SEARCHED = (9, 17)  # runs along the first and the other parameters, among which the worst is looked for
+MOST_BYTES = 2**28  # of a file that is read; some million cells
 NO_LOCK, OVERSHOOT, TIMES = "no_lock", "overshoot", ("stop_time", "stop_distance")
 
 
@@ -94,7 +95,7 @@ def read_proof_file(file: pathlib.Path) -> JsonObject | None:
         file: Path of the file.
     """
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
+        document = json.loads(files.read_content(file, MOST_BYTES))
     except (OSError, ValueError, RecursionError):
         return None
     is_proof = isinstance(document, dict) and str(document.get("format", "")).startswith("diffabs box proof")

@@ -42,8 +42,9 @@ PRECISION = 96  # bits
 ORDER = 7  # of the Taylor polynomials
 LOWER_ORDERS = (2, 1)  # where a number has no more derivatives
 TOLERANCE = 1e-9  # radius of a remainder, or of a disturbance's effect, that a step may add to a state
-STEP_HALVINGS = 40  # of one given step
+MAX_HALVINGS = 40  # of one given step
 PICARD_TRIES = 40
+SPEED_WEIGHT = 0.125  # of the speed relative to the slip, in the scales of QR for a sampled loop
 PIECES = 8  # of a step, for the bounds of a signal
 FASTEST_SLIP, SLOWEST = 1.0, 0.01  # `check_slip_chart` holds for a slip below 1 and a speed above 1 cm/s
 ZERO, ONE, NO_SLOPE = arb(0), arb(1), arb_poly([])
@@ -149,7 +150,7 @@ def _product(x: arb, y: arb) -> arb:
     return z
 
 
-def _elapse(rate: arb, h: arb) -> arb:
+def _integral_range(rate: arb, h: arb) -> arb:
     """Return a ball that contains t r for all t in [0, h] and all r of a rate."""
     return _between(min(ZERO, (rate * h).lower()), max(ZERO, (rate * h).upper()))
 
@@ -267,7 +268,9 @@ class _Series:
         """
         self.program, self.parameters, self.start = program, parameters, states
         self.halves, self.tangents, self.centre = halves, tangents, centre
-        self.chords, self.forced, self.seeds = chords if chords is not None else {}, forced, seeds or {}
+        self.forced = forced
+        # Both may be filled later, so an empty one is kept.
+        self.chords, self.seeds = {} if chords is None else chords, {} if seeds is None else seeds
         count = len(program.operations)
         self.v: list[list[arb]] = [[] for _ in range(count)]
         self.d: list[list[arb_poly]] = [[] for _ in range(count)]
@@ -500,7 +503,7 @@ def _at(coefficients: Sequence[Number], t: arb) -> Number:
 def _relax(x: arb, low: arb | None, high: arb | None) -> _Chord:
     """Return the chord of a limit for all arguments in x."""
 
-    def limit_to(y: arb) -> arb:
+    def clamp(y: arb) -> arb:
         a, b = y.lower(), y.upper()
         if low is not None:
             a, b = max(a, low.lower()), max(b, low.upper())
@@ -515,14 +518,14 @@ def _relax(x: arb, low: arb | None, high: arb | None) -> _Chord:
         return _Chord(ZERO, high, ZERO, high, high)
     if (low is None or a >= low.upper()) and (high is None or b <= high.lower()):
         return _Chord(ONE, ZERO, ZERO, x, x)
-    slope = arb(min(1.0, max(0.0, float(((limit_to(b) - limit_to(a)) / (b - a)).mid())))) if b > a else ZERO
-    # limit_to(y) - slope y is piecewise linear: its extremes lie at the ends and at the limits between them.
+    slope = arb(min(1.0, max(0.0, float(((clamp(b) - clamp(a)) / (b - a)).mid())))) if b > a else ZERO
+    # clamp(y) - slope y is piecewise linear: its extremes lie at the ends and at the limits between them.
     inside = [y for y in (low, high) if y is not None and not (y.upper() < a or y.lower() > b)]
-    gaps = [limit_to(y) - slope * y for y in (a, b, *inside)]
+    gaps = [clamp(y) - slope * y for y in (a, b, *inside)]
     offset = (min(y.lower() for y in gaps) + max(y.upper() for y in gaps)) / 2
     offset = arb(float(offset.mid()))
     width = max((y - offset).abs_upper() for y in gaps).upper()
-    return _Chord(slope, offset, width, limit_to(x), _hull(limit_to(x), slope * x + offset + _symmetric(width)))
+    return _Chord(slope, offset, width, clamp(x), _hull(clamp(x), slope * x + offset + _symmetric(width)))
 
 
 def _remainder(series: _Series, rate: int, order: int) -> arb:
@@ -618,7 +621,7 @@ class _Check:
         start = [e.start[i] for i in p.states]
         if any(p.operations[i].name == "state" for i in p.read_by(start)):
             raise NotProved("a start that depends on a state")
-        point, whole, _ = self.relax(p.start_limits, [ZERO] * self.n, [ZERO] * self.n, tangents, self.np)
+        point, whole, _ = self.relax_limits(p.start_limits, [ZERO] * self.n, [ZERO] * self.n, tangents, self.np)
         self.B, self.r = np.eye(self.n), [ZERO] * self.n
         self.G, self.c = np.zeros((self.n, self.np)), [0.0] * self.n
         self.renew(
@@ -672,7 +675,7 @@ class _Check:
         tangents = self.directions()
         return self.whole(self.box(tangents), tangents=tangents, centre=self.point(self.centre()))
 
-    def relax(
+    def relax_limits(
         self,
         limits: Sequence[int],
         centre: Sequence[arb],
@@ -780,7 +783,10 @@ class _Check:
         except _Undefined:
             return
         if np.isfinite(total).all():
-            self.weights = _balance(total)
+            self.weights = _balance_matrix(total)
+            if p.tick and self.speed >= 0 and self.slip >= 0:
+                # An error of the speed stays, while one of the slip decays: the axes must not turn slip into speed.
+                self.weights[self.speed] = self.weights[self.slip] * SPEED_WEIGHT
 
     # Moves.
 
@@ -789,7 +795,7 @@ class _Check:
         try:
             self.step(h)
         except (_StepFails, _Undefined) as reason:
-            if depth >= STEP_HALVINGS:
+            if depth >= MAX_HALVINGS:
                 raise NotProved(f"{reason} at {float(self.elapsed.mid()):g}") from None
             self.advance(h / 2, depth + 1)
             self.advance(h / 2, depth + 1)
@@ -814,9 +820,10 @@ class _Check:
         push, slack = self.disturb(box, chords, h)
         power = h ** (order + 1)
         rest = [_remainder(far, rate, order + 1) * power for rate in p.flow]
-        for i in range(n):
-            if not rest[i].rad() < TOLERANCE:
-                raise _StepFails("the remainder of a step is too wide")
+        totals = [q for q in (self.travelled, self.clock) if q is not None]
+        total_rest = [_remainder(far, q.rate, order + 1) * power for q in totals]
+        if not all(x.rad() < TOLERANCE for x in (*rest, *total_rest)):
+            raise _StepFails("the remainder of a step is too wide")
         across = any(not x.is_zero() for x in push)
         crossed = [q for q, chord in chords.items() if not chord.width.is_zero()]
         if (
@@ -836,13 +843,10 @@ class _Check:
         ]
         before = self.c, self.G, self.B, self.r
         sums = []
-        for q in (self.travelled, self.clock):
-            if q is not None:
-                middle = _at([ZERO, *(integral(q.rate, k) for k in range(order))], h)
-                along = _at([NO_SLOPE, *(whole.slope(q.rate, k) * (ONE / (k + 1)) for k in range(order))], h)
-                sums.append(
-                    (q, middle + _remainder(far, q.rate, order + 1) * power, along, h * slack.get(q.rate, ZERO))
-                )
+        for q, extra in zip(totals, total_rest, strict=True):
+            middle = _at([ZERO, *(integral(q.rate, k) for k in range(order))], h)
+            along = _at([NO_SLOPE, *(whole.slope(q.rate, k) * (ONE / (k + 1)) for k in range(order))], h)
+            sums.append((q, middle + extra, along, h * slack.get(q.rate, ZERO)))
         limits = self.signal_bounds(point, whole, far, boxed, h, order, slack)
         margin, margin_rate = boxed.value(e.margin), boxed.value(e.margin, 1)
         near = {"margin": margin_rate, "clock": boxed.value(self.clock.rate) if self.clock else ONE}
@@ -878,7 +882,7 @@ class _Check:
         leave neither box nor ranges, these hold for the runs with limits and for those with chords (w = 0).
         """
         p, s = self.program, self.slip
-        _, whole, _ = self.relax(p.limits, centre, X, tangents, self.np + self.n)
+        _, whole, _ = self.relax_limits(p.limits, centre, X, tangents, self.np + self.n)
         arguments = {i: p.operations[i].args[0] for i in whole.chords}
         at_start = {i: whole.range(a) for i, a in arguments.items()}
         # What depends on another limit jumps at the start of a step, where the chord of that limit changes.
@@ -889,11 +893,11 @@ class _Check:
         ) -> tuple[list[arb], dict[int, arb], dict[int, _Chord], _Series]:
             chords = {i: self.chord(whole, i, x) for i, x in ranges.items()}
             series = self.whole(box, chords=chords, forced=True)
-            moved = [x + _elapse(series.value(rate), h) for x, rate in zip(X, p.flow, strict=True)]
+            moved = [x + _integral_range(series.value(rate), h) for x, rate in zip(X, p.flow, strict=True)]
             if s >= 0:
                 moved[s] = moved[s].nonnegative_part() if moved[s].lower() < 0 else moved[s]
             argument = {
-                i: series.value(a) if i in nested else at_start[i] + _elapse(series.value(a, 1), h)
+                i: series.value(a) if i in nested else at_start[i] + _integral_range(series.value(a, 1), h)
                 for i, a in arguments.items()
             }
             return moved, argument, chords, series
@@ -919,7 +923,9 @@ class _Check:
         ):
             ranges, chords = narrower, new_chords
         series = self.whole(narrow, chords=chords, forced=True)
-        box = [_common(x + _elapse(series.value(rate), h), b) for x, rate, b in zip(X, p.flow, narrow, strict=True)]
+        box = [
+            _common(x + _integral_range(series.value(rate), h), b) for x, rate, b in zip(X, p.flow, narrow, strict=True)
+        ]
         if s >= 0 and box[s].lower() < 0:
             box[s] = box[s].nonnegative_part()
         self.ranges = {i: (at_start[i], ranges[i]) for i in ranges}
@@ -1044,7 +1050,7 @@ class _Check:
         p = self.program
         tangents, centre = self.directions(), self.centre()
         X = self.box(tangents)
-        point, whole, _ = self.relax(p.tick_limits, centre, X, tangents, self.np + self.n)
+        point, whole, _ = self.relax_limits(p.tick_limits, centre, X, tangents, self.np + self.n)
         try:
             after = [point.value(i) for i in p.tick]
             slopes = [whole.slope(i) for i in p.tick]
@@ -1060,7 +1066,7 @@ class _Check:
         """Return the time of the set."""
         return self.clock.copy() if self.clock is not None else _Quadrature(-1, self.elapsed, np.zeros(self.np))
 
-    def has_finished(self) -> bool:
+    def is_over(self) -> bool:
         """Return whether all runs have ended; capture the set in which half of them have."""
         if self.rates is None:
             return False
@@ -1129,7 +1135,7 @@ def _wider(x: arb) -> arb:
     return x + arb(0, (x.rad() * arb("0.1") + arb("1e-14")).upper())
 
 
-def _balance(matrix: np.ndarray) -> np.ndarray:
+def _balance_matrix(matrix: np.ndarray) -> np.ndarray:
     """Return powers of two w for which the rows and columns of diag(w) matrix diag(1/w) have equal norms."""
     n = len(matrix)
     a, w = np.array(matrix, float), np.ones(n)
@@ -1192,7 +1198,7 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
             check.do_tick()
             for _ in range(steps):
                 check.advance(period / steps)
-                if check.has_finished():
+                if check.is_over():
                     return check.bounds(True)
             tick += 1
             check.elapsed = period * tick
@@ -1210,7 +1216,7 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
             check.balance(0.0)
         check.advance(arb(float(steps[min(number, len(steps) - 1)])))
         number += 1
-        if check.has_finished():
+        if check.is_over():
             return check.bounds(True)
         if check.past_horizon(horizon):
             return check.bounds(False)

@@ -115,7 +115,9 @@ def test_the_balls_contain_the_intervals():
         assert within((Fraction(a), Fraction(b)), ends(x))
         assert (a < 0 or ends(x)[0] >= 0) and (b > 0 or ends(x)[1] <= 0)  # noqa: PT018
         assert within([Fraction(s) * Fraction(t) for s in (a, b) for t in (p, q)], ends(checker._product(x, y)))
-        assert within([0, Fraction(a) * Fraction(0.3), Fraction(b) * Fraction(0.3)], ends(checker._elapse(x, arb(0.3))))
+        assert within(
+            [0, Fraction(a) * Fraction(0.3), Fraction(b) * Fraction(0.3)], ends(checker._integral_range(x, arb(0.3)))
+        )
         assert within([Fraction(s) for s in (a, b, p, q)], ends(checker._hull(x, y)))
         if max(a, p) <= min(b, q):
             assert within([Fraction(max(a, p)), Fraction(min(b, q))], ends(checker._common(x, y)))
@@ -249,33 +251,98 @@ def test_a_horizon_ends_the_proof_early():
     assert bounds.distance[0] == pytest.approx(math.sin(3 * bounds.stop_time[0]) / 3, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", ["exp", "log", "sin", "atan", "power"])
-def test_functions_are_enclosed(name):
-    """x' = 1 with x(0) = p, and the distance is the integral of a function of x."""
+@pytest.mark.parametrize("name", ["exp", "log", "sin", "atan", "power", "inv"])
+@pytest.mark.parametrize(("cell", "width"), [((0.5, 0.5), 1e-7), ((0.5, 0.54), 3e-2)])
+def test_functions_are_enclosed(name, cell, width):
+    """x' = 1 with x(0) = p, and the distance is the integral of a function of u = x^2 over 1 s."""
     t = Tape()
     p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
     x, _, time = t.states(3)
+    u = t("mul", x, x)
     at = len(t.operations)
     match name:
         case "exp":
-            f, integral = t("exp", x, at), math.exp
+            f, function = t("exp", u, at), np.exp
         case "log":
-            inverse = t("inv", x)
-            f, integral = t("log", x, inverse), lambda x: x * math.log(x) - x
+            inverse = t("inv", u)
+            f, function = t("log", u, inverse), np.log
         case "sin":
-            t("sin", x, at + 1), t("cos", x, at + 2), t("neg", at)
-            f, integral = at, lambda x: -math.cos(x)
+            t("sin", u, at + 1)
+            t("cos", u, at + 2)
+            t("neg", at)
+            f, function = at, np.sin
         case "atan":
-            inverse = t("inv", t("add", one, t("mul", x, x)))
-            f, integral = t("atan", x, inverse), lambda x: x * math.atan(x) - math.log(1 + x * x) / 2
+            inverse = t("inv", t("add", one, t("mul", u, u)))
+            f, function = t("atan", u, inverse), np.arctan
+        case "inv":
+            f, function = t("inv", u), np.reciprocal
         case _:  # power
             exponent = t.number(0.3)
-            at = t("power", x, at + 4, exponent)
-            t("inv", x), t("mul", at, at + 1), t("mul", exponent, at + 2)
-            f, integral = at, lambda x: x**1.3 / 1.3
-    e = t.equations((p, zero, zero), (one, f, one), t("sub", t.number(1.0), time), {"f": f})
-    bounds = check_cell(e, ("f",), [(0.5, 0.5)], [0.05], 10.0)
-    assert_encloses(bounds.distance, [integral(1.5) - integral(0.5)], 1e-8)
+            at = t("power", u, at + 4, exponent)
+            t("inv", u)
+            t("mul", at, at + 1)
+            t("mul", exponent, at + 2)
+            f, function = at, lambda y: y**0.3
+    e = t.equations((p, zero, zero), (one, f, one), t("sub", one, time), {"f": f})
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    truths = [0.5 * weights @ function((start + 0.5 + 0.5 * nodes) ** 2) for start in cell]
+    assert_encloses(check_cell(e, ("f",), [cell], [0.05], 10.0).distance, truths, width)
+
+
+def test_a_wide_cell_is_enclosed_where_the_end_is_not_linear_in_its_start():
+    """x' = x^2, x(0) = p: x = p/(1 - p t), and the distance is -log(1 - p t)."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, _, time = t.states(3)
+    e = t.equations((p, zero, zero), (t("mul", x, x), x, one), t("sub", one, time), {"x": x})
+    cell = (0.4, 0.5)
+    bounds = check_cell(e, ("x",), [cell], [0.05], 10.0)
+    assert_encloses(bounds.distance, [-math.log(1 - p) for p in cell], 0.02)
+    assert 1.0 <= bounds.greatest["x"] <= 1.1
+
+
+def test_a_parameter_of_the_flow_is_enclosed():
+    """x' = -p x, x(0) = 1; the run ends at x = 1/2."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, *_ = t.states(3)
+    e = t.equations((one, zero, zero), (t("neg", t("mul", p, x)), x, one), t("sub", x, t.number(0.5)), {"x": x})
+    cell = (1.0, 1.2)
+    bounds = check_cell(e, ("x",), [cell], [0.02], 10.0)
+    assert_encloses(bounds.stop_time, [math.log(2) / p for p in cell], 0.05)
+    assert_encloses(bounds.distance, [0.5 / p for p in cell], 0.05)
+
+
+def test_a_wide_parameter_of_the_flow_is_enclosed():
+    """x' = p^3, x(0) = 0, during 1 s: linear in time, far from linear in p."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, _, time = t.states(3)
+    rate = t("mul", p, t("mul", p, p))
+    e = t.equations((zero, zero, zero), (rate, x, one), t("sub", one, time), {"x": x})
+    bounds = check_cell(e, ("x",), [(1.0, 2.0)], [1.0], 10.0)
+    assert_encloses(bounds.distance, [0.5, 4.0], 3.5)
+    assert 8.0 <= bounds.greatest["x"] <= 18.0
+
+
+def test_an_end_with_different_rates_is_enclosed():
+    """x' = x^2 ends at x = 2: while the runs pass the end one after another, the rates change."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, *_ = t.states(3)
+    e = t.equations((p, zero, zero), (t("mul", x, x), x, one), t("sub", t.number(2.0), x), {"x": x})
+    cell = (0.45, 0.46)
+    bounds = check_cell(e, ("x",), [cell], [0.002], 10.0)
+    assert_encloses(bounds.stop_time, [1 / p - 0.5 for p in cell], 0.1)
+    assert_encloses(bounds.distance, [math.log(2 / p) for p in cell], 0.3)
+
+
+def test_a_set_across_a_limit_at_a_tick_is_enclosed():
+    """One period: the greatest distance belongs to an end of the cell, where the chord alone would miss it."""
+    until, cell = 0.9, (0.1, 0.3)
+    bounds = check_cell(held(4.0, 0.75, 1.0, until), ("x", "u"), [cell], 1, 10.0)
+    truths = [p * until - min(4 * p, 0.75) * until**2 / 2 for p in np.linspace(*cell, 41)]
+    assert_encloses(bounds.distance, truths, 0.2)
 
 
 def measured(scenario, mass, speed):
@@ -294,7 +361,7 @@ def cell_at(mass, speed, mass_side, speed_side):
 
 
 def proved_by_engine(equations, cell, horizon):
-    """CheckedBounds of the native prover, or None if it has no proof."""
+    """Bounds of the native prover, or None if it has no proof."""
     engine = pytest.importorskip("diffabs.reach.engine")
     prover = engine.Prover(equations, ("slip",), horizon, tolerance=1e-8)
     prover.balance(np.mean(cell, axis=1))
