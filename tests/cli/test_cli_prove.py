@@ -2,9 +2,12 @@
 
 import json
 import pathlib
+from collections.abc import Iterator
 
 import pytest
 from commands import run
+
+from diffabs.scenario.outside import lend_modules
 
 pytestmark = pytest.mark.usefixtures("native_prover")
 EXAMPLES = pathlib.Path(__file__).parents[2] / "examples"
@@ -12,20 +15,20 @@ EXACT_POSITION = 0.04890478782180  # [m] after 0.1 s, the competition's benchmar
 
 
 @pytest.fixture
-def brake(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The words of a proof about the electro-mechanical brake."""
-    monkeypatch.chdir(EXAMPLES)
-    return ["prove", "embrake.toml", "--parts", "embrake", "--over", "reference.value=0.05:0.05", "--json"]
+def brake() -> Iterator[list[str | pathlib.Path]]:
+    """The words of a proof about the electro-mechanical brake, a user's own plant."""
+    with lend_modules(EXAMPLES, ["embrake"]):
+        yield ["prove", EXAMPLES / "embrake.toml", "--over", "reference.value=0.05:0.05", "--json"]
 
 
-def test_the_electro_mechanical_brake_stays_below_its_target(brake: list[str]) -> None:
+def test_the_electro_mechanical_brake_stays_below_its_target(brake: list[str | pathlib.Path]) -> None:
     found = json.loads(run(*brake, "--claim", "max_position=0.05").stdout)
     assert found["verdict"] == "proved"
     greatest = found["bounds"]["greatest position"]
     assert greatest["low"] <= EXACT_POSITION <= greatest["high"] < EXACT_POSITION * 1.001
 
 
-def test_a_false_claim_about_the_brake_is_refuted(brake: list[str]) -> None:
+def test_a_false_claim_about_the_brake_is_refuted(brake: list[str | pathlib.Path]) -> None:
     found = json.loads(run(*brake, "--claim", f"max_position={EXACT_POSITION * 0.999}", status=1).stdout)
     assert found["verdict"] == "refuted"
     assert found["refuted_by"] is not None

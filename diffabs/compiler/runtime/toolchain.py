@@ -102,19 +102,20 @@ def find_compiler() -> Compiler:
     raise NoCompiler("; ".join(reasons) or 'no C++ compiler; pip install ".[kernel]" in a clone brings one')
 
 
-def build_library(text: str, flags: tuple[str, ...] = CPP_FLAGS) -> pathlib.Path:
+def build_library(text: str, flags: tuple[str, ...] = ()) -> pathlib.Path:
     """Compile a C++ text, unless the cache holds its library, and return the library's file.
 
     Args:
         text: C++ source.
-        flags: Flags of the compiler.
+        flags: Flags of the compiler in place of `CPP_FLAGS`, unless empty.
 
     Raises:
         NoCompiler: No compiler works, compilation fails, or the cache folder is unusable: not writable, or writable for
             other users.
     """
     made = find_compiler()
-    digest = _digest(text, made, flags)
+    given = (flags,) if flags else ()
+    digest = _digest(text, made, *given)
     try:
         if path := find_library(digest, ".so"):
             return path
@@ -123,7 +124,7 @@ def build_library(text: str, flags: tuple[str, ...] = CPP_FLAGS) -> pathlib.Path
             source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
             source.write_text(text)
             with stopwatch.count_as_compiling():
-                _compile(made.command, source, result, COMPILE_TIMEOUT_S, flags)
+                _compile(made.command, source, result, COMPILE_TIMEOUT_S, *given)
             return write_library(digest, ".so", result.read_bytes())
     except OSError as error:
         raise NoCompiler(f"no kernel in {cache_folder()}: {error.strerror or error}") from None
@@ -141,15 +142,11 @@ def describe_compiler() -> dict[str, str]:
 
 
 def _compile(
-    command: tuple[str, ...],
-    source: pathlib.Path,
-    result: pathlib.Path,
-    longest: float,
-    flags: tuple[str, ...] = CPP_FLAGS,
+    command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path, longest: float, flags: tuple[str, ...] = ()
 ) -> None:
     """Compile a C++ file to the library `result` in at most `longest` seconds; raise NoCompiler if that fails."""
     include = [f"-I{NATIVE_FOLDER}", f"-I{jax.ffi.include_dir()}"]
-    done = _run_command([*command, *flags, *include, "-o", str(result), str(source), "-lm"], longest)
+    done = _run_command([*command, *(flags or CPP_FLAGS), *include, "-o", str(result), str(source), "-lm"], longest)
     if done.returncode or not result.is_file():
         lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"exit status {done.returncode}"]
         errors = [line for line in lines if "error" in line]
@@ -175,12 +172,13 @@ def _run_command(words: list[str], longest: float) -> subprocess.CompletedProces
         return subprocess.CompletedProcess(words, process.returncode, out, errors)
 
 
-def _digest(text: str, made: Compiler, flags: tuple[str, ...] = CPP_FLAGS) -> str:
+def _digest(text: str, made: Compiler, flags: tuple[str, ...] = ()) -> str:
     """Return the digest of every input of the compilation of `text` (64 hexadecimal digits)."""
     # The FFI header belongs to the digest: a new jaxlib may change the layout of the call frame.
     interface = pathlib.Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     headers = [path.read_bytes() for path in (*sorted(NATIVE_FOLDER.glob("*.h")), interface)]
-    said = [text.encode(), *headers, repr((made, flags, _processor())).encode()]
+    said = [text.encode(), *headers, repr((made, CPP_FLAGS, _processor())).encode()]
+    said += [repr(flags).encode()] if flags else []
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in said)).hexdigest()
 
 
