@@ -241,7 +241,8 @@ struct Group {
     if (!any(alive)) return true;
     for (int q = 0; q < task.signals; q++) {
       I now_ = whole.value(task.signal[q], 0);
-      M seen_ = alive & ~whole.none[task.signal[q]];
+      // Only while no run of the cell can have ended.
+      M seen_ = alive & ~whole.none[task.signal[q]] & (M)(whole.value((int)task.margin, 0).low() > 0);
       above[q] = seen_ ? vmax(above[q], now_.low()) : above[q], below[q] = seen_ ? vmax(below[q], -now_.h) : below[q];
     }
     std::vector<I> R0, R;
@@ -329,6 +330,9 @@ struct Group {
     // 4. The effect of the limits' disturbances.
     for (int i = 0; i < n; i++) push[i] = I(0.0);
     if (any(crossing)) {
+      // The rates may depend on a limited number in any way: its range here includes the disturbance.
+      jac.widths.assign(t.count, fill(0.0));
+      for (int i : clamps) jac.widths[i] = law[i].delta;
       states(jac, B, false);
       for (int i = 0; i < n; i++) if (at[i] >= 0) for (int j = 0; j < jac.nd; j++) jac.slope(at[i], 0)[j] = I(i == j ? 1.0 : 0.0);
       jac.advance(flow, 0);
@@ -541,10 +545,9 @@ struct Group {
 };
 
 struct Ending {
-  std::vector<V> marginG;
-  I m_c, x_c, t_c, m_slopes_unused;
+  I m_c, x_c, t_c;
   std::vector<I> m_d;   // of the margin at the captured set
-  std::vector<V> xG; V xR; I xv;
+  std::vector<V> xG; V xR;
   I inv = I(0.0), speed = I(0.0), pace = I(0.0), m_box = I(0.0);
   std::vector<V> tG; V tR;
   M snapped{}, any_rate{};
@@ -634,7 +637,7 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
       g.set.r[i] = e.mag();
     }
     for (auto& q : g.rows) { q.c = I(0.0), q.R = fill(0.0); q.G.assign(np, fill(0.0)); }
-    for (int q = 0; q < task->quadratures; q++) g.rows[q].c = g.at_tick_mid.value(task->start[n + q], 0);
+    for (int q = 0; q < task->quadratures; q++) g.rows[q].c = g.at_tick.value(task->start[n + q], 0);
     for (auto* every : {&g.top, &g.above, &g.below}) for (auto& x : *every) x = fill(-1e300);
     for (auto& x : g.bottom) x = fill(-1e300);
     for (auto& x : g.reach) x = fill(0.0);
