@@ -66,7 +66,7 @@ def prove(
         with targets.new_target_file(out, "--out") as file:
             try:
                 derive_equations(chosen.loop, box)  # refuses a loop without rules before anything is simulated
-                known, suspects = _worst_runs(chosen, box)
+                known, suspects = _extreme_runs(chosen, box)
                 proof = console.run_with_progress(
                     lambda: prove_box(
                         chosen.loop, box, claims, signals=signals, horizon=chosen.solver.duration, budget=budget,
@@ -197,8 +197,12 @@ def _target(chosen: Scenario) -> float:
     return float(loop.reference.setpoint(loop.start().reference))
 
 
-def _worst_runs(chosen: Scenario, box: dict[str, tuple[float, float]]) -> tuple[dict[str, float], list[list[float]]]:
-    """Return the greatest slip, stop time and stop distance in a grid of runs, and the points of these runs."""
+def _extreme_runs(
+    chosen: Scenario, box: dict[str, tuple[float, float]]
+) -> tuple[dict[str, tuple[float, float]], list[list[float]]]:
+    """Return least and greatest value of greatest slip, stop time and stop distance in a grid of runs, and the points
+    of the greatest ones.
+    """
     import diffabs as d
     from diffabs.core.protocols import BrakeOutput
     from diffabs.objectives import Overshoot, StopDistance, StopTime
@@ -222,14 +226,14 @@ def _worst_runs(chosen: Scenario, box: dict[str, tuple[float, float]]) -> tuple[
         del found["stop_time"], found["stop_distance"]
     worst = {name: int(np.nanargmax(column)) for name, column in found.items() if np.isfinite(column).any()}
     return (
-        {name: float(found[name][i]) for name, i in worst.items()},
+        {name: (float(np.nanmin(found[name])), float(found[name][i])) for name, i in worst.items()},
         [points[i].tolist() for i in dict.fromkeys(worst.values())],
     )
 
 
 def _document(
     proof: "BoxProof", chosen: Scenario, box: dict[str, tuple[float, float]], claims: Sequence["RunClaim"],
-    known: dict[str, float],
+    known: dict[str, tuple[float, float]],
 ) -> JsonObject:  # fmt: skip
     """Return the JSON document; a bound that is not proved is null."""
     units = {"stop_time": "s", "stop_distance": "m"}
@@ -239,8 +243,9 @@ def _document(
         row = {"low": low, "high": high, "unit": units.get(name) or shown.get(name.split()[-1], "")}
         bounds[name] = {key: x if isinstance(x, str) or math.isfinite(x) else None for key, x in row.items()}
         if name in known:
-            bounds[name]["worst_run"] = known[name]
-            bounds[name]["looseness"] = (high - known[name]) / known[name] if math.isfinite(high) else None
+            bounds[name]["least_run"], worst = known[name]
+            bounds[name]["worst_run"] = worst
+            bounds[name]["looseness"] = (high - worst) / worst if math.isfinite(high) else None
     widths = np.array([high - low for low, high in box.values()])
     shares = (
         ((proof.left[:, :, 1] - proof.left[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1)

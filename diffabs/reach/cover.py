@@ -20,6 +20,7 @@ from diffabs.reach.engine import CellBounds, Prover
 from diffabs.reach.equations import Equations, derive_equations
 
 BATCH = 64  # cells between two looks at the clock
+LARGER, LARGER_TRIED = 1.5, 4  # size of a cell to try, in those proved just before; number that may be larger
 SMALLEST = 2.0**-40  # of the box's side: a smaller cell is not halved again
 PROBE_SIZES = (1e-3, 1e-4, 1e-5)  # sizes of the cell that shows how much each parameter matters, in sides of the box
 SPEED_COST = 3.0
@@ -76,7 +77,7 @@ def prove_box(
     signals: Sequence[str] = (),
     horizon: float = 10.0,
     budget: float = 60.0,
-    known: Mapping[str, float] | None = None,
+    known: Mapping[str, tuple[float, float]] | None = None,
     suspects: Sequence[Sequence[float]] = (),
     progress: Callable[[str], None] = lambda line: None,
     threads: int | None = None,
@@ -90,7 +91,7 @@ def prove_box(
         signals: Further signals whose range is wanted, by name.
         horizon: Duration after which a run that has not stopped is no longer followed [s].
         budget: Computing time [s].
-        known: Greatest value of a quantity in runs that were found: bounds are not refined beyond it.
+        known: Least and greatest value of a quantity in runs that were found: bounds are not refined beyond them.
         suspects: Points of the box whose runs may violate a claim; each is tried first, as a cell of one run.
         progress: Called with a line about how far the proof is.
         threads: Number of threads; None for one for each core.
@@ -110,17 +111,20 @@ def prove_box(
     influence = _measure_influence(prover, box, np.array(fastest), threads)
     sides = box[:, 1] - box[:, 0]
     quantities = _Quantities(prover.signals)
-    left, done, rows, refuting, tried = box[None], [], [], None, 0
+    left, done, rows, refuting, tried, fitting = box[None], [], [], None, 0, math.inf
     if suspects:
         points = np.repeat(np.asarray(suspects, float)[:, :, None], 2, 2)
         refuting = _find_violation(quantities, claims, points, prover.prove(points, threads))
     while len(left) and refuting is None and time.monotonic() - began < budget:
         left = left[np.lexsort(left[:, ::-1, 0].T)]
         now, left = left[:BATCH], left[BATCH:]
+        now, rest = _cut_to_size(now, fitting * LARGER, influence)
+        left = np.concatenate([left, rest])
         found = prover.prove(now, threads)
         tried += len(now)
         refuting = _find_violation(quantities, claims, now, found)
         fine = (found.status > 0) & _satisfy(quantities, claims, found)
+        fitting = float(_sizes(now[fine]).max()) if fine.any() else fitting
         done.append(now[fine])
         rows.append(_select(found, fine))
         again = now[~fine]
@@ -237,6 +241,25 @@ def _halve(cells: np.ndarray, influence: np.ndarray) -> np.ndarray:
     return np.concatenate([left, right])
 
 
+def _sizes(cells: np.ndarray) -> np.ndarray:
+    """Return the volumes of cells in floats; sides of length 0 count as 1."""
+    widths = cells[:, :, 1] - cells[:, :, 0]
+    return np.where(widths > 0, widths, 1.0).prod(1)
+
+
+def _cut_to_size(cells: np.ndarray, largest: float, influence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return at most a batch of cells to try, and the others.
+
+    A cell that is larger than `largest` is halved untried, as its neighbours of that size could not be proved. A few
+    stay as they are: if they are proved, larger cells are tried again.
+    """
+    kept, cells = cells[:LARGER_TRIED], cells[LARGER_TRIED:]
+    while (wide := _sizes(cells) > largest).any():
+        cells = np.concatenate([cells[~wide], _halve(cells[wide], influence)])
+    cells = np.concatenate([kept, cells])
+    return cells[:BATCH], cells[BATCH:]
+
+
 def _volume(cell: Any) -> Fraction:
     """Return the product of the widths that are not 0, exactly."""
     widths = (Fraction(high) - Fraction(low) for low, high in cell)
@@ -245,17 +268,17 @@ def _volume(cell: Any) -> Fraction:
 
 def _refine(
     prover: Prover, quantities: _Quantities, cells: np.ndarray, rows: CellBounds, influence: np.ndarray,
-    known: Mapping[str, float], until: float, progress: Callable[[str], None], threads: int | None,
+    known: Mapping[str, tuple[float, float]], until: float, progress: Callable[[str], None], threads: int | None,
 ) -> tuple[np.ndarray, CellBounds, int]:  # fmt: skip
-    """Halve the cells whose upper bound is far from the worst run found, until the time is over."""
+    """Halve the cells whose bounds are far from the least and the greatest value found, until the time is over."""
     tried = 0
     while time.monotonic() < until:
         worst = np.zeros(len(cells), bool)
-        for name, value in known.items():
-            high = quantities.of_cells(rows, name)[1]
-            far = high > value + CLOSE * abs(value)
-            order = np.argsort(high)[::-1][: BATCH // 2]
-            worst[order[far[order]]] = True
+        for name, (least, greatest) in known.items():
+            low, high = quantities.of_cells(rows, name)
+            for excess, size in ((high - greatest, abs(greatest)), (least - low, abs(least))):
+                order = np.argsort(excess)[::-1][: BATCH // 2]
+                worst[order[excess[order] > CLOSE * size]] = True
         if not worst.any():
             break
         halves = _halve(cells[worst], influence)

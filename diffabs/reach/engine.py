@@ -22,7 +22,7 @@ FLAGS = (
     *("-shared", "-fPIC", "-w"),
 )
 CODES = (
-    *("const", "truth", "param", "state", "add", "sub", "neg", "mul", "inv", "clamp", "select", "meet"),
+    *("const", "truth", "param", "state", "add", "sub", "neg", "mul", "inv", "clamp", "round", "select", "meet"),
     *("lt", "le", "eq", "ne", "and", "or", "not", "exp", "log", "sin", "cos", "atan", "power"),
 )  # in the order of `Code` in series.h
 WEIGHT_TABLES = 400  # parts of the range of speeds, or of the horizon, with weights of their own
@@ -30,8 +30,10 @@ SPEED_SHARE = 8  # weight of the slip over that of the speed, which drifts: the 
 NEAR = 0.3  # logarithm of the ratio of speeds whose couplings count together
 CLOCKWORK_WEIGHT = 2.0**20  # of states that are the same in all runs: nothing else mixes with them
 SCOUTED = 20_000  # periods, or steps, of the run that the weights are chosen by
-LANES = 8  # cells that are proved at a time
-SETTINGS = {"order": 6, "tolerance": 3e-7, "slowest": 0.02, "first": 1e-5, "shortest": 1e-8}
+SETTINGS = {"tolerance": 3e-7, "slowest": 0.02, "first": 1e-5, "shortest": 1e-8}
+# Orders of the Taylor polynomials. With 8, one step lasts from one tick to the next; without ticks, limits need steps
+# that are shorter than order 6 allows.
+SAMPLED_ORDER, CONTINUOUS_ORDER = 8, 6
 
 
 class _Tape(ctypes.Structure):
@@ -80,7 +82,7 @@ def library() -> ctypes.CDLL:
     Raises:
         NoCompiler: No C++ compiler of this machine works, or it ignores the rounding mode.
     """
-    sources = [(PROVER_FOLDER / name).read_text() for name in ("interval.h", "series.h", "prove.cpp")]
+    sources = [(PROVER_FOLDER / name).read_text() for name in ("interval.h", "set.h", "series.h", "prove.cpp")]
     text = "\n".join(re.sub(r'#include "[a-z.]*"|#pragma once', "", source) for source in sources)
     try:
         found = ctypes.CDLL(str(toolchain.build_library(text, FLAGS)))
@@ -159,7 +161,7 @@ class Prover:
         """
         e = self.equations = equations
         self.signals, self.horizon = tuple(signals), horizon
-        chosen = SETTINGS | settings
+        chosen = SETTINGS | {"order": CONTINUOUS_ORDER if equations.period is None else SAMPLED_ORDER} | settings
         kept, passing, quadratures = arrange_states(e, self.signals)
         order = [*kept, *passing, *quadratures]
         place = {state: i for i, state in enumerate(order)}
@@ -208,17 +210,17 @@ class Prover:
             cells: Ends of each parameter in SI units, shape (cells, parameters, 2).
             threads: Number of threads; None for one for each core.
         """
-        cells = np.ascontiguousarray(cells, float)
+        cells, lanes = np.ascontiguousarray(cells, float), library().lanes()
         out = np.zeros((len(cells), self._width))
 
         def prove_group(first: int) -> None:
-            part = np.ascontiguousarray(cells[first : first + LANES])
+            part = np.ascontiguousarray(cells[first : first + lanes])
             result = np.zeros((len(part), self._width))
-            self._call(part, result, None)
-            out[first : first + LANES] = result
+            self._call(part, result)
+            out[first : first + lanes] = result
 
         with concurrent.futures.ThreadPoolExecutor(threads or core_count()) as pool:
-            list(pool.map(prove_group, range(0, len(cells), LANES)))
+            list(pool.map(prove_group, range(0, len(cells), lanes)))
         n = len(self.signals)
         pairs = out[:, 8 : 8 + 4 * n].reshape(len(out), 2, n, 2)
         return CellBounds(
@@ -227,11 +229,13 @@ class Prover:
             *(out[:, 8 + 4 * n :], out[:, 5], out[:, 6], out[:, 7]),
         )
 
-    def _call(self, cells: np.ndarray, out: np.ndarray, scout: np.ndarray | None) -> int:
-        """Prove cells into `out`; with `scout`, return how many of its rows have a speed or time and a Jacobian."""
-        pointers = [None if x is None else x.ctypes.data_as(ctypes.c_void_p) for x in (cells, out, scout)]
-        rows = 0 if scout is None else len(scout)
-        return library().prove(ctypes.byref(self.task), ctypes.c_long(len(cells)), *pointers, ctypes.c_long(rows))
+    def _call(
+        self, cells: np.ndarray, out: np.ndarray, *, scout: np.ndarray | None = None, trail: np.ndarray | None = None
+    ) -> int:
+        """Prove one group of cells into `out`, and return how many rows of `scout` or `trail` were written."""
+        pointers = [None if x is None else x.ctypes.data_as(ctypes.c_void_p) for x in (cells, out, scout, trail)]
+        room = max(0 if x is None else len(x) for x in (scout, trail))
+        return library().prove(ctypes.byref(self.task), ctypes.c_long(len(cells)), *pointers, ctypes.c_long(room))
 
     def choose_weights(self, point: np.ndarray) -> None:
         """Choose the units of Lohner's step from the Jacobians along one run.
@@ -243,7 +247,8 @@ class Prover:
         """
         n = self._kept
         found = np.zeros((SCOUTED, 2 + n * n))
-        count = self._call(np.repeat(np.asarray(point, float)[None, :, None], 2, 2), np.zeros((1, self._width)), found)
+        cell = np.repeat(np.asarray(point, float)[None, :, None], 2, 2)
+        count = self._call(cell, np.zeros((1, self._width)), scout=found)
         found = found[:count][np.isfinite(found[:count]).all(1)]  # the first has no axes yet
         if not len(found):
             return

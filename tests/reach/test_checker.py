@@ -364,7 +364,7 @@ def proved_by_engine(equations, cell, horizon):
     """Bounds of the native prover, or None if it has no proof."""
     engine = pytest.importorskip("diffabs.reach.engine")
     prover = engine.Prover(equations, ("slip",), horizon, tolerance=1e-8)
-    prover.balance(np.mean(cell, axis=1))
+    prover.choose_weights(np.mean(cell, axis=1))
     found = prover.prove(np.array([cell] * 8), 1)
     return (found.time[0], found.distance[0], found.greatest[0, 0]) if found.status[0] else None
 

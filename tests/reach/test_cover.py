@@ -35,9 +35,13 @@ def oscillator(period: float | None = None) -> Equations:
     )  # fmt: skip
 
 
-@killed_by("reach/native/prove.cpp", "I remainder = rest.value(a, order + 1) * power;", "I remainder = I(0.0) * power;")
 @killed_by(
-    "reach/native/prove.cpp", "C[i] = sum + remainder + push[i];", "C[i] = point((sum + remainder + push[i]).mid());"
+    "reach/native/prove.cpp",
+    "remainder[i] = rest.value(state_op[i], order + 1) * power;",
+    "remainder[i] = I(0.0) * power;",
+)
+@killed_by(
+    "reach/native/prove.cpp", "C[i] = sum + remainder[i] + push[i];", "C[i] = point((sum + remainder[i]).mid());"
 )
 def test_oscillator_against_its_closed_form() -> None:
     prover = Prover(oscillator(), ("x", "v"), 2.0, order=3, tolerance=1e-6)
@@ -94,7 +98,11 @@ def rig_run(mass: float, speed: float, high: float = 9.03) -> tuple[float, float
     return float(np.max(1 - r1 * found.y[0] / (r2 * found.y[1]))), float(found.t[-1]), float(found.y[3, -1])
 
 
-@killed_by("reach/native/prove.cpp", "r.delta = pure ? zero : dev;", "r.delta = zero;")
+@killed_by(
+    "reach/native/prove.cpp",
+    "r.delta = (linear | over_ | under) ? zero : vmax(gaps.h - middle, gaps.n + middle);",
+    "r.delta = zero;",
+)
 @killed_by(
     "reach/native/prove.cpp", "push[i] = push[i] + Y[i] * symmetric(delta) * HH;", "push[i] = push[i] + Y[i] * I(0.0);"
 )

@@ -91,7 +91,7 @@ def exact_value(name: str, x: float, y: float) -> decimal.Decimal:
     ],
 )
 @killed_by(
-    "reach/native/interval.h", "sum = sum + symmetric(term.mag());  // |y| < 0.7", "// |y| < 0.7", case="exp-series"
+    "reach/native/interval.h", "sum = sum + symmetric(term.mag());  // the rest", "// the rest", case="exp--600-600"
 )
 @killed_by(
     "reach/native/interval.h",

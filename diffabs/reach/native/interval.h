@@ -1,4 +1,4 @@
-// Eight intervals at once, each stored as (-low, high), computed in upward rounding only.
+// Several intervals at once, each stored as (-low, high), computed in upward rounding only.
 //
 // In upward rounding fl(a op b) >= a op b for +, * and /. So a sum or a product of upper bounds is an upper bound, and
 // -low is an upper bound of minus the number. No operation here subtracts a bound from a bound of the same side. No
@@ -9,16 +9,38 @@
 #include <cfenv>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
+#if defined(__AVX__)
+#include <immintrin.h>
+#endif
 
-typedef double V __attribute__((vector_size(64)));
-typedef long long M __attribute__((vector_size(64)));  // a mask: 0 or -1 in each lane
+#define INLINE inline __attribute__((always_inline))
+
+// As many lanes as a register has: gcc computes comparisons of longer vectors one number after the other.
+#if defined(__AVX512F__)
 constexpr int LANES = 8;
+#elif defined(__AVX__)
+constexpr int LANES = 4;
+#else
+constexpr int LANES = 2;
+#endif
+typedef double V __attribute__((vector_size(8 * LANES)));
+typedef long long M __attribute__((vector_size(8 * LANES)));  // a mask: 0 or -1 in each lane
 
-inline V fill(double x) { return V{x, x, x, x, x, x, x, x}; }
-inline M mask(bool on) { long long x = on ? -1 : 0; return M{x, x, x, x, x, x, x, x}; }
-inline V vmax(V a, V b) { return a > b ? a : b; }
-inline V vmin(V a, V b) { return a < b ? a : b; }
-inline V vabs(V a) { return vmax(a, -a); }
+INLINE V fill(double x) { V v; for (int i = 0; i < LANES; i++) v[i] = x; return v; }
+INLINE M mask(bool on) { M m; for (int i = 0; i < LANES; i++) m[i] = on ? -1 : 0; return m; }
+// a > b ? a : b, which is what the instruction computes, also for NaN.
+INLINE V vmax(V a, V b) {
+#if defined(__AVX512F__)
+  return (V)_mm512_max_pd((__m512d)a, (__m512d)b);
+#elif defined(__AVX__)
+  return (V)_mm256_max_pd((__m256d)a, (__m256d)b);
+#else
+  return a > b ? a : b;
+#endif
+}
+INLINE V vmin(V a, V b) { return -vmax(-a, -b); }
+INLINE V vabs(V a) { return vmax(a, -a); }
 inline bool all(M m) { long long x = -1; for (int i = 0; i < LANES; i++) x &= m[i]; return x != 0; }
 inline bool any(M m) { long long x = 0; for (int i = 0; i < LANES; i++) x |= m[i]; return x != 0; }
 inline double largest(V a) { double x = a[0]; for (int i = 1; i < LANES; i++) x = a[i] > x ? a[i] : x; return x; }
@@ -35,23 +57,23 @@ struct I {
   V mag() const { return vmax(n, h); }     // max |x|
   V width() const { return h + n; }        // an upper bound of the width
 };
-inline I point(V x) { return {-x, x}; }
-inline I span(V low, V high) { return {-low, high}; }
-inline I symmetric(V r) { return {r, r}; }
-inline I operator-(I a) { return {a.h, a.n}; }
-inline I operator+(I a, I b) { return {a.n + b.n, a.h + b.h}; }
-inline I operator-(I a, I b) { return {a.n + b.h, a.h + b.n}; }
-inline I operator*(I a, I b) {
+INLINE I point(V x) { return {-x, x}; }
+INLINE I span(V low, V high) { return {-low, high}; }
+INLINE I symmetric(V r) { return {r, r}; }
+INLINE I operator-(I a) { return {a.h, a.n}; }
+INLINE I operator+(I a, I b) { return {a.n + b.n, a.h + b.h}; }
+INLINE I operator-(I a, I b) { return {a.n + b.h, a.h + b.n}; }
+INLINE I operator*(I a, I b) {
   V ma = -a.n, mb = -b.n, mh = -a.h;
   return {vmax(vmax(a.n * mb, mh * b.h), vmax(a.n * b.h, a.h * b.n)),
           vmax(vmax(a.n * b.n, a.h * b.h), vmax(ma * b.h, a.h * mb))};
 }
-inline I scaled(I a, double k) { return k >= 0 ? I(a.n * k, a.h * k) : I(a.h * -k, a.n * -k); }
-inline I hull(I a, I b) { return {vmax(a.n, b.n), vmax(a.h, b.h)}; }
-inline I meet(I a, I b) { return {vmin(a.n, b.n), vmin(a.h, b.h)}; }
-inline M inside(I a, I b) { return (a.n <= b.n) & (a.h <= b.h); }
-inline M empty(I a) { return (-a.n) > a.h; }
-inline I pick(M m, I a, I b) { return {m ? a.n : b.n, m ? a.h : b.h}; }
+INLINE I scaled(I a, double k) { return k >= 0 ? I(a.n * k, a.h * k) : I(a.h * -k, a.n * -k); }
+INLINE I hull(I a, I b) { return {vmax(a.n, b.n), vmax(a.h, b.h)}; }
+INLINE I meet(I a, I b) { return {vmin(a.n, b.n), vmin(a.h, b.h)}; }
+INLINE M inside(I a, I b) { return (a.n <= b.n) & (a.h <= b.h); }
+INLINE M empty(I a) { return (-a.n) > a.h; }
+INLINE I pick(M m, I a, I b) { return {m ? a.n : b.n, m ? a.h : b.h}; }
 
 // 1/a. A lane whose interval has 0 is `none`, and its result is 1.
 inline I inverse(I a, M& none) {
@@ -72,14 +94,14 @@ inline const I* inverses() {
   return table;
 }
 inline I over(int k) { return k < 32 ? inverses()[k] : inverse(I((double)k)); }
-// exp of points, |x| < 700: exp(x) = 2^n exp(y), |y| < 0.4, by a Taylor sum with its remainder.
+// exp of points, |x| < 700: exp(x) = 2^n exp(y), |y| < 0.7, by a Taylor sum with its remainder.
 inline I exp_at(V x) {
   const double ln2 = 0x1.62e42fefa39efp-1;  // log(2) is in ln2 + [2.3190e-17, 2.3191e-17]
-  V n, two;
-  for (int i = 0; i < LANES; i++) n[i] = std::floor(x[i] / ln2 + 0.5), two[i] = std::ldexp(1.0, (int)n[i]);
+  V shifted = x / ln2 + fill(0x1.8p52);      // its last bits are the integer n, above or near x/ln2
+  V n = shifted - fill(0x1.8p52), two = (V)(((M)shifted + 1023) << 52);
   I y = point(x) - point(n) * (I(ln2) + span(fill(2.3190e-17), fill(2.3191e-17))), sum(1.0), term(1.0);
-  for (int k = 1; k <= 14; k++) term = term * y * inverses()[k], sum = sum + term;
-  sum = sum + symmetric(term.mag());  // |y| < 0.7 even if n is off by rounding: the rest is below the last term
+  for (int k = 1; k <= 16; k++) term = term * y * inverses()[k], sum = sum + term;
+  sum = sum + symmetric(term.mag());  // the rest is below the last term
   return {sum.n * two, sum.h * two};
 }
 // exp of every number of an interval, in the lanes where |x| < 700; the others are `none`.
@@ -173,10 +195,10 @@ inline I power_of(I x, I e, M& none) {
   V low = fine ? -x.n : fill(1.0), high = fine ? x.h : fill(1.0);
   M low0 = low <= 1e-290, high0 = high <= 1e-290;
   M bad{};
-  I a = exp_of(log_of(point(low0 ? fill(1.0) : low), bad) * e, bad), b = exp_of(log_of(point(high0 ? fill(1.0) : high), bad) * e, bad);
+  I found = exp_of(log_of(span(low0 ? (high0 ? fill(1.0) : high) : low, high0 ? fill(1.0) : high), bad) * e, bad);
   none |= bad;
   // below 1e-290 the power is at most that of 1e-290
   V tiny = fill(0.0);
   if (any(high0 & (high > 0))) tiny = exp_at(vmax((log_of(I(1e-290), bad) * e).h, fill(-690.0))).h;
-  return {low0 ? fill(0.0) : a.n, high0 ? (high == 0 ? fill(0.0) : tiny) : b.h};
+  return {low0 ? fill(0.0) : found.n, high0 ? (high == 0 ? fill(0.0) : tiny) : found.h};
 }

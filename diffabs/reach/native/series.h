@@ -10,7 +10,7 @@
 
 #include "interval.h"
 
-enum Code { CONST, TRUTH, PARAM, STATE, ADD, SUB, NEG, MUL, INV, CLAMP, SELECT, MEET, LT, LE, EQ, NE, AND, OR, NOT, EXP, LOG, SIN, COS, ATAN, POWER };
+enum Code { CONST, TRUTH, PARAM, STATE, ADD, SUB, NEG, MUL, INV, CLAMP, ROUND, SELECT, MEET, LT, LE, EQ, NE, AND, OR, NOT, EXP, LOG, SIN, COS, ATAN, POWER };
 
 struct Tape {
   long count;
@@ -68,24 +68,25 @@ struct Program {
   }
 };
 
-struct Clamp { V lambda; I c; V delta; };  // clamp(x) is in lambda x + c + [-delta, delta]
+struct Chord { V lambda; I c; V delta; };  // a limited number is in lambda x + c + [-delta, delta]
 
 struct Series {
   const Tape* tape;
-  int orders, nd;
+  const int orders, most;  // greatest order, and number of directions
+  int nd;                  // of the directions, those in use
   std::vector<I> v, d;
   std::vector<M> none;      // lanes in which an operation has no value
   std::vector<M> yes, no;   // of conditions: certainly true, certainly false
   std::vector<char> kind;   // 0: constant, 1: of the parameters only, 2: changes
   std::vector<char> has_value, has_slope;  // of what does not change
   bool natural = true;  // clamps as they are; else as their relaxation
-  const Clamp* clamps = nullptr;
+  const Chord* chords = nullptr;
   const Series* centre = nullptr;  // the same at the centre of the set, for the mean value form at order 0
   std::vector<I> forced;           // of clamps in a box: also the values of the relaxation
   bool use_forced = false;
 
   Series(const Tape& t, int orders, int nd)
-      : tape(&t), orders(orders), nd(nd), v(t.count * (orders + 2)), d(t.count * (orders + 2) * (nd ? nd : 1)), none(t.count), yes(t.count), no(t.count), kind(t.count), forced(t.count), round(t.count, -1) {
+      : tape(&t), orders(orders), most(nd ? nd : 1), nd(nd), v(t.count * (orders + 2)), d(t.count * (orders + 2) * most), none(t.count), yes(t.count), no(t.count), kind(t.count), forced(t.count), round(t.count, -1) {
     forget();
     for (int i = 0; i < t.count; i++) {
       auto of = [&](int j) { return j < 0 ? 0 : (int)kind[j]; };
@@ -93,7 +94,7 @@ struct Series {
       switch (t.code[i]) {
         case CONST: case TRUTH: break;
         case PARAM: k = 1; break;
-        case STATE: case CLAMP: k = 2; break;
+        case STATE: case CLAMP: case ROUND: k = 2; break;
         case EXP: case LOG: case SIN: case COS: case ATAN: case POWER: k = of(t.a[i]); break;
         default: k = std::max(of(t.a[i]), std::max(of(t.b[i]), of(t.c[i])));
       }
@@ -106,10 +107,10 @@ struct Series {
       if (t.code[i] == TRUTH) yes[i] = mask(t.low[i] != 0), no[i] = ~yes[i];
     }
   }
-  I& value(int i, int k) { return v[i * (orders + 2) + k]; }
+  INLINE I& value(int i, int k) { return v[i * (orders + 2) + k]; }
   const I& value(int i, int k) const { return v[i * (orders + 2) + k]; }
-  I* slope(int i, int k) { return &d[(size_t)(i * (orders + 2) + k) * (nd ? nd : 1)]; }
-  const I* slope(int i, int k) const { return &d[(size_t)(i * (orders + 2) + k) * (nd ? nd : 1)]; }
+  INLINE I* slope(int i, int k) { return &d[(size_t)(i * (orders + 2) + k) * most]; }
+  INLINE const I* slope(int i, int k) const { return &d[(size_t)(i * (orders + 2) + k) * most]; }
 
   // The coefficients of order `k` of all operations of a program (of those with a lag: of an earlier order).
   void advance(const Program& p, int k) {
@@ -173,11 +174,18 @@ struct Series {
             y = pick(in, s, pick(out, I(0.0), hull(I(0.0), s)));
           }
         } else {
-          y = point(clamps[i].lambda) * value(a, k);
-          if (k == 0) { y = y + clamps[i].c; if (!widths.empty()) y = y + symmetric(widths[i]); }
+          y = point(chords[i].lambda) * value(a, k);
+          if (k == 0) { y = y + chords[i].c; if (!widths.empty()) y = y + symmetric(widths[i]); }
         }
         break;
       }
+      case ROUND:  // x + w, |w| <= 1/2
+        y = value(a, k);
+        if (natural || !widths.empty()) {
+          if (k == 0) y = use_forced ? forced[i] : y + symmetric(fill(0.5));
+          else none[i] = mask(true);
+        }
+        break;
       case SELECT: {
         I s = value(b, k), u = value(c, k);
         y = pick(yes[a], u, pick(no[a], s, hull(s, u)));
@@ -240,8 +248,8 @@ struct Series {
   }
 
   // t += s x on all directions
-  void add(I* to, I s, const I* x) { for (int j = 0; j < nd; j++) to[j] = to[j] + s * x[j]; }
-  void clear(I* to) { for (int j = 0; j < nd; j++) to[j] = I(0.0); }
+  INLINE void add(I* to, I s, const I* x) { for (int j = 0; j < nd; j++) to[j] = to[j] + s * x[j]; }
+  INLINE void clear(I* to) { for (int j = 0; j < nd; j++) to[j] = I(0.0); }
 
   void slopes(int i, int k) {
     const Tape& t = *tape;
@@ -270,8 +278,9 @@ struct Series {
           for (int j = 1; j <= k; j++) add(y, -(value(i, 0) * value(i, k - j)), slope(a, j)), add(y, -(value(i, 0) * value(a, j)), slope(i, k - j));
         }
         return;
-      case CLAMP: {
-        if (!natural) { for (int j = 0; j < nd; j++) y[j] = point(clamps[i].lambda) * slope(a, k)[j]; }
+      case CLAMP: case ROUND: {
+        if (t.code[i] == ROUND) { for (int j = 0; j < nd; j++) y[j] = slope(a, k)[j]; }
+        else if (!natural) { for (int j = 0; j < nd; j++) y[j] = point(chords[i].lambda) * slope(a, k)[j]; }
         else {
           I low = b < 0 ? I(-1e300) : value(b, 0), high = c < 0 ? I(1e300) : value(c, 0), x = value(a, 0);
           M in = (x.low() >= low.h) & (x.h <= high.low()), out = (x.low() >= high.h) | (x.h <= low.low());
