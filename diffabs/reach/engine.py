@@ -30,7 +30,7 @@ SPEED_SHARE = 8  # weight of the slip over that of the speed, which drifts: the 
 NEAR = 0.3  # logarithm of the ratio of speeds whose couplings count together
 CLOCKWORK_WEIGHT = 2.0**20  # of states that are the same in all runs: nothing else mixes with them
 SCOUTED = 20_000  # periods, or steps, of the run that the weights are chosen by
-SETTINGS = {"tolerance": 3e-7, "slowest": 0.02, "first": 1e-5, "shortest": 1e-8}
+SETTINGS = {"tolerance": 3e-7, "slowest": 0.02, "first": 1e-5, "shortest": 1e-8, "longest": 1e9}
 # Orders of the Taylor polynomials. With 8, one step lasts from one tick to the next; without ticks, limits need steps
 # that are shorter than order 6 allows.
 SAMPLED_ORDER, CONTINUOUS_ORDER = 8, 6
@@ -139,6 +139,20 @@ class CellBounds(NamedTuple):
     across: np.ndarray
 
 
+class CellTube(NamedTuple):
+    """Bounds of all runs of a cell during each step, one row for each step.
+
+    Attributes:
+        time: Earliest beginning and latest end of the step, shape (steps, 2) [s].
+        least: Lower bounds of the signals, shape (steps, signals).
+        greatest: Upper bounds of the signals, shape (steps, signals).
+    """
+
+    time: np.ndarray
+    least: np.ndarray
+    greatest: np.ndarray
+
+
 class Prover:
     """A loop's equations, arranged for the native prover.
 
@@ -157,7 +171,8 @@ class Prover:
             signals: Names of the signals whose range is wanted.
             horizon: Duration after which a run is no longer followed [s].
             settings: Other values of `SETTINGS`: order of the Taylor polynomials, greatest remainder of a step relative
-                to the state, least speed [m/s], length of the first step and of the shortest one.
+                to the state, least speed [m/s], length of the first step, of the shortest one and of the longest one [s], or
+                [s^2/m] of a loop that is paced.
         """
         e = self.equations = equations
         self.signals, self.horizon = tuple(signals), horizon
@@ -186,16 +201,8 @@ class Prover:
             *(e.margin, place.get(e.travelled, -1), place.get(e.clock, -1) if e.paced else -1),
             *(place[e.nonnegative[0]] if e.nonnegative else -1, place.get(e.speed, -1)),
             *(chosen["slowest"], low, high, horizon, chosen["tolerance"]),
-            *(
-                horizon,
-                chosen["shortest"],
-                chosen["first"],
-                int(chosen["order"]),
-                WEIGHT_TABLES,
-                self.weights.ctypes.data,
-                0.0,
-                horizon,
-            ),
+            *(chosen["longest"], chosen["shortest"], chosen["first"], int(chosen["order"]), WEIGHT_TABLES),
+            *(self.weights.ctypes.data, 0.0, horizon),
         )
 
     @property
@@ -228,6 +235,23 @@ class Prover:
             *(pairs[:, 0, :, 0], pairs[:, 0, :, 1], pairs[:, 1, :, 0], pairs[:, 1, :, 1]),
             *(out[:, 8 + 4 * n :], out[:, 5], out[:, 6], out[:, 7]),
         )
+
+    def follow(self, cell: np.ndarray, steps: int = 100_000) -> CellTube:
+        """Return the bounds of one cell at every step: a tube that all its runs stay in.
+
+        Args:
+            cell: Ends of each parameter in SI units, shape (parameters, 2).
+            steps: Greatest number of steps that are returned.
+        """
+        n, lanes = len(self.signals), library().lanes()
+        trail = np.full((steps, lanes, 2 + 2 * n), np.nan)
+        out = np.zeros((1, self._width))
+        count = self._call(np.ascontiguousarray(cell, float)[None], out, trail=trail)
+        rows = trail[:count, 0][np.isfinite(trail[:count, 0, 0])]
+        ends = rows[:, :2]
+        begins = np.concatenate([np.zeros((1, 2)), ends])[: len(ends), 0]
+        pairs = rows[:, 2:].reshape(len(rows), n, 2)
+        return CellTube(np.stack([begins, ends[:, 1]], 1), pairs[:, :, 0], pairs[:, :, 1])
 
     def _call(
         self, cells: np.ndarray, out: np.ndarray, *, scout: np.ndarray | None = None, trail: np.ndarray | None = None

@@ -47,7 +47,8 @@ class RealOperation(NamedTuple):
     """One number: an operation on earlier ones.
 
     Attributes:
-        name: `const`, `truth`, `param`, `state`, arithmetic, `clamp`, `select`, `meet`, comparisons, logic, functions.
+        name: `const`, `truth`, `param`, `state`, arithmetic, `clamp`, `round`, `select`, `meet`, comparisons, logic,
+            functions.
         args: Indices of the operands. `select` has (condition, if false, if true). A function y of u has (u, g) with
             dy = g du, where g is another operation.
         value: Of `const` the number, of `param` and `state` its index, of `clamp` its limits, of `power` its exponent.
@@ -449,6 +450,8 @@ class _Derivation:
                 return number(float(node.args[0].attr))
             case "lt" | "le" | "eq" | "ne" | "and" | "or" | "not":
                 return make(node.op, tuple(args))
+            case "rint":
+                return make("round", (args[0],))
             case "sqrt":
                 return self.power(args[0], number(0.5), 0.5)
             case "exp" | "log" | "sin" | "cos" | "atan":
