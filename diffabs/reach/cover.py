@@ -254,7 +254,7 @@ def _cut_to_size(cells: np.ndarray, largest: float, influence: np.ndarray) -> tu
     stay as they are: if they are proved, larger cells are tried again.
     """
     kept, cells = cells[:LARGER_TRIED], cells[LARGER_TRIED:]
-    while (wide := _sizes(cells) > largest).any():
+    while (wide := _sizes(cells) > largest).any() and len(cells) < 4 * BATCH:
         cells = np.concatenate([cells[~wide], _halve(cells[wide], influence)])
     cells = np.concatenate([kept, cells])
     return cells[:BATCH], cells[BATCH:]
