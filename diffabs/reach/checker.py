@@ -36,7 +36,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from flint import arb, arb_mat, arb_poly, ctx
 
-from diffabs.reach.equations import Equations, RealOperation
+from diffabs.reach.equations import SLOWEST, Equations, RealOperation
 
 PRECISION = 96  # bits
 ORDER = 7  # of the Taylor polynomials
@@ -46,7 +46,7 @@ MAX_HALVINGS = 40  # of one given step
 PICARD_TRIES = 40
 SPEED_WEIGHT = 0.125  # of the speed relative to the slip, in the scales of QR for a sampled loop
 PIECES = 8  # of a step, for the bounds of a signal
-FASTEST_SLIP, SLOWEST = 1.0, 0.01  # `check_slip_chart` holds for a slip below 1 and a speed above 1 cm/s
+FASTEST_SLIP = 1.0  # `check_slip_chart` holds for a slip below 1 and a speed above `SLOWEST`
 ZERO, ONE, NO_SLOPE = arb(0), arb(1), arb_poly([])
 
 
@@ -931,7 +931,7 @@ class _Check:
         self.ranges = {i: (at_start[i], ranges[i]) for i in ranges}
         if s >= 0 and not box[s].upper() < FASTEST_SLIP:
             raise _StepFails("a wheel may lock")
-        if self.speed >= 0 and not box[self.speed].lower() > SLOWEST:
+        if self.speed >= 0 and not box[self.speed].lower() > float(SLOWEST):
             raise _StepFails("the vehicle may stand")
         true = {i: chord._replace(values=chord.limited) for i, chord in chords.items()}
         return box, chords, self.whole(box, chords=true, forced=True)
