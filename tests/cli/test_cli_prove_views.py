@@ -7,9 +7,11 @@ from typing import NamedTuple
 import pytest
 from commands import run
 from mutants import killed_by
+from reports import Page
 from seams import replace_seam
 
 from diffabs.plot.proofs import ProofMap, draw_proof
+from diffabs.report import build_report, find_documents
 
 pytestmark = pytest.mark.usefixtures("native_prover")
 LIMITS = ["--set", "controller.torque_min=0", "--set", "controller.torque_max=9.03"]
@@ -51,6 +53,36 @@ def test_a_map_has_the_units_of_the_command(proved: Proved) -> None:
     assert shown.quantity == "proved upper bound of slip [1]"
     assert shown.bounds.max() <= shown.claimed == 0.2515
     assert shown.worst == pytest.approx([5.4, 5.3], rel=1e-12)
+
+
+@killed_by("report/proofs.py", "table_unit(units.get(path))", "''")
+@killed_by("report/proofs.py", 'if verdict == "proved" and "certificate" in files', "if False")
+def test_a_report_has_verdict_box_bounds_and_map(proved: Proved) -> None:
+    (document,) = find_documents(proved.folder)
+    page = Page(build_report([document]))
+    assert document.kind == "prove"
+    assert "Does every run satisfy greatest slip <= 0.2515, for every plant.mass from 5.3 to 5.4 kg and" in page.text
+    assert "proved greatest slip <= 0.2515" in page.text
+    for name in ("Box", "Bounds of every run", "Cells"):
+        assert name in page.text
+    box, bounds = document.content["over"], document.content["bounds"]
+    shown = {*map(repr, box["plant.mass"]), repr(bounds["greatest slip"]["high"]), repr(bounds["stop_time"]["low"])}
+    assert shown <= set(page.numbers)
+    assert "initial.speed 1.44444 1.47222 m/s" in page.text
+    assert len(page.images) == 1
+    assert page.foreign == []
+    assert f"diffabs verify {proved.folder / 'certificate.proof'}" in page.text
+
+
+def test_a_report_of_a_refuted_claim_says_where(proved: Proved, tmp_path: pathlib.Path) -> None:
+    document = json.loads((proved.folder / "proof.json").read_text())
+    document |= {"verdict": "refuted", "reason": "every run violates the claim where plant.mass = 5.4", "files": {}}
+    document["bounds"] = {name: {**row, "low": None, "high": None} for name, row in document["bounds"].items()}
+    (tmp_path / "x.json").write_text(json.dumps(document))
+    page = Page(build_report(find_documents(tmp_path / "x.json")))
+    assert "refuted: every run violates the claim where plant.mass = 5.4." in page.text
+    assert "diffabs verify" not in page.text
+    assert page.images == []
 
 
 @pytest.mark.slow
