@@ -78,7 +78,7 @@ def certify(
 
 def verify(
     file: Annotated[
-        pathlib.Path, typer.Argument(metavar="FILE.json", help="Certificate written by design or certify.")
+        pathlib.Path, typer.Argument(metavar="FILE.json", help="Certificate written by design, certify or prove.")
     ],
     seconds: Annotated[
         float, typer.Option(help="Limit of the computing time [s]; an undecided file is refused after it.")

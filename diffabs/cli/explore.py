@@ -3,17 +3,19 @@
 import errno
 import pathlib
 import socket
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from diffabs.cli import console, tuning_task
+from diffabs.cli import console, prove, tuning_task
 from diffabs.config.values import ScenarioError
 from diffabs.runtime import interrupt
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
-    from diffabs.explore.session import ProofVerdict
+    from diffabs.explore.session import ProofVerdict, Session
     from diffabs.explore.tuning import TuningTask
 
 PORT = 8342
@@ -30,6 +32,10 @@ def explore(
             help=f"Port of the page; 0 for any free port. Default: {PORT}, or any free port if it is in use.",
         ),
     ] = None,
+    proof: Annotated[
+        pathlib.Path | None,
+        typer.Option(metavar="FILE", help="Certificate of prove: the page says whether it covers the values shown."),
+    ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
 ) -> None:
     """Drag parameters in the browser.
@@ -38,6 +44,7 @@ def explore(
     with console.end_on_errors():
         console.need_extra("explore")
         console.load_scenario(scenario, None)  # reports a wrong scenario here, before a page opens
+        judge = load_judge(proof) if proof else None
         from diffabs.explore import server
         from diffabs.explore.session import Tools
 
@@ -45,7 +52,7 @@ def explore(
         told = {"ready": lambda url: console.say(f"{url} (on this machine only; Ctrl-C ends it)"), "browser": browser}
         if not interrupt.take_interrupt():  # Ctrl-C may have come during the import of the framework
             with console.warnings_in_lines():
-                tools = Tools(prove_scenario, pose_tuning)
+                tools = Tools(prove_scenario, pose_tuning, judge)
                 server.serve(scenario, tools, pathlib.Path.cwd(), there, thread=console.WORKER, **told)
             interrupt.take_interrupt()
         raise KeyboardInterrupt  # only Ctrl-C ends the server
@@ -62,6 +69,26 @@ def _open_socket(port: int | None) -> socket.socket:
             return listen_on_loopback(0)
         why = "another program uses this port" if error.errno == errno.EADDRINUSE else error.strerror
         console.fail(f"--port {port}: {why}")
+
+
+def load_judge(path: pathlib.Path) -> "Callable[[Session], ProofVerdict]":
+    """Return the function that judges a session by a proof's file.
+
+    Args:
+        path: Path of the file.
+
+    Raises:
+        typer.Exit: There is no such file, or it is not the certificate of a proof.
+    """
+    from diffabs.explore.proved import judge_values, load_proved_box
+
+    document = prove.read_proof_file(path)
+    if document is None:
+        console.fail(f"--proof {path}: {'is no certificate of prove' if path.exists() else 'there is no such file'}")
+    try:
+        return partial(judge_values, load_proved_box(path, document))
+    except ValueError as error:
+        console.fail(f"--proof {path}: {' '.join(str(error).split())}")
 
 
 def prove_scenario(chosen: Scenario) -> "ProofVerdict":

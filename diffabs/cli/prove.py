@@ -3,8 +3,8 @@
 import json
 import math
 import pathlib
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 import typer
@@ -18,6 +18,7 @@ from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.scenario import Scenario, dump, loads
 
 if TYPE_CHECKING:
+    from diffabs.plot.proofs import ProofMap
     from diffabs.reach import BoxProof, RunClaim
 
 SEARCHED = (9, 17)  # runs along the first and the other parameters, among which the worst is looked for
@@ -41,6 +42,10 @@ def prove(
     changes: console.Changes = None,
     budget: Annotated[float, typer.Option(help="Computing time of the proof [s].")] = 60.0,
     out: Annotated[pathlib.Path | None, typer.Option(help="Write the certificate to this file.")] = None,
+    plot: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Draw the cells of a box of one or two parameters to this file (.png, .pdf, .svg)."),
+    ] = None,
     as_json: console.Json = False,
 ) -> None:
     """Prove bounds of every run of a box of parameters, with torque limits, lag and sampling.
@@ -50,12 +55,16 @@ def prove(
     with console.end_on_errors():
         if not 0 < budget < math.inf:
             console.fail(f"--budget = {budget:g} is outside (0, inf) s")
+        targets.check_picture(plot)
         from diffabs.compiler.runtime.toolchain import NoCompiler
         from diffabs.reach import NoRule, prove_box
         from diffabs.reach.equations import derive_equations
 
         chosen = console.load_scenario(scenario, changes or (), integrated=False)
-        box = _read_box(over, chosen)
+        sides = _read_sides(over, chosen)
+        box = {side.path: side.ends for side in sides}
+        if plot:
+            _choose_axes(sides)  # refuses other boxes before anything is proved
         claims = [_read_claim(text, chosen) for text in claim or ()]
         if "slip" not in chosen.loop.plant.shows._fields and not claims:
             raise ScenarioError(
@@ -63,14 +72,14 @@ def prove(
             )
         signals = ("slip",) if "slip" in chosen.loop.plant.shows._fields else ()
         far = [""]
-        with targets.new_target_file(out, "--out") as file:
+        with targets.new_target_file(out, "--out") as file, targets.new_target_file(plot, "--plot") as picture:
             try:
                 derive_equations(chosen.loop, box)  # refuses a loop without rules before anything is simulated
-                known, suspects = _extreme_runs(chosen, box)
+                known, where = _extreme_runs(chosen, box)
                 proof = console.run_with_progress(
                     lambda: prove_box(
                         chosen.loop, box, claims, signals=signals, horizon=chosen.solver.duration, budget=budget,
-                        known=known, suspects=suspects, progress=lambda line: far.__setitem__(0, line),
+                        known=known, suspects=_points(where), progress=lambda line: far.__setitem__(0, line),
                     ),
                     f"proving {chosen.name}",
                     lambda: far[0],
@@ -83,6 +92,12 @@ def prove(
 
                 file.write_text(json.dumps(certificate_document(proof, dump(chosen), box, claims)) + "\n")
                 result["files"] = {"certificate": str(out)}
+            if picture:
+                from diffabs.plot.proofs import draw_proof
+
+                shown = _map_of_proof(proof, chosen, sides, claims, known, where)
+                console.run_with_progress(lambda: draw_proof(shown).savefig(picture), "drawing")
+                result["files"] = {**result.get("files", {}), "plot": str(plot)}
         views.as_json(result) if as_json else show_proofs.show_box_proof(result, chosen)
         if proof.verdict != "proved":
             console.fail(f"{chosen.name}: {proof.verdict}: {result['reason']}", console.FAILED)
@@ -113,36 +128,70 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
     """
     console.need_extra("proof")
     from diffabs.reach import NoRule
-    from diffabs.reach.verification import verify_box
+    from diffabs.reach.equations import derive_equations
+    from diffabs.reach.verification import read_proof, verify_box
 
     far = [""]
     try:
-        chosen = loads(str(document["scenario"]).encode(), file.stem, str(file), integrated=False)
+        chosen = loads(str(document.get("scenario")).encode(), file.stem, str(file), integrated=False)
+        box = read_proof(document).over
+        derive_equations(chosen.loop, box)  # refuses a loop or a box without rules before anything is simulated
+        # The runs that would show a false bound are looked for, and their cells are proved again.
+        suspects = _points(_extreme_runs(chosen, box)[1])
         found = console.run_with_progress(
-            lambda: verify_box(chosen.loop, document, share, lambda line: far.__setitem__(0, line)),
+            lambda: verify_box(
+                chosen.loop, chosen.solver.duration, document, share, suspects=suspects,
+                progress=lambda line: far.__setitem__(0, line),
+            ),
             f"verifying {file}",
             lambda: far[0],
-        )
-    except (KeyError, NoRule, ValueError) as error:
+        )  # fmt: skip
+    except (NoRule, ValueError) as error:
         console.fail(f"{file}: {' '.join(str(error).split())}")
-    claims = document["claims"] or [{"quantity": "bounds", "bound": None}]
+    proved, whole = not found.reason, found.checked == found.cells
+    cells = f"{found.checked:,} of {found.cells:,} cells proved again{'' if whole else '; --share 1 proves all'}"
     views.show_verification({
         "file": str(file),
-        "proved": not found.reason,
-        "claims": [{
-            "kind": claim["quantity"],
-            "says": f"{found.checked:,} of {found.cells:,} cells proved again",
-            "reason": found.reason,
-            "proved": not found.reason,
-        } for claim in claims],
+        "proved": proved,
+        "complete": proved and whole,
+        "scenario": document["scenario"],
+        "over": {path: list(ends) for path, ends in box.items()},
+        "claims": [
+            {"kind": statement, "says": cells, "reason": found.reason, "proved": proved}
+            for statement in found.statements
+        ],
         "versions": provenance.versions("numpy"),
     }, as_json)  # fmt: skip
     if found.reason:
         console.fail(f"{file}: not proved: {found.reason}", console.FAILED)
+    if not as_json:
+        console.say(f"for every {_describe_box(box)} of the scenario in the file, whatever its title says")
 
 
-def _read_box(given: Sequence[str], chosen: Scenario) -> dict[str, tuple[float, float]]:
-    """Return the range of each parameter in SI, widened by a rounding so that it holds the decimal numbers given."""
+def _describe_claim(claim: "RunClaim") -> str:
+    """Return a claim in words."""
+    return f"{claim.quantity} {'>=' if claim.quantity.startswith('least') else '<='} {claim.bound:.6g}"
+
+
+def _describe_box(box: Mapping[str, Sequence[float]]) -> str:
+    """Return a box in words, in SI units with all digits that matter."""
+    return ", ".join(f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in box.items())
+
+
+class _Side(NamedTuple):
+    """One parameter of the box: its range in SI, and how the user names it.
+
+    `label` has the unit in which the user gave the range, and `scale` is the factor from SI to that unit.
+    """
+
+    path: str
+    ends: tuple[float, float]
+    label: str
+    scale: float
+
+
+def _read_sides(given: Sequence[str], chosen: Scenario) -> list[_Side]:
+    """Return the range of each parameter, widened by a rounding so that it holds the decimal numbers given."""
     table: JsonObject = {}
     for text in given:
         path, equals, ends = text.partition("=")
@@ -156,13 +205,60 @@ def _read_box(given: Sequence[str], chosen: Scenario) -> dict[str, tuple[float, 
         if path.strip() in table:
             raise ScenarioError(f"--over {path.strip()} is given twice")
         table[path.strip()] = pair
-    box = {}
+    sides = []
     for entry in read_entries(table, "--over", parameters_of(chosen.loop), "not a parameter of this loop"):
         if entry.shape:
             raise ScenarioError(f"{entry.where} is a list; a proof varies single numbers")
         low, high = entry.range()
-        box[entry.path] = (float(np.nextafter(low, -np.inf)), float(np.nextafter(high, np.inf)))
-    return box
+        ends = (float(np.nextafter(low, -np.inf)), float(np.nextafter(high, np.inf)))
+        sides.append(_Side(entry.path, ends, f"{entry.path} [{entry.spec.unit or 1}]", entry.scale))
+    return sides
+
+
+def _choose_axes(sides: Sequence[_Side]) -> list[int]:
+    """Return the indices of the parameters with more than one value. Raises ScenarioError unless there are 1 or 2."""
+    wide = [i for i, side in enumerate(sides) if side.ends[1] - side.ends[0] > 1e-12 * max(map(abs, side.ends))]
+    if len(wide) not in (1, 2):
+        raise ScenarioError(f"--plot draws one or two parameters; {len(wide)} of --over have more than one value")
+    return wide
+
+
+def _map_of_proof(
+    proof: "BoxProof", chosen: Scenario, sides: Sequence[_Side], claims: Sequence["RunClaim"],
+    known: Mapping[str, tuple[float, float]], where: Mapping[str, list[float]],
+) -> "ProofMap":  # fmt: skip
+    """Return the map of the first claim's quantity, else of the greatest slip, in the units of the given ranges."""
+    from diffabs.plot.proofs import ProofMap
+
+    axes = _choose_axes(sides)
+    scales = np.array([sides[i].scale for i in axes])
+    quantity = claims[0].quantity if claims else "greatest slip"
+    word, _, signal = quantity.rpartition(" ")
+    bounds = np.empty(0)
+    if proof.rows is not None:
+        times = {"stop_time": proof.rows.time, "stop_distance": proof.rows.distance}
+        columns = proof.rows.least if word == "least" else proof.rows.greatest
+        bounds = columns[:, proof.prover.signals.index(signal)] if word else times[quantity][:, 1]
+    kind = "lower" if word == "least" else "upper"
+    statement = f": {_describe_claim(claims[0])}" if claims else ""
+
+    def shown_cells(cells: np.ndarray) -> np.ndarray:
+        return cells[..., axes, :] * scales[:, None]
+
+    worst = where.get(quantity)
+    return ProofMap(
+        labels=[sides[i].label for i in axes],
+        box=shown_cells(np.array([side.ends for side in sides])),
+        cells=shown_cells(proof.cells),
+        bounds=bounds,
+        left=shown_cells(proof.left),
+        refuting=None if proof.refuting is None else shown_cells(proof.refuting),
+        worst=None if worst is None else np.array(worst)[axes] * scales,
+        worst_value=known[quantity][1] if quantity in known else None,
+        quantity=f"proved {kind} bound of {signal.replace('_', ' ')} [{_unit_of(quantity, chosen)}]",
+        claimed=claims[0].bound if claims else None,
+        title=f"{chosen.title or chosen.name}\n{proof.verdict}{statement}",
+    )
 
 
 def _read_claim(text: str, chosen: Scenario) -> "RunClaim":
@@ -191,6 +287,12 @@ def _read_claim(text: str, chosen: Scenario) -> "RunClaim":
     return RunClaim(f"{'greatest' if word == 'max' else 'least'} {signal}", bound)
 
 
+def _unit_of(quantity: str, chosen: Scenario) -> str:
+    """Return the unit of a quantity of a proof, empty if the plant declares none."""
+    units = {"stop_time": "s", "stop_distance": "m", **chosen.loop.plant.shows.units}
+    return units.get(quantity.split()[-1], "")
+
+
 def _target(chosen: Scenario) -> float:
     """Return the target slip of the reference."""
     loop = chosen.loop
@@ -199,9 +301,9 @@ def _target(chosen: Scenario) -> float:
 
 def _extreme_runs(
     chosen: Scenario, box: dict[str, tuple[float, float]]
-) -> tuple[dict[str, tuple[float, float]], list[list[float]]]:
-    """Return least and greatest value of greatest slip, stop time and stop distance in a grid of runs, and the points
-    of the greatest ones.
+) -> tuple[dict[str, tuple[float, float]], dict[str, list[float]]]:
+    """Return least and greatest value of greatest slip, stop time and stop distance in a grid of runs, and the point of
+    each greatest one.
     """
     import diffabs as d
     from diffabs.core.protocols import BrakeOutput
@@ -209,7 +311,7 @@ def _extreme_runs(
     from diffabs.stops import SpeedReached
 
     if chosen.loop.plant.shows is not BrakeOutput:
-        return {}, []
+        return {}, {}
     counts = [SEARCHED[min(i, 1)] if len(box) < 3 else 5 for i in range(len(box))]
     axes = [np.linspace(low, high, n)[:: max(1, (n - 1))] if low == high else np.linspace(low, high, n)
             for (low, high), n in zip(box.values(), counts, strict=True)]  # fmt: skip
@@ -227,8 +329,13 @@ def _extreme_runs(
     worst = {name: int(np.nanargmax(column)) for name, column in found.items() if np.isfinite(column).any()}
     return (
         {name: (float(np.nanmin(found[name])), float(found[name][i])) for name, i in worst.items()},
-        [points[i].tolist() for i in dict.fromkeys(worst.values())],
+        {name: points[i].tolist() for name, i in worst.items()},
     )
+
+
+def _points(where: Mapping[str, list[float]]) -> list[list[float]]:
+    """Return points, each once."""
+    return list(map(list, dict.fromkeys(map(tuple, where.values()))))
 
 
 def _document(
@@ -236,11 +343,9 @@ def _document(
     known: dict[str, tuple[float, float]],
 ) -> JsonObject:  # fmt: skip
     """Return the JSON document; a bound that is not proved is null."""
-    units = {"stop_time": "s", "stop_distance": "m"}
-    shown = chosen.loop.plant.shows.units
     bounds = {}
     for name, (low, high) in proof.bounds.items():
-        row = {"low": low, "high": high, "unit": units.get(name) or shown.get(name.split()[-1], "")}
+        row = {"low": low, "high": high, "unit": _unit_of(name, chosen)}
         bounds[name] = {key: x if isinstance(x, str) or math.isfinite(x) else None for key, x in row.items()}
         if name in known:
             bounds[name]["least_run"], worst = known[name]

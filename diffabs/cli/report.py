@@ -18,7 +18,7 @@ def report(
     source: Annotated[
         pathlib.Path,
         typer.Argument(
-            metavar="DIR|FILE.json", help="Result of reproduce, sweep, rare, tune, identify, design or certify."
+            metavar="DIR|FILE.json", help="Result of reproduce, sweep, rare, tune, identify, prove, design or certify."
         ),
     ],
     out: Annotated[

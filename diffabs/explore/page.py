@@ -95,6 +95,8 @@ class Page:
         self.turned_at = time.monotonic()
         now = self.session.scenario()
         self.results.wait()
+        if self.tools.judge:
+            self.results.proved_box(self.tools.judge(self.session))
         self.drawer.ask(partial(self._draw, now, self.version, edit, key))
         self.thinker.ask(partial(self._think, now, self.version))
 
@@ -162,6 +164,8 @@ class Page:
         for other in self.session.withdraw():
             if other != key:
                 self.controls.show(other)
+        if self.tools.judge:
+            self.results.proved_box(self.tools.judge(self.session))
         # A new version discards pending results of the refused number.
         self.version += 1
         self.objected = self.drawn = self.version

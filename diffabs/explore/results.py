@@ -38,6 +38,10 @@ class ResultsPanel:
             self.word = ui.label("").style("font-weight:600; font-size:13.5px").props("data-id=word")
             self.why = ui.label("").classes("why")
         self.proved_of = ui.label("").classes("note").props("data-id=proved-of")
+        with ui.element("div").classes("verdict").props("data-id=proved-box") as self.box_verdict:
+            self.box_word = ui.label("").style("font-weight:600; font-size:13.5px")
+            self.box_why = ui.label("").classes("why")
+        self.box_verdict.set_visibility(False)
         with ui.element("div").classes("card-title"):
             ui.label("poles of the linearised loop")
             self.loop = ui.label("").classes("note").props("data-id=stable")
@@ -117,6 +121,13 @@ class ResultsPanel:
         self.verdict_box.classes(replace=f"verdict {found.word}")
         self.word.set_text(HEADS.get(found.word, "no verdict"))
         self.why.set_text(found.sentence)
+
+    def proved_box(self, found: ProofVerdict) -> None:
+        """Show the verdict `found` of a proof's file on the current values."""
+        self.box_verdict.set_visibility(True)
+        self.box_verdict.classes(replace=f"verdict {found.word}")
+        self.box_word.set_text("proved for the box" if found.word == CERTIFIED else "no proof for these values")
+        self.box_why.set_text(found.sentence)
 
     @staticmethod
     def _of_poles(found: Stability) -> str:

@@ -41,10 +41,12 @@ class Tools(NamedTuple):
     Attributes:
         prove: Returns the verdict of a scenario.
         pose: Returns the runs and constraints of a scenario's [tune].
+        judge: Returns the verdict of a proof's file on the values of a session; None without a file.
     """
 
     prove: Callable[[Scenario], ProofVerdict]
     pose: Callable[[Scenario], tuning.TuningTask]
+    judge: "Callable[[Session], ProofVerdict] | None" = None
 
 
 class Session:

@@ -10,10 +10,27 @@ from diffabs.runtime import provenance
 FORMAT = "diffabs box proof 1"
 
 
+def proved_ends(quantity: str) -> tuple[bool, bool]:
+    """Return whether a file states a low and a high end of a quantity: the ends that the checker can prove.
+
+    Args:
+        quantity: `greatest NAME` or `least NAME` of a signal, `stop_time` or `stop_distance`.
+
+    Raises:
+        ValueError: No proof bounds such a quantity.
+    """
+    word, _, name = quantity.partition(" ")
+    if name and word in ("greatest", "least"):
+        return word == "least", word == "greatest"
+    if quantity in ("stop_time", "stop_distance"):
+        return True, True
+    raise ValueError(f"bounds: no proof bounds {quantity!r}")
+
+
 def certificate_document(
     proof: BoxProof, scenario: str, over: Mapping[str, tuple[float, float]], claims: Sequence[RunClaim]
 ) -> JsonObject:
-    """Return the JSON document of a proof's file.
+    """Return the JSON document of a proof's file; an end that nothing is proved of is null.
 
     Args:
         proof: Proof over the box.
@@ -27,9 +44,11 @@ def certificate_document(
         "scenario": scenario,
         "over": {path: list(ends) for path, ends in over.items()},
         "claims": [claim._asdict() for claim in claims],
-        "signals": list(proof.prover.signals),
         "horizon": proof.prover.horizon,
-        "bounds": {name: [x if math.isfinite(x) else None for x in ends] for name, ends in proof.bounds.items()},
+        "bounds": {
+            name: [x if known and math.isfinite(x) else None for x, known in zip(ends, proved_ends(name), strict=True)]
+            for name, ends in proof.bounds.items()
+        },
         "cells": proof.cells.tolist(),
         "versions": provenance.versions("numpy"),
     }

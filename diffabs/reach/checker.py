@@ -36,8 +36,9 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from flint import arb, arb_mat, arb_poly, ctx
 
-from diffabs.reach.equations import Equations, RealOperation
+from diffabs.reach.equations import SLOWEST, Equations, RealOperation
 
+LIMITED = ("clamp", "round")  # operations that a chord stands for
 PRECISION = 96  # bits
 ORDER = 7  # of the Taylor polynomials
 LOWER_ORDERS = (2, 1)  # where a number has no more derivatives
@@ -46,7 +47,7 @@ MAX_HALVINGS = 40  # of one given step
 PICARD_TRIES = 40
 SPEED_WEIGHT = 0.125  # of the speed relative to the slip, in the scales of QR for a sampled loop
 PIECES = 8  # of a step, for the bounds of a signal
-FASTEST_SLIP, SLOWEST = 1.0, 0.01  # `check_slip_chart` holds for a slip below 1 and a speed above 1 cm/s
+FASTEST_SLIP = 1.0  # `check_slip_chart` holds for a slip below 1 and a speed above `SLOWEST`
 ZERO, ONE, NO_SLOPE = arb(0), arb(1), arb_poly([])
 
 
@@ -194,7 +195,7 @@ class _Program:
 
     def _find_static(self) -> list[bool]:
         """Return which operations depend on no state and no limit, whose chord may differ between two sets."""
-        moving = [operation.name in ("state", "clamp") for operation in self.operations]
+        moving = [operation.name in ("state", *LIMITED) for operation in self.operations]
         while True:  # a factor may come after its function
             now = [m or any(moving[a] for a in o.args if a >= 0) for m, o in zip(moving, self.operations, strict=True)]
             if now == moving:
@@ -226,8 +227,8 @@ class _Program:
             roots = more
 
     def _limits(self, roots: Iterable[int]) -> list[int]:
-        """Return the clamps among the operations that `roots` need, operands first."""
-        found = sorted(i for i in self.read_by(roots) if self.operations[i].name == "clamp")
+        """Return the limits and roundings among the operations that `roots` need, operands first."""
+        found = sorted(i for i in self.read_by(roots) if self.operations[i].name in LIMITED)
         for i in found:
             if any(b >= 0 and not self.static[b] for b in self.operations[i].args[1:]):
                 raise NotProved("a limit that changes during a run")
@@ -378,7 +379,7 @@ class _Series:
                 for j in range(2, k + 1):
                     y += value(a, j) * value(i, k - j)
                 return -y * value(i)
-            case "clamp":
+            case "clamp" | "round":
                 return self._limit(i, k)
             case "select":
                 return value(o.args[2 if self.truth(o.args[0]) else 1], k)
@@ -456,7 +457,7 @@ class _Series:
                 return _convolve(slope, a, value, b, k) + _convolve(slope, b, value, a, k)
             case "inv":  # d(1/a) = -(1/a)^2 da
                 return -_convolve(slope, o.args[0], self._square, i, k)
-            case "clamp":
+            case "clamp" | "round":
                 chord = self._chord(i)
                 y = NO_SLOPE if chord.slope.is_zero() else slope(o.args[0], k) * chord.slope
                 if k == 0 and i in self.seeds:
@@ -700,7 +701,10 @@ class _Check:
         return point, whole, chords
 
     def chord(self, series: _Series, i: int, x: arb) -> _Chord:
-        """Return the chord of a limit for arguments in x."""
+        """Return the chord of a limit, or of a rounding x + w with |w| <= 1/2, for arguments in x."""
+        if self.program.operations[i].name == "round":
+            values = x + arb(0, 0.5)
+            return _Chord(ONE, ZERO, arb(0.5), values, values)
         low, high = (series.value(b) if b >= 0 else None for b in self.program.operations[i].args[1:])
         return _relax(x, low, high)
 
@@ -931,7 +935,7 @@ class _Check:
         self.ranges = {i: (at_start[i], ranges[i]) for i in ranges}
         if s >= 0 and not box[s].upper() < FASTEST_SLIP:
             raise _StepFails("a wheel may lock")
-        if self.speed >= 0 and not box[self.speed].lower() > SLOWEST:
+        if self.speed >= 0 and not box[self.speed].lower() > float(SLOWEST):
             raise _StepFails("the vehicle may stand")
         true = {i: chord._replace(values=chord.limited) for i, chord in chords.items()}
         return box, chords, self.whole(box, chords=true, forced=True)

@@ -218,8 +218,8 @@ def _measure_influence(prover: Prover, box: np.ndarray, point: np.ndarray, threa
         cell = np.stack([np.maximum(point - share * sides, box[:, 0]), point], 1)
         found = prover.prove(cell[None], threads)
         if found.status[0] and (found.reach[0] > 0).any():
-            widths = np.where(sides > 0, cell[:, 1] - cell[:, 0], 1.0)
-            influence = found.reach[0] / widths
+            widths = cell[:, 1] - cell[:, 0]
+            influence = found.reach[0] / np.where(widths > 0, widths, 1.0)
             break
     else:
         influence = 1 / np.where(sides > 0, sides, 1.0)

@@ -170,9 +170,9 @@ class Prover:
             equations: Equations of the loop.
             signals: Names of the signals whose range is wanted.
             horizon: Duration after which a run is no longer followed [s].
-            settings: Other values of `SETTINGS`: order of the Taylor polynomials, greatest remainder of a step relative
-                to the state, least speed [m/s], length of the first step, of the shortest one and of the longest one [s], or
-                [s^2/m] of a loop that is paced.
+            settings: Other values of `SETTINGS`: greatest remainder of a step relative to the state, least speed [m/s],
+                length of the first, the shortest and the longest step [s] (of a paced loop [s^2/m]); and the `order` of
+                the Taylor polynomials.
         """
         e = self.equations = equations
         self.signals, self.horizon = tuple(signals), horizon

@@ -37,6 +37,9 @@ FUNCTIONS = ("exp", "log", "sin", "cos", "atan", "power")
 COMPARISONS = ("lt", "le", "eq", "ne")
 LOGIC = ("and", "or", "not")
 CHART_TRIALS = 20  # random rational points; a rational function that is not the identity passes none, nearly surely
+SLOWEST, FASTEST = Fraction(2, 100), Fraction(200)  # speeds [m/s] at which the chart is checked, ends included
+CHART_DECADES = 6.0  # by which parameters of the box are changed, up and down
+CHART_SLIPS = (Fraction(0), Fraction(1, 2), Fraction(999_999, 10**6))  # slips that go with both ends
 
 
 class NoRule(ValueError):
@@ -178,6 +181,8 @@ class _Derivation:
         for path in paths:
             if path not in known:
                 raise NoRule(f"{path} is not a parameter of the loop")
+            if path.split(".")[0] in BLOCKS and path.split(".")[-1] in ("period", "delay"):
+                raise NoRule(f"{path}: the proof has no rule for a range of periods or delays")
         self.period = _clock_of(self.loop)
         self.given = [self.graph.input(np.float64, UpdateLevel.UNIFORM, (LEAVES, i)) for i in range(len(paths))]
         state = loop.start().plant
@@ -258,7 +263,7 @@ class _Derivation:
         signals = {name: self.convert(x, same) for name, x in zip(signal_names, shows, strict=False)}
         margin = self.convert(shows[len(signal_names)], same)
         if self.charted:
-            check_slip_chart(self.loop)
+            check_slip_chart(self.loop, self.paths)
         return Equations(
             operations=tuple(self.operations), params=self.paths, states=tuple(names),
             start=(*starts, self.make("const", (), 0.0)), flow=tuple(flow), tick=tuple(ticked), period=self.period,
@@ -579,34 +584,45 @@ def _text(path: Any) -> str:
     return ".".join(word for word in words if word not in ("flow", "held"))
 
 
-def check_slip_chart(loop: Loop) -> None:
+def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
     """Check that the plant's slip is 1 - w/v and its start has the slip and the speed asked for, in exact arithmetic.
 
-    Both are rational functions of slip and speed for 0 <= slip < 1 and a speed above 1 cm/s. They are evaluated in
-    fractions at random points; a rational function that differs somewhere would agree there with probability 0.
+    Both sides are evaluated in fractions, at speeds from 2 cm/s to 200 m/s and slips from 0 to almost 1. The points are
+    random, spread evenly over the decades of speed, and the ends of both ranges are among them. Parameters of the plant
+    in `over` are multiplied by factors from 1e-6 to 1e6, both ends included.
+
+    A wrong rational function agrees at a random point with a probability of nearly 0. A function with branches, such as
+    max(v, 0.01), is wrong between two thresholds: it passes only if no point lies between them.
 
     Args:
         loop: Closed loop of a braked wheel.
+        over: Paths of the parameters of the box.
 
     Raises:
         NoRule: They differ.
     """
-    graph = RealGraph()
-    inputs = [graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(2)]
+    graph, paths = RealGraph(), [path for path in over if path.startswith("plant.")]
+    inputs = [graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(2 + len(paths))]
 
-    def show(speed: Any, slip: Any) -> Any:
-        y = loop.plant.output(loop.plant.start(BrakeStart(speed=speed, slip=slip)))
+    def show(speed: Any, slip: Any, *values: Any) -> Any:
+        plant = replace(loop, dict(zip(paths, values, strict=True))).plant
+        y = plant.output(plant.start(BrakeStart(speed=speed, slip=slip)))
         return y.slip, y.speed, y.wheel_speed
 
-    closed = jax.make_jaxpr(show)(*[jax.ShapeDtypeStruct((), np.float64)] * 2)
+    closed = jax.make_jaxpr(show)(*[jax.ShapeDtypeStruct((), np.float64)] * len(inputs))
     constants = [constant_array(graph, np.asarray(x)) for x in closed.consts]
     roots = [x.item() for x in lower_jaxpr(graph, closed.jaxpr, constants, [scalar_array(x) for x in inputs])]
-    draw = random.Random(0)
+    there = {path: Fraction(float(value) or 1.0) for path, _, value in parameters(loop) if path in paths}
+    draw = random.SystemRandom()  # a plant cannot know the points
+    ends = (-CHART_DECADES, CHART_DECADES)
+    points = [(speed, slip, [x] * len(paths)) for speed in (SLOWEST, FASTEST) for slip in CHART_SLIPS for x in ends]
     for _ in range(CHART_TRIALS):
-        speed, slip = Fraction(draw.randint(2, 10**6), 100), Fraction(draw.randint(0, 10**6 - 1), 10**6)
-        values = _exact_values(roots, [speed, slip])
-        if values != [slip, speed, (1 - slip) * speed]:
-            raise NoRule(f"plant {type(loop.plant).__name__}: its slip is not 1 - w/v of its start")
+        speed = min(max(Fraction(10 ** draw.uniform(-1.7, 2.3)).limit_denominator(10**9), SLOWEST), FASTEST)
+        points.append((speed, Fraction(draw.randint(0, 10**6 - 1), 10**6), [draw.uniform(*ends) for _ in paths]))
+    for speed, slip, decades in points:
+        values = [there[path] * Fraction(10.0**x) for path, x in zip(paths, decades, strict=True)]
+        if _exact_values(roots, [speed, slip, *values]) != [slip, speed, (1 - slip) * speed]:
+            raise NoRule(f"plant {type(loop.plant).__name__}: its slip is not 1 - w/v at {float(speed):.3g} m/s")
 
 
 def _exact_values(roots: list[Node], given: list[Fraction]) -> list[Any]:

@@ -1,20 +1,27 @@
-"""The verification of a proof's file: coverage in fractions, and a sample of the cells by the checker."""
+"""The verification of a proof's file: coverage by halving, and a sample of the cells by the checker.
+
+A file is text that anybody can edit, so nothing in it counts except what is proved again here. What is verified is the
+list `statements` of `FileVerdict`: about the loop and the duration of the scenario in the file, and over its box.
+"""
 
 import math
 import random
-from collections.abc import Callable, Sequence
-from fractions import Fraction
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject
-from diffabs.reach.certificate import FORMAT
+from diffabs.reach.certificate import FORMAT, proved_ends
+from diffabs.reach.cover import RunClaim
 from diffabs.reach.equations import Equations, derive_equations
 
 SAMPLED_STEPS = 2  # steps of the checker between two ticks
 PACED_STEP, STEPS = 2e-4, 500  # length in eta [s^2/m]; number of steps of another continuous loop
 CELL_HALVINGS = 3  # of a cell whose bounds by the checker are too wide
-ALLOWED = 1e-3  # a bound of the file may be this much below the checker's, relative: both are upper bounds
+DEEPEST = 200  # halvings of the box that lead to one cell
+
+Cell = list[list[float]]
+Bounds = dict[str, tuple[float | None, float | None]]
 
 
 class FileVerdict(NamedTuple):
@@ -24,24 +31,110 @@ class FileVerdict(NamedTuple):
         checked: Number of cells that were proved again.
         cells: Number of cells in the file.
         reason: Why the file is not verified, empty if it is.
+        statements: What the file states of every run of the box, such as `greatest slip <= 0.33`.
     """
 
     checked: int
     cells: int
     reason: str
+    statements: tuple[str, ...]
+
+
+class ProofFile(NamedTuple):
+    """The content of a proof's file.
+
+    Attributes:
+        over: Range (low, high) of each parameter of the box, by path, in SI units.
+        cells: Ends of each parameter, one row for each cell, shape (cells, parameters, 2).
+        claims: Claims of the proof.
+        bounds: Proved ends (low, high) of each quantity; None where the file states nothing.
+        horizon: Duration after which a run was no longer followed [s].
+    """
+
+    over: dict[str, tuple[float, float]]
+    cells: list[Cell]
+    claims: tuple[RunClaim, ...]
+    bounds: Bounds
+    horizon: float
+
+    @property
+    def statements(self) -> tuple[str, ...]:
+        """What the file states of every run of the box: its claims, then its bounds, with all digits."""
+        claims = (f"{x.quantity} {'>=' if x.quantity.startswith('least') else '<='} {x.bound!r}" for x in self.claims)
+        bounds = (
+            f"{name} {sign} {end!r}"
+            for name, ends in self.bounds.items()
+            for sign, end in zip((">=", "<="), ends, strict=True)
+            if end is not None
+        )
+        return (*claims, *bounds)
+
+
+def read_proof(document: JsonObject) -> ProofFile:
+    """Return the content of a proof's file; every number is finite, and every quantity is one that a proof bounds.
+
+    Args:
+        document: JSON document of the file, from `certificate_document`.
+
+    Raises:
+        ValueError: The document is not the file of a proof.
+    """
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise ValueError(f'not a proof\'s file: its "format" is not {FORMAT!r}')
+    if document.get("verdict") != "proved":
+        raise ValueError(f"nothing to verify: the file's verdict is {document.get('verdict')}, not proved")
+    try:
+        over = {path: (_number(low), _number(high)) for path, (low, high) in document["over"].items()}
+        cells = [[[_number(low), _number(high)] for low, high in cell] for cell in document["cells"]]
+        claims = tuple(RunClaim(str(x["quantity"]), _number(x["bound"])) for x in document["claims"])
+        bounds = {
+            name: (None if low is None else _number(low), None if high is None else _number(high))
+            for name, (low, high) in document["bounds"].items()
+        }
+        horizon = _number(document["horizon"])
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise ValueError(f"not a proof's file: {type(error).__name__} {error}") from None
+    if not over:
+        raise ValueError("over: the box has no parameter")
+    if any(len(cell) != len(over) for cell in cells):
+        raise ValueError("not a proof's file: a cell has not one pair of numbers for each parameter of the box")
+    for name, ends in bounds.items():
+        for word, end, proved in zip(("low", "high"), ends, proved_ends(name), strict=True):
+            if end is not None and not proved:
+                raise ValueError(f"bounds: the checker proves no {word} end of {name}, and the file has {end:.9g}")
+    for claim in claims:
+        if claim.quantity not in bounds:
+            raise ValueError(f"claims: {claim.quantity} has no bound in the file")
+    return ProofFile(over, cells, claims, bounds, horizon)
+
+
+def _number(given: Any) -> float:
+    """Return a finite number of a document. Raises ValueError for anything else."""
+    if isinstance(given, bool) or not isinstance(given, int | float) or not math.isfinite(given):
+        raise ValueError(f"{given!r} is not a finite number")
+    return float(given)
 
 
 def verify_box(
-    loop: Loop, document: JsonObject, share: float = 0.01, progress: Callable[[str], None] = lambda line: None
+    loop: Loop,
+    horizon: float,
+    document: JsonObject,
+    share: float = 0.01,
+    *,
+    suspects: Sequence[Sequence[float]] = (),
+    progress: Callable[[str], None] = lambda line: None,
 ) -> FileVerdict:
-    """Prove a sample of the cells of a proof's file again, by code that shares nothing with the prover.
+    """Prove a sample of the cells of a proof's file again, by code that shares only the equations with the prover.
 
-    The sample is drawn by the system's random numbers, so a file cannot choose it.
+    The cells of the suspects come first. The system's random numbers draw the others, so a file cannot choose them. A
+    share of 1 proves the whole file.
 
     Args:
         loop: Closed loop of the file's scenario.
+        horizon: Duration of the file's scenario [s].
         document: Content of the file, from `certificate_document`.
         share: Share of the cells to check, in (0, 1]; at least one is checked.
+        suspects: Points of the box whose runs may violate a bound, shape (points, parameters), in SI units.
         progress: Called with a line about how far the check is.
 
     Raises:
@@ -49,110 +142,110 @@ def verify_box(
         NoRule: A part of the loop has no sound rule.
         ValueError: The document is not a proof's file.
     """
-    over, cells, claims, bounds = _read(document)
-    if reason := _find_gap(over, cells):
-        return FileVerdict(0, len(cells), reason)
-    for claim in claims:
-        low, high = bounds[claim["quantity"]]
-        worst, least = (low, True) if claim["quantity"].startswith("least") else (high, False)
-        if worst is None or (worst < claim["bound"] if least else worst > claim["bound"]):
-            return FileVerdict(0, len(cells), f"the file's bound {worst} of {claim['quantity']} violates its claim")
-    equations = derive_equations(loop, over)
-    count = max(1, math.ceil(share * len(cells)))
-    for done, i in enumerate(random.SystemRandom().sample(range(len(cells)), count)):
-        reason = _check(equations, document, cells[i], bounds, CELL_HALVINGS)
-        if reason:
-            ends = ", ".join(
-                f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in zip(over, cells[i], strict=True)
-            )
-            return FileVerdict(done, len(cells), f"cell {ends}: {reason}")
-        progress(f"{done + 1} of {count} cells")
-    return FileVerdict(count, len(cells), "")
+    file = read_proof(document)
+    cells, over = file.cells, file.over
+    reason, done = _find_contradiction(file, horizon), 0
+    if not reason:
+        equations = derive_equations(loop, over)
+        chosen = _choose_cells(cells, share, suspects)
+        for done, i in enumerate(chosen, 1):
+            if why := _check(equations, file, cells[i], CELL_HALVINGS):
+                ends = (f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in zip(over, cells[i], strict=True))
+                reason, done = f"cell {', '.join(ends)}: {why}", done - 1
+                break
+            progress(f"{done} of {len(chosen)} cells")
+    return FileVerdict(done, len(cells), reason, file.statements)
 
 
-def _read(document: JsonObject) -> tuple[JsonObject, list[list[list[float]]], list[JsonObject], JsonObject]:
-    """Return box, cells, claims and bounds of a file. Raises ValueError if they do not have the form of one."""
-    try:
-        if document["format"] != FORMAT or document["verdict"] != "proved":
-            raise ValueError("no proof")
-        over = {str(path): (float(low), float(high)) for path, (low, high) in document["over"].items()}
-        cells = [[[float(low), float(high)] for low, high in cell] for cell in document["cells"]]
-        claims = [{"quantity": str(x["quantity"]), "bound": float(x["bound"])} for x in document["claims"]]
-        bounds = {str(name): (low, high) for name, (low, high) in document["bounds"].items()}
-        if any(len(cell) != len(over) for cell in cells) or any(x["quantity"] not in bounds for x in claims):
-            raise ValueError("cells or claims do not fit the box")
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"not a proof's file: {error}") from None
-    return over, cells, claims, bounds
-
-
-def _find_gap(over: JsonObject, cells: Sequence[Sequence[Sequence[float]]]) -> str:
-    """Return why the cells do not cover the box, empty if they do.
-
-    Cells that come from halving are nested or apart. So they cover the box if they differ, lie in it, and their volumes
-    add up to its volume.
-    """
-
-    def volume(cell: Sequence[Sequence[float]]) -> Fraction:
-        widths = (Fraction(high) - Fraction(low) for low, high in cell)
-        return math.prod((w for w in widths if w), start=Fraction(1))
-
-    box = list(over.values())
-    for cell in cells:
-        if any(not low <= a <= b <= high for (a, b), (low, high) in zip(cell, box, strict=True)):
-            return f"the cell {cell} is not in the box"
-    if len({tuple(map(tuple, cell)) for cell in cells}) < len(cells):
-        return "a cell occurs twice"
-    if not _comes_from_halving(box, cells):
-        return "the cells do not come from halving the box"
-    if sum((volume(cell) for cell in cells), Fraction(0)) != volume(box):
-        return "the cells do not cover the box"
+def _find_contradiction(file: ProofFile, horizon: float) -> str:
+    """Return where a file contradicts itself or its scenario's duration [s], empty if it does not."""
+    if file.horizon != horizon:
+        return f"the file follows runs for {file.horizon:g} s, its scenario for {horizon:g} s"
+    for claim in file.claims:
+        low, high = file.bounds[claim.quantity]
+        worst, least = (low, True) if claim.quantity.startswith("least") else (high, False)
+        if worst is None or (worst < claim.bound if least else worst > claim.bound):
+            return f"the file's bound {worst} of {claim.quantity} violates its claim"
+    if not file.statements:
+        return "the file states nothing"
+    if not _comes_from_halving(list(file.over.values()), file.cells):
+        return "the cells do not cover the box: they do not come from halving it"
     return ""
 
 
-def _comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[Sequence[Sequence[float]]]) -> bool:
-    """Return whether the cells are the leaves of a tree of halvings of the box, so that no two overlap."""
+def _choose_cells(cells: Sequence[Cell], share: float, suspects: Sequence[Sequence[float]]) -> list[int]:
+    """Return the indices of the cells with suspects, then of a random sample of all cells."""
+    holding = [
+        i
+        for point in suspects
+        for i, cell in enumerate(cells)
+        if all(low <= x <= high for x, (low, high) in zip(point, cell, strict=True))
+    ]
+    sample = random.SystemRandom().sample(range(len(cells)), max(1, math.ceil(share * len(cells))))
+    return list(dict.fromkeys([*holding, *sample]))
+
+
+def _comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[Cell], depth: int = DEEPEST) -> bool:
+    """Return whether the cells are the leaves of a tree of halvings of the box.
+
+    Then they cover it. A leaf is exactly its part of the box, and the parts of a halving have the whole as their union.
+    """
     if len(cells) == 1:
         return [list(ends) for ends in cells[0]] == [list(ends) for ends in box]
-    for i, (low, high) in enumerate(box):
+    for i, (low, high) in enumerate(box if depth else ()):
         middle = 0.5 * (low + high)
         left = [cell for cell in cells if cell[i][1] <= middle]
         right = [cell for cell in cells if cell[i][0] >= middle]
         if left and right and len(left) + len(right) == len(cells):
             parts = ([*box[:i], end, *box[i + 1 :]] for end in ((low, middle), (middle, high)))
-            if all(_comes_from_halving(part, some) for part, some in zip(parts, (left, right), strict=True)):
+            if all(_comes_from_halving(part, some, depth - 1) for part, some in zip(parts, (left, right), strict=True)):
                 return True
     return False
 
 
-def _check(
-    equations: Equations, document: JsonObject, cell: list[list[float]], bounds: JsonObject, halvings: int
-) -> str:
-    """Return why the checker does not confirm the file's bounds in a cell, empty if it does."""
+def _check(equations: Equations, file: ProofFile, cell: Cell, halvings: int) -> str:
+    """Return why the checker does not prove the file's bounds in a cell, empty if it does.
+
+    A cell in which it fails is halved: its own bounds of a smaller cell are narrower.
+    """
     from diffabs.reach.checker import NotProved, check_cell
 
-    horizon = float(document["horizon"])
-    steps = SAMPLED_STEPS if equations.period is not None else [PACED_STEP if equations.paced else horizon / STEPS]
+    signals = list(dict.fromkeys(name.split()[1] for name in file.bounds if " " in name))
+    if unknown := [name for name in signals if name not in equations.signals]:
+        raise ValueError(f"bounds: the loop has no signal {unknown[0]}")
+    steps = SAMPLED_STEPS if equations.period is not None else [PACED_STEP if equations.paced else file.horizon / STEPS]
     try:
-        found = check_cell(equations, document["signals"], [(low, high) for low, high in cell], steps, horizon)
+        found = check_cell(equations, signals, [(low, high) for low, high in cell], steps, file.horizon)
     except NotProved as error:
         reason = f"not proved: {error}"
     else:
-        reason = ""
-        upper = {f"greatest {name}": x for name, x in found.greatest.items()}
-        upper |= {"stop_time": found.stop_time[1], "stop_distance": found.distance[1]}
-        lower = {f"least {name}": x for name, x in found.least.items()}
-        lower |= {"stop_time": found.stop_time[0], "stop_distance": found.distance[0]}
-        for name, (low, high) in bounds.items():
-            if high is not None and name in upper and upper[name] > high + ALLOWED * abs(high):
-                reason = f"{name} up to {upper[name]:.9g}, in the file {high:.9g}"
-            if low is not None and name in lower and lower[name] < low - ALLOWED * abs(low):
-                reason = f"{name} from {lower[name]:.9g}, in the file {low:.9g}"
+        reason = _compare(
+            file.bounds,
+            {
+                **{f"greatest {name}": (None, x) for name, x in found.greatest.items()},
+                **{f"least {name}": (x, None) for name, x in found.least.items()},
+                "stop_time": found.stop_time,
+                "stop_distance": found.distance,
+            },
+        )
     if not reason or not halvings:
         return reason
     widths = [(high - low) / max(abs(high), 1e-300) for low, high in cell]
-    side = widths.index(max(widths))
+    side = widths.index(max(widths)) if widths else 0
+    if not widths or not widths[side] > 0:
+        return reason
     low, high = cell[side]
     middle = 0.5 * (low + high)
     halves = ([*cell[:side], ends, *cell[side + 1 :]] for ends in ([low, middle], [middle, high]))
-    return next((why for half in halves if (why := _check(equations, document, half, bounds, halvings - 1))), "")
+    return next((why for half in halves if (why := _check(equations, file, half, halvings - 1))), "")
+
+
+def _compare(stated: Bounds, found: Mapping[str, tuple[float | None, float | None]]) -> str:
+    """Return a stated end that the found ends do not prove, empty if they prove all; NaN proves nothing."""
+    for name, (low, high) in stated.items():
+        least, most = found[name]
+        if high is not None and not (most is not None and most <= high):
+            return f"{name} up to {most:.9g}, in the file {high:.9g}"
+        if low is not None and not (least is not None and least >= low):
+            return f"{name} from {least:.9g}, in the file {low:.9g}"
+    return ""

@@ -20,10 +20,11 @@ KEYS_BY_KIND = {  # the keys that only this kind has
     "rare": ("levels", "probability", "bound"),
     "tune": ("free", "history", "constraints"),
     "identify": ("values", "residuals", "chi2"),
+    "prove": ("verdict", "refuted_by", "share_left"),
     "design": ("gain", "states", "over", "poles"),
     "certificate": ("format", "system", "claims"),
 }
-READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, design and certify write"
+READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, prove, design and certify write"
 
 
 class ReportError(ValueError):

@@ -1,6 +1,5 @@
 """Tunings and identifications as sections of a report."""
 
-import pathlib
 from collections.abc import Iterator
 
 from diffabs.core.types import Table
@@ -14,7 +13,7 @@ from diffabs.report.page import (
     ReportVerdict,
     Section,
     describe_origin,
-    embed_image,
+    embed_named,
     format_pairs,
     join_words,
     model_tables,
@@ -71,11 +70,9 @@ def _figures(document: Document) -> Iterator[Figure]:
         yield Figure(
             "The objective after so many gradients", drawn=draw_lines(points, "gradients computed", "objective")
         )
-    if plot := document.content["files"].get("plot"):
-        for path in (document.folder / pathlib.PurePath(plot).name, pathlib.Path(plot)):
-            if found := embed_image(path, "How the tuning went, and its worst run before and after"):
-                yield found
-                return
+    plot = document.content["files"].get("plot")
+    if found := embed_named(document.folder, plot, "How the tuning went, and its worst run before and after"):
+        yield found
 
 
 def _tuning_tables(content: Table) -> Iterator[ReportTable]:

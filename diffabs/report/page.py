@@ -132,6 +132,23 @@ def embed_image(path: pathlib.Path, caption: str = "") -> Figure | None:
     return Figure(caption or path.stem.replace("_", " "), f"data:{kind};base64,{text}")
 
 
+def embed_named(folder: pathlib.Path, named: str | None, caption: str) -> Figure | None:
+    """Return the picture that a document names, from the document's folder or where it was drawn.
+
+    Args:
+        folder: Folder of the document.
+        named: Path of the picture in the document; None without one.
+        caption: Caption.
+
+    Returns:
+        The picture, or None if there is no readable one.
+    """
+    if not named:
+        return None
+    places = (folder / pathlib.PurePath(named).name, pathlib.Path(named))
+    return next((found for path in places if (found := embed_image(path, caption))), None)
+
+
 def model_tables(model: Table | None) -> list[ReportTable]:
     """Return tables of parts, parameters and solver.
 

@@ -1,4 +1,4 @@
-"""Designs, certificates and their claims as sections of a report."""
+"""Designs, certificates with their claims, and proofs over a box as sections of a report."""
 
 from diffabs.core.types import Table
 from diffabs.design.verify import verify_file
@@ -10,6 +10,7 @@ from diffabs.report.page import (
     ReportVerdict,
     Section,
     describe_origin,
+    embed_named,
     join_words,
     model_tables,
     original_command,
@@ -154,3 +155,62 @@ def certificate_section(document: Document) -> Section:
         provenance=describe_origin(content),
         again=[f"diffabs verify {document.path}"],
     )  # fmt: skip
+
+
+def box_section(document: Document) -> Section:
+    """Return the section of a proof over a box of parameters.
+
+    Args:
+        document: Document of `prove`.
+
+    Raises:
+        KeyError: The document lacks a key.
+    """
+    content = document.content
+    verdict, claims = content["verdict"], [_describe_claim(claim) for claim in content["claims"]]
+    units = {path: row["unit"] for path, row in (content.get("model") or {}).get("parameters", {}).items()}
+    ranges = join_words(
+        f"{path} from {low:.6g} to {high:.6g}{_unit(units.get(path))}" for path, (low, high) in content["over"].items()
+    )
+    asked = f"Does every run satisfy {join_words(claims)}" if claims else "Which bounds hold for every run"
+    files = content.get("files") or {}
+    sides = [[path, *ends, table_unit(units.get(path))] for path, ends in content["over"].items()]
+    keys = ("low", "high", "worst_run", "looseness", "unit")
+    bounds = [[name, *(row.get(key) for key in keys)] for name, row in content["bounds"].items()]
+    cells = [["proved", content["cells"]], ["left", content["left"]], ["tried", content["tried"]],
+             ["share of the box that is left [1]", content["share_left"]],
+             ["computing time [s]", content["seconds"]]]  # fmt: skip
+    return Section(
+        title=f"Proof over a box of {content['scenario']}",
+        question=f"{asked}, for every {ranges}?",
+        answer=[f"{verdict}: {content['reason']}." if content["reason"] else f"{verdict}."],
+        verdicts=[ReportVerdict(verdict, claim) for claim in claims] or [ReportVerdict(verdict, "the bounds below")],
+        model=model_tables(content.get("model")),
+        model_note="The values of the box's parameters stand for nothing: the proof is about all of the box."
+        if content.get("model")
+        else UNKNOWN_ORIGIN,
+        figures=[
+            found for found in [embed_named(document.folder, files.get("plot"), "The cells of the proof")] if found
+        ],
+        tables=[
+            ReportTable("Box", ("parameter", "low", "high", "unit"), sides, "in SI; the ends belong to the box"),
+            ReportTable(
+                "Bounds of every run",
+                ("quantity", "proved from", "to", "worst run found", "looseness", "unit"),
+                bounds,
+                "an empty cell: nothing is proved",
+            ),
+            ReportTable("Cells", ("cells", "number"), cells),
+        ],
+        notes=["The runs are those of the model in real numbers, without the rounding of the simulation."],
+        provenance=describe_origin(content),
+        again=[
+            *original_command(content),
+            *([f"diffabs verify {files['certificate']}"] if verdict == "proved" and "certificate" in files else []),
+        ],
+    )
+
+
+def _describe_claim(claim: Table) -> str:
+    relation = ">=" if claim["quantity"].startswith("least") else "<="
+    return f"{claim['quantity'].replace('_', ' ')} {relation} {claim['bound']:.6g}"

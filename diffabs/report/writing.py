@@ -17,6 +17,7 @@ SECTION_BY_KIND: dict[str, Callable[[Document], Section]] = {
     "rare": studies.rare_section,
     "tune": findings.tuning_section,
     "identify": findings.identification_section,
+    "prove": proofs.box_section,
     "design": proofs.design_section,
     "certificate": proofs.certificate_section,
 }

@@ -45,6 +45,13 @@ REFUSALS = [
     ("prove slip-lmi --over plant.mass=5:6 --claim max_slip=x", 2, ["needs a number: max_slip=BOUND"]),
     ("prove slip-lmi --over plant.mass=5:6 --claim no_lock=1", 2, ["no_lock has no bound"]),
     ("prove slip-lmi --over plant.mass=5:6 --budget 0", 2, ["--budget = 0 is outside (0, inf) s"]),
+    (
+        "prove slip-lmi --over plant.mass=5:6 --over initial.speed=5:6 --over reference.slip=0.1:0.2 --plot a.png",
+        2,
+        ["--plot draws one or two parameters; 3 of --over have more than one value"],
+    ),
+    ("prove slip-lmi --over plant.mass=5:6 --plot a.txt", 2, ["the name must end in .png, .pdf, .svg"]),
+    ("prove slip-cured --over controller.period=1e-3:2e-3", 2, ["no rule for a range of periods or delays"]),
     ("prove slip-real --over plant.mass=5:6", 2, ["ticks with the integration grid"]),
     ("prove slip-estimator --over plant.mass=12:13", 2, ["has events"]),
     # compile

@@ -1,5 +1,6 @@
 """The checker's bounds against closed forms, runs and the native prover, with which it shares no code."""
 
+import dataclasses
 import math
 import random
 from fractions import Fraction
@@ -7,10 +8,11 @@ from fractions import Fraction
 import jax
 import numpy as np
 import pytest
+from mutants import killed_by
 from seams import replace_seam
 
 import diffabs as d
-from diffabs.reach.equations import Equations, RealOperation, derive_equations
+from diffabs.reach.equations import Equations, RealOperation, _Derivation, derive_equations
 from diffabs.scenario.scenario import load
 
 flint = pytest.importorskip("flint")
@@ -104,6 +106,9 @@ def within(inner, outer):
     return outer[0] <= min(inner) and max(inner) <= outer[1]
 
 
+@killed_by("reach/checker.py", "for y in (a, b, *inside)]", "for y in (a, b)]")
+@killed_by("reach/checker.py", "return near + 0.0 if arb(near) >= high else nextafter(near, inf)", "return near")
+@killed_by("reach/checker.py", "return arb(value, float(np.spacing(abs(value))))", "return arb(value)")
 def test_the_balls_contain_the_intervals():
     """Sums of ends are compared in fractions; a limit lies within its chord; signs are kept."""
     draw = random.Random(1)
@@ -133,6 +138,11 @@ def test_the_balls_contain_the_intervals():
             assert within([limited], ends(chord.values))
     for value in (0.1, 2.1, 1e-300, 13.88888888888889):
         assert within([Fraction(value), Fraction(repr(value))], ends(checker._constant(value)))
+        with flint.ctx.workprec(checker.PRECISION):
+            third = arb(value) / 3
+            low, high = checker._below(third), checker._above(third)
+            assert ends(third)[0] >= Fraction(low)
+            assert ends(third)[1] <= Fraction(high)
 
 
 def assert_encloses(bounds, truths, width):
@@ -142,6 +152,8 @@ def assert_encloses(bounds, truths, width):
     assert max(truths) <= high <= max(truths) + width
 
 
+@killed_by("reach/checker.py", "return series.value(rate, order - 1) / order", "return ZERO")
+@killed_by("reach/checker.py", "sums.append((q, middle + extra, along,", "sums.append((q, middle, along,")
 @pytest.mark.parametrize(("cell", "width"), [((1.0, 1.0), 1e-10), ((0.9, 1.1), 1e-10)])
 def test_an_oscillator_is_enclosed(cell, width):
     w, until = 3.0, 1.25
@@ -153,6 +165,10 @@ def test_an_oscillator_is_enclosed(cell, width):
     assert -3 * cell[1] >= bounds.least["v"] >= -3 * cell[1] - 3e-3
 
 
+@killed_by(
+    "reach/checker.py", "y += value(a, j) * value(b, k - j)\n                return y", "pass\n                return y"
+)
+@killed_by("reach/checker.py", "(inverse - alpha) * margin.whole", "ZERO")
 @pytest.mark.parametrize(("cell", "width"), [((0.1, 0.1), 1e-6), ((0.1, 0.101), 1e-4)])
 def test_a_logistic_equation_is_enclosed(cell, width):
     r, until = 2.0, 0.9
@@ -163,6 +179,11 @@ def test_a_logistic_equation_is_enclosed(cell, width):
     assert bounds.least["x"] <= cell[0]
 
 
+@killed_by("reach/checker.py", "return [_symmetric(x) for x in moved], slack", "return [ZERO] * n, slack")
+@killed_by("reach/checker.py", "y = y + _along(*self.seeds[i])", "pass")
+@killed_by(
+    "reach/checker.py", "if all(b.contains(m) for b, m in zip(box, moved, strict=True)) and all(", "if True or all("
+)
 @pytest.mark.parametrize(("cell", "width"), [((0.5, 0.5), 1e-5), ((0.5, 0.51), 1e-3)])
 def test_a_limit_within_a_flow_is_enclosed(cell, width):
     bounds = check_cell(limited(2.0), ("x", "rate"), [cell], [0.05] * 33 + [1e-3], 10.0)
@@ -221,6 +242,10 @@ def test_a_lost_disturbance_shows(monkeypatch):
     assert not low <= 1 + math.log(2.0) <= high
 
 
+@killed_by("reach/checker.py", "self.stays_nonnegative(box, chords)", "pass")
+@killed_by("reach/checker.py", "if value(a).contains(0):", "if False:")
+@killed_by("reach/checker.py", "not box[s].upper() < FASTEST_SLIP:", "False:")
+@killed_by("reach/checker.py", "not box[self.speed].lower() > float(SLOWEST):", "False:")
 def test_what_has_no_proof_is_refused():
     t = Tape()
     p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
@@ -238,6 +263,12 @@ def test_what_has_no_proof_is_refused():
     )
     with pytest.raises(NotProved, match="negative"):
         check_cell(falling, ("x",), [(0.5, 0.6)], [0.1], 10.0)
+    rising = t.equations((p, zero, zero), (one, x, one), t("sub", t.number(0.8), time), {"x": x})
+    with pytest.raises(NotProved, match="may lock"):
+        check_cell(dataclasses.replace(rising, nonnegative=(0,)), ("x",), [(0.5, 0.6)], [0.1], 10.0)
+    slower = t.equations((p, zero, zero), (t("neg", one), x, one), t("sub", t.number(0.9), time), {"x": x})
+    with pytest.raises(NotProved, match="may stand"):
+        check_cell(dataclasses.replace(slower, speed=0), ("x",), [(0.85, 0.86)], [0.1], 10.0)
     with pytest.raises(NotProved, match="at its start"):
         check_cell(logistic(2.0, 0.9), ("x",), [(0.8, 0.95)], [0.1], 10.0)
     with pytest.raises(NotProved, match="number of steps"):
@@ -251,6 +282,8 @@ def test_a_horizon_ends_the_proof_early():
     assert bounds.distance[0] == pytest.approx(math.sin(3 * bounds.stop_time[0]) / 3, abs=1e-9)
 
 
+@killed_by("reach/checker.py", "y += j * value(u, j) * value(g, k - j)", "pass")
+@killed_by("reach/checker.py", "return _power(x, value(o.args[2]))", "return _power(x.mid(), value(o.args[2]))")
 @pytest.mark.parametrize("name", ["exp", "log", "sin", "atan", "power", "inv"])
 @pytest.mark.parametrize(("cell", "width"), [((0.5, 0.5), 1e-7), ((0.5, 0.54), 3e-2)])
 def test_functions_are_enclosed(name, cell, width):
@@ -286,7 +319,122 @@ def test_functions_are_enclosed(name, cell, width):
     e = t.equations((p, zero, zero), (one, f, one), t("sub", one, time), {"f": f})
     nodes, weights = np.polynomial.legendre.leggauss(40)
     truths = [0.5 * weights @ function((start + 0.5 + 0.5 * nodes) ** 2) for start in cell]
-    assert_encloses(check_cell(e, ("f",), [cell], [0.05], 10.0).distance, truths, width)
+    bounds = check_cell(e, ("f",), [cell], [0.05], 10.0)
+    assert_encloses(bounds.distance, truths, width)
+    values = function(np.linspace(cell[0], cell[1] + 1.0, 1001) ** 2)
+    assert bounds.least["f"] <= values.min()
+    assert values.max() <= bounds.greatest["f"]
+
+
+RISING = {  # a function f, c and x of about the same slopes c and f'(x): a wrong sign of f' would lose both
+    "exp": (1.0, 0.0, math.exp),
+    "log": (1.0, 1.0, math.log),
+    "sin": (1.0, 0.0, math.sin),
+    "cos": (-1.0, math.pi / 2, math.cos),
+    "atan": (1.0, 0.0, math.atan),
+    "power": (0.3, 1.0, lambda x: x**0.3),
+    "inv": (-1.0, 1.0, lambda x: 1 / x),
+}
+
+
+@killed_by(
+    "reach/checker.py",
+    "return -_convolve(slope, o.args[0], self._sq",
+    "return _convolve(slope, o.args[0], self._sq",
+    case="inv",
+)
+@killed_by("reach/equations.py", 'RealOperation("neg", (at,))', 'RealOperation("add", (at, at))', case="cos")
+@killed_by("reach/equations.py", '(self.number(1.0), self.make("mul", (u, u)))', "(self.number(9.0), u)", case="atan")
+@killed_by(
+    "reach/equations.py", 'RealOperation("mul", (exponent, at + 2))', 'RealOperation("const", (), -0.3)', case="power"
+)
+@pytest.mark.parametrize("name", RISING)
+def test_a_function_has_its_own_derivative(name):
+    """x' = 0, x(0) = p, and the distance is that of c x + f(x) over 1 s; the derivative is that of the equations."""
+    c, centre, function = RISING[name]
+    derivation = object.__new__(_Derivation)
+    derivation.operations, derivation.known = [], {}
+    make, number = derivation.make, derivation.number
+    x, time = make("state", (), 0), make("state", (), 2)
+    if name == "power":
+        f = derivation.power(x, number(0.3), 0.3)
+    else:
+        f = make("inv", (x,)) if name == "inv" else derivation.function(name, x)
+    rate = make("add", (make("mul", (number(c), x)), f))
+    p, zero, one = make("param", (), 0), number(0.0), number(1.0)
+    margin = make("sub", (one, time))
+    e = Equations(
+        tuple(derivation.operations), ("p",), ("x", "s", "t"), (p, zero, zero), (zero, rate, one), (), None, {"x": x},
+        margin, (), 1, -1, 2, False,
+    )  # fmt: skip
+    cell = (centre - 0.1, centre + 0.1)
+    assert_encloses(check_cell(e, ("x",), [cell], [0.25], 10.0).distance, [c * y + function(y) for y in cell], 0.1)
+
+
+@killed_by("reach/checker.py", "h * slack.get(q.rate, ZERO)))", "ZERO))", case="y")
+@killed_by("reach/checker.py", "(b[i] + sum((M[i][j] * D[j] for j in range(n)), ZERO))", "b[i]", case="z")
+@pytest.mark.parametrize("rate", ["y", "z"])
+def test_a_disturbance_reaches_what_it_moves(rate):
+    """x' = 0, y' = max(x, 0), z' = 50 y, and the distance is that of y or z, in one step of 0.1 s."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, y, z, _, time = t.states(5)
+    flow = (zero, t("clamp", x, zero, -1), t("mul", t.number(50.0), y), {"y": y, "z": z}[rate], one)
+    e = t.equations((p, zero, zero, zero, zero), flow, t("sub", t.number(0.1), time), {"z": z})
+    distance = check_cell(e, ("z",), [(-1.0, 1.0)], [0.1], 10.0).distance
+    assert_encloses(distance, [0.0, {"y": 0.5 * 0.1**2, "z": 50 * 0.1**3 / 6}[rate]], 0.05)
+
+
+@killed_by("reach/checker.py", "+ rest * t**order + slack", "+ slack")
+def test_a_signal_has_the_remainder_of_its_polynomial():
+    """The second order of a step of 1e-3 s is 5e-6; the run ends 1e-6 s before step 100 does."""
+    until = 0.1 - 1e-6
+    bounds = check_cell(oscillator(3.0, until), ("x",), [(1.0, 1.0)], [1e-3], 10.0, order=2)
+    assert math.cos(0.3) - 1e-5 <= bounds.least["x"] <= math.cos(3.0 * until)
+
+
+def test_a_cell_of_two_neighbouring_numbers_is_a_set():
+    """Its middle is one of them."""
+    ends = (1.0, float(np.nextafter(1.0, 2.0)))
+    assert all(checker._Check(oscillator(1.0, 1.0), ("x",), [ends], 7).all[0].contains(arb(x)) for x in ends)
+
+
+def growth(until):
+    """x' = x, x(0) = p; the run ends at x = `until`."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, *_ = t.states(3)
+    return t.equations((p, zero, zero), (x, x, one), t("sub", t.number(until), x), {"x": x})
+
+
+@killed_by(
+    "reach/checker.py", "near if self.rates is None else {x: _hull(near[x], self.rates[x]) for x in near}", "near"
+)
+def test_the_rates_of_all_ends_count():
+    """The slowest run of a wide cell ends at a lower rate than the others, which have gone on, have then."""
+    cell = (0.8, 1.2)
+    bounds = check_cell(growth(2.0), ("x",), [cell], [0.01], 10.0)
+    assert_encloses(bounds.stop_time, [math.log(2 / p) for p in cell], 0.3)
+
+
+@killed_by("reach/checker.py", "return self.rates is None and self.time()", "return self.time()")
+def test_a_horizon_between_two_ends_is_no_end():
+    bounds = check_cell(growth(2.0), ("x",), [(0.8, 1.2)], [0.01], 0.7)
+    assert bounds.stop_time[0] <= math.log(2 / 1.2)
+    assert math.log(2 / 0.8) <= bounds.stop_time[1] < math.inf
+
+
+@killed_by("reach/checker.py", "return whole.upper() < 0\n", "return whole.mid() < 0\n")
+def test_a_proof_goes_on_until_the_last_run_ends():
+    """x' = t - 1.5, x(0) = p; the run ends at x = 0.5. Later runs end at lower rates."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, _, time = t.states(3)
+    rate = t("sub", time, t.number(1.5))
+    e = t.equations((p, zero, zero), (rate, x, one), t("sub", x, t.number(0.5)), {"x": x})
+    cell = (0.8, 1.2)
+    truths = [1.5 - math.sqrt(1.5**2 - 2 * (p - 0.5)) for p in cell]
+    assert_encloses(check_cell(e, ("x",), [cell], [0.01], 10.0).stop_time, truths, 0.1)
 
 
 def test_a_wide_cell_is_enclosed_where_the_end_is_not_linear_in_its_start():
@@ -398,3 +546,29 @@ def test_the_cured_gain():
     assert slip - 1e-6 <= bounds.greatest["slip"] <= slip + 1e-4
     if found := proved_by_engine(e, cell, 0.1):
         assert found[2] == pytest.approx(bounds.greatest["slip"], rel=1e-3)
+
+
+@killed_by("reach/checker.py", "values = x + arb(0, 0.5)", "values = x")
+@killed_by(
+    "reach/checker.py",
+    "return _Chord(ONE, ZERO, arb(0.5), values, values)",
+    "return _Chord(ONE, ZERO, ZERO, values, values)",
+)
+def test_a_rounding_at_a_tick_is_enclosed():
+    """x := x/2 + round(4 x)/16 every second from x(0) = p, and the run ends after 3 s."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, distance, time = t.states(3)
+    rounded = t("round", t("mul", t.number(4.0), x))
+    after = t("add", t("mul", t.number(0.5), x), t("mul", t.number(0.0625), rounded))
+    margin = t("sub", t.number(2.5), time)
+    e = t.equations((p, zero, zero), (zero, x, one), margin, {"x": x}, tick=(after, distance, time), period=1.0)
+    bounds = check_cell(e, ("x",), [(0.9, 1.4)], 1, 10.0)
+    runs, ways = np.linspace(0.9, 1.4, 1001), []
+    for _ in range(2):
+        runs = runs / 2 + np.round(4 * runs) / 16
+        ways.append(runs)
+    last = runs / 2 + np.round(4 * runs) / 16
+    truths = ways[0] + ways[1] + 0.5 * last
+    assert_encloses(bounds.distance, truths.tolist(), 0.4)
+    assert bounds.greatest["x"] >= max(map(np.max, ways))

@@ -7,10 +7,9 @@ from collections.abc import Callable
 
 import pytest
 from commands import run
-from mutants import killed_by
 
 from diffabs.core.types import JsonObject
-from diffabs.reach.verification import verify_box
+from diffabs.reach.verification import FileVerdict, verify_box
 from diffabs.scenario.scenario import loads
 
 pytest.importorskip("flint")
@@ -28,60 +27,51 @@ def proof(native_prover: None, tmp_path_factory: pytest.TempPathFactory) -> path
     return file
 
 
-def loop_of(document: JsonObject):
-    return loads(document["scenario"].encode(), "p", "p").loop
+def judge(document: JsonObject) -> FileVerdict:
+    """Return the verdict on a file of the loop and the duration of its own scenario."""
+    chosen = loads(document["scenario"].encode(), "p", "p")
+    return verify_box(chosen.loop, chosen.solver.duration, document, share=1e-6)
 
 
 def test_a_file_is_verified(proof: pathlib.Path) -> None:
     found = json.loads(run("verify", proof, "--share", "1e-6", "--json").stdout)
     assert found["proved"]
+    assert {"greatest slip", "stop_time"} <= {claim["kind"].rpartition(" ")[0][:-3] for claim in found["claims"]}
     document = json.loads(proof.read_text())
     assert document["verdict"] == "proved"
     assert len(document["cells"]) >= 1
 
 
 def lower_bound(document: JsonObject) -> None:
-    document["bounds"]["greatest slip"][1] *= 0.99
+    document["bounds"]["greatest slip"][1] *= 0.999
 
 
 def shorter_stop(document: JsonObject) -> None:
-    document["bounds"]["stop_time"][1] *= 0.99
+    document["bounds"]["stop_time"][1] *= 0.999
 
 
 def greater_torque(document: JsonObject) -> None:
     assert "torque_max = 9.03" in document["scenario"]
-    document["scenario"] = document["scenario"].replace("torque_max = 9.03", "torque_max = 12.0")
+    document["scenario"] = document["scenario"].replace("torque_max = 9.03", "torque_max = 9.1")
 
 
-def missing_cell(document: JsonObject) -> None:
-    document["cells"][0][0][1] = 0.5 * sum(document["cells"][0][0])
-
-
-def wider_box(document: JsonObject) -> None:
-    document["over"]["plant.mass"][1] = 6.2
-
-
-def cell_twice(document: JsonObject) -> None:
-    document["cells"].append(document["cells"][0])
+def shorter_duration(document: JsonObject) -> None:
+    document["horizon"] *= 0.5
 
 
 def false_claim(document: JsonObject) -> None:
     document["claims"] = [{"quantity": "greatest slip", "bound": 0.2}]
 
 
-CHEAP = [missing_cell, wider_box, cell_twice, false_claim]  # noticed before a cell is proved again
+CHEAP = [shorter_duration, false_claim]  # noticed before a cell is proved again; `test_attacks.py` has more
 CHANGES = [*CHEAP, *(pytest.param(x, marks=pytest.mark.slow) for x in (lower_bound, shorter_stop, greater_torque))]
 
 
 @pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
-@killed_by(
-    "reach/verification.py", 'return "the cells do not come from halving the box"', 'return ""', case="missing_cell"
-)
-@killed_by("reach/verification.py", 'return "a cell occurs twice"', "pass", case="cell_twice")
 def test_a_changed_number_is_noticed(proof: pathlib.Path, change: Callable[[JsonObject], None]) -> None:
     document = copy.deepcopy(json.loads(proof.read_text()))
     change(document)
-    assert verify_box(loop_of(document), document, share=1e-6).reason
+    assert judge(document).reason
 
 
 def test_a_file_that_is_no_proof_is_refused(tmp_path: pathlib.Path, proof: pathlib.Path) -> None:

@@ -121,7 +121,7 @@ def test_a_report_executes_nothing(results, kind):
 
 
 def test_every_kind_of_document_has_a_section(results):
-    assert set(SECTION_BY_KIND) == {*SOURCES, "reproduce"}
+    assert set(SECTION_BY_KIND) == {*SOURCES, "reproduce", "prove"}  # cli/test_cli_prove_views.py has the last one
 
 
 SAID = {

@@ -50,6 +50,8 @@ SEAMS = {
     "save_figure": "diffabs.plot.sweeps.save_figure",
     "checker_remainder": "diffabs.reach.checker._remainder",
     "checker_chord": "diffabs.reach.checker._relax",
+    "draw_proof": "diffabs.plot.proofs.draw_proof",
+    "verified_equations": "diffabs.reach.verification.derive_equations",
     "measure_metric": "diffabs.reliability.failure._measure_metric",
     "outside_named": "diffabs.scenario.outside._named",
     "is_step_stable": "diffabs.simulate.admissible.is_step_stable",

@@ -1,0 +1,112 @@
+"""What a proof's file says about the values on the page: whether they lie in its box, and what is proved there."""
+
+import pathlib
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import get, parameters, replace
+from diffabs.core.types import JsonObject
+from diffabs.explore import friction
+from diffabs.explore.session import CERTIFIED, NOT_PROVED, ProofVerdict, Session
+from diffabs.reach.verification import ProofFile, read_proof
+from diffabs.scenario.scenario import Scenario, loads
+
+
+class ProvedBox(NamedTuple):
+    """A proof's file, which nobody has verified here.
+
+    Attributes:
+        name: Name of the file, for the page.
+        content: Box, cells and bounds.
+        chosen: Scenario of the file.
+    """
+
+    name: str
+    content: ProofFile
+    chosen: Scenario
+
+
+def load_proved_box(path: pathlib.Path, document: JsonObject) -> ProvedBox:
+    """Return the content of a proof's file.
+
+    Args:
+        path: Path of the file.
+        document: JSON document of the file.
+
+    Raises:
+        ValueError: The document is not the file of a proof, or its scenario cannot be loaded.
+    """
+    content = read_proof(document)
+    return ProvedBox(
+        str(path), content, loads(str(document.get("scenario")).encode(), path.stem, str(path), integrated=False)
+    )
+
+
+def judge_values(proved: ProvedBox, session: Session) -> ProofVerdict:
+    """Return whether the current values of a session lie in the box of a proof: "certified", else "unknown".
+
+    They do if each of the box's parameters lies in its range, and the duration and the rest of the loop are those of
+    the file's scenario. The sentence says what the file states, or which value differs.
+
+    Args:
+        proved: Proof's file.
+        session: Session.
+    """
+    now = friction.without_factor(session.scenario(), session.given)
+    here, there, over = now.loop, proved.chosen.loop, proved.content.over
+    if differs := _find_difference(here, there, over) or _compare_durations(now, proved.chosen):
+        return ProofVerdict(NOT_PROVED, f"{proved.name} is about {differs}")
+    for path, (low, high) in over.items():
+        if not low <= (value := float(np.asarray(get(here, path)))) <= high:
+            said = (
+                f"outside of the proved box: {_show(session, path, value)} is not in {_range(session, path, low, high)}"
+            )
+            return ProofVerdict(NOT_PROVED, f"{said}, by {proved.name}")
+    box = ", ".join(f"{path} {_range(session, path, *ends)}" for path, ends in over.items())
+    stated = ", ".join(proved.content.statements)
+    return ProofVerdict(CERTIFIED, f"{stated} for {box}, by {proved.name}; verify with diffabs verify {proved.name}")
+
+
+def _find_difference(here: Loop, there: Loop, over: dict[str, tuple[float, float]]) -> str:
+    """Return in which value outside of the box two loops differ, empty if in none."""
+    fixed = {path: low for path, (low, _) in over.items()}
+    known = {path for path, _, _ in parameters(here)}
+    if not fixed.keys() <= known or jax.tree.structure(replace(here, fixed)) != jax.tree.structure(
+        replace(there, fixed)
+    ):
+        return "another loop"
+    for path, spec, value in parameters(here):
+        other = get(there, path)
+        if path not in over and not np.array_equal(np.asarray(value, float), np.asarray(other, float)):
+            unit = "" if spec.unit in ("", "1") else f" {spec.unit}"
+            return f"{path} = {_text(other)}{unit}, here it is {_text(value)}{unit}"
+    same = (
+        np.array_equal(a, b)
+        for a, b in zip(*map(jax.tree.leaves, (replace(here, fixed), replace(there, fixed))), strict=True)
+    )
+    return "" if all(same) else "another loop"
+
+
+def _compare_durations(now: Scenario, there: Scenario) -> str:
+    """Return the difference of two durations, empty if there is none."""
+    ends = float(now.solver.duration), float(there.solver.duration)
+    return "" if ends[0] == ends[1] else f"runs of {ends[1]:g} s, here they last {ends[0]:g} s"
+
+
+def _text(value: object) -> str:
+    return ", ".join(f"{x:.6g}" for x in np.ravel(np.asarray(value, float)))
+
+
+def _show(session: Session, path: str, value: float) -> str:
+    """Return a parameter with its value in the displayed unit."""
+    knob = session.knobs.get(path)
+    return f"{path} = {knob.text(value)} {knob.spec.unit}" if knob else f"{path} = {value:.6g}"
+
+
+def _range(session: Session, path: str, low: float, high: float) -> str:
+    """Return a range in the displayed unit."""
+    knob = session.knobs.get(path)
+    return f"{knob.text(low)} to {knob.text(high)} {knob.spec.unit}" if knob else f"{low:.6g} to {high:.6g}"

@@ -1,0 +1,71 @@
+"""The map of a proof: each cell where it is, in the colour of its bound."""
+
+import numpy as np
+import pytest
+from matplotlib.collections import PatchCollection
+from mutants import killed_by
+
+from diffabs.plot.proofs import ProofMap, draw_proof
+
+CELLS = np.array([[[0, 1], [0, 1]], [[1, 2], [0, 1]], [[0, 2], [1, 1.5]]], float)
+LEFT, REFUTING = np.array([[[0, 1], [1.5, 2]]], float), np.array([[1, 2], [1.5, 2]], float)
+MAP = ProofMap(
+    labels=["plant.mass [kg]", "initial.speed [km/h]"],
+    box=np.array([[0, 2], [0, 2]], float),
+    cells=CELLS,
+    bounds=np.array([0.1, 0.2, np.inf]),
+    left=LEFT,
+    refuting=REFUTING,
+    worst=np.array([2.0, 2.0]),
+    worst_value=0.3,
+    quantity="proved upper bound of slip [1]",
+    claimed=0.25,
+    title="T",
+)
+
+
+def rectangles(collection: PatchCollection) -> np.ndarray:
+    """Ends of each rectangle, shape (cells, 2, 2)."""
+    return np.array(
+        [[[p.vertices[:, i].min(), p.vertices[:, i].max()] for i in (0, 1)] for p in collection.get_paths()]
+    )
+
+
+@killed_by("plot/proofs.py", "proved.set_array(shown.bounds[known])", "proved.set_array(np.arange(known.sum()))")
+@killed_by("plot/proofs.py", "known = np.isfinite(shown.bounds)", "known = np.isfinite(shown.bounds) | True")
+def test_two_parameters_are_a_map_of_rectangles() -> None:
+    figure = draw_proof(MAP)
+    ax, bar = figure.axes
+    proved, unbounded, left = ax.collections
+    np.testing.assert_array_equal(rectangles(proved), CELLS[:2])
+    np.testing.assert_array_equal(proved.get_array(), [0.1, 0.2])
+    np.testing.assert_array_equal(rectangles(unbounded), CELLS[2:])
+    np.testing.assert_array_equal(rectangles(left), LEFT)
+    assert left.get_hatch()
+    assert (ax.get_xlabel(), ax.get_ylabel(), bar.get_ylabel()) == (*MAP.labels, MAP.quantity)
+    (marked,) = ax.patches
+    assert marked.get_bbox().extents.tolist() == [1, 1.5, 2, 2]
+    cross, worst = ax.get_lines()
+    np.testing.assert_array_equal([cross.get_xydata()[0], worst.get_xydata()[0]], [[1.5, 1.75], [2, 2]])
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == ["refutes the claim", "worst run found: 0.3", "not proved", "proved, but no bound of this"]
+
+
+def test_one_parameter_is_a_line_of_intervals() -> None:
+    one = MAP._replace(labels=MAP.labels[:1], box=MAP.box[:1], cells=CELLS[:2, :1], bounds=MAP.bounds[:2])
+    figure = draw_proof(one._replace(left=LEFT[:, :1], refuting=None, worst=np.array([2.0])))
+    (ax,) = figure.axes
+    np.testing.assert_array_equal(ax.collections[0].get_segments(), [[[0, 0.1], [1, 0.1]], [[1, 0.2], [2, 0.2]]])
+    claimed, worst = ax.get_lines()
+    assert claimed.get_ydata()[0] == 0.25
+    np.testing.assert_array_equal(worst.get_xydata(), [[2.0, 0.3]])
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (MAP.labels[0], MAP.quantity)
+
+
+@pytest.mark.parametrize("parameters", [1, 2])
+def test_a_proof_of_nothing_is_drawn(parameters: int) -> None:
+    none = MAP._replace(labels=MAP.labels[:parameters], box=MAP.box[:parameters], cells=np.empty((0, parameters, 2)))
+    none = none._replace(bounds=np.empty(0), left=MAP.box[None, :parameters], refuting=None, worst=None)
+    figure = draw_proof(none)
+    figure.draw_without_rendering()
+    assert [text.get_text() for text in figure.legends[0].get_texts()][-1:] == ["not proved"]
