@@ -53,7 +53,7 @@ def test_there_are_these_journeys_of_at_most_40_lines():
     case="journeys/python-control.md",
 )
 @killed_by("simulate/convert.py", "good.min(), good.max()", "good.max(), good.min()", case="journeys/lanes.md")
-@pytest.mark.filterwarnings("default::DeprecationWarning:torch", "default::FutureWarning:casadi")
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 @pytest.mark.parametrize("page", cases(EXECUTED, *SLOW, *ECOSYSTEM))
 def test_its_code_prints_what_the_page_says(page, tmp_path, monkeypatch):
     if page in needs and shutil.which(needs[page]) is None:
