@@ -17,7 +17,7 @@ coverage: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" --cov=diffabs --cov-branch --cov-report=term:skip-covered
 
 # two larger tiers; each writes into docs/test-status.md when it ran and what failed
-test-nightly test-weekly: test-%: $(VENV)/.test
+test-nightly test-weekly: test-%: $(VENV)/.test $(VENV)/.ecosystem
 	$(BIN)/python tests/support/tiers.py $*
 
 lint: $(VENV)/.lint $(VENV)/.test
@@ -91,6 +91,6 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable ".[all]"
 	touch $@
 
-$(VENV)/.test $(VENV)/.lint $(VENV)/.docs $(VENV)/.bench $(VENV)/.mutate: $(VENV)/.%: $(VENV)/.installed
+$(VENV)/.test $(VENV)/.lint $(VENV)/.docs $(VENV)/.bench $(VENV)/.mutate $(VENV)/.ecosystem: $(VENV)/.%: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --group $*
 	touch $@

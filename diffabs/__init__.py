@@ -5,6 +5,7 @@ from diffabs.runtime import interrupt as _interrupt
 _interrupt.end_early_on_interrupt()  # before JAX, whose import takes seconds
 
 from diffabs.core.loop import Loop as Loop
+from diffabs.core.pytree import arrays as arrays
 from diffabs.core.pytree import replace as replace
 from diffabs.plants import BrakeStart as BrakeStart
 from diffabs.scenario.defaults import balancing as balancing

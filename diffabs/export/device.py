@@ -22,7 +22,7 @@ from diffabs.controllers.sampled import replace_nan
 from diffabs.core.blocks import offers
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
-from diffabs.core.pytree import ParameterSpec, as_arrays, canonical_dtypes, parameters, prepare_parts
+from diffabs.core.pytree import ParameterSpec, arrays, parameters, prepare_parts
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.simulate.step.runge_kutta import rk4_step
@@ -157,7 +157,7 @@ def computer_program(
     loop = with_sampled_controller(loop)
     controller: Part = loop.controller
     with jax.enable_x64(True):
-        typed: Loop = jax.tree.map(lambda x: jnp.asarray(x, dtype), canonical_dtypes(as_arrays(loop)))
+        typed: Loop = jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays(loop))
         computer: Any = typed.controller
         parts = Parts(computer.controller, typed.feedforward, () if given_target else typed.reference)
         # `parts` holds the raw parameters: derived values are traced from them, so they follow a changed parameter.

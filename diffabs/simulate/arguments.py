@@ -14,7 +14,7 @@ from diffabs.core.compiling import is_traced
 from diffabs.core.first_order import without_derivative
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import as_arrays, canonical_dtypes, parameters, replace
+from diffabs.core.pytree import canonical_dtypes, parameters, replace, stack_lists
 from diffabs.core.types import Params, PyTree
 from diffabs.core.validity import find_broken, find_misshapen, part_rules
 from diffabs.objectives import Variation
@@ -41,7 +41,9 @@ def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objec
         ValueError: An argument is invalid, apart from the values of parameters.
     """
     refuse(loop, solver, objectives)
-    loop, objectives = canonical_dtypes((as_arrays(loop), {name: as_arrays(part) for name, part in objectives.items()}))
+    loop, objectives = canonical_dtypes(
+        (stack_lists(loop), {name: stack_lists(part) for name, part in objectives.items()})
+    )
     if is_traced(loop):
         # Only traced values can be differentiated.
         loop = replace(loop, forbid_derivatives(loop, {path: value for path, _, value in parameters(loop)}))

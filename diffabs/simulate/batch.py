@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.pytree import as_arrays, get, parameters, replace
+from diffabs.core.pytree import get, parameters, replace, stack_lists
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.types import Solver
@@ -131,7 +131,7 @@ def group_by_structure(loops: Sequence[PyTree]) -> list[list[int]]:
         loops: Loops to group.
     """
     groups: dict[PyTree, list[int]] = {}
-    for place, loop in enumerate(map(as_arrays, loops)):
+    for place, loop in enumerate(map(stack_lists, loops)):
         groups.setdefault((jax.tree.structure(loop), *map(np.shape, jax.tree.leaves(loop))), []).append(place)
     return list(groups.values())
 

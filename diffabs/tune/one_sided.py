@@ -11,7 +11,7 @@ import numpy as np
 from diffabs.actuators import Delay
 from diffabs.controllers import ConstantInput, NoFeedforward, Relay, SampledOnGrid, SlidingMode
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import as_arrays, replace
+from diffabs.core.pytree import replace, stack_lists
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.types import FixedStep, Solver
@@ -72,7 +72,7 @@ def warn(subject: Part, values: Params, batch: Batch, solver: Solver, where: str
 
     def compare(values: Params) -> PyTree:
         """Return both numbers of each pair in each run, shape (2, runs, pairs)."""
-        loop = as_arrays(build_subject_loop(replace(subject, values)))
+        loop = stack_lists(build_subject_loop(replace(subject, values)))
         both = batch.each(loop, lambda loop, _: [jnp.stack(two) for _, *two in one_sided_candidates(loop, solver)])
         return jnp.moveaxis(jnp.stack(both, axis=1), 2, 0)
 

@@ -28,7 +28,7 @@ from diffabs.compiler.autodiff import jvp
 from diffabs.compiler.ir import UpdateLevel
 from diffabs.compiler.pipeline import run_lanes
 from diffabs.compiler.runtime import library_cache
-from diffabs.core.pytree import as_arrays, get, parameters
+from diffabs.core.pytree import get, parameters, stack_lists
 from diffabs.objectives import IAE, default_objectives
 from diffabs.scenario.defaults import braking
 
@@ -271,7 +271,7 @@ print("on two devices")
 def moved(loop, solver, objectives, path, engine, ulps=0):
     """Values and derivatives of all metrics along changes of everything tunable in a loop, and of what its lanes begin
     with. A list of these where lanes begin so many last digits away, each."""
-    leaves, tree = jax.tree.flatten(as_arrays(loop))
+    leaves, tree = jax.tree.flatten(stack_lists(loop))
     tunable = [spec.tunable for _, spec, _ in parameters(loop)]
     ways = [np.random.default_rng(i).uniform(0.5, 1.0, np.shape(x)) for i, x in enumerate(leaves)]
     spread = float(get(loop, path)) * np.linspace(0.96, 1.04, 12) + 1e-3

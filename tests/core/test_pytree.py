@@ -9,10 +9,25 @@ import pytest
 from mutants import killed_by
 
 import diffabs
+from diffabs.controllers import StateFeedback
 from diffabs.core.arrays import as_array
-from diffabs.core.pytree import canonical_dtypes, get, param, parameters, part, prepare_parts, pytree, replace, static
+from diffabs.core.pytree import (
+    arrays,
+    canonical_dtypes,
+    get,
+    param,
+    parameters,
+    part,
+    prepare_parts,
+    pytree,
+    replace,
+    static,
+)
 from diffabs.core.validity import check_part, find_problems
+from diffabs.objectives import IAE
+from diffabs.plants import MirroredRig
 from diffabs.roads import DRY_ASPHALT, SPLINE_B, MagicFormula, Patches, Scaled
+from diffabs.stops import SpeedReached
 
 
 @pytree
@@ -162,6 +177,41 @@ def test_strong_makes_one_dtype():
         leaves = jax.tree.leaves(canonical_dtypes(tree))
         assert [x.dtype for x in leaves] == [dtype] * len(leaves)
         assert not any(x.weak_type for x in leaves)
+
+
+@killed_by("core/pytree.py", "{path: as_rule_array(value)", "{path: jnp.asarray(value)")
+def test_every_parameter_becomes_an_array_of_one_type():
+    """Also a list and an integer; what is static stays, and so does the precision of an array among them."""
+    made = arrays(Pair(springs=(Spring(stiffness=3, rest=[0.0, 2.0], turns=9), Spring(damping=jnp.float32(0.25)))))
+    leaves = jax.tree.leaves(made)
+    assert [type(x) for x in leaves] == [type(jnp.ones(()))] * 7
+    assert {x.dtype.name for x in leaves} == {"float32"}
+    assert (made.springs[0].turns, made.springs[0].rest.shape, made.limit) == (9, (2,), np.inf)
+    slope = jax.grad(lambda k: arrays(Spring(stiffness=k)).stiffness ** 2)(3.0)
+    np.testing.assert_allclose(slope, 6.0, rtol=1e-15, atol=0)
+
+
+@pytest.mark.slow
+@killed_by("core/pytree.py", "return canonical_dtypes(stack_lists(part))", "return stack_lists(part)")
+def test_equinox_differentiates_every_parameter():
+    """The reverse pass of `jax.grad`, but for what Equinox counts as differentiable: one leaf of this rig's floats."""
+    filter_grad = pytest.importorskip("equinox", reason="equinox is in the group `ecosystem`").filter_grad
+    rig = diffabs.braking(
+        plant=MirroredRig(),
+        controller=StateFeedback(),
+        initial=diffabs.BrakeStart(speed=5.0),
+        stop=SpeedReached(speed=4.0),
+    )
+
+    def iae(loop):
+        return diffabs.measure(loop, diffabs.FixedStep(1e-3, 0.5), {"iae": IAE()}).metrics["iae"]
+
+    found, want = filter_grad(iae)(diffabs.arrays(rig)), jax.grad(iae)(rig)
+    count = len(jax.tree.leaves(rig))
+    assert (len(jax.tree.leaves(filter_grad(iae)(rig))), len(jax.tree.leaves(found))) == (1, count)
+    assert sum(bool(np.any(leaf)) for leaf in jax.tree.leaves(found)) > count // 2
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-15)  # the same program
 
 
 def test_strong_saves_a_compilation():

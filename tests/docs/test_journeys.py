@@ -1,9 +1,10 @@
 """The pages of the site: their code runs, one block after the other, and prints what stands below it; what they name is
 there."""
 
-import importlib
+import importlib.util
 import re
 import shutil
+import warnings
 
 import matplotlib
 import pages
@@ -22,6 +23,7 @@ JOURNEYS = sorted(f"journeys/{path.name}" for path in (DOCS / "journeys").glob("
 WANTED = (
     *("pandas", "pid-over-roads", "own-plant", "own-curve", "lanes", "lq-against-lmi", "python-control", "c-export"),
     *("own-objective", "own-optax", "gpu", "duckdb", "own-reference", "own-sensor", "own-actuator"),
+    *("with-equinox", "with-optimistix", "with-numpyro", "with-blackjax", "with-casadi", "with-botorch"),
 )
 EXECUTED = [*JOURNEYS, "quick-start.md", "tutorials.md", "identify.md", "gradients.md", "howto/precision.md"]
 SLOW = (  # which compile derivatives of many runs, or several loops, or solve programs
@@ -31,6 +33,7 @@ SLOW = (  # which compile derivatives of many runs, or several loops, or solve p
     *("journeys/own-reference.md", "journeys/own-sensor.md", "journeys/own-actuator.md"),
 )
 needs = {"journeys/c-export.md": "cc"}
+ECOSYSTEM = {page: page.removeprefix("journeys/with-").removesuffix(".md") for page in JOURNEYS if "/with-" in page}
 
 
 def text(page):
@@ -51,14 +54,20 @@ def test_there_are_these_journeys_of_at_most_40_lines():
     case="journeys/python-control.md",
 )
 @killed_by("simulate/convert.py", "good.min(), good.max()", "good.max(), good.min()", case="journeys/lanes.md")
-@pytest.mark.parametrize("page", cases(EXECUTED, *SLOW))
+@pytest.mark.parametrize("page", cases(EXECUTED, *SLOW, *ECOSYSTEM))
 def test_its_code_prints_what_the_page_says(page, tmp_path, monkeypatch):
     if page in needs and shutil.which(needs[page]) is None:
         pytest.skip(f"no {needs[page]}")
+    if page in ECOSYSTEM and importlib.util.find_spec(ECOSYSTEM[page]) is None:
+        pytest.skip(f"{ECOSYSTEM[page]} is in the group `ecosystem`")
     monkeypatch.chdir(tmp_path)
     blocks = pages.blocks(text(page))
     assert any(block.said for block in blocks)
-    for block, out in zip(blocks, pages.printed(text(page), page), strict=True):
+    with warnings.catch_warnings():
+        if page in ECOSYSTEM:
+            warnings.simplefilter("ignore")  # other packages warn of themselves and of each other
+        outputs = pages.printed(text(page), page)
+    for block, out in zip(blocks, outputs, strict=True):
         assert out == (block.said or "")
 
 

@@ -6,11 +6,14 @@ import re
 import tempfile
 import textwrap
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from project import ROOT
 from typer.testing import CliRunner
 
+import diffabs as d
+from diffabs import objectives
 from diffabs.cli.main import app
 from diffabs.scenario.scenario import load
 
@@ -54,6 +57,25 @@ def test_4096_masses_and_roads_in_one_call():
     assert len(np.unique(overshoot)) > 4000
     one = names["brake"]({"plant.mass": names["masses"][1234], "plant.road.w4": names["grips"][1234]})
     np.testing.assert_allclose(overshoot[1234], one["overshoot"], rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_values_have_the_shapes_of_the_table():
+    """Names for sizes, such as `runs`, mean the same number in every row."""
+    jaxtyping = pytest.importorskip("jaxtyping", reason="jaxtyping comes with the group `ecosystem`")
+    names = {name: getattr(jaxtyping, name) for name in ("Array", "Bool", "Float")}
+    exec(compile(CODE.partition("masses, grips =")[0], "library.md", "exec"), names)
+    loop, solver, metrics = names["rig"], d.FixedStep(1e-3, 0.02), {"iae": objectives.IAE()}
+    gains = jnp.array([[-11753.0, -48.0]] * 3)
+    batch = d.Batch({"plant.mass": jnp.array([5.3, 5.7, 6.2]), "controller.gain": gains})
+    names |= {"loop": loop, "batch": batch, "run": d.rollout(loop, solver, metrics)}
+    names["runs"] = d.run_batch(loop, batch, solver, metrics, trajectories=True)
+    table = re.findall(r"^\| `(.+?)`, `(.+?)`.* \| `(.+?)` \| `(.+?)` \|$", LIBRARY, re.MULTILINE)
+    assert len(table) == 6
+    with jaxtyping.jaxtyped("context"):
+        for one, many, type_of_one, type_of_many in table:
+            for value, kind in ((one, type_of_one), (many, type_of_many)):
+                assert isinstance(eval(value, names), eval(kind, names)), (value, kind)
 
 
 def test_the_robust_design_runs():

@@ -16,7 +16,7 @@ from diffabs import actuators, controllers, plants, references, roads, stops
 from diffabs.core.cubic import Cubic, HermiteStep
 from diffabs.core.loop import LoopState
 from diffabs.core.protocols import Memory
-from diffabs.core.pytree import as_arrays, canonical_dtypes, get, prepare_parts, refine_parts
+from diffabs.core.pytree import arrays, get, prepare_parts, refine_parts
 from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
@@ -434,9 +434,7 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     "moved = state",
 )
 def test_the_error_of_a_step_is_that_of_the_worst_state():
-    loop = prepare_parts(
-        canonical_dtypes(as_arrays(load("slip-lmi", ["actuator=lag", "actuator.time_constant=0.01"]).loop))
-    )
+    loop = prepare_parts(arrays(load("slip-lmi", ["actuator=lag", "actuator.time_constant=0.01"]).loop))
     state = loop.start()
     state = state.with_flow(jax.tree.map(lambda x: x + 2.0, state.flow()))
     sample = loop.signals(0.0, state).sample
@@ -460,7 +458,7 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
 @killed_by("simulate/step/step_size.py", "(moves) / size", "(moves * 0.0 + size[0]) / size", case="arm-hanging")
 @pytest.mark.parametrize("name", ["slip-lmi", "arm-hanging"])
 def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
-    loop = prepare_parts(canonical_dtypes(as_arrays(load(name).loop)))
+    loop = prepare_parts(arrays(load(name).loop))
     state = loop.start()
     z, tree = jax.flatten_util.ravel_pytree(state.flow())
 
