@@ -368,9 +368,10 @@ def _document(
             for path, ends in (refuting or {}).items()
         )
     elif proof.verdict == "undecided":
-        reason = (
-            f"{100 * shares.sum():.3g} % of the box is left in {len(proof.left):,} cells; a greater --budget goes on"
-        )
+        cells = "one cell" if len(proof.left) == 1 else f"{len(proof.left):,} cells"
+        reason = f"{100 * shares.sum():.3g} % of the box is left in {cells}"
+        reason += f" ({proof.failure})" if proof.failure else ""
+        reason += "; a greater --budget goes on" if len(proof.cells) else ""
     else:
         reason = ""
     return {

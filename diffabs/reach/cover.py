@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffabs.core.loop import Loop
-from diffabs.reach.engine import CellBounds, Prover
+from diffabs.reach.engine import FAILURES, CellBounds, Prover
 from diffabs.reach.equations import Equations, derive_equations
 
 BATCH = 64  # cells between two looks at the clock
@@ -51,6 +51,7 @@ class BoxProof(NamedTuple):
         rows: Bounds of these cells.
         left: CellBounds that are not, shape (cells, parameters, 2).
         refuting: Cell that refutes a claim, or None.
+        failure: Why most of the last cells that failed did, or an empty text.
         tried: Number of cells that were tried.
         seconds: Computing time [s].
         equations: Equations of the loop.
@@ -63,6 +64,7 @@ class BoxProof(NamedTuple):
     rows: CellBounds | None
     left: np.ndarray
     refuting: np.ndarray | None
+    failure: str
     tried: int
     seconds: float
     equations: Equations
@@ -111,11 +113,15 @@ def prove_box(
     influence = _measure_influence(prover, box, np.array(fastest), threads)
     sides = box[:, 1] - box[:, 0]
     quantities = _Quantities(prover.signals)
-    left, done, rows, refuting, tried, fitting = box[None], [], [], None, 0, math.inf
+    left, done, rows, refuting, tried, fitting, failure = box[None], [], [], None, 0, math.inf, ""
     if suspects:
         points = np.repeat(np.asarray(suspects, float)[:, :, None], 2, 2)
         refuting = _find_violation(quantities, claims, points, prover.prove(points, threads))
-    while len(left) and refuting is None and time.monotonic() - began < budget:
+    alone = prover.prove(np.repeat(np.array(fastest)[None, :, None], 2, 2), threads)
+    hopeless = not alone.status[0]  # a cell that contains this run is not proved either
+    if hopeless:
+        failure = f"even one run is not proved: {FAILURES[int(alone.failure[0])]}"
+    while len(left) and refuting is None and not hopeless and time.monotonic() - began < budget:
         left = left[np.lexsort(left[:, ::-1, 0].T)]
         now, left = left[:BATCH], left[BATCH:]
         now, rest = _cut_to_size(now, fitting * LARGER, influence)
@@ -127,6 +133,8 @@ def prove_box(
         fitting = float(_sizes(now[fine]).max()) if fine.any() else fitting
         done.append(now[fine])
         rows.append(_select(found, fine))
+        failed = found.failure[~fine]
+        failure = FAILURES[int(np.bincount(failed[failed > 0]).argmax())] if (failed > 0).any() else ""
         again = now[~fine]
         small = ((again[:, :, 1] - again[:, :, 0]) <= SMALLEST * sides).all(1)
         left = np.concatenate([left, again[small], _halve(again[~small], influence)])
@@ -145,7 +153,10 @@ def prove_box(
         raise AssertionError("the cells do not cover the box")
     bounds = quantities.over_all(merged) if covered and merged is not None else quantities.unbounded
     verdict = "refuted" if refuting is not None else "proved" if covered else "undecided"
-    return BoxProof(verdict, bounds, cells, merged, left, refuting, tried, time.monotonic() - began, equations, prover)
+    return BoxProof(
+        *(verdict, bounds, cells, merged, left, refuting, failure if verdict == "undecided" else "", tried),
+        *(time.monotonic() - began, equations, prover),
+    )
 
 
 class _Quantities:

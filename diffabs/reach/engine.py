@@ -25,6 +25,15 @@ CODES = (
     *("const", "truth", "param", "state", "add", "sub", "neg", "mul", "inv", "clamp", "round", "select", "meet"),
     *("lt", "le", "eq", "ne", "and", "or", "not", "exp", "log", "sin", "cos", "atan", "power"),
 )  # in the order of `Code` in series.h
+FAILURES = (
+    "",
+    "a condition or a number is undecided over a set of states",
+    "the slip may become negative",
+    "no step is short enough to enclose the runs",
+    "a set of states grows too wide",
+    "the stop's margin may rise near the end",
+    "a run needs too many steps",
+)  # in the order of `Why` in prove.cpp
 WEIGHT_TABLES = 400  # parts of the range of speeds, or of the horizon, with weights of their own
 SPEED_SHARE = 8  # weight of the slip over that of the speed, which drifts: the couplings of a period say too much of it
 NEAR = 0.3  # logarithm of the ratio of speeds whose couplings count together
@@ -124,6 +133,7 @@ class CellBounds(NamedTuple):
         reached: Time up to which the cell was proved [s].
         steps: Steps of the cell's group.
         across: Steps or ticks across a limit.
+        failure: Why nothing is proved, as the index of `FAILURES`.
     """
 
     status: np.ndarray
@@ -137,6 +147,7 @@ class CellBounds(NamedTuple):
     reached: np.ndarray
     steps: np.ndarray
     across: np.ndarray
+    failure: np.ndarray
 
 
 class CellTube(NamedTuple):
@@ -208,7 +219,7 @@ class Prover:
     @property
     def _width(self) -> int:
         """Number of results of a cell."""
-        return 8 + 4 * len(self.signals) + len(self.equations.params)
+        return 9 + 4 * len(self.signals) + len(self.equations.params)
 
     def prove(self, cells: np.ndarray, threads: int | None = None) -> CellBounds:
         """Return the bounds of cells.
@@ -233,7 +244,7 @@ class Prover:
         return CellBounds(
             *(out[:, 0].astype(int), out[:, 1:3], out[:, 3:5]),
             *(pairs[:, 0, :, 0], pairs[:, 0, :, 1], pairs[:, 1, :, 0], pairs[:, 1, :, 1]),
-            *(out[:, 8 + 4 * n :], out[:, 5], out[:, 6], out[:, 7]),
+            *(out[:, 8 + 4 * n : -1], out[:, 5], out[:, 6], out[:, 7], out[:, -1].astype(int)),
         )
 
     def follow(self, cell: np.ndarray, steps: int = 100_000) -> CellTube:

@@ -29,7 +29,7 @@ struct Task {
   double keys_low, keys_high;
 };
 
-constexpr long MOST_STEPS = 200000;   // of a group
+constexpr long MOST_STEPS = 50000;    // of a group
 constexpr int MOST_IN_PERIOD = 100;   // steps
 constexpr int MOST_LIMITS = 6;        // limits of one tick, or of one flow, that a set lies across
 constexpr double WIDEST = 0.3;        // a set of slips wider than this proves nothing: a smaller cell may
@@ -69,6 +69,9 @@ struct Ending {
 
 enum Fate { TAKEN, TOO_LONG, NO_SERIES };  // of an attempted step; NO_SERIES: a power at 0 has no such derivative
 
+// Why a lane was lost, in the order of `FAILURES` in engine.py.
+enum Why { NOTHING, NO_VALUE, NEGATIVE, NO_BOX, TOO_WIDE, RISING, TOO_MANY_STEPS };
+
 struct Group {
   const Task& task;
   const int n, nb, np, nd, K;
@@ -92,6 +95,7 @@ struct Group {
   V pmid[16], phalf[16];
   M alive{}, dead{}, done{}, timed{}, ended{};  // ended: some runs may have ended
   M doomed{};                                   // lanes that the attempted step would lose
+  int why[LANES];                               // why a lane was lost
   Ending end;
   I elapsed = I(0.0), gone = I(0.0);  // up to this period; in it
   V reached = fill(0.0);
@@ -125,7 +129,9 @@ struct Group {
     for (int i : limits) if ((int)jac.seeds.size() < MOST_LIMITS) jac.seeds.push_back(i);
   }
   bool is_limit(int i) const { return task.tape.code[i] == CLAMP || task.tape.code[i] == ROUND; }
-  void lose(M which) { dead |= which & alive, alive &= ~which; }
+  void note(M which, Why because) { for (int l = 0; l < LANES; l++) if (which[l] && alive[l] && !doomed[l]) why[l] = because; }
+  void lose(M which, Why because) { note(which, because), dead |= which & alive, alive &= ~which; }
+  void doom(M which, Why because) { note(which, because), doomed |= which; }
 
   // Values of parameters and states in a series.
 
@@ -296,7 +302,7 @@ struct Group {
       std::vector<I> face = B;
       face[s0] = I(0.0);
       M wrong = rates(face);
-      doomed |= at_zero & (wrong | ~(f[s0].n <= 0) | (C[s0].low() < 0));
+      doom(at_zero & (wrong | ~(f[s0].n <= 0) | (C[s0].low() < 0)), NEGATIVE);
     }
     rates(B);
     crossing = M{};
@@ -314,8 +320,8 @@ struct Group {
     set_states(jac, B, false);
     for (int i = 0; i < n; i++) if (state_op[i] >= 0) for (int j = 0; j < jac.nd; j++) jac.slope(state_op[i], 0)[j] = I(i == j ? 1.0 : 0.0);
     jac.advance(flow, 0);
-    if (jac.seeds.size() < limits.size()) doomed |= crossing;
-    for (int i = 0; i < n + task.quadratures; i++) doomed |= crossing & jac.none[task.flow[i]];
+    if (jac.seeds.size() < limits.size()) doom(crossing, NO_VALUE);
+    for (int i = 0; i < n + task.quadratures; i++) doom(crossing & jac.none[task.flow[i]], NO_VALUE);
     for (size_t q = 0; q < jac.seeds.size(); q++) {
       V delta = chords[jac.seeds[q]].delta;
       if (!any((delta > 0) & alive)) continue;
@@ -344,7 +350,7 @@ struct Group {
   Fate attempt(I H, double h, int order) {
     look();
     doomed = M{};
-    for (int i = 0; i < n + task.quadratures; i++) doomed |= whole.none[task.flow[i]];
+    for (int i = 0; i < n + task.quadratures; i++) doom(whole.none[task.flow[i]], NO_VALUE);
     if (!any(alive & ~doomed)) return TAKEN;
     if (!enclose(h)) return TOO_LONG;
     if (any(crossing & alive)) {
@@ -362,7 +368,7 @@ struct Group {
     M singular{};
     for (int i = 0; i < n + task.quadratures; i++) for (Series* s : {&mid, &whole, &rest}) singular |= s->none[task.flow[i]];
     if (order > 1 && any(singular & alive & ~doomed)) return NO_SERIES;
-    doomed |= singular;
+    doom(singular, NO_VALUE);
     if (!bound_disturbances(h)) return TOO_LONG;
     I power = power_of_step(H, order);
     excess = 1e-30;
@@ -382,7 +388,7 @@ struct Group {
 
   // The set at the end of the attempted step, and what signals, quadratures and margin did within it.
   void commit(I H, double h, int order) {
-    lose(doomed);
+    dead |= doomed & alive, alive &= ~doomed;
     if (!any(alive)) return;
     I power = power_of_step(H, order);
     for (int s = 0; s < task.signals; s++) {
@@ -410,9 +416,9 @@ struct Group {
       C[i] = sum + remainder[i] + push[i];
       if (i == task.nonnegative) C[i].n = vmin(C[i].n, fill(0.0));  // the run from the centre is never negative, either
       X[i] = meet(C[i] + symmetric(w), B[i]);
-      lose(empty(X[i]) | ~((X[i].n < 1e200) & (X[i].h < 1e200)));
+      lose(empty(X[i]) | ~((X[i].n < 1e200) & (X[i].h < 1e200)), TOO_WIDE);
     }
-    if (task.nonnegative >= 0) lose(~(X[task.nonnegative].width() < WIDEST));
+    if (task.nonnegative >= 0) lose(~(X[task.nonnegative].width() < WIDEST), TOO_WIDE);
     fresh = false, steps++;
   }
 
@@ -424,7 +430,7 @@ struct Group {
     if (limits.empty()) integrate(box, 0), box.advance(flow, 1);
     I rate = coefficient(box, (int)task.margin, 1);
     M falls = (rate.h < 0) & ~box.none[task.margin];
-    lose(late & ~falls);
+    lose(late & ~falls, RISING);
     auto quadrature_rate = [&](long q, double without) { return q < 0 ? I(without) : box.value(task.flow[q], 0); };
     end.see(late & falls, rate, quadrature_rate(task.travelled, 0.0), quadrature_rate(task.clock, 1.0));
   }
@@ -507,7 +513,7 @@ struct Group {
     }
     begun = true;
     if (fate == TAKEN) commit(last ? left : I(h), h, order);
-    else lose(alive);
+    else doomed = M{}, lose(alive, NO_BOX);
     gone = last ? period_ : gone + I(h), about += h;
     double best = order > 1 ? 0.9 * h * std::pow(excess, -1.0 / (order + 1)) : 1.5 * h;  // the remainder meets the tolerance
     h_next = std::fmax(task.shortest, std::fmin(best, sampled ? 2 * std::fmax(h, h_next * 0.5) : 2 * h));
@@ -543,7 +549,7 @@ struct Group {
       delta[i] = tick_chords[i].delta;
       if (any((delta[i] > 0) & alive)) across++, at_tick.seeds.push_back(i);
     }
-    if (at_tick.seeds.size() > MOST_LIMITS) { lose(alive); return; }
+    if (at_tick.seeds.size() > MOST_LIMITS) { lose(alive, NO_VALUE); return; }
     at_tick.natural = at_tick_mid.natural = false;
     // The values of a limited number over the set include its disturbance; along its own direction it has this size.
     at_tick.own = np + nb, at_tick.widths = at_tick.seed_scale = delta;
@@ -561,7 +567,7 @@ struct Group {
       bad |= at_tick.none[r] | at_tick_mid.none[r] | empty(x[i]);
     }
     C = c, X = x, J = slopes;
-    lose(bad);
+    lose(bad, NO_VALUE);
     fresh = false;
   }
 
@@ -579,7 +585,7 @@ struct Group {
     for (bool over_ = false; !over_ && any(alive);) {
       over_ = step(sampled ? period_ - gone : I(NEVER));
       seen();
-      if (++count > MOST_IN_PERIOD || steps > MOST_STEPS) lose(alive);
+      if (++count > MOST_IN_PERIOD || steps > MOST_STEPS) lose(alive, TOO_MANY_STEPS);
     }
     elapsed = sampled ? period_ * I((double)(number + 1)) : elapsed + gone;
   }
@@ -587,7 +593,7 @@ struct Group {
     M broken{};
     renew_axes(set, C, J, nd, used, weights_now(), broken);
     for (int i = 0; i < nb; i++) broken |= ~((vabs(set.c[i]) < 1e200) & (set.r[i] < 1e200));
-    lose(broken);
+    lose(broken, TOO_WIDE);
     int first = task.nonnegative >= 0 ? (int)task.nonnegative : 0;
     for (int p = 0; p < np; p++) reach[p] = alive ? vmax(reach[p], vabs(set.G[first * np + p])) : reach[p];
   }
@@ -599,7 +605,7 @@ struct Group {
     mid.natural = whole.natural = true, whole.nd = used;
     set_states(mid, C, false), mid.advance(stop, 0), set_states(whole, X, true), whole.advance(stop, 0);
     int m = (int)task.margin;
-    lose(mid.none[m] | whole.none[m]);
+    lose(mid.none[m] | whole.none[m], NO_VALUE);
     I margin = whole.value(m, 0);
     M capture = alive & ended & ~end.captured & (margin.mid() <= 0);
     if (any(capture)) {
@@ -622,7 +628,8 @@ struct Group {
   }
 
   void start(const double* cells, long count) {
-    alive = mask(true), dead = done = timed = ended = M{};
+    alive = mask(true), dead = done = timed = ended = doomed = M{};
+    for (int& w : why) w = NOTHING;
     end = Ending(np, nb), elapsed = I(0.0), reached = fill(0.0);
     steps = across = 0, h_next = task.first, about = 0, box_limit = NEVER, begun = false;
     for (int p = 0; p < np; p++)
@@ -647,7 +654,7 @@ struct Group {
       }
       set.r[i] = e.mag();
     }
-    for (int i = 0; i < n; i++) lose(at_tick.none[task.start[i]]);
+    for (int i = 0; i < n; i++) lose(at_tick.none[task.start[i]], NO_VALUE);
     for (int q = 0; q < task.quadratures; q++) rows[q] = {at_tick.value(task.start[n + q], 0), std::vector<V>(np, fill(0.0)), fill(0.0)};
     for (auto* every : {&top, &above, &below, &bottom}) for (auto& x : *every) x = fill(-NEVER);
     for (auto& x : reach) x = fill(0.0);
@@ -694,7 +701,8 @@ struct Group {
     double* signal = out + 8;
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = fine ? -bottom[s][lane] : -INFINITY, signal[1] = fine ? top[s][lane] : INFINITY;
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = sound ? -below[s][lane] : INFINITY, signal[1] = sound ? above[s][lane] : -INFINITY;
-    for (int p = 0; p < np; p++) signal[p] = reach[p][lane];
+    for (int p = 0; p < np; p++) *signal++ = reach[p][lane];
+    *signal = sound ? why[lane] : TOO_WIDE;
   }
 };
 
@@ -748,7 +756,7 @@ void apply(int code, long count, const double* a, const double* b, double* out) 
 long prove(const Task* task, long count, const double* cells, double* out, double* scout, double* trail, long room) {
   round_upward();
   std::feclearexcept(FE_ALL_EXCEPT);
-  const int nb = (int)task->kept, ns = (int)task->signals, width = 8 + 4 * ns + (int)task->tape.params;
+  const int nb = (int)task->kept, ns = (int)task->signals, width = 9 + 4 * ns + (int)task->tape.params;
   Group g(*task);
   long written = 0;
   auto follow = [&]() {

@@ -1,0 +1,27 @@
+"""Why a cell is not proved is said, and a box that no budget helps is given up at once."""
+
+import numpy as np
+import pytest
+
+from diffabs.reach.cover import RunClaim, prove_box
+from diffabs.reach.engine import FAILURES, Prover
+from diffabs.reach.equations import derive_equations
+from diffabs.scenario.scenario import load
+
+pytestmark = pytest.mark.usefixtures("native_prover")
+
+
+def test_a_slip_that_becomes_negative_is_named() -> None:
+    """Air decelerates the car of [pedro] before its brake does, so its wheel first runs faster than the road."""
+    loop = load("literature-pedro").loop
+    proof = prove_box(loop, {"plant.mass": (435.0, 445.0)}, [RunClaim("greatest slip", 0.9)], horizon=1.0, budget=60)
+    assert (proof.verdict, proof.tried, len(proof.cells)) == ("undecided", 0, 0)
+    assert proof.failure == "even one run is not proved: the slip may become negative"
+
+
+def test_a_cell_that_is_too_wide_is_named() -> None:
+    limits = ["controller.torque_min=0", "controller.torque_max=9.03"]
+    prover = Prover(derive_equations(load("slip-lmi", limits).loop, ["plant.mass", "initial.speed"]), ("slip",), 2.0)
+    found = prover.prove(np.array([[[5.3, 5.4], [13.0, 13.5]], [[5.3, 5.3], [6.0, 6.0]]]), 1)
+    assert [FAILURES[i] for i in found.failure] == ["a set of states grows too wide", ""]
+    assert found.status[1] == 1
