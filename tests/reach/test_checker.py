@@ -548,7 +548,6 @@ def test_the_cured_gain():
         assert found[2] == pytest.approx(bounds.greatest["slip"], rel=1e-3)
 
 
-@killed_by("reach/checker.py", "values = x + arb(0, 0.5)", "values = x")
 @killed_by(
     "reach/checker.py",
     "return _Chord(ONE, ZERO, arb(0.5), values, values)",
