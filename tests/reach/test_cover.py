@@ -136,7 +136,7 @@ def test_false_claims_are_refuted(quantity: str) -> None:
     worst = int(np.argmax(values))
     claim = RunClaim(quantity, values[worst] * 0.999)
     loop = load("slip-lmi", LIMITED).loop
-    assert prove_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=3).verdict != "proved"
+    assert prove_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=1).verdict != "proved"
     assert (
         prove_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=20, suspects=[corners[worst]]).verdict
         == "refuted"
