@@ -10,7 +10,7 @@
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -342,7 +342,7 @@ def decide_attempt(
     searches = active & ~landing & ~refreshing & (~running | (exact & crosses))
     triggered = [taken & landing & ((which == bit_count + i) | one) for i, one in enumerate(crossed)]
     triggered = jax.tree.unflatten(jax.tree.structure(attempt.point.margins), triggered)
-    over = triggered["stop"][0] | (taken & last)
+    over = reduce(jnp.logical_or, triggered["stop"]) | (taken & last)
     lands, mode = jnp.asarray(False), UNCONSTRAINED
     if frozen:
         lands = taken & landing & (which < bit_count)
