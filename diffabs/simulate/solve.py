@@ -432,6 +432,7 @@ def solve(
     _read_times(t0, t1, save)
     _refuse_leaves("y0", y0)
     given_times = t0, t1
+    save = jnp.asarray(save) if isinstance(save, list | tuple) else save
     y0, t0, t1, save = canonical_dtypes((y0, t0, t1, save))
     if not jax.tree.leaves(y0):
         raise ValueError("y0 has no number; a state of at least one is needed")

@@ -47,7 +47,7 @@ from diffabs.simulate.step.event_location import (
     SurfaceCrossing,
     find_surface_crossing,
 )
-from diffabs.simulate.step.outlook import look_ahead, watch_margins
+from diffabs.simulate.step.outlook import look_ahead, margin_error, watch_margins
 from diffabs.simulate.step.runge_kutta import TSIT5, midpoint_error
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.step_size import (
@@ -77,6 +77,9 @@ INITIAL_STABILITY_FRACTION, STABILITY_FRACTION_GROWTH = 1 / 16, 1.6
 MAX_CONSECUTIVE_CROSSINGS = 16  # steps in a row that end on switching surfaces; then steps are unrestricted
 # Fraction of the duration: crossings that follow each other faster are those of a slide.
 SLIDE_INTERVAL_FRACTION = 1e-6
+# The first step after a landing, of a method that `watches`: greatest ratio to the step that has landed, and least
+# ratio to the length that the error allows.
+LANDED_STEP_RATIO, LEAST_LANDED_RATIO = 4.0, 1e-3
 # A step that keeps its mode goes 1.5 times as far as the predicted crossing, so that the crossing lies within the step.
 CROSSING_OVERREACH = 1.5
 
@@ -276,6 +279,7 @@ class AdaptiveStepping:
         if self.watches:
             since, touches = watch_margins(carry, h, seen, system.bit_count)
             past_crossing, grazes = jnp.maximum(past_crossing, since), touches
+            relative = jnp.maximum(relative, margin_error(system, carry, h, seen, state))
         return AdaptiveReport(relative, scale, past_crossing, grazes, surface)
 
     def decide(
@@ -389,7 +393,13 @@ class AdaptiveStepping:
         cut = decision.taken & (carry.length < old)
         wrong = ~decision.fine | ((report.error > 1) & (report.past_crossing <= 0))
         judged = (carry.status == RunStatus.RUNNING) & (decision.taken | wrong)
-        return jnp.maximum(jnp.where(judged, jnp.where(cut, jnp.maximum(new, old), new), old), self.least)
+        new = jnp.where(judged, jnp.where(cut, jnp.maximum(new, old), new), old)
+        if self.watches:
+            # After a landing the next one may be near. A step much longer than the way there would pass over it.
+            landed = decision.taken & (carry.status == RunStatus.LANDING)
+            most = jnp.maximum(LANDED_STEP_RATIO * carry.length, LEAST_LANDED_RATIO * new)
+            new = jnp.where(landed, jnp.minimum(new, most), new)
+        return jnp.maximum(new, self.least)
 
 
 def clip_rtol(rtol: Scalar) -> Scalar:

@@ -9,13 +9,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.cubic import Cubic
+from diffabs.core.cubic import Cubic, HermiteStep
+from diffabs.core.loop import LoopState
 from diffabs.core.types import Array, Bool, PyTree, Scalar
+from diffabs.simulate.step.attempt import mode_in_step
 from diffabs.simulate.step.status import RunStatus
-from diffabs.simulate.step.system import Evaluation
+from diffabs.simulate.step.system import Evaluation, LoopSystem
 
 # A margin grazes if it turns nearer to zero than this fraction of its greater value at the ends of the step.
 GRAZING_DEPTH_FRACTION = 1e-6
+# Allowed error of the cubic in the middle of a step, as a fraction of the greatest value at both ends and there.
+MARGIN_TOLERANCE = 1e-6
 
 
 class Outlook(NamedTuple):
@@ -92,12 +96,45 @@ def watch_margins(carry: PyTree, h: Scalar, seen: Evaluation, bit_count: int) ->
         seen: Dynamics at its end.
         bit_count: Number of bits of the comparisons; events have the numbers after them.
     """
-    forecast = carry.point.forecast
-    outlook = forecast if isinstance(forecast, Outlook) else forecast[1]
     margins, rates, numbers = _list_margins(seen, bit_count)
     running, landing = (carry.status == one for one in (RunStatus.RUNNING, RunStatus.LANDING))
-    found = find_turns(outlook, Outlook(margins, rates), h, landing & (numbers == carry.search.which))
+    found = find_turns(_outlook(carry), Outlook(margins, rates), h, landing & (numbers == carry.search.which))
     return Turns(jnp.where(running, found.time_since, 0.0), (running | landing) & found.grazes)
+
+
+def margin_error(system: LoopSystem, carry: PyTree, h: Scalar, seen: Evaluation, state: LoopState) -> Scalar:
+    """Return the error of the margins' cubics in the middle of an attempt, as a multiple of the allowed one.
+
+    A margin may depend on time alone, which no error of a state shows. The error is 0 without margins, and in a search.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        carry: Carry before the attempt, with an `Outlook` in its forecast.
+        h: Length of the attempt [s].
+        seen: Dynamics at its end.
+        state: State at its end.
+    """
+    margins, rates, _ = _list_margins(seen, 0)
+    if margins.size == 1:  # that of a stop which is never reached
+        return jnp.zeros_like(h)
+    point = carry.point
+    step = HermiteStep(
+        point.t, point.t + h, (point.state.flow(), state.flow()), (point.rates[0], seen.rates[0])
+    )
+    middle = point.t + 0.5 * h
+    mode = mode_in_step(system, point.words, carry.unrestricted)
+    there = system.list_margins(middle, point.state.with_flow(step.at(middle)), point.accumulators, mode)
+    there = jnp.concatenate([jnp.ravel(x) for x in there])
+    start = _outlook(carry)
+    most = jnp.maximum(jnp.maximum(jnp.abs(start.margins), jnp.abs(margins)), jnp.abs(there))
+    off = jnp.abs(Cubic(start.margins, margins, h * start.rates, h * rates)(0.5) - there)
+    off = jnp.where(jnp.isfinite(off) & (most > 0), off / jnp.where(most > 0, most, 1.0), 0.0)
+    return jnp.where(carry.status == RunStatus.RUNNING, jnp.max(off) / MARGIN_TOLERANCE, 0.0)
+
+
+def _outlook(carry: PyTree) -> Outlook:
+    forecast = carry.point.forecast
+    return forecast if isinstance(forecast, Outlook) else forecast[1]
 
 
 def _list_margins(seen: Evaluation, bit_count: int) -> tuple[Array, Array, Array]:
