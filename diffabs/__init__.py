@@ -17,6 +17,7 @@ from diffabs.simulate.run import rollout as rollout
 from diffabs.simulate.solve import Event as Event
 from diffabs.simulate.solve import Solution as Solution
 from diffabs.simulate.solve import solve as solve
+from diffabs.simulate.solve import switches as switches
 from diffabs.simulate.types import Adaptive as Adaptive
 from diffabs.simulate.types import FixedStep as FixedStep
 from diffabs.simulate.types import Run as Run

@@ -20,12 +20,14 @@ solution is NaN.
 import dataclasses
 import enum
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
+from jax._src.source_info_util import summarize  # JAX has no public function that names the line of an operation
 from jax.core import Tracer
 
 from diffabs.core import kinds
@@ -37,12 +39,14 @@ from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
 from diffabs.core.types import AnyArray, Array, Bool, PyTree, Scalar
 from diffabs.simulate.arguments import build_stepping, find_invalid_fields
 from diffabs.simulate.drive.engine import EngineError, resolve_request
-from diffabs.simulate.drive.loops import round_up_capacity
+from diffabs.simulate.drive.loops import log_run, round_up_capacity
 from diffabs.simulate.run import RunCapacity, run_differentiable
 from diffabs.simulate.step.adaptive import AdaptiveStepping
 from diffabs.simulate.step.fixed import FixedStepping
-from diffabs.simulate.step.replay import log_capacity
+from diffabs.simulate.step.replay import log_attempt, log_capacity
+from diffabs.simulate.step.comparisons import SwitchedProgram
 from diffabs.simulate.step.status import RunStatus
+from diffabs.simulate.step.system import UNCONSTRAINED, build_system
 from diffabs.simulate.types import Adaptive, FixedStep, Solver
 
 MAX_EVENTS = 24  # kinds of events of a solution: the log of a run has one bit for each
@@ -52,6 +56,10 @@ MAX_EVENTS = 24  # kinds of events of a solution: the log of a run has one bit f
 LANDING_FRACTION, MAX_QUICK_EVENTS, COINCIDENCE_FRACTION = 1e-7, 8, 1e-10
 # The lift: time in which the condition moves as far, as a fraction of the span, and multiples of the rounding.
 LIFT_FRACTION, LIFT_EPS = 1e-12, 32
+
+MAX_ACCEPTED = 256  # functions that are known to be valid
+_accepted: dict[Any, "Function"] = {}
+SWITCH_SOLVER = Adaptive(1e-6)
 
 Field = Callable[[Scalar, PyTree, PyTree], PyTree]
 
@@ -85,6 +93,23 @@ class Event:
     condition: Field
     reset: Field | None = None
     terminal: bool = False
+
+
+class Switch(NamedTuple):
+    """A comparison in a field that depends on time or state.
+
+    Attributes:
+        source: File and line of the comparison.
+        operation: What JAX calls it: `gt`, `max`, `abs`, `clamp`, `searchsorted`.
+        margin: Difference of its two sides, an array for a comparison of arrays; zero where the answer changes. For a
+            search in knots, the distance to the nearest one.
+        flips: Times at which an answer changes in a run; () without a run.
+    """
+
+    source: str
+    operation: str
+    margin: Array
+    flips: tuple[float, ...]
 
 
 class SolutionEvents(NamedTuple):
@@ -311,19 +336,25 @@ class FieldLoop:
     ) -> tuple[Scalar, Scalar]:
         """Return the lift of an event's condition after an instant, and the fault that ends the run, or 0."""
         t, before, y = jax.lax.stop_gradient((t, before, y))
-        (_, fall), (after, rise) = (self._follow(one.condition, t, at) for at in (before, y))
+        fall = self._follow(one.condition, t, before)[1]
+        # The second derivative, too: it says when a condition that rises is back at zero.
+        moves = (jnp.ones_like(t), self._rate(t, y))
+        (after, rise), (_, bend) = jax.jvp(lambda t, y: self._follow(one.condition, t, y), (t, y), moves)
         slopes = jax.grad(lambda t, y: self._call(one.condition, t, y), argnums=(0, 1))(t, y)
         terms = zip(jax.tree.leaves(slopes), jax.tree.leaves((t, y)), strict=True)
         rounding = LIFT_EPS * jnp.finfo(t.dtype).eps * sum(jnp.sum(jnp.abs(a * b)) for a, b in terms)
-        stays = jnp.abs(after) <= jnp.maximum(LANDING_FRACTION * jnp.abs(fall), rounding)
+        # A landing is relative to the lifted condition, a reset perhaps to the condition itself.
+        off = jnp.minimum(jnp.abs(after), jnp.abs(after + lift))
+        stays = off <= jnp.maximum(LANDING_FRACTION * jnp.abs(fall), rounding)
         small = LIFT_FRACTION * jnp.abs(rise) + rounding
         new = jnp.where(rise > 0, small - after, -small - after)
+        returns = happens & stays & (rise > 0) & (2.0 * rise < -bend * LANDING_FRACTION)
         # At rest on its zero a condition has no next sign. One that did not fall before its event has jumped.
         unclear = happens & stays & (LANDING_FRACTION * jnp.abs(rise) <= rounding)
         jumps = fired & ~(fall < 0)
         # An earlier event of the list that a later reset makes happen at this instant: there is no order for it.
         again = ~happens & (was >= 0) & (after + lift < -rounding)
-        fault = jnp.where(again, float(SolutionStatus.CROWDED), 0.0)
+        fault = jnp.where(again | returns, float(SolutionStatus.CROWDED), 0.0)
         fault = jnp.where(unclear | jumps, float(SolutionStatus.GRAZED), fault)
         return jax.lax.stop_gradient(jnp.where(happens, jnp.where(stays, new, 0.0), lift)), fault
 
@@ -429,29 +460,119 @@ def solve(
     """
     if resolve_request(engine) == "kernel" and engine == "kernel":
         raise EngineError.of("a kernel makes a batch of loops; d.solve makes one run, and jax.vmap batches it by XLA")
-    _read_times(t0, t1, save)
-    _refuse_leaves("y0", y0)
-    given_times = t0, t1
-    save = jnp.asarray(save) if isinstance(save, list | tuple) else save
-    y0, t0, t1, save = canonical_dtypes((y0, t0, t1, save))
-    if not jax.tree.leaves(y0):
-        raise ValueError("y0 has no number; a state of at least one is needed")
-    method, count = _read_solver(solver, *given_times, t0.dtype)
-    span = t1 - t0
-    places = None if save is None else (save - t0) / span
     events = tuple(events)
     if len(events) > MAX_EVENTS:
         raise ValueError(f"events has {len(events)} entries; at most {MAX_EVENTS} are possible")
     if not isinstance(kept_events, int) or kept_events < 1:
         raise ValueError(f"kept_events = {kept_events!r} is no whole number of at least 1")
-    functions = _read_functions(field, events, t0, y0, args)
-    code, constants = FieldCode(functions[0], functions[1]), functions[2]
-    given = {"y0": y0, "t0": t0, "span": span, "args": args, "constants": constants}
-    loop = FieldLoop(given=given, code=code, kept=kept_events)
+    loop, places = _build_loop(field, y0, t0, t1, args, events, save, kept_events)
+    method, count = _read_solver(solver, t0, t1, loop.given["t0"].dtype)
+    program = _trace_program(loop)
+    if program.jumps:
+        worst = program.jumps[0]
+        raise ValueError(
+            f"field has the operation '{worst.name}' at {summarize(worst.source)}: its result jumps where no comparison"
+            " changes, so that no step can end there. Write it as comparisons, or as a state that an event resets"
+        )
+    if isinstance(method, AdaptiveStepping) and not program.bit_count and not events:
+        method = dataclasses.replace(method, is_logged=False, watches=False, smooth=True)
     saves = {} if places is None else {"saves": Saves(places=places)}
     capacity = log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.capacity(loop, count)
     capacity = RunCapacity(round_up_capacity(capacity), 0, 0, finish_solution)
     return run_differentiable(capacity, (loop, saves, method, None))
+
+
+def switches(
+    field: Field, t: Scalar, y: PyTree, args: PyTree = None, *, t1: Scalar = None, solver: Adaptive = SWITCH_SOLVER
+) -> list[Switch]:
+    """Return the switches of a field: its comparisons that depend on time or state, and where they flip.
+
+    Args:
+        field: Function of (t, y, args) that returns dy/dt, as in `solve`.
+        t: Time.
+        y: State at that time.
+        args: What the function needs.
+        t1: End of a run from (t, y) whose flips are listed; None for no run.
+        solver: Solver of that run.
+
+    Examples:
+        >>> import diffabs as d
+        >>> found = d.switches(lambda t, y, args: -abs(y), 0.0, 3.0)
+        >>> print(found[0].operation, found[0].margin)
+        abs 3.0
+
+    Raises:
+        ValueError: An argument is invalid or traced.
+    """
+    if _is_traced(t, y, args, t1):
+        raise ValueError("switches lists numbers of one run: call it outside of jit, vmap and grad")
+    end = t if t1 is None else t1
+    loop, _ = _build_loop(field, y, t, end if t1 is not None else float(t) + 1.0, args, (), None, 1)
+    program, zero = _trace_program(loop), jnp.zeros_like(loop.given["t0"])
+    system = build_system(loop, {}, zero, loop.start(), {}, switched=True)
+    seen = system.evaluate(zero, loop.start(), {}, UNCONSTRAINED).surfaces
+    flips = [] if t1 is None else _list_flips(loop, solver)
+    found = []
+    for (first, shape), op in zip(program.places, program.origins, strict=True):
+        bits = range(first, first + int(np.prod(shape)))
+        margins = [one.value for one in seen if int(np.min(one.numbers)) in bits]
+        margin = margins[0] if len(margins) == 1 else min(margins, key=abs)
+        times = tuple(time for time, bit in flips if bit in bits)
+        found.append(Switch(summarize(op.source), op.name, margin, times))
+    return found
+
+
+def _list_flips(loop: FieldLoop, solver: Adaptive) -> list[tuple[float, int]]:
+    """Return time and number of each comparison that changes in a run."""
+    method, _ = _read_solver(solver, 0.0, 1.0, loop.given["t0"].dtype)
+    if not isinstance(method, AdaptiveStepping):
+        raise ValueError(f"solver = {solver} has fixed steps; d.Adaptive is needed")
+
+    @jax.jit
+    def run(loop: FieldLoop) -> Any:
+        start = method.start(loop, {}, None)
+        step, renew = partial(method.step, loop, {}, None), partial(method.renew, loop)
+        return log_run(step, renew, log_attempt, start, round_up_capacity(log_capacity(loop, solver)))[1]
+
+    log = run(loop)
+    lands = np.ravel(log.lands)
+    times = np.ravel(loop.given["t0"] + loop.given["span"] * log.t)
+    return [(float(times[i]), int(lands[i])) for i in np.flatnonzero(np.ravel(log.taken) & (lands >= 0))]
+
+
+def _build_loop(
+    field: Field,
+    y0: PyTree,
+    t0: Scalar,
+    t1: Scalar,
+    args: PyTree,
+    events: tuple[Event, ...],
+    save: AnyArray,
+    kept: int,
+) -> tuple[FieldLoop, Array | None]:
+    """Return the field as a loop, and the times `save` in units of the span.
+
+    Raises:
+        ValueError: An argument is invalid.
+    """
+    _read_times(t0, t1, save)
+    _refuse_leaves("y0", y0)
+    save = jnp.asarray(save) if isinstance(save, list | tuple) else save
+    y0, t0, t1, save = canonical_dtypes((y0, t0, t1, save))
+    if not jax.tree.leaves(y0):
+        raise ValueError("y0 has no number; a state of at least one is needed")
+    span = t1 - t0
+    dynamics, found, constants = _read_functions(field, events, t0, y0, args)
+    given = {"y0": y0, "t0": t0, "span": span, "args": args, "constants": constants}
+    loop = FieldLoop(given=given, code=FieldCode(dynamics, found), kept=kept)
+    return loop, None if save is None else (save - t0) / span
+
+
+def _trace_program(loop: FieldLoop) -> SwitchedProgram:
+    """Return the program of the loop's flow, with its comparisons."""
+    program = build_system(loop, {}, jnp.zeros_like(loop.given["t0"]), loop.start(), {}, switched=True).program
+    assert program is not None
+    return program
 
 
 def finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree) -> tuple[Solution, None]:
@@ -579,15 +700,22 @@ def _read_functions(
         ValueError: A function or what it returns is invalid, or the field has a switch that cannot be located.
     """
     constants: list[PyTree] = []
+    leaves, tree = jax.tree.flatten((t, y, args))
+    given = tree, tuple(map(jax.typeof, leaves))
 
     def read(function: Any, name: str, like: PyTree) -> Function:
         if not callable(function):
             raise ValueError(f"{name} = {kinds.format_value(function)} is no function of (t, y, args)")
+        known = _hashable(function), jax.tree.structure(like), given
+        if known in _accepted:
+            return _accepted[known]
         program, found = jax.make_jaxpr(function, return_shape=True)(t, y, args)
         _check_result(name, found, like)
-        traced = [x for x in program.consts if _is_traced(x)]
-        if not traced:
-            return Function(_hashable(function), function)
+        if not any(map(_is_traced, program.consts)):
+            while len(_accepted) >= MAX_ACCEPTED:
+                _accepted.pop(next(iter(_accepted)), None)
+            _accepted[known] = Function(_hashable(function), function)
+            return _accepted[known]
 
         # The compiled programs of the engine know no tracer from outside: the closure becomes an argument.
         def call(t: Scalar, y: PyTree, args: PyTree, given: PyTree) -> Any:

@@ -149,7 +149,7 @@ class AdaptiveReport(NamedTuple):
 
 
 @partial(
-    jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps_last_step", "is_logged", "watches"]
+    jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps_last_step", "is_logged", "watches", "smooth"]
 )
 @dataclasses.dataclass(frozen=True)
 class AdaptiveStepping:
@@ -162,6 +162,7 @@ class AdaptiveStepping:
         keeps_last_step: True if the carry keeps the last step, for samples between its ends.
         is_logged: True if the run is logged for a replay with derivatives. Its steps then keep to a mode.
         watches: True if the run ends where it slides or grazes, and a step where a margin turns. It must be logged.
+        smooth: True if nothing switches and no event can happen. The error alone then limits a step, not stability.
     """
 
     h: Scalar
@@ -170,7 +171,13 @@ class AdaptiveStepping:
     keeps_last_step: bool = False
     is_logged: bool = False
     watches: bool = False
-    tableau, has_margin_rates, searches, second_order = TSIT5, True, True, False
+    smooth: bool = False
+    tableau, has_margin_rates, second_order = TSIT5, True, False
+
+    @property
+    def searches(self) -> bool:
+        """True if the method locates events."""
+        return not self.smooth
 
     @property
     def least(self) -> Scalar:
@@ -185,7 +192,7 @@ class AdaptiveStepping:
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)
         scale = error_scales(state, point.sample)
-        limit = spectral_step_limit(loop, point.t, state, scale)
+        limit = self.h * self.steps if self.smooth else spectral_step_limit(loop, point.t, state, scale)
         left = self._next_strike(loop, zero) * self.h
         length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), left, self.least)
         last = span_step(point, point) if self.keeps_last_step else ()
@@ -201,6 +208,8 @@ class AdaptiveStepping:
 
     def renew(self, loop: Loop, carry: Carry) -> Carry:
         """Return the `carry` with a new stability limit of the `loop`, once in `ATTEMPTS_PER_RENEWAL` attempts."""
+        if self.smooth:
+            return carry
         control, at = carry.control, carry.point
         due = carry.running & (control.tries - control.tries_at_renewal >= ATTEMPTS_PER_RENEWAL)
 
@@ -241,7 +250,7 @@ class AdaptiveStepping:
         The derivative changes faster than the run. The allowed error of a step is therefore only
         `DERIVATIVE_RTOL_FRACTION` of that for values.
         """
-        return dataclasses.replace(self, is_logged=True, rtol=clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol))
+        return dataclasses.replace(self, is_logged=True, smooth=False, rtol=clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol))
 
     def is_switched(self, loop: Loop) -> bool:
         """Return True: the comparisons of the `loop`'s flow are always visible."""
@@ -362,7 +371,9 @@ class AdaptiveStepping:
         """Return the `status`, or that of a run which is over because it slides or grazes."""
         if not self.watches:
             return status
-        status = jnp.where(report.grazes & (carry.status != RunStatus.REFRESHING), RunStatus.GRAZED, status)
+        # The shortest step is accepted in any case, also if a margin crosses zero twice in it.
+        passed = (carry.status == RunStatus.RUNNING) & (report.past_crossing > 0) & (carry.length <= self.least)
+        status = jnp.where(report.grazes | passed, RunStatus.GRAZED, status)
         return jnp.where(unrestricted, RunStatus.SLID, status)
 
     def _ahead(self, point: Point) -> Scalar:

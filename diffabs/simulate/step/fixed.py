@@ -86,7 +86,7 @@ class FixedStepping:
     kinks: bool | None = None
     second_order: bool = False
     watches: bool = False
-    tableau, searches = RK4, True
+    tableau, searches, smooth = RK4, True, False
 
     @property
     def has_margin_rates(self) -> bool:

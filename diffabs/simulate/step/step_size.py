@@ -24,7 +24,7 @@ TWO_STEP_RATIO = 1.2  # ratio to the present length: a nearer switching surface 
 CLOCK_REACH_FRACTION = 0.99  # fraction of the time to a clock's instant: a longer step ends on the instant
 STABILITY_RADIUS = 3.0  # the longest step is this number divided by the spectral radius
 POWER_ITERATIONS, MIN_NORM = 12, 1e-20
-MAX_UNROLLED_STATES = 24  # numbers of a flow: the Jacobian of a larger one is not written out
+MAX_UNROLLED_STATES = 12  # numbers of a flow: the Jacobian of a larger one is not written out
 MIN_CROSSING_STEP_FRACTION = 4e-3  # fraction of the length that the error allows: the shortest step to a crossing
 
 
