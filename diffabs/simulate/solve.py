@@ -336,15 +336,15 @@ class FieldLoop:
     ) -> tuple[Scalar, Scalar]:
         """Return the lift of an event's condition after an instant, and the fault that ends the run, or 0."""
         t, before, y = jax.lax.stop_gradient((t, before, y))
-        fall = self._follow(one.condition, t, before)[1]
+        there, fall = self._follow(one.condition, t, before)
         # The second derivative, too: it says when a condition that rises is back at zero.
         moves = (jnp.ones_like(t), self._rate(t, y))
         (after, rise), (_, bend) = jax.jvp(lambda t, y: self._follow(one.condition, t, y), (t, y), moves)
         slopes = jax.grad(lambda t, y: self._call(one.condition, t, y), argnums=(0, 1))(t, y)
         terms = zip(jax.tree.leaves(slopes), jax.tree.leaves((t, y)), strict=True)
         rounding = LIFT_EPS * jnp.finfo(t.dtype).eps * sum(jnp.sum(jnp.abs(a * b)) for a, b in terms)
-        # A landing is relative to the lifted condition, a reset perhaps to the condition itself.
-        off = jnp.minimum(jnp.abs(after), jnp.abs(after + lift))
+        # The reset leaves the condition, or sets it to zero itself.
+        off = jnp.minimum(jnp.abs(after), jnp.abs(after - there))
         stays = off <= jnp.maximum(LANDING_FRACTION * jnp.abs(fall), rounding)
         small = LIFT_FRACTION * jnp.abs(rise) + rounding
         new = jnp.where(rise > 0, small - after, -small - after)
