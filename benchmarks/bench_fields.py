@@ -1,11 +1,11 @@
 """What `d.solve` costs beside a plain solve by diffrax of the same accuracy, where nothing switches and with events.
 
     lorenz     the Lorenz system, t from 0 to 4: no comparison, no event
-    orbit      an eccentric orbit (Arenstorf's kind, eccentricity 0.6), t from 0 to 20: no comparison, no event
+    orbit      an orbit of eccentricity 0.6, t from 0 to 20: no comparison, no event
     ball       a bouncing ball with drag, 4 bounces: diffrax restarts after each one, in a scan over its event
 
 Both sides take Tsitouras' method in float64, each at the loosest tolerance of its ladder whose error against a
-reference is at most the one asked for. Times are of compiled calls, taken in turn; a ratio is the median of those within
+reference is at most the one asked for. Compiled calls are timed in turn; a ratio is the median of those within
 a round. Prints a table, writes JSON with machine and versions.
 
     python benchmarks/bench_fields.py [--accuracy 1e-6] [--rounds 15] [--lanes 1 256]
@@ -30,17 +30,20 @@ BOUNCES, DRAG, KEEP = 4, 0.05, 0.8
 
 
 def lorenz(t, y, args):
+    """Return the rates of the Lorenz system."""
     x, v, z = y
     return 10.0 * (v - x), x * (args - z) - v, x * v - 8 / 3 * z
 
 
 def orbit(t, y, args):
+    """Return the rates of an orbit."""
     x, v = y
     return v, -args * x / jnp.sum(x * x) ** 1.5
 
 
 def ball(t, y, args):
-    x, v = y
+    """Return the rates of a falling ball with drag."""
+    v = y[1]
     return v, -args - DRAG * v * jnp.abs(v)
 
 
@@ -82,9 +85,7 @@ def by_diffrax(case, tolerance):
 
     if case != "ball":
         return lambda args: jax.tree.map(lambda x: x[-1], run(args, 0.0, y0).ys)
-    landing = diffrax.Event(
-        lambda t, y, args, **_: y[0], optimistix.Newton(rtol=1e-12, atol=1e-12), direction=False
-    )
+    landing = diffrax.Event(lambda t, y, args, **_: y[0], optimistix.Newton(rtol=1e-12, atol=1e-12), direction=False)
 
     def bounces(args):
         def one(at, _):
@@ -134,6 +135,7 @@ def measure(case, lanes, accuracy, rounds):
 
 
 def main():
+    """Measure the cases that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--accuracy", type=float, default=1e-6)
     parser.add_argument("--rounds", type=int, default=15)

@@ -34,7 +34,6 @@ from diffabs.simulate.step.replay import ReplayedRun, ReplayStepping, log_attemp
 from diffabs.simulate.step.status import end_unfinished
 from diffabs.simulate.types import Adaptive, Run, Solver, Trajectory
 
-
 Finish = Callable[[Any, Any, PyTree], tuple[Any, PyTree]]  # from loop, objectives and last carry: result, last instant
 
 

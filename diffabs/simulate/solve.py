@@ -42,9 +42,9 @@ from diffabs.simulate.drive.engine import EngineError, resolve_request
 from diffabs.simulate.drive.loops import log_run, round_up_capacity
 from diffabs.simulate.run import RunCapacity, run_differentiable
 from diffabs.simulate.step.adaptive import AdaptiveStepping
+from diffabs.simulate.step.comparisons import SwitchedProgram
 from diffabs.simulate.step.fixed import FixedStepping
 from diffabs.simulate.step.replay import log_attempt, log_capacity
-from diffabs.simulate.step.comparisons import SwitchedProgram
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import UNCONSTRAINED, build_system
 from diffabs.simulate.types import Adaptive, FixedStep, Solver
@@ -269,13 +269,18 @@ class FieldLoop:
         del signals
         rate = self._rate(t, state.plant)
         if self.changes:
-            rate = select(state.controller.held.fault > 0, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), rate), rate)
+            rate = select(
+                state.controller.held.fault > 0, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), rate), rate
+            )
         return rate, (), (), (), ()
 
     def margins(self, t: Scalar, state: LoopState, signals: Signals, flow: Callable[[], PyTree]) -> Margins:
         """Return the conditions; those of terminal events belong to the stop."""
         del signals, flow
-        stops = (jnp.ones_like(jnp.asarray(t)), *(self._call(one.condition, t, state.plant) for one in self.code.terminal))
+        stops = (
+            jnp.ones_like(jnp.asarray(t)),
+            *(self._call(one.condition, t, state.plant) for one in self.code.terminal),
+        )
         if not self.changes:
             return {"stop": stops}
         lifts = state.controller.held.lifts
@@ -663,7 +668,9 @@ def _refuse_leaves(name: str, tree: PyTree) -> None:
     """Raise a ValueError for a leaf that is no real number or array of numbers."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if line := kinds.find_value_objection(leaf):
-            raise ValueError(f"{name}{jax.tree_util.keystr(path)} = {kinds.format_value(leaf)} {line}; a number is needed")
+            raise ValueError(
+                f"{name}{jax.tree_util.keystr(path)} = {kinds.format_value(leaf)} {line}; a number is needed"
+            )
 
 
 def _read_solver(solver: Solver, t0: Scalar, t1: Scalar, dtype: Any) -> tuple[FixedStepping | AdaptiveStepping, int]:

@@ -1,8 +1,8 @@
 """Random piecewise fields with resets, and their solutions by SciPy in pieces that know every switch.
 
-    margins    s_j = w_j.y + b_j + c_j sin(o_j t + f_j)
-    field      dy/dt = A tanh(y) - 0.3 y + u sin t + sum_j (on_j or off_j by the sign of s_j) + k |s_0| + l clip(s_last)
-    events     c_i = v_i.y + d_i falls through zero: y <- y + g_i (1 + 0.2 tanh(y))
+margins    s_j = w_j.y + b_j + c_j sin(o_j t + f_j)
+field      dy/dt = A tanh(y) - 0.3 y + u sin t + sum_j (on_j or off_j by the sign of s_j) + k |s_0| + l clip(s_last)
+events     c_i = v_i.y + d_i falls through zero: y <- y + g_i (1 + 0.2 tanh(y))
 """
 
 import jax.numpy as jnp
@@ -17,15 +17,18 @@ SHAPES = [(1, 1, 1), (2, 2, 1), (3, 3, 2), (4, 4, 1), (5, 1, 2), (6, 2, 1)]
 MAX_PIECES = 400
 
 
+def _unit(x):
+    return x / np.linalg.norm(x, axis=1, keepdims=True)
+
+
 def draw(rng, n, switches, events):
     """Return the parameters of a random field, and its start as `y`."""
     normal = rng.standard_normal
-    unit = lambda x: x / np.linalg.norm(x, axis=1, keepdims=True)
     return {
         "y": normal(n),
         "A": 1.5 * normal((n, n)) / np.sqrt(n),
         "u": normal(n),
-        "w": unit(normal((switches, n))),
+        "w": _unit(normal((switches, n))),
         "b": 0.5 * normal(switches),
         "c": 0.7 * normal(switches),
         "o": rng.uniform(0.5, 6.0, switches),
@@ -34,7 +37,7 @@ def draw(rng, n, switches, events):
         "off": normal((switches, n)),
         "k": 0.5 * normal(n),
         "l": 0.5 * normal(n),
-        "v": unit(normal((events, n))),
+        "v": _unit(normal((events, n))),
         "d": 0.5 * normal(events),
         "g": normal((events, n)),
     }
@@ -93,7 +96,14 @@ def solve_in_pieces(p):
             mark.terminal = True
             mark.direction = (-1 if mode[j] else 1) if j < size else (-1 if armed[j - size] else 1)
         found = solve_ivp(
-            lambda t, y: rate(t, y, p, mode), (t, END), y, "DOP853", rtol=1e-11, atol=1e-12, events=marks, max_step=0.02
+            lambda t, y, mode=mode: rate(t, y, p, mode),
+            (t, END),
+            y,
+            "DOP853",
+            rtol=1e-11,
+            atol=1e-12,
+            events=marks,
+            max_step=0.02,
         )
         if found.status != 1:
             return (found.y[:, -1], counts) if found.success else "fails"

@@ -149,7 +149,9 @@ class AdaptiveReport(NamedTuple):
 
 
 @partial(
-    jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps_last_step", "is_logged", "watches", "smooth"]
+    jax.tree_util.register_dataclass,
+    data_fields=["h", "steps", "rtol"],
+    meta_fields=["keeps_last_step", "is_logged", "watches", "smooth"],
 )
 @dataclasses.dataclass(frozen=True)
 class AdaptiveStepping:
@@ -250,7 +252,9 @@ class AdaptiveStepping:
         The derivative changes faster than the run. The allowed error of a step is therefore only
         `DERIVATIVE_RTOL_FRACTION` of that for values.
         """
-        return dataclasses.replace(self, is_logged=True, smooth=False, rtol=clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol))
+        return dataclasses.replace(
+            self, is_logged=True, smooth=False, rtol=clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol)
+        )
 
     def is_switched(self, loop: Loop) -> bool:
         """Return True: the comparisons of the `loop`'s flow are always visible."""

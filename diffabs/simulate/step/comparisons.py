@@ -146,7 +146,7 @@ class SwitchedProgram:
         return new
 
     def _add_jaxpr(self, jaxpr: Any, constants: list[int], inputs: list[int], source: Any = None) -> list[int]:
-        """Add the operations of a jaxpr, and return the numbers of its outputs; `source` wrote the call of the jaxpr."""
+        """Add the operations of a jaxpr, and return the numbers of its outputs; `source` wrote its call."""
         at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
         def read(atom: PyTree) -> int:

@@ -118,9 +118,7 @@ def margin_error(system: LoopSystem, carry: PyTree, h: Scalar, seen: Evaluation,
     if margins.size == 1:  # that of a stop which is never reached
         return jnp.zeros_like(h)
     point = carry.point
-    step = HermiteStep(
-        point.t, point.t + h, (point.state.flow(), state.flow()), (point.rates[0], seen.rates[0])
-    )
+    step = HermiteStep(point.t, point.t + h, (point.state.flow(), state.flow()), (point.rates[0], seen.rates[0]))
     middle = point.t + 0.5 * h
     mode = mode_in_step(system, point.words, carry.unrestricted)
     there = system.list_margins(middle, point.state.with_flow(step.at(middle)), point.accumulators, mode)

@@ -108,7 +108,8 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
         at = state.with_flow(unflatten(flow))
         return ravel_pytree(loop.flow(t, at, loop.signals(t, at)))[0]
 
-    if size.size <= MAX_UNROLLED_STATES:
+    written_out, rows = size.size <= MAX_UNROLLED_STATES, []
+    if written_out:
         moves = jnp.eye(size.size, dtype=size.dtype) * size
         columns = jax.vmap(lambda one: jax.jvp(rates, (flow,), (one,))[1])(moves) / size
         # Scalars instead of a matrix product: for such small sums XLA on a CPU calls a library, at ten times the cost.
@@ -121,7 +122,7 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
         vector, log = at
         norm = longest(vector)
         vector = [x / norm for x in vector]
-        if size.size <= MAX_UNROLLED_STATES:
+        if written_out:
             vector = [sum(a * x for a, x in zip(row, vector, strict=True)) for row in rows]
         else:
             vector = [jax.jvp(rates, (flow,), (vector[0] * size,))[1] / size]
@@ -131,7 +132,7 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
     half = POWER_ITERATIONS // 2
     # The growth is averaged over the second half of the iterations, after the first half has aligned the vector.
     later = jnp.asarray(np.arange(POWER_ITERATIONS) > half, t.dtype)
-    begin = list(jnp.ones_like(size)) if size.size <= MAX_UNROLLED_STATES else [jnp.ones_like(size)]
+    begin = list(jnp.ones_like(size)) if written_out else [jnp.ones_like(size)]
     # Logarithms: a product of the norms of a stiff loop would overflow single precision.
     vector, log = jax.lax.scan(multiply, (begin, 0.0 * t), later)[0]
     return STABILITY_RADIUS * jnp.exp(-(log + jnp.log(longest(vector))) / half)
