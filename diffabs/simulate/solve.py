@@ -61,7 +61,7 @@ MAX_ACCEPTED = 256  # functions that are known to be valid
 _accepted: dict[Any, "Function"] = {}
 SWITCH_SOLVER = Adaptive(1e-6)
 
-Field = Callable[[Scalar, PyTree, PyTree], PyTree]
+Field = Callable[..., PyTree]  # of (t, y, args)
 
 
 class SolutionStatus(enum.IntEnum):
@@ -262,7 +262,8 @@ class FieldLoop:
         """Return the signals at the time `t` in units of the span, in `state`: nothing but the state of the field."""
         zero = jnp.zeros_like(jnp.asarray(t))
         sample = Sample(t, FieldOutput(zero, state.plant), *(5 * [zero]))
-        return Signals(sample, (), (), {})
+        nothing: Any = ()
+        return Signals(sample, nothing, nothing, {})
 
     def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[PyTree, ...]:
         """Return d(state.flow())/ds; NaN after a fault, which ends the run."""
@@ -363,7 +364,7 @@ class FieldLoop:
         fault = jnp.where(unclear | jumps, float(SolutionStatus.GRAZED), fault)
         return jax.lax.stop_gradient(jnp.where(happens, jnp.where(stays, new, 0.0), lift)), fault
 
-    def _call(self, function: "Function", t: Scalar, y: PyTree) -> Any:
+    def _call(self, function: Callable, t: Scalar, y: PyTree) -> Any:
         """Return the result of a function at the time `t` in units of the span."""
         given = self.given
         return function(given["t0"] + given["span"] * t, y, given["args"], given["constants"])
@@ -371,7 +372,7 @@ class FieldLoop:
     def _rate(self, t: Scalar, y: PyTree) -> PyTree:
         return jax.tree.map(lambda x: self.given["span"] * x, self._call(self.code.field, t, y))
 
-    def _follow(self, condition: "Function", t: Scalar, y: PyTree) -> tuple[Scalar, Scalar]:
+    def _follow(self, condition: Callable, t: Scalar, y: PyTree) -> tuple[Scalar, Scalar]:
         """Return a condition and its rate along the field, from the state `y` at `t` on."""
         moves = (jnp.ones_like(t), self._rate(t, y))
         return jax.jvp(lambda t, y: self._call(condition, t, y), (t, y), moves)
@@ -425,7 +426,7 @@ def solve(
     *,
     solver: Solver,
     events: Sequence[Event] = (),
-    save: AnyArray = None,
+    save: AnyArray | None = None,
     engine: str = "auto",
     kept_events: int = 16,
 ) -> Solution:
@@ -471,7 +472,8 @@ def solve(
     if not isinstance(kept_events, int) or kept_events < 1:
         raise ValueError(f"kept_events = {kept_events!r} is no whole number of at least 1")
     loop, places = _build_loop(field, y0, t0, t1, args, events, save, kept_events)
-    method, count = _read_solver(solver, t0, t1, loop.given["t0"].dtype)
+    asked: Any = solver
+    method, count = _read_solver(asked, t0, t1, loop.given["t0"].dtype)
     program = _trace_program(loop)
     if program.jumps:
         worst = program.jumps[0]
@@ -482,7 +484,7 @@ def solve(
     if isinstance(method, AdaptiveStepping) and not program.bit_count and not events:
         method = dataclasses.replace(method, is_logged=False, watches=False, smooth=True)
     saves = {} if places is None else {"saves": Saves(places=places)}
-    capacity = log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.capacity(loop, count)
+    capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, asked)
     capacity = RunCapacity(round_up_capacity(capacity), 0, 0, finish_solution)
     return run_differentiable(capacity, (loop, saves, method, None))
 
@@ -527,16 +529,17 @@ def switches(
     return found
 
 
-def _list_flips(loop: FieldLoop, solver: Adaptive) -> list[tuple[float, int]]:
+def _list_flips(loop: Any, solver: Adaptive) -> list[tuple[float, int]]:
     """Return time and number of each comparison that changes in a run."""
     method, _ = _read_solver(solver, 0.0, 1.0, loop.given["t0"].dtype)
     if not isinstance(method, AdaptiveStepping):
         raise ValueError(f"solver = {solver} has fixed steps; d.Adaptive is needed")
 
     @jax.jit
-    def run(loop: FieldLoop) -> Any:
-        start = method.start(loop, {}, None)
-        step, renew = partial(method.step, loop, {}, None), partial(method.renew, loop)
+    def run(loop: Any) -> Any:
+        key: Any = None
+        start = method.start(loop, {}, key)
+        step, renew = partial(method.step, loop, {}, key), partial(method.renew, loop)
         return log_run(step, renew, log_attempt, start, round_up_capacity(log_capacity(loop, solver)))[1]
 
     log = run(loop)
@@ -552,10 +555,10 @@ def _build_loop(
     t1: Scalar,
     args: PyTree,
     events: tuple[Event, ...],
-    save: AnyArray,
+    save: AnyArray | None,
     kept: int,
-) -> tuple[FieldLoop, Array | None]:
-    """Return the field as a loop, and the times `save` in units of the span.
+) -> tuple[Any, Array | None]:
+    """Return the field as a `FieldLoop`, and the times `save` in units of the span.
 
     Raises:
         ValueError: An argument is invalid.
@@ -573,7 +576,7 @@ def _build_loop(
     return loop, None if save is None else (save - t0) / span
 
 
-def _trace_program(loop: FieldLoop) -> SwitchedProgram:
+def _trace_program(loop: Any) -> SwitchedProgram:
     """Return the program of the loop's flow, with its comparisons."""
     program = build_system(loop, {}, jnp.zeros_like(loop.given["t0"]), loop.start(), {}, switched=True).program
     assert program is not None
@@ -595,11 +598,11 @@ def finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree
         RunStatus.SLID: SolutionStatus.SLID,
         RunStatus.GRAZED: SolutionStatus.GRAZED,
     }
-    status = jnp.asarray(SolutionStatus.DIVERGED.value)
+    status: Any = jnp.asarray(SolutionStatus.DIVERGED.value)
     for one, meant in known.items():
         status = jnp.where(carry.status == one, meant.value, status)
     # A fault of an event ends the run by rates that are NaN.
-    lost = (status == SolutionStatus.DIVERGED) & (held.fault > 0)
+    lost: Any = (status == SolutionStatus.DIVERGED) & (held.fault > 0)
     status = jnp.where(lost, held.fault.astype(status.dtype), status)
     valid = status <= SolutionStatus.TERMINATED
 
@@ -627,7 +630,7 @@ def _count_events(loop: FieldLoop, carry: PyTree, terminated: Bool) -> SolutionE
     inner, ends, rows = iter(range(len(loop.code.inner))), iter(range(len(distances))), []
     for one in loop.code.events:
         if one.terminal:
-            happens = terminated & (last == next(ends))
+            happens = jnp.asarray(terminated & (last == next(ends)))
             rows.append((jnp.where(happens, never.at[0].set(point.t), never), happens.astype(point.t.dtype)))
         else:
             i = next(inner)
@@ -637,7 +640,7 @@ def _count_events(loop: FieldLoop, carry: PyTree, terminated: Bool) -> SolutionE
     return SolutionEvents(times, counts.astype(int))
 
 
-def _read_times(t0: Scalar, t1: Scalar, save: AnyArray) -> None:
+def _read_times(t0: Scalar, t1: Scalar, save: AnyArray | None) -> None:
     """Check the times of a solution as far as they are concrete.
 
     Raises:
@@ -673,14 +676,15 @@ def _refuse_leaves(name: str, tree: PyTree) -> None:
             )
 
 
-def _read_solver(solver: Solver, t0: Scalar, t1: Scalar, dtype: Any) -> tuple[FixedStepping | AdaptiveStepping, int]:
+def _read_solver(solver: Any, t0: Scalar, t1: Scalar, dtype: Any) -> tuple[FixedStepping | AdaptiveStepping, int]:
     """Return the stepping method in units of the span, and the number of its steps.
 
     Raises:
         ValueError: The solver or a field of it is invalid.
     """
+    count = 1
     if isinstance(solver, Adaptive):
-        solver, count = dataclasses.replace(solver, step=1.0, duration=1.0, every=1), 1
+        solver = dataclasses.replace(solver, step=1.0, duration=1.0, every=1)
     elif not isinstance(solver, FixedStep):
         raise ValueError(f"solver = {kinds.format_value(solver)} is no solver; d.FixedStep or d.Adaptive is needed")
     elif _is_traced(t0, t1):

@@ -42,6 +42,7 @@ def height_after_two(keep):
     return at(keep), jax.grad(at)(keep)
 
 
+@pytest.mark.slow
 @killed_by("simulate/solve.py", "small - after, -small", "0.0 * after, -small")
 @killed_by("simulate/solve.py", "held.counts + events,", "held.counts,")
 def test_events_that_do_not_end_a_run():
@@ -90,12 +91,17 @@ def test_the_time_of_a_switch_has_a_derivative():
 
 def test_a_discontinuity_of_a_field_is_detected():
     """https://github.com/patrick-kidger/diffrax/issues/729: no way was known to detect it."""
-    found = d.switches(steps, 0.0, 0.0, {"switch": 0.7, "up": 1.0, "down": -2.0}, t1=2.0)
+    found = d.switches(steps, 0.0, 0.0, {"switch": 0.7, "up": 1.0, "down": -2.0})
     assert {one.operation for one in found} <= {"le", "gt", "ge", "lt"}
     assert all("test_solve.py" in one.source for one in found)
     assert abs(abs(float(found[0].margin)) - 0.7) < 1e-12
-    assert any(abs(time - 0.7) < 1e-6 for one in found for time in one.flips)
     assert d.switches(fall, 0.0, (1.0, 0.0), {"gravity": GRAVITY}) == []
+
+
+@pytest.mark.slow
+def test_the_flips_of_a_run_are_listed():
+    found = d.switches(steps, 0.0, 0.0, {"switch": 0.7, "up": 1.0, "down": -2.0}, t1=2.0)
+    assert [round(time, 6) for one in found for time in one.flips][:1] == [0.7]
 
 
 @pytest.mark.slow
@@ -128,6 +134,7 @@ def dose(t, y, args):
 DOSE = d.Event(lambda t, y, args: args["at"] - t, lambda t, y, args: {"amount": y["amount"] + args["dose"]})
 
 
+@pytest.mark.slow
 @killed_by("simulate/solve.py", "<= self.places + COINCIDENCE_FRACTION", "< self.places - COINCIDENCE_FRACTION")
 def test_an_event_at_a_save_time_is_over_there():
     """https://github.com/SciML/SciMLSensitivity.jl/issues/1447: 7 % off where an event meets a save time."""
