@@ -301,6 +301,14 @@ class FieldLoop:
         """Return the state after the events that have `fired`, in the order of the argument `events`.
 
         A reset may turn the condition of a later event negative: then that event happens, too.
+
+        Args:
+            clock: The instant.
+            state: State before the instant.
+            before: Signals before the instant.
+            margins: Margins before the instant.
+            fired: For each margin, whether it has just fallen through zero.
+            passed: The step that ends here, by block; None at the start of a run.
         """
         del before
         if passed is None:  # the start, where no condition has fallen
@@ -524,8 +532,9 @@ def switches(
         bits = range(first, first + int(np.prod(shape)))
         margins = [one.value for one in seen if int(np.min(one.numbers)) in bits]
         margin = margins[0] if len(margins) == 1 else min(margins, key=abs)
+        turned = op.queries[0][1]
         times = tuple(time for time, bit in flips if bit in bits)
-        found.append(Switch(summarize(op.source), op.name, margin, times))
+        found.append(Switch(summarize(op.source), op.name, -margin if turned else margin, times))
     return found
 
 

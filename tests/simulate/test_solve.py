@@ -10,7 +10,7 @@ import random_fields
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.interop.diffrax import field_of
+from diffabs.interop import field_of
 from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.solve import SolutionStatus
 

@@ -207,7 +207,7 @@ class SwitchedProgram:
             first, size = self.bit_count, int(np.prod(shape))
             # Answers that fit in a word do not straddle two words: `ComparisonTrace.search` reads a single word.
             fits = first % WORD_BITS + size <= WORD_BITS or size > WORD_BITS
-            self.origins.append(op)
+            self.origins.append(op._replace(queries=((numbers[key], turned),)))
             self.places.append((first if fits else -(-first // WORD_BITS) * WORD_BITS, shape))
         return numbers[key], turned
 
