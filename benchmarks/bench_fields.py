@@ -25,7 +25,7 @@ from rich.table import Table
 
 import diffabs as d
 
-LADDER = [10.0**-k for k in np.arange(3.0, 12.1, 0.5)]
+LADDER = [10.0**-k for k in np.arange(4.0, 12.1, 0.5)]
 BOUNCES, DRAG, KEEP = 4, 0.05, 0.8
 
 

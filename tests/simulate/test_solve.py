@@ -5,9 +5,11 @@ Every example has a closed form. A program takes seconds to compile, so the fast
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pages
 import pytest
 import random_fields
 from mutants import killed_by
+from project import ROOT
 
 import diffabs as d
 from diffabs.interop import field_of
@@ -298,6 +300,15 @@ def test_a_kernel_is_refused():
 def test_fixed_steps_need_concrete_times():
     with pytest.raises(ValueError, match=r"d.FixedStep must know the number of its steps"):
         jax.jit(lambda t1: d.solve(lambda t, y, args: -y, 1.0, 0.0, t1, solver=d.FixedStep(1e-2)).y)(1.0)
+
+
+@pytest.mark.slow
+def test_the_page_runs():
+    page = ROOT / "docs/fields.md"
+    slope, source = pages.printed(page.read_text(encoding="utf-8"), str(page))[0].splitlines()
+    assert np.isfinite(float(slope))
+    assert float(slope) != 0.0
+    assert "fields.md" in source
 
 
 def judge_fields(shape, count, seed):
