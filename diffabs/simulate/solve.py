@@ -616,7 +616,8 @@ def finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree
     valid = status <= SolutionStatus.TERMINATED
 
     def check(x: Array) -> Array:
-        return jnp.where(valid, x, jnp.nan)
+        # A product: a selection would give an invalid number the derivative zero.
+        return x * jnp.where(valid, 1.0, jnp.nan).astype(x.dtype)
 
     t, y = point.t, point.state.plant
     if objectives:

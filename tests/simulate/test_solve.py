@@ -211,6 +211,8 @@ def test_bounces_without_end_are_reported(keep):
     found = bounce(keep, end=12.0, solver=ADAPTIVE)
     assert found.status == SolutionStatus.CROWDED
     assert np.isnan(found.y[0])
+    if keep == 0.5:  # its derivative is no number either
+        assert np.isnan(jax.jacfwd(lambda keep: bounce(keep, end=12.0, solver=ADAPTIVE).y[0])(keep))
 
 
 @pytest.mark.slow

@@ -83,7 +83,7 @@ def look_ahead(fresh: Bool, seen: Evaluation) -> Outlook:
     margins, rates, numbers = _list_margins(seen, 0)
     # The margin of a new answer has any sign. Within its mode it is positive.
     surfaces = jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(seen.margins))
-    turned = fresh & surfaces & (margins < 0)
+    turned = fresh & surfaces & ((margins < 0) | ((margins == 0) & (rates < 0)))
     return Outlook(jnp.where(turned, -margins, margins), jnp.where(turned, -rates, rates))
 
 
