@@ -15,6 +15,10 @@ from diffabs.simulate.batch import Batch as Batch
 from diffabs.simulate.ensemble import run_batch as run_batch
 from diffabs.simulate.run import measure as measure
 from diffabs.simulate.run import rollout as rollout
+from diffabs.simulate.solve import Event as Event
+from diffabs.simulate.solve import Solution as Solution
+from diffabs.simulate.solve import solve as solve
+from diffabs.simulate.solve import switches as switches
 from diffabs.simulate.types import Adaptive as Adaptive
 from diffabs.simulate.types import FixedStep as FixedStep
 from diffabs.simulate.types import Run as Run

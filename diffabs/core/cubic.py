@@ -28,12 +28,12 @@ class Cubic(NamedTuple):
 
     def __call__(self, x: Scalar) -> Scalar:
         """Return p(x)."""
-        c1, c2, c3 = self._coefficients()
+        c1, c2, c3 = self.coefficients()
         return self.start + x * (c1 + x * (c2 + x * c3))
 
     def slope(self, x: Scalar) -> Scalar:
         """Return dp/dx at `x`."""
-        c1, c2, c3 = self._coefficients()
+        c1, c2, c3 = self.coefficients()
         return c1 + x * (2.0 * c2 + x * 3.0 * c3)
 
     def minus(self, level: Scalar) -> "Cubic":
@@ -46,12 +46,12 @@ class Cubic(NamedTuple):
 
     def integral(self, x: Scalar) -> Scalar:
         """Return the integral of p from 0 to `x`; times the step length, it is an integral over time."""
-        c1, c2, c3 = self._coefficients()
+        c1, c2, c3 = self.coefficients()
         return x * (self.start + x * (c1 / 2.0 + x * (c2 / 3.0 + x * c3 / 4.0)))
 
     def moment(self, x: Scalar) -> Scalar:
         """Return the integral of x p(x) from 0 to `x`; times the squared step length, it is an integral over time."""
-        c1, c2, c3 = self._coefficients()
+        c1, c2, c3 = self.coefficients()
         return x * x * (self.start / 2.0 + x * (c1 / 3.0 + x * (c2 / 4.0 + x * c3 / 5.0)))
 
     def root(self) -> Scalar:
@@ -84,7 +84,7 @@ class Cubic(NamedTuple):
         Its derivative is the derivative of p at the place of the extremum. A Newton step moves that place; its effect
         on the value is of second order.
         """
-        c1, c2, c3 = jax.lax.stop_gradient(self._coefficients())
+        c1, c2, c3 = jax.lax.stop_gradient(self.coefficients())
         inside = (c1 > 0) & (c1 + 2.0 * c2 + 3.0 * c3 < 0)
         square = c2 * c2 - 3.0 * c1 * c3
         # Root of p' = c1 + 2 c2 x + 3 c3 x^2 as c1/(sqrt(c2^2 - 3 c1 c3) - c2), which has no cancellation for c2 < 0.
@@ -101,7 +101,8 @@ class Cubic(NamedTuple):
         """Whether p falls at the start."""
         return jax.lax.stop_gradient(self.start_slope) < 0
 
-    def _coefficients(self) -> tuple[PyTree, PyTree, PyTree]:
+    def coefficients(self) -> tuple[PyTree, PyTree, PyTree]:
+        """Return c1, c2 and c3 of p(x) = start + c1 x + c2 x^2 + c3 x^3."""
         rise = self.end - self.start
         c2 = 3.0 * rise - 2.0 * self.start_slope - self.end_slope
         return self.start_slope, c2, self.start_slope + self.end_slope - 2.0 * rise

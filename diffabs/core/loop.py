@@ -67,7 +67,7 @@ class Signals(NamedTuple):
     recorded: dict[str, PyTree]
 
 
-Margins = dict[str, tuple[Any, ...]]  # margins of the stop and of each block with events, by name
+Margins = dict[str, tuple[Any, ...]]  # of stop and blocks, by name; each one of "stop" ends a run
 BLOCKS = ("sensor", "reference", "controller", "actuator")
 
 

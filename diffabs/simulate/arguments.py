@@ -89,7 +89,7 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
     Raises:
         ValueError: A field of the solver is invalid, a parameter has a wrong shape, or a part is not an objective.
     """
-    lines = [*_find_invalid_fields(solver), *find_misshapen(loop)]
+    lines = [*find_invalid_fields(solver), *find_misshapen(loop)]
     for name, part in objectives.items():
         if all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
             lines += find_misshapen(part, f"objectives.{name}.")
@@ -122,8 +122,12 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
         raise ValueError("; ".join(lines))
 
 
-def _find_invalid_fields(solver: Solver) -> Iterator[str]:
-    """Yield one line for each invalid field of the solver."""
+def find_invalid_fields(solver: Solver) -> Iterator[str]:
+    """Yield one line for each invalid field of the solver.
+
+    Args:
+        solver: Solver of the run.
+    """
     names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
     lines = [f"solver.{name} {line}" for name in names if (line := _find_number_fault(solver, name))]
     if lines:

@@ -5,7 +5,7 @@ If a step crosses the stop or the event of a block, shorter steps are attempted 
 place of the crossing in the step.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -33,6 +33,8 @@ from diffabs.simulate.step.adaptive import AdaptiveStepping
 from diffabs.simulate.step.replay import ReplayedRun, ReplayStepping, log_attempt, log_capacity, states_between
 from diffabs.simulate.step.status import end_unfinished
 from diffabs.simulate.types import Adaptive, Run, Solver, Trajectory
+
+Finish = Callable[[Any, Any, PyTree], tuple[Any, PyTree]]  # from loop, objectives and last carry: result, last instant
 
 
 def rollout(
@@ -121,7 +123,7 @@ def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     method = method.with_trajectory() if every else method
     capacity = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
-    run = _run_differentiable(capacity, (loop, objectives, method, key))
+    run = run_differentiable(capacity, (loop, objectives, method, key))
     return run._replace(trajectory=_truncate_trajectory(run.trajectory, count + 1)) if every else run
 
 
@@ -132,11 +134,13 @@ class RunCapacity(NamedTuple):
         tries: Capacity for attempts in the whole run. For fixed steps with a trajectory: between two of its instants.
         instants: Capacity for instants of a trajectory after t = 0; 0 without one.
         every: Number of grid steps between two instants; 0 without a trajectory.
+        finish: Function that returns the result from loop, objectives and the last carry, and the last instant.
     """
 
     tries: int
     instants: int
     every: int
+    finish: Finish = finish_run
 
 
 @partial(jax.jit, static_argnums=1)
@@ -145,10 +149,16 @@ def _truncate_trajectory(trajectory: PyTree, count: int) -> Any:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _run_differentiable(capacity: RunCapacity, run: PyTree) -> Run:
-    """Return the run of (loop, objectives, method, key)."""
+def run_differentiable(capacity: RunCapacity, run: PyTree) -> Any:
+    """Return the run of (loop, objectives, method, key), as `capacity.finish` makes it of the last carry.
+
+    Args:
+        capacity: Capacities that are fixed at compilation.
+        run: The loop, its objectives by name, the stepping method, and the random key or None.
+    """
     loop, objectives, method, key = run
-    return _run(loop, objectives, method, key, jax.device_put(capacity.every), instants=capacity.instants)
+    _, instants, every, finish = capacity
+    return _run(loop, objectives, method, key, jax.device_put(every), instants=instants, finish=finish)
 
 
 def _rule(capacity: RunCapacity, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
@@ -171,16 +181,18 @@ def _second_derivative_objection(loop: Loop, method: PyTree) -> str:
     return ""
 
 
-_run_differentiable.defjvp(_rule, symbolic_zeros=True)
+run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 
-@compile_once(static=("instants",), options=SAME_RESULT_OPTIONS)
-def _run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key, every: Any, *, instants: int) -> Run:
+@compile_once(static=("instants", "finish"), options=SAME_RESULT_OPTIONS)
+def _run(
+    loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key, every: Any, *, instants: int, finish: Finish
+) -> Any:
     """Return a run for values, with capacity for `instants` of a trajectory; 0 without one."""
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
     carry = method.start(loop, objectives, key)
     if not instants:
-        return finish_run(loop, objectives, run_to_end(stepped, partial(method.renew, loop), carry))[0]
+        return finish(loop, objectives, run_to_end(stepped, partial(method.renew, loop), carry))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     seen = partial(method.observe_at, loop)
     carry, seen = run_with_trajectory(
@@ -198,9 +210,9 @@ def _run_reversible(
         return _run_by_replay(loop, objectives, method.for_replay(), key, capacity)
     method = method.for_derivatives()
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
-    carry, (tries, instants, every) = method.start(loop, objectives, key), capacity
+    carry, (tries, instants, every, finish) = method.start(loop, objectives, key), capacity
     if not every:
-        return finish_run(loop, objectives, end_unfinished(scan_to_end(stepped, carry, tries)))[0]
+        return finish(loop, objectives, end_unfinished(scan_to_end(stepped, carry, tries)))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     carry, seen = scan_with_trajectory(
         stepped, method.is_active, partial(method.observe_at, loop), carry, every, count, instants, tries
@@ -213,7 +225,7 @@ def _run_by_replay(
 ) -> Run:
     """Return a run with adaptive steps for derivatives in both modes: logged for its values, then replayed."""
     loop, audit = prepare(loop)
-    objectives, (tries, instants, every) = objectives | audit, capacity
+    objectives, (tries, instants, every, finish) = objectives | audit, capacity
     # The log holds values only: derivatives come from the replay.
     still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
     logged = live.without_trajectory()
@@ -235,7 +247,7 @@ def _run_by_replay(
         start,
         log,
     )
-    judged = finish_run(loop, objectives, ReplayedRun(again.point, status))
+    judged = finish(loop, objectives, ReplayedRun(again.point, status))
     if not every:
         return judged[0]
 

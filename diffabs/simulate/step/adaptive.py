@@ -12,6 +12,9 @@
 Clocks strike on the grid of `Adaptive.step`, and a trajectory keeps instants of this grid. A step need not end on it.
 
 A run that is logged for derivatives keeps to one mode in a step, and locates switching surfaces as events.
+
+A method that `watches` reports what it cannot resolve: a run that slides along a surface is over (`SLID`), and so is
+one with a margin that only touches zero (`GRAZED`). A margin that crosses zero twice within a step cuts the step there.
 """
 
 import dataclasses
@@ -44,6 +47,7 @@ from diffabs.simulate.step.event_location import (
     SurfaceCrossing,
     find_surface_crossing,
 )
+from diffabs.simulate.step.outlook import look_ahead, margin_error, watch_margins
 from diffabs.simulate.step.runge_kutta import TSIT5, midpoint_error
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.step_size import (
@@ -71,6 +75,11 @@ RESET_STEP_FRACTION = 0.1
 # the growth of this fraction per step. An event excites the fastest modes of the derivative far more than the run's.
 INITIAL_STABILITY_FRACTION, STABILITY_FRACTION_GROWTH = 1 / 16, 1.6
 MAX_CONSECUTIVE_CROSSINGS = 16  # steps in a row that end on switching surfaces; then steps are unrestricted
+# Fraction of the duration: crossings that follow each other faster are those of a slide.
+SLIDE_INTERVAL_FRACTION = 1e-6
+# The first step after a landing, of a method that `watches`: greatest ratio to the step that has landed, and least
+# ratio to the length that the error allows.
+LANDED_STEP_RATIO, LEAST_LANDED_RATIO = 4.0, 1e-3
 # A step that keeps its mode goes 1.5 times as far as the predicted crossing, so that the crossing lies within the step.
 CROSSING_OVERREACH = 1.5
 
@@ -126,19 +135,23 @@ class AdaptiveReport(NamedTuple):
     Attributes:
         error: Error as a multiple of the allowed error.
         scale: Largest values of the first signal and of the states so far, as `error_scales` returns them.
-        past_crossing: Time from the first change of a comparison inside the step to the end of the step [s]; 0 without
-            a change.
+        past_crossing: Time from the first change of a comparison inside the step, or the first turn of a margin beyond
+            zero, to the end of the step [s]; 0 without one.
+        grazes: True if a margin only touches zero; False unless the method `watches`.
         surface: Contradicted comparisons; None if steps keep to no mode.
     """
 
     error: Scalar
     scale: PyTree
     past_crossing: Scalar
+    grazes: Bool
     surface: SurfaceCrossing | None
 
 
 @partial(
-    jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps_last_step", "is_logged"]
+    jax.tree_util.register_dataclass,
+    data_fields=["h", "steps", "rtol"],
+    meta_fields=["keeps_last_step", "is_logged", "watches", "smooth"],
 )
 @dataclasses.dataclass(frozen=True)
 class AdaptiveStepping:
@@ -150,6 +163,8 @@ class AdaptiveStepping:
         rtol: Allowed relative error of a step.
         keeps_last_step: True if the carry keeps the last step, for samples between its ends.
         is_logged: True if the run is logged for a replay with derivatives. Its steps then keep to a mode.
+        watches: True if the run ends where it slides or grazes, and a step where a margin turns. It must be logged.
+        smooth: True if nothing switches and no event can happen. The error alone then limits a step, not stability.
     """
 
     h: Scalar
@@ -157,7 +172,14 @@ class AdaptiveStepping:
     rtol: Scalar
     keeps_last_step: bool = False
     is_logged: bool = False
-    tableau, has_margin_rates, searches, second_order = TSIT5, True, True, False
+    watches: bool = False
+    smooth: bool = False
+    tableau, has_margin_rates, second_order = TSIT5, True, False
+
+    @property
+    def searches(self) -> bool:
+        """True if the method locates events."""
+        return not self.smooth
 
     @property
     def least(self) -> Scalar:
@@ -167,14 +189,14 @@ class AdaptiveStepping:
     def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
         error_limited = jnp.minimum(INITIAL_STEP_S, self.h * self.steps) + 0.0 * self.h
-        foresee = partial(self._forecast_crossing, error_limited, jnp.asarray(False))
+        foresee = partial(self._look_ahead, error_limited, jnp.asarray(False), jnp.asarray(True))
         carry = start_carry(self, loop, objectives, key, foresee)
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)
         scale = error_scales(state, point.sample)
-        limit = spectral_step_limit(loop, point.t, state, scale)
+        limit = self.h * self.steps if self.smooth else spectral_step_limit(loop, point.t, state, scale)
         left = self._next_strike(loop, zero) * self.h
-        length, strikes = plan_step(jnp.minimum(error_limited, limit), point.forecast, left, self.least)
+        length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), left, self.least)
         last = span_step(point, point) if self.keeps_last_step else ()
         control = AdaptiveControl(error_limited, limit, scale, zero, zero, last, zero, 1.0 + 0.0 * self.h, no, zero)
         return cast_floats(carry._replace(length=length, base=length, strikes=strikes, control=control), self.h.dtype)
@@ -188,6 +210,8 @@ class AdaptiveStepping:
 
     def renew(self, loop: Loop, carry: Carry) -> Carry:
         """Return the `carry` with a new stability limit of the `loop`, once in `ATTEMPTS_PER_RENEWAL` attempts."""
+        if self.smooth:
+            return carry
         control, at = carry.control, carry.point
         due = carry.running & (control.tries - control.tries_at_renewal >= ATTEMPTS_PER_RENEWAL)
 
@@ -228,7 +252,9 @@ class AdaptiveStepping:
         The derivative changes faster than the run. The allowed error of a step is therefore only
         `DERIVATIVE_RTOL_FRACTION` of that for values.
         """
-        return dataclasses.replace(self, is_logged=True, rtol=clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol))
+        return dataclasses.replace(
+            self, is_logged=True, smooth=False, rtol=clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol)
+        )
 
     def is_switched(self, loop: Loop) -> bool:
         """Return True: the comparisons of the `loop`'s flow are always visible."""
@@ -239,12 +265,14 @@ class AdaptiveStepping:
         """Return the next step to attempt, by the run of `carry` in `system`."""
         return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.is_logged)
 
-    def forecast(self, carry: Carry, seen: Evaluation) -> Scalar:
+    def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
         """Return the predicted time [s] to the first change of an answer, from `seen`, for the run of `carry`.
 
-        A step that keeps its mode gets `CROSSING_OVERREACH` times this time, so that the change lies within it.
+        A step that keeps its mode gets `CROSSING_OVERREACH` times this time, so that the change lies within it. A
+        method that `watches` returns the time and an `Outlook`.
         """
-        return self._forecast_crossing(carry.control.error_limited, carry.unrestricted, seen)
+        fresh = carry.status == RunStatus.REFRESHING
+        return self._look_ahead(carry.control.error_limited, carry.unrestricted, fresh, seen)
 
     def report(
         self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
@@ -260,7 +288,12 @@ class AdaptiveStepping:
         off = midpoint_error(self.tableau, error[0], seen.rates[0], h)
         relative = error_norm(system.loop, state, off, scale, sample) / self.rtol
         surface = find_surface_crossing(seen, carry.search.which, h) if self.is_logged else None
-        return AdaptiveReport(relative, scale, time_since_crossing(seen.surfaces, changed, h), surface)
+        past_crossing, grazes = time_since_crossing(seen.surfaces, changed, h), jnp.asarray(False)
+        if self.watches:
+            since, touches = watch_margins(carry, h, seen, system.bit_count)
+            past_crossing, grazes = jnp.maximum(past_crossing, since), touches
+            relative = jnp.maximum(relative, margin_error(system, carry, h, seen, state))
+        return AdaptiveReport(relative, scale, past_crossing, grazes, surface)
 
     def decide(
         self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
@@ -290,7 +323,7 @@ class AdaptiveStepping:
             fraction = jnp.where(taken, jnp.where(new, grown, INITIAL_STABILITY_FRACTION), fraction)
         longest = jnp.minimum(error_limited, fraction * control.limit)
         left = (self._next_strike(system.loop, after.k) - after.k) * self.h - after.since
-        length, strikes = plan_step(longest, after.point.forecast, left, self.least)
+        length, strikes = plan_step(longest, self._ahead(after.point), left, self.least)
         # A comparison changed inside the step: the next attempt ends there.
         ends_on_crossing = ~taken & (report.past_crossing > 0) & decision.fine
         length = jnp.where(ends_on_crossing, jnp.maximum(carry.length - report.past_crossing, self.least), length)
@@ -298,6 +331,10 @@ class AdaptiveStepping:
         crossings = control.consecutive_crossings
         if self.is_logged:
             calm = taken & new & (carry.length > RESET_STEP_FRACTION * control.error_limited)
+            if self.watches:
+                # Steps without an error are as long as the run, so that no step counts as long beside them.
+                apart = carry.length > SLIDE_INTERVAL_FRACTION * self.h * self.steps
+                calm, crossings = calm | (taken & new & apart), jnp.where(apart, 0, crossings)
             crossings = jnp.where(decision.crosses_surface, crossings + 1, jnp.where(calm, 0, crossings))
             gave_up = searches & (after.search.tries >= MAX_LOCATION_ATTEMPTS)
             gave_up &= after.search.which < system.bit_count
@@ -331,8 +368,26 @@ class AdaptiveStepping:
                 taken=taken,
                 triggered=_pack_events(decision.triggered),
             ),
-            status=jnp.where(lost, RunStatus.DIVERGED, status),
+            status=jnp.where(lost, RunStatus.DIVERGED, self._judge(carry, report, unrestricted, status)),
         )
+
+    def _judge(self, carry: Carry, report: AdaptiveReport, unrestricted: Bool, status: Scalar) -> Scalar:
+        """Return the `status`, or that of a run which is over because it slides or grazes."""
+        if not self.watches:
+            return status
+        # The shortest step is accepted in any case, also if a margin crosses zero twice in it.
+        passed = (carry.status == RunStatus.RUNNING) & (report.past_crossing > 0) & (carry.length <= self.least)
+        status = jnp.where(report.grazes | passed, RunStatus.GRAZED, status)
+        return jnp.where(unrestricted, RunStatus.SLID, status)
+
+    def _ahead(self, point: Point) -> Scalar:
+        """Return the predicted time [s] to the first change of an answer."""
+        return point.forecast[0] if self.watches else point.forecast
+
+    def _look_ahead(self, error_limited: Scalar, unrestricted: Bool, fresh: Bool, seen: Evaluation) -> PyTree:
+        """Return the forecast; `fresh` is True if the answers were taken anew."""
+        crossing = self._forecast_crossing(error_limited, unrestricted, seen)
+        return (crossing, look_ahead(fresh, seen)) if self.watches else crossing
 
     def _next_strike(self, loop: Loop, k: Int) -> Int:
         """Return the number of the first grid instant after the `k`-th at which a clock strikes or the run ends."""
@@ -353,7 +408,13 @@ class AdaptiveStepping:
         cut = decision.taken & (carry.length < old)
         wrong = ~decision.fine | ((report.error > 1) & (report.past_crossing <= 0))
         judged = (carry.status == RunStatus.RUNNING) & (decision.taken | wrong)
-        return jnp.maximum(jnp.where(judged, jnp.where(cut, jnp.maximum(new, old), new), old), self.least)
+        new = jnp.where(judged, jnp.where(cut, jnp.maximum(new, old), new), old)
+        if self.watches:
+            # After a landing the next one may be near. A step much longer than the way there would pass over it.
+            landed = decision.taken & (carry.status == RunStatus.LANDING)
+            most = jnp.maximum(LANDED_STEP_RATIO * carry.length, LEAST_LANDED_RATIO * new)
+            new = jnp.where(landed, jnp.minimum(new, most), new)
+        return jnp.maximum(new, self.least)
 
 
 def clip_rtol(rtol: Scalar) -> Scalar:

@@ -10,7 +10,7 @@
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -130,6 +130,11 @@ class Stepping(Protocol):
         ...
 
     @property
+    def smooth(self) -> bool:
+        """True if nothing switches and no event can happen."""
+        ...
+
+    @property
     def second_order(self) -> bool:
         """True if the times of events have second derivatives."""
         ...
@@ -213,9 +218,11 @@ def advance(
         report = partial(stepping.report, system, carry, request.h)
         return attempt_step(system, start, request, stepping.tableau, forecast, report)
 
-    # Without the barriers, XLA would compile the attempt again into each expression that uses it.
-    attempt = jit_barrier(active, attempt_request)
-    decision = jit_barrier(active, lambda: stepping.decide(system, carry, request, attempt, active))
+    # Without the barriers, XLA would compile the attempt again into each expression that uses it. A step in which
+    # nothing is searched has few such expressions.
+    barrier = (lambda active, work: work()) if stepping.smooth else jit_barrier
+    attempt = barrier(active, attempt_request)
+    decision = barrier(active, lambda: stepping.decide(system, carry, request, attempt, active))
 
     strikes = decision.taken & request.strikes
     k = jnp.where(strikes, request.strike, carry.k)
@@ -231,6 +238,8 @@ def advance(
     after = carry._replace(point=point, k=k, since=since)
     if stepping.searches:
         after = _search(stepping, system, carry, attempt, decision, after)
+    elif stepping.smooth:
+        after = after._replace(status=_next_status(system, carry, attempt, decision, carry.status))
     after = stepping.plan_next(system, carry, attempt, decision, after)
     after = after._replace(status=jnp.where(active, after.status, carry.status).astype(carry.status.dtype))
     if until is not None:  # without a pause, the other fields of a run that is over have no effect
@@ -252,8 +261,13 @@ def _search(
 
     # Few attempts search, so a batch skips the search unless one of its runs needs it.
     search, length, status = jax.lax.cond(any_lane(decision.searches), next_plan, lambda: plan)
-    status = jnp.where(decision.taken, status_after_step(system.loop, carry, attempt, decision), status)
+    status = _next_status(system, carry, attempt, decision, status)
     return after._replace(search=search, length=length, status=status)
+
+
+def _next_status(system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, status: Scalar) -> Scalar:
+    """Return the status after an attempt; `status` where it was not accepted."""
+    return jnp.where(decision.taken, status_after_step(system.loop, carry, attempt, decision), status)
 
 
 def start_carry(
@@ -342,7 +356,7 @@ def decide_attempt(
     searches = active & ~landing & ~refreshing & (~running | (exact & crosses))
     triggered = [taken & landing & ((which == bit_count + i) | one) for i, one in enumerate(crossed)]
     triggered = jax.tree.unflatten(jax.tree.structure(attempt.point.margins), triggered)
-    over = triggered["stop"][0] | (taken & last)
+    over = reduce(jnp.logical_or, triggered["stop"]) | (taken & last)
     lands, mode = jnp.asarray(False), UNCONSTRAINED
     if frozen:
         lands = taken & landing & (which < bit_count)

@@ -17,12 +17,14 @@ import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
+from jax._src.source_info_util import user_frame  # JAX has no public function that names the line of an operation
 from jax.extend.core import JaxprEqn
 
 from diffabs.core.types import PyTree, Scalar
 from diffabs.simulate.step.modes import WORD_BITS, BitRange, ComparisonAnswers, ComparisonTrace, Mode
 
 INLINED_CALLS = ("jit", "pjit", "remat", "remat2", "checkpoint")
+JUMPING_OPERATIONS = ("floor", "ceil", "round", "rem", "argmax", "argmin")
 SEARCHSORTED = "searchsorted"  # of `jax.numpy` or `core.numerics`, in at most WORD_BITS knots
 
 
@@ -30,6 +32,7 @@ class _Op(NamedTuple):
     """An operation on numbered values.
 
     A comparing operation has a name, and for each of its comparisons the number and whether the comparison is reversed.
+    `source` is JAX's record of the line that wrote the operation.
     """
 
     apply: Callable[..., Sequence[PyTree]]
@@ -37,6 +40,7 @@ class _Op(NamedTuple):
     outs: tuple[int, ...]
     shape: tuple[int, ...]
     name: str = ""
+    source: Any = None
     queries: tuple[tuple[int, bool], ...] = ()
 
 
@@ -57,6 +61,9 @@ class SwitchedProgram:
         closed, shape = jax.make_jaxpr(f, return_shape=True)(moving, fixed)
         self.ops: list[_Op] = []
         self.places: list[BitRange] = []
+        self.origins: list[_Op] = []  # of each comparison, the first operation that asks it
+        self.jumps: list[_Op] = []  # operations that jump without a comparison, and count
+        self._jumping: list[_Op] = []
         self._constants: dict[int, PyTree] = {}
         self._names: list[PyTree] = []  # of values; equal for the same operation on the same values
         self._moves: list[bool] = []
@@ -138,8 +145,8 @@ class SwitchedProgram:
         self._constants[new] = x.astype(literal.aval.dtype)[()]
         return new
 
-    def _add_jaxpr(self, jaxpr: Any, constants: list[int], inputs: list[int]) -> list[int]:
-        """Add the operations of a jaxpr, and return the numbers of its outputs."""
+    def _add_jaxpr(self, jaxpr: Any, constants: list[int], inputs: list[int], source: Any = None) -> list[int]:
+        """Add the operations of a jaxpr, and return the numbers of its outputs; `source` wrote its call."""
         at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
         def read(atom: PyTree) -> int:
@@ -147,17 +154,19 @@ class SwitchedProgram:
 
         for eqn in jaxpr.eqns:
             ins = tuple(read(atom) for atom in eqn.invars)
+            # A function of `jax.numpy` is a jaxpr of its own, whose operations no line of a user has written.
+            origin = eqn.source_info if source is None or user_frame(eqn.source_info.traceback) else source
             inner = eqn.params.get("jaxpr") if eqn.primitive.name in INLINED_CALLS else None
             if inner is None or _is_knot_search(eqn):
-                outs = self._operation(eqn, ins)
+                outs = self._operation(eqn, ins, origin)
             else:
                 body, kept = (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, [])
-                outs = self._add_jaxpr(body, self._add_constants(kept), list(ins))
+                outs = self._add_jaxpr(body, self._add_constants(kept), list(ins), origin)
             at.update(zip(eqn.outvars, outs, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    def _operation(self, eqn: Any, ins: tuple[int, ...]) -> list[int]:
-        """Add an operation, and return the numbers of its outputs."""
+    def _operation(self, eqn: Any, ins: tuple[int, ...], source: Any) -> list[int]:
+        """Add an operation, written by the line `source`, and return the numbers of its outputs."""
         # The same operation on the same values gets the same name, so that a repeated comparison has one number.
         said = tuple(sorted((key, str(value)) for key, value in eqn.params.items() if not callable(value)))
         same = (eqn.primitive.name, said, tuple(self._names[i] for i in ins))
@@ -167,21 +176,26 @@ class SwitchedProgram:
         name = SEARCHSORTED if _is_knot_search(eqn) else eqn.primitive.name
         shape = eqn.invars[0].aval.shape if name == SEARCHSORTED else eqn.outvars[0].aval.shape
         asks = name if moves and real and name in _RESULT_FROM_ANSWERS else ""
-        self.ops.append(_Op(_bind_equation(eqn), ins, tuple(outs), shape, asks))
+        self.ops.append(_Op(_bind_equation(eqn), ins, tuple(outs), shape, asks, source))
+        if moves and _jumps(eqn):
+            self._jumping.append(self.ops[-1]._replace(name=eqn.primitive.name))
         return outs
 
     def _number_comparisons(self, counted: set[int]) -> None:
         """Number the comparisons on which the counted outputs depend."""
         numbers: dict[PyTree, int] = {}
-        for i, (op, on) in enumerate(zip(self.ops, self._needed_operations(counted), strict=True)):
+        needed = self._needed_operations(counted)
+        used = {op.outs for op, on in zip(self.ops, needed, strict=True) if on}
+        self.jumps = [op for op in self._jumping if op.outs in used]
+        for i, (op, on) in enumerate(zip(self.ops, needed, strict=True)):
             if on and op.name:
                 asks = [
-                    self._number(numbers, x, y, strict, op.shape)
+                    self._number(numbers, x, y, strict, op)
                     for x, y, strict in _COMPARISONS[op.name](self._zero, *op.ins)
                 ]
                 self.ops[i] = op._replace(queries=tuple(asks))
 
-    def _number(self, numbers: dict[PyTree, int], x: int, y: int, strict: bool, shape: PyTree) -> tuple[int, bool]:
+    def _number(self, numbers: dict[PyTree, int], x: int, y: int, strict: bool, op: _Op) -> tuple[int, bool]:
         """Return the number of x > y or x >= y, and whether that number denotes the negation (y >= x or y > x)."""
         x, y = self._names[x], self._names[y]
         # One number for x > y and y >= x, which are negations of each other: the order of the names decides.
@@ -189,11 +203,23 @@ class SwitchedProgram:
         key = (y, x, not strict) if turned else (x, y, strict)
         if key not in numbers:
             numbers[key] = len(self.places)
+            shape = op.shape
             first, size = self.bit_count, int(np.prod(shape))
             # Answers that fit in a word do not straddle two words: `ComparisonTrace.search` reads a single word.
             fits = first % WORD_BITS + size <= WORD_BITS or size > WORD_BITS
+            self.origins.append(op._replace(queries=((numbers[key], turned),)))
             self.places.append((first if fits else -(-first // WORD_BITS) * WORD_BITS, shape))
         return numbers[key], turned
+
+
+def _jumps(eqn: Any) -> bool:
+    """Return whether the result of an equation jumps where no comparison changes: a rounded number, a place."""
+    name, (first, *_) = eqn.primitive.name, (*eqn.invars, None)
+    if name in JUMPING_OPERATIONS:
+        return first is not None and jnp.issubdtype(first.aval.dtype, jnp.floating)
+    if name != "convert_element_type" or not jnp.issubdtype(first.aval.dtype, jnp.floating):
+        return False
+    return not jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.inexact)
 
 
 def _is_knot_search(eqn: Any) -> bool:

@@ -30,6 +30,7 @@ from diffabs.simulate.step.advance import (
 )
 from diffabs.simulate.step.attempt import Attempt, StepRequest
 from diffabs.simulate.step.event_location import MAX_LOCATION_ATTEMPTS, SurfaceCrossing, find_surface_crossing
+from diffabs.simulate.step.outlook import look_ahead, watch_margins
 from diffabs.simulate.step.runge_kutta import RK4
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
@@ -59,12 +60,15 @@ class FixedStepReport(NamedTuple):
 
     Attributes:
         surface: Contradicted comparisons; None if switching surfaces are not located.
+        grazes: True if a margin crosses zero twice within the step, or only touches it; False unless the method
+            `watches`.
     """
 
     surface: SurfaceCrossing | None
+    grazes: Bool
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["kinks", "second_order"])
+@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["kinks", "second_order", "watches"])
 @dataclasses.dataclass(frozen=True)
 class FixedStepping:
     """Steps of a `FixedStep` solver.
@@ -74,17 +78,25 @@ class FixedStepping:
         steps: Number of steps.
         kinks: True if switching surfaces are located. None locates them for derivatives, and if a rate jumps there.
         second_order: True if the times of events have second derivatives.
+        watches: True if the run ends where it slides or grazes. It must locate switching surfaces.
     """
 
     h: Scalar
     steps: Int
     kinks: bool | None = None
     second_order: bool = False
-    tableau, has_margin_rates, searches = RK4, False, True
+    watches: bool = False
+    tableau, searches, smooth = RK4, True, False
+
+    @property
+    def has_margin_rates(self) -> bool:
+        """True if the rates of all margins are evaluated."""
+        return self.watches
 
     def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
-        carry = start_carry(self, loop, objectives, key)
+        foresee = partial(look_ahead, jnp.asarray(True)) if self.watches else lambda seen: ()
+        carry = start_carry(self, loop, objectives, key, foresee)
         return cast_floats(carry._replace(control=FixedStepControl(carry.k, carry.k)), self.h.dtype)
 
     def step(self, loop: Loop, objectives: Objectives, key: Key, carry: Carry, until: Scalar = None) -> Carry:
@@ -137,9 +149,8 @@ class FixedStepping:
         return propose_step(self, system, carry, carry.k + 1, frozen=system.program is not None)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
-        """Return nothing: fixed steps need no forecast from `seen` for the run of `carry`."""
-        del carry, seen
-        return ()
+        """Return the `Outlook` from `seen` for the run of `carry` if the method `watches`, and else nothing."""
+        return look_ahead(carry.status == RunStatus.REFRESHING, seen) if self.watches else ()
 
     def report(
         self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
@@ -149,7 +160,11 @@ class FixedStepping:
         `h` is the length of the attempt. The `state` and the shares of the `error` have no influence.
         """
         del state, error
-        return FixedStepReport(find_surface_crossing(seen, carry.search.which, h) if system.program else None)
+        surface, grazes = find_surface_crossing(seen, carry.search.which, h) if system.program else None, False
+        if self.watches:
+            turns = watch_margins(carry, h, seen, system.bit_count)
+            grazes = turns.grazes | (turns.time_since > 0)
+        return FixedStepReport(surface, jnp.asarray(grazes))
 
     def decide(
         self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
@@ -184,6 +199,9 @@ class FixedStepping:
             status = jnp.where(becomes_unrestricted, RunStatus.RUNNING, status)
         most = (EVENT_ATTEMPTS_PER_STEP + CROSSING_ATTEMPTS_PER_STEP) * self.steps + SPARE_ATTEMPTS
         lost = (~decision.fine & (carry.unrestricted if system.program else True)) | (extra > most)
+        if self.watches:
+            grazes = attempt.report.grazes & (decision.taken | decision.searches)
+            status = jnp.where(unrestricted, RunStatus.SLID, jnp.where(grazes, RunStatus.GRAZED, status))
         strikes = status == RunStatus.RUNNING
         length = jnp.where(strikes, self.h - after.since, jnp.where(status == RunStatus.REFRESHING, 0.0, after.length))
         return after._replace(

@@ -95,7 +95,7 @@ class ReplayStepping:
 
     live: AdaptiveStepping
     entry: StepLog | None = None
-    has_margin_rates, searches, second_order = True, False, False
+    has_margin_rates, searches, smooth, second_order = True, False, False, False
 
     @property
     def tableau(self) -> Tableau:

@@ -1,6 +1,7 @@
 """Status of a run: running, searching for an event, or over, and the reason."""
 
 import enum
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +26,11 @@ class RunStatus(enum.IntEnum):
         STOPPED: The run is over and has reached its stop.
         TIMED_OUT: The run is over because its duration has passed.
         DIVERGED: The run is over because its numbers are invalid.
+        SLID: The run is over because it slides along a switching surface; only of a method that `watches`.
+        GRAZED: The run is over because a margin only touches zero; only of a method that `watches`.
     """
 
-    RUNNING, SEEKING, PROBING, REFINING, LANDING, REFRESHING, STOPPED, TIMED_OUT, DIVERGED = range(9)
+    RUNNING, SEEKING, PROBING, REFINING, LANDING, REFRESHING, STOPPED, TIMED_OUT, DIVERGED, SLID, GRAZED = range(11)
 
 
 def is_running(carry: PyTree) -> Bool:
@@ -60,11 +63,15 @@ def status_after_step(loop: Loop, carry: PyTree, attempt: PyTree, decision: PyTr
         attempt: The attempt.
         decision: Decision on it.
     """
-    left, start = jnp.abs(attempt.point.margins["stop"][0]), carry.point.margins["stop"][0]
-    near = left <= MAX_MISSED_FRACTION * (start + jnp.abs(carry.search.at_full))
-    landed = jnp.where(near, RunStatus.STOPPED, RunStatus.DIVERGED)
+    before, after, stops = (one["stop"] for one in (carry.point.margins, attempt.point.margins, decision.triggered))
+    at_full = jnp.abs(carry.search.at_full)
+    misses = [
+        stop & ~(jnp.abs(b) <= MAX_MISSED_FRACTION * (a + at_full))
+        for a, b, stop in zip(before, after, stops, strict=True)
+    ]
+    landed = jnp.where(reduce(jnp.logical_or, misses), RunStatus.DIVERGED, RunStatus.STOPPED)
     further = jnp.asarray(RunStatus.RUNNING)
     if not loop.ticks:
         changed = jnp.any(jnp.stack([decision.crosses_surface, *jax.tree.leaves(decision.triggered)]))
         further = jnp.where(changed, RunStatus.REFRESHING, RunStatus.RUNNING)
-    return jnp.where(decision.triggered["stop"][0], landed, jnp.where(decision.over, RunStatus.TIMED_OUT, further))
+    return jnp.where(reduce(jnp.logical_or, stops), landed, jnp.where(decision.over, RunStatus.TIMED_OUT, further))

@@ -24,6 +24,7 @@ TWO_STEP_RATIO = 1.2  # ratio to the present length: a nearer switching surface 
 CLOCK_REACH_FRACTION = 0.99  # fraction of the time to a clock's instant: a longer step ends on the instant
 STABILITY_RADIUS = 3.0  # the longest step is this number divided by the spectral radius
 POWER_ITERATIONS, MIN_NORM = 12, 1e-20
+MAX_UNROLLED_STATES = 12  # numbers of a flow: the Jacobian of a larger one is not written out
 MIN_CROSSING_STEP_FRACTION = 4e-3  # fraction of the length that the error allows: the shortest step to a crossing
 
 
@@ -107,25 +108,31 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
         at = state.with_flow(unflatten(flow))
         return ravel_pytree(loop.flow(t, at, loop.signals(t, at)))[0]
 
-    moves = jnp.eye(size.size, dtype=size.dtype) * size
-    columns = jax.vmap(lambda one: jax.jvp(rates, (flow,), (one,))[1])(moves) / size
-    # Scalars instead of a matrix product: for such small sums XLA on a CPU calls a library, at ten times the cost.
-    rows = [[columns[j, i] for j in range(size.size)] for i in range(size.size)]
+    written_out, rows = size.size <= MAX_UNROLLED_STATES, []
+    if written_out:
+        moves = jnp.eye(size.size, dtype=size.dtype) * size
+        columns = jax.vmap(lambda one: jax.jvp(rates, (flow,), (one,))[1])(moves) / size
+        # Scalars instead of a matrix product: for such small sums XLA on a CPU calls a library, at ten times the cost.
+        rows = [[columns[j, i] for j in range(size.size)] for i in range(size.size)]
 
     def longest(vector: list[PyTree]) -> Any:
-        return reduce(jnp.maximum, map(jnp.abs, vector)) + MIN_NORM
+        return reduce(jnp.maximum, (jnp.max(jnp.abs(x)) if x.ndim else jnp.abs(x) for x in vector)) + MIN_NORM
 
     def multiply(at: tuple[list[PyTree], PyTree], counts: Int) -> tuple[tuple[list[PyTree], PyTree], None]:
         vector, log = at
         norm = longest(vector)
         vector = [x / norm for x in vector]
-        vector = [sum(a * x for a, x in zip(row, vector, strict=True)) for row in rows]
+        if written_out:
+            vector = [sum(a * x for a, x in zip(row, vector, strict=True)) for row in rows]
+        else:
+            vector = [jax.jvp(rates, (flow,), (vector[0] * size,))[1] / size]
         return (vector, log + counts * jnp.log(norm)), None
 
     # A scan instead of an unrolled loop: XLA would compute the matrix again in each round.
     half = POWER_ITERATIONS // 2
     # The growth is averaged over the second half of the iterations, after the first half has aligned the vector.
     later = jnp.asarray(np.arange(POWER_ITERATIONS) > half, t.dtype)
+    begin = list(jnp.ones_like(size)) if written_out else [jnp.ones_like(size)]
     # Logarithms: a product of the norms of a stiff loop would overflow single precision.
-    vector, log = jax.lax.scan(multiply, (list(jnp.ones_like(size)), 0.0 * t), later)[0]
+    vector, log = jax.lax.scan(multiply, (begin, 0.0 * t), later)[0]
     return STABILITY_RADIUS * jnp.exp(-(log + jnp.log(longest(vector))) / half)

@@ -101,6 +101,16 @@ class LoopSystem(NamedTuple):
             return _evaluate_loop(moving, fixed)[:2]
         return self.program(lambda seen: seen[:2], moving, fixed, mode)
 
+    def list_margins(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> list[Scalar]:
+        """Return the margins of comparisons and then of events at time `t`, `state` and `accumulators` in a `mode`."""
+        z, held = split_flow_and_held(state, accumulators)
+        moving, fixed = (t, *z), (held, self.loop, self.objectives)
+        if self.program is None:
+            return jax.tree.leaves(_evaluate_loop(moving, fixed).margins)
+        # The rates are asked for, because they depend on all comparisons.
+        seen, answers = self.program.look(lambda seen: (seen.margins, seen[:2]), moving, fixed, mode)
+        return [margin for _, margin in answers.margins] + jax.tree.leaves(seen[0])
+
     def evaluate(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> Evaluation:
         """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`."""
         z, held = split_flow_and_held(state, accumulators)

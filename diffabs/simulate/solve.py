@@ -1,0 +1,784 @@
+"""Solutions of any field, with events; undeclared switches of the field are located, as in every run.
+
+    dy/dt = field(t, y, args),  y(t0) = y0
+    where condition(t, y, args) falls through zero:  y <- reset(t, y, args), or the solution ends
+
+The engine of `run` makes the run of a `FieldLoop` in the time s = (t - t0)/(t1 - t0) from 0 to 1:
+
+    dy/ds = (t1 - t0) field(t0 + (t1 - t0) s, y, args)
+
+So one program serves every span, t0 and t1 have derivatives, and time may run backwards.
+
+Where an event happens its condition is zero, and rounding decides its sign. If the condition rises after the event, as
+at a bounce, the next fall is an event again. If it falls on, it must rise through zero first. A small constant, the
+lift, is added to the condition up to its next event and makes its sign agree.
+
+Some runs have no right answer, or none that could be computed: `SolutionStatus` names them, and every number of such a
+solution is NaN.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.extend.core as jex
+import jax.numpy as jnp
+import numpy as np
+from jax._src.source_info_util import summarize  # JAX has no public function that names the line of an operation
+from jax.core import Tracer
+
+from diffabs.core import kinds
+from diffabs.core.cubic import Cubic
+from diffabs.core.lanes import any_lane, select
+from diffabs.core.loop import LoopState, Margins, Signals
+from diffabs.core.protocols import Clock, Ending, Memory, Sample, Segment
+from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
+from diffabs.core.types import AnyArray, Array, Bool, PyTree, Scalar
+from diffabs.simulate.arguments import build_stepping, find_invalid_fields
+from diffabs.simulate.drive.engine import EngineError, resolve_request
+from diffabs.simulate.drive.loops import log_run, round_up_capacity
+from diffabs.simulate.run import RunCapacity, run_differentiable
+from diffabs.simulate.step.adaptive import AdaptiveStepping
+from diffabs.simulate.step.comparisons import SwitchedProgram
+from diffabs.simulate.step.fixed import FixedStepping
+from diffabs.simulate.step.replay import log_attempt, log_capacity
+from diffabs.simulate.step.status import RunStatus
+from diffabs.simulate.step.system import UNCONSTRAINED, build_system
+from diffabs.simulate.types import Adaptive, FixedStep, Solver
+
+MAX_EVENTS = 24  # kinds of events of a solution: the log of a run has one bit for each
+# Fractions of the span. A landing is at most `LANDING_FRACTION` from the zero of its condition. Events that follow
+# each other within it have no end, after `MAX_QUICK_EVENTS` of them. A save belongs to the step after an event that
+# is not `COINCIDENCE_FRACTION` later.
+LANDING_FRACTION, MAX_QUICK_EVENTS, COINCIDENCE_FRACTION = 1e-7, 8, 1e-10
+# The lift: time in which the condition moves as far, as a fraction of the span, and multiples of the rounding.
+LIFT_FRACTION, LIFT_EPS = 1e-12, 32
+
+MAX_ACCEPTED = 256  # functions that are known to be valid
+_accepted: dict[Any, "Function"] = {}
+SWITCH_SOLVER = Adaptive(1e-6)
+
+Field = Callable[..., PyTree]  # of (t, y, args)
+
+
+class SolutionStatus(enum.IntEnum):
+    """How a solution ended; up to `TERMINATED`, its numbers are valid.
+
+    Attributes:
+        FINISHED: It reached t1.
+        TERMINATED: A terminal event ended it.
+        DIVERGED: A number is not finite, or the steps would be too many.
+        SLID: It slides along a switching surface of the field, or crosses surfaces ever faster.
+        CROWDED: Events follow each other without end, as the bounces of a ball that comes to rest.
+        GRAZED: A switching surface or the zero of a condition is only touched, or a condition jumps.
+    """
+
+    FINISHED, TERMINATED, DIVERGED, SLID, CROWDED, GRAZED = range(6)
+
+
+@dataclasses.dataclass(frozen=True)
+class Event:
+    """An event where a condition falls through zero.
+
+    Attributes:
+        condition: Function of (t, y, args): a continuous number. It falls along the run, so backwards in time if
+            t1 < t0. A start at exactly zero counts as positive.
+        reset: Function of (t, y, args) that returns the state after the event; None leaves the state.
+        terminal: True if the event ends the solution, without a reset.
+    """
+
+    condition: Field
+    reset: Field | None = None
+    terminal: bool = False
+
+
+class Switch(NamedTuple):
+    """A comparison in a field that depends on time or state.
+
+    Attributes:
+        source: File and line of the comparison.
+        operation: What JAX calls it: `gt`, `max`, `abs`, `clamp`, `searchsorted`.
+        margin: Difference of its two sides, an array for a comparison of arrays; zero where the answer changes. For a
+            search in knots, the distance to the nearest one.
+        flips: Times at which an answer changes in a run; () without a run.
+    """
+
+    source: str
+    operation: str
+    margin: Array
+    flips: tuple[float, ...]
+
+
+class SolutionEvents(NamedTuple):
+    """The events of a solution, in the order of the argument `events`.
+
+    Attributes:
+        times: Times of the first events of each kind, shape (events, kept), differentiable; NaN where there is none.
+        counts: Number of events of each kind, shape (events,), integers.
+    """
+
+    times: Array
+    counts: Array
+
+
+class Solution(NamedTuple):
+    """The solution of a field.
+
+    Attributes:
+        t: Time at the end, or the times `save`. A terminal event ends a solution before t1.
+        y: State there, with an axis for the times in front of each leaf if there is `save`. An event at a save time is
+            over there. After a terminal event the last state is repeated. NaN unless the status is valid.
+        events: Times and counts of the events.
+        status: A `SolutionStatus`, as an integer.
+    """
+
+    t: Array
+    y: PyTree
+    events: SolutionEvents
+    status: Array
+
+
+class EventMemory(NamedTuple):
+    """Held memory of the events that do not end a solution.
+
+    Attributes:
+        counts: Number of events of each kind, shape (events,), as floats.
+        times: Times of the first ones in units of the span, shape (events, kept).
+        lifts: Numbers that are added to the conditions, shape (events,).
+        last: Time of the last event in units of the span.
+        quick: Number of events that followed their predecessor at once.
+        fault: `SolutionStatus` that ends the run, as a float; 0 for none.
+    """
+
+    counts: Array
+    times: Array
+    lifts: Array
+    last: Scalar
+    quick: Scalar
+    fault: Scalar
+
+
+class FieldOutput(NamedTuple):
+    """The signals of a field: no first signal whose error would count, and the state."""
+
+    nothing: Scalar
+    y: PyTree
+
+
+@dataclasses.dataclass(frozen=True)
+class Function:
+    """A function of the user, of (t, y, args): equal to another one of the same function.
+
+    Attributes:
+        key: The function, or its identity if it has no hash; the other attributes follow from it.
+        call: The function, of (t, y, args), or of (t, y, args, constants) with the constants of its closure.
+        place: Place of its constants in the list of all; None if it closes over nothing that is traced.
+    """
+
+    key: Any
+    call: Callable = dataclasses.field(compare=False)
+    place: int | None = None
+
+    def __call__(self, t: Scalar, y: PyTree, args: PyTree, constants: list[PyTree]) -> Any:
+        """Return the result at (`t`, `y`, `args`), with the type of `t`, and the `constants` of all functions."""
+        found = self.call(t, y, args) if self.place is None else self.call(t, y, args, constants[self.place])
+        return jax.tree.map(lambda x: jnp.asarray(x, t.dtype), found)
+
+
+class FieldCode(NamedTuple):
+    """The functions of a solution.
+
+    Attributes:
+        field: The field.
+        events: The events, whose functions are `Function`s, too.
+    """
+
+    field: "Function"
+    events: tuple[Event, ...]
+
+    @property
+    def inner(self) -> list[Event]:
+        """The events that do not end the solution."""
+        return [one for one in self.events if not one.terminal]
+
+    @property
+    def terminal(self) -> list[Event]:
+        """The events that end the solution."""
+        return [one for one in self.events if one.terminal]
+
+
+@pytree
+class FieldPlant:
+    """The plant of a `FieldLoop`: its state is the state of the field."""
+
+    def project(self, state: PyTree) -> PyTree:
+        """Return the state."""
+        return state
+
+    def output(self, state: PyTree) -> FieldOutput:
+        """Return the signals in a state."""
+        return FieldOutput(0.0, state)
+
+
+@pytree
+class FieldLoop:
+    """A field with its events, as the engine reads a loop (`core.loop.Loop`), in the time s.
+
+    Attributes:
+        given: Pytree of y0, t0, span = t1 - t0, args, and the constants of the functions.
+        code: The functions.
+        kept: Number of times that are kept of each event.
+    """
+
+    given: dict[str, PyTree] = part()
+    code: FieldCode = static()
+    kept: int = static()
+    plant = FieldPlant()
+    ticks, jumps, recorders = False, True, ()
+
+    @property
+    def changes(self) -> bool:
+        """Whether there are events that do not end the solution."""
+        return bool(self.code.inner)
+
+    @property
+    def eventful(self) -> bool:
+        """Whether there are events."""
+        return bool(self.code.events)
+
+    def start(self) -> LoopState:
+        """Return the state at t0."""
+        y0, zero = self.given["y0"], jnp.zeros_like(self.given["t0"])
+        count = len(self.code.inner)
+        none = jnp.zeros(count, zero.dtype)
+        times = jnp.full((count, self.kept), jnp.nan, zero.dtype)
+        held = EventMemory(none, times, none, zero - 1.0, zero, zero)
+        return LoopState(y0, Memory(), Memory(), Memory((), held), Memory())
+
+    def signals(self, t: Scalar, state: LoopState) -> Signals:
+        """Return the signals at the time `t` in units of the span, in `state`: nothing but the state of the field."""
+        zero = jnp.zeros_like(jnp.asarray(t))
+        sample = Sample(t, FieldOutput(zero, state.plant), *(5 * [zero]))
+        nothing: Any = ()
+        return Signals(sample, nothing, nothing, {})
+
+    def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[PyTree, ...]:
+        """Return d(state.flow())/ds; NaN after a fault, which ends the run."""
+        del signals
+        rate = self._rate(t, state.plant)
+        if self.changes:
+            rate = select(
+                state.controller.held.fault > 0, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), rate), rate
+            )
+        return rate, (), (), (), ()
+
+    def margins(self, t: Scalar, state: LoopState, signals: Signals, flow: Callable[[], PyTree]) -> Margins:
+        """Return the conditions; those of terminal events belong to the stop."""
+        del signals, flow
+        stops = (
+            jnp.ones_like(jnp.asarray(t)),
+            *(self._call(one.condition, t, state.plant) for one in self.code.terminal),
+        )
+        if not self.changes:
+            return {"stop": stops}
+        lifts = state.controller.held.lifts
+        pairs = zip(self.code.inner, lifts, strict=True)
+        own = (self._call(one.condition, t, state.plant) + lift for one, lift in pairs)
+        return {"events": tuple(own), "stop": stops}
+
+    def change(
+        self,
+        clock: Clock,
+        state: LoopState,
+        before: Signals,
+        margins: Margins,
+        fired: Margins,
+        passed: dict[str, PyTree] | None = None,
+    ) -> LoopState:
+        """Return the state after the events that have `fired`, in the order of the argument `events`.
+
+        A reset may turn the condition of a later event negative: then that event happens, too.
+
+        Args:
+            clock: The instant.
+            state: State before the instant.
+            before: Signals before the instant.
+            margins: Margins before the instant.
+            fired: For each margin, whether it has just fallen through zero.
+            passed: The step that ends here, by block; None at the start of a run.
+        """
+        del before
+        if passed is None:  # the start, where no condition has fallen
+            return state
+        happens = fired["events"]
+        return jax.lax.cond(
+            any_lane(jnp.any(jnp.stack(happens))),
+            lambda: self._change(clock.t, state, margins["events"], happens),
+            lambda: state,
+        )
+
+    def _change(self, t: Scalar, state: LoopState, was: Sequence[Scalar], fired: Sequence[Bool]) -> LoopState:
+        y, held = state.plant, state.controller.held
+        moved, happened = False, []
+        for i, (one, happens) in enumerate(zip(self.code.inner, fired, strict=True)):
+            if moved:
+                happens |= (was[i] >= 0) & (self._call(one.condition, t, y) + held.lifts[i] < 0)
+            happened.append(happens)
+            if one.reset is not None:
+                y, moved = select(happens, self._call(one.reset, t, y), y), True
+        each = zip(self.code.inner, happened, fired, was, held.lifts, strict=True)
+        lifts, faults = zip(*(self._arm(t, state.plant, y, *some) for some in each), strict=True)
+        events = jnp.stack(happened)
+        now = jnp.arange(self.kept) == held.counts[:, None]
+        quick = jnp.where(t - held.last < LANDING_FRACTION, held.quick + 1.0, 0.0)
+        quick, last = select(jnp.any(events), (quick, t), (held.quick, held.last))
+        fault = jnp.max(jnp.stack([held.fault, *faults]))
+        fault = jnp.where((fault == 0) & (quick >= MAX_QUICK_EVENTS), float(SolutionStatus.CROWDED), fault)
+        held = EventMemory(
+            held.counts + events,
+            jnp.where(now & events[:, None], t, held.times),
+            jnp.stack(lifts),
+            *(last, quick, fault),
+        )
+        return state._replace(plant=y, controller=Memory((), jax.tree.map(lambda x: jnp.asarray(x, t.dtype), held)))
+
+    def _arm(
+        self, t: Scalar, before: PyTree, y: PyTree, one: Event, happens: Bool, fired: Bool, was: Scalar, lift: Scalar
+    ) -> tuple[Scalar, Scalar]:
+        """Return the lift of an event's condition after an instant, and the fault that ends the run, or 0."""
+        t, before, y = jax.lax.stop_gradient((t, before, y))
+        there, fall = self._follow(one.condition, t, before)
+        # The second derivative, too: it says when a condition that rises is back at zero.
+        moves = (jnp.ones_like(t), self._rate(t, y))
+        (after, rise), (_, bend) = jax.jvp(lambda t, y: self._follow(one.condition, t, y), (t, y), moves)
+        slopes = jax.grad(lambda t, y: self._call(one.condition, t, y), argnums=(0, 1))(t, y)
+        terms = zip(jax.tree.leaves(slopes), jax.tree.leaves((t, y)), strict=True)
+        rounding = LIFT_EPS * jnp.finfo(t.dtype).eps * sum(jnp.sum(jnp.abs(a * b)) for a, b in terms)
+        # The reset leaves the condition, or sets it to zero itself.
+        off = jnp.minimum(jnp.abs(after), jnp.abs(after - there))
+        stays = off <= jnp.maximum(LANDING_FRACTION * jnp.abs(fall), rounding)
+        small = LIFT_FRACTION * jnp.abs(rise) + rounding
+        new = jnp.where(rise > 0, small - after, -small - after)
+        returns = happens & stays & (rise > 0) & (2.0 * rise < -bend * LANDING_FRACTION)
+        # At rest on its zero a condition has no next sign. One that did not fall before its event has jumped.
+        unclear = happens & stays & (LANDING_FRACTION * jnp.abs(rise) <= rounding)
+        jumps = fired & ~(fall < 0)
+        # An earlier event of the list that a later reset makes happen at this instant: there is no order for it.
+        again = ~happens & (was >= 0) & (after + lift < -rounding)
+        fault = jnp.where(again | returns, float(SolutionStatus.CROWDED), 0.0)
+        fault = jnp.where(unclear | jumps, float(SolutionStatus.GRAZED), fault)
+        return jax.lax.stop_gradient(jnp.where(happens, jnp.where(stays, new, 0.0), lift)), fault
+
+    def _call(self, function: Callable, t: Scalar, y: PyTree) -> Any:
+        """Return the result of a function at the time `t` in units of the span."""
+        given = self.given
+        return function(given["t0"] + given["span"] * t, y, given["args"], given["constants"])
+
+    def _rate(self, t: Scalar, y: PyTree) -> PyTree:
+        return jax.tree.map(lambda x: self.given["span"] * x, self._call(self.code.field, t, y))
+
+    def _follow(self, condition: Callable, t: Scalar, y: PyTree) -> tuple[Scalar, Scalar]:
+        """Return a condition and its rate along the field, from the state `y` at `t` on."""
+        moves = (jnp.ones_like(t), self._rate(t, y))
+        return jax.jvp(lambda t, y: self._call(condition, t, y), (t, y), moves)
+
+
+@pytree
+class Saves:
+    """An objective that keeps the state at given times, from the cubic of each step."""
+
+    places: Array = param(unit="1", free=True)  # of the span, shape (n,)
+
+    def start(self, sample: Sample) -> Memory:
+        """Return the first state for each time."""
+        count = len(self.places)
+        return Memory(
+            held=jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (count, *jnp.shape(x))), sample.output.y)
+        )
+
+    def flow(self, memory: Memory, sample: Sample) -> PyTree:
+        """Return no rates."""
+        del memory, sample
+        return ()
+
+    def update(self, memory: Memory, segment: Segment) -> PyTree:
+        """Return the states, with those in the step."""
+        (start, end), rates = (segment.start, segment.end), segment.shown_rates()
+        first, last = (jax.tree.map(lambda rate: segment.h * rate, one.output.y) for one in rates)
+        # Each time is overwritten from step to step up to the one in which it lies, so that an event on it is over.
+        begun = jax.lax.stop_gradient(start.t) <= self.places + COINCIDENCE_FRACTION
+        x = (self.places - start.t) / jnp.where(segment.h > 0, segment.h, 1.0)
+        inside = begun & (jax.lax.stop_gradient(x) <= 2.0)
+
+        def keep(old: Array, a: Array, b: Array, da: Array, db: Array) -> Array:
+            new = jax.vmap(Cubic(a, b, da, db))(x)
+            return jnp.where(jnp.reshape(inside, (-1, *(jnp.ndim(a) * [1]))), new, old)
+
+        return jax.tree.map(keep, memory.held, start.output.y, end.output.y, first, last)
+
+    def value(self, memory: Memory, ending: Ending) -> PyTree:
+        """Return the states."""
+        del ending
+        return memory.held
+
+
+def solve(
+    field: Field,
+    y0: PyTree,
+    t0: Scalar,
+    t1: Scalar,
+    args: PyTree = None,
+    *,
+    solver: Solver,
+    events: Sequence[Event] = (),
+    save: AnyArray | None = None,
+    engine: str = "auto",
+    kept_events: int = 16,
+) -> Solution:
+    """Solve dy/dt = field(t, y, args) from t0 to t1, with events.
+
+    Every comparison in the field that depends on t or y is a switch: steps end where it changes, so that values keep
+    the order of the method, and derivatives are right. `switches` lists them. The function works under `jax.jit`,
+    `jax.vmap` and both modes of differentiation, by y0, t0, t1, args, `save` and whatever the functions close over. It
+    is compiled once for each `field`, so pass parameters by `args`.
+
+    Args:
+        field: Pure function of (t, y, args) that returns dy/dt, with the structure and shapes of y.
+        y0: State at t0, any pytree of real numbers and arrays.
+        t0: Start [unit of time of the field].
+        t1: End; before t0, time runs backwards.
+        args: Anything that the functions need, a pytree of arrays and numbers.
+        solver: `FixedStep` or `Adaptive`. Only `step` or `rtol` is read: t0 and t1 replace the duration, and `save` the
+            stride. Fixed steps are shortened to a whole number.
+        events: Events; several at one instant happen in this order.
+        save: Times between t0 and t1 at which the state is returned, shape (n,); None for the state at the end.
+        engine: "auto" or "xla". No kernel makes solutions.
+        kept_events: Number of times that are kept of each event.
+
+    Returns:
+        The solution. Read its `status`: without a valid one its numbers are NaN.
+
+    Raises:
+        ValueError: An argument is invalid. A switch of the field is no comparison, such as `jnp.floor`. A second
+            derivative is asked of adaptive steps.
+
+    Examples:
+        >>> import diffabs as d
+        >>> heater = lambda t, y, target: jnp.where(y < target, 2.0, -1.0)
+        >>> found = d.solve(lambda t, y, rate: -rate * y, 1.0, 0.0, 2.0, 0.5, solver=d.Adaptive(1e-8))
+        >>> print(f"{found.y:.6f}")
+        0.367879
+    """
+    if resolve_request(engine) == "kernel" and engine == "kernel":
+        raise EngineError.of("a kernel makes a batch of loops; d.solve makes one run, and jax.vmap batches it by XLA")
+    events = tuple(events)
+    if len(events) > MAX_EVENTS:
+        raise ValueError(f"events has {len(events)} entries; at most {MAX_EVENTS} are possible")
+    if not isinstance(kept_events, int) or kept_events < 1:
+        raise ValueError(f"kept_events = {kept_events!r} is no whole number of at least 1")
+    loop, places = _build_loop(field, y0, t0, t1, args, events, save, kept_events)
+    asked: Any = solver
+    method, count = _read_solver(asked, t0, t1, loop.given["t0"].dtype)
+    program = _trace_program(loop)
+    if program.jumps:
+        worst = program.jumps[0]
+        raise ValueError(
+            f"field has the operation '{worst.name}' at {summarize(worst.source)}: its result jumps where no comparison"
+            " changes, so that no step can end there. Write it as comparisons, or as a state that an event resets"
+        )
+    if isinstance(method, AdaptiveStepping) and not program.bit_count and not events:
+        method = dataclasses.replace(method, is_logged=False, watches=False, smooth=True)
+    saves = {} if places is None else {"saves": Saves(places=places)}
+    capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, asked)
+    capacity = RunCapacity(round_up_capacity(capacity), 0, 0, finish_solution)
+    return run_differentiable(capacity, (loop, saves, method, None))
+
+
+def switches(
+    field: Field, t: Scalar, y: PyTree, args: PyTree = None, *, t1: Scalar = None, solver: Adaptive = SWITCH_SOLVER
+) -> list[Switch]:
+    """Return the switches of a field: its comparisons that depend on time or state, and where they flip.
+
+    Args:
+        field: Function of (t, y, args) that returns dy/dt, as in `solve`.
+        t: Time.
+        y: State at that time.
+        args: What the function needs.
+        t1: End of a run from (t, y) whose flips are listed; None for no run.
+        solver: Solver of that run.
+
+    Examples:
+        >>> import diffabs as d
+        >>> found = d.switches(lambda t, y, args: -abs(y), 0.0, 3.0)
+        >>> print(found[0].operation, found[0].margin)
+        abs 3.0
+
+    Raises:
+        ValueError: An argument is invalid or traced.
+    """
+    if _is_traced(t, y, args, t1):
+        raise ValueError("switches lists numbers of one run: call it outside of jit, vmap and grad")
+    end = t if t1 is None else t1
+    loop, _ = _build_loop(field, y, t, end if t1 is not None else float(t) + 1.0, args, (), None, 1)
+    program, zero = _trace_program(loop), jnp.zeros_like(loop.given["t0"])
+    system = build_system(loop, {}, zero, loop.start(), {}, switched=True)
+    seen = system.evaluate(zero, loop.start(), {}, UNCONSTRAINED).surfaces
+    flips = [] if t1 is None else _list_flips(loop, solver)
+    found = []
+    for (first, shape), op in zip(program.places, program.origins, strict=True):
+        bits = range(first, first + int(np.prod(shape)))
+        margins = [one.value for one in seen if int(np.min(one.numbers)) in bits]
+        margin = margins[0] if len(margins) == 1 else min(margins, key=abs)
+        turned = op.queries[0][1]
+        times = tuple(time for time, bit in flips if bit in bits)
+        found.append(Switch(summarize(op.source), op.name, -margin if turned else margin, times))
+    return found
+
+
+def _list_flips(loop: Any, solver: Adaptive) -> list[tuple[float, int]]:
+    """Return time and number of each comparison that changes in a run."""
+    method, _ = _read_solver(solver, 0.0, 1.0, loop.given["t0"].dtype)
+    if not isinstance(method, AdaptiveStepping):
+        raise ValueError(f"solver = {solver} has fixed steps; d.Adaptive is needed")
+
+    @jax.jit
+    def run(loop: Any) -> Any:
+        key: Any = None
+        start = method.start(loop, {}, key)
+        step, renew = partial(method.step, loop, {}, key), partial(method.renew, loop)
+        return log_run(step, renew, log_attempt, start, round_up_capacity(log_capacity(loop, solver)))[1]
+
+    log = run(loop)
+    lands = np.ravel(log.lands)
+    times = np.ravel(loop.given["t0"] + loop.given["span"] * log.t)
+    return [(float(times[i]), int(lands[i])) for i in np.flatnonzero(np.ravel(log.taken) & (lands >= 0))]
+
+
+def _build_loop(
+    field: Field,
+    y0: PyTree,
+    t0: Scalar,
+    t1: Scalar,
+    args: PyTree,
+    events: tuple[Event, ...],
+    save: AnyArray | None,
+    kept: int,
+) -> tuple[Any, Array | None]:
+    """Return the field as a `FieldLoop`, and the times `save` in units of the span.
+
+    Raises:
+        ValueError: An argument is invalid.
+    """
+    _read_times(t0, t1, save)
+    _refuse_leaves("y0", y0)
+    save = jnp.asarray(save) if isinstance(save, list | tuple) else save
+    y0, t0, t1, save = canonical_dtypes((y0, t0, t1, save))
+    if not jax.tree.leaves(y0):
+        raise ValueError("y0 has no number; a state of at least one is needed")
+    span = t1 - t0
+    dynamics, found, constants = _read_functions(field, events, t0, y0, args)
+    given = {"y0": y0, "t0": t0, "span": span, "args": args, "constants": constants}
+    loop = FieldLoop(given=given, code=FieldCode(dynamics, found), kept=kept)
+    return loop, None if save is None else (save - t0) / span
+
+
+def _trace_program(loop: Any) -> SwitchedProgram:
+    """Return the program of the loop's flow, with its comparisons."""
+    program = build_system(loop, {}, jnp.zeros_like(loop.given["t0"]), loop.start(), {}, switched=True).program
+    assert program is not None
+    return program
+
+
+def finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree) -> tuple[Solution, None]:
+    """Return the solution of a run that is over.
+
+    Args:
+        loop: Field with its events.
+        objectives: The states to save, or nothing.
+        carry: Carry of any stepping method at the end of the run.
+    """
+    point, held, t0, span = carry.point, carry.point.state.controller.held, loop.given["t0"], loop.given["span"]
+    known = {
+        RunStatus.TIMED_OUT: SolutionStatus.FINISHED,
+        RunStatus.STOPPED: SolutionStatus.TERMINATED,
+        RunStatus.SLID: SolutionStatus.SLID,
+        RunStatus.GRAZED: SolutionStatus.GRAZED,
+    }
+    status: Any = jnp.asarray(SolutionStatus.DIVERGED.value)
+    for one, meant in known.items():
+        status = jnp.where(carry.status == one, meant.value, status)
+    # A fault of an event ends the run by rates that are NaN.
+    lost: Any = (status == SolutionStatus.DIVERGED) & (held.fault > 0)
+    status = jnp.where(lost, held.fault.astype(status.dtype), status)
+    valid = status <= SolutionStatus.TERMINATED
+
+    def check(x: Array) -> Array:
+        # A product: a selection would give an invalid number the derivative zero.
+        return x * jnp.where(valid, 1.0, jnp.nan).astype(x.dtype)
+
+    t, y = point.t, point.state.plant
+    if objectives:
+        over = objectives["saves"].places > jax.lax.stop_gradient(t) - COINCIDENCE_FRACTION
+        rows = jax.tree.map(lambda x: jnp.expand_dims(over, range(1, 1 + jnp.ndim(x))), y)
+        y = jax.tree.map(jnp.where, rows, y, point.accumulators["saves"].held)
+        t = objectives["saves"].places
+    events = _count_events(loop, carry, status == SolutionStatus.TERMINATED)
+    times = check(t0 + span * events.times)
+    return Solution(check(t0 + span * t), jax.tree.map(check, y), events._replace(times=times), status), None
+
+
+def _count_events(loop: FieldLoop, carry: PyTree, terminated: Bool) -> SolutionEvents:
+    """Return times, in units of the span, and counts of all events in their order."""
+    point, held = carry.point, carry.point.state.controller.held
+    # The condition that has ended the solution is zero to rounding.
+    distances = [jnp.abs(margin) for margin in point.margins["stop"][1:]]
+    last = jnp.argmin(jnp.stack(distances)) if distances else 0
+    never = jnp.full(loop.kept, jnp.nan, point.t.dtype)
+    inner, ends, rows = iter(range(len(loop.code.inner))), iter(range(len(distances))), []
+    for one in loop.code.events:
+        if one.terminal:
+            happens = jnp.asarray(terminated & (last == next(ends)))
+            rows.append((jnp.where(happens, never.at[0].set(point.t), never), happens.astype(point.t.dtype)))
+        else:
+            i = next(inner)
+            rows.append((held.times[i], held.counts[i]))
+    times = jnp.stack([time for time, _ in rows]) if rows else jnp.zeros((0, loop.kept), point.t.dtype)
+    counts = jnp.stack([count for _, count in rows]) if rows else jnp.zeros(0, point.t.dtype)
+    return SolutionEvents(times, counts.astype(int))
+
+
+def _read_times(t0: Scalar, t1: Scalar, save: AnyArray | None) -> None:
+    """Check the times of a solution as far as they are concrete.
+
+    Raises:
+        ValueError: A time is invalid.
+    """
+    for name, x, rank in (("t0", t0, 0), ("t1", t1, 0), ("save", save, 1)):
+        if x is None:
+            continue
+        if line := kinds.find_value_objection(x):
+            raise ValueError(f"{name} = {kinds.format_value(x)} {line}; a time is needed")
+        if len(kinds.value_shape(x)) != rank:
+            needed = "a list of times" if rank else "one time"
+            raise ValueError(f"{name} has shape {kinds.value_shape(x)}; {needed} is needed")
+        if not _is_traced(x) and not np.all(np.isfinite(np.asarray(x, float))):
+            raise ValueError(f"{name} = {kinds.format_value(x)} is not finite")
+    if _is_traced(t0, t1):
+        return
+    if t0 == t1:
+        raise ValueError(f"t1 = {t1} is equal to t0; another time is needed")
+    if save is not None and not _is_traced(save):
+        low, high = sorted((float(t0), float(t1)))
+        outside = [x for x in np.asarray(save, float) if not low <= x <= high]
+        if outside:
+            raise ValueError(f"save has {outside[0]}; times in [{low:g}, {high:g}] are possible")
+
+
+def _refuse_leaves(name: str, tree: PyTree) -> None:
+    """Raise a ValueError for a leaf that is no real number or array of numbers."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if line := kinds.find_value_objection(leaf):
+            raise ValueError(
+                f"{name}{jax.tree_util.keystr(path)} = {kinds.format_value(leaf)} {line}; a number is needed"
+            )
+
+
+def _read_solver(solver: Any, t0: Scalar, t1: Scalar, dtype: Any) -> tuple[FixedStepping | AdaptiveStepping, int]:
+    """Return the stepping method in units of the span, and the number of its steps.
+
+    Raises:
+        ValueError: The solver or a field of it is invalid.
+    """
+    count = 1
+    if isinstance(solver, Adaptive):
+        solver = dataclasses.replace(solver, step=1.0, duration=1.0, every=1)
+    elif not isinstance(solver, FixedStep):
+        raise ValueError(f"solver = {kinds.format_value(solver)} is no solver; d.FixedStep or d.Adaptive is needed")
+    elif _is_traced(t0, t1):
+        raise ValueError("t0 or t1 is traced: d.FixedStep must know the number of its steps; d.Adaptive need not")
+    elif solver.kinks is False:
+        raise ValueError("solver.kinks = False: d.solve locates all switches; leave it out")
+    else:
+        solver = dataclasses.replace(solver, duration=abs(float(t1) - float(t0)), every=1)
+    if lines := list(find_invalid_fields(solver)):
+        raise ValueError("; ".join(lines).replace("solver.duration =", "t1 - t0 ="))
+    if isinstance(solver, FixedStep):
+        count = solver.steps
+        solver = FixedStep(1.0 / count, 1.0, kinks=True)
+    method = dataclasses.replace(build_stepping(solver, dtype), watches=True)
+    return dataclasses.replace(method, is_logged=True) if isinstance(method, AdaptiveStepping) else method, count
+
+
+def _read_functions(
+    field: Field, events: Sequence[Event], t: Scalar, y: PyTree, args: PyTree
+) -> tuple[Function, tuple[Event, ...], list[PyTree]]:
+    """Return the field, the events, and the traced constants of their functions.
+
+    Raises:
+        ValueError: A function or what it returns is invalid, or the field has a switch that cannot be located.
+    """
+    constants: list[PyTree] = []
+    leaves, tree = jax.tree.flatten((t, y, args))
+    given = tree, tuple(map(jax.typeof, leaves))
+
+    def read(function: Any, name: str, like: PyTree) -> Function:
+        if not callable(function):
+            raise ValueError(f"{name} = {kinds.format_value(function)} is no function of (t, y, args)")
+        known = _hashable(function), jax.tree.structure(like), given
+        if known in _accepted:
+            return _accepted[known]
+        program, found = jax.make_jaxpr(function, return_shape=True)(t, y, args)
+        _check_result(name, found, like)
+        if not any(map(_is_traced, program.consts)):
+            while len(_accepted) >= MAX_ACCEPTED:
+                _accepted.pop(next(iter(_accepted)), None)
+            _accepted[known] = Function(_hashable(function), function)
+            return _accepted[known]
+
+        # The compiled programs of the engine know no tracer from outside: the closure becomes an argument.
+        def call(t: Scalar, y: PyTree, args: PyTree, given: PyTree) -> Any:
+            run = jex.jaxpr_as_fun(jex.ClosedJaxpr(program.jaxpr, given))
+            return jax.tree.unflatten(jax.tree.structure(found), run(*jax.tree.leaves((t, y, args))))
+
+        constants.append(list(program.consts))
+        return Function(call, call, len(constants) - 1)
+
+    dynamics, found = read(field, "field", y), []
+    for i, one in enumerate(events):
+        if not isinstance(one, Event):
+            raise ValueError(f"events.{i} = {kinds.format_value(one)} is no d.Event")
+        if one.terminal and one.reset is not None:
+            raise ValueError(f"events.{i} is terminal and has a reset; a terminal event has none")
+        condition = read(one.condition, f"events.{i}.condition", t)
+        reset = None if one.reset is None else read(one.reset, f"events.{i}.reset", y)
+        found.append(Event(condition, reset, one.terminal))
+    return dynamics, tuple(found), constants
+
+
+def _check_result(name: str, found: PyTree, like: PyTree) -> None:
+    """Check that a function returns real numbers with structure and shapes of `like`."""
+    if jax.tree.structure(found) != jax.tree.structure(like):
+        here, there = jax.tree.structure(found), jax.tree.structure(like)
+        raise ValueError(f"{name} returns the structure {here}; {there} is needed")
+    paths = jax.tree_util.tree_leaves_with_path(found)
+    for (path, a), b in zip(paths, jax.tree.leaves(like), strict=True):
+        place = jax.tree_util.keystr(path)
+        if a.shape != b.shape:
+            raise ValueError(f"{name} returns shape {a.shape}{place and f' at {place}'}; {b.shape} is needed")
+        if line := kinds.find_value_objection(a):
+            raise ValueError(f"{name} returns a number that {line}{place and f' at {place}'}; a real one is needed")
+
+
+def _hashable(function: Any) -> Any:
+    try:
+        hash(function)
+    except TypeError:  # a callable with arrays in it: equal to itself only
+        return id(function)
+    return function
+
+
+def _is_traced(*values: PyTree) -> bool:
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(values))

@@ -1,0 +1,145 @@
+"""Margins that cross zero twice within a step, or only touch it: what the signs at both ends of a step do not show.
+
+The cubic from values and rates at both ends stands for a margin within the step. A margin that turns beyond zero has
+two crossings in the step. One that turns near zero has two or none, which rounding and errors decide: it grazes.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.cubic import Cubic, HermiteStep
+from diffabs.core.loop import LoopState
+from diffabs.core.types import Array, Bool, PyTree, Scalar
+from diffabs.simulate.step.attempt import mode_in_step
+from diffabs.simulate.step.status import RunStatus
+from diffabs.simulate.step.system import Evaluation, LoopSystem
+
+# A margin grazes if it turns nearer to zero than this fraction of its greater value at the ends of the step.
+GRAZING_DEPTH_FRACTION = 1e-6
+# Allowed error of the cubic in the middle of a step, as a fraction of the greatest value at both ends and there.
+MARGIN_TOLERANCE = 1e-6
+
+
+class Outlook(NamedTuple):
+    """Margins of comparisons and events at an instant.
+
+    Attributes:
+        margins: Margins, shape (n,); infinite without a margin.
+        rates: Their rates [1/s], shape (n,).
+    """
+
+    margins: Array
+    rates: Array
+
+
+class Turns(NamedTuple):
+    """Where margins turn back within a step, or just beyond a landing.
+
+    Attributes:
+        time_since: Time [s] from the first turn beyond zero to the end of the step; 0 without one.
+        grazes: True if a margin turns so near to zero that errors decide whether it is crossed.
+    """
+
+    time_since: Scalar
+    grazes: Bool
+
+
+def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -> Turns:
+    """Return where margins cross zero twice within a step, which their signs at both ends do not show.
+
+    Args:
+        starts: Margins at the start.
+        ends: Margins at the end.
+        length: Length of the step [s].
+        landing: True for the margin on whose zero the step ends, shape (n,).
+    """
+    # With the sign of the start, each margin is positive before its first crossing.
+    sign = jnp.where(starts.margins < 0, -1.0, 1.0).astype(starts.margins.dtype)
+    a, b, da, db = (sign * x for x in (starts.margins, ends.margins, length * starts.rates, length * ends.rates))
+    cubic = Cubic(a, b, da, db)
+    c1, c2, c3 = cubic.coefficients()
+    square = c2 * c2 - 3.0 * c1 * c3
+    bend = c2 + jnp.sqrt(jnp.where(square > 0, square, 0.0))
+    place = -c1 / jnp.where(bend > 0, bend, jnp.inf)
+    inside = (square > 0) & (bend > 0) & (place > 0) & (place < 1) & (b >= 0) & ~landing
+    lowest, most = cubic(place), jnp.maximum(jnp.abs(a), jnp.abs(b))
+    touches = inside & (jnp.abs(lowest) <= GRAZING_DEPTH_FRACTION * most)
+    # Beyond a landing the margin is continued as a parabola: its depth is slope^2/(2 curvature).
+    curvature = 2.0 * c2 + 6.0 * c3
+    shallow = landing & (curvature > 0) & (0.5 * db * db <= GRAZING_DEPTH_FRACTION * most * curvature)
+    since = jnp.where(inside & (lowest < 0), (1.0 - place) * length, 0.0)
+    return Turns(jnp.max(since, initial=0.0), jnp.any(touches | shallow))
+
+
+def look_ahead(fresh: Bool, seen: Evaluation) -> Outlook:
+    """Return the margins at an instant.
+
+    Args:
+        fresh: True if the answers to the comparisons were taken anew, so that none is contradicted.
+        seen: Dynamics at the instant.
+    """
+    margins, rates, numbers = _list_margins(seen, 0)
+    # The margin of a new answer has any sign. Within its mode it is positive.
+    surfaces = jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(seen.margins))
+    turned = fresh & surfaces & ((margins < 0) | ((margins == 0) & (rates < 0)))
+    return Outlook(jnp.where(turned, -margins, margins), jnp.where(turned, -rates, rates))
+
+
+def watch_margins(carry: PyTree, h: Scalar, seen: Evaluation, bit_count: int) -> Turns:
+    """Return where margins turn back in an attempt; nowhere during a search, whose lengths are arbitrary.
+
+    Args:
+        carry: Carry before the attempt, with an `Outlook` as its forecast.
+        h: Length of the attempt [s].
+        seen: Dynamics at its end.
+        bit_count: Number of bits of the comparisons; events have the numbers after them.
+    """
+    margins, rates, numbers = _list_margins(seen, bit_count)
+    running, landing = (carry.status == one for one in (RunStatus.RUNNING, RunStatus.LANDING))
+    found = find_turns(_outlook(carry), Outlook(margins, rates), h, landing & (numbers == carry.search.which))
+    return Turns(jnp.where(running, found.time_since, 0.0), (running | landing) & found.grazes)
+
+
+def margin_error(system: LoopSystem, carry: PyTree, h: Scalar, seen: Evaluation, state: LoopState) -> Scalar:
+    """Return the error of the margins' cubics in the middle of an attempt, as a multiple of the allowed one.
+
+    A margin may depend on time alone, which no error of a state shows. The error is 0 without margins, and in a search.
+
+    Args:
+        system: Dynamics of the loop and its objectives.
+        carry: Carry before the attempt, with an `Outlook` in its forecast.
+        h: Length of the attempt [s].
+        seen: Dynamics at its end.
+        state: State at its end.
+    """
+    margins, rates, _ = _list_margins(seen, 0)
+    if margins.size == 1:  # that of a stop which is never reached
+        return jnp.zeros_like(h)
+    point = carry.point
+    step = HermiteStep(point.t, point.t + h, (point.state.flow(), state.flow()), (point.rates[0], seen.rates[0]))
+    middle = point.t + 0.5 * h
+    mode = mode_in_step(system, point.words, carry.unrestricted)
+    there = system.list_margins(middle, point.state.with_flow(step.at(middle)), point.accumulators, mode)
+    there = jnp.concatenate([jnp.ravel(x) for x in there])
+    start = _outlook(carry)
+    most = jnp.maximum(jnp.maximum(jnp.abs(start.margins), jnp.abs(margins)), jnp.abs(there))
+    off = jnp.abs(Cubic(start.margins, margins, h * start.rates, h * rates)(0.5) - there)
+    off = jnp.where(jnp.isfinite(off) & (most > 0), off / jnp.where(most > 0, most, 1.0), 0.0)
+    return jnp.where(carry.status == RunStatus.RUNNING, jnp.max(off) / MARGIN_TOLERANCE, 0.0)
+
+
+def _outlook(carry: PyTree) -> Outlook:
+    forecast = carry.point.forecast
+    return forecast if isinstance(forecast, Outlook) else forecast[1]
+
+
+def _list_margins(seen: Evaluation, bit_count: int) -> tuple[Array, Array, Array]:
+    """Return margins, rates and numbers of the comparisons and then of the events, each of shape (n,)."""
+    surfaces = [(one.value, one.rate, one.numbers) for one in seen.surfaces]
+    values, rates = (jax.tree.leaves(tree) for tree in (seen.margins, seen.margin_rates))
+    events = [(*pair, bit_count + i) for i, pair in enumerate(zip(values, rates, strict=True))]
+    columns = zip(*surfaces, *events, strict=True)
+    margins, rates, numbers = (jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in column]) for column in columns)
+    return margins, rates, numbers
