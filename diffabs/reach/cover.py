@@ -47,9 +47,9 @@ class BoxProof(NamedTuple):
     Attributes:
         verdict: proved, refuted or undecided.
         bounds: Proved range (low, high) of each quantity over the box; infinite ends where nothing is proved.
-        cells: CellBounds that are proved, shape (cells, parameters, 2).
+        cells: Cells that are proved, shape (cells, parameters, 2).
         rows: Bounds of these cells.
-        left: CellBounds that are not, shape (cells, parameters, 2).
+        left: Cells that are not, shape (cells, parameters, 2).
         refuting: Cell that refutes a claim, or None.
         failure: Why most of the last cells that failed did, or an empty text.
         tried: Number of cells that were tried.
@@ -114,6 +114,7 @@ def prove_box(
     sides = box[:, 1] - box[:, 0]
     quantities = _Quantities(prover.signals)
     left, done, rows, refuting, tried, fitting, failure = box[None], [], [], None, 0, math.inf, ""
+    suspects = [point for point in suspects if ((box[:, 0] <= point) & (point <= box[:, 1])).all()]
     if suspects:
         points = np.repeat(np.asarray(suspects, float)[:, :, None], 2, 2)
         refuting = _find_violation(quantities, claims, points, prover.prove(points, threads))

@@ -33,6 +33,7 @@ FAILURES = (
     "a set of states grows too wide",
     "the stop's margin may rise near the end",
     "a run needs too many steps",
+    "a run may have ended at its start",
 )  # in the order of `Why` in prove.cpp
 WEIGHT_TABLES = 400  # parts of the range of speeds, or of the horizon, with weights of their own
 SPEED_SHARE = 8  # weight of the slip over that of the speed, which drifts: the couplings of a period say too much of it
@@ -122,7 +123,8 @@ class CellBounds(NamedTuple):
     """Proved bounds of cells of parameters, one row for each.
 
     Attributes:
-        status: 1 if every run of the cell ends, 2 if it is proved up to the horizon, 0 if nothing is proved.
+        status: 1 if every run of the cell ends, 2 if it is proved up to the horizon (to 1e-12 of it), 0 if nothing is
+            proved.
         time: Stop time, low and high [s].
         distance: Stop distance, low and high [m].
         least: Lower bounds of the signals.
@@ -191,6 +193,11 @@ class Prover:
         kept, passing, quadratures = arrange_states(e, self.signals)
         order = [*kept, *passing, *quadratures]
         place = {state: i for i, state in enumerate(order)}
+        if e.paced and place[e.clock] < len(kept) + len(passing):
+            raise NoRule("a continuous loop of a braked wheel that reads the time")
+        for operation in e.operations:
+            if operation.name == "clamp" and any(e.operations[x].name != "const" for x in operation.args[1:] if x >= 0):
+                raise NoRule("a limit that is not a number")
         self._kept, self._clockwork = len(kept), [place[i] for i in clockwork_states(e, kept)]
         moving = len(kept) + len(passing)
         roots = {
@@ -252,12 +259,17 @@ class Prover:
 
         Args:
             cell: Ends of each parameter in SI units, shape (parameters, 2).
-            steps: Greatest number of steps that are returned.
+            steps: Greatest number of steps.
+
+        Raises:
+            ValueError: The cell is not proved, or has more steps.
         """
         n, lanes = len(self.signals), library().lanes()
         trail = np.full((steps, lanes, 2 + 2 * n), np.nan)
         out = np.zeros((1, self._width))
         count = self._call(np.ascontiguousarray(cell, float)[None], out, trail=trail)
+        if not out[0, 0] or count == steps:
+            raise ValueError(f"the cell {np.asarray(cell).tolist()} is not proved in {steps:,} steps")
         rows = trail[:count, 0][np.isfinite(trail[:count, 0, 0])]
         ends = rows[:, :2]
         begins = np.concatenate([np.zeros((1, 2)), ends])[: len(ends), 0]
@@ -387,13 +399,14 @@ def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], lis
         NoRule: A tick changes a state that the stop reads.
     """
     asked = _reads(e, [e.margin])[0]
-    live = _reads(e, [e.margin, *(e.signals[name] for name in signals)])[0]
+    integrals = [i for i in (e.travelled, e.clock if e.paced else -1) if i >= 0]
+    live = _reads(e, [e.margin, *(e.signals[name] for name in signals), *(e.flow[i] for i in integrals)])[0]
     while True:
         more = live | _reads(e, [root for i in live for root in (e.flow[i], *((e.tick[i],) if e.tick else ()))])[0]
         if more == live:
             break
         live = more
-    quadratures = [i for i in (e.travelled, e.clock if e.paced else -1) if i >= 0 and i not in live]
+    quadratures = [i for i in integrals if i not in live]
     if not e.tick:
         return sorted(live), [], quadratures
     for i in asked:

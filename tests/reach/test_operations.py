@@ -22,7 +22,7 @@ def intervals(rng: np.random.Generator, count: int, low: float = -8, high: float
 
 @pytest.mark.parametrize("count", [5_000, pytest.param(50_000, marks=pytest.mark.slow)], ids=["few", "many"])
 @pytest.mark.parametrize("name", ["add", "sub", "mul", "inv"])
-@killed_by("reach/native/prove.cpp", "double* out) {\n  round_upward();\n  for", "double* out) {\n  for")
+@killed_by("reach/native/prove.cpp", "double* out) {\n  Upward upward;\n  for", "double* out) {\n  for")
 @killed_by(
     "reach/native/interval.h",
     "  none |= ~fine;\n  V low = fine ? -a.n : fill(1.0)",

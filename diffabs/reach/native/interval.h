@@ -4,13 +4,13 @@
 // -low is an upper bound of minus the number. No operation here subtracts a bound from a bound of the same side. No
 // function of the C library is trusted: exp, sin, cos and atan are series with a remainder, and log is verified by exp.
 //
-// Compile with -frounding-math -ffp-contract=off. A thread calls `round_upward()` first.
+// Compile with -frounding-math -ffp-contract=off. Every computation lives in the scope of an `Upward`.
 #pragma once
 #include <cfenv>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#if defined(__AVX__)
+#if defined(__SSE2__)
 #include <immintrin.h>
 #endif
 
@@ -45,7 +45,18 @@ inline bool all(M m) { long long x = -1; for (int i = 0; i < LANES; i++) x &= m[
 inline bool any(M m) { long long x = 0; for (int i = 0; i < LANES; i++) x |= m[i]; return x != 0; }
 inline double largest(V a) { double x = a[0]; for (int i = 1; i < LANES; i++) x = a[i] > x ? a[i] : x; return x; }
 inline double least(V a) { double x = a[0]; for (int i = 1; i < LANES; i++) x = a[i] < x ? a[i] : x; return x; }
-inline void round_upward() { std::fesetround(FE_UPWARD); }
+// Upward rounding, with numbers below 1e-308 kept, as long as it lives.
+struct Upward {
+  std::fenv_t before;
+  Upward() {
+    std::fegetenv(&before);
+    std::fesetround(FE_UPWARD);
+#if defined(__SSE2__)
+    _mm_setcsr(_mm_getcsr() & ~0x8040u);
+#endif
+  }
+  ~Upward() { std::fesetenv(&before); }
+};
 
 struct I {
   V n, h;  // -low, high
@@ -188,17 +199,19 @@ inline I atan_of(I x, M& none) {
   none |= ~fine;
   return {atan_at(fine ? -x.n : fill(0.0)).n, atan_at(fine ? x.h : fill(0.0)).h};
 }
-// x^e for x >= 0 and e > 0 in an interval; a lane that may be negative is `none`.
+// max(x, 0)^e for e > 0: 0 where x is negative, as the operation means it.
 inline I power_of(I x, I e, M& none) {
-  M fine = (x.n <= 0) & (e.n < 0);
+  M fine = e.n < 0;
   none |= ~fine;
-  V low = fine ? -x.n : fill(1.0), high = fine ? x.h : fill(1.0);
-  M low0 = low <= 1e-290, high0 = high <= 1e-290;
+  V low = vmax(-x.n, fill(0.0)), high = vmax(x.h, fill(0.0));
+  M tiny_low = (low <= 1e-290) | ~fine, tiny_high = (high <= 1e-290) | ~fine;
   M bad{};
-  I found = exp_of(log_of(span(low0 ? (high0 ? fill(1.0) : high) : low, high0 ? fill(1.0) : high), bad) * e, bad);
+  // A lane without logarithms gets those of 1. Below exp(-690) the power counts as [0, exp(-690)].
+  I logs = log_of(span(tiny_low ? (tiny_high ? fill(1.0) : high) : low, tiny_high ? fill(1.0) : high), bad) * e;
+  M small = logs.low() < -690;
+  I found = exp_of(span(vmax(logs.low(), fill(-690.0)), vmax(logs.h, fill(-690.0))), bad);
   none |= bad;
-  // below 1e-290 the power is at most that of 1e-290
-  V tiny = fill(0.0);
-  if (any(high0 & (high > 0))) tiny = exp_at(vmax((log_of(I(1e-290), bad) * e).h, fill(-690.0))).h;
-  return {low0 ? fill(0.0) : found.n, high0 ? (high == 0 ? fill(0.0) : tiny) : found.h};
+  V tiny = fill(0.0);  // of a number below 1e-290: at most the power of 1e-290
+  if (any(tiny_high & (high > 0))) tiny = exp_at(vmax((log_of(I(1e-290), bad) * e).h, fill(-690.0))).h;
+  return {(tiny_low | small) ? fill(0.0) : found.n, tiny_high ? (high == 0 ? fill(0.0) : tiny) : found.h};
 }

@@ -70,7 +70,7 @@ struct Ending {
 enum Fate { TAKEN, TOO_LONG, NO_SERIES };  // of an attempted step; NO_SERIES: a power at 0 has no such derivative
 
 // Why a lane was lost, in the order of `FAILURES` in engine.py.
-enum Why { NOTHING, NO_VALUE, NEGATIVE, NO_BOX, TOO_WIDE, RISING, TOO_MANY_STEPS };
+enum Why { NOTHING, NO_VALUE, NEGATIVE, NO_BOX, TOO_WIDE, RISING, TOO_MANY_STEPS, ENDED_AT_START };
 
 struct Group {
   const Task& task;
@@ -78,8 +78,11 @@ struct Group {
   const bool sampled;
   const I period_;
   std::vector<int> limits, tick_limits, state_op;
+  bool nested = false;  // a limit of the flow reads another one
   Program flow, tick, starts, stop;
-  Series mid, whole, rest, box, jac, at_tick, at_tick_mid;
+  // mid: at C. whole: over X and C, with slopes. rest: over B, for the remainder. box: over B, for rates. edge: on faces
+  // of B. jac: over B, with derivatives by states and disturbances.
+  Series mid, whole, rest, box, edge, jac, at_tick, at_tick_mid;
   std::vector<Chord> chords, tick_chords;
   Set set;
   std::vector<Row> rows;
@@ -92,7 +95,7 @@ struct Group {
   std::vector<I> now;           // of signals, within the last step
   std::vector<V> above, below;  // every run of the cell goes above, and below, these values of the signals (low, -high)
   std::vector<V> reach;         // greatest half width of the first signal that each parameter causes
-  V pmid[16], phalf[16];
+  std::vector<V> pmid, phalf;   // middle and half width of each parameter
   M alive{}, dead{}, done{}, timed{}, ended{};  // ended: some runs may have ended
   M doomed{};                                   // lanes that the attempted step would lose
   int why[LANES];                               // why a lane was lost
@@ -114,12 +117,14 @@ struct Group {
       : task(t), n((int)t.states), nb((int)t.kept), np((int)t.tape.params), nd(np + nb + (t.period_high > 0 ? MOST_LIMITS : 0)), K((int)t.order),
         sampled(t.period_high > 0), period_(span(fill(t.period_low), fill(t.period_high))), state_op(n, -1),
         flow(t.tape, flow_roots(t)), tick(t.tape, roots(t.tick, t.states)), starts(t.tape, roots(t.start, t.states + t.quadratures)), stop(t.tape, {(int)t.margin}),
-        mid(t.tape, K, 0), whole(t.tape, K, nd), rest(t.tape, K + 1, 0), box(t.tape, 1, 0), jac(t.tape, 0, n + MOST_LIMITS),
+        mid(t.tape, K, 0), whole(t.tape, K, nd), rest(t.tape, K + 1, 0), box(t.tape, 1, 0), edge(t.tape, 1, 0), jac(t.tape, 0, n + MOST_LIMITS),
         at_tick(t.tape, 0, nd), at_tick_mid(t.tape, 0, 0), chords(t.tape.count), tick_chords(t.tape.count),
         set(nb, np), rows(t.quadratures), C(n), J(n * nd), X(n), used(np + nb), B(n), f(n), push(n), remainder(n),
-        top(t.signals), bottom(t.signals), now(t.signals), above(t.signals), below(t.signals), reach(np), end(np, nb) {
+        top(t.signals), bottom(t.signals), now(t.signals), above(t.signals), below(t.signals), reach(np), pmid(np), phalf(np), end(np, nb) {
     for (int i : flow.list) if (is_limit(i)) limits.push_back(i);
     for (int i : tick.list) if (is_limit(i)) tick_limits.push_back(i);
+    for (int i : limits)
+      for (int j : Program(t.tape, {t.tape.a[i]}).list) nested |= is_limit(j);
     for (int i = 0; i < t.tape.count; i++) if (t.tape.code[i] == STATE && t.tape.index[i] < n) state_op[t.tape.index[i]] = i;
     whole.centre = &mid, at_tick.centre = &at_tick_mid;
     mid.chords = whole.chords = rest.chords = jac.chords = chords.data();
@@ -199,7 +204,9 @@ struct Group {
     if (fresh) return;
     mid.natural = whole.natural = true, whole.nd = used;
     set_states(mid, C, false), mid.advance(flow, 0);
-    set_states(whole, X, true), whole.advance(flow, 0);
+    std::vector<I> every(n);
+    for (int i = 0; i < n; i++) every[i] = hull(X[i], C[i]);  // the mean value theorem goes from a point of C to one of X
+    set_states(whole, every, true), whole.advance(flow, 0);
     fresh = true;
   }
 
@@ -233,38 +240,38 @@ struct Group {
     std::vector<I> raw0, raw;
     for (int i : limits) raw0.push_back(whole.value(task.tape.a[i], 0));
     raw = raw0;
-    box.natural = true, box.use_forced = !limits.empty();
-    auto rates = [&](const std::vector<I>& where) {
+    for (Series* one : {&box, &edge}) one->natural = true, one->use_forced = !limits.empty();
+    auto rates_in = [&](Series& at, const std::vector<I>& where, std::vector<I>& to) {
       for (size_t q = 0; q < limits.size(); q++) {
         int i = limits[q];
         Chord& r = chords[i] = chord_over(raw[q], i, whole);
         I relaxed = point(r.lambda) * raw[q] + r.c + symmetric(r.delta);
-        box.forced[i] = task.tape.code[i] == ROUND ? relaxed : hull(clamped(raw[q], lower_limit(whole, i), upper_limit(whole, i)), relaxed);
+        at.forced[i] = task.tape.code[i] == ROUND ? relaxed : hull(clamped(raw[q], lower_limit(whole, i), upper_limit(whole, i)), relaxed);
       }
-      set_states(box, where, false);
-      box.advance(flow, 0);
+      set_states(at, where, false);
+      at.advance(flow, 0);
       M none{};
-      for (int i = 0; i < n; i++) f[i] = box.value(task.flow[i], 0), none |= box.none[task.flow[i]];
-      for (int q = 0; q < task.quadratures; q++) none |= box.none[task.flow[n + q]];
-      if (!limits.empty()) integrate(box, 0), box.advance(flow, 1);
-      for (int i : limits) none |= box.none[task.tape.a[i]];
+      for (int i = 0; i < n; i++) to[i] = at.value(task.flow[i], 0), none |= at.none[task.flow[i]];
+      for (int q = 0; q < task.quadratures; q++) none |= at.none[task.flow[n + q]];
+      if (!limits.empty()) integrate(at, 0), at.advance(flow, 1);
+      for (int i : limits) none |= at.none[task.tape.a[i]];
       return none;
     };
+    auto rates = [&](const std::vector<I>& where) { return rates_in(box, where, f); };
+    std::vector<I> there(n);
     auto moved = [&](int i) {  // where a state may be by h
       I next = X[i] + HH * f[i];
       if (i == s0) next.n = vmin(next.n, fill(0.0));
       return next;
     };
     auto faces_inward = [&](int i) {  // no run crosses the faces of B in direction i: the rates there point inward
-      const std::vector<I> before = f;
       std::vector<I> face = B;
       M ok = mask(true);
       for (bool upper : {false, true}) {
         face[i] = point(upper ? B[i].h : B[i].low());
-        ok &= ~rates(face);
-        ok &= upper ? f[i].h <= 0 : f[i].n <= 0;
+        ok &= ~rates_in(edge, face, there);
+        ok &= upper ? there[i].h <= 0 : there[i].n <= 0;
       }
-      f = before;
       return ok;
     };
     auto wider = [](I x, double share) { return x + symmetric(x.width() * share + 1e-14); };
@@ -289,7 +296,7 @@ struct Group {
         ok &= in;
         raw[q] = pick(in, raw[q], wider(hull(next, raw[q]), 0.1));
       }
-      found = all(ok | ~alive);
+      found = all(ok | ~alive | doomed);
     }
     if (!found) { box_limit = 0.6 * h; return false; }
     for (int again = 0; again < 2; again++) {  // X + [0, h] f(B) holds the runs as well, and is narrower
@@ -301,8 +308,8 @@ struct Group {
     if (any(at_zero)) {
       std::vector<I> face = B;
       face[s0] = I(0.0);
-      M wrong = rates(face);
-      doom(at_zero & (wrong | ~(f[s0].n <= 0) | (C[s0].low() < 0)), NEGATIVE);
+      M wrong = rates_in(edge, face, there);
+      doom(at_zero & (wrong | ~(there[s0].n <= 0)), NEGATIVE);
     }
     rates(B);
     crossing = M{};
@@ -319,8 +326,8 @@ struct Group {
     for (int i : limits) jac.widths[i] = chords[i].delta;
     set_states(jac, B, false);
     for (int i = 0; i < n; i++) if (state_op[i] >= 0) for (int j = 0; j < jac.nd; j++) jac.slope(state_op[i], 0)[j] = I(i == j ? 1.0 : 0.0);
-    jac.advance(flow, 0);
-    if (jac.seeds.size() < limits.size()) doom(crossing, NO_VALUE);
+    jac.advance(flow, 0), jac.spread_none(flow);
+    if (nested || jac.seeds.size() < limits.size()) doom(crossing, NO_VALUE);
     for (int i = 0; i < n + task.quadratures; i++) doom(crossing & jac.none[task.flow[i]], NO_VALUE);
     for (size_t q = 0; q < jac.seeds.size(); q++) {
       V delta = chords[jac.seeds[q]].delta;
@@ -391,10 +398,11 @@ struct Group {
     dead |= doomed & alive, alive &= ~doomed;
     if (!any(alive)) return;
     I power = power_of_step(H, order);
+    M early = time_now().h <= task.horizon;
     for (int s = 0; s < task.signals; s++) {
       I start = whole.value(task.signal[s], 0);
-      // Only while no run of the cell can have ended.
-      M seen = alive & ~ended & ~whole.none[task.signal[s]] & (M)(box.value((int)task.margin, 0).low() > 0);
+      // Only while no run can have ended, or be at the horizon, and not of a chord, which holds no real number.
+      M seen = alive & early & ~ended & ~crossing & ~whole.none[task.signal[s]] & (M)(box.value((int)task.margin, 0).low() > 0);
       above[s] = seen ? vmax(above[s], start.low()) : above[s], below[s] = seen ? vmax(below[s], -start.h) : below[s];
       now[s] = signal_within(task.signal[s], order, h, H, s);
       top[s] = alive ? vmax(top[s], now[s].h) : top[s];
@@ -414,7 +422,6 @@ struct Group {
         J[i * nd + j] = g, w += g.mag();
       }
       C[i] = sum + remainder[i] + push[i];
-      if (i == task.nonnegative) C[i].n = vmin(C[i].n, fill(0.0));  // the run from the centre is never negative, either
       X[i] = meet(C[i] + symmetric(w), B[i]);
       lose(empty(X[i]) | ~((X[i].n < 1e200) & (X[i].h < 1e200)), TOO_WIDE);
     }
@@ -515,7 +522,7 @@ struct Group {
     if (fate == TAKEN) commit(last ? left : I(h), h, order);
     else doomed = M{}, lose(alive, NO_BOX);
     gone = last ? period_ : gone + I(h), about += h;
-    double best = order > 1 ? 0.9 * h * std::pow(excess, -1.0 / (order + 1)) : 1.5 * h;  // the remainder meets the tolerance
+    double best = order > 1 ? 0.9 * h * std::pow(std::fmax(excess, 1e-30), -1.0 / (order + 1)) : 1.5 * h;  // the remainder meets the tolerance
     h_next = std::fmax(task.shortest, std::fmin(best, sampled ? 2 * std::fmax(h, h_next * 0.5) : 2 * h));
     return last || !sampled;
   }
@@ -573,7 +580,7 @@ struct Group {
 
   const double* weights_now() {
     double key = task.speed >= 0 ? std::log(std::fmax(least(alive ? set.c[task.speed] : fill(NEVER)), 1e-3)) : about;
-    double place = (key - task.keys_low) / (task.keys_high - task.keys_low) * task.tables;
+    double place = (key - task.keys_low) / std::fmax(task.keys_high - task.keys_low, 1e-9) * task.tables;
     return task.weights + nb * (long)std::fmin(std::fmax(place, 0), task.tables - 1);
   }
 
@@ -591,21 +598,25 @@ struct Group {
   }
   void renew() {
     M broken{};
-    renew_axes(set, C, J, nd, used, weights_now(), broken);
+    renew_axes(set, C, J, nd, used, weights_now(), task.nonnegative, broken);
     for (int i = 0; i < nb; i++) broken |= ~((vabs(set.c[i]) < 1e200) & (set.r[i] < 1e200));
     lose(broken, TOO_WIDE);
     int first = task.nonnegative >= 0 ? (int)task.nonnegative : 0;
     for (int p = 0; p < np; p++) reach[p] = alive ? vmax(reach[p], vabs(set.G[first * np + p])) : reach[p];
   }
 
-  // Whether all runs have ended, or are at the horizon. The margin reads only states that a tick does not change.
-  void end_runs() {
-    reached = alive ? (task.clock >= n ? rows[task.clock - n].c.low() : elapsed.low()) : reached;
-    open();
+  void look_at_margin() {
     mid.natural = whole.natural = true, whole.nd = used;
     set_states(mid, C, false), mid.advance(stop, 0), set_states(whole, X, true), whole.advance(stop, 0);
+    lose(mid.none[task.margin] | whole.none[task.margin], NO_VALUE);
+  }
+  // Whether all runs have ended, or are at the horizon. The margin reads only states that a tick does not change.
+  void end_runs() {
+    gone = I(0.0);
+    reached = alive ? time_now().low() : reached;
+    open();
+    look_at_margin();
     int m = (int)task.margin;
-    lose(mid.none[m] | whole.none[m], NO_VALUE);
     I margin = whole.value(m, 0);
     M capture = alive & ended & ~end.captured & (margin.mid() <= 0);
     if (any(capture)) {
@@ -613,17 +624,19 @@ struct Group {
       set_(end.margin_c, mid.value(m, 0)), set_(end.margin, margin), set_(end.time_c, elapsed);
       for (int j = 0; j < np + nb; j++) set_(end.margin_slope[j], slope_of(whole, m, 0, j));
       auto take = [&](long q, I& c, std::vector<V>& G, V& R) {
-        if (q < n) return;
-        set_(c, rows[q - n].c);
-        for (int j = 0; j < np; j++) G[j] = capture ? rows[q - n].G[j] : G[j];
-        R = capture ? rows[q - n].R : R;
+        if (q < 0) return;
+        V rest_ = fill(0.0);
+        if (q < n) for (int j = 0; j < nb; j++) rest_ += vabs(set.B[q * nb + j]) * set.r[j];
+        else rest_ = rows[q - n].R;
+        set_(c, q < n ? C[q] : rows[q - n].c);
+        for (int j = 0; j < np; j++) G[j] = capture ? (q < n ? set.G[q * np + j] : rows[q - n].G[j]) : G[j];
+        R = capture ? rest_ : R;
       };
       take(task.clock, end.time_c, end.time_G, end.time_R), take(task.travelled, end.way_c, end.way_G, end.way_R);
       end.captured |= capture;
     }
     M over_ = alive & end.captured & (margin.h < 0);
-    M late = task.clock >= n ? (M)((rows[task.clock - n].c - symmetric(rows[task.clock - n].R)).low() >= task.horizon) : mask(about >= task.horizon - 1e-9);
-    late &= alive & ~over_;
+    M late = alive & ~over_ & (M)(time_now().low() >= task.horizon * (1 - 1e-12));
     timed |= late, done |= over_ | late, alive &= ~(over_ | late);
   }
 
@@ -638,7 +651,7 @@ struct Group {
         double m = 0.5 * (c[0] + c[1]);
         pmid[p][l] = m, phalf[p][l] = std::fmax(c[1] - m, m - c[0]);
       }
-    for (Series* s : {&mid, &rest, &whole, &box, &jac, &at_tick, &at_tick_mid}) set_params(*s, s == &mid || s == &at_tick_mid);
+    for (Series* s : {&mid, &rest, &whole, &box, &edge, &jac, &at_tick, &at_tick_mid}) set_params(*s, s == &mid || s == &at_tick_mid);
     at_tick.natural = at_tick_mid.natural = true, at_tick.nd = np + nb;
     at_tick.widths.clear(), at_tick.seeds.clear(), at_tick.own = -1;
     at_tick_mid.advance(starts, 0), at_tick.advance(starts, 0);
@@ -655,10 +668,13 @@ struct Group {
       set.r[i] = e.mag();
     }
     for (int i = 0; i < n; i++) lose(at_tick.none[task.start[i]], NO_VALUE);
+    if (task.nonnegative >= 0) lose(at_tick.value(task.start[task.nonnegative], 0).low() < 0, NEGATIVE);
     for (int q = 0; q < task.quadratures; q++) rows[q] = {at_tick.value(task.start[n + q], 0), std::vector<V>(np, fill(0.0)), fill(0.0)};
     for (auto* every : {&top, &above, &below, &bottom}) for (auto& x : *every) x = fill(-NEVER);
     for (auto& x : reach) x = fill(0.0);
     open();
+    look_at_margin();
+    lose(~(whole.value((int)task.margin, 0).low() > 0), ENDED_AT_START);
   }
 
   // A lane that is lost goes along as one run of another, so that its numbers stay harmless.
@@ -696,7 +712,8 @@ struct Group {
     I T = end.time(), W = end.way();
     out[0] = fine ? (timed[lane] ? 2 : 1) : 0;
     out[1] = stopped ? -T.n[lane] : 0, out[2] = stopped ? T.h[lane] : INFINITY;
-    out[3] = stopped ? -W.n[lane] : 0, out[4] = stopped ? W.h[lane] : INFINITY;
+    bool moved = stopped && task.travelled >= 0;
+    out[3] = moved ? -W.n[lane] : 0, out[4] = moved ? W.h[lane] : INFINITY;
     out[5] = reached[lane], out[6] = (double)steps, out[7] = (double)across;
     double* signal = out + 8;
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = fine ? -bottom[s][lane] : -INFINITY, signal[1] = fine ? top[s][lane] : INFINITY;
@@ -712,17 +729,17 @@ int lanes() { return LANES; }
 
 // Whether sums, products and quotients are rounded upward as compiled, also those of numbers known at compile time.
 int rounds_upward() {
-  round_upward();
+  Upward upward;
   volatile double third = 3.0, tenth = 0.1;
   V a = fill(1.0) / fill(third), b = fill(tenth) * fill(tenth), c = fill(1.0) + fill(1e-30), d = fill(1.0) / fill(3.0);
-  bool up = a[0] > 0x1.5555555555555p-2 && b[0] > 0x1.47ae147ae147bp-7 && c[0] > 1.0 && d[0] == a[0] && -(fill(-1.0) / fill(third))[0] < a[0];
-  std::fesetround(FE_TONEAREST);
-  return up;
+  V negative = -fill(tenth) * fill(tenth), tiny = fill(1e-300 * tenth) * fill(1e-300 * tenth);
+  return a[0] > 0x1.5555555555555p-2 && b[0] > 0x1.47ae147ae147bp-7 && c[0] > 1.0 && d[0] == a[0] &&
+         -(fill(-1.0) / fill(third))[0] < a[0] && -negative[0] < b[0] && tiny[0] > 0;
 }
 
 // One operation on `count` pairs of intervals, for tests. codes: those of `Code`; out: low and high.
 void apply(int code, long count, const double* a, const double* b, double* out) {
-  round_upward();
+  Upward upward;
   for (long first = 0; first < count; first += LANES) {
     I x(1.0), y(1.0), r(0.0), other;
     for (int l = 0; l < LANES; l++) {
@@ -746,7 +763,6 @@ void apply(int code, long count, const double* a, const double* b, double* out) 
       out[2 * (first + l)] = none[l] ? -INFINITY : -r.n[l], out[2 * (first + l) + 1] = none[l] ? INFINITY : r.h[l];
     }
   }
-  std::fesetround(FE_TONEAREST);
 }
 
 // Proves at most LANES cells, each params x (low, high), into `out`, a row of results for each (`Group::write`).
@@ -754,7 +770,7 @@ void apply(int code, long count, const double* a, const double* b, double* out) 
 // trail, if not null: for each step and each cell its time (low, high) and that of each signal; NaN once a cell is over.
 // Returns the number of rows in scout or trail, which have room for `room` rows.
 long prove(const Task* task, long count, const double* cells, double* out, double* scout, double* trail, long room) {
-  round_upward();
+  Upward upward;
   std::feclearexcept(FE_ALL_EXCEPT);
   const int nb = (int)task->kept, ns = (int)task->signals, width = 9 + 4 * ns + (int)task->tape.params;
   Group g(*task);
@@ -789,7 +805,6 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
   }
   bool sound = !std::fetestexcept(FE_INVALID | FE_OVERFLOW | FE_DIVBYZERO);
   for (int l = 0; l < LANES && l < count; l++) g.write(out + width * l, l, sound);
-  std::fesetround(FE_TONEAREST);
   return written;
 }
 }

@@ -118,6 +118,7 @@ struct Series {
     for (int i : p.order) if (k >= p.lag[i]) once(i, k - p.lag[i], has_value, &Series::values);
     if (nd == 0) return;
     for (int i : p.dorder) if (k >= p.dlag[i]) once(i, k - p.dlag[i], has_slope, &Series::slopes);
+    if (k == 0 && centre) spread_none(p);
     // Once more, operands first: each value is also within the mean value form, and so are the values made from it.
     if (k == 0 && centre) rounds++;
     if (k == 0 && centre) for (int i : p.list) {
@@ -126,6 +127,14 @@ struct Series {
       if (p.dlag[i]) continue;
       slopes(i, 0);
       if (tape->code[i] != STATE && !is_truth(tape->code[i])) refine(i);
+    }
+  }
+  // Marks what is made from numbers that have no value, or no derivative: a factor may come after its function.
+  void spread_none(const Program& p) {
+    for (int i : p.list) {
+      int a = tape->a[i], b = tape->b[i], c = tape->c[i];
+      auto of = [&](int x) { return x < 0 ? M{} : none[x]; };
+      none[i] |= tape->code[i] == SELECT ? of(a) | (yes[a] & of(c)) | (no[a] & of(b)) : tape->code[i] == MEET ? of(a) : of(a) | of(b) | of(c);
     }
   }
   // What does not change in a run is computed once a cell.
@@ -306,7 +315,8 @@ struct Series {
       }
     }
   }
-  bool e_above_one(int i) const { int b = tape->b[i]; return tape->code[b] == MUL && tape->code[tape->b[b]] == POWER && tape->b[b] != i; }
+  // Whether the factor of u^e is e times a power: then u^e is u u^(e-1).
+  bool e_above_one(int i) const { int b = tape->b[i]; return b >= 0 && tape->code[b] == MUL && tape->code[tape->b[b]] == POWER && tape->b[b] != i; }
   std::vector<long> round;  // when a power was computed
   long rounds = 0;
   int own = -1;            // first direction of the clamps' own disturbances

@@ -87,13 +87,14 @@ static void enclose_inverse(const std::vector<V>& Q, std::vector<I>& inv, int n,
 }
 
 // The set of all C + J (p, r, w) with p, r, w in [-1, 1]: p keeps its matrix, r gets new axes, and all else goes into r.
-// J has `nd` columns a row, of which `used` are not 0. The axes are orthogonal in units of 1/weight (powers of 2).
-static void renew_axes(Set& set, const std::vector<I>& C, const std::vector<I>& J, int nd, int used, const double* weight, M& lost) {
+// J has `nd` columns a row, of which `used` are not 0. The axes are orthogonal in units of 1/weight (powers of 2). The
+// state `nonnegative`, if there is one, gets a centre that is not negative.
+static void renew_axes(Set& set, const std::vector<I>& C, const std::vector<I>& J, int nd, int used, const double* weight, long nonnegative, M& lost) {
   const int n = set.n, np = set.np;
   std::vector<I> E(n), inv(n * n);
   std::vector<V> A(n * n);
   for (int i = 0; i < n; i++) {
-    set.c[i] = C[i].mid();
+    set.c[i] = i == nonnegative ? vmax(C[i].mid(), fill(0.0)) : C[i].mid();
     E[i] = C[i] - point(set.c[i]);
     for (int j = 0; j < np; j++) {
       I g = J[i * nd + j];
