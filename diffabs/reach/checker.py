@@ -42,6 +42,7 @@ from diffabs.reach.equations import SLOWEST, Equations, RealOperation
 LIMITED = ("clamp", "round")  # operations that a chord stands for
 PRECISION = 96  # bits
 ORDER = 7  # of the Taylor polynomials
+MOST_COEFFICIENTS = 64  # of a number that does not change
 LOWER_ORDERS = (2, 1)  # where a number has no more derivatives
 TOLERANCE = 1e-9  # radius of a remainder, or of a disturbance's effect, that a step may add to a state
 SHARE = 1e-4  # of a state's own radius, which a remainder may be in addition
@@ -290,8 +291,6 @@ class _Series:
 
     def value(self, i: int, k: int = 0) -> arb:
         """Return coefficient k of operation i."""
-        if k and self.program.static[i]:
-            return ZERO
         known = self.v[i]
         while len(known) <= k:
             self._add_value(i, len(known), known)
@@ -299,8 +298,6 @@ class _Series:
 
     def slope(self, i: int, k: int = 0) -> arb_poly:
         """Return the derivatives of coefficient k of operation i along the directions."""
-        if k and self.program.static[i]:
-            return NO_SLOPE
         known = self.d[i]
         while len(known) <= k:
             self._add_slope(i, len(known), known)
@@ -309,35 +306,81 @@ class _Series:
     def extend(self, roots: Sequence[int], k: int, slopes: bool = False) -> None:
         """Compute coefficient k of operations, or its derivatives, in the order in which another set needed them.
 
-        What is computed does not depend on that order: a number that it lacks is computed when it is asked for.
+        The order saves time and decides nothing: what a rule lacks is computed when it is asked for.
         """
-        plans, key = self.program.plans, (*roots, k, slopes)
+        program, v, d = self.program, self.v, self.d
+        key = (*roots, k, slopes)
         try:
-            for along, i, m in plans.get(key, ()):
-                known = self.d[i] if along else self.v[i]
-                if len(known) == m:
-                    (self._add_slope if along else self._add_value)(i, m, known)
-        except _Undefined:
-            pass  # perhaps of a number that this set does not need
+            for along, i, m in program.plans.get(key, ()):
+                if along:
+                    if len(d[i]) == m:
+                        d[i].append(program.slopes[i](self, m))
+                elif len(v[i]) == m:
+                    x = program.values[i](self, m)
+                    if not x.is_finite():
+                        break
+                    v[i].append(x)
+        except (_Undefined, IndexError):
+            pass  # perhaps this set does not need that number, or needs another one before it
         self.order = []
         for i in roots:
             (self.slope if slopes else self.value)(i, k)
         if self.order:
-            plans[key] = [*plans.get(key, ()), *self.order]
+            program.plans[key] = [*program.plans.get(key, ()), *self.order]
         self.order = None
 
     def _add_value(self, i: int, k: int, known: list[arb]) -> None:
+        self._prepare(i, k, slopes=False)
         x = self.program.values[i](self, k)
         if not x.is_finite():
             raise _Undefined(f"{self.program.operations[i].name}: no finite value")
         known.append(x)
-        if self.order is not None:
+        if self.program.static[i]:
+            known += [ZERO] * MOST_COEFFICIENTS
+        elif self.order is not None:
             self.order.append((False, i, k))
 
     def _add_slope(self, i: int, k: int, known: list[arb_poly]) -> None:
+        self._prepare(i, k, slopes=True)
         known.append(self.program.slopes[i](self, k))
-        if self.order is not None:
+        if self.program.static[i]:
+            known += [NO_SLOPE] * MOST_COEFFICIENTS
+        elif self.order is not None:
             self.order.append((True, i, k))
+
+    def _prepare(self, i: int, k: int, slopes: bool) -> None:
+        """Compute what the rule for coefficient k of operation i reads."""
+        program = self.program
+        o = program.operations[i]
+
+        same = self.slope if slopes else self.value
+        match o.name:
+            case "state":
+                if k:
+                    same(program.flow[program.place[o.value]], k - 1)
+            case "select":
+                same(o.args[2 if self.truth(o.args[0]) else 1], k)
+            case "clamp" | "round":
+                forced = self.forced and not slopes
+                if k if forced else not self.chord(i).slope.is_zero():
+                    same(o.args[0], k)
+            case "power" | "exp" | "log" | "sin" | "cos" | "atan":
+                same(o.args[0], k)
+                if slopes:
+                    self.value(o.args[1], k)
+                elif k:
+                    self.value(o.args[1], k - 1)
+                elif o.name == "power":
+                    self.value(o.args[2], 0)
+            case "const" | "param" | "truth":
+                pass
+            case _:
+                for a in o.args[:1] if o.name == "meet" and (k or slopes) else o.args:
+                    same(a, k)
+                    if slopes and o.name == "mul":
+                        self.value(a, k)
+                if slopes and o.name == "inv":
+                    self.square(i, k)
 
     def width(self, i: int) -> arb:
         """Return the ball of all changes of operation i from the centre of the set, to first order."""
@@ -420,7 +463,8 @@ def _along(direction: int, size: arb) -> arb_poly:
 
 
 def _convolve(x: Sequence[Number], y: Sequence[arb], k: int) -> Number:
-    """Return coefficient k of the product of two series."""
+    """Return coefficient k of the product of two series. Raises IndexError if one has no such coefficient."""
+    x[k], y[k]  # a slice would be shorter without a word
     return sum(map(mul, x[: k + 1], y[k::-1]), ZERO if isinstance(x[0], arb) else NO_SLOPE)
 
 
@@ -433,42 +477,36 @@ def _value_rule(program: _Program, i: int) -> ValueRule:
     o, static = program.operations[i], program.static
     a, b = (*o.args, -1, -1)[:2]
 
-    def convolve(s: _Series, k: int) -> arb:
-        s.value(a, k), s.value(b, k)
-        return _convolve(s.v[a], s.v[b], k)
-
     def product(s: _Series, k: int) -> arb:
         if k == 0:
-            y = _product(s.value(a), s.value(b))
+            y = _product(s.v[a][0], s.v[b][0])
             return y.nonnegative_part() if a == b and y.lower() < 0 else y
         if static[a]:
-            return s.value(a) * s.value(b, k)
+            return s.v[a][0] * s.v[b][k]
         if static[b]:
-            return s.value(a, k) * s.value(b)
-        return convolve(s, k)
+            return s.v[a][k] * s.v[b][0]
+        return _convolve(s.v[a], s.v[b], k)
 
     def inverse(s: _Series, k: int) -> arb:
         if k == 0:
-            if s.value(a).contains(0):
+            if s.v[a][0].contains(0):
                 raise _Undefined("a division by a number that may be 0")
-            return 1 / s.value(a)
-        s.value(a, k), s.value(i, k - 1)
+            return 1 / s.v[a][0]
         return -_convolve(s.v[a][1 : k + 1], s.v[i], k - 1) * s.v[i][0]
 
     def state(s: _Series, k: int) -> arb:
         place = program.place[o.value]
-        return s.value(program.flow[place], k - 1) / k if k else s.start[place]
+        return s.v[program.flow[place]][k - 1] / k if k else s.start[place]
 
     def meet(s: _Series, k: int) -> arb:
-        return s.value(a, k) if k else _common(s.value(a), s.value(b))
+        return s.v[a][k] if k else _common(s.v[a][0], s.v[b][0])
 
     def function(first: Callable[[_Series], arb]) -> ValueRule:
         def rule(s: _Series, k: int) -> arb:
             if k == 0:
                 return first(s)
             if static[b]:
-                return s.value(a, k) * s.value(b)
-            s.value(a, k), s.value(b, k - 1)
+                return s.v[a][k] * s.v[b][0]
             g, u = s.v[b], s.v[a]  # y' = g u'
             return sum((j * u[j] * g[k - j] for j in range(1, k + 1)), ZERO) / k
 
@@ -482,11 +520,11 @@ def _value_rule(program: _Program, i: int) -> ValueRule:
         case "state":
             return state
         case "add":
-            return lambda s, k: s.value(a, k) + s.value(b, k)
+            return lambda s, k: s.v[a][k] + s.v[b][k]
         case "sub":
-            return lambda s, k: s.value(a, k) - s.value(b, k)
+            return lambda s, k: s.v[a][k] - s.v[b][k]
         case "neg":
-            return lambda s, k: -s.value(a, k)
+            return lambda s, k: -s.v[a][k]
         case "mul":
             return product
         case "inv":
@@ -494,21 +532,21 @@ def _value_rule(program: _Program, i: int) -> ValueRule:
         case "clamp" | "round":
             return lambda s, k: s.limit(i, k)
         case "select":
-            return lambda s, k: s.value(o.args[2 if s.truth(a) else 1], k)
+            return lambda s, k: s.v[o.args[2 if s.truth(a) else 1]][k]
         case "meet":
             return meet
         case "power":
-            return function(lambda s: _power(s.value(a), s.value(o.args[2])))
+            return function(lambda s: _power(s.v[a][0], s.v[o.args[2]][0]))
         case "exp":
-            return function(lambda s: s.value(a).exp())
+            return function(lambda s: s.v[a][0].exp())
         case "log":
-            return function(lambda s: s.value(a).log())
+            return function(lambda s: s.v[a][0].log())
         case "sin":
-            return function(lambda s: s.value(a).sin())
+            return function(lambda s: s.v[a][0].sin())
         case "cos":
-            return function(lambda s: s.value(a).cos())
+            return function(lambda s: s.v[a][0].cos())
         case "atan":
-            return function(lambda s: s.value(a).atan())
+            return function(lambda s: s.v[a][0].atan())
 
     def unknown(s: _Series, k: int) -> arb:
         raise NotProved(f"{o.name}: the checker has no such operation")
@@ -527,30 +565,27 @@ def _slope_rule(program: _Program, i: int) -> SlopeRule:
     def state(s: _Series, k: int) -> arb_poly:
         place = program.place[o.value]
         if k:
-            return s.slope(program.flow[place], k - 1) * (ONE / k)
+            return s.d[program.flow[place]][k - 1] * (ONE / k)
         return s.tangents[place] if s.tangents is not None else NO_SLOPE
 
     def product(s: _Series, k: int) -> arb_poly:
         if static[a]:
-            return s.slope(b, k) * s.value(a) + s.slope(a) * s.value(b, k)
+            return s.d[b][k] * s.v[a][0] + s.d[a][0] * s.v[b][k]
         if static[b]:
-            return s.slope(a, k) * s.value(b) + s.slope(b) * s.value(a, k)
-        s.value(a, k), s.value(b, k), s.slope(a, k), s.slope(b, k)
+            return s.d[a][k] * s.v[b][0] + s.d[b][0] * s.v[a][k]
         return _convolve(s.d[a], s.v[b], k) + _convolve(s.d[b], s.v[a], k)
 
     def inverse(s: _Series, k: int) -> arb_poly:  # d(1/a) = -(1/a)^2 da
-        s.slope(a, k)
         return -_convolve(s.d[a], s.square(i, k), k)
 
     def limit(s: _Series, k: int) -> arb_poly:
         chord = s.chord(i)
-        y = NO_SLOPE if chord.slope.is_zero() else s.slope(a, k) * chord.slope
+        y = NO_SLOPE if chord.slope.is_zero() else s.d[a][k] * chord.slope
         return y + _along(*s.seeds[i]) if k == 0 and i in s.seeds else y
 
     def function(s: _Series, k: int) -> arb_poly:  # dy = g du
         if static[b]:
-            return s.slope(a, k) * s.value(b)
-        s.slope(a, k), s.value(b, k)
+            return s.d[a][k] * s.v[b][0]
         return _convolve(s.d[a], s.v[b], k)
 
     match o.name:
@@ -561,11 +596,11 @@ def _slope_rule(program: _Program, i: int) -> SlopeRule:
         case "state":
             return state
         case "add":
-            return lambda s, k: s.slope(a, k) + s.slope(b, k)
+            return lambda s, k: s.d[a][k] + s.d[b][k]
         case "sub":
-            return lambda s, k: s.slope(a, k) - s.slope(b, k)
+            return lambda s, k: s.d[a][k] - s.d[b][k]
         case "neg":
-            return lambda s, k: -s.slope(a, k)
+            return lambda s, k: -s.d[a][k]
         case "mul":
             return product
         case "inv":
@@ -573,9 +608,9 @@ def _slope_rule(program: _Program, i: int) -> SlopeRule:
         case "clamp" | "round":
             return limit
         case "select":
-            return lambda s, k: s.slope(o.args[2 if s.truth(a) else 1], k)
+            return lambda s, k: s.d[o.args[2 if s.truth(a) else 1]][k]
         case "meet":
-            return lambda s, k: s.slope(a, k)
+            return lambda s, k: s.d[a][k]
     return function
 
 
@@ -1224,7 +1259,7 @@ def _without_slopes(series: _Series) -> _Series:
     other = _Series(series.program, series.parameters, series.start)
     for i, static in enumerate(series.program.static):
         if static:
-            other.v[i], other.d[i] = series.v[i], [NO_SLOPE]
+            other.v[i], other.d[i] = series.v[i], [NO_SLOPE] * MOST_COEFFICIENTS
     return other
 
 
