@@ -49,6 +49,7 @@ SHARE = 1e-4  # of a state's own radius, which a remainder may be in addition
 MAX_HALVINGS = 40  # of one given step
 PICARD_TRIES = 40
 SPEED_WEIGHT = 0.125  # of the speed relative to the slip, in the scales of QR for a sampled loop
+BALANCED = 16  # ticks, or steps of a continuous loop, between two choices of the scales of QR
 PIECES = 8  # of a step, for the bounds of a signal
 FASTEST_SLIP = 1.0  # `check_slip_chart` holds for a slip below 1 and a speed above `SLOWEST`
 ZERO, ONE, NO_SLOPE = arb(0), arb(1), arb_poly([])
@@ -700,6 +701,8 @@ class _Check:
 
     def __init__(self, equations: Equations, signals: Iterable[str], cell: Sequence[tuple[float, float]], order: int):
         e, self.order = equations, order
+        if not 1 <= order < MOST_COEFFICIENTS - 2:
+            raise NotProved(f"no polynomial has the order {order}")
         if len(cell) != len(e.params):
             raise NotProved("the cell needs one pair of numbers for each parameter")
         p = self.program = _Program(e, signals)
@@ -721,6 +724,7 @@ class _Check:
         nothing = [ZERO] * self.n
         self.constant_mid = _Series(p, self.mids, nothing)
         self.constant_all = _Series(p, self.all, nothing, halves=self.halves)
+        self.without_slopes = _without_slopes(self.constant_all)
         self.weights = np.ones(self.n)
         self.steps = self.across = 0
         self.elapsed = ZERO  # the independent variable
@@ -814,8 +818,12 @@ class _Check:
         point = self.point(centre, chords=chords)
         whole = self.whole(states, tangents=tangents, centre=point, chords=chords, seeds=seeds)
         for q, i in enumerate(limits):
+            argument = self.program.operations[i].args[0]
             try:
-                chords[i] = self.chord(whole, i, whole.range(self.program.operations[i].args[0]))
+                point.extend([argument], 0)
+                whole.extend([argument], 0)
+                whole.extend([argument], 0, slopes=True)
+                chords[i] = self.chord(whole, i, whole.range(argument))
                 seeds[i] = (first + q, chords[i].width)
             except _Undefined:
                 continue  # an error where the limit is needed
@@ -1010,11 +1018,15 @@ class _Check:
         # What depends on another limit jumps at the start of a step, where the chord of that limit changes.
         nested = {i for i, a in arguments.items() if any(p.operations[j].name == "clamp" for j in p.read_by([a]))}
 
+        inner = [a for i, a in arguments.items() if i not in nested]
+
         def image(
             box: list[arb], ranges: dict[int, arb]
         ) -> tuple[list[arb], dict[int, arb], dict[int, _Chord], _Series]:
             chords = {i: self.chord(whole, i, x) for i, x in ranges.items()}
             series = self.whole(box, chords=chords, forced=True)
+            series.extend(p.flow, 0)
+            series.extend(inner, 1)
             moved = [x + _integral_range(series.value(rate), h) for x, rate in zip(X, p.flow, strict=True)]
             if s >= 0:
                 moved[s] = moved[s].nonnegative_part() if moved[s].lower() < 0 else moved[s]
@@ -1115,12 +1127,13 @@ class _Check:
             chords=chords,
             forced=True,
             seeds=seeds,
-            constants=_without_slopes(self.constant_all),
+            constants=self.without_slopes,
         )
 
         def largest(x: arb_poly, first: int, last: int) -> list[arb]:
             return [x[j].abs_upper() for j in range(first, last)]
 
+        series.extend(p.flow, 0, slopes=True)
         slopes = [series.slope(rate) for rate in p.flow]
         M = [largest(x, 0, n) for x in slopes]
         b = [sum(largest(x, n, n + len(crossed)), ZERO).upper() for x in slopes]
@@ -1185,6 +1198,8 @@ class _Check:
         X = self.box(tangents)
         point, whole, _ = self.relax_limits(p.tick_limits, centre, X, tangents, self.np + self.n)
         try:
+            point.extend(p.tick, 0)
+            whole.extend(p.tick, 0, slopes=True)
             after = [point.value(i) for i in p.tick]
             slopes = [whole.slope(i) for i in p.tick]
             for i in p.tick:
@@ -1327,7 +1342,8 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
             raise NotProved("a sampled loop needs a number of steps between two ticks")
         period, tick = _constant(e.period), 0
         while True:
-            check.balance(e.period)
+            if tick % BALANCED == 0:
+                check.balance(e.period)
             check.do_tick()
             for _ in range(steps):
                 check.advance(period / steps)
@@ -1345,7 +1361,7 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
         raise NotProved("a step's length must be positive")
     number = 0
     while True:
-        if number % 16 == 0:
+        if number % BALANCED == 0:
             check.balance(0.0)
         check.advance(arb(float(steps[min(number, len(steps) - 1)])))
         number += 1
