@@ -45,7 +45,7 @@ ORDER = 7  # of the Taylor polynomials
 MOST_COEFFICIENTS = 64  # of a number that does not change
 LOWER_ORDERS = (2, 1)  # where a number has no more derivatives
 TOLERANCE = 1e-9  # radius of a remainder, or of a disturbance's effect, that a step may add to a state
-SHARE = 1e-4  # of a state's own radius, which a remainder may be in addition
+SHARE = 1e-3  # of a state's own radius, which a remainder may be in addition
 MAX_HALVINGS = 40  # of one given step
 PICARD_TRIES = 40
 SPEED_WEIGHT = 0.125  # of the speed relative to the slip, in the scales of QR for a sampled loop
@@ -1036,25 +1036,33 @@ class _Check:
             }
             return moved, argument, chords, series
 
+        def points_inward(i: int, box: list[arb], chords: dict[int, _Chord]) -> bool:
+            for end, sign in ((box[i].upper(), 1), (box[i].lower(), -1)):
+                face = [end if j == i else x for j, x in enumerate(box)]
+                if not sign * self.whole(face, chords=chords, forced=True).value(p.flow[i]) <= 0:
+                    return False
+            return True
+
         box, ranges = list(X), dict(at_start)
-        for _ in range(PICARD_TRIES):
+        for tries in range(PICARD_TRIES):
             moved, argument, chords, _ = image(box, ranges)
-            if all(b.contains(m) for b, m in zip(box, moved, strict=True)) and all(
-                ranges[i].contains(argument[i]) for i in ranges
-            ):
+            stays = [b.contains(m) or (tries > 0 and points_inward(i, box, chords)) for i, (b, m) in enumerate(zip(box, moved, strict=True))]
+            if all(stays) and all(ranges[i].contains(argument[i]) for i in ranges):
                 break
-            box = [b if b.contains(m) else _wider(_hull(b, m)) for b, m in zip(box, moved, strict=True)]
+            box = [b if kept else _wider(_hull(b, m)) for b, m, kept in zip(box, moved, stays, strict=True)]
             if s >= 0:
                 box[s] = box[s].nonnegative_part() if box[s].lower() < 0 else box[s]
             ranges = {i: x if x.contains(argument[i]) else _wider(_hull(x, argument[i])) for i, x in ranges.items()}
         else:
             raise _StepFails("no box holds the runs of a step")
         # The image holds the runs as well. Where it proves itself once more, its chords are narrower.
-        narrow, narrower = moved, argument
+        narrow = [_common(b, m) for b, m in zip(box, moved, strict=True)]
+        narrower = {i: _common(x, argument[i]) for i, x in ranges.items()}
         again, argument, new_chords, _ = image(narrow, narrower)
-        if all(b.contains(m) for b, m in zip(narrow, again, strict=True)) and all(
-            narrower[i].contains(argument[i]) for i in ranges
-        ):
+        if all(
+            b.contains(m) or points_inward(i, narrow, new_chords)
+            for i, (b, m) in enumerate(zip(narrow, again, strict=True))
+        ) and all(narrower[i].contains(argument[i]) for i in ranges):
             ranges, chords = narrower, new_chords
         series = self.whole(narrow, chords=chords, forced=True)
         box = [

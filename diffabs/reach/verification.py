@@ -15,7 +15,7 @@ from diffabs.reach.certificate import FORMAT, proved_ends
 from diffabs.reach.cover import RunClaim
 from diffabs.reach.equations import Equations, derive_equations
 
-SAMPLED_STEPS = 2  # steps of the checker between two ticks
+SAMPLED_STEPS = 1  # steps of the checker between two ticks
 PACED_STEP, STEPS = 2e-4, 500  # length in eta [s^2/m]; number of steps of another continuous loop
 CELL_HALVINGS = 3  # of a cell whose bounds by the checker are too wide
 DEEPEST = 200  # halvings of the box that lead to one cell
