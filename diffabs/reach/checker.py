@@ -45,7 +45,7 @@ ORDER = 7  # of the Taylor polynomials
 MOST_COEFFICIENTS = 64  # of a number that does not change
 LOWER_ORDERS = (2, 1)  # where a number has no more derivatives
 TOLERANCE = 1e-9  # radius of a remainder, or of a disturbance's effect, that a step may add to a state
-SHARE = 1e-3  # of a state's own radius, which a remainder may be in addition
+SHARE = 1e-4  # of a state's own radius, which a remainder may be in addition
 MAX_HALVINGS = 40  # of one given step
 PICARD_TRIES = 40
 SPEED_WEIGHT = 0.125  # of the speed relative to the slip, in the scales of QR for a sampled loop
@@ -189,7 +189,7 @@ class _Program:
         self.operations = e.operations
         self.static = self._find_static()
         self.moving = [i for i, static in enumerate(self.static) if not static]
-        self.plans: dict[tuple[int, ...], list[tuple[bool, int, int]]] = {}
+        self.plans: dict[tuple[int, ...], dict[tuple[bool, int, int], None]] = {}
         self.signals = {name: e.signals[name] for name in signals}
         self.states = self._find_states()
         self.place = {state: i for i, state in enumerate(self.states)}
@@ -311,23 +311,22 @@ class _Series:
         """
         program, v, d = self.program, self.v, self.d
         key = (*roots, k, slopes)
-        try:
-            for along, i, m in program.plans.get(key, ()):
+        plan = program.plans.setdefault(key, {})
+        for along, i, m in plan:
+            try:
                 if along:
                     if len(d[i]) == m:
                         d[i].append(program.slopes[i](self, m))
                 elif len(v[i]) == m:
                     x = program.values[i](self, m)
-                    if not x.is_finite():
-                        break
-                    v[i].append(x)
-        except (_Undefined, IndexError):
-            pass  # perhaps this set does not need that number, or needs another one before it
+                    if x.is_finite():
+                        v[i].append(x)
+            except (_Undefined, IndexError):
+                continue  # perhaps this set does not need that number, or needs another one before it
         self.order = []
         for i in roots:
             (self.slope if slopes else self.value)(i, k)
-        if self.order:
-            program.plans[key] = [*program.plans.get(key, ()), *self.order]
+        plan.update(dict.fromkeys(self.order))
         self.order = None
 
     def _add_value(self, i: int, k: int, known: list[arb]) -> None:
@@ -1046,7 +1045,10 @@ class _Check:
         box, ranges = list(X), dict(at_start)
         for tries in range(PICARD_TRIES):
             moved, argument, chords, _ = image(box, ranges)
-            stays = [b.contains(m) or (tries > 0 and points_inward(i, box, chords)) for i, (b, m) in enumerate(zip(box, moved, strict=True))]
+            stays = [
+                b.contains(m) or (tries > 0 and points_inward(i, box, chords))
+                for i, (b, m) in enumerate(zip(box, moved, strict=True))
+            ]
             if all(stays) and all(ranges[i].contains(argument[i]) for i in ranges):
                 break
             box = [b if kept else _wider(_hull(b, m)) for b, m, kept in zip(box, moved, stays, strict=True)]
