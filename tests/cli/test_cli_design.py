@@ -319,6 +319,7 @@ def test_undecided_is_not_proved(tmp_path, monkeypatch):
     assert checked(tmp_path / "c.json").returncode == 1
 
 
+@pytest.mark.slow
 def test_sampled_loop_behind_a_delay():
     controller = "controller={type='sampled',controller={type='state-feedback',gain=[-1000,-50]}}"
     changes = ("--set", controller, "--set", "actuator.type=delay", "--set", "design={}")

@@ -120,6 +120,7 @@ engine.check_process()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+@pytest.mark.slow
 def test_a_kernel_in_a_forked_process_is_an_error():
     """XLA's threads stay in the parent, also where it has only read a scenario: the child would wait for ever."""
     words = [sys.executable, "-W", "ignore:os.fork", "-c", FORKED]

@@ -394,7 +394,7 @@ def integrating(late: float) -> tuple[Loop, float]:
     "jnp.not_equal(raw, limited) & ((raw - limited) * gain * error > 0)",
 )
 @killed_by("simulate/step/fixed.py", "loop.jumps if self.kinks is None", "False if self.kinks is None")
-@pytest.mark.parametrize("late", [0.0, 0.0337])
+@pytest.mark.parametrize("late", [0.0, pytest.param(0.0337, marks=pytest.mark.slow)])
 def test_where_a_rate_jumps_a_value_is_right_too(late):
     """An integral that waits for a limit starts at once when the limit is left: in the middle of a step of 10 ms, which
     is off by as much as it is long unless it ends there."""

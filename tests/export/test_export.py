@@ -559,6 +559,7 @@ def test_structured_text_commands_what_the_parts_do(name, dtype):
 
 
 @killed_by("export/structured_text.py", '.replace("e", "E")', "")
+@pytest.mark.slow
 def test_a_whole_run_is_what_the_function_block_does():
     chosen = load("slip-cured", ["initial.speed_kmh=40"])
     every = round(float(chosen.loop.controller.period) / chosen.solver.step)

@@ -294,9 +294,13 @@ def test_noise_is_a_disturbance_and_limits_do_not_act():
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        ({"controller": ConstantTorque()}, "its command does not follow"),
+        pytest.param({"controller": ConstantTorque()}, "its command does not follow", marks=pytest.mark.slow),
         ({"controller": Relay()}, "acts at instants"),
-        ({"controller": PID(kp=1.0, high=0.5, low=0.0)}, "does not follow what is measured at the setpoint"),
+        pytest.param(
+            {"controller": PID(kp=1.0, high=0.5, low=0.0)},
+            "does not follow what is measured at the setpoint",
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["constant", "relay", "at its limit"],
 )

@@ -234,6 +234,7 @@ def test_control_c_twice_does_not_wait(longer, tmp_path):
 # A full disk
 
 
+@pytest.mark.slow
 def test_a_full_disk(copy, whole, monkeypatch):
     """As the system says it: three chunks are missing, the second of them does not find room."""
     for name in sorted(chunks(copy))[3:6]:
@@ -372,11 +373,15 @@ CHANGED = [
     (("--set", "sweep.over.plant.mass=5.3,6.3"), 'study.space.variables.plant.mass.high is 6.2 there, 6.3 here'),
     (("--set", "sweep.design=sobol"), 'study.space.design.type is "random" there, "sobol" here'),
     (("--set", "sweep.failures.overshoot=0.5"), "study.failures.overshoot is null there, 0.5 here"),
-    (("--engine", "kernel"), 'study.engine.name is "xla" there, "kernel" here'),
 ]  # fmt: skip
+KERNEL = (("--engine", "kernel"), 'study.engine.name is "xla" there, "kernel" here')
 
 
-@pytest.mark.parametrize(("changes", "needed"), CHANGED, ids=[readable_id(needed) for _, needed in CHANGED])
+@pytest.mark.parametrize(
+    ("changes", "needed"),
+    [*CHANGED, pytest.param(*KERNEL, marks=pytest.mark.slow)],
+    ids=[readable_id(needed) for _, needed in [*CHANGED, KERNEL]],
+)
 def test_another_configuration_is_refused(whole, changes, needed):
     before = contents(whole.folder)
     result = run("sweep", whole.scenario, "--out", whole.folder, "--resume", *changes, status=2)

@@ -227,7 +227,12 @@ class TestDescent:
         assert a.history == b.history
 
     @pytest.mark.parametrize(
-        "optimiser", [optax.adam(0.05), optax.sgd(0.02, momentum=0.9), optax.lbfgs(), optax.adan(0.1)]
+        "optimiser",
+        [
+            optax.adam(0.05),
+            optax.sgd(0.02, momentum=0.9),
+            *(pytest.param(x, marks=pytest.mark.slow) for x in (optax.lbfgs(), optax.adan(0.1))),
+        ],
     )
     def test_any_optimiser_of_optax(self, optimiser):
         given = Optimiser(optax.with_extra_args_support(optimiser), False)
