@@ -31,7 +31,6 @@ third derivative at u = 0. A step of lower order does not ask for it, and the ch
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from math import inf, isfinite, nextafter
-from operator import mul
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -42,14 +41,11 @@ from diffabs.reach.equations import SLOWEST, Equations, RealOperation
 LIMITED = ("clamp", "round")  # operations that a chord stands for
 PRECISION = 96  # bits
 ORDER = 7  # of the Taylor polynomials
-MOST_COEFFICIENTS = 64  # of a number that does not change
 LOWER_ORDERS = (2, 1)  # where a number has no more derivatives
 TOLERANCE = 1e-9  # radius of a remainder, or of a disturbance's effect, that a step may add to a state
-SHARE = 1e-4  # of a state's own radius, which a remainder may be in addition
 MAX_HALVINGS = 40  # of one given step
 PICARD_TRIES = 40
 SPEED_WEIGHT = 0.125  # of the speed relative to the slip, in the scales of QR for a sampled loop
-BALANCED = 16  # ticks, or steps of a continuous loop, between two choices of the scales of QR
 PIECES = 8  # of a step, for the bounds of a signal
 FASTEST_SLIP = 1.0  # `check_slip_chart` holds for a slip below 1 and a speed above `SLOWEST`
 ZERO, ONE, NO_SLOPE = arb(0), arb(1), arb_poly([])
@@ -188,8 +184,6 @@ class _Program:
         e = self.equations = equations
         self.operations = e.operations
         self.static = self._find_static()
-        self.moving = [i for i, static in enumerate(self.static) if not static]
-        self.plans: dict[tuple[int, ...], dict[tuple[bool, int, int], None]] = {}
         self.signals = {name: e.signals[name] for name in signals}
         self.states = self._find_states()
         self.place = {state: i for i, state in enumerate(self.states)}
@@ -198,8 +192,6 @@ class _Program:
         self.limits = self._limits([*self.flow, e.margin, *self.signals.values()])
         self.tick_limits = self._limits(self.tick)
         self.start_limits = self._limits([e.start[i] for i in self.states])
-        self.values = [_value_rule(self, i) for i in range(len(self.operations))]
-        self.slopes = [_slope_rule(self, i) for i in range(len(self.operations))]
 
     def _find_static(self) -> list[bool]:
         """Return which operations depend on no state and no limit, whose chord may differ between two sets."""
@@ -280,107 +272,35 @@ class _Series:
         self.forced = forced
         # Both may be filled later, so an empty one is kept.
         self.chords, self.seeds = {} if chords is None else chords, {} if seeds is None else seeds
-        self.squares: dict[int, list[arb]] = {}
-        self.decided: dict[int, bool] = {}
-        self.order: list[tuple[bool, int, int]] | None = None  # of the numbers that are computed, while it is recorded
         count = len(program.operations)
-        self.v: list[list[arb]] = [[] for _ in range(count)] if constants is None else [*constants.v]
-        self.d: list[list[arb_poly]] = [[] for _ in range(count)] if constants is None else [*constants.d]
+        self.v: list[list[arb]] = [[] for _ in range(count)]
+        self.d: list[list[arb_poly]] = [[] for _ in range(count)]
+        self.squares: dict[int, list[arb]] = {}
         if constants is not None:
-            for i in program.moving:
-                self.v[i], self.d[i] = [], []
+            for i, static in enumerate(program.static):
+                if static:
+                    self.v[i], self.d[i] = constants.v[i], constants.d[i]
 
     def value(self, i: int, k: int = 0) -> arb:
         """Return coefficient k of operation i."""
+        if k and self.program.static[i]:
+            return ZERO
         known = self.v[i]
         while len(known) <= k:
-            self._add_value(i, len(known), known)
+            x = self._value(i, len(known))
+            if not x.is_finite():
+                raise _Undefined(f"{self.program.operations[i].name}: no finite value")
+            known.append(x)
         return known[k]
 
     def slope(self, i: int, k: int = 0) -> arb_poly:
         """Return the derivatives of coefficient k of operation i along the directions."""
+        if k and self.program.static[i]:
+            return NO_SLOPE
         known = self.d[i]
         while len(known) <= k:
-            self._add_slope(i, len(known), known)
+            known.append(self._slope(i, len(known)))
         return known[k]
-
-    def extend(self, roots: Sequence[int], k: int, slopes: bool = False) -> None:
-        """Compute coefficient k of operations, or its derivatives, in the order in which another set needed them.
-
-        The order saves time and decides nothing: what a rule lacks is computed when it is asked for.
-        """
-        program, v, d = self.program, self.v, self.d
-        key = (*roots, k, slopes)
-        plan = program.plans.setdefault(key, {})
-        for along, i, m in plan:
-            try:
-                if along:
-                    if len(d[i]) == m:
-                        d[i].append(program.slopes[i](self, m))
-                elif len(v[i]) == m:
-                    x = program.values[i](self, m)
-                    if x.is_finite():
-                        v[i].append(x)
-            except (_Undefined, IndexError):
-                continue  # perhaps this set does not need that number, or needs another one before it
-        self.order = []
-        for i in roots:
-            (self.slope if slopes else self.value)(i, k)
-        plan.update(dict.fromkeys(self.order))
-        self.order = None
-
-    def _add_value(self, i: int, k: int, known: list[arb]) -> None:
-        self._prepare(i, k, slopes=False)
-        x = self.program.values[i](self, k)
-        if not x.is_finite():
-            raise _Undefined(f"{self.program.operations[i].name}: no finite value")
-        known.append(x)
-        if self.program.static[i]:
-            known += [ZERO] * MOST_COEFFICIENTS
-        elif self.order is not None:
-            self.order.append((False, i, k))
-
-    def _add_slope(self, i: int, k: int, known: list[arb_poly]) -> None:
-        self._prepare(i, k, slopes=True)
-        known.append(self.program.slopes[i](self, k))
-        if self.program.static[i]:
-            known += [NO_SLOPE] * MOST_COEFFICIENTS
-        elif self.order is not None:
-            self.order.append((True, i, k))
-
-    def _prepare(self, i: int, k: int, slopes: bool) -> None:
-        """Compute what the rule for coefficient k of operation i reads."""
-        program = self.program
-        o = program.operations[i]
-
-        same = self.slope if slopes else self.value
-        match o.name:
-            case "state":
-                if k:
-                    same(program.flow[program.place[o.value]], k - 1)
-            case "select":
-                same(o.args[2 if self.truth(o.args[0]) else 1], k)
-            case "clamp" | "round":
-                forced = self.forced and not slopes
-                if k if forced else not self.chord(i).slope.is_zero():
-                    same(o.args[0], k)
-            case "power" | "exp" | "log" | "sin" | "cos" | "atan":
-                same(o.args[0], k)
-                if slopes:
-                    self.value(o.args[1], k)
-                elif k:
-                    self.value(o.args[1], k - 1)
-                elif o.name == "power":
-                    self.value(o.args[2], 0)
-            case "const" | "param" | "truth":
-                pass
-            case _:
-                for a in o.args[:1] if o.name == "meet" and (k or slopes) else o.args:
-                    same(a, k)
-                    if slopes and o.name == "mul":
-                        self.value(a, k)
-                if slopes and o.name == "inv":
-                    self.square(i, k)
 
     def width(self, i: int) -> arb:
         """Return the ball of all changes of operation i from the centre of the set, to first order."""
@@ -395,11 +315,6 @@ class _Series:
 
     def truth(self, i: int) -> bool:
         """Return a condition that all numbers of the set decide alike."""
-        if i not in self.decided:
-            self.decided[i] = self._decide(i)
-        return self.decided[i]
-
-    def _decide(self, i: int) -> bool:
         o = self.program.operations[i]
         match o.name:
             case "truth":
@@ -425,14 +340,82 @@ class _Series:
             raise _Undefined("a condition that the runs decide differently")
         return yes
 
-    def chord(self, i: int) -> _Chord:
+    def _value(self, i: int, k: int) -> arb:
+        o, value, static = self.program.operations[i], self.value, self.program.static
+        match o.name:
+            case "const":
+                return _constant(o.value)
+            case "param":
+                return self.parameters[o.value]
+            case "state":
+                place = self.program.place[o.value]
+                return value(self.program.flow[place], k - 1) / k if k else self.start[place]
+            case "add":
+                return value(o.args[0], k) + value(o.args[1], k)
+            case "sub":
+                return value(o.args[0], k) - value(o.args[1], k)
+            case "neg":
+                return -value(o.args[0], k)
+            case "mul":
+                a, b = o.args
+                if k == 0:
+                    y = _product(value(a), value(b))
+                    return y.nonnegative_part() if a == b and y.lower() < 0 else y
+                if static[a]:
+                    return value(a) * value(b, k)
+                if static[b]:
+                    return value(a, k) * value(b)
+                y = value(a) * value(b, k)
+                for j in range(1, k + 1):
+                    y += value(a, j) * value(b, k - j)
+                return y
+            case "inv":
+                (a,) = o.args
+                if k == 0:
+                    if value(a).contains(0):
+                        raise _Undefined("a division by a number that may be 0")
+                    return 1 / value(a)
+                y = value(a, 1) * value(i, k - 1)
+                for j in range(2, k + 1):
+                    y += value(a, j) * value(i, k - j)
+                return -y * value(i)
+            case "clamp" | "round":
+                return self._limit(i, k)
+            case "select":
+                return value(o.args[2 if self.truth(o.args[0]) else 1], k)
+            case "meet":
+                x = value(o.args[0], k)
+                return x if k else _common(x, value(o.args[1]))
+        if k == 0:
+            x = value(o.args[0])
+            match o.name:
+                case "power":
+                    return _power(x, value(o.args[2]))
+                case "exp":
+                    return x.exp()
+                case "log":
+                    return x.log()
+                case "sin":
+                    return x.sin()
+                case "cos":
+                    return x.cos()
+                case "atan":
+                    return x.atan()
+            raise NotProved(f"{o.name}: the checker has no such operation")
+        u, g = o.args[:2]  # y' = g u'
+        y = k * value(u, k) * value(g)
+        for j in range(1, k):
+            y += j * value(u, j) * value(g, k - j)
+        return y / k
+
+    def _chord(self, i: int) -> _Chord:
         if i not in self.chords:
             raise _Undefined("a limit of a number that has no value")
         return self.chords[i]
 
-    def limit(self, i: int, k: int) -> arb:
+    def _limit(self, i: int, k: int) -> arb:
         """Return coefficient k of a limit."""
-        chord, a = self.chord(i), self.program.operations[i].args[0]
+        chord, a = self._chord(i), self.program.operations[i].args[0]
         if self.forced:
             if k == 0:
                 return chord.values
@@ -447,14 +430,52 @@ class _Series:
             y += _symmetric(chord.width)
         return y
 
-    def square(self, i: int, k: int) -> list[arb]:
-        """Return the coefficients of the square of operation i, at least up to number k."""
+    def _slope(self, i: int, k: int) -> arb_poly:
+        o, value, slope, static = self.program.operations[i], self.value, self.slope, self.program.static
+        match o.name:
+            case "const":
+                return NO_SLOPE
+            case "param":
+                return _along(o.value, self.halves[o.value]) if self.halves is not None else NO_SLOPE
+            case "state":
+                place = self.program.place[o.value]
+                if k:
+                    return slope(self.program.flow[place], k - 1) * (ONE / k)
+                return self.tangents[place] if self.tangents is not None else NO_SLOPE
+            case "add":
+                return slope(o.args[0], k) + slope(o.args[1], k)
+            case "sub":
+                return slope(o.args[0], k) - slope(o.args[1], k)
+            case "neg":
+                return -slope(o.args[0], k)
+            case "mul":
+                a, b = o.args
+                if static[a]:
+                    return slope(b, k) * value(a) + slope(a) * value(b, k)
+                if static[b]:
+                    return slope(a, k) * value(b) + slope(b) * value(a, k)
+                return _convolve(slope, a, value, b, k) + _convolve(slope, b, value, a, k)
+            case "inv":  # d(1/a) = -(1/a)^2 da
+                return -_convolve(slope, o.args[0], self._square, i, k)
+            case "clamp" | "round":
+                chord = self._chord(i)
+                y = NO_SLOPE if chord.slope.is_zero() else slope(o.args[0], k) * chord.slope
+                if k == 0 and i in self.seeds:
+                    y = y + _along(*self.seeds[i])
+                return y
+            case "select":
+                return slope(o.args[2 if self.truth(o.args[0]) else 1], k)
+            case "meet":
+                return slope(o.args[0], k)
+        return _convolve(slope, o.args[0], value, o.args[1], k)  # dy = g du
+
+    def _square(self, i: int, k: int) -> arb:
+        """Return coefficient k of the square of operation i."""
         known = self.squares.setdefault(i, [])
         while len(known) <= k:
             m = len(known)
-            self.value(i, m)
-            known.append(_convolve(self.v[i], self.v[i], m))
-        return known
+            known.append(sum((self.value(i, j) * self.value(i, m - j) for j in range(m + 1)), ZERO))
+        return known[k]
 
 
 def _along(direction: int, size: arb) -> arb_poly:
@@ -462,156 +483,14 @@ def _along(direction: int, size: arb) -> arb_poly:
     return arb_poly([*[ZERO] * direction, size])
 
 
-def _convolve(x: Sequence[Number], y: Sequence[arb], k: int) -> Number:
-    """Return coefficient k of the product of two series. Raises IndexError if one has no such coefficient."""
-    x[k], y[k]  # a slice would be shorter without a word
-    return sum(map(mul, x[: k + 1], y[k::-1]), ZERO if isinstance(x[0], arb) else NO_SLOPE)
-
-
-ValueRule = Callable[[_Series, int], arb]
-SlopeRule = Callable[[_Series, int], arb_poly]
-
-
-def _value_rule(program: _Program, i: int) -> ValueRule:
-    """Return the rule for coefficient k of operation i of a series."""
-    o, static = program.operations[i], program.static
-    a, b = (*o.args, -1, -1)[:2]
-
-    def product(s: _Series, k: int) -> arb:
-        if k == 0:
-            y = _product(s.v[a][0], s.v[b][0])
-            return y.nonnegative_part() if a == b and y.lower() < 0 else y
-        if static[a]:
-            return s.v[a][0] * s.v[b][k]
-        if static[b]:
-            return s.v[a][k] * s.v[b][0]
-        return _convolve(s.v[a], s.v[b], k)
-
-    def inverse(s: _Series, k: int) -> arb:
-        if k == 0:
-            if s.v[a][0].contains(0):
-                raise _Undefined("a division by a number that may be 0")
-            return 1 / s.v[a][0]
-        return -_convolve(s.v[a][1 : k + 1], s.v[i], k - 1) * s.v[i][0]
-
-    def state(s: _Series, k: int) -> arb:
-        place = program.place[o.value]
-        return s.v[program.flow[place]][k - 1] / k if k else s.start[place]
-
-    def meet(s: _Series, k: int) -> arb:
-        return s.v[a][k] if k else _common(s.v[a][0], s.v[b][0])
-
-    def function(first: Callable[[_Series], arb]) -> ValueRule:
-        def rule(s: _Series, k: int) -> arb:
-            if k == 0:
-                return first(s)
-            if static[b]:
-                return s.v[a][k] * s.v[b][0]
-            g, u = s.v[b], s.v[a]  # y' = g u'
-            return sum((j * u[j] * g[k - j] for j in range(1, k + 1)), ZERO) / k
-
-        return rule
-
-    match o.name:
-        case "const":
-            return lambda s, k: _constant(o.value)
-        case "param":
-            return lambda s, k: s.parameters[o.value]
-        case "state":
-            return state
-        case "add":
-            return lambda s, k: s.v[a][k] + s.v[b][k]
-        case "sub":
-            return lambda s, k: s.v[a][k] - s.v[b][k]
-        case "neg":
-            return lambda s, k: -s.v[a][k]
-        case "mul":
-            return product
-        case "inv":
-            return inverse
-        case "clamp" | "round":
-            return lambda s, k: s.limit(i, k)
-        case "select":
-            return lambda s, k: s.v[o.args[2 if s.truth(a) else 1]][k]
-        case "meet":
-            return meet
-        case "power":
-            return function(lambda s: _power(s.v[a][0], s.v[o.args[2]][0]))
-        case "exp":
-            return function(lambda s: s.v[a][0].exp())
-        case "log":
-            return function(lambda s: s.v[a][0].log())
-        case "sin":
-            return function(lambda s: s.v[a][0].sin())
-        case "cos":
-            return function(lambda s: s.v[a][0].cos())
-        case "atan":
-            return function(lambda s: s.v[a][0].atan())
-
-    def unknown(s: _Series, k: int) -> arb:
-        raise NotProved(f"{o.name}: the checker has no such operation")
-
-    return unknown
-
-
-def _slope_rule(program: _Program, i: int) -> SlopeRule:
-    """Return the rule for the derivatives of coefficient k of operation i of a series."""
-    o, static = program.operations[i], program.static
-    a, b = (*o.args, -1, -1)[:2]
-
-    def parameter(s: _Series, k: int) -> arb_poly:
-        return _along(o.value, s.halves[o.value]) if s.halves is not None else NO_SLOPE
-
-    def state(s: _Series, k: int) -> arb_poly:
-        place = program.place[o.value]
-        if k:
-            return s.d[program.flow[place]][k - 1] * (ONE / k)
-        return s.tangents[place] if s.tangents is not None else NO_SLOPE
-
-    def product(s: _Series, k: int) -> arb_poly:
-        if static[a]:
-            return s.d[b][k] * s.v[a][0] + s.d[a][0] * s.v[b][k]
-        if static[b]:
-            return s.d[a][k] * s.v[b][0] + s.d[b][0] * s.v[a][k]
-        return _convolve(s.d[a], s.v[b], k) + _convolve(s.d[b], s.v[a], k)
-
-    def inverse(s: _Series, k: int) -> arb_poly:  # d(1/a) = -(1/a)^2 da
-        return -_convolve(s.d[a], s.square(i, k), k)
-
-    def limit(s: _Series, k: int) -> arb_poly:
-        chord = s.chord(i)
-        y = NO_SLOPE if chord.slope.is_zero() else s.d[a][k] * chord.slope
-        return y + _along(*s.seeds[i]) if k == 0 and i in s.seeds else y
-
-    def function(s: _Series, k: int) -> arb_poly:  # dy = g du
-        if static[b]:
-            return s.d[a][k] * s.v[b][0]
-        return _convolve(s.d[a], s.v[b], k)
-
-    match o.name:
-        case "const":
-            return lambda s, k: NO_SLOPE
-        case "param":
-            return parameter
-        case "state":
-            return state
-        case "add":
-            return lambda s, k: s.d[a][k] + s.d[b][k]
-        case "sub":
-            return lambda s, k: s.d[a][k] - s.d[b][k]
-        case "neg":
-            return lambda s, k: -s.d[a][k]
-        case "mul":
-            return product
-        case "inv":
-            return inverse
-        case "clamp" | "round":
-            return limit
-        case "select":
-            return lambda s, k: s.d[o.args[2 if s.truth(a) else 1]][k]
-        case "meet":
-            return lambda s, k: s.d[a][k]
-    return function
+def _convolve(
+    slope: Callable[[int, int], arb_poly], a: int, value: Callable[[int, int], arb], b: int, k: int
+) -> arb_poly:
+    """Return coefficient k of the derivatives of a times the values of b."""
+    y = slope(a, k) * value(b, 0)
+    for j in range(k):
+        y += slope(a, j) * value(b, k - j)
+    return y
 
 
 def _at(coefficients: Sequence[Number], t: arb) -> Number:
@@ -700,8 +579,6 @@ class _Check:
 
     def __init__(self, equations: Equations, signals: Iterable[str], cell: Sequence[tuple[float, float]], order: int):
         e, self.order = equations, order
-        if not 1 <= order < MOST_COEFFICIENTS - 2:
-            raise NotProved(f"no polynomial has the order {order}")
         if len(cell) != len(e.params):
             raise NotProved("the cell needs one pair of numbers for each parameter")
         p = self.program = _Program(e, signals)
@@ -723,7 +600,6 @@ class _Check:
         nothing = [ZERO] * self.n
         self.constant_mid = _Series(p, self.mids, nothing)
         self.constant_all = _Series(p, self.all, nothing, halves=self.halves)
-        self.without_slopes = _without_slopes(self.constant_all)
         self.weights = np.ones(self.n)
         self.steps = self.across = 0
         self.elapsed = ZERO  # the independent variable
@@ -817,12 +693,8 @@ class _Check:
         point = self.point(centre, chords=chords)
         whole = self.whole(states, tangents=tangents, centre=point, chords=chords, seeds=seeds)
         for q, i in enumerate(limits):
-            argument = self.program.operations[i].args[0]
             try:
-                point.extend([argument], 0)
-                whole.extend([argument], 0)
-                whole.extend([argument], 0, slopes=True)
-                chords[i] = self.chord(whole, i, whole.range(argument))
+                chords[i] = self.chord(whole, i, whole.range(self.program.operations[i].args[0]))
                 seeds[i] = (first + q, chords[i].width)
             except _Undefined:
                 continue  # an error where the limit is needed
@@ -941,18 +813,21 @@ class _Check:
         self.stays_nonnegative(box, chords)
         moved, failure = None, _Undefined("no order")
         for order in (self.order, *LOWER_ORDERS):
-            try:  # the remainder decides most failures, so it is first
-                far, rest = self.remainders(X, box, chords, h, order)
-                moved = (*self.taylor(centre, X, tangents, chords, order), far, order)
+            try:
+                moved = self.taylor(centre, X, tangents, box, chords, order)
                 break
             except _Undefined as reason:
                 failure = reason
         if moved is None:
             raise failure
         point, whole, far, order = moved
-        rest, total_rest = rest[:n], rest[n:]
-        totals = [q for q in (self.travelled, self.clock) if q is not None]
         push, slack = self.disturb(box, chords, h)
+        power = h ** (order + 1)
+        rest = [_remainder(far, rate, order + 1) * power for rate in p.flow]
+        totals = [q for q in (self.travelled, self.clock) if q is not None]
+        total_rest = [_remainder(far, q.rate, order + 1) * power for q in totals]
+        if not all(x.rad() < TOLERANCE for x in (*rest, *total_rest)):
+            raise _StepFails("the remainder of a step is too wide")
         across = any(not x.is_zero() for x in push)
         crossed = [q for q, chord in chords.items() if not chord.width.is_zero()]
         if (
@@ -1017,15 +892,11 @@ class _Check:
         # What depends on another limit jumps at the start of a step, where the chord of that limit changes.
         nested = {i for i, a in arguments.items() if any(p.operations[j].name == "clamp" for j in p.read_by([a]))}
 
-        inner = [a for i, a in arguments.items() if i not in nested]
-
         def image(
             box: list[arb], ranges: dict[int, arb]
         ) -> tuple[list[arb], dict[int, arb], dict[int, _Chord], _Series]:
             chords = {i: self.chord(whole, i, x) for i, x in ranges.items()}
             series = self.whole(box, chords=chords, forced=True)
-            series.extend(p.flow, 0)
-            series.extend(inner, 1)
             moved = [x + _integral_range(series.value(rate), h) for x, rate in zip(X, p.flow, strict=True)]
             if s >= 0:
                 moved[s] = moved[s].nonnegative_part() if moved[s].lower() < 0 else moved[s]
@@ -1035,36 +906,25 @@ class _Check:
             }
             return moved, argument, chords, series
 
-        def points_inward(i: int, box: list[arb], chords: dict[int, _Chord]) -> bool:
-            for end, sign in ((box[i].upper(), 1), (box[i].lower(), -1)):
-                face = [end if j == i else x for j, x in enumerate(box)]
-                if not sign * self.whole(face, chords=chords, forced=True).value(p.flow[i]) <= 0:
-                    return False
-            return True
-
         box, ranges = list(X), dict(at_start)
-        for tries in range(PICARD_TRIES):
+        for _ in range(PICARD_TRIES):
             moved, argument, chords, _ = image(box, ranges)
-            stays = [
-                b.contains(m) or (tries > 0 and points_inward(i, box, chords))
-                for i, (b, m) in enumerate(zip(box, moved, strict=True))
-            ]
-            if all(stays) and all(ranges[i].contains(argument[i]) for i in ranges):
+            if all(b.contains(m) for b, m in zip(box, moved, strict=True)) and all(
+                ranges[i].contains(argument[i]) for i in ranges
+            ):
                 break
-            box = [b if kept else _wider(_hull(b, m)) for b, m, kept in zip(box, moved, stays, strict=True)]
+            box = [b if b.contains(m) else _wider(_hull(b, m)) for b, m in zip(box, moved, strict=True)]
             if s >= 0:
                 box[s] = box[s].nonnegative_part() if box[s].lower() < 0 else box[s]
             ranges = {i: x if x.contains(argument[i]) else _wider(_hull(x, argument[i])) for i, x in ranges.items()}
         else:
             raise _StepFails("no box holds the runs of a step")
         # The image holds the runs as well. Where it proves itself once more, its chords are narrower.
-        narrow = [_common(b, m) for b, m in zip(box, moved, strict=True)]
-        narrower = {i: _common(x, argument[i]) for i, x in ranges.items()}
+        narrow, narrower = moved, argument
         again, argument, new_chords, _ = image(narrow, narrower)
-        if all(
-            b.contains(m) or points_inward(i, narrow, new_chords)
-            for i, (b, m) in enumerate(zip(narrow, again, strict=True))
-        ) and all(narrower[i].contains(argument[i]) for i in ranges):
+        if all(b.contains(m) for b, m in zip(narrow, again, strict=True)) and all(
+            narrower[i].contains(argument[i]) for i in ranges
+        ):
             ranges, chords = narrower, new_chords
         series = self.whole(narrow, chords=chords, forced=True)
         box = [
@@ -1091,32 +951,21 @@ class _Check:
             raise _StepFails("a state that must not be negative may fall below 0")
 
     def taylor(
-        self, centre: Sequence[arb], X: Sequence[arb], tangents: Sequence[arb_poly],
+        self, centre: Sequence[arb], X: Sequence[arb], tangents: Sequence[arb_poly], box: Sequence[arb],
         chords: dict[int, _Chord], order: int,
-    ) -> tuple[_Series, _Series]:  # fmt: skip
-        """Return the series at the centre and over the set, with all coefficients that a step needs."""
+    ) -> tuple[_Series, _Series, _Series, int]:  # fmt: skip
+        """Return the series at the centre, over the set and over the box, with all coefficients that a step needs."""
         point = self.point(centre, chords=chords)
         whole = self.whole(X, tangents=tangents, centre=None, chords=chords)
-        roots = [*self.program.flow, *(q.rate for q in (self.travelled, self.clock) if q is not None)]
-        for k in range(order):
-            point.extend(roots, k)
-            whole.extend(roots, k, slopes=True)
-        return point, whole
-
-    def remainders(
-        self, X: Sequence[arb], box: Sequence[arb], chords: dict[int, _Chord], h: arb, order: int
-    ) -> tuple[_Series, list[arb]]:
-        """Return the series over the box, and Lagrange's remainders of the states and the quadratures."""
         far = self.whole(box, chords=chords)
         roots = [*self.program.flow, *(q.rate for q in (self.travelled, self.clock) if q is not None)]
         for k in range(order + 1):
-            far.extend(roots, k)
-        power = h ** (order + 1)
-        rest = [_remainder(far, rate, order + 1) * power for rate in roots]
-        room = [TOLERANCE + SHARE * x.rad() for x in X]
-        if not all(x.rad() < (room[i] if i < self.n else TOLERANCE) for i, x in enumerate(rest)):
-            raise _StepFails("the remainder of a step is too wide")
-        return far, rest
+            for rate in roots:
+                far.value(rate, k)
+                if k < order:
+                    point.value(rate, k)
+                    whole.slope(rate, k)
+        return point, whole, far, order
 
     def disturb(self, box: Sequence[arb], chords: dict[int, _Chord], h: arb) -> tuple[list[arb], dict[int, arb]]:
         """Return how far the disturbances move each state by the end of a step, and each other operation at most.
@@ -1137,13 +986,12 @@ class _Check:
             chords=chords,
             forced=True,
             seeds=seeds,
-            constants=self.without_slopes,
+            constants=_without_slopes(self.constant_all),
         )
 
         def largest(x: arb_poly, first: int, last: int) -> list[arb]:
             return [x[j].abs_upper() for j in range(first, last)]
 
-        series.extend(p.flow, 0, slopes=True)
         slopes = [series.slope(rate) for rate in p.flow]
         M = [largest(x, 0, n) for x in slopes]
         b = [sum(largest(x, n, n + len(crossed)), ZERO).upper() for x in slopes]
@@ -1208,8 +1056,6 @@ class _Check:
         X = self.box(tangents)
         point, whole, _ = self.relax_limits(p.tick_limits, centre, X, tangents, self.np + self.n)
         try:
-            point.extend(p.tick, 0)
-            whole.extend(p.tick, 0, slopes=True)
             after = [point.value(i) for i in p.tick]
             slopes = [whole.slope(i) for i in p.tick]
             for i in p.tick:
@@ -1284,7 +1130,7 @@ def _without_slopes(series: _Series) -> _Series:
     other = _Series(series.program, series.parameters, series.start)
     for i, static in enumerate(series.program.static):
         if static:
-            other.v[i], other.d[i] = series.v[i], [NO_SLOPE] * MOST_COEFFICIENTS
+            other.v[i], other.d[i] = series.v[i], [NO_SLOPE]
     return other
 
 
@@ -1352,8 +1198,7 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
             raise NotProved("a sampled loop needs a number of steps between two ticks")
         period, tick = _constant(e.period), 0
         while True:
-            if tick % BALANCED == 0:
-                check.balance(e.period)
+            check.balance(e.period)
             check.do_tick()
             for _ in range(steps):
                 check.advance(period / steps)
@@ -1371,7 +1216,7 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
         raise NotProved("a step's length must be positive")
     number = 0
     while True:
-        if number % BALANCED == 0:
+        if number % 16 == 0:
             check.balance(0.0)
         check.advance(arb(float(steps[min(number, len(steps) - 1)])))
         number += 1

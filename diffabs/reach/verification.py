@@ -4,8 +4,6 @@ A file is text that anybody can edit, so nothing in it counts except what is pro
 list `statements` of `FileVerdict`: about the loop and the duration of the scenario in the file, and over its box.
 """
 
-import contextlib
-import functools
 import math
 import random
 from collections.abc import Callable, Mapping, Sequence
@@ -16,9 +14,8 @@ from diffabs.core.types import JsonObject
 from diffabs.reach.certificate import FORMAT, proved_ends
 from diffabs.reach.cover import RunClaim
 from diffabs.reach.equations import Equations, derive_equations
-from diffabs.runtime.workers import map_in_processes
 
-SAMPLED_STEPS = 1  # steps of the checker between two ticks
+SAMPLED_STEPS = 2  # steps of the checker between two ticks
 PACED_STEP, STEPS = 2e-4, 500  # length in eta [s^2/m]; number of steps of another continuous loop
 CELL_HALVINGS = 3  # of a cell whose bounds by the checker are too wide
 DEEPEST = 200  # halvings of the box that lead to one cell
@@ -125,7 +122,6 @@ def verify_box(
     share: float = 0.01,
     *,
     suspects: Sequence[Sequence[float]] = (),
-    processes: int = 1,
     progress: Callable[[str], None] = lambda line: None,
 ) -> FileVerdict:
     """Prove a sample of the cells of a proof's file again, by code that shares only the equations with the prover.
@@ -139,39 +135,25 @@ def verify_box(
         document: Content of the file, from `certificate_document`.
         share: Share of the cells to check, in (0, 1]; at least one is checked.
         suspects: Points of the box whose runs may violate a bound, shape (points, parameters), in SI units.
-        processes: Number of processes that share the cells. With more than one, a script that calls this function needs
-            `if __name__ == "__main__"`.
         progress: Called with a line about how far the check is.
 
     Raises:
         ModuleNotFoundError: The extra `proof` is not installed.
         NoRule: A part of the loop has no sound rule.
         ValueError: The document is not a proof's file.
-        WorkerEnded: A process ended before it answered, perhaps for want of memory.
     """
     file = read_proof(document)
     cells, over = file.cells, file.over
     reason, done = _find_contradiction(file, horizon), 0
     if not reason:
         equations = derive_equations(loop, over)
-        signals = tuple(dict.fromkeys(name.split()[1] for name in file.bounds if " " in name))
-        if unknown := [name for name in signals if name not in equations.signals]:
-            raise ValueError(f"bounds: the loop has no signal {unknown[0]}")
-        chosen = [cells[i] for i in _choose_cells(cells, share, suspects)]
-        check = functools.partial(_check, _Question(equations, signals, file.bounds, file.horizon))
-        answers = (
-            map_in_processes(check, chosen, processes)
-            if processes > 1 and len(chosen) > 1
-            else ((i, check(cell)) for i, cell in enumerate(chosen))
-        )
-        with contextlib.closing(answers):
-            for i, why in answers:
-                if why:
-                    ends = (f"{path} {a:.9g} to {b:.9g}" for path, (a, b) in zip(over, chosen[i], strict=True))
-                    reason = f"cell {', '.join(ends)}: {why}"
-                    break
-                done += 1
-                progress(f"{done} of {len(chosen)} cells")
+        chosen = _choose_cells(cells, share, suspects)
+        for done, i in enumerate(chosen, 1):
+            if why := _check(equations, file, cells[i], CELL_HALVINGS):
+                ends = (f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in zip(over, cells[i], strict=True))
+                reason, done = f"cell {', '.join(ends)}: {why}", done - 1
+                break
+            progress(f"{done} of {len(chosen)} cells")
     return FileVerdict(done, len(cells), reason, file.statements)
 
 
@@ -221,33 +203,24 @@ def _comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[Cell], d
     return False
 
 
-class _Question(NamedTuple):
-    """What the checker must prove of a cell: numbers and names, which a process can send to another."""
-
-    equations: Equations
-    signals: tuple[str, ...]
-    bounds: Bounds
-    horizon: float
-
-
-def _check(asked: _Question, cell: Cell, halvings: int = CELL_HALVINGS) -> str:
+def _check(equations: Equations, file: ProofFile, cell: Cell, halvings: int) -> str:
     """Return why the checker does not prove the file's bounds in a cell, empty if it does.
 
     A cell in which it fails is halved: its own bounds of a smaller cell are narrower.
     """
     from diffabs.reach.checker import NotProved, check_cell
 
-    equations = asked.equations
-    steps = (
-        SAMPLED_STEPS if equations.period is not None else [PACED_STEP if equations.paced else asked.horizon / STEPS]
-    )
+    signals = list(dict.fromkeys(name.split()[1] for name in file.bounds if " " in name))
+    if unknown := [name for name in signals if name not in equations.signals]:
+        raise ValueError(f"bounds: the loop has no signal {unknown[0]}")
+    steps = SAMPLED_STEPS if equations.period is not None else [PACED_STEP if equations.paced else file.horizon / STEPS]
     try:
-        found = check_cell(equations, asked.signals, [(low, high) for low, high in cell], steps, asked.horizon)
+        found = check_cell(equations, signals, [(low, high) for low, high in cell], steps, file.horizon)
     except NotProved as error:
         reason = f"not proved: {error}"
     else:
         reason = _compare(
-            asked.bounds,
+            file.bounds,
             {
                 **{f"greatest {name}": (None, x) for name, x in found.greatest.items()},
                 **{f"least {name}": (x, None) for name, x in found.least.items()},
@@ -264,7 +237,7 @@ def _check(asked: _Question, cell: Cell, halvings: int = CELL_HALVINGS) -> str:
     low, high = cell[side]
     middle = 0.5 * (low + high)
     halves = ([*cell[:side], ends, *cell[side + 1 :]] for ends in ([low, middle], [middle, high]))
-    return next((why for half in halves if (why := _check(asked, half, halvings - 1))), "")
+    return next((why for half in halves if (why := _check(equations, file, half, halvings - 1))), "")
 
 
 def _compare(stated: Bounds, found: Mapping[str, tuple[float | None, float | None]]) -> str:

@@ -248,7 +248,7 @@ BASIC = (("param", (), 0), ("state", (), 0), ("state", (), 1), ("const", (), 0.0
 
 @killed_by(
     "reach/native/prove.cpp",
-    "r.delta = (linear | over_ | under) ? zero : vmax(gaps.h - middle, gaps.n + middle);",
+    "r.delta = (linear | above | under) ? zero : vmax(gaps.h - middle, gaps.n + middle);",
     "r.delta = zero;",
 )
 @killed_by("reach/native/prove.cpp", "push[i] = push[i] + Y[i] * symmetric(delta) * HH;", "push[i] = I(0.0);")

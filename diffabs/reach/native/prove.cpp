@@ -23,7 +23,9 @@ struct Task {
   long margin, travelled, clock;  // operation of the stop's margin; which quadratures are distance and time, or -1
   long nonnegative;               // a state that is never negative, or -1
   long speed;                     // a state that stays above `slowest`, or -1
-  double slowest, period_low, period_high, horizon, tolerance, longest, shortest, first;
+  double slowest, period_low, period_high, horizon;  // m/s, s
+  double tolerance;                 // greatest remainder of a step, relative to the state
+  double longest, shortest, first;  // of steps [s], paced [s^2/m]; a step of `shortest` may have any remainder
   long order, tables;
   const double* weights;  // tables x kept, by the logarithm of the speed, or by the time
   double keys_low, keys_high;
@@ -31,31 +33,32 @@ struct Task {
 
 constexpr long MOST_STEPS = 50000;    // of a group
 constexpr int MOST_IN_PERIOD = 100;   // steps
-constexpr int MOST_LIMITS = 6;        // limits of one tick, or of one flow, that a set lies across
+constexpr int MOST_LIMITS = 6;        // limits that a set lies across in one tick; all limits of a flow
 constexpr double WIDEST = 0.3;        // a set of slips wider than this proves nothing: a smaller cell may
 constexpr double NEVER = 1e300;
 
 struct Row { I c; std::vector<V> G; V R; };  // a quadrature: c + G p + [-R, R]
 
-// When and where runs end: at t + m/a, from a captured set with the margin m, if all rates of the margin are in -a.
+// When and where runs end: the margin falls at rates a. A run with margin m at the captured time t ends at t + m/a; m may
+// be negative.
 struct Ending {
   M captured{}, seen{};
-  I fall = I(0.0), speed = I(0.0), pace = I(0.0);  // 1/a; rates of distance and time, in all steps near the end
+  I inverse_rate = I(0.0), speed = I(0.0), pace = I(0.0);  // 1/a and rates of distance and time, in all late steps
   I margin_c = I(0.0), margin = I(0.0);            // of the captured set: at its centre, and over it
   std::vector<I> margin_slope;
   I time_c = I(0.0), way_c = I(0.0);
   std::vector<V> time_G, way_G;
   V time_R = fill(0.0), way_R = fill(0.0);
   Ending(int np, int nb) : margin_slope(np + nb, I(0.0)), time_G(np, fill(0.0)), way_G(np, fill(0.0)) {}
-  void see(M late, I margin_rate, I speed_, I pace_) {
+  void note_late_step(M late, I margin_rate, I speed_, I pace_) {
     I a = inverse(pick(late, -margin_rate, I(1.0)));
     auto add = [&](I& to, I x) { to = pick(late, pick(seen, hull(to, x), x), to); };
-    add(fall, a), add(speed, speed_), add(pace, pace_);
+    add(inverse_rate, a), add(speed, speed_), add(pace, pace_);
     seen |= late;
   }
   // A quadrature at the end: it goes on at a rate in `rate`, whose middle times m/a adds its slopes to its own.
   I at_end(I c, const std::vector<V>& G, V R, I rate) const {
-    I alpha = point(fall.mid()), spread = symmetric(vmax(fall.h - alpha.h, fall.n + alpha.h));
+    I alpha = point(inverse_rate.mid()), spread = symmetric(vmax(inverse_rate.h - alpha.h, inverse_rate.n + alpha.h));
     I tau = alpha * margin_c + spread * margin;  // from the captured set to the end, without the slopes of m
     V slopes = fill(0.0), w = R;
     for (const I& d : margin_slope) slopes += (alpha * d).mag();
@@ -67,7 +70,8 @@ struct Ending {
   I way() const { return at_end(way_c, way_G, way_R, speed); }
 };
 
-enum Fate { TAKEN, TOO_LONG, NO_SERIES };  // of an attempted step; NO_SERIES: a power at 0 has no such derivative
+// Of an attempted step. NO_SERIES: a Taylor coefficient is undefined; order 1 may do.
+enum Fate { TAKEN, TOO_LONG, NO_SERIES };
 
 // Why a lane was lost, in the order of `FAILURES` in engine.py.
 enum Why { NOTHING, NO_VALUE, NEGATIVE, NO_BOX, TOO_WIDE, RISING, TOO_MANY_STEPS, ENDED_AT_START };
@@ -86,9 +90,11 @@ struct Group {
   std::vector<Chord> chords, tick_chords;
   Set set;
   std::vector<Row> rows;
-  std::vector<I> C, J, X;               // within a period, all runs are in C + J (p, r, w) and in X
+  // Within a period, all runs are in C + J (p, r, w), p, r, w in [-1, 1], and in X. C is the Taylor value at the centre
+  // plus the remainder and the disturbance of every run.
+  std::vector<I> C, J, X;
   int used;                             // directions of J that are not 0
-  bool fresh = false;                   // `mid` and `whole` are those of C, J, X, at order 0, with limits as they are
+  bool fresh = false;                   // `mid` and `whole` hold order 0 at C and X, with real limits
   std::vector<I> B, f, push, remainder; // of a step: a box no run leaves, rates in it, effect of disturbances
   M crossing{};
   std::vector<V> top, bottom;   // of signals
@@ -96,12 +102,15 @@ struct Group {
   std::vector<V> above, below;  // every run of the cell goes above, and below, these values of the signals (low, -high)
   std::vector<V> reach;         // greatest half width of the first signal that each parameter causes
   std::vector<V> pmid, phalf;   // middle and half width of each parameter
-  M alive{}, dead{}, done{}, timed{}, ended{};  // ended: some runs may have ended
+  // alive: still followed. dead: the proof failed. done: ended, or at the horizon (timed). ended: a run may have ended.
+  M alive{}, dead{}, done{}, timed{}, ended{};
   M doomed{};                                   // lanes that the attempted step would lose
   int why[LANES];                               // why a lane was lost
   Ending end;
   I elapsed = I(0.0), gone = I(0.0);  // up to this period; in it
   V reached = fill(0.0);
+  // box_limit: 0.6 of the last length without a box; grows by 1 % a step. cross_step: longest step across a limit.
+  // excess: greatest remainder of the step, in tolerances. about: approximate time, for the choice of weights.
   double h_next = 0, about = 0, box_limit = NEVER, cross_step = NEVER, excess = 0;
   long steps = 0, across = 0;
   bool begun = false;
@@ -129,7 +138,7 @@ struct Group {
     whole.centre = &mid, at_tick.centre = &at_tick_mid;
     mid.chords = whole.chords = rest.chords = jac.chords = chords.data();
     at_tick.chords = at_tick_mid.chords = tick_chords.data();
-    rest.natural = jac.natural = false;
+    rest.real_limits = jac.real_limits = false;
     jac.own = n;
     for (int i : limits) if ((int)jac.seeds.size() < MOST_LIMITS) jac.seeds.push_back(i);
   }
@@ -178,10 +187,10 @@ struct Group {
     if (task.tape.code[i] == ROUND) return {fill(1.0), I(0.0), fill(0.5)};
     I low = lower_limit(s, i), high = upper_limit(s, i);
     V a = raw.low(), b = raw.h, zero = fill(0.0);
-    M linear = (a >= low.h) & (b <= high.low()), over_ = a >= high.h, under = b <= low.low();
+    M linear = (a >= low.h) & (b <= high.low()), above = a >= high.h, under = b <= low.low();
     V wide = vmax(b - a, fill(1e-300)), fa = vmin(vmax(a, low.h), high.h), fb = vmin(vmax(b, low.h), high.h);
     Chord r;
-    r.lambda = linear ? fill(1.0) : (over_ | under) ? zero : vmin(vmax((fb - fa) / wide, zero), fill(1.0));
+    r.lambda = linear ? fill(1.0) : (above | under) ? zero : vmin(vmax((fb - fa) / wide, zero), fill(1.0));
     I slope = point(r.lambda);
     auto gap = [&](I at) { return clamped(at, low, high) - slope * at; };
     I gaps = hull(gap(point(a)), gap(point(b)));  // the gap is extreme at the ends, or at a limit between them
@@ -192,8 +201,8 @@ struct Group {
       gaps = pick(in, hull(gaps, gap(limit)), gaps);
     }
     V middle = gaps.mid();
-    r.c = pick(linear, I(0.0), pick(over_, high, pick(under, low, point(middle))));
-    r.delta = (linear | over_ | under) ? zero : vmax(gaps.h - middle, gaps.n + middle);
+    r.c = pick(linear, I(0.0), pick(above, high, pick(under, low, point(middle))));
+    r.delta = (linear | above | under) ? zero : vmax(gaps.h - middle, gaps.n + middle);
     return r;
   }
 
@@ -202,7 +211,7 @@ struct Group {
   // Order 0 of all operations at the start of a step, with limits as they are.
   void look() {
     if (fresh) return;
-    mid.natural = whole.natural = true, whole.nd = used;
+    mid.real_limits = whole.real_limits = true, whole.nd = used;
     set_states(mid, C, false), mid.advance(flow, 0);
     std::vector<I> every(n);
     for (int i = 0; i < n; i++) every[i] = hull(X[i], C[i]);  // the mean value theorem goes from a point of C to one of X
@@ -240,7 +249,7 @@ struct Group {
     std::vector<I> raw0, raw;
     for (int i : limits) raw0.push_back(whole.value(task.tape.a[i], 0));
     raw = raw0;
-    for (Series* one : {&box, &edge}) one->natural = true, one->use_forced = !limits.empty();
+    for (Series* one : {&box, &edge}) one->real_limits = true, one->use_forced = !limits.empty();
     auto rates_in = [&](Series& at, const std::vector<I>& where, std::vector<I>& to) {
       for (size_t q = 0; q < limits.size(); q++) {
         int i = limits[q];
@@ -363,7 +372,7 @@ struct Group {
     if (any(crossing & alive)) {
       across++;
       if (h > 1.01 * cross_step) return TOO_LONG;  // up to a limit first, then across it in short steps
-      mid.natural = whole.natural = false, fresh = false;
+      mid.real_limits = whole.real_limits = false, fresh = false;
       mid.advance(flow, 0), whole.advance(flow, 0);
     }
     for (int k = 0; k < order; k++) {
@@ -408,7 +417,7 @@ struct Group {
       top[s] = alive ? vmax(top[s], now[s].h) : top[s];
       bottom[s] = alive ? vmax(bottom[s], now[s].n) : bottom[s];
     }
-    see_end();
+    note_possible_end();
     for (int q = 0; q < task.quadratures; q++) move_quadrature(rows[q], task.flow[n + q], order, h, H, power);
     for (int i = 0; i < n; i++) {
       int a = state_op[i];
@@ -430,7 +439,7 @@ struct Group {
   }
 
   // While a run may have ended, the margin must fall: its rates there bound the time from the captured set to the end.
-  void see_end() {
+  void note_possible_end() {
     M late = alive & (end.captured | (M)(box.value((int)task.margin, 0).low() <= 0) | box.none[task.margin]);
     ended |= late;
     if (!any(late)) return;
@@ -439,7 +448,7 @@ struct Group {
     M falls = (rate.h < 0) & ~box.none[task.margin];
     lose(late & ~falls, RISING);
     auto quadrature_rate = [&](long q, double without) { return q < 0 ? I(without) : box.value(task.flow[q], 0); };
-    end.see(late & falls, rate, quadrature_rate(task.travelled, 0.0), quadrature_rate(task.clock, 1.0));
+    end.note_late_step(late & falls, rate, quadrature_rate(task.travelled, 0.0), quadrature_rate(task.clock, 1.0));
   }
 
   void move_quadrature(Row& row, int rate, int order, double h, I H, I power) {
@@ -546,7 +555,7 @@ struct Group {
 
   // A tick: every state through the tick's operations, with one direction for each limit that the set lies across.
   void apply_tick() {
-    at_tick.natural = at_tick_mid.natural = true, at_tick.nd = np + nb;
+    at_tick.real_limits = at_tick_mid.real_limits = true, at_tick.nd = np + nb;
     at_tick.widths.clear(), at_tick.seeds.clear(), at_tick.own = -1;
     set_states(at_tick_mid, C, false), at_tick_mid.advance(tick, 0);
     set_states(at_tick, X, true), at_tick.advance(tick, 0);
@@ -557,7 +566,7 @@ struct Group {
       if (any((delta[i] > 0) & alive)) across++, at_tick.seeds.push_back(i);
     }
     if (at_tick.seeds.size() > MOST_LIMITS) { lose(alive, NO_VALUE); return; }
-    at_tick.natural = at_tick_mid.natural = false;
+    at_tick.real_limits = at_tick_mid.real_limits = false;
     // The values of a limited number over the set include its disturbance; along its own direction it has this size.
     at_tick.own = np + nb, at_tick.widths = at_tick.seed_scale = delta;
     at_tick.nd = used = np + nb + (int)at_tick.seeds.size();
@@ -589,8 +598,8 @@ struct Group {
     if (sampled) apply_tick();
     gone = I(0.0);
     int count = 0;
-    for (bool over_ = false; !over_ && any(alive);) {
-      over_ = step(sampled ? period_ - gone : I(NEVER));
+    for (bool is_over = false; !is_over && any(alive);) {
+      is_over = step(sampled ? period_ - gone : I(NEVER));
       seen();
       if (++count > MOST_IN_PERIOD || steps > MOST_STEPS) lose(alive, TOO_MANY_STEPS);
     }
@@ -606,7 +615,7 @@ struct Group {
   }
 
   void look_at_margin() {
-    mid.natural = whole.natural = true, whole.nd = used;
+    mid.real_limits = whole.real_limits = true, whole.nd = used;
     set_states(mid, C, false), mid.advance(stop, 0), set_states(whole, X, true), whole.advance(stop, 0);
     lose(mid.none[task.margin] | whole.none[task.margin], NO_VALUE);
   }
@@ -635,9 +644,9 @@ struct Group {
       take(task.clock, end.time_c, end.time_G, end.time_R), take(task.travelled, end.way_c, end.way_G, end.way_R);
       end.captured |= capture;
     }
-    M over_ = alive & end.captured & (margin.h < 0);
-    M late = alive & ~over_ & (M)(time_now().low() >= task.horizon * (1 - 1e-12));
-    timed |= late, done |= over_ | late, alive &= ~(over_ | late);
+    M is_over = alive & end.captured & (margin.h < 0);
+    M late = alive & ~is_over & (M)(time_now().low() >= task.horizon * (1 - 1e-12));
+    timed |= late, done |= is_over | late, alive &= ~(is_over | late);
   }
 
   void start(const double* cells, long count) {
@@ -652,7 +661,7 @@ struct Group {
         pmid[p][l] = m, phalf[p][l] = std::fmax(c[1] - m, m - c[0]);
       }
     for (Series* s : {&mid, &rest, &whole, &box, &edge, &jac, &at_tick, &at_tick_mid}) set_params(*s, s == &mid || s == &at_tick_mid);
-    at_tick.natural = at_tick_mid.natural = true, at_tick.nd = np + nb;
+    at_tick.real_limits = at_tick_mid.real_limits = true, at_tick.nd = np + nb;
     at_tick.widths.clear(), at_tick.seeds.clear(), at_tick.own = -1;
     at_tick_mid.advance(starts, 0), at_tick.advance(starts, 0);
     for (V& x : set.B) x = fill(0.0);

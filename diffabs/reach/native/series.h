@@ -1,9 +1,9 @@
 // A loop's equations on Taylor series whose coefficients are intervals with derivatives in `nd` directions.
 //
-// The equations are a list of operations, operands first (`equations.py`). Order k of an operation needs only orders up
-// to k of its operands. A function y of u with dy = g du needs g one order later than u, and derivatives of g later than
-// its values. So each operation has a lag of its values and one of its derivatives. At u = 0 a power u^2.1 has a first
-// and a second derivative but no third: with lags, nothing asks for the third where a step of order 1 starts at 0.
+// The equations are a list of operations, operands first (`equations.py`). Order k of an operation needs orders up to k of
+// its operands. A function y(u) has its factor g = dy/du as an operand; order k of y needs g up to order k - 1 only. So g
+// has a lag of 1: call k of `advance` computes its order k - 1. `dlag` is the same for derivatives along directions. At
+// u = 0 a power u^2.1 has two derivatives but no third: with lags, a step of order 1 that starts there needs none.
 #pragma once
 #include <algorithm>
 #include <vector>
@@ -79,14 +79,14 @@ struct Series {
   std::vector<M> yes, no;   // of conditions: certainly true, certainly false
   std::vector<char> kind;   // 0: constant, 1: of the parameters only, 2: changes
   std::vector<char> has_value, has_slope;  // of what does not change
-  bool natural = true;  // clamps as they are; else as their relaxation
+  bool real_limits = true;  // a limit is itself; else it is its chord, without the disturbance unless `widths` is set
   const Chord* chords = nullptr;
   const Series* centre = nullptr;  // the same at the centre of the set, for the mean value form at order 0
-  std::vector<I> forced;           // of clamps in a box: also the values of the relaxation
+  std::vector<I> forced;           // of limits over a step: the hull of the limit and of its chord with disturbance
   bool use_forced = false;
 
   Series(const Tape& t, int orders, int nd)
-      : tape(&t), orders(orders), most(nd ? nd : 1), nd(nd), v(t.count * (orders + 2)), d(t.count * (orders + 2) * most), none(t.count), yes(t.count), no(t.count), kind(t.count), forced(t.count), round(t.count, -1) {
+      : tape(&t), orders(orders), most(nd ? nd : 1), nd(nd), v(t.count * (orders + 2)), d(t.count * (orders + 2) * most), none(t.count), yes(t.count), no(t.count), kind(t.count), forced(t.count), computed_in(t.count, -1) {
     forget();
     for (int i = 0; i < t.count; i++) {
       auto of = [&](int j) { return j < 0 ? 0 : (int)kind[j]; };
@@ -114,19 +114,19 @@ struct Series {
 
   // The coefficients of order `k` of all operations of a program (of those with a lag: of an earlier order).
   void advance(const Program& p, int k) {
-    if (k == 0) { rounds++; for (int i : p.list) if (kind[i] == 2) none[i] = M{}; }
+    if (k == 0) { pass_number++; for (int i : p.list) if (kind[i] == 2) none[i] = M{}; }
     for (int i : p.order) if (k >= p.lag[i]) once(i, k - p.lag[i], has_value, &Series::values);
     if (nd == 0) return;
     for (int i : p.dorder) if (k >= p.dlag[i]) once(i, k - p.dlag[i], has_slope, &Series::slopes);
     if (k == 0 && centre) spread_none(p);
     // Once more, operands first: each value is also within the mean value form, and so are the values made from it.
-    if (k == 0 && centre) rounds++;
+    if (k == 0 && centre) pass_number++;
     if (k == 0 && centre) for (int i : p.list) {
       if (p.lag[i] || kind[i] < 2) continue;
       values(i, 0);
       if (p.dlag[i]) continue;
       slopes(i, 0);
-      if (tape->code[i] != STATE && !is_truth(tape->code[i])) refine(i);
+      if (tape->code[i] != STATE && !is_truth(tape->code[i])) meet_mean_value(i);
     }
   }
   // Marks what is made from numbers that have no value, or no derivative: a factor may come after its function.
@@ -137,14 +137,14 @@ struct Series {
       none[i] |= tape->code[i] == SELECT ? of(a) | (yes[a] & of(c)) | (no[a] & of(b)) : tape->code[i] == MEET ? of(a) : of(a) | of(b) | of(c);
     }
   }
-  // What does not change in a run is computed once a cell.
+  // What does not change in a run is computed once a cell. `k` is the order after the lag.
   void once(int i, int k, std::vector<char>& has, void (Series::*compute)(int, int)) {
     if (kind[i] < 2) { if (k || has[i]) return; has[i] = 1; }
     (this->*compute)(i, k);
   }
   void forget() { has_value.assign(tape->count, 0), has_slope.assign(tape->count, 0); }
   static bool is_truth(int code) { return code == TRUTH || (code >= LT && code <= NOT); }
-  void refine(int i) {
+  void meet_mean_value(int i) {
     V w = fill(0.0);
     for (int j = 0; j < nd; j++) w += slope(i, 0)[j].mag();
     I mean = centre->value(i, 0) + symmetric(w), both = meet(mean, value(i, 0));
@@ -175,7 +175,7 @@ struct Series {
         break;
       case CLAMP: {
         I low = b < 0 ? I(-1e300) : value(b, 0), high = c < 0 ? I(1e300) : value(c, 0), x = value(a, 0);
-        if (natural) {
+        if (real_limits) {
           if (k == 0) y = use_forced ? forced[i] : clamped(x, low, high);
           else {
             M in = (x.low() >= low.h) & (x.h <= high.low()), out = (x.low() >= high.h) | (x.h <= low.low());
@@ -190,7 +190,7 @@ struct Series {
       }
       case ROUND:  // x + w, |w| <= 1/2
         y = value(a, k);
-        if (natural || !widths.empty()) {
+        if (real_limits || !widths.empty()) {
           if (k == 0) y = use_forced ? forced[i] : y + symmetric(fill(0.5));
           else none[i] = mask(true);
         }
@@ -229,10 +229,10 @@ struct Series {
             case LOG: y = log_of(x, bad); break;
             case ATAN: y = atan_of(x, bad); break;
             case POWER: {
-              if (tape->b[i] >= 0 && round[i] == rounds) return;
-              round[i] = rounds;
+              if (tape->b[i] >= 0 && computed_in[i] == pass_number) return;
+              computed_in[i] = pass_number;
               // u^e = u u^(e-1), whose factor g = e u^(e-1) is the second operand
-              int less = e_above_one(i) ? t.b[b] : -1;
+              int less = has_power_factor(i) ? t.b[b] : -1;
               if (less < 0) { y = power_of(x, value(c, 0), bad); break; }
               once(t.c[less], 0, has_value, &Series::values);
               values(less, 0);
@@ -289,7 +289,7 @@ struct Series {
         return;
       case CLAMP: case ROUND: {
         if (t.code[i] == ROUND) { for (int j = 0; j < nd; j++) y[j] = slope(a, k)[j]; }
-        else if (!natural) { for (int j = 0; j < nd; j++) y[j] = point(chords[i].lambda) * slope(a, k)[j]; }
+        else if (!real_limits) { for (int j = 0; j < nd; j++) y[j] = point(chords[i].lambda) * slope(a, k)[j]; }
         else {
           I low = b < 0 ? I(-1e300) : value(b, 0), high = c < 0 ? I(1e300) : value(c, 0), x = value(a, 0);
           M in = (x.low() >= low.h) & (x.h <= high.low()), out = (x.low() >= high.h) | (x.h <= low.low());
@@ -316,9 +316,9 @@ struct Series {
     }
   }
   // Whether the factor of u^e is e times a power: then u^e is u u^(e-1).
-  bool e_above_one(int i) const { int b = tape->b[i]; return b >= 0 && tape->code[b] == MUL && tape->code[tape->b[b]] == POWER && tape->b[b] != i; }
-  std::vector<long> round;  // when a power was computed
-  long rounds = 0;
+  bool has_power_factor(int i) const { int b = tape->b[i]; return b >= 0 && tape->code[b] == MUL && tape->code[tape->b[b]] == POWER && tape->b[b] != i; }
+  std::vector<long> computed_in;  // when a power was computed
+  long pass_number = 0;
   int own = -1;            // first direction of the clamps' own disturbances
   std::vector<int> seeds;  // the clamps that have one
   std::vector<V> widths, seed_scale;  // of the clamps of a tick: the disturbance over the set, and along its direction
