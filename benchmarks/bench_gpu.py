@@ -1,5 +1,6 @@
 """Closed loops per second on an NVIDIA GPU: a kernel of diffabs, its XLA path, and diffrax, on the problem of the peers
-(peers/problem.py), at equal accuracy; and what share of the card's FP32 rate the kernel's own arithmetic is.
+(peers/problem.py), at equal accuracy; and what share of the card's FP32 rate the kernel's own arithmetic is. With
+--lorenz the Lorenz ensemble of bench_yardsticks.py follows, by 1,000 equal steps: kernel, and diffrax under vmap.
 
 The rate is measured first, by a kernel that only multiplies and adds. The share counts the real additions,
 multiplications and divisions of a step as the program has them, one each, times the steps of the runs; selections,
@@ -8,7 +9,7 @@ comparisons, elementary functions and whole numbers count nothing. Times are tak
 Never run yet where this was written: no machine there has a GPU. With --machine-code no GPU is asked for: registers and
 spills of the packaged scenarios for sm_80 and sm_90, as NVRTC's assembler tells them.
 
-    python benchmarks/bench_gpu.py [--lanes 131072 1048576] [--dtypes float32 float64] [--rounds 5]
+    python benchmarks/bench_gpu.py [--lanes 131072 1048576] [--dtypes float32 float64] [--rounds 5] [--lorenz 768000]
     python benchmarks/bench_gpu.py --machine-code
 """
 
@@ -152,6 +153,26 @@ def measured(lanes, dtype, rounds, peak):
     return rows
 
 
+def ensemble(lanes, dtype, rounds):
+    """Return a row for each contender on the Lorenz ensemble, on the device that JAX has."""
+    import bench_yardsticks as yardsticks
+
+    jax.config.update("jax_enable_x64", dtype == "float64")
+    which, truth = yardsticks.checked(lanes)
+    rho, rows = yardsticks.rhos(lanes).astype(dtype), []
+    makers = {
+        "Lorenz: kernel": yardsticks.by_diffabs("fixed", rho),
+        "Lorenz: diffrax, RK4": yardsticks.by_diffrax("fixed", rho, lanes),
+    }
+    calls = {name: prepared(None) for name, prepared in makers.items()}
+    errors = {name: yardsticks.worst(call(), which, truth) for name, call in calls.items()}
+    taken = record.in_turn({name: functools.partial(record.timed, call) for name, call in calls.items()}, rounds)
+    for name, error in errors.items():
+        row = {"name": name, "lanes": lanes, "dtype": dtype, "setting": 1 / yardsticks.STEPS, "error": error}
+        rows.append(row | {"runs": lanes / statistics.median(taken[name])})
+    return rows
+
+
 class Translated(Exception):
     """A program, and how it is to be run."""
 
@@ -197,6 +218,7 @@ def on_a_gpu(options):
         raise SystemExit("JAX runs on no GPU here: pip install jax[cuda13] on a machine with one")
     peak, rounds = rate(on, options.rounds), options.rounds
     rows = [row for n in options.lanes for dtype in options.dtypes for row in measured(n, dtype, rounds, peak)]
+    rows += [row for n in options.lorenz for dtype in options.dtypes for row in ensemble(n, dtype, rounds)]
     table = Table("", "lanes", "numbers", "setting", "worst error", "runs/s", "of FP32 peak")
     for row in rows:
         share = f"{row['share']:.1%}" if "share" in row else ""
@@ -212,6 +234,7 @@ def main():
     parser.add_argument("--lanes", type=int, nargs="+", default=[1 << 17, 1 << 20])
     parser.add_argument("--dtypes", nargs="+", default=["float32", "float64"], choices=("float32", "float64"))
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--lorenz", type=int, nargs="*", default=[], metavar="LANES")
     parser.add_argument("--out", type=pathlib.Path)
     parser.add_argument("--machine-code", action="store_true")
     options = parser.parse_args()

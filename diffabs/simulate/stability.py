@@ -238,12 +238,13 @@ def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
     if probes:
         starts = probes(loop.initial, loop.reference.setpoint(loop.start().reference), loop.stop)
         return jax.vmap(lambda start: function(dataclasses.replace(loop, initial=start)))(starts)
-    starts = jax.tree.map(lambda x: jnp.array([0.0, 1.0]) * x, loop.initial)
     arrived = dataclasses.replace(loop, reference=_AtTarget(reference=loop.reference))
-    found = [
-        jax.vmap(lambda start, one=one: function(dataclasses.replace(one, initial=start)))(starts)
-        for one in (loop, arrived)
-    ]
+
+    # The axis is that of the factors, because a start may be without numbers.
+    def begin(factor: Scalar, one: Loop) -> PyTree:
+        return function(dataclasses.replace(one, initial=jax.tree.map(lambda x: factor * x, loop.initial)))
+
+    found = [jax.vmap(partial(begin, one=one))(jnp.array([0.0, 1.0])) for one in (loop, arrived)]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
 
