@@ -33,6 +33,7 @@ docs: $(VENV)/.docs
 bench: $(VENV)/.bench
 	$(BIN)/python benchmarks/bench_peers.py
 	$(BIN)/python benchmarks/bench_work_precision.py
+	$(BIN)/python benchmarks/bench_fields.py
 	$(BIN)/python benchmarks/bench_gradient.py
 	$(BIN)/python benchmarks/bench_gradient.py --rtol 1e-5 --loops lmi est
 	$(BIN)/python benchmarks/bench_riccati.py

@@ -2,7 +2,9 @@
 
     lorenz     the Lorenz system, t from 0 to 4: no comparison, no event
     orbit      an orbit of eccentricity 0.6, t from 0 to 20: no comparison, no event
+    network    20 states, two layers of tanh with random weights, t from 0 to 5: no comparison, no event
     ball       a bouncing ball with drag, 4 bounces: diffrax restarts after each one, in a scan over its event
+    ball-grad  the same with the derivative of the final height by gravity, forwards on both sides
 
 Both sides take Tsitouras' method in float64, each at the loosest tolerance of its ladder whose error against a
 reference is at most the one asked for. Compiled calls are timed in turn; a ratio is the median of those within
@@ -12,6 +14,7 @@ a round. Prints a table, writes JSON with machine and versions.
 """
 
 import argparse
+import json
 import pathlib
 
 import diffrax
@@ -24,6 +27,8 @@ from rich.console import Console
 from rich.table import Table
 
 import diffabs as d
+
+jax.config.update("jax_enable_x64", True)
 
 LADDER = [10.0**-k for k in np.arange(4.0, 12.1, 0.5)]
 BOUNCES, DRAG, KEEP = 4, 0.05, 0.8
@@ -47,10 +52,22 @@ def ball(t, y, args):
     return v, -args - DRAG * v * jnp.abs(v)
 
 
+SIZE = 20
+_numbers = np.random.default_rng(0)
+WEIGHTS = [jnp.asarray(_numbers.standard_normal((SIZE, SIZE)) / np.sqrt(SIZE)) for _ in range(2)]
+
+
+def network(t, y, args):
+    """Return the rates of a network with two layers."""
+    return args * WEIGHTS[1] @ jnp.tanh(WEIGHTS[0] @ y + jnp.sin(t)) - y
+
+
 CASES = {
     "lorenz": (lorenz, (1.0, 1.0, 25.0), 4.0, 28.0),
     "orbit": (orbit, (jnp.array([0.4, 0.0]), jnp.array([0.0, 2.0])), 20.0, 1.0),
+    "network": (network, jnp.linspace(-1.0, 1.0, SIZE), 5.0, 3.0),
     "ball": (ball, (1.0, 0.0), 2.2, 9.81),
+    "ball-grad": (ball, (1.0, 0.0), 2.2, 9.81),
 }
 
 
@@ -58,8 +75,17 @@ def by_diffabs(case, tolerance):
     """Return the function from args to the final state."""
     field, y0, end, _ = CASES[case]
     bounce = d.Event(lambda t, y, args: y[0], lambda t, y, args: (y[0], -KEEP * y[1]))
-    events = [bounce] if case == "ball" else []
-    return lambda args: d.solve(field, y0, 0.0, end, args, solver=d.Adaptive(tolerance), events=events).y
+    events = [bounce] if field is ball else []
+
+    def final(args):
+        return d.solve(field, y0, 0.0, end, args, solver=d.Adaptive(tolerance), events=events).y
+
+    return _with_slope(final) if case == "ball-grad" else final
+
+
+def _with_slope(final):
+    """Return the function from args to the final height and its derivative."""
+    return lambda args: jax.jvp(lambda args: final(args)[0], (args,), (jnp.ones_like(args),))
 
 
 def by_diffrax(case, tolerance):
@@ -83,7 +109,7 @@ def by_diffrax(case, tolerance):
             adjoint=diffrax.ForwardMode(),
         )
 
-    if case != "ball":
+    if field is not ball:
         return lambda args: jax.tree.map(lambda x: x[-1], run(args, 0.0, y0).ys)
     landing = diffrax.Event(lambda t, y, args, **_: y[0], optimistix.Newton(rtol=1e-12, atol=1e-12), direction=False)
 
@@ -98,7 +124,7 @@ def by_diffrax(case, tolerance):
         (t, y), _ = jax.lax.scan(one, (jnp.asarray(0.0), y0), length=BOUNCES)
         return jax.tree.map(lambda x: x[-1], run(args, t, y).ys)
 
-    return bounces
+    return _with_slope(bounces) if case == "ball-grad" else bounces
 
 
 def measure(case, lanes, accuracy, rounds):
@@ -143,7 +169,6 @@ def main():
     parser.add_argument("--cases", nargs="+", default=list(CASES))
     parser.add_argument("--out", type=pathlib.Path)
     asked = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
     rows = [measure(case, lanes, asked.accuracy, asked.rounds) for case in asked.cases for lanes in asked.lanes]
     table = Table("case", "lanes", "diffabs ms", "rtol", "error", "diffrax ms", "rtol", "error", "ratio")
     for row in rows:
@@ -152,7 +177,9 @@ def main():
     console = Console()
     console.print(table)
     packages = ("jaxlib", "numpy", "diffrax", "equinox")
-    console.print(f"written to {record.written('fields', {'rows': rows}, asked.out, packages)}")
+    path = record.written("fields", {"rows": rows}, asked.out, packages)
+    told = json.loads(path.read_text(encoding="utf-8"))
+    console.print(told["machine"], told["versions"], f"written to {path}")
 
 
 if __name__ == "__main__":

@@ -44,6 +44,7 @@ from diffabs.simulate.run import RunCapacity, run_differentiable
 from diffabs.simulate.step.adaptive import AdaptiveStepping
 from diffabs.simulate.step.comparisons import SwitchedProgram
 from diffabs.simulate.step.fixed import FixedStepping
+from diffabs.simulate.step.inner_functions import HOST_CALLS
 from diffabs.simulate.step.replay import log_attempt, log_capacity
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import UNCONSTRAINED, build_system
@@ -60,6 +61,14 @@ LIFT_FRACTION, LIFT_EPS = 1e-12, 32
 MAX_ACCEPTED = 256  # functions that are known to be valid
 _accepted: dict[Any, "Function"] = {}
 SWITCH_SOLVER = Adaptive(1e-6)
+# By the function that hides a comparison: what to write instead.
+ADVICE = (
+    (("scan",), "Write the loop as a loop of Python, or compare before it"),
+    (("while",), "Write a fixed number of turns as a loop of Python, or compare before it"),
+    (("custom_jvp_call", "custom_vjp_call"), "Compare outside of the function, or leave out its derivative rule"),
+    (HOST_CALLS, "Write the function in JAX"),
+    ((), "Compare outside of the function"),
+)
 
 Field = Callable[..., PyTree]  # of (t, y, args)
 
@@ -462,8 +471,8 @@ def solve(
         The solution. Read its `status`: without a valid one its numbers are NaN.
 
     Raises:
-        ValueError: An argument is invalid. A switch of the field is no comparison, such as `jnp.floor`. A second
-            derivative is asked of adaptive steps.
+        ValueError: An argument is invalid. A switch of the field cannot be located: it is no comparison, such as
+            `jnp.floor`, or a loop hides it. A second derivative is asked of adaptive steps.
 
     Examples:
         >>> import diffabs as d
@@ -483,12 +492,6 @@ def solve(
     asked: Any = solver
     method, count = _read_solver(asked, t0, t1, loop.given["t0"].dtype)
     program = _trace_program(loop)
-    if program.jumps:
-        worst = program.jumps[0]
-        raise ValueError(
-            f"field has the operation '{worst.name}' at {summarize(worst.source)}: its result jumps where no comparison"
-            " changes, so that no step can end there. Write it as comparisons, or as a state that an event resets"
-        )
     if isinstance(method, AdaptiveStepping) and not program.bit_count and not events:
         method = dataclasses.replace(method, is_logged=False, watches=False, smooth=True)
     saves = {} if places is None else {"saves": Saves(places=places)}
@@ -517,7 +520,7 @@ def switches(
         abs 3.0
 
     Raises:
-        ValueError: An argument is invalid or traced.
+        ValueError: An argument is invalid or traced, or a switch of the field cannot be located.
     """
     if _is_traced(t, y, args, t1):
         raise ValueError("switches lists numbers of one run: call it outside of jit, vmap and grad")
@@ -586,9 +589,25 @@ def _build_loop(
 
 
 def _trace_program(loop: Any) -> SwitchedProgram:
-    """Return the program of the loop's flow, with its comparisons."""
+    """Return the program of the loop's flow, with its comparisons.
+
+    Raises:
+        ValueError: The field has a switch that no step can end on.
+    """
     program = build_system(loop, {}, jnp.zeros_like(loop.given["t0"]), loop.start(), {}, switched=True).program
     assert program is not None
+    for worst in program.hidden:
+        advice = next((one for names, one in ADVICE if worst.function in names), ADVICE[-1][1])
+        raise ValueError(
+            f"field has the comparison '{worst.name}' within '{worst.function}' at {summarize(worst.source)}: no step"
+            f" can end where its answer changes. {advice}"
+        )
+    for worst in program.jumps:
+        raise ValueError(
+            f"field has the operation '{worst.name}' at {summarize(worst.source)}: its result jumps or bends where no"
+            " comparison changes, so that no step can end there. Write it as comparisons, or as a state that an event"
+            " resets"
+        )
     return program
 
 

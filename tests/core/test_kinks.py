@@ -58,6 +58,15 @@ KINKED: dict[str, tuple[Callable[[Any, Any], Any], int]] = {  # of x, which move
     "of what is fixed": (lambda x, p: jnp.where(p > 0.3, x, -x), 0),
     "of equality": (lambda x, p: jnp.where(x == p, 1.0, x), 0),
     "of integers": (lambda x, p: jnp.where(x.astype(int) > 1, 1.0, x), 0),
+    "a conditional": (lambda x, p: jax.lax.cond(x > p, lambda: x * x, lambda: x), 1),
+    "in one of three": (
+        lambda x, p: jax.lax.switch((p > 0.3).astype(int), [jnp.abs, lambda x: jnp.maximum(x, p), jnp.sign], x),
+        4,
+    ),
+    "relu": (lambda x, p: jax.nn.relu(x - p), 1),
+    "the greatest": (lambda x, p: jnp.max(x * jnp.array([1.0, -2.0, 0.5]) - p), 2),
+    "the least of columns": (lambda x, p: jnp.sum(jnp.min(x * jnp.array([[1.0, -2.0], [0.5, 3.0]]) - p, axis=0)), 2),
+    "of a smooth function": (lambda x, p: jax.nn.softplus(x - p), 0),
     "in a loop": (lambda x, p: jax.lax.fori_loop(0, 2, lambda _, y: jnp.where(y > p, y, 2.0 * y), x), 0),
 }
 
@@ -144,9 +153,30 @@ def test_a_search_below_all_knots_has_one_side():
     assert found[3] == pytest.approx(-0.1)
 
 
-@killed_by("simulate/step/comparisons.py", '"remat", "remat2", ', "")
+@killed_by("simulate/step/inner_functions.py", '"remat", "remat2", ', "")
 def test_a_comparison_within_a_checkpoint_is_seen():
     assert program(jax.checkpoint(lambda x, p: jnp.maximum(x, p))).bit_count == 1
+
+
+@killed_by("simulate/step/inner_functions.py", "jax.lax.stop_gradient(x), x) if _is_real(x)", "x, x) if _is_real(x)")
+def test_a_branch_that_is_not_taken_has_no_infinite_derivative():
+    def root(x: Any, p: Any) -> Any:
+        return jax.lax.cond(x > p, lambda x: jnp.sqrt(jnp.maximum(x - p, 0.0)), lambda x: x, x)
+
+    one = program(root)
+    assert jax.grad(lambda x: one(same, x, jnp.asarray(0.6), held(one, 0.1)))(0.6) == 1.0
+
+
+def test_what_a_loop_hides_is_told():
+    """Of numbers that move, in whatever turn, and that count; what a loop compares of others is not hidden."""
+
+    def turns(x: Any, p: Any) -> Any:
+        late = jax.lax.fori_loop(0, 3, lambda _, both: (both[1] > p, x * x), (p > 0.1, p))[1]
+        return late, jax.lax.fori_loop(0, 3, lambda i, y: jnp.where(p > 0.1 * i, y, 2.0 * y), x)
+
+    assert [(one.name, one.function) for one in program(turns).hidden] == [("gt", "scan")]
+    one = SwitchedProgram(turns, jnp.asarray(0.1), jnp.asarray(0.6), lambda out: out[1])
+    assert one.hidden == []
 
 
 @killed_by("simulate/step/modes.py", "most.eps**ROUNDING_POWER *", "0.0 *")

@@ -20,7 +20,7 @@ from diffabs.scenario.scenario import load
 TEXT, COMMANDS, LIBRARY, SWEEPS = (
     (ROOT / page).read_text() for page in ("README.md", "docs/commands.md", "docs/library.md", "docs/sweeps.md")
 )
-(START,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+START, FIELD = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 CODE, DESIGN, TUNE = re.findall(r"```python\n(.*?)```", LIBRARY, re.DOTALL)
 
 
@@ -35,6 +35,15 @@ def test_the_readme_prints_its_table(capsys):
     least, greatest, at, slope = numbers["stop_distance"]
     assert greatest / least == pytest.approx(2, rel=0.1)  # nearly in proportion to 1/grip
     assert (at, slope) == (0.4, pytest.approx(-12.33 / 0.4, rel=0.1))
+
+
+@pytest.mark.slow
+def test_the_readme_solves_a_field(capsys):
+    assert len([line for line in FIELD.splitlines() if line]) <= 10
+    exec(compile(FIELD, "README.md", "exec"), {})
+    # 8 (1 - exp(-t)) up to 3, then 4 + (target - 4) exp(t* - t)
+    wanted = [4 - np.exp(-2) * 8 / 5, np.exp(-2) * 8 * (1 / 5 - 1 / 25)]
+    np.testing.assert_allclose([float(x) for x in capsys.readouterr().out.split()], wanted, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -263,6 +263,9 @@ def test_a_field_of_diffrax_goes_in():
         field_of(fall)
 
 
+ruled, ruled_backwards = jax.custom_jvp(jnp.abs), jax.custom_vjp(jnp.abs)
+ruled.defjvp(lambda at, moves: (jnp.abs(*at), jnp.sign(*at) * moves[0]))
+ruled_backwards.defvjp(lambda y: (jnp.abs(y), y), lambda y, slope: (jnp.sign(y) * slope,))
 TERMINAL_RESET = d.Event(fall, fall, terminal=True)
 REFUSED = {
     "solver = 3 is no solver": {"solver": 3},
@@ -279,6 +282,18 @@ REFUSED = {
     r"field returns shape \(2,\); \(\) is needed": {"field": lambda t, y, args: jnp.ones(2)},
     "field returns the structure": {"field": lambda t, y, args: (y,)},
     "field has the operation 'floor' at .*test_solve": {"field": lambda t, y, args: jnp.floor(y)},
+    "field has the operation 'sort' at": {"field": lambda t, y, args: jnp.sort(jnp.stack([y, t]))[0]},
+    "comparison 'lt' within 'scan' at .*test_solve.* as a loop of Python": {
+        "field": lambda t, y, args: jax.lax.fori_loop(0, 2, lambda _, x: jnp.where(y < 0.5, 1.0, x), 0.0)
+    },
+    "comparison 'gt' within 'while' at .* a fixed number of turns": {
+        "field": lambda t, y, args: jax.lax.while_loop(lambda x: y > x, lambda x: 2 * x, 0.1)
+    },
+    "comparison 'abs' within 'custom_jvp_call' at .* leave out its derivative rule": {
+        "field": lambda t, y, args: ruled(y)
+    },
+    "comparison 'abs' within 'custom_vjp_call'": {"field": lambda t, y, args: ruled_backwards(y)},
+    "'pure_callback' at .*Write the function in JAX": {"field": lambda t, y, args: jax.pure_callback(np.cos, t, y)},
     "events.0 = 1 is no d.Event": {"events": [1]},
     "events.0 is terminal and has a reset": {"events": [TERMINAL_RESET]},
     r"events.0.condition returns shape \(3,\)": {"events": [d.Event(lambda t, y, args: jnp.ones(3))]},
@@ -292,6 +307,52 @@ def test_bad_arguments_are_refused_in_one_line(message):
     with pytest.raises(ValueError, match=message) as caught:
         d.solve(given.pop("field"), given.pop("y0"), given.pop("t0"), given.pop("t1"), **given)
     assert "\n" not in str(caught.value)
+    if message.startswith(("field has", "comparison", "'pure")):
+        with pytest.raises(ValueError, match=message):
+            d.switches(REFUSED[message]["field"], 0.0, 1.0)
+
+
+def both(y, level):
+    """2 below the level and 0.5 above it."""
+    return jnp.where(y < level, 2.0, 0.5)
+
+
+INNER = {  # fields that are 2 below the level and 0.5 above it
+    "cond": lambda t, y, level: jax.lax.cond(y < level, lambda: 2.0, lambda: 0.5),
+    "switch": lambda t, y, level: jax.lax.switch(jnp.where(y < level, 2, 0), [lambda: 0.5, lambda: 9.0, lambda: 2.0]),
+    "in a branch": lambda t, y, level: jax.lax.cond(t < 9.0, both, lambda y, level: 3.0 * y, y, level),
+    "jit": lambda t, y, level: jax.jit(both)(y, level),
+    "remat": lambda t, y, level: jax.checkpoint(both)(y, level),
+    "of the greatest": lambda t, y, level: both(jnp.max(jnp.stack([y, -t, t - 9.0])), level),
+    "beside a loop": lambda t, y, level: (
+        both(y, level) * jax.lax.fori_loop(0, 2, lambda i, x: x + jnp.where(level > 0.9 * i, 0.5, 9.0), 0.0)
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", INNER)
+def test_a_jump_in_an_inner_function_is_located(name):
+    def final(level):
+        return d.solve(INNER[name], 0.0, 0.0, 1.0, level, solver=ADAPTIVE).y
+
+    value, slope = jax.value_and_grad(final)(1.0)
+    assert abs(value - 1.25) < 1e-8  # level + (1 - level/2)/2
+    assert abs(slope - 0.75) < 1e-8
+
+
+@pytest.mark.slow
+def test_the_bend_of_relu_is_located():
+    """y = t up to the level, then level - 1 + exp(t - level)."""
+
+    def final(level):
+        return d.solve(
+            lambda t, y, level: 1.0 + jax.nn.relu(y - level), 0.0, 0.0, 2.0, level, solver=d.Adaptive(1e-6)
+        ).y
+
+    value, slope = jax.value_and_grad(final)(0.5)
+    assert abs(value - (0.5 - 1 + np.exp(1.5))) < 1e-5
+    assert abs(slope - (1 - np.exp(1.5))) < 1e-5
 
 
 def test_a_kernel_is_refused():

@@ -7,7 +7,7 @@ parts need not declare them.
 The answers to all comparisons together are a mode. With frozen answers the program is smooth also beyond its kinks, as
 event location requires, and a derivative at a kink is one-sided.
 
-Comparisons inside loops, conditionals, and functions with their own derivative rule stay unchanged.
+`inner_functions` says which functions are opened. What the others compare stays unchanged, and is recorded as hidden.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,11 +21,16 @@ from jax._src.source_info_util import user_frame  # JAX has no public function t
 from jax.extend.core import JaxprEqn
 
 from diffabs.core.types import PyTree, Scalar
+from diffabs.simulate.step.inner_functions import (
+    SEARCHSORTED,
+    Hidden,
+    find_bent,
+    find_hidden,
+    is_knot_search,
+    jumps,
+    open_equation,
+)
 from diffabs.simulate.step.modes import WORD_BITS, BitRange, ComparisonAnswers, ComparisonTrace, Mode
-
-INLINED_CALLS = ("jit", "pjit", "remat", "remat2", "checkpoint")
-JUMPING_OPERATIONS = ("floor", "ceil", "round", "rem", "argmax", "argmin")
-SEARCHSORTED = "searchsorted"  # of `jax.numpy` or `core.numerics`, in at most WORD_BITS knots
 
 
 class _Op(NamedTuple):
@@ -63,7 +68,9 @@ class SwitchedProgram:
         self.places: list[BitRange] = []
         self.origins: list[_Op] = []  # of each comparison, the first operation that asks it
         self.jumps: list[_Op] = []  # operations that jump without a comparison, and count
+        self.hidden: list[Hidden] = []  # comparisons that closed functions hide, and that count
         self._jumping: list[_Op] = []
+        self._hiding: list[tuple[tuple[int, ...], Hidden]] = []
         self._constants: dict[int, PyTree] = {}
         self._names: list[PyTree] = []  # of values; equal for the same operation on the same values
         self._moves: list[bool] = []
@@ -152,16 +159,16 @@ class SwitchedProgram:
         def read(atom: PyTree) -> int:
             return self._literal(atom) if isinstance(atom, jex.Literal) else at[atom]
 
+        bent = find_bent(jaxpr)
         for eqn in jaxpr.eqns:
             ins = tuple(read(atom) for atom in eqn.invars)
             # A function of `jax.numpy` is a jaxpr of its own, whose operations no line of a user has written.
-            origin = eqn.source_info if source is None or user_frame(eqn.source_info.traceback) else source
-            inner = eqn.params.get("jaxpr") if eqn.primitive.name in INLINED_CALLS else None
-            if inner is None or _is_knot_search(eqn):
+            origin = _nearest_line(eqn.source_info, source)
+            inner = open_equation(eqn, [self._moves[i] for i in ins], not bent.isdisjoint(eqn.outvars))
+            if inner is None:
                 outs = self._operation(eqn, ins, origin)
             else:
-                body, kept = (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, [])
-                outs = self._add_jaxpr(body, self._add_constants(kept), list(ins), origin)
+                outs = self._add_jaxpr(inner.jaxpr, self._add_constants(inner.consts), list(ins), origin)
             at.update(zip(eqn.outvars, outs, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
@@ -173,12 +180,14 @@ class SwitchedProgram:
         moves = any(self._moves[i] for i in ins)
         outs = [self._value((*same, i), moves) for i in range(len(eqn.outvars))]
         real = all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in eqn.invars)
-        name = SEARCHSORTED if _is_knot_search(eqn) else eqn.primitive.name
+        name = SEARCHSORTED if is_knot_search(eqn) else eqn.primitive.name
         shape = eqn.invars[0].aval.shape if name == SEARCHSORTED else eqn.outvars[0].aval.shape
         asks = name if moves and real and name in _RESULT_FROM_ANSWERS else ""
         self.ops.append(_Op(_bind_equation(eqn), ins, tuple(outs), shape, asks, source))
-        if moves and _jumps(eqn):
+        if moves and jumps(eqn):
             self._jumping.append(self.ops[-1]._replace(name=eqn.primitive.name))
+        if found := find_hidden(eqn, [self._moves[i] for i in ins]):
+            self._hiding.append((tuple(outs), found._replace(source=_nearest_line(found.source, source))))
         return outs
 
     def _number_comparisons(self, counted: set[int]) -> None:
@@ -187,6 +196,7 @@ class SwitchedProgram:
         needed = self._needed_operations(counted)
         used = {op.outs for op, on in zip(self.ops, needed, strict=True) if on}
         self.jumps = [op for op in self._jumping if op.outs in used]
+        self.hidden = [one for outs, one in self._hiding if outs in used]
         for i, (op, on) in enumerate(zip(self.ops, needed, strict=True)):
             if on and op.name:
                 asks = [
@@ -212,21 +222,9 @@ class SwitchedProgram:
         return numbers[key], turned
 
 
-def _jumps(eqn: Any) -> bool:
-    """Return whether the result of an equation jumps where no comparison changes: a rounded number, a place."""
-    name, (first, *_) = eqn.primitive.name, (*eqn.invars, None)
-    if name in JUMPING_OPERATIONS:
-        return first is not None and jnp.issubdtype(first.aval.dtype, jnp.floating)
-    if name != "convert_element_type" or not jnp.issubdtype(first.aval.dtype, jnp.floating):
-        return False
-    return not jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.inexact)
-
-
-def _is_knot_search(eqn: Any) -> bool:
-    """Return whether an equation searches one number in at most `WORD_BITS` knots."""
-    shapes = [atom.aval.shape for atom in eqn.invars]
-    named = eqn.primitive.name in INLINED_CALLS and eqn.params.get("name") == SEARCHSORTED
-    return named and len(shapes) == 2 and shapes[1] == () and len(shapes[0]) == 1 and shapes[0][0] <= WORD_BITS
+def _nearest_line(source: Any, caller: Any) -> Any:
+    """Return JAX's record `source` of an operation if it names a line of a user, and otherwise that of its caller."""
+    return source if caller is None or user_frame(source.traceback) else caller
 
 
 def _bind_equation(eqn: JaxprEqn) -> Callable[..., Sequence[PyTree]]:
