@@ -23,7 +23,7 @@ test-nightly test-weekly: test-%: $(VENV)/.test $(VENV)/.ecosystem
 lint: $(VENV)/.lint $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright --threads 2
+	$(BIN)/pyright
 	$(BIN)/lint-imports
 
 # the site, in out/site; a warning or a dead link is an error

@@ -62,7 +62,7 @@ MAX_ACCEPTED = 256  # functions that are known to be valid
 _accepted: dict[Any, "Function"] = {}
 SWITCH_SOLVER = Adaptive(1e-6)
 # By the function that hides a comparison: what to write instead.
-ADVICE = (
+REFUSAL_ADVICE = (
     (("scan",), "Write the loop as a loop of Python, or compare before it"),
     (("while",), "Write a fixed number of turns as a loop of Python, or compare before it"),
     (("custom_jvp_call", "custom_vjp_call"), "Compare outside of the function, or leave out its derivative rule"),
@@ -597,7 +597,7 @@ def _trace_program(loop: Any) -> SwitchedProgram:
     program = build_system(loop, {}, jnp.zeros_like(loop.given["t0"]), loop.start(), {}, switched=True).program
     assert program is not None
     for worst in program.hidden:
-        advice = next((one for names, one in ADVICE if worst.function in names), ADVICE[-1][1])
+        advice = next((one for names, one in REFUSAL_ADVICE if worst.function in names), REFUSAL_ADVICE[-1][1])
         raise ValueError(
             f"field has the comparison '{worst.name}' within '{worst.function}' at {summarize(worst.source)}: no step"
             f" can end where its answer changes. {advice}"

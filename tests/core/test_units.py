@@ -33,6 +33,7 @@ def test_the_csv_file_of_the_lab_rig(tmp_path):
     assert header[-2:] == ["command [1]", "control [1]"]
 
 
+@pytest.mark.slow
 def test_figure_and_trajectories_of_the_lab_rig(tmp_path, monkeypatch):
     import zarr
 

@@ -381,6 +381,7 @@ def test_an_operation_without_translation_is_named():
 
 @killed_by("export/difference_equations.py", "ENTRY_ROUNDING = 1e-12", "ENTRY_ROUNDING = 0.0")
 @needs_cc
+@pytest.mark.slow
 def test_the_command_writes_a_file_that_compiles(tmp_path):
     path = tmp_path / "controller.c"
     command("export", "slip-cured", "--float32", "-o", path)

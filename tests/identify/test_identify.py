@@ -333,6 +333,7 @@ class TestTraces:
         with pytest.raises(ValueError, match=message):
             identify(LOOP, data, FREE, solver=SOLVER)
 
+    @pytest.mark.slow
     def test_a_step_that_is_not_stable_is_named(self):
         data = Traces(t=T, columns={"speed": T})
         loop = dataclasses.replace(
