@@ -100,6 +100,26 @@ def test_a_discontinuity_of_a_field_is_detected():
     assert d.switches(fall, 0.0, (1.0, 0.0), {"gravity": GRAVITY}) == []
 
 
+def test_an_opened_function_is_where_it_is_called():
+    found = d.switches(lambda t, y, args: jnp.max(y) * jnp.arctan2(y, 1.0 - t), 0.0, jnp.ones(2))
+    assert [one.operation for one in found] == ["max", "ge"]
+    assert all("test_solve.py" in one.source for one in found)
+
+
+@pytest.mark.slow
+def test_the_jump_of_an_angle_is_located():
+    """The angle is atan2(level - y, -1): near pi below the level and near -pi above it."""
+
+    def final(level):
+        def field(t, y, level):
+            return 2.0 + 0.5 / jnp.pi * jnp.arctan2(level - y, -1.0)
+
+        return d.solve(field, 0.0, 0.0, 1.0, level, solver=ADAPTIVE).y
+
+    difference = (final(0.7 + 1e-4) - final(0.7 - 1e-4)) / 2e-4
+    assert abs(jax.grad(final)(0.7) - difference) < 1e-6
+
+
 @pytest.mark.slow
 def test_the_flips_of_a_run_are_listed():
     found = d.switches(steps, 0.0, 0.0, {"switch": 0.7, "up": 1.0, "down": -2.0}, t1=2.0)
