@@ -174,7 +174,7 @@ def main():
     for row in rows:
         numbers = [f"{row[n][k]:.2g}" for n in ("diffabs", "diffrax") for k in ("ms", "tolerance", "error")]
         table.add_row(row["case"], str(row["lanes"]), *numbers, f"{row['ratio']:.2f}")
-    console = Console()
+    console = Console(width=120)
     console.print(table)
     packages = ("jaxlib", "numpy", "diffrax", "equinox")
     path = record.written("fields", {"rows": rows}, asked.out, packages)

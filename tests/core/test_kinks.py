@@ -66,6 +66,7 @@ KINKED: dict[str, tuple[Callable[[Any, Any], Any], int]] = {  # of x, which move
     "relu": (lambda x, p: jax.nn.relu(x - p), 1),
     "the greatest": (lambda x, p: jnp.max(x * jnp.array([1.0, -2.0, 0.5]) - p), 2),
     "the least of columns": (lambda x, p: jnp.sum(jnp.min(x * jnp.array([[1.0, -2.0], [0.5, 3.0]]) - p, axis=0)), 2),
+    "an angle": (lambda x, p: jnp.arctan2(p - x, jnp.where(p > 0.3, -1.0, x)).astype(np.float32), 1),
     "of a smooth function": (lambda x, p: jax.nn.softplus(x - p), 0),
     "in a loop": (lambda x, p: jax.lax.fori_loop(0, 2, lambda _, y: jnp.where(y > p, y, 2.0 * y), x), 0),
 }

@@ -100,6 +100,26 @@ def test_a_discontinuity_of_a_field_is_detected():
     assert d.switches(fall, 0.0, (1.0, 0.0), {"gravity": GRAVITY}) == []
 
 
+def test_an_opened_function_is_where_it_is_called():
+    found = d.switches(lambda t, y, args: jnp.max(y) * jnp.arctan2(y, 1.0 - t), 0.0, jnp.ones(2))
+    assert [one.operation for one in found] == ["max", "ge"]
+    assert all("test_solve.py" in one.source for one in found)
+
+
+@pytest.mark.slow
+def test_the_jump_of_an_angle_is_located():
+    """The angle is atan2(level - y, -1): near pi below the level and near -pi above it."""
+
+    def final(level):
+        def field(t, y, level):
+            return 2.0 + 0.5 / jnp.pi * jnp.arctan2(level - y, -1.0)
+
+        return d.solve(field, 0.0, 0.0, 1.0, level, solver=ADAPTIVE).y
+
+    difference = (final(0.7 + 1e-4) - final(0.7 - 1e-4)) / 2e-4
+    assert abs(jax.grad(final)(0.7) - difference) < 1e-6
+
+
 @pytest.mark.slow
 def test_the_flips_of_a_run_are_listed():
     found = d.switches(steps, 0.0, 0.0, {"switch": 0.7, "up": 1.0, "down": -2.0}, t1=2.0)
@@ -374,8 +394,11 @@ def test_the_page_runs():
     assert "fields.md" in source
 
 
+WIDTHS = [1e-4, -1e-4, 3e-5, -3e-5, 1e-5, -1e-5]
+
+
 def judge_fields(shape, count, seed):
-    """Return how many random fields of a shape are right, refused, or wrong, by a word for each."""
+    """Return how many random fields of a shape are right, reported, or wrong, by a word for each."""
     rng = np.random.default_rng(seed)
     fields = [random_fields.draw(rng, *shape) for _ in range(count)]
     moves = [{name: 0.1 * rng.standard_normal(x.shape) for name, x in one.items()} for one in fields]
@@ -385,19 +408,17 @@ def judge_fields(shape, count, seed):
         run = d.solve(random_fields.field, p["y"], 0.0, random_fields.END, p, solver=d.Adaptive(1e-8), events=events)
         return run.y, (run.status, run.events.counts)
 
-    batch, along = (jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (fields, moves))
-    values, (status, counts) = jax.jit(jax.vmap(final))(batch)
-    tangent = jax.vmap(lambda p, v: jax.jvp(final, (p,), (v,), has_aux=True))
-    _, slopes, (logged, _) = jax.jit(tangent)(batch, along)
-    shifted = jax.jit(
-        jax.vmap(lambda p, v, h: final(jax.tree.map(lambda x, dx: x + h * dx, p, v))[0], in_axes=(0, 0, None))
-    )
-    differences = [(shifted(batch, along, h) - shifted(batch, along, -h)) / (2 * h) for h in (1e-4, 3e-5, 1e-5)]
+    # One by one: a batch would wait for its longest run, which has a hundred times the steps of the others.
+    run = jax.jit(final)
+    tangent = jax.jit(lambda p, v: jax.jvp(final, (p,), (v,), has_aux=True))
     tally = {}
-    for i, one in enumerate(fields):
-        truth = random_fields.solve_in_pieces(one)
-        here = [np.asarray(x[i]) for x in differences]
-        word = _judge_field(truth, values[i], status[i], counts[i], slopes[i], logged[i], here)
+    for p, v in zip(fields, moves, strict=True):
+        value, (status, counts) = run(p)
+        _, slope, (logged, _) = tangent(p, v)
+        ends = [run(jax.tree.map(lambda x, dx, h=h: x + h * dx, p, v))[0] for h in WIDTHS]
+        differences = [np.asarray(a - b) / (2 * h) for a, b, h in zip(ends[::2], ends[1::2], WIDTHS[::2], strict=True)]
+        truth = random_fields.solve_in_pieces(p)
+        word = _judge_field(truth, value, status, counts, slope, logged, differences)
         tally[word] = tally.get(word, 0) + 1
     return tally
 

@@ -2,7 +2,9 @@
 
 margins    s_j = w_j.y + b_j + c_j sin(o_j t + f_j)
 field      dy/dt = A tanh(y) - 0.3 y + u sin t + sum_j (on_j or off_j by the sign of s_j) + k |s_0| + l clip(s_last)
-events     c_i = v_i.y + d_i falls through zero: y <- y + g_i (1 + 0.2 tanh(y))
+events     c_i = v_i.y + d_i falls through zero: y <- y + g_i (1 + 0.2 tanh(y)),  |v_i.g_i| >= 0.1
+
+A reset that moves the state less across its zero would happen thousands of times, one after the other.
 """
 
 import jax.numpy as jnp
@@ -24,7 +26,7 @@ def _unit(x):
 def draw(rng, n, switches, events):
     """Return the parameters of a random field, and its start as `y`."""
     normal = rng.standard_normal
-    return {
+    given = {
         "y": normal(n),
         "A": 1.5 * normal((n, n)) / np.sqrt(n),
         "u": normal(n),
@@ -41,6 +43,9 @@ def draw(rng, n, switches, events):
         "d": 0.5 * normal(events),
         "g": normal((events, n)),
     }
+    across = np.sum(given["v"] * given["g"], axis=1, keepdims=True)
+    given["g"] += (np.copysign(np.maximum(np.abs(across), 0.1), across) - across) * given["v"]
+    return given
 
 
 def find_margins(t, y, p, np=jnp):

@@ -21,6 +21,7 @@ from jax._src.source_info_util import user_frame  # JAX has no public function t
 from jax.extend.core import JaxprEqn
 
 from diffabs.core.types import PyTree, Scalar
+from diffabs.simulate.step import inner_functions
 from diffabs.simulate.step.inner_functions import (
     SEARCHSORTED,
     Hidden,
@@ -224,7 +225,8 @@ class SwitchedProgram:
 
 def _nearest_line(source: Any, caller: Any) -> Any:
     """Return JAX's record `source` of an operation if it names a line of a user, and otherwise that of its caller."""
-    return source if caller is None or user_frame(source.traceback) else caller
+    frame = user_frame(source.traceback)
+    return source if caller is None or (frame and frame.file_name != inner_functions.__file__) else caller
 
 
 def _bind_equation(eqn: JaxprEqn) -> Callable[..., Sequence[PyTree]]:

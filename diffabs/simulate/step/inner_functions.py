@@ -1,7 +1,8 @@
 """Comparisons inside functions of a program: which functions `comparisons` opens, and what the others hide.
 
 A call is opened by its own program. A conditional that compares becomes a selection among all its branches, and the
-greatest number of an array a tournament. The rules of JAX's own functions with a derivative rule are known.
+greatest number of an array a tournament. The function atan2, which jumps behind its origin, becomes two halves. The
+rules of JAX's own functions with a derivative rule are known.
 
 Loops, other functions with a derivative rule, and calls of the host stay closed. A comparison in them that depends on
 time or state is hidden: no step can end where its answer changes.
@@ -22,7 +23,7 @@ COMPARING_OPERATIONS = ("gt", "ge", "lt", "le", "max", "min", "abs", "sign", "cl
 SEARCHSORTED = "searchsorted"  # of `jax.numpy` or `core.numerics`, in at most `WORD_BITS` knots
 INLINED_CALLS = ("jit", "pjit", "remat", "remat2", "checkpoint", "closed_call", "core_call")
 JUMPING_OPERATIONS = ("floor", "ceil", "round", "rem", "argmax", "argmin", "bitcast_convert_type", "lt_to", "le_to")
-SORTING_OPERATIONS = ("sort", "top_k", "approx_top_k", "cummax", "cummin")
+SORTING_OPERATIONS = ("sort", "top_k", "approx_top_k", "cummax", "cummin", "reduce_window_max", "reduce_window_min")
 REDUCING_OPERATIONS = {"reduce_max": jnp.maximum, "reduce_min": jnp.minimum}
 CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call")
 HOST_CALLS = ("pure_callback", "io_callback", "ffi_call")
@@ -63,6 +64,8 @@ def open_equation(eqn: Any, moves: Sequence[bool], bends: bool) -> Any:
         return _close(params["call_jaxpr"])
     if name == "cond" and find_hidden(eqn, moves):
         return _trace(eqn, lambda which, *xs: _select_branch(params["branches"], which, xs))
+    if name == "atan2" and any(moves) and all(map(_is_real, eqn.invars)):
+        return _trace(eqn, _turn_angle)
     if name in REDUCING_OPERATIONS and bends and moves[0] and _is_real(eqn.invars[0]):
         return _trace(eqn, lambda x: [_hold_tournament(REDUCING_OPERATIONS[name], x, params["axes"])])
     return None
@@ -137,7 +140,7 @@ def _search_body(jaxpr: Any, moves: Sequence[bool]) -> tuple[Hidden | None, list
         outs = [any(ins)] * len(eqn.outvars)
         if any(ins) and hidden is None:
             compares = name in COMPARING_OPERATIONS and all(map(_is_real, eqn.invars))
-            compares |= name in REDUCING_OPERATIONS and _is_real(eqn.invars[0])
+            compares |= name in (*REDUCING_OPERATIONS, "atan2") and _is_real(eqn.invars[0])
             if compares or jumps(eqn) or is_knot_search(eqn):
                 hidden = Hidden(SEARCHSORTED if is_knot_search(eqn) else name, name, eqn.source_info)
             else:
@@ -191,6 +194,14 @@ def _select_branch(branches: Sequence[Any], which: Array, xs: Sequence[PyTree]) 
     return [
         jax.lax.select_n(which.astype(bool) if len(outs) == 2 else which, *outs) for outs in zip(*each, strict=True)
     ]
+
+
+def _turn_angle(y: Array, x: Array) -> list[Array]:
+    """Return atan2(y, x), which jumps at y = 0 > x, from two functions that are smooth there, and a comparison."""
+    away = jnp.sqrt(x * x + y * y)
+    above = 0.5 * jnp.pi - 2.0 * jnp.arctan(x / jnp.where(away + y == 0, 1.0, away + y))
+    below = -0.5 * jnp.pi + 2.0 * jnp.arctan(x / jnp.where(away - y == 0, 1.0, away - y))
+    return [jnp.where(away == 0, 0.0, jnp.where(y >= 0, above, below)).astype(x.dtype)]
 
 
 def _hold_tournament(pick: Callable[[Any, Any], Any], x: Array, axes: Sequence[int]) -> Array:
