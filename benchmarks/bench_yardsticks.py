@@ -5,7 +5,7 @@
     ball         4 bounces with drag: the height at the end and its derivative by gravity; diffrax restarts after each
     robertson    stiff reactions, rates 0.04, 1e4, 3e7, by explicit steps (d.solve) and by implicit ones (Kvaerno5)
 
-The ensemble is a user's plant under `d.run_batch`. Beside it stand peers/lorenz.cpp, compiled by the compiler of the
+The ensemble is `d.solve` under vmap, by a kernel. Beside it stand peers/lorenz.cpp, compiled by the compiler of the
 kernel with its flags and again with those of peers/c.py, on as many threads; and diffrax under vmap and jit, over
 blocks of lanes. The error is the greatest over the lanes that SciPy's DOP853 computes to 1e-13, relative to the
 greatest state. Adaptive methods get the loosest tolerance of their ladder that is accurate. Times are taken in turn; a
@@ -20,8 +20,7 @@ import functools
 import os
 import pathlib
 import statistics
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import bench_fields
 import diffrax
@@ -35,57 +34,13 @@ from rich.table import Table
 from scipy.integrate import solve_ivp
 
 import diffabs as d
-from diffabs import controllers, references, stops
 from diffabs.compiler.runtime import toolchain
-from diffabs.core.pytree import param, pytree
 from diffabs.simulate.solve import SolutionStatus
 
 STEPS, ACCURACY, CHECKED, BLOCK = 1000, 1e-8, 256, 512
 LADDER = [10.0**-k for k in np.arange(6.0, 12.1, 0.5)]
 RATES = (0.04, 1e4, 3e7)  # of Robertson's reactions
 SOURCE = pathlib.Path(__file__).with_name("peers") / "lorenz.cpp"
-
-
-class Place(NamedTuple):
-    """The state of the Lorenz system."""
-
-    x: Any
-    y: Any
-    z: Any
-    units = MappingProxyType({"x": "1", "y": "1", "z": "1"})
-
-
-@pytree
-class Lorenz:
-    """The Lorenz system as a plant, whose control has no effect."""
-
-    sigma: Any = param(default=10.0, unit="1")
-    rho: Any = param(default=21.0, unit="1")
-    beta: Any = param(default=8 / 3, unit="1")
-    shows, control_unit = Place, "1"
-    project = output = lambda self, state: state
-
-    def start(self, initial):
-        """Return (1, 0, 0)."""
-        return Place(1.0 + 0.0 * self.rho, 0.0 * self.rho, 0.0 * self.rho)
-
-    def derivative(self, t, state, control):
-        """Return the rates."""
-        x, y, z = state
-        return Place(self.sigma * (y - x), x * (self.rho - z) - y, x * y - self.beta * z)
-
-    def holding(self, output, target):
-        """Return no control."""
-        return 0.0 * target
-
-
-LOOP = d.Loop(
-    plant=Lorenz(),
-    initial=(),
-    reference=references.Setpoint(value=0.0),
-    controller=controllers.ConstantTorque(torque=0.0),
-    stop=stops.NoStop(),
-)
 
 
 def rhos(lanes):
@@ -115,12 +70,15 @@ def worst(found, which, truth):
 
 def by_diffabs(kind, rho, engine="kernel"):
     """Return the function from a tolerance to the call that returns the final states (3, lanes)."""
-    batch = d.Batch({"plant.rho": jnp.asarray(rho)})
 
     def prepared(tolerance):
-        solver = d.FixedStep(1 / STEPS, 1.0) if kind == "fixed" else d.Adaptive(tolerance, 1.0, 1.0)
-        call = functools.partial(d.run_batch, LOOP, batch, solver, engine=engine)
-        return lambda: jax.block_until_ready(call().ending.sample.output)
+        solver = d.FixedStep(1 / STEPS, 1.0) if kind == "fixed" else d.Adaptive(tolerance)
+
+        def final(rho):
+            return d.solve(bench_fields.lorenz, (1.0, 0.0, 0.0), 0.0, 1.0, rho, solver=solver, engine=engine).y
+
+        call = jax.jit(jax.vmap(final))
+        return lambda: jax.block_until_ready(call(rho))
 
     return prepared
 

@@ -5,6 +5,8 @@ misses the zero of the stop's margin, a metric is outside its physical range, or
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -16,6 +18,7 @@ from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.types import Run, Trajectory
 
 PHYSICAL_RANGE_TOLERANCE = 1e-9  # a metric may exceed its physical range by this much
+Finish = Callable[[Any, Any, PyTree], tuple[Any, PyTree]]  # from loop, objectives and last carry: result, last instant
 AUDIT_METRIC = ""  # name of a plant's audit among the objectives; no metric has an empty name
 
 

@@ -5,7 +5,7 @@ If a step crosses the stop or the event of a block, shorter steps are attempted 
 place of the crossing in the step.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -28,13 +28,11 @@ from diffabs.simulate.drive.loops import (
     scan_to_end,
     scan_with_trajectory,
 )
-from diffabs.simulate.result import finish_run, observe, prepare
+from diffabs.simulate.result import Finish, finish_run, observe, prepare
 from diffabs.simulate.step.adaptive import AdaptiveStepping
 from diffabs.simulate.step.replay import ReplayedRun, ReplayStepping, log_attempt, log_capacity, states_between
 from diffabs.simulate.step.status import end_unfinished
 from diffabs.simulate.types import Adaptive, Run, Solver, Trajectory
-
-Finish = Callable[[Any, Any, PyTree], tuple[Any, PyTree]]  # from loop, objectives and last carry: result, last instant
 
 
 def rollout(

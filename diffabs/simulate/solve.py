@@ -464,7 +464,8 @@ def solve(
             stride. Fixed steps are shortened to a whole number.
         events: Events; several at one instant happen in this order.
         save: Times between t0 and t1 at which the state is returned, shape (n,); None for the state at the end.
-        engine: "auto" or "xla". No kernel makes solutions.
+        engine: "xla", or "kernel": a program of this machine for a batch by `jax.vmap`, with forward derivatives.
+            "auto" is "xla", which has both modes and makes one run as fast.
         kept_events: Number of times that are kept of each event.
 
     Returns:
@@ -481,8 +482,7 @@ def solve(
         >>> print(f"{found.y:.6f}")
         0.367879
     """
-    if resolve_request(engine) == "kernel" and engine == "kernel":
-        raise EngineError.of("a kernel makes a batch of loops; d.solve makes one run, and jax.vmap batches it by XLA")
+    engine = resolve_request(engine)
     events = tuple(events)
     if len(events) > MAX_EVENTS:
         raise ValueError(f"events has {len(events)} entries; at most {MAX_EVENTS} are possible")
@@ -492,12 +492,32 @@ def solve(
     asked: Any = solver
     method, count = _read_solver(asked, t0, t1, loop.given["t0"].dtype)
     program = _trace_program(loop)
-    if isinstance(method, AdaptiveStepping) and not program.bit_count and not events:
-        method = dataclasses.replace(method, is_logged=False, watches=False, smooth=True)
+    if not program.bit_count and not events:
+        lean = {"is_logged": False, "smooth": True} if isinstance(method, AdaptiveStepping) else {"kinks": False}
+        method = dataclasses.replace(method, watches=False, **lean)
     saves = {} if places is None else {"saves": Saves(places=places)}
+    if engine == "kernel":
+        return _solve_by_kernel(loop, saves, method)
     capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, asked)
     capacity = RunCapacity(round_up_capacity(capacity), 0, 0, finish_solution)
     return run_differentiable(capacity, (loop, saves, method, None))
+
+
+def _solve_by_kernel(loop: Any, saves: dict[str, Any], method: FixedStepping | AdaptiveStepping) -> Solution:
+    """Return the solution as a kernel makes it.
+
+    Raises:
+        EngineError: A kernel is not possible.
+    """
+    # Local imports: `import diffabs` must not need the kernel package.
+    from diffabs.compiler.lower.rules import Unsupported
+    from diffabs.compiler.runtime.toolchain import NoCompiler
+    from diffabs.simulate.drive.kernel import run_single
+
+    try:
+        return run_single(loop, saves, method, finish_solution)
+    except (Unsupported, NoCompiler) as error:
+        raise EngineError.of(error) from None
 
 
 def switches(

@@ -282,6 +282,7 @@ def stepped(delay, command, slope, lengths, jumps=()):
     return np.array(found), tries
 
 
+@pytest.mark.slow
 @killed_by(
     "actuators/delay.py",
     "_piece(m.window, last).end)",

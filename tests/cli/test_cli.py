@@ -129,6 +129,7 @@ def test_a_long_trajectory_is_thinned(tmp_path, monkeypatch):
     assert (tmp_path / "reader.csv").read_text() == "old"
 
 
+@pytest.mark.slow
 def test_not_stopped_is_done_but_said_loudly():
     result = run("simulate", "slip-lmi", *SHORT)
     assert "NOT STOPPED within solver.duration = 0.02 s" in result.stderr
@@ -336,6 +337,7 @@ def test_show_prints_a_scenario_to_start_from(tmp_path):
     assert first["title"] == second["title"] == "slip-lmi with plant.mass=6.2, " + ", ".join(SHORT[1::2])
 
 
+@pytest.mark.slow
 def test_completion_offers_commands_scenarios_and_fields():
     code = """
 import contextlib, os, sys

@@ -63,6 +63,7 @@ def test_check_without_a_metric_to_compare_gives_no_number(file):
     assert "warning: accuracy unknown: reference computes once in every step" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_step_that_cannot_be_shortened(file):
     long = RELAY.replace("duration = 1.0", "duration = 6e4")
     assert_one_error_line(failed := run("simulate", file(long), "--check", status=2))

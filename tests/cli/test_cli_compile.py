@@ -3,6 +3,7 @@
 import json
 
 import jax
+import pytest
 from commands import run
 from mutants import killed_by
 from project import ROOT
@@ -27,6 +28,7 @@ def test_the_numbers_of_operations():
     assert sum(line.endswith(", step") for line in listed) == counts["lower"]["step"]
 
 
+@pytest.mark.slow
 @killed_by("cli/compile.py", 'call = derivative if by or name == "jvp" else values', "call = values")
 def test_a_program_is_shown_after_every_pass(tmp_path):
     texts = {name: run("compile", "slip-lmi", "--show", name).stdout for name in PASSES}

@@ -383,6 +383,7 @@ def test_without_the_extra(command, monkeypatch, no_polytope):
     assert 'pip install ".[design]" in a clone' in result.stderr
 
 
+@pytest.mark.slow
 @killed_by(
     "sweep/distributions.py",
     "from numpy.typing import ArrayLike\n",

@@ -376,6 +376,7 @@ def test_a_refused_edit_is_withdrawn_with_later_edits(session):
     assert session.value("initial.speed") == pytest.approx(30 / 3.6)
 
 
+@pytest.mark.slow
 def test_a_loop_without_a_linear_model_says_so():
     with pytest.raises(ValueError, match="no linear loop"):
         stability.linear_stability(friction.with_factor(load("lab-rig")), None)
@@ -585,6 +586,7 @@ def test_a_worker_does_the_newest_and_drops_what_waited():
     assert [type(error) for error in errors] in ([ZeroDivisionError], [])
 
 
+@pytest.mark.slow
 @killed_by("cli/explore.py", "PORT = 8342\n", "PORT = 8342\nfrom diffabs.tune import Method as Method\n")
 def test_the_framework_is_only_loaded_by_the_command():
     code = (

@@ -58,6 +58,7 @@ def observer():
     return ObserverFeedback(gain=draw.normal(size=6), voltage_max=3.0, **matrices)
 
 
+DTYPES = [pytest.param(np.float64, id="float64"), pytest.param(np.float32, id="float32", marks=pytest.mark.slow)]
 LOOPS = {
     "state feedback": rig(StateFeedback(gain=(-300.0, -48.0))),
     "PID, filtered derivative": rig(PID(kp=60.0, ki=400.0, kd=0.3, high=9.03, low=0.0)),
@@ -164,7 +165,7 @@ def commands_of_c(found, text, name, seen, folder):
     case="observer-float64",
 )
 @needs_cc
-@pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", LOOPS)
 def test_what_is_exported_commands_what_the_parts_do(name, dtype, tmp_path):
     loop, seen = LOOPS[name], measured(LOOPS[name], seed=11)
@@ -542,7 +543,7 @@ def commands_of_text(text, seen):
     case="PID, filtered derivative-float64",
 )
 @killed_by("export/structured_text.py", "self.device.moves - 1", "self.device.moves", case="filtered target-float64")
-@pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", LOOPS)
 def test_structured_text_commands_what_the_parts_do(name, dtype):
     """Over 10,000 samples to rounding: an integral gathers some, in single precision as much as C does."""

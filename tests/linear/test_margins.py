@@ -258,6 +258,7 @@ def test_a_sampled_loop_with_delay_fits_its_step_response():
     np.testing.assert_allclose([0.0, *((whole.C @ x).item() for x in states)], wanted, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 @killed_by("linear/stability_margins.py", "loop.period is None or not math.isfinite(guess)", "True")
 def test_a_sampled_loop_is_unstable_beyond_its_delay_margin():
     loop = rig(controller=Sampled(controller=StateFeedback(gain=(-3000.0, -48.0)), period=4e-3))
@@ -350,6 +351,7 @@ def test_a_band_is_of_the_corners_and_of_samples_between():
         band(loop, {"plant.mass": (6.2, 5.3)})
 
 
+@pytest.mark.slow
 def test_the_command_says_margins_and_where_they_are_worst(tmp_path):
     done = command("margins", "slip-cured", "--json", "--samples", "4", "--plot", str(tmp_path / "loop.png"))
     result = json.loads(done.stdout)

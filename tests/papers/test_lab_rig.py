@@ -31,6 +31,7 @@ def test_a_curve_has_at_most_80_readings():
     assert all((np.diff(points[:, 0]) >= 0).all() for name, points in curves.items() if name != "brake-torque")
 
 
+@pytest.mark.slow
 def test_the_makers_simulations_are_those_of_the_mask():
     """A pixel of the drawings is 5.3 rpm, and 0.001 (0.7: 0.003) of slip."""
     with jax.enable_x64(True):

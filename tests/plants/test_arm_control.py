@@ -171,6 +171,7 @@ def test_poles_of_the_loop_are_those_of_regulator_and_filter(observer):
     np.testing.assert_allclose(np.sum(poles), np.sum(np.r_[regulated, filtered]), rtol=1e-12, atol=0)
 
 
+@pytest.mark.slow
 @killed_by(
     "controllers/balance.py",
     "voltage = clamp(estimate.voltage, -self.voltage_max, self.voltage_max)",

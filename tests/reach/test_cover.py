@@ -5,6 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from marks import cases
 from mutants import killed_by
 from scipy.integrate import solve_ivp
 
@@ -140,7 +141,9 @@ def test_a_distance_that_is_a_signal_has_its_bounds() -> None:
     assert found.distance[0, 1] - found.distance[0, 0] < 0.01
 
 
-@pytest.mark.parametrize("quantity", ["greatest slip", "stop_time", "stop_distance"])
+@pytest.mark.parametrize(
+    "quantity", cases(["greatest slip", "stop_time", "stop_distance"], "stop_time", "stop_distance")
+)
 def test_false_claims_are_refuted(quantity: str) -> None:
     column = ("greatest slip", "stop_time", "stop_distance").index(quantity)
     corners = [(m, v) for m in SMALL["plant.mass"] for v in SMALL["initial.speed"]]

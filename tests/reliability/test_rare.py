@@ -393,6 +393,7 @@ class TestGradient:
         doubled = runs(linear(100), 100, B6, 1, gradient=of_linear(100), price=6.0)[0]
         assert doubled.cost == informed[0].cost + 3 * informed[0].gradients
 
+    @pytest.mark.slow
     def test_it_pays_for_curved_limits_and_for_two_regions(self):
         """Against subset simulation alone: 10 and 20 for seeds 0 to 199."""
         score, gradient = parabola(0.05)

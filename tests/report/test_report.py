@@ -337,6 +337,7 @@ def test_the_old_report_stays_where_the_new_one_cannot_be_made(results, tmp_path
     assert left_in(tmp_path) == {"report.html", "x.json"}
 
 
+@pytest.mark.slow
 def test_a_terminal_of_80_columns(results, tmp_path):
     with Terminal("report", results / "tune.json", "-o", tmp_path / "report.html") as terminal:
         assert terminal.status() == 0, terminal.text

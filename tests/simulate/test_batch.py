@@ -88,6 +88,7 @@ def driven(request, monkeypatch):
 
 
 class TestLanes:
+    @pytest.mark.slow
     def test_are_what_they_are_meant_to_be(self, expected):
         taken = expected.ending.sample.t / SOLVER.step
         assert np.flatnonzero(expected.diverged).tolist() == [AT_ONCE, DIVERGING]  # one begins below its stop

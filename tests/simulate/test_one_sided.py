@@ -236,7 +236,9 @@ def warned(subject, free, batch=None):
     return [str(warning.message) for warning in told]
 
 
-@pytest.mark.parametrize("name", cases(POINTS, "relay", "torque", "delay", "gain"))
+@pytest.mark.parametrize(
+    "name", cases(POINTS, "relay", "sampled relay", "torque", "delay", "delay, steps", "gain", "gain, constant")
+)
 def test_points_with_one_side_are_named(name):
     loop, paths, said = POINTS[name]
     free = [path for path, spec, value in parameters(loop) if spec.tunable and np.isfinite(value).all()]

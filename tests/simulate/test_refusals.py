@@ -7,6 +7,7 @@ import re
 import commands
 import jax
 import jax.numpy as jnp
+import lorenz
 import numpy as np
 import pytest
 from mutants import killed_by
@@ -176,6 +177,12 @@ class TestBeforeARun:
         alike = {"initial.slip": np.linspace(0.0, 0.5, 5)}  # moves no matrix
         assert stable_step.is_step_stable(RIG, alike, 1e-4).all()
         assert not stable_step.is_step_stable(RIG, alike, 2e-2).any()
+
+    def test_a_plant_without_a_start_has_a_stable_step(self):
+        """RK4 on the Lorenz system from (1, 0, 0) with rho = 0: its stiffest mode is -10, stable up to 2.785/10."""
+        values = {"plant.rho": np.zeros(2)}
+        assert stable_step.is_step_stable(lorenz.LOOP, values, 0.278).all()
+        assert not stable_step.is_step_stable(lorenz.LOOP, values, 0.279).any()
 
     @pytest.mark.slow
     @killed_by(

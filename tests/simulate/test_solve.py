@@ -2,6 +2,8 @@
 
 Every example has a closed form. A program takes seconds to compile, so the fast tests share few fields."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -375,9 +377,24 @@ def test_the_bend_of_relu_is_located():
     assert abs(slope - (1 - np.exp(1.5))) < 1e-5
 
 
-def test_a_kernel_is_refused():
-    with pytest.raises(EngineError, match="batches it by XLA"):
-        d.solve(fall, (1.0, 0.0), 0.0, 1.0, solver=ADAPTIVE, engine="kernel")
+@killed_by("simulate/drive/kernel.py", "return jax.tree.map(operator.itemgetter(0), lane)", "return lane")
+def test_a_kernel_solves_a_batch():
+    levels = jnp.array([0.5, 0.8])
+
+    def final(level):
+        return d.solve(
+            lambda t, y, level: jnp.where(y < level, 1.0, 2.0), 0.0, 0.0, 1.0, level, solver=ADAPTIVE, engine="kernel"
+        ).y
+
+    np.testing.assert_allclose(jax.vmap(final)(levels), 2.0 - levels, atol=1e-8)  # level + 2 (1 - level)
+    np.testing.assert_allclose(jax.vmap(jax.jacfwd(final))(levels), [-1.0, -1.0], atol=1e-8)
+    with pytest.raises(ValueError, match="a kernel has no reverse mode"):
+        jax.grad(final)(0.5)
+
+
+def test_a_field_without_a_translation_is_refused_by_a_kernel():
+    with pytest.raises(EngineError, match="engine = 'kernel' is not possible: "):
+        d.solve(lambda t, y, args: jnp.linalg.solve(y, y), jnp.eye(2), 0.0, 1.0, solver=ADAPTIVE, engine="kernel")
 
 
 def test_fixed_steps_need_concrete_times():
@@ -394,6 +411,7 @@ def test_the_page_runs():
     assert "fields.md" in source
 
 
+SOLVER, BY_BOTH = d.Adaptive(1e-8), 10  # fields that XLA solves, too
 WIDTHS = [1e-4, -1e-4, 3e-5, -3e-5, 1e-5, -1e-5]
 
 
@@ -404,21 +422,33 @@ def judge_fields(shape, count, seed):
     moves = [{name: 0.1 * rng.standard_normal(x.shape) for name, x in one.items()} for one in fields]
     events = random_fields.build_events(shape[2])
 
-    def final(p):
-        run = d.solve(random_fields.field, p["y"], 0.0, random_fields.END, p, solver=d.Adaptive(1e-8), events=events)
+    def final(p, engine="kernel"):
+        run = d.solve(
+            random_fields.field, p["y"], 0.0, random_fields.END, p, solver=SOLVER, events=events, engine=engine
+        )
         return run.y, (run.status, run.events.counts)
 
-    # One by one: a batch would wait for its longest run, which has a hundred times the steps of the others.
-    run = jax.jit(final)
-    tangent = jax.jit(lambda p, v: jax.jvp(final, (p,), (v,), has_aux=True))
+    def slope(p, v, engine="kernel"):
+        return jax.jvp(lambda p: final(p, engine), (p,), (v,), has_aux=True)
+
+    batch, along = (jax.tree.map(lambda *x: jnp.stack(x), *some) for some in (fields, moves))
+    runs = jax.jit(jax.vmap(final))
+    ends = [runs(jax.tree.map(lambda x, dx, h=h: x + h * dx, batch, along))[0] for h in WIDTHS]
+    differences = [np.asarray(a - b) / (2 * h) for a, b, h in zip(ends[::2], ends[1::2], WIDTHS[::2], strict=True)]
+    values, (statuses, counts) = runs(batch)
+    _, slopes, (logged, _) = jax.jit(jax.vmap(slope))(batch, along)
+
+    tangent = jax.jit(partial(slope, engine="xla"))
+    for i in range(BY_BOTH):
+        value, move, (status, _) = tangent(fields[i], moves[i])
+        if status != SolutionStatus.DIVERGED:  # a derivative by XLA has a limit of steps, that of a kernel has none
+            assert status == statuses[i]
+            np.testing.assert_allclose(value, values[i], rtol=1e-9)
+            np.testing.assert_allclose(move, slopes[i], rtol=1e-6, atol=1e-9 * np.max(np.abs(slopes[i])))
     tally = {}
-    for p, v in zip(fields, moves, strict=True):
-        value, (status, counts) = run(p)
-        _, slope, (logged, _) = tangent(p, v)
-        ends = [run(jax.tree.map(lambda x, dx, h=h: x + h * dx, p, v))[0] for h in WIDTHS]
-        differences = [np.asarray(a - b) / (2 * h) for a, b, h in zip(ends[::2], ends[1::2], WIDTHS[::2], strict=True)]
-        truth = random_fields.solve_in_pieces(p)
-        word = _judge_field(truth, value, status, counts, slope, logged, differences)
+    for i, p in enumerate(fields):
+        mine = values[i], statuses[i], counts[i], slopes[i], logged[i], [one[i] for one in differences]
+        word = _judge_field(random_fields.solve_in_pieces(p), *mine)
         tally[word] = tally.get(word, 0) + 1
     return tally
 

@@ -132,6 +132,7 @@ def test_diverged_runs_are_counted_and_keep_their_row(study, swept):
     assert np.isfinite(swept.column("iae")[~bad]).all()
 
 
+@pytest.mark.slow
 def test_failures_are_counted_while_it_runs(study, swept, tmp_path):
     told = []
     sweep(study, tmp_path / "out", progress=told.append)

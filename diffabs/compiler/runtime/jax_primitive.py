@@ -173,7 +173,7 @@ def _batching_rule(
             at = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
             x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
             x = jnp.moveaxis(x, 0, at)
-            more.append(x.reshape(*x.shape[:at], -1, *x.shape[at + 2 :]))
+            more.append(x.reshape(*x.shape[:at], size * many, *x.shape[at + 2 :]))
         found = run_lanes_primitive.bind(*arrays[:values], *more, **how, many=size * many, as_lanes=as_lanes)
         results = [
             x.reshape(x.shape[0], size, many, *x.shape[2:]) if key.tangent else x
@@ -194,10 +194,10 @@ def _batching_rule(
             x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
             if shared:
                 x = jnp.broadcast_to(x[:, None], (size, count, *x.shape[1:]))
-            x = x.reshape(-1, *x.shape[2:])
+            x = x.reshape(size * count, *x.shape[2:])  # not -1: an array may be empty
         given.append(x)
     found = run_lanes_primitive.bind(*given, **how, many=many, as_lanes=as_lanes | own)
-    return [x.reshape(size, -1, *x.shape[1:]) for x in found], [0] * len(found)
+    return [x.reshape(size, count, *x.shape[1:]) for x in found], [0] * len(found)
 
 
 batching.primitive_batchers[run_lanes_primitive] = _batching_rule

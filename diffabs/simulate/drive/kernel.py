@@ -5,6 +5,7 @@ XLA computes the starts and the results, as for every other run. The package `co
 room for the next one, as in `packed`. The kernel deals the runs to threads of its own, on all cores of the processor.
 """
 
+import functools
 import operator
 from collections.abc import Mapping
 from typing import Any
@@ -28,7 +29,7 @@ from diffabs.simulate.arguments import forbid_derivatives, prepare_arguments, re
 from diffabs.simulate.drive.engine import check_process
 from diffabs.simulate.drive.loops import STEPS_PER_BLOCK
 from diffabs.simulate.drive.packed import STEPS_PER_EXCHANGE, EarlyEnd, split_by_lane
-from diffabs.simulate.result import finish_run
+from diffabs.simulate.result import Finish, finish_run
 from diffabs.simulate.step.adaptive import AdaptiveStepping
 from diffabs.simulate.step.replay import LaggedReplay, LaggedReplayStepping
 from diffabs.simulate.step.status import RunStatus
@@ -74,7 +75,7 @@ def run_native(
         """Return the runs of one launch; `mine` holds their rows of `lanes`."""
         given = loop, mine[0], dict(objectives), method, *mine[1:], enough
         # A call through a derivative rule costs more than a short run.
-        return _run_differentiable(given) if is_traced(given) else _run(*given)
+        return _run_differentiable(finish_run, given) if is_traced(given) else _run(*given, finish=finish_run)
 
     if count <= MAX_LANES_PER_LAUNCH:
         return run_launch(lanes)
@@ -85,13 +86,30 @@ def run_native(
     return jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
 
 
-@jax.custom_jvp
-def _run_differentiable(given: PyTree) -> Run:
+def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish) -> Any:
+    """Return one run, as `finish` makes it of the last carry; `jax.vmap` makes a lane of each run of a batch.
+
+    Args:
+        loop: Loop of the run.
+        objectives: Objectives by name.
+        method: Stepping method.
+        finish: Function that returns the result from loop, objectives and the last carry.
+
+    Raises:
+        Unsupported: The step has an operation without a translation.
+        NoCompiler: This machine has no compiler.
+    """
+    lane = _run_differentiable(finish, (loop, {}, objectives, method, None, jnp.ones(1, bool), None, None))
+    return jax.tree.map(operator.itemgetter(0), lane)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _run_differentiable(finish: Finish, given: PyTree) -> Any:
     """Return the runs of (loop, values, objectives, method, keys, accepted, data for early ends, early ends)."""
-    return _run(*given)
+    return _run(*given, finish=finish)
 
 
-def _rule(primals: PyTree, tangents: PyTree) -> tuple[Run, Run]:
+def _rule(finish: Finish, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     """Return the runs and their tangents.
 
     Fixed steps are those of `FixedStepping.for_derivatives`. Adaptive steps are replayed one by one
@@ -102,7 +120,7 @@ def _rule(primals: PyTree, tangents: PyTree) -> tuple[Run, Run]:
     refuse_derivative(given_loop, measured, method)
     paths = differentiated_paths(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
 
-    def run(given: PyTree) -> Run:
+    def run(given: PyTree) -> Any:
         # Only paths with a nonzero tangent are prepared for derivatives.
         loop, values, objectives, method, *rest = given
         loop = prepare_derivatives(loop, paths)
@@ -111,7 +129,7 @@ def _rule(primals: PyTree, tangents: PyTree) -> tuple[Run, Run]:
             if isinstance(method, AdaptiveStepping)
             else method.for_derivatives()
         )
-        return _run(loop, values, objectives, method, *rest)
+        return _run(loop, values, objectives, method, *rest, finish=finish)
 
     return jvp_nonzero(run, primals, tangents)
 
@@ -119,7 +137,7 @@ def _rule(primals: PyTree, tangents: PyTree) -> tuple[Run, Run]:
 _run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 
-@jax.jit
+@functools.partial(jax.jit, static_argnames="finish")
 def _run(
     loop: Loop,
     values: dict[str, PyTree],
@@ -129,7 +147,9 @@ def _run(
     accepted: Scalar,
     own: PyTree,
     enough: EarlyEnd | None,
-) -> Run:
+    *,
+    finish: Finish,
+) -> Any:
     """Return the results of all runs; `method` is the stepping method, and `own` the runs' data for `enough`."""
     leaves, build_lane = split_by_lane(loop, values, objectives)
 
@@ -142,8 +162,8 @@ def _run(
         output = build_lane(lane[0])[0].plant.output(carry.point.state.plant)
         return carry.running & ~enough.has_reached(lane[2], output)
 
-    def finish(mine: PyTree, carry: PyTree) -> Run:
-        return finish_run(*build_lane(mine), carry)[0]
+    def judge(mine: PyTree, carry: PyTree) -> Any:
+        return finish(*build_lane(mine), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)
     _check_logs(loop, begins.point.state)
@@ -156,10 +176,10 @@ def _run(
         begins,
         steps=STEPS_PER_BLOCK,
         rounds=1 if enough is None else STEPS_PER_EXCHANGE // STEPS_PER_BLOCK,
-        read=read_leaves(finish, leaves, begins),
-        wanted=read_leaves(finish, leaves, begins, differentiably=True),
+        read=read_leaves(judge, leaves, begins),
+        wanted=read_leaves(judge, leaves, begins, differentiably=True),
     )
-    return jax.vmap(finish)(leaves, carry)
+    return jax.vmap(judge)(leaves, carry)
 
 
 def _check_logs(loop: Loop, state: LoopState) -> None:
@@ -204,7 +224,7 @@ def kernel_objection(loop: Loop, values: Params, solver: Solver, objectives: Map
     count = len(next(iter(columns.values())))
     keys = jax.vmap(jax.random.key)(jnp.arange(count))
     try:
-        _run.lower(checked, columns, dict(measured), method, keys, jnp.ones(count, bool), None, None)
+        _run.lower(checked, columns, dict(measured), method, keys, jnp.ones(count, bool), None, None, finish=finish_run)
     except (Unsupported, NoCompiler) as error:
         return str(error)
     return None
