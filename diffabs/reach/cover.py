@@ -136,9 +136,13 @@ def prove_box(
         rows.append(_select(found, fine))
         failed = found.failure[~fine]
         failure = FAILURES[int(np.bincount(failed[failed > 0]).argmax())] if (failed > 0).any() else ""
-        again = now[~fine]
-        small = ((again[:, :, 1] - again[:, :, 0]) <= SMALLEST * sides).all(1)
-        left = np.concatenate([left, again[small], _halve(again[~small], influence)])
+        again, matters = now[~fine], _widths(now) * influence
+        for claim in claims:
+            vague = (found.status > 0) & ~_satisfy(quantities, [claim], found)
+            matters[vague] = quantities.widening(claim.quantity, found)[vague]
+        matters = matters[~fine]
+        small = (_widths(again) <= SMALLEST * sides).all(1)
+        left = np.concatenate([left, again[small], _halve(again[~small], matters[~small])])
         if small.any():
             break
         progress(f"{sum(map(len, done)):,} cells proved, {len(left):,} left")
@@ -184,6 +188,10 @@ class _Quantities:
             return found.above[:, i], found.greatest[:, i]
         return found.least[:, i], found.below[:, i]
 
+    def widening(self, name: str, found: CellBounds) -> np.ndarray:
+        """Return about how much each side of a cell widens its bounds of a quantity, shape (cells, sides)."""
+        return found.reach[:, ("stop_time", "stop_distance").index(name) + 1 if " " not in name else 0]
+
     def over_all(self, found: CellBounds) -> dict[str, tuple[float, float]]:
         pairs = {name: self.of_cells(found, name) for name in self.names()}
         return {name: (float(low.min()), float(high.max())) for name, (low, high) in pairs.items()}
@@ -223,15 +231,15 @@ def _select(found: CellBounds, which: np.ndarray) -> CellBounds:
 def _measure_influence(prover: Prover, box: np.ndarray, point: np.ndarray, threads: int | None) -> np.ndarray:
     """Return how much each parameter moves the first signal, per unit, in the runs near a point of the box.
 
-    A cell is halved along the side that moves it most. A wrong choice costs time, and no more.
+    A cell that is not proved is halved along the side that moves it most. A wrong choice costs time, and no more.
     """
     sides = box[:, 1] - box[:, 0]
     for share in PROBE_SIZES:
         cell = np.stack([np.maximum(point - share * sides, box[:, 0]), point], 1)
         found = prover.prove(cell[None], threads)
-        if found.status[0] and (found.reach[0] > 0).any():
+        if found.status[0] and (found.reach[0, 0] > 0).any():
             widths = cell[:, 1] - cell[:, 0]
-            influence = found.reach[0] / np.where(widths > 0, widths, 1.0)
+            influence = found.reach[0, 0] / np.where(widths > 0, widths, 1.0)
             break
     else:
         influence = 1 / np.where(sides > 0, sides, 1.0)
@@ -241,11 +249,12 @@ def _measure_influence(prover: Prover, box: np.ndarray, point: np.ndarray, threa
     return np.maximum(influence, 1e-3 * (influence * sides).max() / np.where(sides > 0, sides, 1.0))
 
 
-def _halve(cells: np.ndarray, influence: np.ndarray) -> np.ndarray:
-    """Return the halves of cells, each along the side that moves its first signal most."""
+def _halve(cells: np.ndarray, matters: np.ndarray) -> np.ndarray:
+    """Return the halves of cells, each along the side that matters most; `matters` has the shape (cells, sides)."""
     if not len(cells):
         return cells
-    side = ((cells[:, :, 1] - cells[:, :, 0]) * influence).argmax(1)
+    # A rounded middle may be an end: such a side cannot be halved.
+    side = np.where(cells[:, :, 1] > cells[:, :, 0], matters, -1.0).argmax(1)
     rows = np.arange(len(cells))
     middle = 0.5 * (cells[rows, side, 0] + cells[rows, side, 1])
     left, right = cells.copy(), cells.copy()
@@ -253,10 +262,13 @@ def _halve(cells: np.ndarray, influence: np.ndarray) -> np.ndarray:
     return np.concatenate([left, right])
 
 
+def _widths(cells: np.ndarray) -> np.ndarray:
+    return cells[:, :, 1] - cells[:, :, 0]
+
+
 def _sizes(cells: np.ndarray) -> np.ndarray:
     """Return the volumes of cells in floats; sides of length 0 count as 1."""
-    widths = cells[:, :, 1] - cells[:, :, 0]
-    return np.where(widths > 0, widths, 1.0).prod(1)
+    return np.where(_widths(cells) > 0, _widths(cells), 1.0).prod(1)
 
 
 def _cut_to_size(cells: np.ndarray, largest: float, influence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -267,7 +279,7 @@ def _cut_to_size(cells: np.ndarray, largest: float, influence: np.ndarray) -> tu
     """
     kept, cells = cells[:LARGER_TRIED], cells[LARGER_TRIED:]
     while (wide := _sizes(cells) > largest).any() and len(cells) < 4 * BATCH:
-        cells = np.concatenate([cells[~wide], _halve(cells[wide], influence)])
+        cells = np.concatenate([cells[~wide], _halve(cells[wide], _widths(cells[wide]) * influence)])
     cells = np.concatenate([kept, cells])
     return cells[:BATCH], cells[BATCH:]
 
@@ -285,15 +297,17 @@ def _refine(
     """Halve the cells whose bounds are far from the least and the greatest value found, until the time is over."""
     tried = 0
     while time.monotonic() < until:
-        worst = np.zeros(len(cells), bool)
+        matters = np.zeros(cells.shape[:2])
         for name, (least, greatest) in known.items():
             low, high = quantities.of_cells(rows, name)
             for excess, size in ((high - greatest, abs(greatest)), (least - low, abs(least))):
                 order = np.argsort(excess)[::-1][: BATCH // 2]
-                worst[order[excess[order] > CLOSE * size]] = True
+                loose = order[excess[order] > CLOSE * size]
+                matters[loose] = quantities.widening(name, rows)[loose]
+        worst = matters.any(1)
         if not worst.any():
             break
-        halves = _halve(cells[worst], influence)
+        halves = _halve(cells[worst], matters[worst])
         found = prover.prove(halves, threads)
         tried += len(halves)
         n = int(worst.sum())

@@ -131,7 +131,8 @@ class CellBounds(NamedTuple):
         greatest: Upper bounds of the signals.
         below: Values that the signals of every run of the cell fall below, or reach.
         above: Values that the signals of every run of the cell rise above, or reach.
-        reach: Greatest half width of the first signal that each parameter causes.
+        reach: About the half widths that each parameter causes: of the first signal at its greatest, of the stop time,
+            and of the stop distance, shape (cells, 3, parameters).
         reached: Time up to which the cell was proved [s].
         steps: Steps of the cell's group.
         across: Steps or ticks across a limit.
@@ -226,7 +227,7 @@ class Prover:
     @property
     def _width(self) -> int:
         """Number of results of a cell."""
-        return 9 + 4 * len(self.signals) + len(self.equations.params)
+        return 9 + 4 * len(self.signals) + 3 * len(self.equations.params)
 
     def prove(self, cells: np.ndarray, threads: int | None = None) -> CellBounds:
         """Return the bounds of cells.
@@ -251,7 +252,7 @@ class Prover:
         return CellBounds(
             *(out[:, 0].astype(int), out[:, 1:3], out[:, 3:5]),
             *(pairs[:, 0, :, 0], pairs[:, 0, :, 1], pairs[:, 1, :, 0], pairs[:, 1, :, 1]),
-            *(out[:, 8 + 4 * n : -1], out[:, 5], out[:, 6], out[:, 7], out[:, -1].astype(int)),
+            *(out[:, 8 + 4 * n : -1].reshape(len(out), 3, -1), out[:, 5], out[:, 6], out[:, 7], out[:, -1].astype(int)),
         )
 
     def follow(self, cell: np.ndarray, steps: int = 100_000) -> CellTube:

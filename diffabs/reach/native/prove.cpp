@@ -68,6 +68,8 @@ struct Ending {
   }
   I time() const { return at_end(time_c, time_G, time_R, pace); }
   I way() const { return at_end(way_c, way_G, way_R, speed); }
+  // About the half width that parameter j causes in a quadrature at the end: for the choice of a side to halve.
+  V caused(const std::vector<V>& G, I rate, int j) const { return vabs(G[j] + rate.mid() * (inverse_rate.mid() * margin_slope[j].mid())); }
 };
 
 // Of an attempted step. NO_SERIES: a Taylor coefficient is undefined; order 1 may do.
@@ -728,6 +730,8 @@ struct Group {
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = fine ? -bottom[s][lane] : -INFINITY, signal[1] = fine ? top[s][lane] : INFINITY;
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = sound ? -below[s][lane] : INFINITY, signal[1] = sound ? above[s][lane] : -INFINITY;
     for (int p = 0; p < np; p++) *signal++ = reach[p][lane];
+    for (int p = 0; p < np; p++) *signal++ = end.caused(end.time_G, end.pace, p)[lane];
+    for (int p = 0; p < np; p++) *signal++ = end.caused(end.way_G, end.speed, p)[lane];
     *signal = sound ? why[lane] : TOO_WIDE;
   }
 };
@@ -781,7 +785,7 @@ void apply(int code, long count, const double* a, const double* b, double* out) 
 long prove(const Task* task, long count, const double* cells, double* out, double* scout, double* trail, long room) {
   Upward upward;
   std::feclearexcept(FE_ALL_EXCEPT);
-  const int nb = (int)task->kept, ns = (int)task->signals, width = 9 + 4 * ns + (int)task->tape.params;
+  const int nb = (int)task->kept, ns = (int)task->signals, width = 9 + 4 * ns + 3 * (int)task->tape.params;
   Group g(*task);
   long written = 0;
   auto follow = [&]() {
