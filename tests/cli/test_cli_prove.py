@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import re
 from collections.abc import Iterator
 
 import pytest
@@ -45,3 +46,12 @@ def test_a_pid_quarter_car_on_other_roads(road: str, file) -> None:
     for name in ("stop_time", "stop_distance"):
         low, high = (found["bounds"][name][end] for end in ("low", "high"))
         assert 0 < high - low < 2e-3 * high
+
+
+@pytest.mark.slow
+def test_the_command_of_the_readme_proves_the_cured_loop() -> None:
+    readme = (EXAMPLES.parent / "README.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"`diffabs (prove [^`]*)`", readme)
+    found = json.loads(run(*command.split(), "--json").stdout)
+    assert found["verdict"] == "proved"
+    assert found["bounds"]["greatest slip"]["high"] <= 0.2017

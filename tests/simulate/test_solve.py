@@ -443,8 +443,9 @@ def judge_fields(shape, count, seed):
         value, move, (status, _) = tangent(fields[i], moves[i])
         if status != SolutionStatus.DIVERGED:  # a derivative by XLA has a limit of steps, that of a kernel has none
             assert status == statuses[i]
-            np.testing.assert_allclose(value, values[i], rtol=1e-9)
-            np.testing.assert_allclose(move, slopes[i], rtol=1e-6, atol=1e-9 * np.max(np.abs(slopes[i])))
+            # To the accuracy of the solver: the last bit of a step's length decides where the next ones end.
+            np.testing.assert_allclose(value, values[i], rtol=0, atol=1e-6 * np.max(np.abs(value)))
+            np.testing.assert_allclose(move, slopes[i], rtol=0, atol=1e-5 * np.max(np.abs(move)) + 1e-8)
     tally = {}
     for i, p in enumerate(fields):
         mine = values[i], statuses[i], counts[i], slopes[i], logged[i], [one[i] for one in differences]

@@ -16,7 +16,7 @@ import diffabs as d
 END = 3.0
 # Dimensions, switches and events. Together they cover dimensions from 1 to 6, and 1 to 4 switches.
 SHAPES = [(1, 1, 1), (2, 2, 1), (3, 3, 2), (4, 4, 1), (5, 1, 2), (6, 2, 1)]
-MAX_PIECES = 400
+MAX_PIECES = 5000  # one field has 1,298 events
 
 
 def _unit(x):
