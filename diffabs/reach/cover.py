@@ -304,7 +304,7 @@ def _refine(
                 order = np.argsort(excess)[::-1][: BATCH // 2]
                 loose = order[excess[order] > CLOSE * size]
                 matters[loose] = quantities.widening(name, rows)[loose]
-        worst = matters.any(1)
+        worst = np.any(matters > 0, axis=1)
         if not worst.any():
             break
         halves = _halve(cells[worst], matters[worst])
@@ -312,7 +312,7 @@ def _refine(
         tried += len(halves)
         n = int(worst.sum())
         better = (found.status[:n] > 0) & (found.status[n:] > 0)
-        keep = ~worst
+        keep = np.logical_not(worst)
         keep[np.flatnonzero(worst)[~better]] = True
         new = np.concatenate([better, better])
         if not new.any():
