@@ -136,10 +136,11 @@ def prove_box(
         rows.append(_select(found, fine))
         failed = found.failure[~fine]
         failure = FAILURES[int(np.bincount(failed[failed > 0]).argmax())] if (failed > 0).any() else ""
-        again, matters = now[~fine], _widths(now) * influence
+        matters = _widths(now) * influence
         for claim in claims:
             vague = (found.status > 0) & ~_satisfy(quantities, [claim], found)
-            matters[vague] = quantities.widening(claim.quantity, found)[vague]
+            matters[vague] = quantities.weigh_sides(claim.quantity, found)[vague]
+        again = now[~fine]
         matters = matters[~fine]
         small = (_widths(again) <= SMALLEST * sides).all(1)
         left = np.concatenate([left, again[small], _halve(again[~small], matters[~small])])
@@ -188,7 +189,7 @@ class _Quantities:
             return found.above[:, i], found.greatest[:, i]
         return found.least[:, i], found.below[:, i]
 
-    def widening(self, name: str, found: CellBounds) -> np.ndarray:
+    def weigh_sides(self, name: str, found: CellBounds) -> np.ndarray:
         """Return about how much each side of a cell widens its bounds of a quantity, shape (cells, sides)."""
         return found.reach[:, ("stop_time", "stop_distance").index(name) + 1 if " " not in name else 0]
 
@@ -303,7 +304,7 @@ def _refine(
             for excess, size in ((high - greatest, abs(greatest)), (least - low, abs(least))):
                 order = np.argsort(excess)[::-1][: BATCH // 2]
                 loose = order[excess[order] > CLOSE * size]
-                matters[loose] = quantities.widening(name, rows)[loose]
+                matters[loose] = quantities.weigh_sides(name, rows)[loose]
         worst = np.any(matters > 0, axis=1)
         if not worst.any():
             break
