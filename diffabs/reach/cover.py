@@ -139,10 +139,11 @@ def prove_box(
         matters = _widths(now) * influence
         for claim in claims:
             vague = (found.status > 0) & ~_satisfy(quantities, [claim], found)
-            matters[vague] = quantities.weigh_sides(claim.quantity, found)[vague]
+            matters[vague] = quantities.weigh_sides(claim.quantity, found, _widths(now) * influence)[vague]
         again = now[~fine]
-        matters = matters[~fine]
-        small = (_widths(again) <= SMALLEST * sides).all(1)
+        # A side that is too short is not halved, however much it matters.
+        matters = np.where(_widths(now) > SMALLEST * sides, matters, -1.0)[~fine]
+        small = (matters < 0).all(1)
         left = np.concatenate([left, again[small], _halve(again[~small], matters[~small])])
         if small.any():
             break
@@ -151,7 +152,8 @@ def prove_box(
     merged = CellBounds(*(np.concatenate(columns) for columns in zip(*rows, strict=True))) if rows else None
     if not claims and not len(left) and merged is not None:
         cells, merged, more = _refine(
-            prover, quantities, cells, merged, influence, known or {}, began + budget, progress, threads
+            *(prover, quantities, cells, merged, influence, SMALLEST * sides, known or {}),
+            *(began + budget, progress, threads),
         )
         tried += more
     covered = not len(left) and merged is not None
@@ -189,9 +191,13 @@ class _Quantities:
             return found.above[:, i], found.greatest[:, i]
         return found.least[:, i], found.below[:, i]
 
-    def weigh_sides(self, name: str, found: CellBounds) -> np.ndarray:
-        """Return about how much each side of a cell widens its bounds of a quantity, shape (cells, sides)."""
-        return found.reach[:, ("stop_time", "stop_distance").index(name) + 1 if " " not in name else 0]
+    def weigh_sides(self, name: str, found: CellBounds, otherwise: np.ndarray) -> np.ndarray:
+        """Return about how much each side of a cell widens its bounds of a quantity, shape (cells, sides).
+
+        If no side does, return the row of `otherwise`.
+        """
+        own = found.reach[:, ("stop_time", "stop_distance").index(name) + 1 if " " not in name else 0]
+        return np.where((own > 0).any(1, keepdims=True), own, otherwise)
 
     def over_all(self, found: CellBounds) -> dict[str, tuple[float, float]]:
         pairs = {name: self.of_cells(found, name) for name in self.names()}
@@ -254,8 +260,7 @@ def _halve(cells: np.ndarray, matters: np.ndarray) -> np.ndarray:
     """Return the halves of cells, each along the side that matters most; `matters` has the shape (cells, sides)."""
     if not len(cells):
         return cells
-    # A rounded middle may be an end: such a side cannot be halved.
-    side = np.where(cells[:, :, 1] > cells[:, :, 0], matters, -1.0).argmax(1)
+    side = matters.argmax(1)
     rows = np.arange(len(cells))
     middle = 0.5 * (cells[rows, side, 0] + cells[rows, side, 1])
     left, right = cells.copy(), cells.copy()
@@ -292,8 +297,9 @@ def _volume(cell: Any) -> Fraction:
 
 
 def _refine(
-    prover: Prover, quantities: _Quantities, cells: np.ndarray, rows: CellBounds, influence: np.ndarray,
-    known: Mapping[str, tuple[float, float]], until: float, progress: Callable[[str], None], threads: int | None,
+    prover: Prover, quantities: _Quantities, cells: np.ndarray, rows: CellBounds,
+    influence: np.ndarray, smallest: np.ndarray, known: Mapping[str, tuple[float, float]],
+    until: float, progress: Callable[[str], None], threads: int | None,
 ) -> tuple[np.ndarray, CellBounds, int]:  # fmt: skip
     """Halve the cells whose bounds are far from the least and the greatest value found, until the time is over."""
     tried = 0
@@ -304,7 +310,8 @@ def _refine(
             for excess, size in ((high - greatest, abs(greatest)), (least - low, abs(least))):
                 order = np.argsort(excess)[::-1][: BATCH // 2]
                 loose = order[excess[order] > CLOSE * size]
-                matters[loose] = quantities.weigh_sides(name, rows)[loose]
+                matters[loose] = quantities.weigh_sides(name, rows, _widths(cells) * influence)[loose]
+        matters[_widths(cells) <= smallest] = 0.0
         worst = np.any(matters > 0, axis=1)
         if not worst.any():
             break

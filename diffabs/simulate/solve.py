@@ -465,7 +465,7 @@ def solve(
         events: Events; several at one instant happen in this order.
         save: Times between t0 and t1 at which the state is returned, shape (n,); None for the state at the end.
         engine: "xla", or "kernel": a program of this machine for a batch by `jax.vmap`, with forward derivatives.
-            "auto" is "xla", which has both modes and makes one run as fast.
+            "auto" is that of $DIFFABS_ENGINE, or else "xla", which has both modes.
         kept_events: Number of times that are kept of each event.
 
     Returns:

@@ -129,6 +129,17 @@ def test_published_gain_within_its_limits() -> None:
         assert high - column.max() < 2e-3 * column.max()
 
 
+@killed_by("reach/native/prove.cpp", "rate.mid() * (inverse_rate.mid()", "0.0 * (inverse_rate.mid()")
+@killed_by("reach/native/prove.cpp", "end.caused(end.way_G, end.speed, p)", "end.caused(end.time_G, end.speed, p)")
+def test_the_sides_of_a_cell_widen_time_and_distance_as_in_runs() -> None:
+    prover = Prover(derive_equations(load("slip-lmi", LIMITED).loop, list(SMALL)), ("slip",), 2.0)
+    prover.choose_weights(np.array([5.3, 6.0]))
+    found = prover.prove(np.array([[[5.3, 5.302], [6.0, 6.01]]]), 1)
+    near, heavy, fast = (np.array(rig_run(*at)[1:]) for at in ((5.3, 6.0), (5.302, 6.0), (5.3, 6.01)))
+    halves = np.abs(np.stack([heavy - near, fast - near], 1)) / 2
+    np.testing.assert_allclose(found.reach[0, 1:], halves, rtol=0.1)
+
+
 @killed_by("reach/native/prove.cpp", "if (q < 0) return;", "if (q < n) return;")
 def test_a_distance_that_is_a_signal_has_its_bounds() -> None:
     prover = Prover(derive_equations(load("slip-lmi", LIMITED).loop, list(SMALL)), ("slip", "distance"), 2.0)

@@ -98,7 +98,9 @@ def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish) ->
     Raises:
         Unsupported: The step has an operation without a translation.
         NoCompiler: This machine has no compiler.
+        RuntimeError: The process was forked after JAX had started.
     """
+    check_process()
     lane = _run_differentiable(finish, (loop, {}, objectives, method, None, jnp.ones(1, bool), None, None))
     return jax.tree.map(operator.itemgetter(0), lane)
 
