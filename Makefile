@@ -23,7 +23,7 @@ test-nightly test-weekly: test-%: $(VENV)/.test $(VENV)/.ecosystem
 lint: $(VENV)/.lint $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+	$(BIN)/pyright --threads 2
 	$(BIN)/lint-imports
 
 # the site, in out/site; a warning or a dead link is an error
@@ -89,10 +89,11 @@ $(VENV)/.python:
 	$(BIN)/python -m pip install --quiet "pip>=25.1"
 	touch $@
 
+# --no-compile: Python compiles what is imported, and that is a small part of what is installed
 $(VENV)/.installed: $(VENV)/.python pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable ".[all]"
+	$(BIN)/python -m pip install --quiet --no-compile --editable ".[all]"
 	touch $@
 
 $(VENV)/.test $(VENV)/.lint $(VENV)/.docs $(VENV)/.bench $(VENV)/.mutate $(VENV)/.ecosystem: $(VENV)/.%: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --group $*
+	$(BIN)/python -m pip install --quiet --no-compile --group $*
 	touch $@

@@ -67,6 +67,7 @@ def test_derivatives_are_those_of_the_closed_form(name):
         np.testing.assert_allclose(jax.grad(mean)(jnp.asarray(0.0142)), expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_adaptive_steps_and_a_lag_behind_it():
     """The mean of a lag's output over a long time is the mean of its input."""
     actuator = Series(blocks=(DeadTime(rise=0.0123, fall=0.0042), Lag(time_constant=2e-3)))

@@ -119,6 +119,7 @@ def test_figure_and_nothing_else_is_left(whole):
     assert (folder / "a.csv").stat().st_mode & 0o777 == 0o666 & ~umask()
 
 
+@pytest.mark.slow
 def test_a_long_trajectory_is_thinned(tmp_path, monkeypatch):
     replace_seam(monkeypatch, "max_csv_rows", 5)
     (tmp_path / "a.csv").write_text("old")
@@ -251,6 +252,7 @@ def test_json_says_all_that_it_ran_with(whole):
     assert document["title"] == "State feedback on the mirrored rig, published gain"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", scenario.names())
 def test_parts_and_parameters_of_the_json_make_the_same_loop(name):
     chosen = scenario.load(name, integrated=False)
@@ -388,11 +390,13 @@ def test_as_a_module_with_double_precision():
     assert value != float(np.float32(value))
 
 
+@pytest.mark.slow
 def test_help_imports_no_matplotlib():
     code = "import sys, diffabs.cli.main; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+@pytest.mark.slow
 def test_control_c_ends_a_long_run_with_one_line(tmp_path):
     endless = ["controller={type='constant-torque',torque=0.0}", "solver.step=1e-5", "solver.duration=1000"]
     command = [sys.executable, "-m", "diffabs", "simulate", "slip-lmi", "--csv", str(tmp_path / "a.csv")]

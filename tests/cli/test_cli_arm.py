@@ -32,6 +32,7 @@ def falling(tmp_path_factory):
     return result, json.loads(result.stdout), path
 
 
+@pytest.mark.slow
 def test_the_papers_start_falls_and_that_is_said(falling):
     """A result, and not a failure of the program: status 0."""
     result, document, _ = falling
@@ -61,6 +62,7 @@ def test_every_column_has_its_unit(falling):
     assert falling[1]["metrics"]["settling_time"] is None  # never
 
 
+@pytest.mark.slow
 def test_the_hanging_arm_stays_up():
     """Peaks of an independent solution, to the digits that it gives; nothing is said of a stop that is not wanted."""
     result = run("simulate", "arm-hanging", "--json")

@@ -11,6 +11,7 @@ from project import ROOT
 from diffabs.compiler.passes import PASSES
 
 
+@pytest.mark.slow
 @killed_by("compiler/listing.py", "sum(node.level == level and", "sum(node.level >= level and")
 def test_the_numbers_of_operations():
     """Elimination computes no number that nothing reads, and a tangent with fewer operations than jvp gives."""

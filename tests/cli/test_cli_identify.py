@@ -273,6 +273,7 @@ def test_interrupted_it_leaves_nothing_half_written(small, csv, tmp_path, monkey
     assert left_in(tmp_path) == {"small.toml", "run.csv"}
 
 
+@pytest.mark.slow
 def test_too_few_data_are_bad_input(small, csv):
     result = run("identify", small, "--data", csv("t [s],slip [1]", "0.1,0.1"), *FREE, status=2)
     assert_one_error_line(result)

@@ -36,6 +36,7 @@ def test_a_false_claim_about_the_brake_is_refuted(brake: list[str | pathlib.Path
     assert found["refuted_by"] is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("road", cases(["burckhardt", "magic-formula"], "magic-formula"))
 def test_a_pid_quarter_car_on_other_roads(road: str, file) -> None:
     scenario = file(f'[plant]\ntype = "quarter-car"\n[road]\ntype = "{road}"\n[solver]\nduration = 6.0\nstep = 1e-4\n')

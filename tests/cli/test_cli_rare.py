@@ -45,6 +45,7 @@ def test_the_document_is_the_librarys_answer(scenario):
     assert min(result["failures"]["initial.speed"]) > 32 / 3.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", cases(["invented", "real"], "real"))
 def test_tables_for_a_person(scenario, runs, monkeypatch):
     if runs == "invented":  # 8.5 m/s^2 from each speed to 25 km/h: nothing is compiled

@@ -84,6 +84,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 @killed_by("cli/console.py", "        files.remove_unfinished()\n", "")
 def test_what_a_thread_was_writing_goes_with_it(tmp_path):
     with started(sys.executable, "-c", LEAVING, str(tmp_path)) as process:

@@ -102,6 +102,7 @@ class TestRuns:
         for name, value in runs[0].metrics.items():
             np.testing.assert_array_equal(found[0].metrics[name], value)
 
+    @pytest.mark.slow
     def test_do_not_depend_on_their_order_nor_on_threads(self, runs, monkeypatch):
         replace_seam(monkeypatch, "thread_count", lambda: 3)
         native._run.clear_cache()
@@ -405,6 +406,7 @@ class TestCarry:
         np.testing.assert_allclose(found[3], expected[3], rtol=1e-13)
         np.testing.assert_array_equal(found[4], carry[4])
 
+    @pytest.mark.slow
     @killed_by("compiler/emit/cpp.py", "gate.args[1] is number and ", "")
     @killed_by("compiler/emit/cpp.py", "if r.id not in self.rare.stored:", "if True:")
     def test_of_a_rare_branch_is_right_with_and_without_it(self):

@@ -72,6 +72,7 @@ class TestText:
         assert found.metrics["iae"].dtype == np.float32
         same(found, expected, rtol=2e-4, atol=1e-6)
 
+    @pytest.mark.slow
     @killed_by(
         "compiler/native/lane.h",
         "T most(T a, T b) { return a == a ? higher(a, b) : a; }",

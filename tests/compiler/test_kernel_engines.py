@@ -108,6 +108,7 @@ def no_compiler(monkeypatch):
 class TestDefault:
     """Nobody names an engine."""
 
+    @pytest.mark.slow
     @killed_by("simulate/drive/engine.py", "and (why_not or why_xla):", "and why_not:")
     @killed_by("simulate/drive/engine.py", "log_own_choice(why_not or why_xla)", "log_xla_reason(why_not or why_xla)")
     def test_derivatives_of_both_modes_are_those_of_xla(self, users_engine, caplog):

@@ -59,6 +59,7 @@ def trajectory(loop):
     return np.asarray(kept.output.slip)[:SAMPLES], np.asarray(kept.command)[:SAMPLES]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [0, 1], ids=["sampled", "sampled on the grid"])
 def test_a_lost_sample_holds_memory_and_command(which):
     """Against the difference equations of the PID, which skip the samples that are lost."""

@@ -216,6 +216,7 @@ def test_two_events_in_one_step():
     close(torque_mean, 5.3 + brentq(lambda x: float(rise(x)) - 0.01, 0.0, 1.0), rtol=1e-9)
 
 
+@pytest.mark.slow
 @killed_by(
     "simulate/step/fixed.py",
     "jnp.where(lost, RunStatus.DIVERGED, status)",
@@ -235,6 +236,7 @@ def test_what_switches_in_every_step_is_no_run():
     assert np.isnan(run.metrics["iae"])
 
 
+@pytest.mark.slow
 @killed_by("objectives/tracking.py", "cubic.start * cubic.end < 0", "cubic.start * cubic.end < -1e9")
 @killed_by("core/cubic.py", "return jnp.where(inside & (top > ends), top, ends)", "return ends")
 @pytest.mark.parametrize("h", [1e-3, 5e-4])
@@ -340,6 +342,7 @@ def parabola(t, top=5.3e-3, a=9.0, bend=4e4):
     return seen(0.15 + 20.0 * (t - top) + 300.0 * (t - top) ** 2, deceleration=a - bend * (t - top) ** 2)
 
 
+@pytest.mark.slow
 @killed_by(
     "simulate/step/event_location.py",
     "jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier",
@@ -433,6 +436,7 @@ def test_literal_follows_the_slip_while_friction_rises():
     close(target, [0.2, *slip[1:6], *[slip[5]] * 6])
 
 
+@pytest.mark.slow
 @killed_by("references/peak_slip.py", "(m.latched < 0.5) & (m.greatest > self.arming)", "(m.latched < 0.5)")
 @pytest.mark.parametrize(("threshold", "arming", "latches"), [(0.05, 3.0, True), (0.05, 9.1, False), (0.5, 3.0, False)])
 def test_robust_latch(threshold, arming, latches):

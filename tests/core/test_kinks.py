@@ -96,7 +96,7 @@ def same(out: Any) -> Any:
 @killed_by(
     "simulate/step/comparisons.py", "asks = name if moves and real", "asks = name if real", case="of what is fixed"
 )
-@pytest.mark.parametrize("name", KINKED)
+@pytest.mark.parametrize("name", cases(KINKED, "in a loop", "in one of three", "a conditional", "many"))
 def test_a_program_is_the_function(name):
     f, count = KINKED[name]
     one = program(f)
@@ -119,6 +119,7 @@ def test_a_regime_goes_on_beyond_its_kinks(name, at, beyond, value, slope):
     np.testing.assert_allclose([found, move], [value, slope], rtol=1e-15)
 
 
+@pytest.mark.slow
 @killed_by("simulate/step/modes.py", "against = margin < -_rounding_error(x)", "against = margin < -jnp.inf", case="gt")
 @pytest.mark.parametrize("name", [name for name, (_, count) in KINKED.items() if count])
 def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
@@ -358,6 +359,7 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
     np.testing.assert_allclose(run.metrics["y"], [0.2, 0.4], atol=0.02)
 
 
+@pytest.mark.slow
 @killed_by(
     "simulate/step/fixed.py",
     "fine &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True",

@@ -26,6 +26,7 @@ def test_a_plant_says_the_unit_of_its_control(plant, unit):
     assert plant.control_unit == unit
 
 
+@pytest.mark.slow
 @killed_by("core/loop.py", "(plant.control_unit, getattr", '("N m", getattr')
 def test_the_csv_file_of_the_lab_rig(tmp_path):
     run("simulate", "lab-rig", *SHORT, "--csv", tmp_path / "run.csv")
@@ -58,6 +59,7 @@ def test_what_is_measured_of_a_control_has_its_unit():
     assert [unit_of(TorqueRate(), plant) for plant in (car, rig)] == ["N m/s", "1/s"]
 
 
+@pytest.mark.slow
 def test_the_usual_figure_is_of_a_torque():
     chosen = scenario.load("slip-lmi", SHORT[1::2])
     texts = {text.get_text() for text in plot.draw_braking(rollout(chosen.loop, chosen.solver)).findobj(Text)}

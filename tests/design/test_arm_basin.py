@@ -193,6 +193,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @killed_by("design/capture.py", "_growth(systems, p, inverse, level) < decay", "np.ones(len(p), bool)")
 @pytest.mark.parametrize("case", CASES)
 def test_in_the_ellipsoid_its_function_falls(case):

@@ -210,6 +210,7 @@ def refute_each_other(loops, discrete=False, nearly=1e-9):
     return bool((angles == 0).any()) if not ((angles > 0) & (angles < nearly)).any() else None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "discrete"), [(2, False), (2, True), (3, False)])
 def test_a_negative_eigenvalue_of_the_product_refutes(order, discrete):
     random, refuted = np.random.default_rng(order), 0

@@ -315,6 +315,7 @@ def test_a_part_that_raises_or_exits_is_one_line(tmp_path, monkeypatch, file, st
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["simulate", "design"])
 def test_a_part_that_prints_does_not_spoil_the_document(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
@@ -348,6 +349,7 @@ def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):
     assert "entry point servo of diffabs.parts: cannot be imported" in result.stderr
 
 
+@pytest.mark.slow
 @killed_by("cli/usage.py", "register_parts(parts or ())", "register_parts(())")
 def test_simulate_prints_writes_and_draws(tmp_path, monkeypatch):
     from matplotlib.figure import Figure

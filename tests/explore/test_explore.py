@@ -320,6 +320,7 @@ def test_poles_of_a_closed_loop_are_those_of_its_polynomial():
     )
 
 
+@pytest.mark.slow
 @killed_by(
     "scenario/section_design.py", 'self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else', ""
 )

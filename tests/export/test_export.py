@@ -145,6 +145,7 @@ def commands_of_c(found, text, name, seen, folder):
     return np.array(said.split(), float)
 
 
+@pytest.mark.slow
 @killed_by(
     "compiler/operations.py",
     '"lower({0}, {1})", "{0} < {1} ? {0} : {1}"',

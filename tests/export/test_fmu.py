@@ -86,6 +86,7 @@ def test_an_fmu_runs_as_the_simulation_does(name, tmp_path):
     assert np.ptp(found[:, 0]) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_loop_closed_outside_is_the_loop(tmp_path):
     """The plant as FMU, the controller as Structured Text: together what was simulated, to 1e-6."""
     loop = braking(

@@ -143,6 +143,7 @@ class SlipOnly:
 jax.tree_util.register_pytree_node(SlipOnly, lambda r: ((), ()), lambda s, c: SlipOnly())
 
 
+@pytest.mark.slow
 def test_lab_rig_rests_where_it_is_held():
     """The remaining state, the brake, where its own rate is zero; then the slip's is, too."""
     model = SlipModel(plant=LabRig(), speed=8.0)

@@ -143,6 +143,7 @@ def test_a_delay_in_continuous_time_against_the_closed_form():
     assert not margins(loop._replace(delay=0.99 * math.pi / (2 * k) + 0.02)).stable
 
 
+@pytest.mark.slow
 @killed_by(
     "linear/stability_margins.py", "times = 1 + math.floor((system.delay - first) * w / (2 * math.pi))", "times = 1"
 )
@@ -330,6 +331,7 @@ def test_python_control_there_and_back():
         margins(Transfer(np.eye(2) * -1, np.eye(2), np.eye(2), np.zeros((2, 2))))
 
 
+@pytest.mark.slow
 @killed_by("linear/robustness.py", "return {name: max(self.systems", "return {name: min(self.systems")
 def test_a_band_is_of_the_corners_and_of_samples_between():
     loop, over = rig(), {"plant.mass": (5.3, 6.2), "initial.speed": (2.0, 10.0)}
@@ -378,8 +380,8 @@ def test_the_command_says_margins_and_where_they_are_worst(tmp_path):
         (["slip-cured", "--at", "speed"], 2, "a number is needed"),
         (["slip-cured", "--at", "speed=-1"], 2, "--at initial.speed = -1"),
         (["slip-cured", "--at", "speed=1", "--at", "speed=2"], 2, "given twice"),
-        (["lab-rig"], 1, "does not follow what is measured"),
-        (["slip-lmi", "--set", "controller.gain=30,30"], 1, "not stable"),
+        pytest.param(["lab-rig"], 1, "does not follow what is measured", marks=pytest.mark.slow),
+        pytest.param(["slip-lmi", "--set", "controller.gain=30,30"], 1, "not stable", marks=pytest.mark.slow),
     ],
 )
 def test_the_command_refuses_in_one_line(arguments, status, words):
@@ -389,6 +391,7 @@ def test_the_command_refuses_in_one_line(arguments, status, words):
     assert words in errors[0]
 
 
+@pytest.mark.slow
 def test_the_page_runs(capsys):
     page = ROOT / "docs" / "margins.md"
     code = page.read_text().partition("```python\n")[2].partition("```")[0]

@@ -168,6 +168,7 @@ def rounding(a, b, q, r, p):
     return x * np.finfo(float).eps * terms / np.linalg.norm(p)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("case", cases(range(20), 0, 1, 2, 3, 12, 13, 4, 5, 6, 11, 14, 15, 16, 17, 18, 19))
 def test_scipys_cases_in_continuous_time(case):

@@ -86,6 +86,7 @@ def test_a_row_without_a_printed_number_is_undecidable():
     np.testing.assert_allclose(row["bound"], 28.542, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_limit_cycle_and_the_three_broken_conditions():
     with jax.enable_x64(True):
         rows = [judge_row(row) for row in read_rows() if row["source"] == "four-phase"]

@@ -186,6 +186,7 @@ def test_an_observer_knows_the_limit_of_its_voltage(observer):
     assert float(found.voltage) == pytest.approx(float(inner.gain @ predicted), rel=1e-12)
 
 
+@pytest.mark.slow
 @killed_by(
     "controllers/balance.py",
     "jnp.where(number > 0, predicted + self.correction @ error, self.start(signal).held.state)",

@@ -345,6 +345,7 @@ def test_load_does_not_change_a_cars_deceleration():
     np.testing.assert_allclose(decelerations[0], decelerations[1], rtol=1e-15, atol=0)
 
 
+@pytest.mark.slow
 @killed_by("plants/road_vehicle.py", "self.drag * v * v + self.rolling", "self.drag * v + self.rolling")
 @killed_by("plants/road_vehicle.py", "return self.wheel_load * self.road", "return self.mass * GRAVITY * self.road")
 def test_a_locked_road_vehicle_stops_in_closed_form():

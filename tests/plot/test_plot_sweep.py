@@ -373,6 +373,7 @@ ODD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(ODD))
 def test_odd_sweeps_are_drawn_without_a_warning(made, tmp_path, monkeypatch, kind):
     variables, metrics, given, names = ODD[kind]

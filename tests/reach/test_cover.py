@@ -129,6 +129,7 @@ def test_published_gain_within_its_limits() -> None:
         assert high - column.max() < 2e-3 * column.max()
 
 
+@pytest.mark.slow
 @killed_by("reach/native/prove.cpp", "rate.mid() * (inverse_rate.mid()", "0.0 * (inverse_rate.mid()")
 @killed_by("reach/native/prove.cpp", "end.caused(end.way_G, end.speed, p)", "end.caused(end.time_G, end.speed, p)")
 def test_the_sides_of_a_cell_widen_time_and_distance_as_in_runs() -> None:
@@ -140,6 +141,7 @@ def test_the_sides_of_a_cell_widen_time_and_distance_as_in_runs() -> None:
     np.testing.assert_allclose(found.reach[0, 1:], halves, rtol=0.1)
 
 
+@pytest.mark.slow
 @killed_by("reach/native/prove.cpp", "if (q < 0) return;", "if (q < n) return;")
 def test_a_distance_that_is_a_signal_has_its_bounds() -> None:
     prover = Prover(derive_equations(load("slip-lmi", LIMITED).loop, list(SMALL)), ("slip", "distance"), 2.0)

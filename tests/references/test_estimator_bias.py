@@ -64,6 +64,7 @@ def ours(bias):
     return float(run.ending.sample.output.distance), bool(run.stopped)
 
 
+@pytest.mark.slow
 @killed_by("references/peak_slip.py", "return jnp.abs(signal.deceleration)", "return signal.deceleration", case="0.1")
 @pytest.mark.parametrize("bias", [-0.2, -0.05, 0.0, 0.1, 0.2])
 def test_a_biased_accelerometer_misleads_the_latch(bias):

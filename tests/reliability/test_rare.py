@@ -100,6 +100,7 @@ class TestKnown:
         assert max(each.evaluations for each in found) <= 2800 + 2520 * (levels - 1) + 2000  # 17400 for 1e-6
         assert all(each.reason is SubsetReason.REACHED for each in found)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("score", "d", "threshold", "truth"),
         [

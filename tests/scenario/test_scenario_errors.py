@@ -290,6 +290,7 @@ def test_unstable_step(checked_step):
     assert "is not stable" in message("slip-estimator", "controller.kp=10000", f"solver.step={1.02 * largest}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names())
 def test_packaged_step_is_stable(checked_step, name):
     load(name)

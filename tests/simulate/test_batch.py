@@ -160,6 +160,7 @@ class TestLanes:
         one = jax.device_get(d.measure(LOOP, SOLVER, MEASURED, key=jax.random.key(3)))
         same(jax.tree.map(lambda x: x[1], found), one)
 
+    @pytest.mark.slow
     def test_none_is_one_lane(self, driven):
         found = driven(QUIET, Batch(), SOLVER, MEASURED)
         same(found, jax.tree.map(lambda x: x[None], jax.device_get(d.measure(QUIET, SOLVER, MEASURED))))

@@ -50,6 +50,7 @@ def test_value_across_events(name, ours):
     assert misses(ours(name)[0], event_oracle.values(name), 1e-8, FLOOR) == []
 
 
+@pytest.mark.slow
 def test_values_are_as_right_where_a_rate_jumps():
     """Without being asked: conditional integration begins and ends within a step."""
     name = "fixed slip, PI, clamping"
@@ -74,6 +75,7 @@ def test_derivatives_converge_with_the_second_order_at_least(name, ours):
     assert not bad.any(), list(zip(np.array(event_oracle.METRICS)[bad], coarse[bad], fine[bad], strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", event_oracle.LOOPS)
 def test_the_oracle_does_not_depend_on_its_tolerance(name, monkeypatch):
     usual = event_oracle.values(name)

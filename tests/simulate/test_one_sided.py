@@ -102,6 +102,7 @@ CLOCKS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("loop", "path", "period"), CLOCKS)
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
 @pytest.mark.parametrize("solver", [d.FixedStep(PERIOD, 0.01), d.Adaptive(1e-4, 0.01, PERIOD)])

@@ -70,6 +70,7 @@ def _fields(loop):
     return {"plant": loop.plant, "initial": loop.initial, "stop": loop.stop}
 
 
+@pytest.mark.slow
 @killed_by(
     "plants/mirrored_rig.py", "slip_ratio(v, w, self.crawl_speed)", "slip_ratio(w, v, self.crawl_speed)", case="2"
 )

@@ -55,6 +55,7 @@ def test_standstill_of_a_locked_wheel_in_closed_form(step):
     np.testing.assert_allclose(run.metrics["locked_time"], (10 - 0.05) / DECELERATION, rtol=1e-12)
 
 
+@pytest.mark.slow
 @killed_by("simulate/step/advance.py", "(running & exact & ~crosses))", "(running & exact))")
 def test_speed_reached_lands_between_samples():
     loop = dataclasses.replace(SLIDING, stop=SpeedReached(speed=3.0))
@@ -66,6 +67,7 @@ def test_speed_reached_lands_between_samples():
     assert run.metrics["variation"] == 0
 
 
+@pytest.mark.slow
 @killed_by(
     "objectives/braking.py",
     "rates = (jnp.abs(rate.control) for rate in segment.sample_rates())",
@@ -79,6 +81,7 @@ def test_the_torque_rate_of_a_lag_is_that_of_its_exponential():
     np.testing.assert_allclose(run.metrics["rate"], 500.0 / lag, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_peak_of_a_falling_slip_is_its_first_value():
     loop = dataclasses.replace(RIG, initial=d.BrakeStart(speed=10.0, slip=0.6))
     run = d.rollout(loop, d.FixedStep(1e-3, 0.01), {"max_slip": MaxSlip()})

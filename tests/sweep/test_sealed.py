@@ -211,6 +211,7 @@ def test_the_digest_of_a_manifest_is_that_of_the_rest(whole, copy):
     assert (copy / "manifest.json").read_bytes() == before
 
 
+@pytest.mark.slow
 @killed_by("sweep/manifest.py", 'if given.get("digest") != json_digest(manifest):', "if False:")
 def test_a_scenario_that_was_edited_in_the_manifest_is_seen(copy, whole):
     def heavier(there):
@@ -255,6 +256,7 @@ def deep(levels):
 VALUES = (None, True, -1, 0, 1e308, float("nan"), "x", "\ud800", [], [1], {}, {"type": "x"}, deep(200), 10**400)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("again", [False, True])
 def test_no_value_of_a_manifest_ends_in_a_traceback(copy, whole, again):
     """Also where somebody worked out the digest anew: read without a word, it is the same sweep."""

@@ -326,6 +326,7 @@ def by_command(request, tmp_path_factory):
     return folder / "out", json.loads(done.stdout), done.stderr
 
 
+@pytest.mark.slow
 def test_the_command_computes_the_table(by_command, swept):
     folder, document, said = by_command
     assert (document["samples"], document["complete"], said) == (70, True, "")

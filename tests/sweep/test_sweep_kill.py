@@ -298,6 +298,7 @@ def test_a_disk_that_is_really_full(longer, tmp_path):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0, 3])
 def test_a_disk_that_is_full_before_it_begins(whole, tmp_path, monkeypatch, size):
     """Neither folder nor manifest find room."""

@@ -459,6 +459,7 @@ class TestCoverage:
         found = coverage(lambda k: every[k], lambda: random.binomial(n, p), p)
         assert abs(found - exact) < 2
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("exact", [True, False])
     def test_correlations(self, exact):
         random, rho = np.random.default_rng(35), 0.6
@@ -468,6 +469,7 @@ class TestCoverage:
             each = iter(getattr(one, kind)[0] for one in found)
             assert abs(coverage(lambda one: one, lambda each=each: next(each), truth) - 95) < 2
 
+    @pytest.mark.slow
     def test_correlations_of_what_is_not_binormal(self):
         """y = (x - 1/4)^2 of uniform x. Spearman's by hand: the law of y is 2 sqrt(y), then 1/4 + sqrt(y)."""
         random = np.random.default_rng(36)
