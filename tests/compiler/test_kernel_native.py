@@ -166,3 +166,14 @@ def test_rules_are_those_of_jax():
     for name in RULES:
         np.testing.assert_allclose(found[name], expected[name], rtol=4e-15, atol=1e-14, err_msg=name)
     np.testing.assert_array_equal(found["draws, 32 bits"], expected["draws, 32 bits"])
+
+
+@killed_by("compiler/native/lanes.h", "0x4530000080000000ull", "0x4530000000000000ull")
+def test_whole_numbers_of_64_bits_are_rounded_once():
+    """On a processor without AVX-512 the conversion is ours."""
+    rng, most = np.random.default_rng(7), np.iinfo(np.int64).max
+    near = [s * (1 << e) + d for e in range(64) for d in (-1025, -513, -1, 0, 1, 511, 1023) for s in (1, -1)]
+    ends = np.array([k for k in near if -most - 1 <= k <= most], np.int64)
+    k = np.concatenate([ends, rng.integers(-most - 1, most, 4000, endpoint=True)])
+    found = applied({"real": lambda x, y, k: k.astype(float)}, np.zeros(len(k)), np.zeros(len(k)), k)
+    np.testing.assert_array_equal(found["real"], k.astype(np.float64))

@@ -6,8 +6,10 @@
 #include <math.h>
 #include <stdint.h>
 #if defined(__AVX512F__) && defined(__AVX512VL__) && defined(__AVX512DQ__) && defined(__AVX512BW__) && !defined(PLAIN)
-#include <immintrin.h>
 #define WIDE
+#endif
+#ifdef __AVX__
+#include <immintrin.h>
 #endif
 #if defined(__AVX512F__)
 #define BYTES 64
@@ -87,7 +89,11 @@ FN mask operator&(mask a, mask b) { return mask{a.m & b.m}; }
 FN mask operator|(mask a, mask b) { return mask{a.m | b.m}; }
 FN mask operator^(mask a, mask b) { return mask{a.m ^ b.m}; }
 FN mask operator~(mask a) { return mask{~a.m}; }
+#ifdef __AVX__
+FN bool any(mask a) { return !_mm256_testz_si256((__m256i)a.m, (__m256i)a.m); }
+#else
 FN bool any(mask a) { bool on = false; for (int q = 0; q < LANES; q++) on |= a.m[q] != 0; return on; }
+#endif
 FN bool get(mask a, int q) { return a.m[q] != 0; }
 FN void set(mask& a, int q, bool on) { a.m[q] = on ? -1 : 0; }
 FN mask all(bool on) { return mask{word{} - (on ? 1 : 0)}; }
@@ -181,6 +187,14 @@ template<class V, class T> FN V bits_as(T x, V) { return (V)x; }
 /* Conversions. As in XLA, a real number outside the integers' range becomes the nearest integer, and NaN becomes 0. */
 template<class V, class T> FN V to(T x, V) { return CAST(V, x); }
 template<class V> FN V to(mask a, V) { return sel(a, V{} + 1, V{}); }
+#ifndef WIDE
+/* Without AVX-512 no instruction converts vectors of i64. The halves are the last bits of 2^52 and of 2^84 + 2^63, so
+   both parts are exact, and the last sum rounds once. */
+FN vf64 to(vi64 x, vf64) {
+  const vf64 low = (vf64)(((vu64)x & 0xffffffffull) | 0x4330000000000000ull);
+  const vf64 high = (vf64)((vu64)x >> 32 ^ 0x4530000080000000ull);
+  return (high - 0x1.00000801p84) + low; }
+#endif
 template<class V, class T> FN V bounded(T x, T low, T high, V first, V last) {
   const mask fits = lt(low, x) & lt(x, high);
   const V inside = CAST(V, sel(fits, x, T{}));
