@@ -43,9 +43,12 @@ PRECISION = 96  # bits
 ORDER = 7  # of the Taylor polynomials
 LOWER_ORDERS = (2, 1)  # where a number has no more derivatives
 TOLERANCE = 1e-9  # radius of a remainder, or of a disturbance's effect, that a step may add to a state
+REMAINDER_SHARE = 1e-4  # of a state's own radius, which a remainder may be in addition
 MAX_HALVINGS = 40  # of one given step
 PICARD_TRIES = 40
-SPEED_WEIGHT = 0.125  # of the speed relative to the slip, in the scales of QR for a sampled loop
+BALANCE_INTERVAL = 16  # ticks, or steps of a continuous loop, between two choices of the scales of QR
+NEW_SCALE_SHARE = 1 / 16  # of a new choice in the logarithms of the scales: each turn of the axes widens the set
+SPEED_WEIGHT = 256.0  # of the speed over the slip, in the scales of QR for a sampled loop
 PIECES = 8  # of a step, for the bounds of a signal
 FASTEST_SLIP = 1.0  # `check_slip_chart` holds for a slip below 1 and a speed above `SLOWEST`
 ZERO, ONE, NO_SLOPE = arb(0), arb(1), arb_poly([])
@@ -762,7 +765,8 @@ class _Check:
     def balance(self, period: float) -> None:
         """Choose the scales of the states for QR; every choice is sound.
 
-        They balance the Jacobian of the loop without limits at the centre.
+        They balance the Jacobian of the loop without limits at the centre, for a sampled loop that of a whole period.
+        They follow it slowly.
 
         Args:
             period: Time between two ticks [s]; not used for a continuous loop.
@@ -783,14 +787,17 @@ class _Check:
                 for k in range(1, 30):
                     power = power @ flow * (period / k)
                     step = step + power
-                total = np.abs(step) + np.abs(matrix(p.tick))
+                tick = matrix(p.tick)
+                total = np.maximum(np.abs(tick @ step), np.abs(step @ tick))  # a set is renewed after both
         except _Undefined:
             return
         if np.isfinite(total).all():
-            self.weights = _balance_matrix(total)
+            weights = _balance_matrix(total)
             if p.tick and self.speed >= 0 and self.slip >= 0:
-                # An error of the speed stays, while one of the slip decays: the axes must not turn slip into speed.
-                self.weights[self.speed] = self.weights[self.slip] * SPEED_WEIGHT
+                # An error of the speed stays, while one of the slip decays: the axes must not turn speed into slip.
+                weights[self.speed] = weights[self.slip] * SPEED_WEIGHT
+            share = NEW_SCALE_SHARE if self.steps else 1.0
+            self.weights = weights**share * self.weights ** (1 - share)
 
     # Moves.
 
@@ -826,7 +833,8 @@ class _Check:
         rest = [_remainder(far, rate, order + 1) * power for rate in p.flow]
         totals = [q for q in (self.travelled, self.clock) if q is not None]
         total_rest = [_remainder(far, q.rate, order + 1) * power for q in totals]
-        if not all(x.rad() < TOLERANCE for x in (*rest, *total_rest)):
+        room = [TOLERANCE + REMAINDER_SHARE * x.rad() for x in X] + [arb(TOLERANCE)] * len(totals)
+        if not all(x.rad() < most for x, most in zip((*rest, *total_rest), room, strict=True)):
             raise _StepFails("the remainder of a step is too wide")
         across = any(not x.is_zero() for x in push)
         crossed = [q for q, chord in chords.items() if not chord.width.is_zero()]
@@ -1198,7 +1206,8 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
             raise NotProved("a sampled loop needs a number of steps between two ticks")
         period, tick = _constant(e.period), 0
         while True:
-            check.balance(e.period)
+            if tick % BALANCE_INTERVAL == 0:
+                check.balance(e.period)
             check.do_tick()
             for _ in range(steps):
                 check.advance(period / steps)
@@ -1216,7 +1225,7 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
         raise NotProved("a step's length must be positive")
     number = 0
     while True:
-        if number % 16 == 0:
+        if number % BALANCE_INTERVAL == 0:
             check.balance(0.0)
         check.advance(arb(float(steps[min(number, len(steps) - 1)])))
         number += 1

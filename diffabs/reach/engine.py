@@ -36,7 +36,7 @@ FAILURES = (
     "a run may have ended at its start",
 )  # in the order of `Why` in prove.cpp
 WEIGHT_TABLES = 400  # parts of the range of speeds, or of the horizon, with weights of their own
-SPEED_SHARE = 8  # weight of the slip over that of the speed, which drifts: the couplings of a period say too much of it
+SPEED_WEIGHT = 256.0  # of the speed over the slip: an error of the speed stays, and must not turn into one of the slip
 NEAR = 0.3  # logarithm of the ratio of speeds whose couplings count together
 CLOCKWORK_WEIGHT = 2.0**20  # of states that are the same in all runs: nothing else mixes with them
 SCOUTED = 20_000  # periods, or steps, of the run that the weights are chosen by
@@ -311,7 +311,7 @@ class Prover:
             self.weights[k] = balance_weights(jacobians[close].max(0))
             self.weights[k, self._clockwork] = CLOCKWORK_WEIGHT
             if self.task.speed >= 0:
-                self.weights[k, self.task.speed] = self.weights[k, self.task.nonnegative] / SPEED_SHARE
+                self.weights[k, self.task.speed] = self.weights[k, self.task.nonnegative] * SPEED_WEIGHT
 
 
 def _tape_arrays(e: Equations, place: dict[int, int]) -> dict[str, np.ndarray]:
