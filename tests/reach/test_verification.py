@@ -50,9 +50,10 @@ def shorter_stop(document: JsonObject) -> None:
     document["bounds"]["stop_time"][1] *= 0.995
 
 
-def greater_torque(document: JsonObject) -> None:
+def smaller_torque(document: JsonObject) -> None:
+    """The greatest slip becomes 0.2816, and the file says 0.2804."""
     assert "torque_max = 9.03" in document["scenario"]
-    document["scenario"] = document["scenario"].replace("torque_max = 9.03", "torque_max = 9.1")
+    document["scenario"] = document["scenario"].replace("torque_max = 9.03", "torque_max = 8.9")
 
 
 def shorter_duration(document: JsonObject) -> None:
@@ -64,7 +65,7 @@ def false_claim(document: JsonObject) -> None:
 
 
 CHEAP = [shorter_duration, false_claim]  # noticed before a cell is proved again; `test_attacks.py` has more
-CHANGES = [*CHEAP, *(pytest.param(x, marks=pytest.mark.slow) for x in (lower_bound, shorter_stop, greater_torque))]
+CHANGES = [*CHEAP, *(pytest.param(x, marks=pytest.mark.slow) for x in (lower_bound, shorter_stop, smaller_torque))]
 
 
 @pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
