@@ -149,7 +149,7 @@ def verify_box(
         equations = derive_equations(loop, over)
         chosen = _choose_cells(cells, share, suspects)
         for done, i in enumerate(chosen, 1):
-            if why := _check(equations, file, cells[i], CELL_HALVINGS):
+            if why := _check(equations, file, cells[i], _choose_sides(over, cells[i])):
                 ends = (f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in zip(over, cells[i], strict=True))
                 reason, done = f"cell {', '.join(ends)}: {why}", done - 1
                 break
@@ -203,10 +203,22 @@ def _comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[Cell], d
     return False
 
 
-def _check(equations: Equations, file: ProofFile, cell: Cell, halvings: int) -> str:
+def _choose_sides(over: Mapping[str, tuple[float, float]], cell: Cell) -> list[int]:
+    """Return the parameters along which the checker halves a cell, one after the other.
+
+    Those that the prover has halved most often come first: they move the runs most.
+    """
+    shares = [
+        (high - low) / (b - a) if low < high else 0.0 for (low, high), (a, b) in zip(cell, over.values(), strict=True)
+    ]
+    order = sorted((i for i, share in enumerate(shares) if share > 0), key=lambda i: shares[i])
+    return (order * CELL_HALVINGS)[:CELL_HALVINGS]
+
+
+def _check(equations: Equations, file: ProofFile, cell: Cell, sides: Sequence[int]) -> str:
     """Return why the checker does not prove the file's bounds in a cell, empty if it does.
 
-    A cell in which it fails is halved: its own bounds of a smaller cell are narrower.
+    A cell in which it fails is halved along the first of `sides`: its bounds of a smaller cell are narrower.
     """
     from diffabs.reach.checker import NotProved, check_cell
 
@@ -228,16 +240,13 @@ def _check(equations: Equations, file: ProofFile, cell: Cell, halvings: int) -> 
                 "stop_distance": found.distance,
             },
         )
-    if not reason or not halvings:
+    if not reason or not sides:
         return reason
-    widths = [(high - low) / max(abs(high), 1e-300) for low, high in cell]
-    side = widths.index(max(widths)) if widths else 0
-    if not widths or not widths[side] > 0:
-        return reason
+    side = sides[0]
     low, high = cell[side]
     middle = 0.5 * (low + high)
     halves = ([*cell[:side], ends, *cell[side + 1 :]] for ends in ([low, middle], [middle, high]))
-    return next((why for half in halves if (why := _check(equations, file, half, halvings - 1))), "")
+    return next((why for half in halves if (why := _check(equations, file, half, sides[1:]))), "")
 
 
 def _compare(stated: Bounds, found: Mapping[str, tuple[float | None, float | None]]) -> str:
