@@ -82,6 +82,9 @@ def objection(document: JsonObject) -> str:
         return str(error)
 
 
+@killed_by(
+    "reach/verification.py", "return (order * CELL_HALVINGS)[:CELL_HALVINGS]", "return order[:1] * CELL_HALVINGS"
+)
 def test_the_honest_file_is_verified() -> None:
     found = judge(HONEST)
     assert found.reason == ""
