@@ -11,9 +11,8 @@ the last block of each structure.
 """
 
 import contextlib
-import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
@@ -22,11 +21,13 @@ import jax
 import numpy as np
 
 from diffabs.compiler.runtime.toolchain import NoCompiler
-from diffabs.core.types import Bool, JsonObject, Params, Part, PyTree
+from diffabs.core.protocols import Objective
+from diffabs.core.types import Bool, Int, JsonObject, Params, Part, PyTree
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.ensemble import run_batch
+from diffabs.simulate.types import Solver
 from diffabs.sweep.study import FLAG_COLUMNS, Study, noise_key, numeric_values, precision
 
 BLOCKS_PER_CHUNK = 8
@@ -51,14 +52,16 @@ class _Block(NamedTuple):
 
 
 class Runner:
-    """A runner of a study's chunks on devices of this process; it compiles once for each structure of the loop."""
+    """A runner of a study's chunks on devices of this process.
+
+    A process compiles once for each structure of the loop, also for other runners and other numbers.
+    """
 
     def __init__(self, study: Study, devices: Sequence[PyTree] | None = None):
         """Set the `study` and the `devices`, one for each block that runs at a time; by default all local ones once."""
         self.study = study
         self.devices = list(devices or jax.local_devices())
         self.size = study.chunk if not study.parts else -(-study.chunk // BLOCKS_PER_CHUNK)
-        self._programs: dict[tuple[str, ...], PyTree] = {}
         self._pool = ThreadPoolExecutor(len(self.devices))
 
     def run(self, chunks: Sequence[int]) -> list[Columns]:
@@ -72,7 +75,7 @@ class Runner:
             columns |= {name: np.zeros(len(columns["sample"]), bool) for name in FLAG_COLUMNS[:-1]}
             columns |= {FLAG_COLUMNS[-1]: np.full(len(columns["sample"]), "", object)}
         for names, blocks in self._sort_into_blocks(drawn).items():
-            run = partial(self._run_on_device, self._variant(names), self._program(names))
+            run = partial(self._run_on_device, self._variant(names))
             for k in range(0, len(blocks), len(self.devices)):
                 together = blocks[k : k + len(self.devices)]  # at most one for each device
                 for block, found in zip(together, self._pool.map(run, together, self.devices), strict=True):
@@ -101,29 +104,21 @@ class Runner:
                     found.setdefault(kind, []).append(block)
         return found
 
-    def _run_on_device(self, loop: Part, program: Any, block: _Block, device: Any) -> Columns:
+    def _run_on_device(self, loop: Part, block: _Block, device: Any) -> Columns:
         with jax.default_device(device):
             asked = batch_admissibility(loop, block.values, self.study.solver)
         with precision(self.study.dtype), _convert_compiler_errors():
-            given = self._arguments(block, asked.accepted)
-            found = jax.device_get(program(*jax.device_put(given, device)))
+            given = jax.device_put(self._arguments(loop, block, asked.accepted), device)
+            found = jax.device_get(_measure_block(*given, self.study.solver, self.study.engine))
         return found | {"refused": asked.texts.astype(object)}
 
-    def _arguments(self, block: _Block, accepted: Bool) -> tuple[PyTree, ...]:
-        values = {path: column.astype(self.study.dtype) for path, column in block.values.items()}
-        return values, block.samples.astype(np.uint32), accepted
+    def _arguments(self, loop: Part, block: _Block, accepted: Bool) -> tuple[PyTree, ...]:
+        numbers = loop, dict(self.study.objectives), block.values
+        converted = jax.tree.map(lambda x: np.asarray(x, self.study.dtype), numbers)
+        return *converted, np.asarray(self.study.seed), block.samples.astype(np.uint32), accepted
 
     def _variant(self, names: tuple[str, ...]) -> Any:
         return self.study.variant(dict(zip(self.study.parts, names, strict=True)))
-
-    def _program(self, names: tuple[str, ...]) -> Any:
-        if names not in self._programs:
-            loop, objectives = jax.tree.map(
-                lambda x: np.asarray(x, self.study.dtype), (self._variant(names), dict(self.study.objectives))
-            )
-            study = dataclasses.replace(self.study, objectives=objectives)
-            self._programs[names] = jax.jit(partial(_measure_block, study, loop))
-        return self._programs[names]
 
 
 @contextlib.contextmanager
@@ -149,15 +144,25 @@ def find_study_objection(study: Study) -> str | None:
         for names, blocks in runner._sort_into_blocks([runner._draw_chunk(0)]).items():
             with precision(study.dtype), _convert_compiler_errors():
                 # Lowering a program also compiles its kernel.
-                runner._program(names).lower(*runner._arguments(blocks[0], np.ones(runner.size, bool)))
+                given = runner._arguments(runner._variant(names), blocks[0], np.ones(runner.size, bool))
+                _measure_block.lower(*given, study.solver, study.engine)
     except ValueError as error:
         return str(error)
     return None
 
 
-def _measure_block(study: Study, loop: Part, values: Params, samples: PyTree, accepted: Bool) -> JsonObject:
+@partial(jax.jit, static_argnames=("solver", "engine"))
+def _measure_block(
+    loop: Part,
+    objectives: Mapping[str, Objective],
+    values: Params,
+    seed: Int,
+    samples: Int,
+    accepted: Bool,
+    solver: Solver,
+    engine: str,
+) -> JsonObject:
     """Return metrics and flags of a block; only the accepted samples run."""
-    keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples)
-    given = (loop, Batch(values, keys), study.solver, study.objectives)
-    done = run_batch(*given, together=False, accepted=accepted, engine=study.engine)
+    keys = jax.vmap(lambda sample: noise_key(seed, sample))(samples)
+    done = run_batch(loop, Batch(values, keys), solver, objectives, together=False, accepted=accepted, engine=engine)
     return done.metrics | {"stopped": done.stopped, "diverged": done.diverged}
