@@ -14,7 +14,11 @@ from marks import readable_id
 from project import CACHE
 from seams import replace_seam
 
-QUICK = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
+QUICK = [
+    *("--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"),
+    # These passes copy the program of a run again and again, to evaluate how often its loop repeats.
+    "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops",
+]
 if importlib.metadata.version("jaxlib").startswith("0.10."):  # later ones end the process that names it
     QUICK.append("--xla_cpu_use_fusion_emitters=false")
 

@@ -54,6 +54,7 @@ class Cubic(NamedTuple):
         c1, c2, c3 = self.coefficients()
         return x * x * (self.start / 2.0 + x * (c1 / 3.0 + x * (c2 / 4.0 + x * c3 / 5.0)))
 
+    @jax.jit  # a step has many roots: they are traced and differentiated once
     def root(self) -> Scalar:
         """Return the x in [0, 1] at which p changes sign.
 
@@ -78,6 +79,7 @@ class Cubic(NamedTuple):
         changes = ((still.start < 0) != (still.end < 0)) | (still.start == 0)
         return jnp.where(changes, x, 1.0)
 
+    @jax.jit
     def greatest(self) -> Scalar:
         """Return the greatest value of p in [0, 1].
 

@@ -126,6 +126,7 @@ def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
     """Return an upper bound on |lambda| of all modes for each run [1/s], shape (runs,); infinite if unknown."""
     count = len(jax.tree.leaves(values)[0])
 
+    @jax.jit  # traced once, used three times
     def matrices(values: PyTree) -> jax.Array:
         return jnp.reshape(found := _jacobians_of(_lane_builder(loop)(values)), (-1, *found.shape[-2:]))
 

@@ -289,7 +289,8 @@ def start_carry(
         forecast: Prediction of the stepping method (`Stepping.forecast`).
     """
     none, zero = 0.0 * stepping.h, jnp.asarray(0)
-    state, accumulators = start_state(loop, objectives, Clock(none, stepping.h, zero, key))
+    # With the types of later steps the loop is traced once for all of them.
+    state, accumulators = cast_floats(start_state(loop, objectives, Clock(none, stepping.h, zero, key)), none.dtype)
     logs, state = log_rows(state), borrow(state, None)
     system = build_system(
         *(loop, objectives, none, state, accumulators),

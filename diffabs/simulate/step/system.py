@@ -98,7 +98,7 @@ class LoopSystem(NamedTuple):
         """Return dz/dt at time `t` within a `mode`, with z and `held` as `split_flow_and_held` returns them."""
         moving, fixed = (t, *z), (held, self.loop, self.objectives)
         if self.program is None:
-            return _evaluate_loop(moving, fixed)[:2]
+            return _evaluate_rates(moving, fixed)
         return self.program(lambda seen: seen[:2], moving, fixed, mode)
 
     def list_margins(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> list[Scalar]:
@@ -255,3 +255,9 @@ def _evaluate_loop(moving: PyTree, fixed: PyTree) -> LoopEvaluation:
     rate = loop.flow(t, state, signals)
     margins = loop.margins(t, state, signals, lambda: rate)
     return LoopEvaluation(rate, accumulator_rates(objectives, accumulators, signals.sample), signals, margins)
+
+
+@jax.jit  # traced and differentiated once for all stages of a step
+def _evaluate_rates(moving: PyTree, fixed: PyTree) -> PyTree:
+    """Return the rates of `_evaluate_loop`."""
+    return _evaluate_loop(moving, fixed)[:2]
