@@ -47,13 +47,9 @@ def small(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("new", "verdict"),
-    [
-        ("= 2", "dies"),
-        pytest.param("= 1.0", "SURVIVES", marks=pytest.mark.slow),
-        pytest.param("= -1", "dies: no end after 20 s", marks=pytest.mark.slow),
-    ],
+    ("new", "verdict"), [("= 2", "dies"), ("= 1.0", "SURVIVES"), ("= -1", "dies: no end after 20 s")]
 )
 def test_a_mutant_has_so_much_time(small, new, verdict):
     """One that never ends is dead, and so is what it has started; the file is left as it was."""

@@ -48,6 +48,7 @@ def test_several_switches_are_on_their_way():
     np.testing.assert_allclose(run.metrics["mean"][1], (expected - 0.0) / LENGTH, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_more_switches_than_its_capacity_are_a_run_that_diverged():
     commands = [0.0, 1.0] * 9
     assert run_of(DeadTime(rise=0.095, fall=0.095, capacity=4), commands).diverged

@@ -75,6 +75,7 @@ def test_the_hanging_arm_stays_up():
     assert "STOPPED" not in result.stderr
 
 
+@pytest.mark.slow
 def test_a_rider_whom_the_spring_cannot_hold_is_a_warning():
     result = run("simulate", "arm-hanging", *SHORT, "--set", "plant.stiffness=294")
     assert "warning: plant.stiffness = 294 N m/rad does not hold the rider" in result.stderr
@@ -95,6 +96,7 @@ def test_an_arms_controller_on_a_wheel_is_one_line():
     assert "balance-feedback needs theta" in result.stderr
 
 
+@pytest.mark.slow
 def test_design_proves_one_gain_for_all_riders():
     document = json.loads(run("design", "arm-hanging", "--json").stdout)
     assert document["quadratically_stable"] is True

@@ -203,6 +203,7 @@ def test_design_needs_weights(no_polytope):
 # certify
 
 
+@pytest.mark.slow
 def test_published_gain_has_no_common_lyapunov_matrix(tmp_path):
     result = run("certify", "slip-lmi", "--json", "--out", tmp_path / "c.json", status=1)
     document = json.loads(result.stdout)
@@ -222,6 +223,7 @@ def test_published_gain_has_no_common_lyapunov_matrix(tmp_path):
     assert run("verify", tmp_path / "c.json").stdout == "proved  infeasible: no common Lyapunov matrix exists\n"
 
 
+@pytest.mark.slow
 def test_what_is_known_besides_of_the_published_gain():
     """Not unstable: poles of every frozen loop in closed form, s^2 = ..., and the proof that follows the speed."""
     result = run("certify", "slip-lmi", "--json", status=1)

@@ -43,6 +43,7 @@ def proved(native_prover: None, tmp_path_factory: pytest.TempPathFactory) -> Pro
     return prove_and_draw(tmp_path_factory.mktemp("proved"), "--claim", "max_slip=0.2515")
 
 
+@pytest.mark.slow
 @killed_by("cli/prove.py", "sides[i].scale for i in axes", "1.0 for i in axes")
 def test_a_map_has_the_units_of_the_command(proved: Proved) -> None:
     folder, shown = proved
@@ -55,6 +56,7 @@ def test_a_map_has_the_units_of_the_command(proved: Proved) -> None:
     assert shown.worst == pytest.approx([5.4, 5.3], rel=1e-12)
 
 
+@pytest.mark.slow
 @killed_by("report/proofs.py", "table_unit(units.get(path))", "''")
 @killed_by("report/proofs.py", 'if verdict == "proved" and "certificate" in files', "if False")
 def test_a_report_has_verdict_box_bounds_and_map(proved: Proved) -> None:

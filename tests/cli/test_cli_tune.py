@@ -209,6 +209,7 @@ def test_the_section_reaches_the_tuning(small, invented):
     assert document["history"] == [point._asdict() for point in HISTORY]
 
 
+@pytest.mark.slow
 def test_a_latin_hypercube_of_lanes(small, invented):
     run("tune", small, "--set", "tune.samples=9", "--set", "tune.over.initial.speed_kmh=49,50")
     lanes = invented["problem"].batch.values
@@ -292,6 +293,7 @@ def fake(problem):
     )
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_not_linear_has_no_certificate(small, monkeypatch):
     replace_seam(monkeypatch, "tune_tune", lambda problem, **how: fake(problem))
     changes = ("controller=relay", "tune.free.reference.slip=0.1,0.3")

@@ -88,6 +88,7 @@ def test_a_time_in_words(seconds, words):
     assert progress.format_duration(seconds) == words
 
 
+@pytest.mark.slow
 @killed_by("cli/progress.py", "if told != (told := words):", "if True:")
 def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     """Where nothing can be drawn over, in lines; those that only differ in time are not told again."""

@@ -157,6 +157,7 @@ class TestObjections:
     def test_there_is_none(self):
         assert native.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) is None
 
+    @pytest.mark.slow
     @killed_by("compiler/runtime/toolchain.py", "if said is not None and not said.strip():", "if False:")
     @killed_by("simulate/drive/engine.py", "    log_xla_reason(why_not)\n", "")
     @killed_by("simulate/drive/engine.py", "    _refused[structure] = why_not\n", "")
@@ -391,6 +392,7 @@ class TestCarry:
 
         return jax.device_get((jax.jit(native)(levels, carry), jax.jit(jax.vmap(known))(levels, carry)))
 
+    @pytest.mark.slow
     @killed_by("compiler/program.py", "left += [nodes[i] for nodes in updates]", "pass")
     @killed_by("compiler/program.py", "i in read else carried[i]", "True else carried[i]")
     def test_what_nothing_reads_stays_as_it_was(self):

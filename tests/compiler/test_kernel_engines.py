@@ -169,6 +169,7 @@ print(describe_placement(jax.device_put(np.zeros(4), jax.NamedSharding(mesh, jax
 """
 
 
+@pytest.mark.slow
 @killed_by("compiler/runtime/cpu.py", "    return core_count()\n", "    return 1\n")
 @killed_by("simulate/drive/sharding.py", "if any(len(devices) > 1 for devices in places):", "if False:")
 def test_several_devices_of_one_processor():

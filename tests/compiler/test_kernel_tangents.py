@@ -164,6 +164,7 @@ class TestLaunch:
         np.testing.assert_allclose(found[1], known[1], rtol=2e-13)
         assert not np.any(found[2])
 
+    @pytest.mark.slow
     @killed_by(
         "compiler/autodiff/eliminate.py",
         "x not in self.vertices and self.levels[x] < UpdateLevel.STEP for x in once",
@@ -184,6 +185,7 @@ class TestLaunch:
         known = jnp.outer((1 + 0.1 * RATES) ** STEPS * RATES, jnp.ones(3))
         np.testing.assert_allclose(jax.jacfwd(run)(jnp.arange(3.0)), known, rtol=1e-13)
 
+    @pytest.mark.slow
     @killed_by(
         "compiler/runtime/jax_primitive.py", "MAX_TANGENTS_PER_LAUNCH = 8 ", "MAX_TANGENTS_PER_LAUNCH = 1 ", case="8-1"
     )

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 from delays import loop
 from mutants import killed_by
 from signals import Mean, Script, seen
@@ -46,6 +47,7 @@ def test_a_sampled_band_logic_multiplies():
     np.testing.assert_allclose(mean(logic), expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_lag_follows_the_torque():
     """The mean of a lag's output is that of its input, less the last value times the lag's time constant."""
     logic = FourPhase(torque_low=5.0, torque_high=10.0, slip_low=0.02, slip_high=0.9, rate=100.0)

@@ -78,6 +78,7 @@ def test_a_lost_sample_holds_memory_and_command(which):
     assert np.ptp(commands[LOST.stop :]) > 1e-3
 
 
+@pytest.mark.slow
 def test_what_the_controller_does_not_read_is_not_missed():
     inner = PID(kp=60.0, ki=400.0, high=9.03, low=0.0)
     _, whole = trajectory(rig(computers(inner)[0], first=1.0, last=2.0))

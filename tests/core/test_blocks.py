@@ -257,6 +257,7 @@ def test_the_integral_of_an_error_that_changes_sign(h):
     close(found["itae"], np.trapezoid(t * 0.03 * np.abs(np.sin(w * t)), t), rtol=3e-6 * (h / 1e-3) ** 4)
 
 
+@pytest.mark.slow
 @killed_by(
     "core/messages.py",
     "Shown.of(self.start), Shown.of(self.end)",
@@ -273,7 +274,7 @@ def test_the_integral_of_an_error_that_changes_sign(h):
         (d.FixedStep(1e-3, 1.0), 3e-6),
         (d.FixedStep(5e-4, 1.0), 2e-7),
         # No state moves as fast as this script, so its steps are long, a tenth of a period.
-        pytest.param(d.Adaptive(1e-8, 1.0), 1.5e-4, marks=pytest.mark.slow),
+        (d.Adaptive(1e-8, 1.0), 1.5e-4),
     ],
 )
 def test_the_integral_of_an_error_whose_setpoint_moves(solver, rtol):
@@ -398,6 +399,7 @@ def test_the_estimators_go_by_the_size_of_the_acceleration(reference):
     close(target, [0.1] * 9 if latch else [0.2] * 7 + [0.107, 0.108], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_latch_does_not_move_for_rounding():
     """A controller that holds the best slip keeps the deceleration at its maximum, to rounding: 3, and 3 (1 + 1e-7)."""
 

@@ -167,6 +167,7 @@ def test_lanes_are_looked_at(values, message):
         d.run_batch(RIG, d.Batch(values), SOLVER, MEASURED)
 
 
+@pytest.mark.slow
 def test_arrays_of_double_precision_where_single_is_the_default():
     """NumPy's and Python's numbers are of the default precision; an array of JAX says which one is meant."""
     double = jnp.array(5.3)

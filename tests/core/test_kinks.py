@@ -339,6 +339,7 @@ def test_a_step_ends_on_a_comparison_near_the_start():
     np.testing.assert_allclose(found, jax.jit(jax.jacfwd(iae))(gains), rtol=1e-12)
 
 
+@pytest.mark.slow
 @killed_by(
     "simulate/step/fixed.py",
     "gave_up &= decision.searches & (after.search.which < system.bit_count)",

@@ -213,6 +213,7 @@ def test_in_the_ellipsoid_its_function_falls(case):
     assert np.sqrt(np.linalg.inv(s)[0, 0]) > 1.7e-3
 
 
+@pytest.mark.slow
 @killed_by("design/capture.py", "1 / reach.max(axis=1)", "np.full(len(p), 1e9)")
 def test_no_ellipsoid_where_the_loop_does_not_return():
     """A rider of 72 kg falls, slowly; NaN is no gain; an unlimited motor and a current limit change what is linear."""

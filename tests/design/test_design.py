@@ -136,6 +136,7 @@ def unfailing(count, seed):
     return reported
 
 
+@pytest.mark.slow
 def test_no_silent_failure():
     assert len(unfailing(60, 3)) <= 1
 

@@ -144,6 +144,7 @@ class Cube:
         return StateSpace(y[:4].reshape(2, 2), y[4:].reshape(2, 1))
 
 
+@pytest.mark.slow
 def test_merged_facets_are_decided_by_linear_programs():
     """The facets of a cube in six dimensions are flat to rounding: Qhull gives up on its 64 corners."""
     over = dict.fromkeys("abcdef", (0.0, 1.0))

@@ -223,6 +223,7 @@ def decay(gain, A, B, period=None):
 GAINS = ((-11753.0, -158.17), (-999.7, -111.07), (-0.834, -2.599))
 
 
+@pytest.mark.slow
 @killed_by("design/interior/decay_rate.py", "SHIFT_GAP = 1e-8", "SHIFT_GAP = 1e-2", case="gain0-continuous")
 @both_times
 @pytest.mark.parametrize("gain", GAINS)

@@ -212,6 +212,7 @@ def test_what_it_says(tmp_path):
     assert (found["proved"], found["claims"][0]["proved"], found["claims"][0]["reason"]) == (True, True, "")
 
 
+@pytest.mark.slow
 def test_the_checker_imports_no_solver_and_no_diffabs(tmp_path):
     path = saved(certificate("decay", P=np.eye(2), rate=0.5), tmp_path)
     code = "import sys; sys.modules.update(dict.fromkeys(['cvxpy', 'scipy', 'clarabel', 'optax'])); "
@@ -252,6 +253,7 @@ def test_many_states_are_decided(tmp_path):
     assert time.monotonic() - begun < 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [(64, 250.0), (64, 2.0, 40)], ids=["digits", "vertices"])
 def test_what_takes_too_long_is_refused(given, tmp_path):
     path = tmp_path / "c.json"

@@ -55,7 +55,8 @@ def test_scipy_gives_the_published_run():
     np.testing.assert_allclose(found, [1.615305, 12.370507, 0.363764, 0.02296340], rtol=1e-6)  # docs/results.md
 
 
-@pytest.mark.parametrize("dtype", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_c_agrees_with_scipy(dtype):
     c, reference = module("peers.c"), module("peers.reference")
     try:

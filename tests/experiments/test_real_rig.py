@@ -61,6 +61,7 @@ def quiet(rig, speed, case):
     return d.replace(one, {path: float(value[0]) for path, value in box.columns(at).items()})
 
 
+@pytest.mark.slow
 @killed_by("controllers/sampled_on_grid.py", "waits * m.last + (1 - waits) * m.next", "m.next", case="all wrong-known")
 @killed_by(
     "sensors/speed.py",
@@ -68,7 +69,7 @@ def quiet(rig, speed, case):
     "error = self.last + 0.0 * t",
     case="all wrong-known",
 )
-@pytest.mark.parametrize("speed", ["known", pytest.param("estimated", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("speed", ["known", "estimated"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_document_runs_elsewhere(rig, speed, case):
     """To rounding, until the wheel's speed is rounded the other way: that is, until the end."""

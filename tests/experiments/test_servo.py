@@ -121,6 +121,7 @@ def test_the_linear_servo_follows_its_closed_form(servo):
         np.testing.assert_allclose(mirrored[name], found.metrics[name], rtol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_the_servo_at_its_limits_agrees_with_scipy(servo):
     """Dry friction, load, limited voltage and a clamped integral; above 1 rad the peak has no limit of a slip."""
     motor = servo.DCMotor(load=0.05)
@@ -177,6 +178,7 @@ def operating_point_speed(loop, model):
     return dataclasses.replace(model, plant=loop.plant).matrices().A[1, 1]
 
 
+@pytest.mark.slow
 @killed_by("linear/operating_point.py", "if not found.residue < MAX_REST_RESIDUE:", "if False:")
 def test_what_has_no_linear_model_says_so(servo):
     loop, _ = linear(servo)

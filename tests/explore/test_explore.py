@@ -74,6 +74,7 @@ def session(file):
     return Session(str(file(SHORT)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names())
 def test_every_packaged_scenario_opens_with_what_one_drags(name):
     found = Session(name)
@@ -338,6 +339,7 @@ def test_margins_are_those_of_the_library(session):
     assert np.all(found.poles.real < 0)
 
 
+@pytest.mark.slow
 @killed_by("explore/stability.py", "if known and known.of == of:", "if known:")
 @killed_by("explore/stability.py", "if known and known.of == of:", "if False:")
 def test_corners_are_looked_at_again_only_where_they_move(session):

@@ -105,6 +105,7 @@ def test_a_loop_closed_outside_is_the_loop(tmp_path):
     assert found[-1, 0] == pytest.approx(0.2, abs=0.02)
 
 
+@pytest.mark.slow
 @killed_by(
     "export/plant_c.py",
     'm->v[{self.places[path]}]" if where',
@@ -135,6 +136,7 @@ def test_a_state_can_be_kept_and_taken_again(tmp_path):
     np.testing.assert_array_equal(followed(one, 20, lambda k: 3.0, ("slip", "speed", "distance")), first)
 
 
+@pytest.mark.slow
 @killed_by("export/fmi2.c", ": ceil(whole);", ": 1.0;")
 def test_steps_of_any_length_are_taken_by_whole_ones(tmp_path):
     """A step of the importer that is no multiple is divided into equal ones, none longer than that of the plant."""
@@ -303,6 +305,7 @@ def test_what_is_no_state_of_this_plant_is_refused(strict):
     one.restore(kept)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("about", ["bell \x07, null \0", "\x1b[2J", "<a b='&'> ]]>", "\ud800", "\ufffe"])
 def test_a_description_is_xml_whatever_the_title(about, tmp_path):
     path = tmp_path / "plant.fmu"

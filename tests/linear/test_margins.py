@@ -114,6 +114,7 @@ def nearest(system):
     return min(best, math.inf if system.period else 1.0)
 
 
+@pytest.mark.slow
 def test_margins_are_where_the_closed_loop_turns_unstable():
     for seed in range(12):
         for sampled in (False, True):

@@ -101,6 +101,7 @@ def test_the_former_names_of_limits_still_work_in_a_scenario():
         loads(text, "mine", "mine.toml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("limit", "warned"), [(90.0, False), (5.0, True)])
 def test_the_command_warns_of_a_run_at_a_limit(limit, warned):
     changes = ("--set", f"controller.high={limit}", "--set", "solver.step=1.5e-4")

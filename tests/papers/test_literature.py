@@ -22,6 +22,7 @@ FOLDER = ROOT / "benchmarks" / "literature"
 VERDICTS = {"reproduced", "refuted", "undecidable"}
 
 
+@pytest.mark.slow
 def test_every_row_names_what_it_needs():
     for row in read_rows():
         assert row["source"] in read_sources()

@@ -302,6 +302,7 @@ def test_the_printed_equations_miss_terms_of_their_lagrangian():
         np.testing.assert_allclose(missing, expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_equation_7_is_the_lagrangian_of_another_machine():
     """One in which gravity pulls arm and rider the other way than they lean; with the sums it is `ArmBalance`."""
     free = ArmBalance(stiffness=0.0, damping=0.0)

@@ -61,6 +61,7 @@ def test_a_long_axis_has_powers_and_a_short_one_numbers():
     assert said(2e-7) == "2\N{MULTIPLICATION SIGN}10⁻⁷"
 
 
+@pytest.mark.slow
 @killed_by("plot/frequency.py", "(1 / (1 + main), COLOURS[1]", "(main / (1 + main), COLOURS[1]")
 def test_the_curves_of_a_loop_are_its_response():
     loop = braking(plant=MirroredRig(), reference=FixedSlip(), feedforward=HoldingInput(), controller=StateFeedback())

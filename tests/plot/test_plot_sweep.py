@@ -342,6 +342,7 @@ def test_a_number_of_a_list_has_its_own_unit(made):
     assert {ax.get_xlabel(), ax.get_ylabel()} == {"gain.0 [N m/s]", "gain.1 [N m]"}
 
 
+@pytest.mark.slow
 def test_draw_writes_what_there_is(found, tmp_path):
     paths = plots.draw_sweep(found, summarise_sweep(found), tmp_path, UNITS)
     names = ["distributions", "exceedance", "worst", "sensitivity", "failure_map"]

@@ -89,6 +89,7 @@ class TestKnown:
     """Within a factor of 1.5: of the seeds 0 to 199 all but one in d = 2 and 10, where importance sampling follows, and
     91 % where subset simulation stays alone, as in d = 100, so at least 6 of 10 with a probability of 0.999."""
 
+    @pytest.mark.slow
     @killed_by("reliability/subset_simulation.py", "math.sqrt(1 - s**2) * z + s", "z + s")
     @killed_by("reliability/subset_simulation.py", "accepted = new >= value", "accepted = new >= -np.inf")
     @pytest.mark.parametrize("beta", [3.0, 4.75342, 5.19934])

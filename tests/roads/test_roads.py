@@ -296,6 +296,7 @@ def test_monotone_curve_is_best_locked():
     np.testing.assert_allclose(slope[:, 0], 0.0, rtol=0, atol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["DRY_ASPHALT", "SNOW", "RIG", "RIG_UNROUNDED", "magic", "patches, three"])
 def test_peak_is_differentiable_in_every_parameter(name):
     """Where patches meet. A root is found to 1e-16 of mu' over mu'', here 1 to 200, and differences divide it by

@@ -77,7 +77,8 @@ def delayed(time=0.0061):
     return dataclasses.replace(RIG, actuator=actuators.Delay(time=time, capacity=16), controller=controller)
 
 
-@pytest.mark.parametrize(("make", "step"), [(relay, 1e-3), pytest.param(delayed, 1e-3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("make", "step"), [(relay, 1e-3), (delayed, 1e-3)])
 def test_events_and_delays_are_estimated_to_their_size(make, step):
     """Against the same loop with steps 32 times shorter; within a factor of ten."""
     found = acc.estimate_accuracy(make(), d.FixedStep(step, 2.0), OBJECTIVES)

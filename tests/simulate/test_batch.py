@@ -203,6 +203,7 @@ class TestLanes:
         assert first.max() > second.min()
         same(jax.device_get(d.run_batch(LOOP, lanes, SOLVER, MEASURED, together=True, accepted=True)), expected)
 
+    @pytest.mark.slow
     def test_are_compiled_once(self, keys, monkeypatch):
         replace_seam(monkeypatch, "lanes_at_once", SOME)
         lanes = Batch(VALUES, keys)

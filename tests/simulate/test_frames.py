@@ -142,6 +142,7 @@ def test_frames_have_units_and_end_where_the_run_does(run):
         jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), run).pandas()
 
 
+@pytest.mark.slow
 def test_a_run_draws_the_figure_of_its_plant(run, tmp_path):
     figure = run.plot(rig().plant, title="a rig")
     assert figure.get_axes()[0].get_ylabel() == "slip [1]"

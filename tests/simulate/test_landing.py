@@ -98,7 +98,8 @@ def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
     close(slope * 0.03, -levels[-1], rtol=1e-7)
 
 
-@pytest.mark.parametrize("derivative", cases([jax.jacfwd, jax.jacrev], jax.jacrev))
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_derivatives_of_a_moment_are_those_at_the_zero(derivative):
     """x' = -k x comes down to a level, at steps of 0.4/k: against differences of the runs themselves. The last try
     ends up to a ten-thousandth of a step from there, in which a derivative that is taken at its end changes by 1e-5."""

@@ -18,6 +18,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @killed_by("simulate/matlab.py", "values[:rows]", "values")
 def test_a_mat_file_has_what_the_csv_has(folder):
     found = io.loadmat(folder / "run.mat", simplify_cells=True)

@@ -217,6 +217,7 @@ class TestBeforeARun:
 
 
 class TestAfterARun:
+    @pytest.mark.slow
     @killed_by("simulate/result.py", 'audit = getattr(loop.plant, "audit", None)', "audit = None")
     @pytest.mark.parametrize("step", [1e-4, 1e-3])
     def test_an_unstable_step_with_finite_numbers_is_refused(self, step):
@@ -374,6 +375,7 @@ class TestWhoeverRuns:
         with pytest.raises(ValueError, match=r"\d+ of 40 points cannot be run: initial.speed is not above"):
             failure_probability(study, "iae", 1.0, samples=40)
 
+    @pytest.mark.slow
     def test_worst_case_tune_and_identify_refuse_at_the_start(self, any_step):
         ask = {"solver": SOLVER, "measured": BRAKING}
         with pytest.raises(ValueError, match=r"the box has points that cannot be run; lane 0: initial.speed = 1 m/s"):

@@ -117,6 +117,7 @@ def test_literal_estimator_does_not_brake():
     assert run.ending.sample.output.distance > 270
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_frozen_after_its_end_and_thinned():
     run = d.rollout(SLIDING, d.FixedStep(1e-3, 3.0, every=10), BRAKING)
     trajectory = run.trajectory

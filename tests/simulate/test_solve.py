@@ -377,6 +377,7 @@ def test_the_bend_of_relu_is_located():
     assert abs(slope - (1 - np.exp(1.5))) < 1e-5
 
 
+@pytest.mark.slow
 @killed_by("simulate/drive/kernel.py", "return jax.tree.map(operator.itemgetter(0), lane)", "return lane")
 def test_a_kernel_solves_a_batch():
     levels = jnp.array([0.5, 0.8])

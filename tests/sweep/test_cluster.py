@@ -356,6 +356,7 @@ def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tm
     assert sweep(study, tmp_path, on=Dask(inside)).digest == alone.digest
 
 
+@pytest.mark.slow
 @killed_by("sweep/cluster.py", "await asyncio.wait_for(call(), TIMEOUT_SECONDS + 1)", "await call()")
 def test_what_listens_but_is_no_scheduler(study, tmp_path, impatient):
     """It never says a word; so that nobody waits for ever if we did, it is gone after a while."""

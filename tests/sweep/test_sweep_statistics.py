@@ -482,6 +482,7 @@ class TestCoverage:
                 missed = abs(coverage(lambda one: one, lambda each=each: next(each), truth) - 95)
                 assert missed > 3 if exact else missed < 2
 
+    @pytest.mark.slow
     def test_paired(self):
         """Differences of mean 0.2, median 0.2, and 34.5 % of them negative."""
         random = np.random.default_rng(37)

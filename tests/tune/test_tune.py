@@ -222,17 +222,14 @@ class TestDescent:
         assert min(abs(ends[2] - e) for e in ends[:2]) < 1e-4
         assert lanes[3].reason is Reason.START
 
+    @pytest.mark.slow
     def test_it_is_deterministic(self):
         a, b = (descend(rosenbrock, np.full(4, -1.2), iterations=60)[0] for _ in range(2))
         assert a.history == b.history
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
-        "optimiser",
-        [
-            optax.adam(0.05),
-            optax.sgd(0.02, momentum=0.9),
-            *(pytest.param(x, marks=pytest.mark.slow) for x in (optax.lbfgs(), optax.adan(0.1))),
-        ],
+        "optimiser", [optax.adam(0.05), optax.sgd(0.02, momentum=0.9), optax.lbfgs(), optax.adan(0.1)]
     )
     def test_any_optimiser_of_optax(self, optimiser):
         given = Optimiser(optax.with_extra_args_support(optimiser), False)

@@ -234,6 +234,7 @@ class TestCertifiedDecay:
         np.testing.assert_allclose(self.excess(gain, 3.0), [1 / 3], rtol=1e-5)
         np.testing.assert_allclose(self.excess(gain, 0.5), [-1.5], rtol=1e-5)
 
+    @pytest.mark.slow
     def test_its_slope_is_that_of_the_slowest_pole(self):
         slope = jax.jacfwd(lambda k: self.excess(k, 3.0)[0])(jnp.array([-6.0, -4.0]))
         # (2 s + 1 - k2) ds = s dk2 + dk1 at s = -2, and decay = -s
