@@ -9,7 +9,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from diffabs.cli import console, show, targets
+from diffabs.cli import console, show, tables, targets
 from diffabs.compiler.listing import count_by_level
 from diffabs.compiler.lower.rules import Unsupported
 from diffabs.compiler.passes import PASSES, LaneCall, find_lane_calls, list_pass
@@ -124,4 +124,4 @@ def _show(result: JsonObject, chosen: Scenario) -> None:
     for name, counts in result["operations"].items():
         table.add_row(name, *(str(counts[level]) for level in ("uniform", "lane", "step")))
     by = ", ".join(result["by"])
-    show.show_titled_table(f"{chosen.title or chosen.name}: operations of its kernel; tangents by {by}", table)
+    tables.show_titled_table(f"{chosen.title or chosen.name}: operations of its kernel; tangents by {by}", table)

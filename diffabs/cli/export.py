@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from diffabs import __version__
-from diffabs.cli import console, show, targets
+from diffabs.cli import console, show, tables, targets
 from diffabs.config.values import ScenarioError
 from diffabs.core.types import PyTree
 from diffabs.core.units import units_of
@@ -161,7 +161,7 @@ def _show_table(chosen: Scenario, file: pathlib.Path | None, as_json: bool) -> N
         table = Table("next", *columns)
         for name, row in rows.items():
             table.add_row(name, *(f"{value:.8g}" for value in row))
-        show.show_titled_table(f"{chosen.title or chosen.name}: every {1e3 * found['period']:g} ms, at k", table)
+        tables.show_titled_table(f"{chosen.title or chosen.name}: every {1e3 * found['period']:g} ms, at k", table)
         console.say(
             "note: d is the deviation from rest at the setpoint, x the deviation of the controller's state; limits are"
             " not included"

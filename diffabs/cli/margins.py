@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from diffabs.cli import console, show, targets
+from diffabs.cli import console, show, tables, targets
 from diffabs.config.values import ScenarioError, format_given, read_number_in_range
 from diffabs.core.pytree import ParameterSpec, replace
 from diffabs.core.types import JsonObject, Scalar
@@ -184,7 +184,7 @@ def _show(result: JsonObject, chosen: Scenario, nominal: "System", found: "Band 
         table.add_row(words, *row)
     when = f"sampled every {1e3 * result['period']:g} ms" if result["period"] else "in continuous time"
     delay = f", {1e3 * result['delay_in_the_loop']:g} ms of delay" if result["delay_in_the_loop"] else ""
-    show.show_titled_table(f"{chosen.title or chosen.name}: the linearised loop, {when}{delay}", table)
+    tables.show_titled_table(f"{chosen.title or chosen.name}: the linearised loop, {when}{delay}", table)
     if frozen := getattr(chosen.loop.plant, "frozen", ()):
         console.say(f"note: {' and '.join(frozen)} are held constant; limits are not included")
     show.show_files(result)

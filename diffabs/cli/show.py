@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, Group
+from rich.console import Group
 from rich.table import Table
 
 from diffabs.cli.console import say
-from diffabs.cli.tables import fit_table
+from diffabs.cli.tables import open_console, show_titled_table
 from diffabs.core.loop import run_signals
 from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.papers.digest import Digest
@@ -22,7 +22,6 @@ from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.types import Trajectory
 
 BOUND_SHARE = 1e-3  # of its range: a tuned number this close to a bound counts as on it
-PIPE_WIDTH = 140  # columns of a table on a pipe or in a file
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
 COSTS = (
     "trace cost bounds the sum of the costs x'Px of runs from 1 in each single state. guaranteed cost is this bound,"
@@ -133,7 +132,7 @@ def show_paper(digest: Digest, folder: pathlib.Path) -> None:
         digest: Compact result.
         folder: Folder of the files.
     """
-    _console().print(show_digest(digest))
+    open_console().print(show_digest(digest))
     say(f"{digest.figures} figures, summary.json and report.html: {folder}\n")
 
 
@@ -182,7 +181,7 @@ def show_proof(result: JsonObject, title: str, units: Mapping[str, str], verdict
             numbers.add_row(name.replace("_", " "), f"{result[name]:.8g}", unit)
     show_titled_table("proof", numbers)
     if result["guaranteed_cost"] is not None:
-        _console().print(COSTS)
+        open_console().print(COSTS)
     corners = result["corners"] or [{} for _ in result["poles"]]
     discrete = result["period"] is not None
     names = [f"{name} [{units[name]}]" for name in corners[0]]
@@ -204,7 +203,7 @@ def show_verification(result: JsonObject, json_wanted: bool) -> None:
     """
     if json_wanted:
         return as_json(result)
-    console = _console()
+    console = open_console()
     for claim in result["claims"]:
         line = f"{'proved' if claim['proved'] else 'NOT PROVED'}  {claim['kind']}: {claim['says']}"
         console.print(line, soft_wrap=not console.is_terminal)
@@ -299,26 +298,6 @@ def format_brief(value: Scalar) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(format_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
     return round_for_table(value) if isinstance(value, float) else str(value)
-
-
-def show_titled_table(title: str, table: Table) -> None:
-    """Print a table to stdout, below its title.
-
-    Args:
-        title: Title; empty for none.
-        table: Table, which is split into several if it is too wide.
-    """
-    for column in table.columns:
-        column.overflow = "fold"  # fold long cells: rich would cut them off
-    console = _console()
-    console.print(*([title] if title else []), *fit_table(table, console.width), sep="\n")
-
-
-def _console() -> Console:
-    console = Console(markup=False, emoji=False, highlight=False)  # rich would read the unit `[N m]` as a style
-    if not console.is_terminal:
-        console.width = PIPE_WIDTH
-    return console
 
 
 def numbers_at_bounds(free: Params) -> Iterator[str]:

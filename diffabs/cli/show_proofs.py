@@ -3,7 +3,7 @@
 from rich.table import Table
 
 from diffabs.cli.console import say
-from diffabs.cli.show import show_titled_table
+from diffabs.cli.tables import show_titled_table
 from diffabs.core.types import JsonObject
 from diffabs.scenario.scenario import Scenario
 

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from diffabs.cli.console import say
-from diffabs.cli.show import format_brief, show_titled_table
+from diffabs.cli.show import format_brief
+from diffabs.cli.tables import show_titled_table
 from diffabs.core.types import JsonObject
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario

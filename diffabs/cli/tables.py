@@ -1,10 +1,33 @@
-"""Tables that fit a terminal: cells are folded between words, and a table that is still too wide becomes several."""
+"""Tables on stdout that fit a terminal: cells are folded between words, and a table too wide becomes several."""
 
 import copy
 
+from rich.console import Console
 from rich.table import Column, Table
 
+PIPE_WIDTH = 140  # columns of a table on a pipe or in a file
 FRAME, PER_COLUMN = 1, 3  # width of the frame; further width of frame and padding for each column
+
+
+def show_titled_table(title: str, table: Table) -> None:
+    """Print a table to stdout, below its title.
+
+    Args:
+        title: Title; empty for none.
+        table: Table, which is split into several if it is too wide.
+    """
+    for column in table.columns:
+        column.overflow = "fold"  # fold long cells: rich would cut them off
+    console = open_console()
+    console.print(*([title] if title else []), *fit_table(table, console.width), sep="\n")
+
+
+def open_console() -> Console:
+    """Return rich's console on stdout. It reads no markup, and a pipe has `PIPE_WIDTH` columns."""
+    console = Console(markup=False, emoji=False, highlight=False)  # rich would read the unit `[N m]` as a style
+    if not console.is_terminal:
+        console.width = PIPE_WIDTH
+    return console
 
 
 def fit_table(table: Table, width: int) -> list[Table]:

@@ -29,7 +29,7 @@ from diffabs.core.loop import BLOCKS, Loop, LoopState
 from diffabs.core.messages import Clock
 from diffabs.core.protocols import BrakeOutput
 from diffabs.core.pytree import parameters, replace
-from diffabs.core.types import PyTree
+from diffabs.core.types import PyTree, Scalar
 from diffabs.plants import BrakeStart
 
 LEAVES, STATE, TIME = "leaf", "state", "t"
@@ -192,7 +192,7 @@ class _Derivation:
         self.operations: list[RealOperation] = []
         self.known: dict[Any, int] = {}
 
-    def with_params(self, values: Any) -> Loop:
+    def with_params(self, values: PyTree) -> Loop:
         return replace(self.loop, dict(zip(self.paths, values, strict=True)))
 
     def lower(self, function: Callable[..., Any], *groups: list[Node]) -> list[Node]:
@@ -219,7 +219,7 @@ class _Derivation:
         n = len(names)
         nodes = [self.graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(n + 1)]
 
-        def state_of(numbers: Any) -> Any:
+        def state_of(numbers: PyTree) -> PyTree:
             leaves, at = [], 0
             for _, leaf in shown:
                 size = int(np.prod(leaf.shape))
@@ -227,7 +227,7 @@ class _Derivation:
                 at += size
             return jax.tree.unflatten(made, leaves)
 
-        def flat(tree: Any) -> list[Any]:
+        def flat(tree: PyTree) -> list[Any]:
             return [jnp.asarray(x, float) for leaf in jax.tree.leaves(tree) for x in jnp.ravel(leaf)]
 
         begun = self.lower(lambda values: flat(start(self.with_params(values))), self.given)
@@ -274,20 +274,20 @@ class _Derivation:
     def programs(self) -> tuple[Any, Any, Any, Any]:
         """Return the functions start(loop), rates(loop, state, t), after(loop, state, t) and show(loop, state, t)."""
 
-        def loop_state(loop: Loop, state: Any) -> LoopState:
+        def loop_state(loop: Loop, state: PyTree) -> LoopState:
             if not self.charted:
                 return state
             x = loop.plant.start(BrakeStart(speed=state.plant.speed, slip=state.plant.slip))
             return state._replace(plant=x._replace(distance=state.plant.distance))
 
-        def rates(loop: Loop, state: Any, t: Any) -> Any:
+        def rates(loop: Loop, state: PyTree, t: Scalar) -> PyTree:
             whole = loop_state(loop, state)
             flow = loop.flow(t, whole, loop.signals(t, whole))
             moved = jax.tree.map(jnp.zeros_like, whole).with_flow(flow)
             if not self.charted:
                 return moved
 
-            def speeds(x: Any) -> tuple[Any, Any]:
+            def speeds(x: PyTree) -> tuple[Scalar, Scalar]:
                 y = loop.plant.output(x)
                 return y.speed, y.wheel_speed
 
@@ -295,12 +295,12 @@ class _Derivation:
             slip, speed, _ = state.plant
             return moved._replace(plant=_Chart(((1 - slip) * dv - dw) / speed, dv, moved.plant.distance))
 
-        def after(loop: Loop, state: Any, t: Any) -> Any:
+        def after(loop: Loop, state: PyTree, t: Scalar) -> PyTree:
             whole = loop_state(loop, state)
             clock = _Tick(t, jnp.asarray(self.period), 0, None)
             return loop.change(clock, whole, loop.signals(t, whole), {}, {}, None)._replace(plant=state.plant)
 
-        def show(loop: Loop, state: Any, t: Any) -> Any:
+        def show(loop: Loop, state: PyTree, t: Scalar) -> PyTree:
             whole = loop_state(loop, state)
             sample = loop.signals(t, whole).sample
             return [
@@ -314,7 +314,7 @@ class _Derivation:
 
         return self.chart, rates, after, show
 
-    def chart(self, loop: Loop) -> Any:
+    def chart(self, loop: Loop) -> PyTree:
         """Return the start of the loop in the coordinates of the proof."""
         state = loop.start()
         if not self.charted:
@@ -521,9 +521,9 @@ class _Derivation:
 class _Chart(NamedTuple):
     """The states of a braked wheel in a proof: slip [1], speed [m/s], distance [m]."""
 
-    slip: Any
-    speed: Any
-    distance: Any
+    slip: Scalar
+    speed: Scalar
+    distance: Scalar
 
 
 def _power_of(node: Node) -> tuple[Node, Node] | None:
@@ -578,7 +578,7 @@ def _clock_of(loop: Loop) -> float | None:
     return next(iter(periods), None)
 
 
-def _text(path: Any) -> str:
+def _text(path: PyTree) -> str:
     """Return a path of a pytree as dotted text, without the words flow and held."""
     words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
     return ".".join(word for word in words if word not in ("flow", "held"))
@@ -604,7 +604,7 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
     graph, paths = RealGraph(), [path for path in over if path.startswith("plant.")]
     inputs = [graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(2 + len(paths))]
 
-    def show(speed: Any, slip: Any, *values: Any) -> Any:
+    def show(speed: Scalar, slip: Scalar, *values: Scalar) -> Scalar:
         plant = replace(loop, dict(zip(paths, values, strict=True))).plant
         y = plant.output(plant.start(BrakeStart(speed=speed, slip=slip)))
         return y.slip, y.speed, y.wheel_speed

@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax._src.source_info_util import summarize  # JAX has no public function that names the line of an operation
 from jax.core import Tracer
+from jax.typing import DTypeLike
 
 from diffabs.core import kinds
 from diffabs.core.cubic import Cubic
@@ -36,7 +37,7 @@ from diffabs.core.lanes import any_lane, select
 from diffabs.core.loop import LoopState, Margins, Signals
 from diffabs.core.protocols import Clock, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
-from diffabs.core.types import AnyArray, Array, Bool, PyTree, Scalar
+from diffabs.core.types import AnyArray, Array, Bool, Part, PyTree, Scalar
 from diffabs.simulate.arguments import build_stepping, find_invalid_fields
 from diffabs.simulate.drive.engine import EngineError, resolve_request
 from diffabs.simulate.drive.loops import log_run, round_up_capacity
@@ -191,7 +192,7 @@ class Function:
     call: Callable = dataclasses.field(compare=False)
     place: int | None = None
 
-    def __call__(self, t: Scalar, y: PyTree, args: PyTree, constants: list[PyTree]) -> Any:
+    def __call__(self, t: Scalar, y: PyTree, args: PyTree, constants: list[PyTree]) -> PyTree:
         """Return the result at (`t`, `y`, `args`), with the type of `t`, and the `constants` of all functions."""
         found = self.call(t, y, args) if self.place is None else self.call(t, y, args, constants[self.place])
         return jax.tree.map(lambda x: jnp.asarray(x, t.dtype), found)
@@ -271,7 +272,7 @@ class FieldLoop:
         """Return the signals at the time `t` in units of the span, in `state`: nothing but the state of the field."""
         zero = jnp.zeros_like(jnp.asarray(t))
         sample = Sample(t, FieldOutput(zero, state.plant), *(5 * [zero]))
-        nothing: Any = ()
+        nothing: PyTree = ()
         return Signals(sample, nothing, nothing, {})
 
     def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[PyTree, ...]:
@@ -381,7 +382,7 @@ class FieldLoop:
         fault = jnp.where(unclear | jumps, float(SolutionStatus.GRAZED), fault)
         return jax.lax.stop_gradient(jnp.where(happens, jnp.where(stays, new, 0.0), lift)), fault
 
-    def _call(self, function: Callable, t: Scalar, y: PyTree) -> Any:
+    def _call(self, function: Callable, t: Scalar, y: PyTree) -> PyTree:
         """Return the result of a function at the time `t` in units of the span."""
         given = self.given
         return function(given["t0"] + given["span"] * t, y, given["args"], given["constants"])
@@ -503,7 +504,7 @@ def solve(
     return run_differentiable(capacity, (loop, saves, method, None))
 
 
-def _solve_by_kernel(loop: Any, saves: dict[str, Any], method: FixedStepping | AdaptiveStepping) -> Solution:
+def _solve_by_kernel(loop: Part, saves: dict[str, PyTree], method: FixedStepping | AdaptiveStepping) -> Solution:
     """Return the solution as a kernel makes it.
 
     Raises:
@@ -561,14 +562,14 @@ def switches(
     return found
 
 
-def _list_flips(loop: Any, solver: Adaptive) -> list[tuple[float, int]]:
+def _list_flips(loop: Part, solver: Adaptive) -> list[tuple[float, int]]:
     """Return time and number of each comparison that changes in a run."""
     method, _ = _read_solver(solver, 0.0, 1.0, loop.given["t0"].dtype)
     if not isinstance(method, AdaptiveStepping):
         raise ValueError(f"solver = {solver} has fixed steps; d.Adaptive is needed")
 
     @jax.jit
-    def run(loop: Any) -> Any:
+    def run(loop: Part) -> PyTree:
         key: Any = None
         start = method.start(loop, {}, key)
         step, renew = partial(method.step, loop, {}, key), partial(method.renew, loop)
@@ -608,7 +609,7 @@ def _build_loop(
     return loop, None if save is None else (save - t0) / span
 
 
-def _trace_program(loop: Any) -> SwitchedProgram:
+def _trace_program(loop: Part) -> SwitchedProgram:
     """Return the program of the loop's flow, with its comparisons.
 
     Raises:
@@ -646,11 +647,11 @@ def finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree
         RunStatus.SLID: SolutionStatus.SLID,
         RunStatus.GRAZED: SolutionStatus.GRAZED,
     }
-    status: Any = jnp.asarray(SolutionStatus.DIVERGED.value)
+    status: Scalar = jnp.asarray(SolutionStatus.DIVERGED.value)
     for one, meant in known.items():
         status = jnp.where(carry.status == one, meant.value, status)
     # A fault of an event ends the run by rates that are NaN.
-    lost: Any = (status == SolutionStatus.DIVERGED) & (held.fault > 0)
+    lost: Scalar = (status == SolutionStatus.DIVERGED) & (held.fault > 0)
     status = jnp.where(lost, held.fault.astype(status.dtype), status)
     valid = status <= SolutionStatus.TERMINATED
 
@@ -725,7 +726,7 @@ def _refuse_leaves(name: str, tree: PyTree) -> None:
             )
 
 
-def _read_solver(solver: Any, t0: Scalar, t1: Scalar, dtype: Any) -> tuple[FixedStepping | AdaptiveStepping, int]:
+def _read_solver(solver: Any, t0: Scalar, t1: Scalar, dtype: DTypeLike) -> tuple[FixedStepping | AdaptiveStepping, int]:
     """Return the stepping method in units of the span, and the number of its steps.
 
     Raises:
@@ -778,7 +779,7 @@ def _read_functions(
             return _accepted[known]
 
         # The compiled programs of the engine know no tracer from outside: the closure becomes an argument.
-        def call(t: Scalar, y: PyTree, args: PyTree, given: PyTree) -> Any:
+        def call(t: Scalar, y: PyTree, args: PyTree, given: PyTree) -> PyTree:
             run = jex.jaxpr_as_fun(jex.ClosedJaxpr(program.jaxpr, given))
             return jax.tree.unflatten(jax.tree.structure(found), run(*jax.tree.leaves((t, y, args))))
 

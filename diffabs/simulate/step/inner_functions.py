@@ -9,7 +9,7 @@ time or state is hidden: no step can end where its answer changes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.extend.core as jex
@@ -17,6 +17,8 @@ import jax.numpy as jnp
 
 from diffabs.core.types import Array, PyTree
 from diffabs.simulate.step.modes import WORD_BITS
+
+Equation: TypeAlias = Any  # jax.extend.core.JaxprEqn, whose type does not tell the shapes of its variables
 
 # What compares real numbers, as `comparisons` answers it.
 COMPARING_OPERATIONS = ("gt", "ge", "lt", "le", "max", "min", "abs", "sign", "clamp")
@@ -49,7 +51,7 @@ class Hidden(NamedTuple):
     source: Any
 
 
-def open_equation(eqn: Any, moves: Sequence[bool], bends: bool) -> Any:
+def open_equation(eqn: Equation, moves: Sequence[bool], bends: bool) -> jex.ClosedJaxpr | None:
     """Return the program that replaces an equation; None for an equation that stays.
 
     Args:
@@ -71,7 +73,7 @@ def open_equation(eqn: Any, moves: Sequence[bool], bends: bool) -> Any:
     return None
 
 
-def find_hidden(eqn: Any, moves: Sequence[bool]) -> Hidden | None:
+def find_hidden(eqn: Equation, moves: Sequence[bool]) -> Hidden | None:
     """Return a comparison that depends on time or state in the inner functions of an equation, or None.
 
     Args:
@@ -89,7 +91,7 @@ def find_hidden(eqn: Any, moves: Sequence[bool]) -> Hidden | None:
     return None
 
 
-def jumps(eqn: Any) -> bool:
+def jumps(eqn: Equation) -> bool:
     """Return whether the result of an equation jumps or bends where no comparison changes: a rounded number, a place.
 
     Args:
@@ -103,7 +105,7 @@ def jumps(eqn: Any) -> bool:
     return name == "convert_element_type" and not jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.inexact)
 
 
-def is_knot_search(eqn: Any) -> bool:
+def is_knot_search(eqn: Equation) -> bool:
     """Return whether an equation searches one number in at most `WORD_BITS` knots.
 
     Args:
@@ -114,11 +116,11 @@ def is_knot_search(eqn: Any) -> bool:
     return named and len(shapes) == 2 and shapes[1] == () and len(shapes[0]) == 1 and shapes[0][0] <= WORD_BITS
 
 
-def find_bent(jaxpr: Any) -> set[Any]:
+def find_bent(jaxpr: jex.Jaxpr) -> set[jex.Var]:
     """Return the variables of a jaxpr whose derivatives reach its results: not those behind a `stop_gradient`.
 
     Args:
-        jaxpr: Jaxpr, open.
+        jaxpr: jex.Jaxpr, open.
     """
     found = {one for one in jaxpr.outvars if not isinstance(one, jex.Literal)}
     for eqn in reversed(jaxpr.eqns):
@@ -127,11 +129,11 @@ def find_bent(jaxpr: Any) -> set[Any]:
     return found
 
 
-def _search_body(jaxpr: Any, moves: Sequence[bool]) -> tuple[Hidden | None, list[bool]]:
+def _search_body(jaxpr: jex.Jaxpr, moves: Sequence[bool]) -> tuple[Hidden | None, list[bool]]:
     """Return the first comparison of a jaxpr that depends on inputs that move, and which of its results move."""
     on = dict(zip(jaxpr.invars, moves, strict=True))
 
-    def read(atom: Any) -> bool:
+    def read(atom: jex.Var | jex.Literal) -> bool:
         return not isinstance(atom, jex.Literal) and on.get(atom, False)
 
     hidden = None
@@ -146,12 +148,12 @@ def _search_body(jaxpr: Any, moves: Sequence[bool]) -> tuple[Hidden | None, list
             else:
                 hidden = find_hidden(eqn, ins)
         if name in INLINED_CALLS:
-            outs = _search_body(_close(eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")).jaxpr, ins)[1]
+            outs = _search_body(_close(eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]).jaxpr, ins)[1]
         on.update(zip(eqn.outvars, outs, strict=True))
     return hidden, [read(atom) for atom in jaxpr.outvars]
 
 
-def _list_bodies(eqn: Any, moves: list[bool]) -> Iterator[tuple[Any, list[bool]]]:
+def _list_bodies(eqn: Equation, moves: list[bool]) -> Iterator[tuple[jex.Jaxpr, list[bool]]]:
     """Yield the inner jaxprs of an equation, each with those of its inputs that depend on time or state."""
     name, params = eqn.primitive.name, eqn.params
     if name == "cond":
@@ -174,7 +176,7 @@ def _list_bodies(eqn: Any, moves: list[bool]) -> Iterator[tuple[Any, list[bool]]
         yield from ((one, [True] * len(one.invars)) for one in bodies)
 
 
-def _follow_carry(body: Any, fixed: list[bool], carry: list[bool], rest: list[bool]) -> list[bool]:
+def _follow_carry(body: jex.Jaxpr, fixed: list[bool], carry: list[bool], rest: list[bool]) -> list[bool]:
     """Return which numbers of a loop's carry depend on time or state, in any of its turns."""
     while True:
         after = _search_body(body, [*fixed, *carry, *rest])[1][: len(carry)]
@@ -184,7 +186,7 @@ def _follow_carry(body: Any, fixed: list[bool], carry: list[bool], rest: list[bo
         carry = more
 
 
-def _select_branch(branches: Sequence[Any], which: Array, xs: Sequence[PyTree]) -> list[PyTree]:
+def _select_branch(branches: Sequence[jex.ClosedJaxpr], which: Array, xs: Sequence[PyTree]) -> list[PyTree]:
     """Return the results of the branch `which`; all are computed, and the others have no derivatives."""
     each = []
     for i, one in enumerate(branches):
@@ -204,7 +206,7 @@ def _turn_angle(y: Array, x: Array) -> list[Array]:
     return [jnp.where(away == 0, 0.0, jnp.where(y >= 0, above, below)).astype(x.dtype)]
 
 
-def _hold_tournament(pick: Callable[[Any, Any], Any], x: Array, axes: Sequence[int]) -> Array:
+def _hold_tournament(pick: Callable[[Array, Array], Array], x: Array, axes: Sequence[int]) -> Array:
     """Return the greatest or least numbers along axes by comparisons of two."""
     kept = [size for axis, size in enumerate(x.shape) if axis not in axes]
     x = jnp.moveaxis(x, axes, range(len(axes))).reshape(-1, *kept)
@@ -214,21 +216,21 @@ def _hold_tournament(pick: Callable[[Any, Any], Any], x: Array, axes: Sequence[i
     return x[0]
 
 
-def _trace(eqn: Any, function: Callable[..., Sequence[PyTree]]) -> Any:
+def _trace(eqn: Equation, function: Callable[..., Sequence[PyTree]]) -> jex.ClosedJaxpr:
     return jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(one.aval.shape, one.aval.dtype) for one in eqn.invars))
 
 
-def _close(jaxpr: Any) -> Any:
+def _close(jaxpr: jex.Jaxpr | jex.ClosedJaxpr) -> jex.ClosedJaxpr:
     """Return a jaxpr, open or closed, as a closed one."""
-    return jaxpr if hasattr(jaxpr, "consts") else jex.ClosedJaxpr(jaxpr, ())
+    return jaxpr if isinstance(jaxpr, jex.ClosedJaxpr) else jex.ClosedJaxpr(jaxpr, ())
 
 
-def _origin(eqn: Any) -> str:
+def _origin(eqn: Equation) -> str:
     """Return the name of the function of JAX that a call with a derivative rule calls; "" if it is not of JAX."""
     told = getattr(_close(eqn.params["call_jaxpr"]).jaxpr.debug_info, "func_src_info", None) or ""
     name, _, place = told.partition(" at ")
     return name if "/jax/_src/" in place.replace("\\", "/") else ""
 
 
-def _is_real(x: Any) -> bool:
+def _is_real(x: PyTree) -> bool:
     return jnp.issubdtype(getattr(x, "aval", x).dtype, jnp.floating)
