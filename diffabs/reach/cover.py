@@ -236,7 +236,9 @@ def _select(found: CellBounds, which: np.ndarray) -> CellBounds:
 
 
 def _measure_influence(prover: Prover, box: np.ndarray, point: np.ndarray, threads: int | None) -> np.ndarray:
-    """Return how much each parameter moves the first signal, per unit, in the runs near a point of the box.
+    """Return how much a unit of each parameter moves the slip in the runs near a point of the box.
+
+    Without a slip it is state 0.
 
     A cell that is not proved is halved along the side that moves it most. A wrong choice costs time, and no more.
     """

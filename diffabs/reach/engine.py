@@ -29,10 +29,10 @@ FAILURES = (
     "",
     "a condition or a number is undecided over a set of states",
     "the slip may become negative",
-    "no step is short enough to enclose the runs",
+    "no step encloses the runs, with a slip below 1 and above the least speed",
     "a set of states grows too wide",
     "the stop's margin may rise near the end",
-    "a run needs too many steps",
+    "the cell needs too many steps",
     "a run may have ended at its start",
 )  # in the order of `Why` in prove.cpp
 WEIGHT_TABLES = 400  # parts of the range of speeds, or of the horizon, with weights of their own
@@ -131,11 +131,11 @@ class CellBounds(NamedTuple):
         greatest: Upper bounds of the signals.
         below: Values that the signals of every run of the cell fall below, or reach.
         above: Values that the signals of every run of the cell rise above, or reach.
-        reach: About the half widths that each parameter causes: of the first signal at its greatest, of the stop time,
-            and of the stop distance, shape (cells, 3, parameters).
+        reach: About the half widths that each parameter causes: of the slip at its greatest (of state 0
+            without a slip), of the stop time, and of the stop distance, shape (cells, 3, parameters).
         reached: Time up to which the cell was proved [s].
         steps: Steps of the cell's group.
-        across: Steps or ticks across a limit.
+        across: Attempted steps across a limit, and limits that ticks cross.
         failure: Why nothing is proved, as the index of `FAILURES`.
     """
 

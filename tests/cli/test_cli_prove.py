@@ -4,10 +4,12 @@ import json
 import pathlib
 import re
 from collections.abc import Iterator
+from fractions import Fraction
 
 import pytest
 from commands import run
 from marks import cases
+from mutants import killed_by
 
 from diffabs.scenario.outside import lend_modules
 
@@ -34,6 +36,19 @@ def test_a_false_claim_about_the_brake_is_refuted(brake: list[str | pathlib.Path
     found = json.loads(run(*brake, "--claim", f"max_position={EXACT_POSITION * 0.999}", status=1).stdout)
     assert found["verdict"] == "refuted"
     assert found["refuted_by"] is not None
+
+
+@killed_by("cli/prove.py", "below = 1 - 2.0**-50", "below = 1")
+def test_a_bound_of_the_overshoot_is_never_rounded_up() -> None:
+    """At a target of 0.2, some of these products are rounded up."""
+    shares = [f"0.{i}" for i in range(83, 99)]
+    claims = [word for share in shares for word in ("--claim", f"overshoot={share}")]
+    limits = [word for change in ("torque_min=0", "torque_max=9.03") for word in ("--set", f"controller.{change}")]
+    found = json.loads(run("prove", "slip-lmi", *limits, "--over", "plant.mass=5.5:5.5", *claims, "--json").stdout)
+    assert found["verdict"] == "proved"
+    for share, claim in zip(shares, found["claims"], strict=True):
+        exact = (1 + Fraction(share)) * Fraction("0.2")
+        assert exact * (1 - Fraction(1, 10**14)) < Fraction(claim["bound"]) <= exact
 
 
 @pytest.mark.slow

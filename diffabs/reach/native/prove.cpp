@@ -3,8 +3,13 @@
 // A set of states is {c + G p + B r} (`set.h`). One step of a flow has a Taylor polynomial at c, its derivatives along
 // (G, B) over the whole set (mean value theorem), and a remainder over a box that no run leaves (Picard, Schauder).
 //
-// A limit is the chord lambda x + c with a disturbance |w| <= delta, which is 0 unless the set lies across the limit. At
-// a tick, w is one more direction. Within a step, w(t) is measurable, and Alekseev's formula bounds its effect.
+// A torque limit, and any other limit (minimum, maximum, rounding), is a chord lambda x + c with a disturbance
+// |w| <= delta. delta is 0 unless the set straddles the limit. At a tick, w is one more direction. Within a step, w(t) is
+// measurable, and Alekseev's formula bounds its effect. Limits are constants: engine.py refuses others.
+//
+// docs/proofs.md has the method. cover.py splits cells; engine.py compiles this file, calls `rounds_upward` at load, and
+// chooses the settings and the units of the axes (weights). In a paced loop the variable of integration is eta with
+// d eta = dt/v, not time.
 //
 //     Group::prove    start, then periods until every lane is over or lost
 //     Group::period   tick, steps of the flow up to the next tick (without a clock: one step), new axes
@@ -20,27 +25,27 @@ struct Task {
   const int32_t *start, *flow, *tick;  // operations, for each state (tick: -1 for a continuous loop)
   long signals;
   const int32_t* signal;
-  long margin, travelled, clock;  // operation of the stop's margin; which quadratures are distance and time, or -1
+  long margin, travelled, clock;  // operation of the stop's margin; places of distance and time among states and quadratures, or -1
   long nonnegative;               // a state that is never negative, or -1
   long speed;                     // a state that stays above `slowest`, or -1
   double slowest, period_low, period_high, horizon;  // m/s, s
   double tolerance;                 // greatest remainder of a step, relative to the state
-  double longest, shortest, first;  // of steps [s], paced [s^2/m]; a step of `shortest` may have any remainder
+  double longest, shortest, first;  // of steps [s], paced [s^2/m]; a step of `shortest` or below may have any remainder
   long order, tables;
-  const double* weights;  // tables x kept, by the logarithm of the speed, or by the time
+  const double* weights;  // units of the axes, tables x kept, by the logarithm of the speed, or by the time
   double keys_low, keys_high;
 };
 
 constexpr long MOST_STEPS = 50000;    // of a group
 constexpr int MOST_IN_PERIOD = 100;   // steps
 constexpr int MOST_LIMITS = 6;        // limits that a set lies across in one tick; all limits of a flow
-constexpr double WIDEST = 0.3;        // a set of slips wider than this proves nothing: a smaller cell may
+constexpr double WIDEST_SLIP = 0.3;        // a set of slips wider than this proves nothing: a smaller cell may
 constexpr double NEVER = 1e300;
 
-struct Row { I c; std::vector<V> G; V R; };  // a quadrature: c + G p + [-R, R]
+struct Quadrature { I c; std::vector<V> G; V R; };  // c + G p + [-R, R]
 
-// When and where runs end: the margin falls at rates a. A run with margin m at the captured time t ends at t + m/a; m may
-// be negative.
+// When and where runs end: the margin falls at rates a. The captured set is the first one, after a run may have ended,
+// with a margin of at most 0 in its middle. A run with margin m there, at time t, ends at t + m/a; m may be negative.
 struct Ending {
   M captured{}, seen{};
   I inverse_rate = I(0.0), speed = I(0.0), pace = I(0.0);  // 1/a and rates of distance and time, in all late steps
@@ -56,10 +61,11 @@ struct Ending {
     add(inverse_rate, a), add(speed, speed_), add(pace, pace_);
     seen |= late;
   }
-  // A quadrature at the end: it goes on at a rate in `rate`, whose middle times m/a adds its slopes to its own.
+  // A quadrature at the end. From the captured set it goes on for m/a at a rate in `rate`. Its slope in each direction is
+  // its own plus that of m/a times the middle of the rate.
   I at_end(I c, const std::vector<V>& G, V R, I rate) const {
     I alpha = point(inverse_rate.mid()), spread = symmetric(vmax(inverse_rate.h - alpha.h, inverse_rate.n + alpha.h));
-    I tau = alpha * margin_c + spread * margin;  // from the captured set to the end, without the slopes of m
+    I tau = alpha * margin_c + spread * margin;  // from the captured set to the end, at the set's centre
     V slopes = fill(0.0), w = R;
     for (const I& d : margin_slope) slopes += (alpha * d).mag();
     I middle = point(rate.mid());
@@ -72,10 +78,11 @@ struct Ending {
   V caused(const std::vector<V>& G, I rate, int j) const { return vabs(G[j] + rate.mid() * (inverse_rate.mid() * margin_slope[j].mid())); }
 };
 
-// Of an attempted step. NO_SERIES: a Taylor coefficient is undefined; order 1 may do.
-enum Fate { TAKEN, TOO_LONG, NO_SERIES };
+// Of an attempted step. NO_SERIES: a higher Taylor coefficient is undefined; a step of order 1 may have none.
+enum Fate { ACCEPTED, TOO_LONG, NO_SERIES };
 
-// Why a lane was lost, in the order of `FAILURES` in engine.py.
+// Why a lane was lost, in the order of `FAILURES` in engine.py. NO_BOX: no step encloses the runs with a slip below 1 and
+// a speed above `slowest`. TOO_WIDE: also an overflow, or an invalid operation, in any lane of the group.
 enum Why { NOTHING, NO_VALUE, NEGATIVE, NO_BOX, TOO_WIDE, RISING, TOO_MANY_STEPS, ENDED_AT_START };
 
 struct Group {
@@ -86,12 +93,12 @@ struct Group {
   std::vector<int> limits, tick_limits, state_op;
   bool nested = false;  // a limit of the flow reads another one
   Program flow, tick, starts, stop;
-  // mid: at C. whole: over X and C, with slopes. rest: over B, for the remainder. box: over B, for rates. edge: on faces
-  // of B. jac: over B, with derivatives by states and disturbances.
+  // The equations' series, each over another set. mid: at C. whole: over X and C, with slopes. rest: over B, for the
+  // remainder. box: over B, for rates. edge: on faces of B. jac: over B, with derivatives by states and disturbances.
   Series mid, whole, rest, box, edge, jac, at_tick, at_tick_mid;
   std::vector<Chord> chords, tick_chords;
   Set set;
-  std::vector<Row> rows;
+  std::vector<Quadrature> rows;
   // Within a period, all runs are in C + J (p, r, w), p, r, w in [-1, 1], and in X. C is the Taylor value at the centre
   // plus the remainder and the disturbance of every run.
   std::vector<I> C, J, X;
@@ -101,18 +108,19 @@ struct Group {
   M crossing{};
   std::vector<V> top, bottom;   // of signals
   std::vector<I> now;           // of signals, within the last step
-  std::vector<V> above, below;  // every run of the cell goes above, and below, these values of the signals (low, -high)
-  std::vector<V> reach;         // greatest half width of the first signal that each parameter causes
+  std::vector<V> above, below;  // every run of the cell goes above, and below, these values of the signals; bottom and below are negated
+  std::vector<V> reach;         // greatest half width that each parameter causes in the slip, or in state 0 without a slip
   std::vector<V> pmid, phalf;   // middle and half width of each parameter
   // alive: still followed. dead: the proof failed. done: ended, or at the horizon (timed). ended: a run may have ended.
   M alive{}, dead{}, done{}, timed{}, ended{};
-  M doomed{};                                   // lanes that the attempted step would lose
+  M doomed{};                                   // lanes that are dead once the attempted step is committed
   int why[LANES];                               // why a lane was lost
   Ending end;
-  I elapsed = I(0.0), gone = I(0.0);  // up to this period; in it
+  I elapsed = I(0.0), gone = I(0.0);  // the variable of integration up to this period, and in it
   V reached = fill(0.0);
   // box_limit: 0.6 of the last length without a box; grows by 1 % a step. cross_step: longest step across a limit.
-  // excess: greatest remainder of the step, in tolerances. about: approximate time, for the choice of weights.
+  // excess: greatest remainder of the step, in tolerances. about: approximate time or eta, for the choice of weights.
+  // across: attempts across a limit, and limits that ticks cross.
   double h_next = 0, about = 0, box_limit = NEVER, cross_step = NEVER, excess = 0;
   long steps = 0, across = 0;
   bool begun = false;
@@ -149,9 +157,9 @@ struct Group {
   void lose(M which, Why because) { note(which, because), dead |= which & alive, alive &= ~which; }
   void doom(M which, Why because) { note(which, because), doomed |= which; }
 
-  // Values of parameters and states in a series.
+  // Values of parameters and states in a series. `load_params` also clears what it has cached.
 
-  void set_params(Series& s, bool centre) {
+  void load_params(Series& s, bool centre) {
     s.forget();
     for (int i = 0; i < task.tape.count; i++)
       if (task.tape.code[i] == PARAM) {
@@ -160,7 +168,7 @@ struct Group {
         if (s.nd && &s != &jac) s.slope(i, 0)[p] = point(phalf[p]);
       }
   }
-  void set_states(Series& s, const std::vector<I>& at, bool slopes) {
+  void load_states(Series& s, const std::vector<I>& at, bool slopes) {
     for (int k = 0; k < n; k++) {
       int i = state_op[k];
       if (i < 0) continue;
@@ -211,19 +219,19 @@ struct Group {
   // Attempts at a step.
 
   // Order 0 of all operations at the start of a step, with limits as they are.
-  void look() {
+  void evaluate_at_start() {
     if (fresh) return;
     mid.real_limits = whole.real_limits = true, whole.nd = used;
-    set_states(mid, C, false), mid.advance(flow, 0);
+    load_states(mid, C, false), mid.advance(flow, 0);
     std::vector<I> every(n);
     for (int i = 0; i < n; i++) every[i] = hull(X[i], C[i]);  // the mean value theorem goes from a point of C to one of X
-    set_states(whole, every, true), whole.advance(flow, 0);
+    load_states(whole, every, true), whole.advance(flow, 0);
     fresh = true;
   }
 
-  // A length that ends before a limit, or, across one, is a quarter of the time in which the set itself crosses it.
+  // A length that ends short of the next limit. While the set crosses one, it is a quarter of the time that this takes.
   double shorten_before_limits(double h) {
-    look();
+    evaluate_at_start();
     integrate(mid, 0), mid.advance(flow, 1);
     V want = fill(h), near = fill(NEVER);
     for (int i : limits) {
@@ -242,9 +250,9 @@ struct Group {
     return least(alive ? want : fill(h));
   }
 
-  // A box B that no run leaves within [0, h]: in each direction, X + [0, h] f(B) is in it, or its faces point inward.
-  // (With f continued constantly outside of B, neither kind of direction lets a run out.) Also finds
-  // the chords of all limited numbers; false if there is none.
+  // A box B that no run leaves within [0, h]: in each direction, X + [0, h] f(B) is in it, or the rates on its faces point
+  // inward. (With f continued constantly outside of B, neither kind of direction lets a run out.) Also finds the chords of
+  // all limited numbers; false if there is no such box. `forced` holds the limit and its chord, so that one box serves both.
   bool enclose(double h) {
     const int s0 = (int)task.nonnegative;
     const I HH = span(fill(0.0), fill(h));
@@ -259,7 +267,7 @@ struct Group {
         I relaxed = point(r.lambda) * raw[q] + r.c + symmetric(r.delta);
         at.forced[i] = task.tape.code[i] == ROUND ? relaxed : hull(clamped(raw[q], lower_limit(whole, i), upper_limit(whole, i)), relaxed);
       }
-      set_states(at, where, false);
+      load_states(at, where, false);
       at.advance(flow, 0);
       M none{};
       for (int i = 0; i < n; i++) to[i] = at.value(task.flow[i], 0), none |= at.none[task.flow[i]];
@@ -335,7 +343,7 @@ struct Group {
     const I HH = span(fill(0.0), fill(h));
     jac.widths.assign(task.tape.count, fill(0.0));  // the range of a limited number includes its disturbance
     for (int i : limits) jac.widths[i] = chords[i].delta;
-    set_states(jac, B, false);
+    load_states(jac, B, false);
     for (int i = 0; i < n; i++) if (state_op[i] >= 0) for (int j = 0; j < jac.nd; j++) jac.slope(state_op[i], 0)[j] = I(i == j ? 1.0 : 0.0);
     jac.advance(flow, 0), jac.spread_none(flow);
     if (nested || jac.seeds.size() < limits.size()) doom(crossing, NO_VALUE);
@@ -366,10 +374,10 @@ struct Group {
 
   // Everything that a step of length H, at most h, needs. Nothing of the set changes.
   Fate attempt(I H, double h, int order) {
-    look();
+    evaluate_at_start();
     doomed = M{};
     for (int i = 0; i < n + task.quadratures; i++) doom(whole.none[task.flow[i]], NO_VALUE);
-    if (!any(alive & ~doomed)) return TAKEN;
+    if (!any(alive & ~doomed)) return ACCEPTED;
     if (!enclose(h)) return TOO_LONG;
     if (any(crossing & alive)) {
       across++;
@@ -381,7 +389,7 @@ struct Group {
       if (k) mid.advance(flow, k), whole.advance(flow, k);
       integrate(mid, k), integrate(whole, k);
     }
-    set_states(rest, B, false);
+    load_states(rest, B, false);
     for (int k = 0; k <= order; k++) rest.advance(flow, k), integrate(rest, k);
     M singular{};
     for (int i = 0; i < n + task.quadratures; i++) for (Series* s : {&mid, &whole, &rest}) singular |= s->none[task.flow[i]];
@@ -396,7 +404,7 @@ struct Group {
       V share = remainder[i].width() / (task.tolerance * (vabs(C[i].h) + 1e-3));
       excess = std::fmax(excess, largest(alive & ~doomed ? share : fill(0.0)));
     }
-    return order > 1 && excess > 2 && h > task.shortest ? TOO_LONG : TAKEN;
+    return order > 1 && excess > 2 && h > task.shortest ? TOO_LONG : ACCEPTED;
   }
   static I power_of_step(I H, int order) {
     I power(1.0);
@@ -412,7 +420,7 @@ struct Group {
     M early = time_now().h <= task.horizon;
     for (int s = 0; s < task.signals; s++) {
       I start = whole.value(task.signal[s], 0);
-      // Only while no run can have ended, or be at the horizon, and not of a chord, which holds no real number.
+      // Only while no run can have ended, or be at the horizon, and not across a limit: `whole` then has chords without their disturbance.
       M seen = alive & early & ~ended & ~crossing & ~whole.none[task.signal[s]] & (M)(box.value((int)task.margin, 0).low() > 0);
       above[s] = seen ? vmax(above[s], start.low()) : above[s], below[s] = seen ? vmax(below[s], -start.h) : below[s];
       now[s] = signal_within(task.signal[s], order, h, H, s);
@@ -436,7 +444,7 @@ struct Group {
       X[i] = meet(C[i] + symmetric(w), B[i]);
       lose(empty(X[i]) | ~((X[i].n < 1e200) & (X[i].h < 1e200)), TOO_WIDE);
     }
-    if (task.nonnegative >= 0) lose(~(X[task.nonnegative].width() < WIDEST), TOO_WIDE);
+    if (task.nonnegative >= 0) lose(~(X[task.nonnegative].width() < WIDEST_SLIP), TOO_WIDE);
     fresh = false, steps++;
   }
 
@@ -453,7 +461,7 @@ struct Group {
     end.note_late_step(late & falls, rate, quadrature_rate(task.travelled, 0.0), quadrature_rate(task.clock, 1.0));
   }
 
-  void move_quadrature(Row& row, int rate, int order, double h, I H, I power) {
+  void move_quadrature(Quadrature& row, int rate, int order, double h, I H, I power) {
     I sum(0.0), left = coefficient(rest, rate, order) * over(order + 1) * power;
     for (int k = order; k-- > 0;) sum = (sum + coefficient(mid, rate, k) * over(k + 1)) * H;
     for (int j = 0; j < used; j++) {
@@ -507,7 +515,8 @@ struct Group {
     return range;
   }
 
-  // One step of at most `left` (the exact time up to the tick, or none); returns whether it ends with the tick.
+  // One step of at most `left` (the exact time up to the tick, or none); returns whether the period is over. Without a
+  // tick, each step is a period.
   bool step(I left) {
     double h = std::fmin(h_next, std::fmin(task.longest, box_limit)), room = largest(alive ? left.h : fill(0.0));
     box_limit = std::fmin(1.01 * box_limit, NEVER), cross_step = NEVER;
@@ -521,8 +530,8 @@ struct Group {
     for (int tries = 0; tries < 40; tries++) {
       if (last) h = room;
       fate = attempt(last ? left : I(h), h, order);
-      if (fate == TAKEN) break;
-      fresh = false;  // marks of orders above 0
+      if (fate == ACCEPTED) break;
+      fresh = false;  // higher orders may have set `none`
       if (fate == NO_SERIES) order = 1, h = std::fmin(h, task.first);
       else if (excess > 2) h = std::fmax(task.shortest, h * std::fmin(0.8, std::fmax(0.1, 0.8 * std::pow(excess, -1.0 / (order + 1)))));
       else if (h < task.shortest * 0.01 || h < 1e-12) break;
@@ -530,7 +539,7 @@ struct Group {
       excess = 0, last = false;
     }
     begun = true;
-    if (fate == TAKEN) commit(last ? left : I(h), h, order);
+    if (fate == ACCEPTED) commit(last ? left : I(h), h, order);
     else doomed = M{}, lose(alive, NO_BOX);
     gone = last ? period_ : gone + I(h), about += h;
     double best = order > 1 ? 0.9 * h * std::pow(std::fmax(excess, 1e-30), -1.0 / (order + 1)) : 1.5 * h;  // the remainder meets the tolerance
@@ -541,7 +550,7 @@ struct Group {
   // Periods.
 
   // C, J, X of the kept states from the set; the others are 0 until a tick gives them.
-  void open() {
+  void load_set() {
     used = np + nb;
     for (int i = 0; i < n; i++) {
       bool kept = i < nb;
@@ -559,8 +568,8 @@ struct Group {
   void apply_tick() {
     at_tick.real_limits = at_tick_mid.real_limits = true, at_tick.nd = np + nb;
     at_tick.widths.clear(), at_tick.seeds.clear(), at_tick.own = -1;
-    set_states(at_tick_mid, C, false), at_tick_mid.advance(tick, 0);
-    set_states(at_tick, X, true), at_tick.advance(tick, 0);
+    load_states(at_tick_mid, C, false), at_tick_mid.advance(tick, 0);
+    load_states(at_tick, X, true), at_tick.advance(tick, 0);
     std::vector<V> delta(task.tape.count, fill(0.0));
     for (int i : tick_limits) {
       tick_chords[i] = chord_over(at_tick.value(task.tape.a[i], 0), i, at_tick);
@@ -618,14 +627,14 @@ struct Group {
 
   void look_at_margin() {
     mid.real_limits = whole.real_limits = true, whole.nd = used;
-    set_states(mid, C, false), mid.advance(stop, 0), set_states(whole, X, true), whole.advance(stop, 0);
+    load_states(mid, C, false), mid.advance(stop, 0), load_states(whole, X, true), whole.advance(stop, 0);
     lose(mid.none[task.margin] | whole.none[task.margin], NO_VALUE);
   }
   // Whether all runs have ended, or are at the horizon. The margin reads only states that a tick does not change.
   void end_runs() {
     gone = I(0.0);
     reached = alive ? time_now().low() : reached;
-    open();
+    load_set();
     look_at_margin();
     int m = (int)task.margin;
     I margin = whole.value(m, 0);
@@ -662,7 +671,7 @@ struct Group {
         double m = 0.5 * (c[0] + c[1]);
         pmid[p][l] = m, phalf[p][l] = std::fmax(c[1] - m, m - c[0]);
       }
-    for (Series* s : {&mid, &rest, &whole, &box, &edge, &jac, &at_tick, &at_tick_mid}) set_params(*s, s == &mid || s == &at_tick_mid);
+    for (Series* s : {&mid, &rest, &whole, &box, &edge, &jac, &at_tick, &at_tick_mid}) load_params(*s, s == &mid || s == &at_tick_mid);
     at_tick.real_limits = at_tick_mid.real_limits = true, at_tick.nd = np + nb;
     at_tick.widths.clear(), at_tick.seeds.clear(), at_tick.own = -1;
     at_tick_mid.advance(starts, 0), at_tick.advance(starts, 0);
@@ -683,7 +692,7 @@ struct Group {
     for (int q = 0; q < task.quadratures; q++) rows[q] = {at_tick.value(task.start[n + q], 0), std::vector<V>(np, fill(0.0)), fill(0.0)};
     for (auto* every : {&top, &above, &below, &bottom}) for (auto& x : *every) x = fill(-NEVER);
     for (auto& x : reach) x = fill(0.0);
-    open();
+    load_set();
     look_at_margin();
     lose(~(whole.value((int)task.margin, 0).low() > 0), ENDED_AT_START);
   }
@@ -712,7 +721,7 @@ struct Group {
 
   I time_now() const {
     if (task.clock < n) return elapsed + gone;
-    const Row& row = rows[task.clock - n];
+    const Quadrature& row = rows[task.clock - n];
     V w = row.R;
     for (const V& g : row.G) w += vabs(g);
     return row.c + symmetric(w);

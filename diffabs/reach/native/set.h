@@ -16,7 +16,8 @@ struct Set {
   }
 };
 
-// Orthonormal columns near those of A (n x n), longest first. A guess: its inverse is enclosed below.
+// An approximate Q of Lohner's QR of A (n x n): the columns are first sorted by length, longest first, so that the units of
+// the states decide which axis is kept. `enclose_inverse` makes up for rounding.
 static void orthonormalise(std::vector<V>& A, int n) {
   std::vector<V> len(n);
   for (int j = 0; j < n; j++) { len[j] = fill(0.0); for (int i = 0; i < n; i++) len[j] += A[i * n + j] * A[i * n + j]; }
@@ -45,7 +46,7 @@ static void orthonormalise(std::vector<V>& A, int n) {
     V before = fill(0.0);
     for (int i = 0; i < n; i++) x[i] = A[i * n + j], before += x[i] * x[i];
     V norm = remove_earlier(x, j);
-    M tiny = (norm <= 1e-16 * before) | (norm < 1e-200);  // no direction left: the unit vector that is most new
+    M tiny = (norm <= 1e-16 * before) | (norm < 1e-200);  // no direction left: the unit vector with the largest rest
     if (any(tiny)) {
       V best = fill(-1.0);
       for (int u = 0; u < n; u++) {
