@@ -79,7 +79,6 @@ def steps(t, y, args):
     return jnp.piecewise(t, [t <= args["switch"], t > args["switch"]], [args["up"], args["down"]])
 
 
-@killed_by("simulate/step/event_location.py", "return -rises", "return -0.0 * rises")
 @killed_by("simulate/step/replay.py", "close = on & (", "close = on & False & (")
 def test_the_time_of_a_switch_has_a_derivative():
     """https://github.com/patrick-kidger/diffrax/issues/363: dy/d(switch) of a piecewise field was zero."""
