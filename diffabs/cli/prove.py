@@ -278,7 +278,9 @@ def _read_claim(text: str, chosen: Scenario) -> "RunClaim":
     try:
         bound = float(given)
     except ValueError:
-        raise ScenarioError(f"--claim {text} needs a number: {name}=BOUND") from None
+        bound = math.nan
+    if not math.isfinite(bound):
+        raise ScenarioError(f"--claim {text} needs a finite number: {name}=BOUND")
     if name == OVERSHOOT:
         below = 1 - 2.0**-50  # the product is rounded, and the target may be a rounded decimal
         return RunClaim("greatest slip", (1 + bound) * _target(chosen) * below)

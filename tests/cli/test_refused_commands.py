@@ -42,7 +42,8 @@ REFUSALS = [
     ("prove slip-lmi --over plant.mass=6:5", 2, ["is inverted"]),
     ("prove slip-lmi --over plant.mass=-1:5", 2, ["outside (0, inf) kg"]),
     ("prove slip-lmi --over plant.mass=5:6 --claim max_slp=1", 2, ["did you mean max_slip?"]),
-    ("prove slip-lmi --over plant.mass=5:6 --claim max_slip=x", 2, ["needs a number: max_slip=BOUND"]),
+    ("prove slip-lmi --over plant.mass=5:6 --claim max_slip=x", 2, ["needs a finite number: max_slip=BOUND"]),
+    ("prove slip-lmi --over plant.mass=5:6 --claim overshoot=nan", 2, ["needs a finite number: overshoot=BOUND"]),
     ("prove slip-lmi --over plant.mass=5:6 --claim no_lock=1", 2, ["no_lock has no bound"]),
     ("prove slip-lmi --over plant.mass=5:6 --budget 0", 2, ["--budget = 0 is outside (0, inf) s"]),
     (
