@@ -37,8 +37,9 @@ pytestmark = pytest.mark.xdist_group("kernel tangents")
 LANES, STEPS = 37, 5
 RTOL = 1e-5  # of a run with adaptive steps: ten times that of a step
 EXACT, LANDED, SWITCHING = 1e-12, 1e-6, 2e-3  # of the largest derivative among the lanes, or of the metric
-# of a stop that is extrapolated over 400 s: XLA's own derivative moves by 1e-12 where the start does by an ulp
-ROUNDED = {"literal": 3e-12}
+# Of a stop that is extrapolated over 400 s or 2,200 s: where the start moves by an ulp, XLA's own derivative moves by
+# 1e-12 or 3e-13.
+ROUNDED = {"literal": 3e-12, "literature-park": 3e-12}
 LEAST = 1e-2  # a final slip error of 3e-4 is a difference of slips near 1, and has their digits
 # What last digits decide in XLA as well, and is measured there: which comparisons of the slip hold when the computer of
 # slip-real brakes for the first time a wheel that turned freely; how many ticks the noisy computer of lab-rig takes;
@@ -356,7 +357,7 @@ def test_a_scenario(name, kind):
     if kind == "adaptive":
         solver = d.Adaptive(rtol=0.1 * RTOL, duration=one.solver.duration, step=one.solver.step)
     given = (one.loop, solver, dict(one.objectives), VARIED.get(name, "initial.speed"))
-    close = EXACT if kind == "grid" else SWITCHING if name == "slip-cured" else LANDED
+    close = ROUNDED.get(name, EXACT) if kind == "grid" else SWITCHING if name == "slip-cured" else LANDED
     if (name, kind) == ("lab-rig", "adaptive"):
         close = SWITCHING  # noise, by a computer
     values = {"grid": 1e-13, "kinks": 1e-12, "adaptive": SWITCHING if name == "slip-cured" else RTOL}[kind]

@@ -93,6 +93,26 @@ def test_random_loops_of_any_parts_are_right_to_1e_4(name):
     close(run, d.measure(refine_parts(loop, FINE), fixed, measured, key=key), 1e-4, 1e-3)
 
 
+@killed_by("simulate/step/adaptive.py", "SHORT_OF_SURFACE_FRACTION = 0.995", "SHORT_OF_SURFACE_FRACTION = 1.0")
+@pytest.mark.slow
+def test_a_rate_that_jumps_at_a_limit_is_passed():
+    """A valve stops at its limit. Steps that end there once went away from it, and became ever shorter."""
+    structure = random_loops.STRUCTURES["valve"]
+    loops = [random_loops.drawn("valve", 0, number) for number in range(40)]
+    batch = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one) for one in x]), *loops)
+    wanted = {name: structure.objectives[name] for name in ("stop_time", "effort")}
+
+    def measured(rtol):
+        solver = d.Adaptive(rtol, structure.duration, structure.step)
+        return jax.jit(jax.vmap(lambda loop: d.measure(loop, solver, wanted).metrics))(batch)
+
+    finest = measured(1e-7)
+    assert np.all(np.isfinite(finest["stop_time"]))
+    for rtol in (1e-3, 1e-5, 1e-6):
+        for name, value in measured(rtol).items():
+            np.testing.assert_allclose(value, finest[name], rtol=10 * rtol, err_msg=f"{name} at rtol {rtol}")
+
+
 @killed_by(
     "simulate/step/adaptive.py", "jnp.minimum(loop.next_tick(k, self.h), self.steps)", "jnp.minimum(k + 1, self.steps)"
 )

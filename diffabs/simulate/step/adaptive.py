@@ -80,6 +80,8 @@ SLIDE_INTERVAL_FRACTION = 1e-6
 # The first step after a landing, of a method that `watches`: greatest ratio to the step that has landed, and least
 # ratio to the length that the error allows.
 LANDED_STEP_RATIO, LEAST_LANDED_RATIO = 4.0, 1e-3
+# The second attempt to reach a surface at which a rate jumps, as a fraction of the predicted time to it.
+SHORT_OF_SURFACE_FRACTION = 0.995
 # A step that keeps its mode goes 1.5 times as far as the predicted crossing, so that the crossing lies within the step.
 CROSSING_OVERREACH = 1.5
 
@@ -327,6 +329,8 @@ class AdaptiveStepping:
         # A comparison changed inside the step: the next attempt ends there.
         ends_on_crossing = ~taken & (report.past_crossing > 0) & decision.fine
         length = jnp.where(ends_on_crossing, jnp.maximum(carry.length - report.past_crossing, self.least), length)
+        falls_short = self._jumps_at_end(carry, report, decision)
+        length = jnp.where(falls_short, SHORT_OF_SURFACE_FRACTION * carry.length, length)
         searches, status, unrestricted = decision.searches, after.status, carry.unrestricted
         crossings = control.consecutive_crossings
         if self.is_logged:
@@ -356,7 +360,7 @@ class AdaptiveStepping:
         return after._replace(
             length=length,
             base=jnp.where(status == RunStatus.RUNNING, length, carry.base),
-            strikes=strikes & ~searches & ~ends_on_crossing & ~refreshes,
+            strikes=strikes & ~searches & ~ends_on_crossing & ~falls_short & ~refreshes,
             unrestricted=unrestricted,
             control=control._replace(
                 error_limited=error_limited,
@@ -396,6 +400,17 @@ class AdaptiveStepping:
     def _forecast_crossing(self, error_limited: Scalar, unrestricted: Bool, seen: Evaluation) -> Scalar:
         ahead = forecast_crossing(seen.surfaces, error_limited, self.least)
         return jnp.where(unrestricted, 1.0, CROSSING_OVERREACH) * ahead if self.is_logged else ahead
+
+    def _jumps_at_end(self, carry: Carry, report: AdaptiveReport, decision: Decision) -> Bool:
+        """Return True if the attempt by the run of `carry` aimed at a surface and has an error above the allowed one.
+
+        A rate jumps there. A stage beyond the surface has the rate of the other side, and the weights of the stages
+        are not all positive: the step may even go away from the surface.
+        """
+        if self.is_logged:  # all stages keep to one mode
+            return jnp.asarray(False)
+        aimed = (carry.status == RunStatus.RUNNING) & (carry.length == self._ahead(carry.point))
+        return aimed & decision.fine & ~decision.taken & (report.error > 1) & (report.past_crossing <= 0)
 
     def _error_limited_length(self, carry: Carry, attempt: Attempt, decision: Decision) -> Scalar:
         """Return the step length that the error allows [s].
