@@ -33,8 +33,10 @@ def write_trajectories(study: Study, folder: str | pathlib.Path, samples: Sequen
         samples: Numbers of the samples.
 
     Raises:
-        ValueError: A sample is not in the sweep.
+        ValueError: `samples` is empty, or a sample is not in the sweep.
     """
+    if not samples:
+        raise ValueError("samples = []: give the number of at least one sample")
     path = pathlib.Path(folder) / TRAJECTORIES_NAME
     seen = [run_signals(rerun_sample(study, i).sample, study.loop.plant) for i in samples]
     with files.new_folder(path) as folder:

@@ -312,6 +312,12 @@ def test_trajectories_are_those_of_rollout(study, tmp_path):
     assert left_in(tmp_path) == {"trajectories.zarr"}
 
 
+def test_no_trajectories_are_refused(study, tmp_path):
+    with pytest.raises(ValueError, match="give the number of at least one sample"):
+        write_trajectories(study, tmp_path, [])
+    assert not list(tmp_path.iterdir())
+
+
 # From the command line
 
 
