@@ -14,6 +14,7 @@ from diffabs.cli import show as views
 from diffabs.config.values import ScenarioError, format_given, unknown_name_error
 from diffabs.core.types import JsonObject
 from diffabs.runtime import files, provenance
+from diffabs.runtime.process import core_count
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.scenario import Scenario, dump, loads
 
@@ -141,7 +142,7 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
         found = console.run_with_progress(
             lambda: verify_box(
                 chosen.loop, chosen.solver.duration, document, share, suspects=suspects,
-                progress=lambda line: far.__setitem__(0, line),
+                progress=lambda line: far.__setitem__(0, line), processes=core_count(),
             ),
             f"verifying {file}",
             lambda: far[0],

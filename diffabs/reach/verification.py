@@ -5,8 +5,10 @@ list `statements` of `FileVerdict`: about the loop and the duration of the scena
 """
 
 import math
+import multiprocessing
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from diffabs.core.loop import Loop
@@ -123,6 +125,7 @@ def verify_box(
     *,
     suspects: Sequence[Sequence[float]] = (),
     progress: Callable[[str], None] = lambda line: None,
+    processes: int = 1,
 ) -> FileVerdict:
     """Prove a sample of the cells of a proof's file again, by code that shares only the equations with the prover.
 
@@ -136,6 +139,8 @@ def verify_box(
         share: Share of the cells to check, in (0, 1]; at least one is checked.
         suspects: Points of the box whose runs may violate a bound, shape (points, parameters), in SI units.
         progress: Called with a line about how far the check is.
+        processes: Number of processes that check cells at the same time. Several need a main module that can be
+            imported, as always with `multiprocessing`.
 
     Raises:
         ModuleNotFoundError: The extra `proof` is not installed.
@@ -146,11 +151,11 @@ def verify_box(
     cells, over = file.cells, file.over
     reason, done = _find_contradiction(file, horizon), 0
     if not reason:
-        equations = derive_equations(loop, over)
-        chosen = _choose_cells(cells, share, suspects)
-        for done, i in enumerate(chosen, 1):
-            if why := _check(equations, file, cells[i], _choose_sides(over, cells[i])):
-                ends = (f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in zip(over, cells[i], strict=True))
+        check = partial(_check_cell, derive_equations(loop, over), file)
+        chosen = [cells[i] for i in _choose_cells(cells, share, suspects)]
+        for done, (cell, why) in enumerate(_map_cells(check, chosen, processes), 1):
+            if why:
+                ends = (f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in zip(over, cell, strict=True))
                 reason, done = f"cell {', '.join(ends)}: {why}", done - 1
                 break
             progress(f"{done} of {len(chosen)} cells")
@@ -201,6 +206,21 @@ def _comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[Cell], d
             if all(_comes_from_halving(part, some, depth - 1) for part, some in zip(parts, (left, right), strict=True)):
                 return True
     return False
+
+
+def _map_cells(check: Callable[[Cell], str], cells: Sequence[Cell], processes: int) -> Iterator[tuple[Cell, str]]:
+    """Yield each of the cells and the result of its check, in their order, from that many processes."""
+    if min(processes, len(cells)) <= 1:
+        yield from ((cell, check(cell)) for cell in cells)
+        return
+    # `spawn`: a process that has started threads, as JAX does, must not be forked.
+    with multiprocessing.get_context("spawn").Pool(min(processes, len(cells))) as pool:
+        yield from zip(cells, pool.imap(check, cells), strict=True)
+
+
+def _check_cell(equations: Equations, file: ProofFile, cell: Cell) -> str:
+    """Return why the checker does not prove the file's bounds in a cell of the file, empty if it does."""
+    return _check(equations, file, cell, _choose_sides(file.over, cell))
 
 
 def _choose_sides(over: Mapping[str, tuple[float, float]], cell: Cell) -> list[int]:

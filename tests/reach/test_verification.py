@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 from commands import run
+from mutants import killed_by
 
 from diffabs.core.types import JsonObject
 from diffabs.reach.verification import FileVerdict, verify_box
@@ -81,3 +82,16 @@ def test_a_file_that_is_no_proof_is_refused(tmp_path: pathlib.Path, proof: pathl
         broken = tmp_path / f"{key}.json"
         broken.write_text(json.dumps({name: value for name, value in document.items() if name != key}))
         run("verify", broken, status=2)
+
+
+@killed_by("reach/verification.py", "zip(cells, pool.imap(check, cells), strict=True)", "zip(cells[:1], [''])")
+@pytest.mark.slow
+def test_several_processes_check_every_cell(proof: pathlib.Path) -> None:
+    document = json.loads(proof.read_text())
+    (mass, (low, high)), *_ = document["cells"]
+    middle = 0.5 * (low + high)
+    document["cells"] = [[mass, [low, middle]], [mass, [middle, high]]]
+    chosen = loads(document["scenario"].encode(), "p", "p")
+    found = verify_box(chosen.loop, chosen.solver.duration, document, share=1.0, processes=2)
+    assert found.checked == found.cells == 2
+    assert not found.reason
