@@ -7,8 +7,10 @@ list `statements` of `FileVerdict`: about the loop and the duration of the scena
 import math
 import multiprocessing
 import random
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 from diffabs.core.loop import Loop
@@ -18,7 +20,7 @@ from diffabs.reach.cover import RunClaim
 from diffabs.reach.equations import Equations, derive_equations
 
 SAMPLED_STEPS = 2  # steps of the checker between two ticks
-PACED_STEP, STEPS = 2e-4, 500  # length in eta [s^2/m]; number of steps of another continuous loop
+PACED_STEP, STEPS = 4e-4, 500  # length in eta [s^2/m]; number of steps of another continuous loop
 CELL_HALVINGS = 3  # of a cell whose bounds by the checker are too wide
 DEEPEST = 200  # halvings of the box that lead to one cell
 
@@ -58,6 +60,11 @@ class ProofFile(NamedTuple):
     claims: tuple[RunClaim, ...]
     bounds: Bounds
     horizon: float
+
+    @property
+    def signals(self) -> list[str]:
+        """The signals that the file bounds."""
+        return list(dict.fromkeys(name.split()[1] for name in self.bounds if " " in name))
 
     @property
     def statements(self) -> tuple[str, ...]:
@@ -151,7 +158,10 @@ def verify_box(
     cells, over = file.cells, file.over
     reason, done = _find_contradiction(file, horizon), 0
     if not reason:
-        check = partial(_check_cell, derive_equations(loop, over), file)
+        equations = derive_equations(loop, over)
+        if unknown := [name for name in file.signals if name not in equations.signals]:
+            raise ValueError(f"bounds: the loop has no signal {unknown[0]}")
+        check = partial(_check_cell, equations, file)
         chosen = [cells[i] for i in _choose_cells(cells, share, suspects)]
         for done, (cell, why) in enumerate(_map_cells(check, chosen, processes), 1):
             if why:
@@ -213,9 +223,29 @@ def _map_cells(check: Callable[[Cell], str], cells: Sequence[Cell], processes: i
     if min(processes, len(cells)) <= 1:
         yield from ((cell, check(cell)) for cell in cells)
         return
-    # `spawn`: a process that has started threads, as JAX does, must not be forked.
-    with multiprocessing.get_context("spawn").Pool(min(processes, len(cells))) as pool:
-        yield from zip(cells, pool.imap(check, cells), strict=True)
+    # `spawn`: a process that has started threads, as JAX does, must not be forked. Pipes and not a `Pool`, whose
+    # semaphores would outlive a command that Ctrl-C ends.
+    context, readers, workers = multiprocessing.get_context("spawn"), [], []
+    count = min(processes, len(cells))
+    try:
+        for k in range(count):
+            reader, writer = context.Pipe(duplex=False)
+            workers.append(context.Process(target=_send_results, args=(check, cells[k::count], writer), daemon=True))
+            workers[-1].start()
+            writer.close()
+            readers.append(reader)
+        for i, cell in enumerate(cells):
+            yield cell, readers[i % count].recv()
+    finally:
+        for worker in workers:
+            worker.kill()
+
+
+def _send_results(check: Callable[[Cell], str], cells: Sequence[Cell], results: Connection) -> None:
+    """Send the result of each check. Ctrl-C does not end this process: the parent does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for cell in cells:
+        results.send(check(cell))
 
 
 def _check_cell(equations: Equations, file: ProofFile, cell: Cell) -> str:
@@ -242,12 +272,9 @@ def _check(equations: Equations, file: ProofFile, cell: Cell, sides: Sequence[in
     """
     from diffabs.reach.checker import NotProved, check_cell
 
-    signals = list(dict.fromkeys(name.split()[1] for name in file.bounds if " " in name))
-    if unknown := [name for name in signals if name not in equations.signals]:
-        raise ValueError(f"bounds: the loop has no signal {unknown[0]}")
     steps = SAMPLED_STEPS if equations.period is not None else [PACED_STEP if equations.paced else file.horizon / STEPS]
     try:
-        found = check_cell(equations, signals, [(low, high) for low, high in cell], steps, file.horizon)
+        found = check_cell(equations, file.signals, [(low, high) for low, high in cell], steps, file.horizon)
     except NotProved as error:
         reason = f"not proved: {error}"
     else:

@@ -43,8 +43,17 @@ ROUNDED = {"literal": 3e-12, "literature-park": 3e-12}
 LEAST = 1e-2  # a final slip error of 3e-4 is a difference of slips near 1, and has their digits
 # What last digits decide in XLA as well, and is measured there: which comparisons of the slip hold when the computer of
 # slip-real brakes for the first time a wheel that turned freely; how many ticks the noisy computer of lab-rig takes;
-# whether the step with the peak of the voltage of arm-hanging ends at its limit or a little behind.
-BY_ROUNDING, SWAY = {("slip-real", "kinks"), ("lab-rig", "adaptive"), ("arm-hanging", "adaptive")}, 3
+# whether the step with the peak of the voltage of arm-hanging ends at its limit or a little behind. The overshoot of
+# literature-mathworks moves by 2.5e-12.
+BY_ROUNDING, SWAY = (
+    {
+        ("slip-real", "kinks"),
+        ("literature-mathworks", "kinks"),
+        ("lab-rig", "adaptive"),
+        ("arm-hanging", "adaptive"),
+    },
+    3,
+)
 PARTS_HERE = [case for case in CASES if case[0] != "stop"]
 
 
