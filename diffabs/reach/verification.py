@@ -20,7 +20,7 @@ from diffabs.reach.cover import RunClaim
 from diffabs.reach.equations import Equations, derive_equations
 
 SAMPLED_STEPS = 2  # steps of the checker between two ticks
-PACED_STEP, STEPS = 4e-4, 500  # length in eta [s^2/m]; number of steps of another continuous loop
+PACED_STEP, STEPS = 4e-4, 500  # length in eta [s^2/m] of a paced loop; number of steps of other continuous loops
 CELL_HALVINGS = 3  # of a cell whose bounds by the checker are too wide
 DEEPEST = 200  # halvings of the box that lead to one cell
 
@@ -219,7 +219,10 @@ def _comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[Cell], d
 
 
 def _map_cells(check: Callable[[Cell], str], cells: Sequence[Cell], processes: int) -> Iterator[tuple[Cell, str]]:
-    """Yield each of the cells and the result of its check, in their order, from that many processes."""
+    """Yield each of the cells and the result of its check, in the given order, from at most `processes` processes.
+
+    A cell whose process ends before it answers is not proved.
+    """
     if min(processes, len(cells)) <= 1:
         yield from ((cell, check(cell)) for cell in cells)
         return
@@ -235,7 +238,11 @@ def _map_cells(check: Callable[[Cell], str], cells: Sequence[Cell], processes: i
             writer.close()
             readers.append(reader)
         for i, cell in enumerate(cells):
-            yield cell, readers[i % count].recv()
+            try:
+                why = readers[i % count].recv()
+            except EOFError:
+                why = "the process that checked it has ended"
+            yield cell, why
     finally:
         for worker in workers:
             worker.kill()

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import os
 import pathlib
 from collections.abc import Callable
 
@@ -10,7 +11,7 @@ from commands import run
 from mutants import killed_by
 
 from diffabs.core.types import JsonObject
-from diffabs.reach.verification import FileVerdict, verify_box
+from diffabs.reach.verification import FileVerdict, _map_cells, verify_box
 from diffabs.scenario.scenario import loads
 
 pytest.importorskip("flint")
@@ -84,7 +85,7 @@ def test_a_file_that_is_no_proof_is_refused(tmp_path: pathlib.Path, proof: pathl
         run("verify", broken, status=2)
 
 
-@killed_by("reach/verification.py", "readers[i % count].recv()", "''")
+@killed_by("reach/verification.py", "why = readers[i % count].recv()", "why = ''")
 @pytest.mark.slow
 def test_several_processes_check_every_cell(proof: pathlib.Path) -> None:
     document = json.loads(proof.read_text())
@@ -101,3 +102,9 @@ def test_several_processes_check_every_cell(proof: pathlib.Path) -> None:
     assert not found.reason
     lower_bound(document)
     assert verdict().reason
+
+
+@killed_by("reach/verification.py", 'why = "the process that checked it has ended"', 'why = ""')
+@pytest.mark.slow
+def test_a_cell_whose_process_ends_is_not_proved() -> None:
+    assert all(why for _, why in _map_cells(os._exit, [3, 3], 2))

@@ -74,13 +74,13 @@ RESET_STEP_FRACTION = 0.1
 # For derivatives: the first step after an event or a switching surface, as a fraction of the longest stable step, and
 # the growth of this fraction per step. An event excites the fastest modes of the derivative far more than the run's.
 INITIAL_STABILITY_FRACTION, STABILITY_FRACTION_GROWTH = 1 / 16, 1.6
-MAX_CONSECUTIVE_CROSSINGS = 16  # steps in a row that end on switching surfaces; then steps are unrestricted
+MAX_CONSECUTIVE_CROSSINGS = 16  # steps in a row that end on switching surfaces; later ones keep to no mode
 # Fraction of the duration: crossings that follow each other faster are those of a slide.
 SLIDE_INTERVAL_FRACTION = 1e-6
 # The first step after a landing, of a method that `watches`: greatest ratio to the step that has landed, and least
 # ratio to the length that the error allows.
 LANDED_STEP_RATIO, LEAST_LANDED_RATIO = 4.0, 1e-3
-# The second attempt to reach a surface at which a rate jumps, as a fraction of the predicted time to it.
+# The second attempt to reach a surface at which a rate jumps, as a fraction of the length of the first.
 SHORT_OF_SURFACE_FRACTION = 0.995
 # A step that keeps its mode goes 1.5 times as far as the predicted crossing, so that the crossing lies within the step.
 CROSSING_OVERREACH = 1.5
@@ -402,10 +402,10 @@ class AdaptiveStepping:
         return jnp.where(unrestricted, 1.0, CROSSING_OVERREACH) * ahead if self.is_logged else ahead
 
     def _jumps_at_end(self, carry: Carry, report: AdaptiveReport, decision: Decision) -> Bool:
-        """Return True if the attempt by the run of `carry` aimed at a surface and has an error above the allowed one.
+        """Return True if an attempt by the run of `carry` aimed at a surface, did not pass it, and has a large error.
 
-        A rate jumps there. A stage beyond the surface has the rate of the other side, and the weights of the stages
-        are not all positive: the step may even go away from the surface.
+        Then a rate jumps at the surface. A stage beyond it has the rate of the other side, and the weights of the
+        stages are not all positive: the step may even go away from the surface. Always False if the run is logged.
         """
         if self.is_logged:  # all stages keep to one mode
             return jnp.asarray(False)
@@ -415,7 +415,8 @@ class AdaptiveStepping:
     def _error_limited_length(self, carry: Carry, attempt: Attempt, decision: Decision) -> Scalar:
         """Return the step length that the error allows [s].
 
-        An accepted step that was cut short may only raise this length. A step with a surface inside leaves it.
+        An accepted step that was cut short may only raise this length. A rejected step with
+        a surface inside leaves it unchanged.
         """
         old, report = carry.control.error_limited, attempt.report
         new = jnp.where(decision.fine, propose_length(carry.length, report.error), MIN_STEP_RATIO * carry.length)
