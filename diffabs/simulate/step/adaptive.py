@@ -402,7 +402,7 @@ class AdaptiveStepping:
         return jnp.where(unrestricted, 1.0, CROSSING_OVERREACH) * ahead if self.is_logged else ahead
 
     def _jumps_at_end(self, carry: Carry, report: AdaptiveReport, decision: Decision) -> Bool:
-        """Return True if an attempt by the run of `carry` aimed at a surface, did not pass it, and has a large error.
+        """Return True if an attempt by the run of `carry` aimed at a surface and has more than the allowed error.
 
         Then a rate jumps at the surface. A stage beyond it has the rate of the other side, and the weights of the
         stages are not all positive: the step may even go away from the surface. Always False if the run is logged.
@@ -415,8 +415,8 @@ class AdaptiveStepping:
     def _error_limited_length(self, carry: Carry, attempt: Attempt, decision: Decision) -> Scalar:
         """Return the step length that the error allows [s].
 
-        An accepted step that was cut short may only raise this length. A rejected step with
-        a surface inside leaves it unchanged.
+        An accepted step that was cut short may only raise this length. A rejected step with a surface inside leaves
+        it unchanged.
         """
         old, report = carry.control.error_limited, attempt.report
         new = jnp.where(decision.fine, propose_length(carry.length, report.error), MIN_STEP_RATIO * carry.length)
