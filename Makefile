@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 
 .PHONY: demo test test-nightly test-weekly coverage versions lint docs bench bench-peers bench-check bench-figure mutants mutate-changes fuzz clean
 .DELETE_ON_ERROR:
+# Packages are installed without bytecode: the first process that imports one writes it for all others.
+unexport PYTHONDONTWRITEBYTECODE
 
 demo: $(VENV)/.installed
 	$(BIN)/diffabs reproduce all --out out

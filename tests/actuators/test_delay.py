@@ -64,6 +64,7 @@ def played(controller, actuator, steps, h=H, **solver):
 # A smooth command
 
 
+@pytest.mark.slow
 @killed_by("core/log.py", "if self.lent else rows", "if False else rows", case="1.0")
 @pytest.mark.parametrize("back", [1.0, 2.0, 2.7, 5.5])
 def test_a_ramp_comes_later(back):
@@ -320,8 +321,9 @@ def test_steps_of_any_length():
 # Where there is no room
 
 
+@pytest.mark.slow
 @killed_by("actuators/delay.py", "window = jnp.where(count < size, rows, jnp.nan)", "window = rows", case="0.0009-True")
-@pytest.mark.parametrize(("every", "diverges"), [pytest.param(4.1e-3, False, marks=pytest.mark.slow), (0.9e-3, True)])
+@pytest.mark.parametrize(("every", "diverges"), [(4.1e-3, False), (0.9e-3, True)])
 def test_a_delay_that_has_no_room_has_no_value(every, diverges):
     """30 steps of delay in a ring of 32: commands that jump each fourth step fit, those that jump in each do not."""
     there = loop(Toggles(first=1.3e-4, every=every), Delay(time=30 * H, capacity=32))

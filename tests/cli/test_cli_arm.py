@@ -48,6 +48,7 @@ def test_the_papers_start_falls_and_that_is_said(falling):
     ]
 
 
+@pytest.mark.slow
 def test_every_column_has_its_unit(falling):
     """And the last row is the fall."""
     header, *rows = csv.reader(falling[2].read_text().splitlines())

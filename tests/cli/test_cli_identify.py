@@ -73,6 +73,7 @@ def test_readings_are_what_is_in_the_file(csv):
     assert columns["slip"].tolist() == [0, 0.05, 0.1]
 
 
+@pytest.mark.slow
 def test_readings_are_what_simulate_writes(small, tmp_path):
     run("simulate", small, "--csv", tmp_path / "run.csv", "--set", "solver.duration=0.02")
     t, columns = read_measurements(tmp_path / "run.csv", UNITS)

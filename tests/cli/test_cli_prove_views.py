@@ -76,6 +76,7 @@ def test_a_report_has_verdict_box_bounds_and_map(proved: Proved) -> None:
     assert f"diffabs verify {proved.folder / 'certificate.proof'}" in page.text
 
 
+@pytest.mark.slow
 def test_a_report_of_a_refuted_claim_says_where(proved: Proved, tmp_path: pathlib.Path) -> None:
     document = json.loads((proved.folder / "proof.json").read_text())
     document |= {"verdict": "refuted", "reason": "every run violates the claim where plant.mass = 5.4", "files": {}}

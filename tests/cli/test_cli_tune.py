@@ -132,6 +132,7 @@ def tuned(tmp_path_factory):
     return folder, json.loads(result.stdout), result.stderr
 
 
+@pytest.mark.slow
 def test_json_has_what_scripts_rely_on(tuned):
     folder, document, said = tuned
     assert list(document) == KEYS
@@ -180,6 +181,7 @@ def test_the_tuned_scenario_simulates_to_the_reported_numbers(tuned):
     assert document["constraints"][0]["after"] == document["metrics"]["after"]["worst"]["overshoot"]
 
 
+@pytest.mark.slow
 def test_figure_and_file_and_nothing_else_are_left(tuned):
     folder, document, _ = tuned
     assert left_in(folder) == {"small.toml", "out.toml", "a.png"}

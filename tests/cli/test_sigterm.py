@@ -95,6 +95,7 @@ def test_what_a_thread_was_writing_goes_with_it(tmp_path):
     assert left_in(tmp_path) == set()
 
 
+@pytest.mark.slow
 def test_a_run_leaves_no_half_file(room):
     words = ("simulate", "slip-lmi", "--set", "solver.step=1e-7", "--csv", room / "run.csv", "--plot", room / "run.png")
     with started(*command("x", "y")[:3], *map(str, words), cwd=room) as process:

@@ -142,6 +142,7 @@ RULES = {
 }
 
 
+@pytest.mark.slow
 @killed_by("compiler/native/lanes.h", "REALLY(mask_max)(x, R_MASK(cmpeq)(x, x), x, y)", "REALLY(max)(x, y)")
 @killed_by(
     "compiler/operations.py", 'NEGATED = {"eq": "ne", "ne": "eq"}', 'NEGATED = {"eq": "ne", "ne": "eq", "lt": "le"}'

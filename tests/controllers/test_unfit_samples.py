@@ -97,6 +97,7 @@ class Switch:
         return jnp.where(signal.measured.slip < signal.target, 3.0, 1.0)
 
 
+@pytest.mark.slow
 def test_a_comparison_does_not_hide_that_a_sample_is_lost():
     slips, commands = trajectory(rig(computers(Switch())[0]))
     kept = np.r_[: LOST.start, LOST.stop : SAMPLES]

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import cases
 from mutants import killed_by
 from scipy.optimize import brentq
 from signals import H, Mean, Script, close, seen
@@ -305,7 +306,7 @@ def test_sliding_mode():
 
 
 @killed_by("controllers/sampled.py", "t + self.delay - jax", "t - jax")
-@pytest.mark.parametrize("delay", [0.0, 1.5, 2.0, 4.0])
+@pytest.mark.parametrize("delay", cases([0.0, 1.5, 2.0, 4.0], 0.0, 2.0, 4.0))
 def test_sampled_is_a_zero_order_hold(delay):
     """Against the textbook loop: u_k held from t_k + delay on, integral by forward Euler."""
     period, steps, fine = 4, 23, 2  # in steps; `fine` resolves the mean
@@ -389,6 +390,7 @@ def test_latch_follows_later_maxima():
     close(falling, [0.5] * 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reference", [PeakLatch(), PeakLiteral()])
 def test_the_estimators_go_by_the_size_of_the_acceleration(reference):
     """|a| = |0.31 - 100 t|, which falls at once and exceeds 0.31 again at 6.2 ms: the latch takes the first slip and

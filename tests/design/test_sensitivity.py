@@ -234,6 +234,7 @@ def test_decay_is_what_can_be_proved(gain, system):
     assert certify(gain, system, Spec(decay=1.0001 * rate)).decay_rate is None
 
 
+@pytest.mark.slow
 @killed_by(
     "design/interior/decay_rate.py",
     "2 * jnp.sum(weights * left)",

@@ -130,7 +130,8 @@ def test_what_is_used_most_has_an_example():
 
 DEAR = (  # some seconds of compiling
     *("diffabs.tune.tuning.build_problem", "diffabs.reliability.failure.failure_probability"),
-    "diffabs.simulate.ensemble.run_batch",
+    *("diffabs.simulate.ensemble.run_batch", "diffabs.simulate.run.measure", "diffabs.linear.linearization.linearize"),
+    "diffabs.roads.optimum.peak",
 )
 
 

@@ -221,12 +221,14 @@ def test_a_friction_factor_comes_and_goes_without_a_trace(name):
         assert get(again.loop, "plant.road.road.w4") == get(given.loop, "plant.road.w4")
 
 
+@pytest.mark.slow
 @killed_by("explore/session.py", "        now = self.scenario()\n", "        now = self._base\n", case="turned0")
 @pytest.mark.parametrize(
     "turned",
     [
         {"plant.mass": 5.61},
-        *(pytest.param(x, marks=pytest.mark.slow) for x in ({"plant.mass": 5.61, "plant.road.scale": 0.77}, {})),
+        {"plant.mass": 5.61, "plant.road.scale": 0.77},
+        {},
     ],
 )
 def test_the_command_line_reproduces_the_saved_scenario(session, tmp_path, turned):

@@ -63,8 +63,8 @@ def random_loop(seed, sampled):
 @pytest.mark.parametrize(
     ("sampled", "seeds"),
     [
-        pytest.param(False, range(16), id="continuous"),
-        pytest.param(False, range(16, 40), id="continuous, more", marks=pytest.mark.slow),
+        pytest.param(False, range(4), id="continuous"),
+        pytest.param(False, range(4, 40), id="continuous, more", marks=pytest.mark.slow),
         pytest.param(True, range(40), id="sampled", marks=pytest.mark.slow),
     ],
 )

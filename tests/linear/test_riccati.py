@@ -97,6 +97,7 @@ def test_the_rig_is_its_closed_form(speed, q):
     np.testing.assert_allclose(np.trace(found.P), k1 * k2 + k1 * c - k2 * speed / BETA, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_published_gain_of_the_arm():
     """A two-wheeler balanced by an arm, linearised; Q = I, R = 1 (F = -K there)."""
     rows = [
@@ -341,6 +342,7 @@ def test_a_weight_that_is_not_definite_is_reported():
     assert not DARE(2 * np.eye(2), np.ones((2, 2)), np.eye(2), np.zeros((2, 2))).stabilising  # R + B'PB stays singular
 
 
+@pytest.mark.slow
 def test_repeated_poles_and_unseen_unstable_modes():
     jordan = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
     b = np.array([[0.0], [0.0], [1.0]])
@@ -369,6 +371,7 @@ def test_nearly_unstabilisable_is_right_or_reported():
     assert reported <= 8  # from a coupling of 1e-7 on
 
 
+@pytest.mark.slow
 def test_no_silent_failure_among_a_thousand():
     random = np.random.default_rng(7)
     a, b = (np.stack([rig(speed)[i] for speed in np.geomspace(SLOW, FAST, 1000)]) for i in (0, 1))

@@ -102,6 +102,7 @@ def brake_by_scipy(plant, command, speed, end):
     return rims
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("which", "command"), [("mask", 0.75), ("identified", 0.65)])
 @killed_by("papers/lab_rig.py", "np.interp(curves.t + shift, t, wheel)", "np.interp(curves.t, t, wheel)")
 def test_step_braking_against_scipy(which, command):

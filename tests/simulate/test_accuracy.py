@@ -37,6 +37,7 @@ def truth(low=-np.inf, high=np.inf):
     return brake(RIG.plant, torque, speed=10.0, stop=4.0, slip=0.15, memory=1, rates=rates)
 
 
+@pytest.mark.slow
 @killed_by(
     "simulate/accuracy.py",
     "error = jnp.abs(d1) + jnp.abs(d2) / (1 - jnp.minimum(q, MAX_DIFFERENCE_RATIO))",
@@ -58,6 +59,7 @@ def test_the_error_of_a_smooth_loop_is_that_of_fourth_order():
         assert one.converges
 
 
+@pytest.mark.slow
 def test_the_estimate_shows_the_order_lost_to_a_torque_limit():
     loop = d.replace(RIG, {"controller.torque_min": 0.0, "controller.torque_max": 8.0})
     exact = truth(0.0, 8.0)

@@ -35,6 +35,7 @@ SLIDING = braking(  # a locked wheel decelerates at mu(1) g: everything about it
 DECELERATION = 0.75761 * 9.81  # last knot of the spline, times g
 
 
+@pytest.mark.slow
 def test_order_four_on_the_smooth_loop():
     fine = d.measure(RIG, d.FixedStep(1e-4, 2.0), BRAKING).metrics
     steps = np.array([1e-3, 5e-4])
@@ -131,6 +132,7 @@ def test_a_trajectory_is_frozen_after_its_end_and_thinned():
     )
 
 
+@pytest.mark.slow
 def test_streamed_and_stored_runs_agree():
     solver = d.FixedStep(1e-3, 2.0, every=7)
     streamed, stored = d.measure(RIG, solver, BRAKING), d.rollout(RIG, solver, BRAKING)

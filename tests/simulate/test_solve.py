@@ -79,6 +79,7 @@ def steps(t, y, args):
     return jnp.piecewise(t, [t <= args["switch"], t > args["switch"]], [args["up"], args["down"]])
 
 
+@pytest.mark.slow
 @killed_by("simulate/step/replay.py", "close = on & (", "close = on & False & (")
 def test_the_time_of_a_switch_has_a_derivative():
     """https://github.com/patrick-kidger/diffrax/issues/363: dy/d(switch) of a piecewise field was zero."""

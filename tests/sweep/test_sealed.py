@@ -88,6 +88,7 @@ def test_compare_sees_it_too(copy, whole):
         refused(copy, whole, f"{path} is damaged")
 
 
+@pytest.mark.slow
 @killed_by("sweep/results.py", "self._seen.get(chunk) == state", "chunk in self._seen")
 def test_a_file_that_changes_while_it_is_open_is_verified_again(copy):
     found, path = Results(copy), chunk_files(copy)[0]

@@ -93,6 +93,7 @@ def same(found, expected, **tolerance):
 # What is in the table
 
 
+@pytest.mark.slow
 @killed_by("sweep/runner.py", "noise_key(seed, sample)", "noise_key(seed, 0)")
 def test_each_row_is_its_lane_run_by_itself(posed, made):
     assert made.column("sample").tolist() == list(range(150))

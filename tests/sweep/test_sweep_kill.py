@@ -151,6 +151,7 @@ for LAST in range(1, 8):
 """
 
 
+@pytest.mark.slow
 def test_killed_at_each_step_of_writing(tmp_path):
     """Manifest and two chunks: each is written, flushed (1), renamed (2), and its folder flushed (3)."""
     table, seals = manifest(2, 1), Seals(manifest(2, 1))

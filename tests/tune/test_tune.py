@@ -165,6 +165,7 @@ def rosenbrock(z):
 
 
 class TestDescent:
+    @pytest.mark.slow
     def test_reaches_the_minimum_as_scipy_does(self):
         start = np.full(6, -1.0)
         (lane,) = descend(rosenbrock, start, iterations=200)
@@ -349,6 +350,7 @@ class TestConstraints:
 class TestInterruption:
     """What is kept is the best that was met, whatever the search was busy with."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("after", [1, 2, 5, 12, 30])
     def test_it_is_the_best_so_far(self, after):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))

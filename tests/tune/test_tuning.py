@@ -205,6 +205,7 @@ class TestPoles:
         loop = self.loop_for(np.array([-1.0, -2.0]))
         np.testing.assert_allclose(*(np.sort(np.asarray(one.excess(loop, {}))) for one in both), rtol=1e-9)
 
+    @pytest.mark.slow
     def test_the_derivative_in_the_gain(self):
         a, b = SlipModel().matrices()
         system = Polytope(a[None], b[None], states=SlipModel().states)
