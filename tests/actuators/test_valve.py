@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 from delays import loop
 from mutants import killed_by
 from signals import Mean
@@ -13,6 +14,7 @@ from diffabs.controllers import PlayedCommand
 LENGTH = 0.2
 
 
+@pytest.mark.slow
 @killed_by("actuators/valve.py", "smaller(rate, 0.0)", "rate")
 @killed_by("actuators/valve.py", "self.gain * signal", "signal")
 def test_a_valve_waits_at_its_limits():

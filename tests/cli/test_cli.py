@@ -139,6 +139,7 @@ def test_not_stopped_is_done_but_said_loudly():
     assert document["stopped"] is False
 
 
+@pytest.mark.slow
 def test_table_shows_units():
     lines = run("simulate", "slip-lmi", *SHORT).stdout.splitlines()
     units = {line.split("│")[1].strip(): line.split("│")[3].strip() for line in lines if line.startswith("│")}

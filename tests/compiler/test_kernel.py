@@ -200,6 +200,7 @@ class TestObjections:
         with pytest.raises(ValueError, match="together, for trajectories or for derivatives"):
             d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="kernel", accepted=True, **more)
 
+    @pytest.mark.slow
     def test_of_reverse_mode(self):
         def iae(gain):
             loop = d.replace(LOOP, {"controller.gain.0": gain})

@@ -100,7 +100,6 @@ WAYS = {
         jnp.stack([RATES, 2 * RATES], 1), RATES
     ),
 }
-FAST = ("of the lanes", "several tangents for several gains")
 
 
 class TestLaunch:
@@ -137,7 +136,7 @@ class TestLaunch:
         "0 * x + jnp.moveaxis(x, axis, 0)[:1]\n            if shared:",
         case="for several gains",
     )
-    @pytest.mark.parametrize("way", cases(WAYS, *(way for way in WAYS if way not in FAST)))
+    @pytest.mark.parametrize("way", cases(WAYS, *(way for way in WAYS if way != "of the lanes")))
     def test_derivatives_are_those_of_xla(self, way):
         found, expected = (jax.device_get(WAYS[way](lambda g, r, e=e: chain(g, r, e))) for e in ("kernel", "xla"))
         assert np.abs(expected[..., :3]).max() > 0
@@ -157,6 +156,7 @@ class TestLaunch:
         assert seen[-1][UpdateLevel.STEP] == (1, 2, 3)
         assert seen[-1][UpdateLevel.LANE] == ()
 
+    @pytest.mark.slow
     @killed_by("compiler/autodiff/jvp.py", "if outputs_needed is not None:", "if False:")
     def test_only_what_is_asked_for_is_carried(self, monkeypatch):
         """The third number leads to nothing but itself, and has no tangent; the second has those that it has anyway."""

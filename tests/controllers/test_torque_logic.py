@@ -40,6 +40,7 @@ def test_a_band_logic_is_three_exponentials():
     np.testing.assert_allclose(mean(logic), area / LENGTH, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_sampled_band_logic_multiplies():
     """10 (1 + 3/50)^k while the slip is below the band, sampled every 20 ms."""
     logic = Sampled(controller=BandLogic(slip_low=0.9, slip_high=0.95, growth=3.0, torque=10.0), period=0.02)

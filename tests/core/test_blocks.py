@@ -197,6 +197,7 @@ def test_relay_switches_on_the_far_side_of_its_band():
     close(mean, 1.0 + 8.0 * on / (20 * np.pi), rtol=1e-9)
 
 
+@pytest.mark.slow
 @killed_by("simulate/step/event_location.py", "enough & ~at_once & crossings.another", "enough & ~at_once & False")
 def test_two_events_in_one_step():
     """The deceleration has its maximum 0.3 into step 5, at a slip of 0.15; the relay, whose target is that from then

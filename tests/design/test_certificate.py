@@ -297,7 +297,8 @@ def random_claim(rng, kind, discrete, stretch):
 
 
 @pytest.mark.parametrize(("kind", "discrete"), [(kind, False) for kind in KINDS]
-                         + [(kind, True) for kind in KINDS if kind not in ("damping", "scheduled")])  # fmt: skip
+                         + [pytest.param(kind, True, marks=pytest.mark.slow)
+                            for kind in KINDS if kind not in ("damping", "scheduled")])  # fmt: skip
 def test_both_verifiers_agree(kind, discrete):
     rng = np.random.default_rng(KINDS.index(kind))
     verdicts = []

@@ -28,7 +28,7 @@ WANTED = (
 EXECUTED = [*JOURNEYS, "quick-start.md", "tutorials.md", "identify.md", "gradients.md", "howto/precision.md"]
 SLOW = (  # which compile derivatives of many runs, or several loops, or solve programs
     *("journeys/pid-over-roads.md", "journeys/lq-against-lmi.md", "journeys/own-optax.md", "journeys/duckdb.md"),
-    *("journeys/python-control.md", "journeys/own-objective.md", "journeys/pandas.md"),
+    *("journeys/python-control.md", "journeys/own-objective.md", "journeys/pandas.md", "journeys/own-plant.md"),
     *("journeys/lanes.md", "tutorials.md", "identify.md", "gradients.md", "quick-start.md"),
     *("journeys/gpu.md", "journeys/own-curve.md", "howto/precision.md"),
     *("journeys/own-reference.md", "journeys/own-sensor.md", "journeys/own-actuator.md"),

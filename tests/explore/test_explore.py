@@ -614,6 +614,7 @@ def test_a_wrong_scenario_is_refused_before_listening(monkeypatch, file):
     assert re.fullmatch(r"error: plant\.mass = -1 is outside \(0, inf\) kg\n", found.stderr)
 
 
+@pytest.mark.slow
 def test_precision_is_that_of_the_command_line(session):
     assert jax.config.jax_enable_x64
     assert curves.run_curves(session.scenario()).t.dtype == np.float64

@@ -168,6 +168,7 @@ def test_lag_is_a_state():
     assert b[:, 0].tolist() == [0, 0, 50.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 1.3e-3, 4e-3])
 def test_sampling_against_scipy(delay):
     """SciPy's zero-order hold over the two parts of a period."""

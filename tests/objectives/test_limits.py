@@ -68,6 +68,7 @@ def test_controllers_have_no_brake_limits_by_default():
     assert d.braking().controller.low == 0.0
 
 
+@pytest.mark.slow
 def test_a_run_says_for_how_long_its_control_is_at_a_limit():
     """At 1,200 N from the start until 60e3 (0.03 - x) falls below it, x = 0.01: x = 0.06 (1 - exp(-20 t))."""
     pid = controllers.PID(kp=60e3, low=-1e6, high=1200.0)

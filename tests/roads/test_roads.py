@@ -305,6 +305,7 @@ def test_peak_is_differentiable_in_every_parameter(name):
     np.testing.assert_allclose(jacobian(found, road), differences(found, road), rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_peak_of_a_table_moves_with_its_knot():
     """Spline B peaks at its seventh knot and stays there: slip and mu are those of the knot."""
     expected = np.zeros((34, 2))

@@ -26,6 +26,8 @@ from diffabs.sweep.manifest import Seals, encode_manifest
 from diffabs.sweep.seal import CHUNK_NAME_PATTERN, encode_chunk
 from diffabs.sweep.store import Store
 
+pytestmark = pytest.mark.slow  # each computes sweeps; what is wrong with one chunk is also seen in test_sealed
+
 SHORT = SCENARIO.replace("samples = 3200", "samples = 640")
 LONG = SCENARIO.replace("step = 1e-3", "step = 5e-4").replace("samples = 3200", "samples = 6400")  # to be killed in it
 LEFT = {".lock", "manifest.json", "chunks", "summary.json"}
@@ -93,7 +95,6 @@ def contents(folder):
 # Kills
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kills", [3, 20])
 def test_killed_again_and_again(longer, tmp_path, kills):
     """In turns between its chunks, and on its way to the first one."""
@@ -151,7 +152,6 @@ for LAST in range(1, 8):
 """
 
 
-@pytest.mark.slow
 def test_killed_at_each_step_of_writing(tmp_path):
     """Manifest and two chunks: each is written, flushed (1), renamed (2), and its folder flushed (3)."""
     table, seals = manifest(2, 1), Seals(manifest(2, 1))
@@ -171,7 +171,6 @@ def test_killed_at_each_step_of_writing(tmp_path):
         assert not list(store.folder.rglob("*.tmp"))
 
 
-@pytest.mark.slow
 def test_what_a_kill_leaves_behind(copy, whole):
     """Beginnings of files, and a folder of trajectories that were being written."""
     (copy / "manifest.json.tmp").write_text("{")
@@ -187,7 +186,6 @@ def test_what_a_kill_leaves_behind(copy, whole):
 # Ctrl-C, and another process
 
 
-@pytest.mark.slow
 def test_control_c_says_how_to_go_on(longer, tmp_path):
     """And meanwhile nobody else may have the folder."""
     folder, long = tmp_path / "out", ("--samples", "64000")  # so that it is not done before the key is pressed
@@ -213,7 +211,6 @@ def test_control_c_says_how_to_go_on(longer, tmp_path):
     assert there < chunks(folder)
 
 
-@pytest.mark.slow
 def test_control_c_twice_does_not_wait(longer, tmp_path):
     """For a chunk that takes minutes. What it leaves can be continued."""
     folder = tmp_path / "out"
@@ -235,7 +232,6 @@ def test_control_c_twice_does_not_wait(longer, tmp_path):
 # A full disk
 
 
-@pytest.mark.slow
 def test_a_full_disk(copy, whole, monkeypatch):
     """As the system says it: three chunks are missing, the second of them does not find room."""
     for name in sorted(chunks(copy))[3:6]:
@@ -276,7 +272,6 @@ mount -o remount,size=64m "${OUT%/*}"
 """
 
 
-@pytest.mark.slow
 def test_a_disk_that_is_really_full(longer, tmp_path):
     """A small one, in a name space of its own; then it grows."""
     allowed = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", str(tmp_path)]
@@ -299,7 +294,6 @@ def test_a_disk_that_is_really_full(longer, tmp_path):
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [0, 3])
 def test_a_disk_that_is_full_before_it_begins(whole, tmp_path, monkeypatch, size):
     """Neither folder nor manifest find room."""
@@ -332,10 +326,7 @@ def test_a_damaged_chunk_is_found(copy, how):
 
 @pytest.mark.parametrize(
     "how",
-    [
-        "a bit in the middle",
-        *(pytest.param(how, marks=pytest.mark.slow) for how in ("truncated", "a bit of the footer")),
-    ],
+    ["a bit in the middle", "truncated", "a bit of the footer"],
 )
 def test_a_damaged_chunk_is_computed_again(copy, whole, how):
     path = sorted((copy / "chunks").iterdir())[1]
@@ -347,7 +338,6 @@ def test_a_damaged_chunk_is_computed_again(copy, whole, how):
     assert path.read_bytes() == data
 
 
-@pytest.mark.slow
 def test_chunks_that_are_gone_or_damaged_together(copy, whole):
     names = sorted(chunks(copy))
     (copy / "chunks" / names[0]).unlink()
@@ -381,7 +371,7 @@ KERNEL = (("--engine", "kernel"), 'study.engine.name is "xla" there, "kernel" he
 
 @pytest.mark.parametrize(
     ("changes", "needed"),
-    [*CHANGED, pytest.param(*KERNEL, marks=pytest.mark.slow)],
+    [*CHANGED, KERNEL],
     ids=[readable_id(needed) for _, needed in [*CHANGED, KERNEL]],
 )
 def test_another_configuration_is_refused(whole, changes, needed):
@@ -422,7 +412,6 @@ def test_a_manifest_from_another_configuration_is_refused(copy, whole, change, n
     assert contents(copy) == before
 
 
-@pytest.mark.slow
 def test_another_commit_is_not_another_configuration(copy, whole):
     (copy / "manifest.json").write_text(changed((copy / "manifest.json").read_text(), "commit"))
     document = json.loads(run("sweep", whole.scenario, "--out", copy, "--resume", "--json").stdout)

@@ -246,6 +246,7 @@ class TestCertifiedDecay:
 
 
 class TestWeights:
+    @pytest.mark.slow
     @killed_by("tune/weights.py", "root = root + jnp.diag(diagonal)", "root = jnp.diag(diagonal)")
     def test_the_gain_is_that_of_the_riccati_equation(self):
         model = SlipModel(speed=20 / 3.6)
