@@ -19,7 +19,9 @@ from typing import Any
 INTERRUPTED, TERMINATED = 130, 143  # exit status after Ctrl-C, after SIGTERM
 MAX_UNHEARD_PRESSES = 3
 SHOW_CURSOR = b"\x1b[?25h"
-COMMAND_NAMES = ("diffabs", "-m")  # `python -m diffabs` is called -m until the package is imported
+# `python -m diffabs` is called -m until the package is imported, and diffabs/__main__.py from then on.
+COMMAND_NAMES = ("diffabs", "-m")
+CHILD_FLAG = "--multiprocessing-fork"  # an argument of each process that `multiprocessing` starts anew
 
 _pending = 0
 _terminated = False
@@ -28,9 +30,12 @@ _terminated = False
 def end_early_on_interrupt() -> None:
     """Let Ctrl-C end the process at once until `begin_hearing`; does nothing unless the process is the command
     `diffabs`.
+
+    A child process of the command ignores Ctrl-C: the command itself ends it.
     """
-    if _is_command():
-        _answer(_leave)
+    program = pathlib.Path(sys.argv[0] if sys.argv else "")
+    if program.name.removesuffix(".exe") in COMMAND_NAMES or program.parts[-2:] == ("diffabs", "__main__.py"):
+        _answer(signal.SIG_IGN if CHILD_FLAG in sys.orig_argv else _leave)
 
 
 def begin_hearing() -> None:
@@ -64,13 +69,6 @@ def take_interrupt() -> bool:
         return False
     _pending = 0
     return True
-
-
-def _is_command() -> bool:
-    """Return whether this process is the command `diffabs`, not a child process or another program."""
-    multiprocessing = sys.modules.get("multiprocessing.process")
-    child = multiprocessing is not None and multiprocessing.parent_process() is not None
-    return not child and pathlib.Path(sys.argv[0] if sys.argv else "").name.removesuffix(".exe") in COMMAND_NAMES
 
 
 def _answer(handler: Any) -> None:

@@ -12,6 +12,7 @@ import time
 import types
 
 import pytest
+from mutants import killed_by
 from rich.console import Console
 from rich.table import Table
 from seams import replace_seam
@@ -209,6 +210,28 @@ def signals():
 def test_a_library_leaves_control_c_alone(signals):
     interrupt.end_early_on_interrupt()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@killed_by(
+    "runtime/interrupt.py", "signal.SIG_IGN if CHILD_FLAG in sys.orig_argv else _leave", "_leave", case="a child"
+)
+@killed_by("runtime/interrupt.py", 'program.parts[-2:] == ("diffabs", "__main__.py")', "False", case="child of -m")
+@pytest.mark.parametrize(
+    ("program", "words", "answer"),
+    [
+        pytest.param("diffabs", [], "_leave", id="the command"),
+        pytest.param("diffabs", [interrupt.CHILD_FLAG], "SIG_IGN", id="a child"),
+        pytest.param("diffabs/__main__.py", [interrupt.CHILD_FLAG], "SIG_IGN", id="child of -m"),
+        pytest.param("mine/__main__.py", [interrupt.CHILD_FLAG], "default_int_handler", id="child of another program"),
+    ],
+)
+def test_control_c_while_a_process_imports(program, words, answer):
+    """The command ends; its children leave it to the command, which says once that it was interrupted."""
+    code = (
+        f"import signal, sys; sys.argv[0] = '{program}'; import diffabs; print(repr(signal.getsignal(signal.SIGINT)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    assert answer in done.stdout
 
 
 def test_what_is_to_be_ignored_stays_ignored(signals):
