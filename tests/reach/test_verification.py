@@ -11,7 +11,7 @@ from commands import run
 from mutants import killed_by
 
 from diffabs.core.types import JsonObject
-from diffabs.reach.verification import FileVerdict, _map_cells, verify_box
+from diffabs.reach.verification import CELL_HALVINGS, FileVerdict, _choose_sides, _map_cells, verify_box
 from diffabs.scenario.scenario import loads
 
 pytest.importorskip("flint")
@@ -108,3 +108,10 @@ def test_several_processes_check_every_cell(proof: pathlib.Path) -> None:
 @pytest.mark.slow
 def test_a_cell_whose_process_ends_is_not_proved() -> None:
     assert all(why for _, why in _map_cells(os._exit, [3, 3], 2))
+
+
+@killed_by("reach/verification.py", "key=lambda i: shares[i]", "key=lambda i: -shares[i]")
+def test_the_side_that_the_prover_halved_most_is_halved_first() -> None:
+    """A side that is a point is not halved."""
+    over = {"plant.mass": (5.0, 6.0), "initial.speed": (8.0, 16.0), "plant.inertia": (1.0, 1.0)}
+    assert _choose_sides(over, ((5.5, 5.75), (8.0, 8.5), (1.0, 1.0))) == ([1, 0] * CELL_HALVINGS)[:CELL_HALVINGS]
