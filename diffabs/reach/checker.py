@@ -28,7 +28,7 @@ to the last bound m' < 0. By the mean value theorem a run ends m/|m'| after the 
 third derivative at u = 0. A step of lower order does not ask for it, and the checker takes such a step there.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from math import inf, isfinite, nextafter
 from typing import Any, NamedTuple, TypeVar
@@ -296,6 +296,11 @@ class _Series:
             known.append(x)
         return known[k]
 
+    def values(self, i: int, k: int) -> list[arb]:
+        """Return coefficients 0 to k of operation i, which depends on a state; further ones may follow."""
+        self.value(i, k)
+        return self.v[i]
+
     def slope(self, i: int, k: int = 0) -> arb_poly:
         """Return the derivatives of coefficient k of operation i along the directions."""
         if k and self.program.static[i]:
@@ -368,20 +373,16 @@ class _Series:
                     return value(a) * value(b, k)
                 if static[b]:
                     return value(a, k) * value(b)
-                y = value(a) * value(b, k)
-                for j in range(1, k + 1):
-                    y += value(a, j) * value(b, k - j)
-                return y
+                x, y = self.values(a, k), self.values(b, k)
+                return _dot(x, y, 0, k, k)
             case "inv":
                 (a,) = o.args
                 if k == 0:
                     if value(a).contains(0):
                         raise _Undefined("a division by a number that may be 0")
                     return 1 / value(a)
-                y = value(a, 1) * value(i, k - 1)
-                for j in range(2, k + 1):
-                    y += value(a, j) * value(i, k - j)
-                return -y * value(i)
+                x, y = self.values(a, k), self.v[i]
+                return -_dot(x, y, 1, k, k) * y[0]
             case "clamp" | "round":
                 return self._limit(i, k)
             case "select":
@@ -405,10 +406,10 @@ class _Series:
                 case "atan":
                     return x.atan()
             raise NotProved(f"{o.name}: the checker has no such operation")
-        u, g = o.args[:2]  # y' = g u'
-        y = k * value(u, k) * value(g)
+        u, g = self.values(o.args[0], k), self.values(o.args[1], k - 1)  # y' = g u'
+        y = k * u[k] * g[0]
         for j in range(1, k):
-            y += j * value(u, j) * value(g, k - j)
+            y += j * u[j] * g[k - j]
         return y / k
 
     def _chord(self, i: int) -> _Chord:
@@ -457,9 +458,9 @@ class _Series:
                     return slope(b, k) * value(a) + slope(a) * value(b, k)
                 if static[b]:
                     return slope(a, k) * value(b) + slope(b) * value(a, k)
-                return _convolve(slope, a, value, b, k) + _convolve(slope, b, value, a, k)
+                return self._convolve(a, self.values(b, k), k) + self._convolve(b, self.values(a, k), k)
             case "inv":  # d(1/a) = -(1/a)^2 da
-                return -_convolve(slope, o.args[0], self._square, i, k)
+                return -self._convolve(o.args[0], self._squares(i, k), k)
             case "clamp" | "round":
                 chord = self._chord(i)
                 y = NO_SLOPE if chord.slope.is_zero() else slope(o.args[0], k) * chord.slope
@@ -470,15 +471,20 @@ class _Series:
                 return slope(o.args[2 if self.truth(o.args[0]) else 1], k)
             case "meet":
                 return slope(o.args[0], k)
-        return _convolve(slope, o.args[0], value, o.args[1], k)  # dy = g du
+        return self._convolve(o.args[0], self.values(o.args[1], k), k)  # dy = g du
 
-    def _square(self, i: int, k: int) -> arb:
-        """Return coefficient k of the square of operation i."""
-        known = self.squares.setdefault(i, [])
+    def _squares(self, i: int, k: int) -> list[arb]:
+        """Return coefficients 0 to k of the square of operation i."""
+        known, x = self.squares.setdefault(i, []), self.values(i, k)
         while len(known) <= k:
             m = len(known)
-            known.append(sum((self.value(i, j) * self.value(i, m - j) for j in range(m + 1)), ZERO))
-        return known[k]
+            known.append(_dot(x, x, 0, m, m))
+        return known
+
+    def _convolve(self, a: int, values: list[arb], k: int) -> arb_poly:
+        """Return coefficient k of the derivatives of operation a times the series with these coefficients."""
+        self.slope(a, k)
+        return _dot(self.d[a], values, 0, k, k)
 
 
 def _along(direction: int, size: arb) -> arb_poly:
@@ -486,14 +492,12 @@ def _along(direction: int, size: arb) -> arb_poly:
     return arb_poly([*[ZERO] * direction, size])
 
 
-def _convolve(
-    slope: Callable[[int, int], arb_poly], a: int, value: Callable[[int, int], arb], b: int, k: int
-) -> arb_poly:
-    """Return coefficient k of the derivatives of a times the values of b."""
-    y = slope(a, k) * value(b, 0)
-    for j in range(k):
-        y += slope(a, j) * value(b, k - j)
-    return y
+def _dot(x: Sequence[Number], y: Sequence[arb], first: int, last: int, k: int) -> Number:
+    """Return the sum of x[j] y[k - j] for j from `first` to `last`."""
+    total = x[first] * y[k - first]
+    for j in range(first + 1, last + 1):
+        total += x[j] * y[k - j]
+    return total
 
 
 def _at(coefficients: Sequence[Number], t: arb) -> Number:
