@@ -19,6 +19,8 @@ PROBED_SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # slips that a run may
 
 FROZEN_OUTPUTS = ("speed", "distance")  # outputs that a linear model of the slip keeps constant
 GRAVITY = 9.81  # m/s^2, the value in all numbers of the papers
+# A step that ends on standstill leaves a speed of its own rounding. Some plants treat a wheel that turns differently.
+STANDSTILL_SPEED = 1e-9  # m/s or rad/s
 
 
 @pytree
@@ -55,12 +57,12 @@ def halt_at_zero(speed: Scalar, rate: Scalar) -> Scalar:
 
 
 def forward_speed(speed: Scalar) -> Scalar:
-    """Return the speed, or 0 where a step went past standstill.
+    """Return the speed, or 0 where a step ended at standstill or beyond it.
 
     Args:
         speed: Speed or angular speed after a step.
     """
-    return jnp.where(jnp.greater(speed, 0), speed, 0.0)
+    return jnp.where(jnp.greater(speed, STANDSTILL_SPEED), speed, 0.0)
 
 
 def usual_parts(self: Any) -> dict[str, PyTree]:

@@ -327,12 +327,17 @@ def test_a_stopped_wheel_stays_stopped_until_released(name):
     assert 0 < wheel_rate(0.999 * asked) < 0.01 * released
 
 
-@killed_by("plants/wheel.py", "return jnp.where(jnp.greater(speed, 0), speed, 0.0)", "return speed", case="plant0")
+@killed_by("plants/wheel.py", "jnp.where(jnp.greater(speed, STANDSTILL_SPEED), speed, 0.0)", "speed", case="plant0")
+@killed_by("plants/wheel.py", "jnp.greater(speed, STANDSTILL_SPEED)", "jnp.greater(speed, 0)", case="plant0")
 @pytest.mark.parametrize("plant", [QuarterCar(road=SNOW), MirroredRig(road=DRY_ASPHALT), LabRig()])
 def test_projection(plant):
-    """Speeds below zero become zero, the rest stays."""
+    """Speeds below zero, and those that rounding leaves at standstill, become zero, the rest stays."""
     state = plant.start(BrakeStart(speed=10.0, slip=0.3))
     assert plant.project(state) == state
+    rounded = plant.project(type(state)(*(1e-17 for _ in state)))
+    assert [name for name, x in rounded._asdict().items() if x != 0] == [
+        name for name in state._fields if name in ("distance", "brake")
+    ]
     backwards = type(state)(*(-1.0 - jnp.arange(float(len(state)))))
     expected = [x if name in ("distance", "brake") else 0.0 for name, x in backwards._asdict().items()]
     np.testing.assert_allclose(plant.project(backwards), expected, rtol=0, atol=0)
