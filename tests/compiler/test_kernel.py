@@ -180,7 +180,9 @@ class TestObjections:
 
     @killed_by("compiler/runtime/toolchain.py", "            _check_loads(command)\n", "", case="false")
     @pytest.mark.parametrize("command", ["false", "/no/such/compiler"])
-    def test_of_a_compiler_that_does_not_work(self, command, monkeypatch):
+    def test_of_a_compiler_that_does_not_work(self, command, monkeypatch, tmp_path):
+        """In a cache of its own: a mutant that finds it working would leave that in the shared one."""
+        monkeypatch.setenv(library_cache.CACHE, str(tmp_path))
         monkeypatch.setenv(toolchain.COMPILER, command)
         with pytest.raises(toolchain.NoCompiler, match=command):
             toolchain.find_compiler()
