@@ -3,11 +3,11 @@
     python tests/support/tiers.py fast | nightly | weekly [JOB ...]
 
 fast      tests without the mark `slow`: every change, `make test`
-nightly   a sixth of the slow tests and a seventh of the mutants, others each day, and fast tests of the engine with
-          the compiler flags that users have
+nightly   a twentieth of the slow tests and a seventh of the mutants, others each day, and fast tests of the engine
+          with the compiler flags that users have: at most 25 minutes on 2 cores
 weekly    all slow tests, all fast tests with these flags, all mutants, and the fuzzers
 
-Each sixth of the slow tests has processes of its own: JAX keeps compiled programs, some 35 MB for each slow test.
+Each part of the slow tests has processes of its own: JAX keeps compiled programs, some 35 MB for each slow test.
 
 JOB: only jobs whose name contains one of these texts. Each job writes its row when it ends, so the rows of a tier may
 be of several days and commits. The exit status is 1 if something failed. A job that is interrupted writes nothing."""
@@ -31,7 +31,8 @@ PYTEST = ("-m", "pytest", "-n", "2", "--dist", "loadfile", "--no-loadscope-reord
 ENGINE = ("tests/core", "tests/simulate", "tests/objectives", "tests/controllers", "tests/actuators")
 USERS_FLAGS = MappingProxyType({"DIFFABS_TEST_XLA": "default"})
 SHOWN_FAILURES = 12
-SLOW_PARTS, MUTANT_PARTS = 6, 7
+SLOW_PARTS = 6
+SLOW_NIGHTS, MUTANT_NIGHTS = 20, 7  # nights in which all slow tests, all mutants have their turn
 
 
 class Job(NamedTuple):
@@ -46,18 +47,18 @@ def jobs_of_tier(tier: str, today: datetime.date) -> list[Job]:
     """Return the jobs of a tier on a day. Raises KeyError for a tier that does not exist."""
     mutants, fuzz, day = "tests/support/mutants.py", "tests/support/fuzz_", today.toordinal()
 
-    def slow_tests(name: str, part: int) -> Job:
-        return Job(name, (*PYTEST, "-m", "slow"), MappingProxyType({"DIFFABS_TEST_PART": f"{part}/{SLOW_PARTS}"}))
+    def slow_tests(name: str, part: int, parts: int) -> Job:
+        return Job(name, (*PYTEST, "-m", "slow"), MappingProxyType({"DIFFABS_TEST_PART": f"{part}/{parts}"}))
 
     return {
         "fast": [Job("fast tests", (*PYTEST, "-m", "not slow"))],
         "nightly": [
-            slow_tests("a sixth of the slow tests", day % SLOW_PARTS),
+            slow_tests("a twentieth of the slow tests", day % SLOW_NIGHTS, SLOW_NIGHTS),
             Job("the engine's tests, users' flags", (*PYTEST, "-m", "not slow", *ENGINE), USERS_FLAGS),
-            Job("a seventh of the mutants", (mutants, "--part", f"{day % MUTANT_PARTS}/{MUTANT_PARTS}")),
+            Job("a seventh of the mutants", (mutants, "--part", f"{day % MUTANT_NIGHTS}/{MUTANT_NIGHTS}")),
         ],
         "weekly": [
-            *(slow_tests(f"slow tests, part {part + 1} of {SLOW_PARTS}", part) for part in range(SLOW_PARTS)),
+            *(slow_tests(f"slow tests, part {k + 1} of {SLOW_PARTS}", k, SLOW_PARTS) for k in range(SLOW_PARTS)),
             Job("fast tests, users' flags", (*PYTEST, "-m", "not slow"), USERS_FLAGS),
             Job("all mutants", (mutants,)),
             Job("scenarios of the fuzzer", (f"{fuzz}scenarios.py", "--count", "20000", "--seed", "0")),
