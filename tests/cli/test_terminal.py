@@ -225,13 +225,12 @@ def test_a_library_leaves_control_c_alone(signals):
         pytest.param("mine/__main__.py", [interrupt.CHILD_FLAG], "default_int_handler", id="child of another program"),
     ],
 )
-def test_control_c_while_a_process_imports(program, words, answer):
+def test_control_c_while_a_process_imports(program, words, answer, signals, monkeypatch):
     """The command ends; its children leave it to the command, which says once that it was interrupted."""
-    code = (
-        f"import signal, sys; sys.argv[0] = '{program}'; import diffabs; print(repr(signal.getsignal(signal.SIGINT)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
-    assert answer in done.stdout
+    monkeypatch.setattr(sys, "argv", [program])
+    monkeypatch.setattr(sys, "orig_argv", ["python", program, *words])
+    interrupt.end_early_on_interrupt()
+    assert answer in repr(signal.getsignal(signal.SIGINT))
 
 
 def test_what_is_to_be_ignored_stays_ignored(signals):
