@@ -358,6 +358,25 @@ def test_l2_bound_and_smallest_l2_gain():
         design(RIG, impossible)
 
 
+DOUBLE_INTEGRATOR = Polytope(A=[[[0.0, 1.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, -2.0]]], B=[[[0.0], [1.0]]] * 2)
+UNSTABLE = Polytope(A=[[[1.0, 0.0], [0.0, -1.0]], [[1.0, 0.0], [0.0, -1.5]]], B=[[[1.0], [1.0]]] * 2)
+MISSED = {
+    # The solver returns a gain for each, with residuals within its tolerance.
+    "L2 gain": (DOUBLE_INTEGRATOR, {"l2": L2Gain(output=np.eye(2), bound=1e-3)}, "is above its bound 0.001"),
+    # x' = x + u from x = 1 needs u(0) < -1.
+    "input": (UNSTABLE, {"input": InputLimit(1.0, (1.0, 0.0))}, r"inputs within \[1.00.*\], not within \[1.0\]"),
+}
+
+
+@killed_by("design/synthesis.py", "not proof.l2_gain <= spec.l2.bound", "False", case="L2 gain")
+@killed_by("design/synthesis.py", "not np.all(proof.input_limit <= spec.input.limit)", "False", case="input")
+@pytest.mark.parametrize("name", MISSED)
+def test_a_gain_that_misses_a_bound_is_refused(name):
+    system, given, said = MISSED[name]
+    with pytest.raises(DesignError, match=said):
+        design(system, Spec(Q=(1.0, 1.0), R=1.0, **given))
+
+
 # discrete time
 
 PERIOD = 1e-3
