@@ -65,6 +65,23 @@ def smaller(x: Scalar, y: Scalar) -> Scalar:
     return jnp.where(jnp.less_equal(x, y), x, y)
 
 
+def invalidate(x: Scalar, invalid: Scalar, inputs: PyTree) -> Scalar:
+    """Return x, or NaN where it is invalid; then its derivatives by every input are NaN, too.
+
+    A selection alone would give an invalid number the derivative zero.
+
+    Args:
+        x: Result.
+        invalid: Whether the result is invalid.
+        inputs: Pytree of everything that the result may depend on; only its floating-point leaves count.
+    """
+    leaves = [leaf for leaf in map(jnp.asarray, jax.tree.leaves(inputs)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    # An infinite limit must not make a valid result NaN.
+    total = sum(jnp.sum(jnp.where(jnp.isfinite(leaf), leaf, 0.0)).astype(x.dtype) for leaf in leaves)
+    one, none = (jnp.where(invalid, jnp.nan, factor).astype(x.dtype) for factor in (1.0, 0.0))
+    return one * x + none * total
+
+
 @jax.custom_jvp
 def quotient(x: Scalar, y: Scalar) -> Scalar:
     """Return x/y; its derivatives (dx - (x/y) dy)/y share one 1/y. JAX's own derivatives divide three more times.

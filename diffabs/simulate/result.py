@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, LoopState
+from diffabs.core.numerics import invalidate
 from diffabs.core.protocols import Ending, Objective
 from diffabs.core.pytree import prepare_parts
 from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
@@ -49,7 +50,7 @@ def finish_run(loop: Loop, objectives: dict[str, Objective], carry: PyTree) -> t
     metrics = {name: o.value(carry.point.accumulators[name], ending) for name, o in objectives.items()}
     wrong = [_is_impossible(name, objectives[name], value) for name, value in metrics.items()]
     diverged = jnp.any(jnp.stack([carry.status == RunStatus.DIVERGED, *wrong]))
-    metrics = {n: jnp.where(diverged, jnp.nan, value) for n, value in metrics.items() if n != AUDIT_METRIC}
+    metrics = {n: invalidate(value, diverged, loop) for n, value in metrics.items() if n != AUDIT_METRIC}
     timed_out = (carry.status == RunStatus.TIMED_OUT) & ~diverged
     return Run(metrics, stopped & ~diverged, diverged, timed_out, ending, None), last
 

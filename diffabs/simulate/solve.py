@@ -35,6 +35,7 @@ from diffabs.core import kinds
 from diffabs.core.cubic import Cubic
 from diffabs.core.lanes import any_lane, select
 from diffabs.core.loop import LoopState, Margins, Signals
+from diffabs.core.numerics import invalidate
 from diffabs.core.protocols import Clock, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
 from diffabs.core.types import AnyArray, Array, Bool, Part, PyTree, Scalar
@@ -139,8 +140,8 @@ class Solution(NamedTuple):
 
     Attributes:
         t: Time at the end, or the times `save`. A terminal event ends a solution before t1.
-        y: State there, with an axis for the times in front of each leaf if there is `save`. An event at a save time is
-            over there. After a terminal event the last state is repeated. NaN unless the status is valid.
+        y: State there, with an axis for the times in front of each leaf if there is `save`. An event at a save time
+            before t1 is over there. After a terminal event the last state is repeated. NaN unless the status is valid.
         events: Times and counts of the events.
         status: A `SolutionStatus`, as an integer.
     """
@@ -463,7 +464,7 @@ def solve(
         args: Anything that the functions need, a pytree of arrays and numbers.
         solver: `FixedStep` or `Adaptive`. Only `step` or `rtol` is read: t0 and t1 replace the duration, and `save` the
             stride. Fixed steps are shortened to a whole number.
-        events: Events; several at one instant happen in this order.
+        events: Events; several at one instant happen in this order. One exactly at t1 does not happen.
         save: Times between t0 and t1 at which the state is returned, shape (n,); None for the state at the end.
         engine: "xla", or "kernel": a program of this machine for a batch by `jax.vmap`, with forward derivatives.
             "auto" is that of $DIFFABS_ENGINE, or else "xla", which has both modes.
@@ -474,7 +475,8 @@ def solve(
 
     Raises:
         ValueError: An argument is invalid. A switch of the field cannot be located: it is no comparison, such as
-            `jnp.floor`, or a loop hides it. A second derivative is asked of adaptive steps.
+            `jnp.floor`, or a loop hides it. A second derivative is asked of adaptive steps. A field with switches or
+            events has float32 numbers.
 
     Examples:
         >>> import diffabs as d
@@ -493,7 +495,13 @@ def solve(
     asked: Any = solver
     method, count = _read_solver(asked, t0, t1, loop.given["t0"].dtype)
     program = _trace_program(loop)
-    if not program.bit_count and not events:
+    switched = bool(program.bit_count or events)
+    if switched and loop.given["t0"].dtype != jnp.float64:
+        raise ValueError(
+            "float32 cannot locate the switches and events of a field; call"
+            ' jax.config.update("jax_enable_x64", True), and give float64 numbers'
+        )
+    if not switched:
         lean = {"is_logged": False, "smooth": True} if isinstance(method, AdaptiveStepping) else {"kinks": False}
         method = dataclasses.replace(method, watches=False, **lean)
     saves = {} if places is None else {"saves": Saves(places=places)}
@@ -653,12 +661,7 @@ def finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree
     # A fault of an event ends the run by rates that are NaN.
     lost: Scalar = (status == SolutionStatus.DIVERGED) & (held.fault > 0)
     status = jnp.where(lost, held.fault.astype(status.dtype), status)
-    valid = status <= SolutionStatus.TERMINATED
-
-    def check(x: Array) -> Array:
-        # A product: a selection would give an invalid number the derivative zero.
-        return x * jnp.where(valid, 1.0, jnp.nan).astype(x.dtype)
-
+    check = partial(invalidate, invalid=status > SolutionStatus.TERMINATED, inputs=loop.given)
     t, y = point.t, point.state.plant
     if objectives:
         over = objectives["saves"].places > jax.lax.stop_gradient(t) - COINCIDENCE_FRACTION

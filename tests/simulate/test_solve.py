@@ -176,6 +176,8 @@ def test_an_event_at_a_save_time_is_over_there():
     found = jax.jvp(saved, (args,), (moves,))
     truth = jax.jvp(closed, (args,), (moves,))
     np.testing.assert_allclose(found, truth, atol=1e-6)
+    late = d.solve(dose, {"amount": 3.0}, 0.0, 5.0, args, solver=ADAPTIVE, events=[DOSE])  # at t1 it does not happen
+    np.testing.assert_allclose(late.y["amount"], 3.0 * np.exp(-1.5), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -320,6 +322,11 @@ REFUSED = {
     "events.0 is terminal and has a reset": {"events": [TERMINAL_RESET]},
     r"events.0.condition returns shape \(3,\)": {"events": [d.Event(lambda t, y, args: jnp.ones(3))]},
     "kept_events = 0 is no whole number": {"kept_events": 0},
+    "float32 cannot locate": {"field": lambda t, y, args: -jnp.abs(y - 0.5), "y0": jnp.float32(1.0)},
+    "float32 cannot .* and give float64 numbers": {
+        "events": [d.Event(lambda t, y, args: 0.5 - t)],
+        "y0": jnp.float32(1.0),
+    },
 }
 
 
@@ -407,8 +414,7 @@ def test_fixed_steps_need_concrete_times():
 def test_the_page_runs():
     page = ROOT / "docs/fields.md"
     slope, source = pages.printed(page.read_text(encoding="utf-8"), str(page))[0].splitlines()
-    assert np.isfinite(float(slope))
-    assert float(slope) != 0.0
+    assert abs(float(slope) - 1.7314957) < 1e-6  # SciPy in pieces, central differences of 1e-5
     assert "fields.md" in source
 
 

@@ -6,7 +6,7 @@
     surfaces   a step ends near the predicted change of a comparison. A change between 2 % and 95 % of a step repeats
                the step up to there. Each stage evaluates its comparisons
     events     if a margin falls through zero within a step, the step is attempted again until it ends on the zero
-               (`event_location`)
+               (`event_location`). A margin that crosses zero twice within a step cuts the step there (`outlook`)
     clocks     a step ends where the clock of a block strikes
 
 Clocks strike on the grid of `Adaptive.step`, and a trajectory keeps instants of this grid. A step need not end on it.
@@ -14,7 +14,7 @@ Clocks strike on the grid of `Adaptive.step`, and a trajectory keeps instants of
 A run that is logged for derivatives keeps to one mode in a step, and locates switching surfaces as events.
 
 A method that `watches` reports what it cannot resolve: a run that slides along a surface is over (`SLID`), and so is
-one with a margin that only touches zero (`GRAZED`). A margin that crosses zero twice within a step cuts the step there.
+one with a margin that only touches zero (`GRAZED`). It looks for turns of the comparisons' margins, too.
 """
 
 import dataclasses
@@ -139,7 +139,7 @@ class AdaptiveReport(NamedTuple):
         scale: Largest values of the first signal and of the states so far, as `error_scales` returns them.
         past_crossing: Time from the first change of a comparison inside the step, or the first turn of a margin beyond
             zero, to the end of the step [s]; 0 without one.
-        grazes: True if a margin only touches zero; False unless the method `watches`.
+        grazes: True if a margin only touches zero.
         surface: Contradicted comparisons; None if steps keep to no mode.
     """
 
@@ -270,8 +270,8 @@ class AdaptiveStepping:
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
         """Return the predicted time [s] to the first change of an answer, from `seen`, for the run of `carry`.
 
-        A step that keeps its mode gets `CROSSING_OVERREACH` times this time, so that the change lies within it. A
-        method that `watches` returns the time and an `Outlook`.
+        A step that keeps its mode gets `CROSSING_OVERREACH` times this time, so that the change lies within it. The
+        second result is an `Outlook`.
         """
         fresh = carry.status == RunStatus.REFRESHING
         return self._look_ahead(carry.control.error_limited, carry.unrestricted, fresh, seen)
@@ -290,12 +290,11 @@ class AdaptiveStepping:
         off = midpoint_error(self.tableau, error[0], seen.rates[0], h)
         relative = error_norm(system.loop, state, off, scale, sample) / self.rtol
         surface = find_surface_crossing(seen, carry.search.which, h) if self.is_logged else None
-        past_crossing, grazes = time_since_crossing(seen.surfaces, changed, h), jnp.asarray(False)
+        turns = watch_margins(carry, h, self._select_watched(seen), system.bit_count)
+        past_crossing = jnp.maximum(time_since_crossing(seen.surfaces, changed, h), turns.time_since)
         if self.watches:
-            since, touches = watch_margins(carry, h, seen, system.bit_count)
-            past_crossing, grazes = jnp.maximum(past_crossing, since), touches
             relative = jnp.maximum(relative, margin_error(system, carry, h, seen, state))
-        return AdaptiveReport(relative, scale, past_crossing, grazes, surface)
+        return AdaptiveReport(relative, scale, past_crossing, turns.grazes, surface)
 
     def decide(
         self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
@@ -386,12 +385,15 @@ class AdaptiveStepping:
 
     def _ahead(self, point: Point) -> Scalar:
         """Return the predicted time [s] to the first change of an answer."""
-        return point.forecast[0] if self.watches else point.forecast
+        return point.forecast[0]
 
     def _look_ahead(self, error_limited: Scalar, unrestricted: Bool, fresh: Bool, seen: Evaluation) -> PyTree:
         """Return the forecast; `fresh` is True if the answers were taken anew."""
-        crossing = self._forecast_crossing(error_limited, unrestricted, seen)
-        return (crossing, look_ahead(fresh, seen)) if self.watches else crossing
+        return self._forecast_crossing(error_limited, unrestricted, seen), look_ahead(fresh, self._select_watched(seen))
+
+    def _select_watched(self, seen: Evaluation) -> Evaluation:
+        """Return the dynamics with those margins only whose turns are looked for: of events, or all if it `watches`."""
+        return seen if self.watches else seen._replace(surfaces=[])
 
     def _next_strike(self, loop: Loop, k: Int) -> Int:
         """Return the number of the first grid instant after the `k`-th at which a clock strikes or the run ends."""

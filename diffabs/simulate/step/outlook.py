@@ -16,8 +16,9 @@ from diffabs.simulate.step.attempt import mode_in_step
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import Evaluation, LoopSystem
 
-# A margin grazes if it turns nearer to zero than this fraction of its greater value at the ends of the step.
-GRAZING_DEPTH_FRACTION = 1e-6
+# A margin grazes if it turns nearer to zero than this fraction of its greater value at the ends of the step, or than
+# its rounding, in multiples of the machine epsilon.
+GRAZING_DEPTH_FRACTION, GRAZING_DEPTH_EPS = 1e-6, 32
 # Allowed error of the cubic in the middle of a step, as a fraction of the greatest value at both ends and there.
 MARGIN_TOLERANCE = 1e-6
 
@@ -65,11 +66,12 @@ def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -
     place = -c1 / jnp.where(bend > 0, bend, jnp.inf)
     inside = (square > 0) & (bend > 0) & (place > 0) & (place < 1) & (b >= 0) & ~landing
     lowest, most = cubic(place), jnp.maximum(jnp.abs(a), jnp.abs(b))
-    touches = inside & (jnp.abs(lowest) <= GRAZING_DEPTH_FRACTION * most)
+    undecided = max(GRAZING_DEPTH_FRACTION, GRAZING_DEPTH_EPS * float(jnp.finfo(a.dtype).eps)) * most
+    touches = inside & (jnp.abs(lowest) <= undecided)
     # Beyond a landing the margin is continued as a parabola: its depth is slope^2/(2 curvature).
     curvature = 2.0 * c2 + 6.0 * c3
-    shallow = landing & (curvature > 0) & (0.5 * db * db <= GRAZING_DEPTH_FRACTION * most * curvature)
-    since = jnp.where(inside & (lowest < 0), (1.0 - place) * length, 0.0)
+    shallow = landing & (curvature > 0) & (0.5 * db * db <= undecided * curvature)
+    since = jnp.where(inside & (lowest < -undecided), (1.0 - place) * length, 0.0)
     return Turns(jnp.max(since, initial=0.0), jnp.any(touches | shallow))
 
 
@@ -91,7 +93,7 @@ def watch_margins(carry: PyTree, h: Scalar, seen: Evaluation, bit_count: int) ->
     """Return where margins turn back in an attempt; nowhere during a search, whose lengths are arbitrary.
 
     Args:
-        carry: Carry before the attempt, with an `Outlook` as its forecast.
+        carry: Carry before the attempt, with an `Outlook` in its forecast.
         h: Length of the attempt [s].
         seen: Dynamics at its end.
         bit_count: Number of bits of the comparisons; events have the numbers after them.

@@ -54,6 +54,7 @@ class StepLog(NamedTuple):
         next_words: Mode of the next step.
         unrestricted: True if the step has no mode.
         lands: Number of the comparison that changes at its end, or -1.
+        begins_at_zero: True if the margin at its end is zero from the beginning of the step, where it does not fall.
         refresh: True for a step of length 0 that evaluates the rates.
         over: True if the run ends there.
     """
@@ -68,6 +69,7 @@ class StepLog(NamedTuple):
     next_words: ModeBits
     unrestricted: Bool
     lands: Int
+    begins_at_zero: Bool
     refresh: Bool
     over: Bool
 
@@ -155,7 +157,13 @@ class ReplayStepping:
         words = select(one.refresh, one.next_words, one.words)
         mode = mode_in_step(system, words, one.unrestricted)
         strikes = one.k != k
-        shift_end = partial(_time_to_event, one, strikes)
+
+        def shift_end(end: Evaluation) -> Scalar:
+            # A margin that is zero from the beginning moves with it. Its slope is near zero: a quotient by the slope
+            # would magnify the rounding of its derivative.
+            with_start = one.begins_at_zero & ~strikes
+            return jnp.where(with_start, carry.control.delay, _time_to_event(one, strikes, end))
+
         return StepRequest(h, end, self.h, mode, one.refresh, strikes, one.k, shift_end)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
@@ -286,7 +294,8 @@ def log_attempt(old: Carry, new: Carry) -> StepLog:
         new: Carry after the attempt.
     """
     taken, triggered = new.control.taken, new.control.triggered
-    lands = jnp.where((old.status == RunStatus.LANDING) & taken & (triggered == 0), old.search.which, -1)
+    landing = old.status == RunStatus.LANDING
+    lands = jnp.where(landing & taken & (triggered == 0), old.search.which, -1)
     return StepLog(
         taken=taken,
         t=new.point.t,
@@ -298,6 +307,7 @@ def log_attempt(old: Carry, new: Carry) -> StepLog:
         next_words=new.point.words,
         unrestricted=old.unrestricted,
         lands=lands,
+        begins_at_zero=landing & old.search.at_once & (old.search.fall == 0),
         refresh=old.status == RunStatus.REFRESHING,
         over=~new.running,
     )
