@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from diffabs.controllers import ObserverFeedback, Sampled
 from diffabs.controllers.balance import MEASURED_NAMES, STATE_NAMES
@@ -19,8 +20,9 @@ from diffabs.core.types import AnyArray, Bool, Part
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.regulator import dlqr
-from diffabs.linear.riccati import dare
+from diffabs.linear.riccati import dare, symmetric_part
 from diffabs.linear.slip_model import Sampling
+from diffabs.linear.weights import check_symmetric
 
 SELECTION = np.eye(len(STATE_NAMES))[[STATE_NAMES.index(name) for name in MEASURED_NAMES]]  # C: theta and psi
 
@@ -43,7 +45,7 @@ def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
     """Return the steady-state Kalman filter of x+ = A x + w, y = C x + v; NaN where no such filter exists.
 
     The gain L corrects the prediction: x^ = x^- + L (y - C x^-). The predictor's gain is A L. The result is
-    differentiable in every argument.
+    differentiable in every argument. Of traced covariances only the symmetric part counts.
 
     Args:
         A: State matrix, shape (n, n).
@@ -52,11 +54,15 @@ def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
         V: Covariance of v, shape (p, p), positive definite.
 
     Raises:
-        ValueError: The shapes do not fit, or the matrices are complex or float32.
+        ValueError: The shapes do not fit, there is no state or no output, or the matrices are complex or float32. For
+            covariances that are not traced also: W or V is not symmetric and finite.
     """
     A, C, W, V = as_float_arrays(A, C, W, V)
+    for name, covariance, size in (("W", W, len(A)), ("V", V, len(C))):
+        if not isinstance(covariance, Tracer):
+            check_symmetric(name, covariance, size)
     found = dare(A.T, C.T, W, V)
-    spread = C @ found.P @ C.T + V
+    spread = C @ found.P @ C.T + symmetric_part(V)
     return Filter(jnp.linalg.solve(spread, C @ found.P).T, found.P, found.stabilising)
 
 

@@ -36,7 +36,10 @@ def lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
     """Return P of A' P + P A + Q = 0 and its relative residual.
 
     For a stable A, P is the integral of exp(A't) Q exp(At). P is differentiable to any order in both modes; the
-    residual counts as constant. P is not finite if two eigenvalues of A have the sum zero.
+    residual counts as constant.
+
+    If two eigenvalues of A have the sum zero, the equation has no unique solution. P is then not finite, or rounding
+    determines it. Such a P is often 1e15 times as large as Q, and its residual can be small.
 
     Args:
         A: State matrix, shape (n, n).
@@ -52,7 +55,9 @@ def discrete_lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
     """Return P of A' P A - P + Q = 0 and its relative residual.
 
     For a stable A, P is the sum of (A')^k Q A^k. P is differentiable to any order in both modes; the residual counts as
-    constant. P is not finite if two eigenvalues of A have the product one.
+    constant.
+
+    If two eigenvalues of A have the product one, the equation has no unique solution. P is then as in `lyapunov`.
 
     Args:
         A: State matrix, shape (n, n).

@@ -4,7 +4,8 @@
     dlqr   minimises the sum,                                  x+ = A x + B u    K = -(R + B'P B)^-1 (B'P A + S')
 
 Both are pure JAX: compiled, batched and differentiable in every matrix. Untraced matrices are checked before the
-equation is solved. Inside `jit` and `vmap` the flag `stabilising` reports a failure, and K is NaN.
+equation is solved. Inside `jit` and `vmap` the flag `stabilising` reports a failure, and K is NaN. Of traced Q and R
+only the symmetric part counts.
 """
 
 from typing import NamedTuple
@@ -15,8 +16,8 @@ from jax.core import Tracer
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.types import AnyArray, Bool, Matrix, PyTree
-from diffabs.linear.riccati import care, dare
-from diffabs.linear.weights import as_weight_matrix
+from diffabs.linear.riccati import care, dare, symmetric_part
+from diffabs.linear.weights import as_weight_matrix, check_symmetric
 
 # The input moves a mode s if the smallest singular value of (A - s I, B), relative to the largest, exceeds this.
 PBH_TOLERANCE = 1e-10
@@ -56,9 +57,9 @@ def lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None =
         S: Cross weight, shape (n, m); None for zero.
 
     Raises:
-        ValueError: The shapes do not fit, or the arrays are float32, in which no P can be proven. For matrices that are
-            not traced also: an entry is not finite, Q or R is not symmetric, R is not positive definite, or the pair
-            (A, B) is not stabilisable.
+        ValueError: The shapes do not fit, there is no state or no input, or the arrays are float32, in which no P can
+            be proven. For matrices that are not traced also: an entry is not finite, Q or R is not symmetric, R is not
+            positive definite, or the pair (A, B) is not stabilisable.
     """
     _check_matrices(A, B, Q, R, discrete=False)
     return _solve_lqr(A, B, Q, R, S)
@@ -92,7 +93,7 @@ def dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
 def _solve_lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Regulator:
     found = care(A, B, Q, R, S)
     turned = jnp.asarray(B).T @ found.P + (0.0 if S is None else jnp.asarray(S).T)
-    return Regulator(-jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned), *found)
+    return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R, found.P.dtype)), turned), *found)
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
@@ -100,7 +101,7 @@ def _solve_dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -
     found = dare(A, B, Q, R, S)
     b = jnp.asarray(B)
     turned = b.T @ found.P @ jnp.asarray(A) + (0.0 if S is None else jnp.asarray(S).T)
-    return Regulator(-jnp.linalg.solve(jnp.asarray(R) + b.T @ found.P @ b, turned), *found)
+    return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R)) + b.T @ found.P @ b, turned), *found)
 
 
 def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, *, discrete: bool) -> None:
@@ -110,14 +111,12 @@ def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, *, discr
     a, b = np.asarray(A, float), np.asarray(B, float)
     if a.ndim != 2 or a.shape[0] != a.shape[1] or b.ndim != 2 or len(b) != len(a):
         raise ValueError(f"A has shape {a.shape} and B {b.shape}; (n, n) and (n, m) are needed")
+    if not b.size:
+        raise ValueError(f"B has shape {b.shape}; at least one state and one input are needed")
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise ValueError("A or B has an entry that is not finite")
-    for name, value, size in (("Q", Q, len(a)), ("R", R, b.shape[1])):
-        value = np.asarray(value, float)
-        if value.shape != (size, size):
-            raise ValueError(f"{name} has shape {value.shape}; ({size}, {size}) is needed")
-        if not np.isfinite(value).all() or not np.allclose(value, value.T, rtol=1e-12, atol=0):
-            raise ValueError(f"{name} = {value.tolist()} is not symmetric and finite")
+    check_symmetric("Q", Q, len(a))
+    check_symmetric("R", R, b.shape[1])
     as_weight_matrix("R", R, b.shape[1], definite=True)
     unmoved = unstabilisable_mode(a, b, discrete=discrete)
     if unmoved is not None:

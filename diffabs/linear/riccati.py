@@ -74,7 +74,7 @@ def care(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
         S: Cross weight, shape (n, m); None for zero.
 
     Raises:
-        ValueError: The shapes do not fit, or the matrices are complex or float32.
+        ValueError: The shapes do not fit, there is no state or no input, or the matrices are complex or float32.
     """
     return _riccati(_solve_continuous, A, B, Q, R, S)
 
@@ -90,7 +90,8 @@ def dare(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
         A: State matrix, shape (n, n).
         B: Input matrix, shape (n, m).
         Q: Weight of the states, shape (n, n); only its symmetric part counts. It may be indefinite, and P then too.
-        R: Weight of the inputs, shape (m, m), positive semidefinite; it may be singular where R + B' P B > 0.
+        R: Weight of the inputs, shape (m, m), positive semidefinite; only its symmetric part counts. It may be singular
+            where R + B' P B > 0.
         S: Cross weight, shape (n, m); None for zero.
 
     Raises:
@@ -99,11 +100,22 @@ def dare(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
     return _riccati(_solve_discrete, A, B, Q, R, S)
 
 
+def symmetric_part(X: AnyArray) -> AnyArray:
+    """Return (X + X')/2: the part of a weight that counts in x'X x.
+
+    Args:
+        X: Matrix, shape (n, n).
+    """
+    return (X + X.T) / 2
+
+
 def _riccati(solution: Callable, A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Riccati:
     A, B, Q, R = as_float_arrays(A, B, Q, R)
     S = jnp.zeros_like(B) if S is None else as_float_arrays(S)[0].astype(B.dtype)
     if jnp.iscomplexobj(B) or jnp.iscomplexobj(S):
         raise ValueError("A, B, Q, R, S must be real; [[Re, -Im], [Im, Re]] of each is the same equation, real")
+    if not B.size:
+        raise ValueError(f"B has shape {B.shape}; at least one state and one input are needed")
     n, m = B.shape
     shapes = (A.shape, Q.shape, R.shape, S.shape)
     if shapes != ((n, n), (n, n), (m, m), (n, m)):
@@ -117,7 +129,7 @@ def _riccati(solution: Callable, A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyAr
 
 @compile_once(static=1, options=SAME_RESULT_OPTIONS)
 def _solve_compiled(solution: Callable, A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray) -> Riccati:
-    P, residual = solution(A, B, (Q + Q.T) / 2, (R + R.T) / 2, S)
+    P, residual = solution(A, B, symmetric_part(Q), symmetric_part(R), S)
     return Riccati(P, residual, jnp.all(jnp.isfinite(P)))
 
 

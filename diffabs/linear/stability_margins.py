@@ -6,6 +6,10 @@ The poles decide whether the closed loop is stable. With a pure delay in continu
 imaginary axis are counted while the delay grows from zero. They cross only where |L| = 1 (Cooke and van den Driessche,
 On zeroes of some transcendental equations, 1986). Crossings are bracketed on a grid, which is refined until neighbours
 are close, and bisected to rounding.
+
+In continuous time the direct path D is the limit of L at infinite frequency, and it counts as a value of L. A delay
+turns this limit through all angles. With |D| > 1 every delay makes infinitely many unstable poles. With |D| = 1 they
+come arbitrarily close to the imaginary axis, which counts as unstable too.
 """
 
 import math
@@ -16,7 +20,7 @@ import numpy as np
 
 from diffabs.core.types import Matrix, Scalar
 from diffabs.linear.opened_loop import OpenLoop
-from diffabs.linear.transfer import Transfer
+from diffabs.linear.transfer import Transfer, check_delay
 
 GRID_DECADES, PER_DECADE = 4, 60  # beyond the slowest and the fastest pole; points of the grid before it is refined
 NEIGHBOUR_DISTANCE, MAX_GRID_REFINEMENTS = 0.05, 14  # relative distance of neighbours; how often the grid is refined
@@ -32,6 +36,8 @@ DELAY_SEARCH_STEPS, MAX_DELAY_MULTIPLE = 40, 4.0
 class Margins(NamedTuple):
     """Margins of a loop; all but `stable` and `crossover` are NaN for an unstable closed loop.
 
+    In continuous time a frequency may be infinite: the limit of L counts.
+
     Attributes:
         stable: Whether the closed loop is stable.
         gain: Factors (low, high), low < 1 < high: the loop is stable for its gain times any factor between them. They
@@ -39,7 +45,7 @@ class Margins(NamedTuple):
         gain_at: Frequencies (low, high) at which the factors bring L to -1 [rad/s]; NaN without a limit.
         phase: Phase margin [rad]: the smallest angle, lag or lead, that reaches -1; infinity without a crossover.
         phase_at: Its frequency [rad/s].
-        delay: Delay margin [s]; infinity without a limit.
+        delay: Delay margin [s]; infinity without a limit, 0 if every delay makes the loop unstable.
         sensitivity: Ms, the largest |S|; 1/Ms is the modulus margin.
         sensitivity_at: Its frequency [rad/s].
         complementary: Mt, the largest |T|.
@@ -69,9 +75,10 @@ class Crossovers(NamedTuple):
     """Frequencies at which |L| = 1, and frequencies at which L is real and negative.
 
     Attributes:
-        gain_at: Frequencies with |L| = 1 [rad/s].
+        gain_at: Frequencies with |L| = 1 [rad/s]; infinity is one of them if |D| = 1 in continuous time.
         phases: Phase of L above -pi at these frequencies, in (-pi, pi] [rad].
-        phase_at: Frequencies at which L is real and negative [rad/s].
+        phase_at: Frequencies at which L is real and negative [rad/s]. Infinity is one of them in continuous time if
+            D < 0, or if there is a delay and D is not zero.
         factors: 1/|L| at the frequencies `phase_at`.
     """
 
@@ -84,18 +91,20 @@ class Crossovers(NamedTuple):
 def margins(loop: OpenLoop | Transfer) -> Margins:
     """Return the margins of an open loop.
 
-    The delay margin is the smallest (phase lag to -1)/frequency over all crossovers. An `OpenLoop` with a sampled
-    controller is sampled again with each added delay instead, so its delay margin is exact.
+    The delay margin is the smallest (phase lag to -1)/frequency over all crossovers. For a sampled `Transfer` it is at
+    most one period if the loop is unstable with one more period of delay. An `OpenLoop` with a sampled controller is
+    sampled again with each added delay instead, so its delay margin is exact.
 
     Args:
         loop: Open loop with one input and one output.
 
     Raises:
-        ValueError: The system has several inputs or outputs.
+        ValueError: The system has several inputs or outputs, or a negative delay.
     """
     system = loop.transfer() if isinstance(loop, OpenLoop) else loop
     if np.shape(system.D) != (1, 1):
         raise ValueError(f"margins are of one input and one output; the system has {np.shape(system.D)[::-1]}")
+    check_delay(system)
     w = frequency_grid(system)
     found = find_crossovers(system, w)
     crossover = float(found.gain_at.max()) if len(found.gain_at) else math.nan
@@ -107,7 +116,7 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
     gain, gain_at = _gain_margins(found)
     ms, mt = _sensitivities(system, w)
     angle = (float(phase), float(phase_at))
-    return Margins(True, gain, gain_at, *angle, _delay_margin(loop, found), *ms, *mt, crossover)
+    return Margins(True, gain, gain_at, *angle, _delay_margin(loop, system, found), *ms, *mt, crossover)
 
 
 def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers:
@@ -126,7 +135,14 @@ def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers
     values = _response(system, phase_at).real
     real = (values < 0) & np.isfinite(values)
     real &= np.abs(_response(system, phase_at).imag) <= 1e-6 * np.abs(values)  # a sign change at a pole is no crossing
-    return Crossovers(gain_at, phases, phase_at[real], -1 / values[real])
+    phase_at, factors = phase_at[real], -1 / values[real]
+    if system.period is None:
+        far = _limit_at_infinity(system)
+        if abs(far) == 1:
+            gain_at, phases = np.append(gain_at, math.inf), np.append(phases, np.angle(-far))
+        if far < 0:
+            phase_at, factors = np.append(phase_at, math.inf), np.append(factors, -1 / far)
+    return Crossovers(gain_at, phases, phase_at, factors)
 
 
 def is_stable(system: Transfer) -> bool:
@@ -136,9 +152,15 @@ def is_stable(system: Transfer) -> bool:
 
     Args:
         system: Open loop with one input and one output.
+
+    Raises:
+        ValueError: The delay is negative, or no whole number of periods if sampled.
     """
+    check_delay(system)
     if system.period is not None or not system.delay:
         return unstable_poles(system.without_delay()) == 0
+    if _is_unstable_with_any_delay(system):
+        return False
     # The poles of the delay-free loop, and the crossings of |L| = 1. A pair crosses to the right where |L| falls and to
     # the left where |L| rises, again and again with each further turn of the delay, 2 pi/w.
     count = unstable_poles(system._replace(delay=0.0))
@@ -275,9 +297,24 @@ def _sensitivities(system: Transfer, w: np.ndarray) -> tuple[tuple[float, float]
     )
     peaks = [_peak(function, w) for function in sensitivities]
     if system.period is None:
-        far = system.D[0, 0]
-        peaks = [max(peak, (end, math.inf)) for peak, end in zip(peaks, (1 / abs(1 + far), abs(far)), strict=True)]
+        far = _limit_at_infinity(system)
+        ends = (1 / abs(1 + far), abs(far / (1 + far)))
+        peaks = [max(peak, (end, math.inf)) for peak, end in zip(peaks, ends, strict=True)]
     return peaks[0], peaks[1]
+
+
+def _limit_at_infinity(system: Transfer) -> float:
+    """Return the limit of L at infinite frequency, in continuous time.
+
+    With a delay the phase turns without end. Of the circle of values the one nearest to -1 is returned.
+    """
+    direct = float(system.D[0, 0])
+    return -abs(direct) if system.delay else direct
+
+
+def _is_unstable_with_any_delay(system: Transfer) -> bool:
+    """Return whether the closed loop is unstable with every positive delay: |D| >= 1 in continuous time."""
+    return system.period is None and abs(system.D[0, 0]) >= 1
 
 
 def _is_real(system: Transfer, w: float) -> bool:
@@ -299,10 +336,17 @@ def _gain_margins(found: Crossovers) -> tuple[tuple[float, float], tuple[float, 
     return (low, high), (low_at, high_at)
 
 
-def _delay_margin(loop: OpenLoop | Transfer, found: Crossovers) -> float:
-    """Return the delay margin of a stable loop [s]."""
+def _delay_margin(loop: OpenLoop | Transfer, system: Transfer, found: Crossovers) -> float:
+    """Return the delay margin of a stable loop [s]; `system` is its transfer function."""
+    if _is_unstable_with_any_delay(system):
+        return 0.0
     delays = (found.phases % (2 * math.pi)) / found.gain_at
     guess = float(delays.min()) if len(delays) else math.inf
+    if isinstance(loop, Transfer) and loop.period is not None:
+        # If |L| >= 1 at half the sampling rate, a whole period is too much. The crossovers do not show this, because
+        # e^(-jwd) with a part of a period does not close the Nyquist curve there.
+        late = loop._replace(delay=loop.delay + loop.period)
+        return guess if is_stable(late) else min(guess, loop.period)
     if not isinstance(loop, OpenLoop) or loop.period is None or not math.isfinite(guess):
         return guess
     step, low = max(guess, loop.period) / DELAY_SEARCH_STEPS, 0.0

@@ -7,6 +7,7 @@ Matrices are NumPy arrays. The delay is exact: its response is e^(-j w delay), w
 """
 
 import contextlib
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ class Transfer(NamedTuple):
         C: Output matrix, shape (p, n).
         D: Direct path, shape (p, m).
         period: Sampling period [s]; None in continuous time.
-        delay: Pure delay [s], a whole number of periods for a sampled system.
+        delay: Pure delay [s], at least 0, a whole number of periods for a sampled system.
     """
 
     A: Matrix
@@ -56,8 +57,10 @@ class Transfer(NamedTuple):
         """Return the same system with its whole periods of delay as states: a chain of shifts for each input.
 
         Raises:
-            ValueError: The system has a delay in continuous time, or one that is not a whole number of periods.
+            ValueError: The system has a delay in continuous time, or one that is negative or no whole number of
+                periods.
         """
+        check_delay(self)
         if self.period is None:
             if self.delay:
                 raise ValueError(f"delay = {self.delay:g} s: in continuous time a pure delay has no finite state")
@@ -69,6 +72,16 @@ class Transfer(NamedTuple):
         for _ in range(round(shifts)):
             system = _delay_one_period(system)
         return system._replace(delay=0.0)
+
+
+def check_delay(system: Transfer) -> None:
+    """Raise ValueError for a delay that is negative or not finite.
+
+    Args:
+        system: System with any number of inputs and outputs.
+    """
+    if not 0 <= system.delay < math.inf:
+        raise ValueError(f"delay = {system.delay:g} s is outside [0, inf) s")
 
 
 def _solve_or_infinite(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -4,6 +4,38 @@ import numpy as np
 
 from diffabs.core.types import Scalar
 
+SYMMETRY_TOLERANCE = 1e-12  # difference of X[i, j] and X[j, i] that is rounding, relative to the entry's size
+
+
+def is_symmetric(X: np.ndarray) -> bool:
+    """Return whether a matrix is finite, and symmetric up to rounding.
+
+    The size of an entry, for rounding, is |X[i, j]| or sqrt|X[i, i] X[j, j]|, the larger one.
+
+    Args:
+        X: Matrix, shape (n, n).
+    """
+    if not np.isfinite(X).all():
+        return False
+    scale = np.sqrt(np.abs(np.diag(X)))
+    size = np.maximum(np.abs(X), np.outer(scale, scale))
+    return bool((np.abs(X - X.T) <= SYMMETRY_TOLERANCE * size).all())
+
+
+def check_symmetric(name: str, value: Scalar, size: int) -> None:
+    """Raise ValueError for a matrix that is not symmetric up to rounding, or not finite.
+
+    Args:
+        name: Name of the matrix, for messages.
+        value: Matrix, shape (size, size); another shape is refused.
+        size: Number of rows.
+    """
+    array = np.asarray(value, float)
+    if array.shape != (size, size):
+        raise ValueError(f"{name} has shape {array.shape}; ({size}, {size}) is needed")
+    if not is_symmetric(array):
+        raise ValueError(f"{name} = {array.tolist()} is not symmetric and finite")
+
 
 def as_weight_matrix(name: str, value: Scalar, size: int, *, definite: bool) -> np.ndarray:
     """Return a weight as a symmetric matrix (size, size).
@@ -25,7 +57,7 @@ def as_weight_matrix(name: str, value: Scalar, size: int, *, definite: bool) -> 
         raise ValueError(f"{name} has shape {np.shape(value)}; it needs ({size}, {size}), or its diagonal ({size},)")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} = {array.tolist()} has an entry that is not finite")
-    if not np.allclose(array, array.T, rtol=1e-12, atol=0):
+    if not is_symmetric(array):
         raise ValueError(f"{name} = {array.tolist()} is not symmetric")
     lowest, largest = np.linalg.eigvalsh(array)[[0, -1]]
     if lowest < -1e-13 * max(largest, 0.0) or largest < 0 or (definite and lowest <= 0):

@@ -174,6 +174,89 @@ def test_ends_of_the_axis():
     assert found.gain_at[1] == pytest.approx(math.pi / 0.1)
 
 
+def biproper(direct, residue, pole, **more):
+    """D + r/(s - p), or the same in z."""
+    return Transfer(*(np.array([[float(x)]]) for x in (pole, 1.0, residue, direct)), **more)
+
+
+def static(direct, **more):
+    return Transfer(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[float(direct)]]), **more)
+
+
+END = (math.nan, math.inf)  # no lower limit, and the upper one at infinite frequency
+# The closed pole of k (D + r/(s - p)) is p - k r/(1 + k D). |T| of (D s + b)/(s + c) is monotonic in w.
+DIRECT = {
+    "constant 0.5": (static(0.5), {"sensitivity": 2 / 3, "complementary": 1 / 3, "delay": math.inf}),
+    "constant 2": (static(2.0), {"sensitivity": 1 / 3, "complementary": 2 / 3, "delay": 0.0}),
+    "constant 1": (static(1.0), {"complementary": 0.5, "phase": math.pi, "crossover": math.inf, "delay": 0.0}),
+    "D = -0.5": (biproper(-0.5, 0.5, -1), {"gain": (0.0, 2.0), "gain_at": END, "sensitivity": 2.0}),
+    "D = -2": (biproper(-2, -4, -1), {"gain": (0.5, math.inf), "gain_at": (math.inf, math.nan), "delay": 0}),
+    "D = 2": (biproper(2, 2, -1), {"complementary": 0.8, "gain": (0.0, math.inf), "delay": 0.0}),
+    "constant 0.5, late": (static(0.5, delay=1e-6), {"sensitivity": 2.0, "complementary": 1.0, "gain": (0.0, 2.0)}),
+    "D = 0.5, late": (
+        biproper(0.5, -0.5, -1, delay=0.1),
+        {"sensitivity": 2.0, "complementary": 1.0, "gain_at": END},
+    ),
+    "sampled": (biproper(-0.5, 0.4, 0.5, period=0.1), {"gain": (0.0, 1.5 / 1.15), "stable": True}),
+    "sampled constant": (static(2.0, period=0.1), {"complementary": 2 / 3, "delay": 0.1}),
+}
+
+
+@killed_by("linear/stability_margins.py", "abs(far / (1 + far)))", "abs(far))", case="constant 2")
+@killed_by("linear/stability_margins.py", "if far < 0:", "if False:", case="D = -0.5")
+@killed_by("linear/stability_margins.py", "-abs(direct) if system.delay", "direct if True", case="constant 0.5, late")
+@pytest.mark.parametrize("name", DIRECT)
+def test_a_direct_path_counts_at_infinite_frequency(name):
+    system, wanted = DIRECT[name]
+    found = margins(system)
+    assert found.stable
+    for margin, value in wanted.items():
+        assert getattr(found, margin) == pytest.approx(value, rel=1e-9, nan_ok=True), margin
+
+
+@killed_by("linear/stability_margins.py", "abs(system.D[0, 0]) >= 1", "abs(system.D[0, 0]) >= 3", case="2.0")
+@pytest.mark.parametrize("direct", [2.0, -1.5, 0.5, -0.4])
+def test_a_large_direct_path_bears_no_delay(direct):
+    """1 + L e^(-s d) has zeros near s = (log(-D) + 2 pi j k)/d for large k; Newton's method finds one."""
+    d, loop = 0.01, biproper(direct, direct, -1)
+
+    def denominator(s):
+        return 1 + direct * (s + 2) / (s + 1) * np.exp(-s * d)
+
+    s = (np.log(-direct + 0j) + 200j * math.pi) / d
+    for _ in range(20):
+        s -= 2e-6 * denominator(s) / (denominator(s + 1e-6) - denominator(s - 1e-6))
+    assert abs(denominator(s)) < 1e-9
+    assert is_stable(loop._replace(delay=d)) == (s.real < 0) == (abs(direct) < 1)
+
+
+@killed_by("linear/stability_margins.py", "guess if is_stable(late) else min(guess, loop.period)", "guess")
+def test_a_sampled_loop_bears_the_periods_of_its_margin():
+    """Poles with n periods of delay are the roots of z^n (z - p) + D (z - p) + r. Many loops have |L| > 1 at z = -1."""
+    draw, compared = np.random.default_rng(5), 0
+    for _ in range(200):
+        direct, residue, pole = draw.normal(size=3)
+        direct *= draw.integers(2)
+
+        def is_late_stable(n, p=pole, rest=(direct, residue - direct * pole)):
+            return np.abs(np.roots(np.polyadd([1.0, -p, *np.zeros(n)], rest))).max() < 1
+
+        if is_late_stable(0):
+            compared += 1
+            found = margins(biproper(direct, residue, pole, period=0.1)).delay / 0.1
+            first = next((n for n in range(1, 50) if not is_late_stable(n)), math.inf)
+            assert first == (math.ceil(found - 1e-9) if found < 49 else math.inf)
+    assert compared > 50
+
+
+@killed_by("linear/transfer.py", "if not 0 <= system.delay < math.inf:", "if False:", case="is_stable-None")
+@pytest.mark.parametrize("period", [None, 0.1])
+@pytest.mark.parametrize("judge", [margins, is_stable])
+def test_a_negative_delay_is_refused(judge, period):
+    with pytest.raises(ValueError, match=r"^delay = -0\.1 s is outside \[0, inf\) s$"):
+        judge(biproper(0.0, 0.5, 0.5, period=period, delay=-0.1))
+
+
 LOOPS = {
     "state feedback": {},
     "PID": {"controller": PID(kp=60.0, ki=400.0, kd=0.3, low=-np.inf, high=np.inf)},

@@ -17,6 +17,7 @@ from diffabs.linear.gaussian import kalman
 from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
 from diffabs.linear.regulator import dlqr, lqr, unstabilisable_mode
 from diffabs.linear.riccati import care, dare
+from diffabs.linear.weights import is_symmetric
 
 ALPHA, BETA, FAST, SLOW = 83.8796606703, 133.472842636189, 140.291806958, 14.0291806958
 CARE, DARE = jax.jit(care), jax.jit(dare)
@@ -82,8 +83,8 @@ def test_dare_is_scipys(n):
 
 @killed_by(
     "linear/regulator.py",
-    "return Regulator(-jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned)",
-    "return Regulator(jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned)",
+    "return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R, found.P.dtype)), turned)",
+    "return Regulator(jnp.linalg.solve(symmetric_part(jnp.asarray(R, found.P.dtype)), turned)",
     case="q1-140.291806958",
 )
 @pytest.mark.parametrize("speed", [FAST, SLOW])
@@ -137,6 +138,15 @@ def test_lyapunov_equations_are_scipys():
         found = jax.jit(discrete_lyapunov)(a, q)
         np.testing.assert_allclose(found.P, sl.solve_discrete_lyapunov(a.T, q), rtol=1e-9, atol=1e-9)
         assert found.residual < 1e-13
+
+
+@killed_by("linear/lyapunov.py", "jnp.linalg.solve(operator, -Q.ravel())", "jnp.linalg.lstsq(operator, -Q.ravel())[0]")
+@pytest.mark.parametrize(("solve", "modes"), [(lyapunov, (1.0, -1.0, 0.5)), (discrete_lyapunov, (2.0, 0.5, 0.3))])
+def test_a_singular_lyapunov_equation_has_a_huge_solution(solve, modes):
+    for seed in range(6):
+        basis = np.random.default_rng(seed).normal(size=(3, 3))
+        found = solve(basis @ np.diag(modes) @ np.linalg.inv(basis), np.eye(3))
+        assert not np.abs(found.P).max() < 1e12
 
 
 # SciPy's own cases: the collections of benchmarks of Benner, Laub and Mehrmann (1995), and others
@@ -252,6 +262,60 @@ def test_the_filter_of_numbers_in_lists():
     found = kalman([[1.0]], [[1.0]], [[1.0]], [[1.0]])
     np.testing.assert_allclose(found.P, (1 + np.sqrt(5)) / 2, rtol=1e-12)
     np.testing.assert_allclose(found.gain, found.P / (found.P + 1), rtol=1e-12)
+
+
+def symmetric(x):
+    return (x + x.T) / 2
+
+
+def gain_of(name, a, b, q, r):
+    """The gain of SciPy's solution for the symmetric parts."""
+    q, r = symmetric(q), symmetric(r)
+    if name == "lqr":
+        return -np.linalg.solve(r, b.T @ sl.solve_continuous_are(a, b, q, r))
+    p = sl.solve_discrete_are(a, b, q, r)
+    weight = r + b.T @ p @ b
+    return -np.linalg.solve(weight, b.T @ p @ a) if name == "dlqr" else np.linalg.solve(weight, b.T @ p).T
+
+
+GAINS = {
+    "lqr": lambda *data: lqr(*data).gain,
+    "dlqr": lambda *data: dlqr(*data).gain,
+    "kalman": lambda a, b, q, r: kalman(a.T, b.T, q, r).gain,
+}
+
+
+@killed_by("linear/gaussian.py", "C @ found.P @ C.T + symmetric_part(V)", "C @ found.P @ C.T + V", case="kalman")
+@killed_by("linear/regulator.py", "symmetric_part(jnp.asarray(R, found.P.dtype))", "jnp.asarray(R)", case="lqr")
+@killed_by("linear/regulator.py", "symmetric_part(jnp.asarray(R)) + b.T", "jnp.asarray(R) + b.T", case="dlqr")
+@pytest.mark.parametrize("name", GAINS)
+def test_traced_weights_count_by_their_symmetric_part(name):
+    """In the gain, and in its derivative in a single entry."""
+    a, b, q, r, _ = random_problem(3, 0, m=2)
+    q, r = q + np.triu(np.ones((3, 3)), 1), r + np.array([[0.0, 0.4], [-0.6, 0.0]])
+    gain = jax.jit(GAINS[name])
+    np.testing.assert_allclose(gain(a, b, q, r), gain_of(name, a, b, q, r), rtol=1e-9, atol=1e-9)
+    entry, h = np.array([[0.0, 1.0], [0.0, 0.0]]), 1e-4
+    slope = jax.jvp(lambda r: gain(a, b, q, r), (r,), (entry,))[1]
+    ends = [gain_of(name, a, b, q, r + sign * h * entry) for sign in (1, -1)]
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-7)
+
+
+@killed_by("linear/gaussian.py", "check_symmetric(name, covariance, size)", "pass", case="W")
+@pytest.mark.parametrize("name", ["W", "V"])
+def test_a_covariance_that_is_not_symmetric_is_refused(name):
+    wrong = np.array([[1.0, 0.8], [-0.8, 1.0]])
+    with pytest.raises(ValueError, match=rf"^{name} = .* is not symmetric and finite$"):
+        kalman(**{"A": 0.5 * np.eye(2), "C": np.eye(2), "W": np.eye(2), "V": np.eye(2), name: wrong})
+
+
+@killed_by("linear/weights.py", "np.outer(scale, scale)", "0.0")
+def test_rounding_does_not_make_a_matrix_unsymmetric():
+    """A product F P F' has small entries that are all rounding; differences far above rounding are refused."""
+    product = np.array([[1e8, 3e-9], [-2e-9, 1e8]])
+    assert is_symmetric(product)
+    assert not is_symmetric(product + np.array([[0.0, 1e-3], [0.0, 0.0]]))
+    assert not is_symmetric(np.array([[1e8, 1e-6], [2e-6, 1e-8]]))
 
 
 def test_complex_matrices_are_refused():
@@ -407,6 +471,15 @@ def test_bad_matrices(change, message):
             given["A"] = np.diag([1.5, 0.5])
         with pytest.raises(ValueError, match=message):
             regulator(**given)
+
+
+@killed_by("linear/regulator.py", "if not b.size:", "if False:", case="lqr-no input")
+@killed_by("linear/riccati.py", "if not B.size:", "if False:", case="care-no state")
+@pytest.mark.parametrize(("n", "m"), [(0, 1), (2, 0)], ids=["no state", "no input"])
+@pytest.mark.parametrize("solve", [lqr, dlqr, care, dare])
+def test_a_system_without_states_or_inputs_is_refused(solve, n, m):
+    with pytest.raises(ValueError, match=rf"^B has shape \({n}, {m}\); at least one state and one input are needed$"):
+        solve(-np.eye(n), np.zeros((n, m)), np.eye(n), np.eye(m))
 
 
 def test_the_mode_that_is_not_moved():
