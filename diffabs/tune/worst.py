@@ -2,14 +2,18 @@
 
     maximise metric(p),  p in [low, high]
 
-One batch screens up to 64 corners of the box and random points. Gradient ascent starts from the worst of them. The
-method is local: a bound exceeded is a proven counterexample, but the worst case found depends on the starts. The worst
-case is often a corner; a run of all corners then finds it without a gradient. `WorstCase.report` states how the search
-found the worst case, and whether a certificate covers the box.
+One batch screens up to 64 corners of the box and random points. Gradient ascent starts from the worst of them. Another
+batch runs the ends of the ascents again: a run with derivatives may have other steps (`FixedStep.kinks`). Every metric
+compared is thus that of a plain run.
+
+The method is local: a bound exceeded is a proven counterexample, but the worst case found depends on the starts. The
+worst case is often a corner; a run of all corners then finds it without a gradient. `WorstCase.report` states how the
+search found the worst case, and whether a certificate covers the box.
 """
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,17 +23,20 @@ import numpy as np
 from scipy.stats import qmc
 
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
+from diffabs.core.kinds import format_value
+from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import replace
+from diffabs.core.pytree import ParameterSpec, parameters, replace
 from diffabs.core.reason import Reason
 from diffabs.core.types import Part, PyTree
+from diffabs.core.units import units_of
 from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import describe_engine
 from diffabs.simulate.ensemble import run_batch
-from diffabs.simulate.types import Solver
+from diffabs.simulate.types import Run, Solver
 from diffabs.tune.descent import Descent, DescentState, lbfgs
 from diffabs.tune.method import DerivativeMode, Stopping
 from diffabs.tune.problem import Multipliers, Problem, choose_gradient_mode
@@ -44,7 +51,8 @@ EDGE_SHARE = 0.01  # of a range: least distance of a start from the ends; an asc
 class WorstCase:
     """The greatest value of a metric that a search has found.
 
-    A point with a NaN metric counts as -inf here, and appears in `diverged` instead.
+    All metrics are those of plain runs, without derivatives. A point with a NaN metric counts as -inf here, and appears
+    in `diverged` instead.
 
     Attributes:
         metric: Name of the metric.
@@ -57,7 +65,8 @@ class WorstCase:
         loop: Loop with the parameters of the worst case.
         rollouts: Cost of the search; a gradient counts as `price` rollouts.
         bound: Bound on the metric, or None.
-        diverged: Parameters of the first screened point at which the run diverges or the metric is NaN, or None.
+        diverged: Parameters of the first point, screened or at the end of an ascent, at which the run diverges or the
+            metric is NaN; or None.
         reasons: Reason for the end of each ascent.
         engine: Engine of the ascents, with compiler and flags if it is a kernel.
     """
@@ -78,7 +87,7 @@ class WorstCase:
 
     @property
     def met(self) -> bool | None:
-        """Whether the metric stays within the bound and no screened run diverged; None without a bound."""
+        """Whether the metric stays within the bound and no run diverged; None without a bound."""
         return None if self.bound is None else self.diverged is None and self.value <= self.bound
 
     def report(self, proved: bool | None = None) -> str:
@@ -106,7 +115,7 @@ class WorstCase:
 
     def _finder(self) -> str:
         """Return a sentence on how the search found the worst case: corner, screened point or gradients."""
-        if self.value <= self.corner * (1 + CORNER_TOLERANCE):
+        if math.isclose(self.value, self.corner, rel_tol=CORNER_TOLERANCE):
             return f"That is a corner of the box: running its {self.corners} corners finds it."
         if self.value <= self.screened:
             return f"That is one of the points that were run first (worst corner {self.corner:.6g})."
@@ -149,25 +158,29 @@ def worst_case(
         engine: Engine of the runs and their derivatives, as in `build_problem`.
 
     Raises:
-        ValueError: A path or range does not fit, the metric is unknown, a screened point cannot be run, or a requested
-            kernel is impossible.
+        ValueError: A path or range does not fit, the metric is unknown, a number is out of its range, a screened point
+            cannot be run, or a requested kernel is impossible.
     """
     check_part(loop)
     measured = default_objectives(loop.plant) if measured is None else measured
     if metric not in measured:
         raise ValueError(f"{metric} is not measured; there is {', '.join(measured)}")
-    middle = replace(loop, {path: 0.5 * (np.asarray(a, float) + np.asarray(b, float)) for path, (a, b) in over.items()})
+    _check_numbers(loop, measured[metric], bound, {"screen": screen, "starts": starts, "iterations": iterations})
+    middle = replace(loop, _find_middle(loop, over))
     free, key = parameter_space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
     ranges = np.array(free.ranges)
     corners = np.array(list(itertools.islice(itertools.product(*ranges), MAX_CORNERS)))
     points = np.concatenate([corners, _draw_points(ranges, screen, seed)])
-    batch = Batch(_values_by_path(free, points), None if key is None else np.repeat(key, len(points)))
-    if line := first_refusal(loop, batch.values, solver):
+    if line := first_refusal(loop, _values_by_path(free, points), solver):
         raise ValueError(f"the box has points that cannot be run; {line}")
-    screened = jax.device_get(run_batch(loop, batch, solver, measured, accepted=True, engine=engine))
+
+    def run_points(points: np.ndarray) -> Run:
+        batch = Batch(_values_by_path(free, points), None if key is None else np.repeat(key, len(points)))
+        return jax.device_get(run_batch(loop, batch, solver, measured, accepted=True, engine=engine))
+
+    runs, screened = run_points(points), len(points)
     # NaN sorts last: a diverged point is a counterexample of its own, not a start.
-    values = np.nan_to_num(screened.metrics[metric], nan=-np.inf)
-    worst = np.argsort(-values)[:starts]
+    worst = np.argsort(-runs.metrics[metric])[:starts]
     # The weight -1 turns the minimisation of Problem into a maximisation.
     problem = Problem(
         middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), choose_gradient_mode(free)
@@ -175,24 +188,22 @@ def worst_case(
     problem = problem.with_engine(engine)
     lanes = _ascend(problem, points[worst], iterations) if starts else []
     price = price or (1 + 1.5 * free.size if problem.mode is DerivativeMode.FORWARD else 6.0)
-    # The worst screened point, unless an ascent has found a worse one.
+    ends = _find_ends(free, lanes)
+    if len(ends):
+        points = np.concatenate([points, ends])
+        runs = jax.tree.map(lambda *columns: np.concatenate(columns), runs, run_points(ends))
+    values = np.where(np.isnan(runs.metrics[metric]), -np.inf, runs.metrics[metric])
     i = int(np.argmax(values))
-    place, value = _values_by_path(free, points[i]), float(values[i])
-    metrics = {name: x[i] for name, x in screened.metrics.items()}
-    for lane in lanes:
-        if lane.reason is not Reason.START and -float(lane.evaluation.objective) > value:
-            place, value = free.values(jnp.asarray(lane.z)), -float(lane.evaluation.objective)
-            metrics = {name: x[0] for name, x in lane.evaluation.metrics.items()}
-    place = {path: np.asarray(x) for path, x in place.items()}
-    bad = np.flatnonzero(screened.diverged | np.isnan(screened.metrics[metric]))
+    place = _values_by_path(free, points[i])
+    bad = np.flatnonzero(runs.diverged | np.isnan(runs.metrics[metric]))
     return WorstCase(
         metric=metric,
         values=place,
-        value=value,
+        value=float(values[i]),
         corners=len(corners),
         corner=float(np.max(values[: len(corners)])),
-        screened=float(values[i]),
-        metrics={name: float(x) for name, x in metrics.items()},
+        screened=float(np.max(values[:screened])),
+        metrics={name: float(x[i]) for name, x in runs.metrics.items()},
         loop=replace(loop, place),
         rollouts=len(points) + price * sum(lane.evaluations for lane in lanes),
         bound=bound,
@@ -200,6 +211,38 @@ def worst_case(
         reasons=[lane.reason or Reason.LIMIT for lane in lanes],
         engine=describe_engine(problem.engine),
     )
+
+
+def _check_numbers(loop: Loop, objective: Objective, bound: float | None, counts: Mapping[str, int]) -> None:
+    """Raise a ValueError if the bound of the objective is not finite, or a count is no whole number or is negative."""
+    allowed = ParameterSpec(objective.unit or "1").around(units_of(loop.plant))
+    if bound is not None and not allowed.holds(bound):
+        raise ValueError(f"bound = {bound:g} is outside {allowed.interval()}")
+    for name, count in counts.items():
+        if not isinstance(count, int | np.integer) or count < 0:
+            raise ValueError(f"{name} = {count!r} is no whole number in [0, inf)")
+
+
+def _find_middle(loop: Loop, over: Mapping[str, Range]) -> dict[str, np.ndarray]:
+    """Return the middle of the box by path, without the paths that are no parameters.
+
+    Raises:
+        ValueError: A range is not a pair of finite numbers, or of arrays of the parameter's shape.
+    """
+    middle = {}
+    for path, spec, value in parameters(loop):
+        if path not in over:
+            continue
+        try:
+            ends = np.array([np.broadcast_to(end, np.shape(value)) for end in over[path]], float)
+        except (TypeError, ValueError):
+            ends = np.array([])
+        if len(ends) != 2 or not np.isfinite(ends).all():
+            shape = f" of shape {np.shape(value)}" if np.ndim(value) else ""
+            needed = f"a pair (low, high) of finite numbers{shape} in {spec.around(units_of(loop.plant)).interval()}"
+            raise ValueError(f"over: {path} = {format_value(over[path])} is not {needed}")
+        middle[path] = ends.mean(axis=0)
+    return middle
 
 
 def _draw_points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
@@ -218,6 +261,15 @@ def _values_by_path(free: FreeSpace, point: Any) -> dict[str, PyTree]:
         found[entry.path] = point[..., first : first + n].reshape((*np.shape(point)[:-1], *entry.shape))
         first += n
     return found
+
+
+def _find_ends(free: FreeSpace, lanes: list[DescentState]) -> np.ndarray:
+    """Return the ends of the ascents whose start could be run, shape (ends, p)."""
+    low, high = np.array(free.ranges).T
+    ends = [jnp.asarray(lane.z) for lane in lanes if lane.reason is not Reason.START]
+    rows = [np.concatenate([np.ravel(x) for x in free.values(z).values()]) for z in ends]
+    # Rounding of the map from z may leave the box.
+    return np.clip(np.reshape(rows, (-1, free.size)), low, high)
 
 
 def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[DescentState]:

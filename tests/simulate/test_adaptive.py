@@ -381,7 +381,7 @@ def test_the_worst_case_is_that_of_fixed_steps():
         worst_case(rig().loop, over=box, metric="max_slip", solver=solver, iterations=10)
         for solver in (d.Adaptive(1e-5, 2.5), d.FixedStep(5e-4, 2.5))
     )
-    np.testing.assert_allclose(found.value, fixed.value, rtol=1e-6)
+    np.testing.assert_allclose(found.value, fixed.value, rtol=1e-5)
     for path, value in fixed.values.items():
         np.testing.assert_allclose(found.values[path], value, rtol=1e-4)  # on which the worst hardly depends there
 
