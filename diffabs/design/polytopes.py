@@ -8,6 +8,7 @@ B) of the same parameters.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -49,7 +50,8 @@ class Polytope:
         coverage: Check of the hull, if there is one.
 
     Raises:
-        ValueError: Shapes that do not fit, numbers that are not finite, no vertex or more than 2^12.
+        ValueError: Shapes that do not fit, entries that are not finite, a period that is not positive and finite, no
+            vertex or more than 2^12.
     """
 
     A: np.ndarray
@@ -60,7 +62,7 @@ class Polytope:
     coverage: Coverage | None = None
 
     def __post_init__(self) -> None:
-        """Convert the matrices to float64 and check their shapes."""
+        """Convert the matrices to float64; check their shapes and the period."""
         for name in ("A", "B"):
             object.__setattr__(self, name, np.array(getattr(self, name), float))
         a, b = self.A.shape, self.B.shape
@@ -70,6 +72,8 @@ class Polytope:
             raise ValueError(f"a polytope of {a[0]} vertices is outside [1, {MAX_VERTICES}]: an LMI for each")
         if not (np.isfinite(self.A).all() and np.isfinite(self.B).all()):
             raise ValueError("a vertex of the polytope has an entry that is not finite")
+        if self.period is not None and not 0 < self.period < math.inf:
+            raise ValueError(f"period = {self.period:g} is outside (0, inf) s")
 
     @property
     def vertices(self) -> int:

@@ -1,13 +1,18 @@
 """Specifications of a design or a certificate; they combine freely, and all are optional."""
 
 import dataclasses
-import math
 from typing import Any
 
 import numpy as np
 
+from diffabs.core.kinds import find_value_objection, format_value
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import Matrix, Part, PyTree, Scalar
 from diffabs.linear.weights import as_weight_matrix
+
+DECAY_RANGE = ParameterSpec("1/s", low=0.0)
+DAMPING_RANGE = ParameterSpec("1", low=0.0, high=1.0, open_high=True)
+L2_RANGE = ParameterSpec("1", low=0.0, open_low=True)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,12 +87,10 @@ class Spec:
                 "Q": as_weight_matrix("Q", self.Q, order, definite=False),
                 "R": as_weight_matrix("R", self.R, inputs, definite=True),
             }
-        if not (math.isfinite(self.decay) and self.decay >= 0):
-            raise ValueError(f"decay = {self.decay:g} is outside [0, inf) 1/s")
-        if not 0 <= self.damping < 1:
-            raise ValueError(f"damping = {self.damping:g} is outside [0, 1)")
-        if self.rates is not None and not (np.isfinite(self.rates).all() and self.rates[0] <= self.rates[1]):
-            raise ValueError(f"rates = {self.rates} are not a lower and an upper bound")
+        _check_number("decay", self.decay, DECAY_RANGE)
+        _check_number("damping", self.damping, DAMPING_RANGE)
+        if self.rates is not None:
+            _check_rates(self.rates)
         limit, gain = self.input, self.l2
         if limit:
             values, points = np.atleast_1d(np.array(limit.limit, float)), np.atleast_2d(np.array(limit.points, float))
@@ -109,7 +112,22 @@ class Spec:
                 raise ValueError(f"L2 output C {c.shape} and feedthrough D {d.shape}: {needed}")
             if e is not None and not np.isfinite(e).all():
                 raise ValueError("the L2 disturbance matrix has an entry that is not finite")
-            if gain.bound is not None and not (math.isfinite(gain.bound) and gain.bound > 0):
-                raise ValueError(f"L2 bound = {gain.bound:g} is outside (0, inf)")
+            if gain.bound is not None:
+                _check_number("L2 bound", gain.bound, L2_RANGE)
             gain = L2Gain(c, d, e, gain.bound)
         return dataclasses.replace(self, **weights, input=limit, l2=gain)
+
+
+def _check_number(name: str, value: Scalar, allowed: ParameterSpec) -> None:
+    """Raise a ValueError if a value is no number, or is out of range."""
+    if find_value_objection(value) or np.ndim(value):
+        raise ValueError(f"{name} = {format_value(value)} is no number in {allowed.interval()}")
+    if not allowed.holds(value):
+        raise ValueError(f"{name} = {value:g} is outside {allowed.interval()}")
+
+
+def _check_rates(rates: PyTree) -> None:
+    """Raise a ValueError if rates are not a lower and an upper bound."""
+    if find_value_objection(rates) or np.shape(rates) != (2,) or not -np.inf < rates[0] <= rates[1] < np.inf:
+        needed = "a pair (low, high) of finite numbers with low <= high, in the parameter's unit per second"
+        raise ValueError(f"rates = {format_value(rates)} is not {needed}")

@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 Matrix = list[list[Fraction]]
 # Limits of a file: bytes; states or inputs; vertices, cells or points.
 MAX_CERTIFICATE_BYTES, MAX_STATES_OR_INPUTS, MAX_LIST_ENTRIES = 2**24, 64, 2**12
+MAX_SHOWN_ENTRIES = 64  # of a matrix in a statement; of a larger one the statement shows the sizes
 MAX_SECONDS = 6.0  # s, so that the command answers within 10 s
 _deadline: contextvars.ContextVar[tuple[float, float]] = contextvars.ContextVar(
     "deadline", default=(math.inf, math.inf)
@@ -489,9 +490,31 @@ def _describe_claim(kind: str, d: Mapping[str, Any], discrete: bool) -> str:
     if kind == "scheduled":
         low, high = (f"{float(rate):.9g}" for rate in d["rates"])
         return f"stable, with a decay of at least {pace}, while the parameter moves at {low} to {high} a second"
+    if kind == "l2":
+        matrices = ", ".join(_describe_numbers(name, d[name]) for name in ("Bw", "C", "D"))
+        gain = f"the L2 gain from w to C x + D u is below {number['gamma']:.9g}"
+        return f"{gain}, where Bw w acts on the states: {matrices}"
+    if kind == "input":
+        limits, starts = _describe_numbers("limit", d["limit"], 9), _describe_numbers("points", d["points"])
+        return f"each |u| stays below its limit from every start in the hull of the points: {limits}, {starts}"
     return {
         "decay": f"stable, with a decay of at least {pace}, however the system varies",
         "damping": f"every fixed system is damped by {number.get('zeta', 0.0):.9g} or more",
-        "l2": f"the L2 gain is below {number.get('gamma', 0.0):.9g}",
-        "input": "the input stays within its limits from the hull of the points",
     }[kind]
+
+
+def _describe_numbers(name: str, value: Any, digits: int = 6) -> str:
+    """Return the name and the entries of nested lists, or their sizes if the entries are many."""
+    sizes, part = [], value
+    while isinstance(part, list):
+        sizes.append(len(part))
+        part = part[0]
+    if math.prod(sizes) > MAX_SHOWN_ENTRIES:
+        return f"{name} of the file ({' by '.join(map(str, sizes))})"
+    return f"{name} = {_format_numbers(value, digits)}"
+
+
+def _format_numbers(value: Any, digits: int) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(_format_numbers(each, digits) for each in value)}]"
+    return f"{float(value):.{digits}g}"

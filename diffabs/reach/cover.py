@@ -9,7 +9,7 @@ Cells come from halving, and the sum of their volumes equals the volume of the b
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -99,12 +99,14 @@ def prove_box(
         threads: Number of threads; None for one for each core.
 
     Raises:
+        ValueError: A claim is about a quantity that the loop does not have.
         NoRule: A part, an operation or a parameter of the loop has no sound rule.
         NoCompiler: No C++ compiler of this machine works.
     """
     began = time.monotonic()
     paths = tuple(over)
     equations = derive_equations(loop, paths)
+    _check_claims(claims, equations.signals)
     wanted = tuple(dict.fromkeys([*signals, *(c.quantity.split()[1] for c in claims if " " in c.quantity)]))
     prover = Prover(equations, wanted, horizon)
     box = np.array([over[path] for path in paths], float)
@@ -206,6 +208,15 @@ class _Quantities:
     @property
     def unbounded(self) -> dict[str, tuple[float, float]]:
         return dict.fromkeys(self.names(), (-math.inf, math.inf))
+
+
+def _check_claims(claims: Sequence[RunClaim], signals: Collection[str]) -> None:
+    """Raise a ValueError if a claim is about a quantity that is not of these signals, the stop time or distance."""
+    known = _Quantities(tuple(signals)).names()
+    for claim in claims:
+        if claim.quantity not in known:
+            names = f"stop_time, stop_distance, and greatest NAME or least NAME of a signal: {', '.join(signals)}"
+            raise ValueError(f"claims: {claim.quantity!r} is no quantity of this loop; there is {names}")
 
 
 def _satisfy(quantities: _Quantities, claims: Sequence[RunClaim], found: CellBounds) -> np.ndarray:

@@ -14,12 +14,14 @@ from fractions import Fraction
 import checker
 import numpy as np
 import pytest
+from mutants import killed_by
 from project import ROOT
 from seams import replace_seam
 
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
+from diffabs.design.spec import L2Gain, Spec
 
 OUTSIDERS = ROOT / "experiments" / "check_certificate.py"
 spec = importlib.util.spec_from_file_location("check_certificate", OUTSIDERS)
@@ -799,3 +801,23 @@ def test_costs_are_rounded_up_and_only_claimed_until_proved():
     assert unproved.summary()["guaranteed_cost"] is None
     discrete = Certificate(scalar(0.5, 0.1), [[0.0]], (Claim("decay", {"P": [[1.0]], "factor": 0.6}),))
     assert discrete.decay_rate == -np.log(0.6) / 0.1
+
+
+@killed_by("design/spec.py", "if find_value_objection(value) or np.ndim(value):", "if False:", case="text")
+@killed_by("design/spec.py", "np.shape(rates) != (2,)", "False", case="one rate")
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        pytest.param({"decay": "2"}, r"decay = '2' is no number in \[0, inf\) 1/s", id="text"),
+        pytest.param({"decay": (1.0, 2.0)}, r"decay = \(1.0, 2.0\) is no number in \[0, inf\) 1/s", id="two numbers"),
+        pytest.param({"damping": "a"}, r"damping = 'a' is no number in \[0, 1\)", id="damping"),
+        pytest.param({"l2": L2Gain([[1.0]], bound="1")}, r"L2 bound = '1' is no number in \(0, inf\)", id="bound"),
+        pytest.param({"rates": 1.0}, r"rates = 1.0 is not a pair \(low, high\) of finite numbers", id="one rate"),
+        pytest.param({"rates": (1.0, "2")}, r"rates = \(1.0, '2'\) is not a pair", id="rate of text"),
+        pytest.param({"rates": (2.0, 1.0)}, r"rates = \(2.0, 1.0\) is not a pair", id="inverted"),
+        pytest.param({"rates": (0.0, math.nan)}, r"rates = \(0.0, nan\) is not a pair", id="nan"),
+    ],
+)
+def test_a_specification_says_what_does_not_fit(given, message):
+    with pytest.raises(ValueError, match=message):
+        Spec(**given).check(1, 1)

@@ -5,6 +5,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 from seams import replace_seam
@@ -12,6 +13,7 @@ from seams import replace_seam
 from diffabs.actuators import Lag
 from diffabs.core.pytree import param, pytree, replace
 from diffabs.design.parameter_box import polytope, schedule
+from diffabs.design.polytopes import Polytope
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.plants import MirroredRig
@@ -287,6 +289,13 @@ MANY = pytree(
 def test_errors(model, over, message):
     with pytest.raises(ValueError, match=message):
         polytope(model, over)
+
+
+@killed_by("design/polytopes.py", "not 0 < self.period < math.inf", "not self.period < math.inf", case="-1.0")
+@pytest.mark.parametrize("period", [-1.0, 0.0, np.nan, np.inf])
+def test_a_period_that_is_not_positive_is_refused(period):
+    with pytest.raises(ValueError, match=rf"period = {period:g} is outside \(0, inf\) s"):
+        Polytope([[[0.5]]], [[[1.0]]], period)
 
 
 def test_matrices_that_are_not_finite():

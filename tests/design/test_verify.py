@@ -212,6 +212,43 @@ def test_what_it_says(tmp_path):
     assert (found["proved"], found["claims"][0]["proved"], found["claims"][0]["reason"]) == (True, True, "")
 
 
+LARGE = Certificate(Polytope([-np.eye(64)], [np.ones((64, 1))]), np.zeros((1, 64)), (
+    Claim("input", {"P": np.eye(64), "limit": [1.0], "points": np.full((2, 64), 0.1)}),
+))  # fmt: skip
+DISTURBED = {"P": np.eye(2), "gamma": 2.5, "Bw": [[[1 / 3], [0.0]]], "C": np.eye(2), "D": [[0.0], [1.0]]}
+
+
+@killed_by("design/verify.py", '("Bw", "C", "D"))', '("C", "D"))', case="l2")
+@killed_by("design/verify.py", "if math.prod(sizes) > MAX_SHOWN_NUMBERS:", "if False:", case="large")
+@pytest.mark.parametrize(
+    ("proof", "statement"),
+    [
+        pytest.param(
+            certificate("l2", **DISTURBED),
+            "the L2 gain from w to C x + D u is below 2.5, where Bw w acts on the states:"
+            " Bw = [[[0.333333], [0]]], C = [[1, 0], [0, 1]], D = [[0], [1]]",
+            id="l2",
+        ),
+        pytest.param(
+            certificate("input", P=np.eye(2), limit=[0.123456789], points=[[0.5, -0.5]]),
+            "each |u| stays below its limit from every start in the hull of the points:"
+            " limit = [0.123456789], points = [[0.5, -0.5]]",
+            id="input",
+        ),
+        pytest.param(
+            LARGE,
+            "each |u| stays below its limit from every start in the hull of the points:"
+            " limit = [1], points of the file (2 by 64)",
+            id="large",
+        ),
+    ],
+)
+def test_a_statement_has_its_numbers(tmp_path, proof, statement):
+    """Nothing else in a file ties a claim to its disturbance, output, limits and starts."""
+    (verdict,) = verify.verify_file(saved(proof, tmp_path))
+    assert (verdict.says, verdict.reason) == (statement, "")
+
+
 @pytest.mark.slow
 def test_the_checker_imports_no_solver_and_no_diffabs(tmp_path):
     path = saved(certificate("decay", P=np.eye(2), rate=0.5), tmp_path)

@@ -196,6 +196,14 @@ def test_without_time_nothing_is_decided() -> None:
     assert proof.bounds["stop_time"] == (-math.inf, math.inf)
 
 
+@killed_by("reach/cover.py", "    _check_claims(claims, equations.signals)\n", "", case="largest slip")
+@pytest.mark.parametrize("quantity", ["overshoot", "largest slip", "greatest slop", "greatest slip speed"])
+def test_a_claim_about_no_quantity_is_refused(quantity: str) -> None:
+    message = f"claims: '{quantity}' is no quantity of this loop; there is stop_time, stop_distance, and .* slip, speed"
+    with pytest.raises(ValueError, match=message):
+        prove_box(load("slip-lmi", LIMITED).loop, SMALL, [RunClaim(quantity, 0.34)], horizon=2.0)
+
+
 @killed_by("reach/cover.py", "again = now[~fine]\n", "again = now[~fine][1:]\n")
 def test_cells_cover_the_box() -> None:
     worst = max(rig_run(m, v)[0] for m in SMALL["plant.mass"] for v in SMALL["initial.speed"])
