@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import io
 import multiprocessing
 import os
 import shlex
@@ -135,6 +136,12 @@ def describe_source(chosen: Scenario) -> JsonObject:
         chosen: Scenario.
     """
     return {"scenario": chosen.name, "model": describe_model(chosen), "made": describe_run()}
+
+
+def escape_unencodable_output() -> None:
+    """Make stdout write escapes in place of characters that its encoding lacks, as stderr does."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def say(line: str) -> None:
@@ -332,7 +339,7 @@ def _wait_for_interrupt(thread: threading.Thread) -> bool:
 
 
 def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: bool = True) -> Scenario:
-    """Return a scenario, and write a warning for each value that is allowed but probably a mistake.
+    """Return a scenario, and write its notes and a warning for each value that is allowed but probably a mistake.
 
     Args:
         scenario: Name of a packaged scenario, or path of a TOML file.
@@ -343,6 +350,8 @@ def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: b
         ScenarioError: As in `load`.
     """
     chosen = run_with_progress(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
+    for line in chosen.notes:
+        say(f"note: {line}")
     for line in chosen.cautions():
         say(f"warning: {line}")
     return chosen

@@ -12,7 +12,6 @@ gc.disable()  # during imports: collections would scan all of JAX's objects, a s
 import contextlib
 import dataclasses
 import importlib
-import itertools
 import math
 import pathlib
 from collections.abc import Iterator
@@ -134,7 +133,8 @@ def simulate(
             console.fail("--from-sweep DIR and --sample N need each other")
         if from_sweep and (changes or seed is not None):
             console.fail("--from-sweep runs a sample unchanged: --set and --seed do not apply")
-        _check_targets({"csv": csv, "mat": mat, "plot": plot})
+        targets.check_picture(plot)
+        targets.check_mat(mat)
         kept = bool(csv or mat or plot)
         with contextlib.ExitStack() as files:
             csv_file = files.enter_context(targets.new_target_file(csv, "--csv"))
@@ -196,16 +196,6 @@ def _warnings(chosen: Scenario, run: Run, limited: float) -> Iterator[str]:
         limits, unit = at_limits(chosen.loop), chosen.loop.plant.control_unit
         ends = f"{float(limits.low):g} to {float(limits.high):g} {unit}"
         yield f"the control is at a limit ({ends}) for {100 * limited:.0f} % of the run: gains hardly matter there"
-
-
-def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
-    """Raise typer.Exit for files that cannot be written, or that are the same file."""
-    targets.check_picture(wanted["plot"])
-    targets.check_mat(wanted["mat"])
-    places = {name: targets.resolve_path(path, f"--{name}") for name, path in wanted.items() if path}
-    for one, other in itertools.combinations(places, 2):
-        if places[one] == places[other]:
-            console.fail(f"--{one} and --{other} are the same file, {wanted[one]}")
 
 
 def _run(chosen: Scenario, key: Key, keep: bool) -> tuple[Run, float]:

@@ -166,17 +166,13 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
     if found.reason:
         console.fail(f"{file}: not proved: {found.reason}", console.FAILED)
     if not as_json:
-        console.say(f"for every {_describe_box(box)} of the scenario in the file, whatever its title says")
+        said = show_proofs.describe_box(box, chosen, digits=9)
+        console.say(f"for every {said} of the scenario in the file, whatever its title says")
 
 
 def _describe_claim(claim: "RunClaim") -> str:
     """Return a claim in words."""
     return f"{claim.quantity} {'>=' if claim.quantity.startswith('least') else '<='} {claim.bound:.6g}"
-
-
-def _describe_box(box: Mapping[str, Sequence[float]]) -> str:
-    """Return a box in words, in SI units with all digits that matter."""
-    return ", ".join(f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in box.items())
 
 
 class _Side(NamedTuple):
@@ -283,6 +279,8 @@ def _read_claim(text: str, chosen: Scenario) -> "RunClaim":
     if not math.isfinite(bound):
         raise ScenarioError(f"--claim {text} needs a finite number: {name}=BOUND")
     if name == OVERSHOOT:
+        if bound < 0:  # the metric is 0 for every run below its target
+            raise ScenarioError(f"--claim {OVERSHOOT} = {bound:g} is outside [0, inf)")
         below = 1 - 2.0**-50  # the product is rounded, and the target may be a rounded decimal
         return RunClaim("greatest slip", (1 + bound) * _target(chosen) * below)
     if name in TIMES:

@@ -1,10 +1,13 @@
 """The view of a proof over a box."""
 
+from collections.abc import Mapping, Sequence
+
 from rich.table import Table
 
 from diffabs.cli.console import say
 from diffabs.cli.tables import show_titled_table
 from diffabs.core.types import JsonObject
+from diffabs.scenario.parameter_paths import parameters_of
 from diffabs.scenario.scenario import Scenario
 
 
@@ -15,11 +18,11 @@ def show_box_proof(result: JsonObject, chosen: Scenario) -> None:
         result: JSON document of the proof.
         chosen: Scenario.
     """
-    box = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in result["over"].items())
+    box = describe_box(result["over"], chosen)
     table = Table("quantity", "proved from", "to", "unit", "worst run found", "looseness")
     for name, row in result["bounds"].items():
-        ends = ("" if row[key] is None else f"{row[key]:.6g}" for key in ("low", "high"))
-        worst = f"{row['worst_run']:.6g}" if "worst_run" in row else ""
+        ends = ("" if row[key] is None else f"{row[key]:z.6g}" for key in ("low", "high"))
+        worst = f"{row['worst_run']:z.6g}" if "worst_run" in row else ""
         loose = f"{100 * row['looseness']:.2g} %" if row.get("looseness") is not None else ""
         table.add_row(name, *ends, row["unit"], worst, loose)
     if result["verdict"] == "proved":
@@ -28,3 +31,16 @@ def show_box_proof(result: JsonObject, chosen: Scenario) -> None:
         relation = ">=" if claim["quantity"].startswith("least") else "<="
         say(f"{result['verdict']}: {claim['quantity']} {relation} {claim['bound']:.6g}")
     say(f"{result['cells']:,} cells proved, {result['tried']:,} tried, {result['seconds']:.1f} s")
+
+
+def describe_box(box: Mapping[str, Sequence[float]], chosen: Scenario, digits: int = 6) -> str:
+    """Return a box in words, in SI units.
+
+    Args:
+        box: Range (low, high) of each parameter by path.
+        chosen: Scenario with the parameters.
+        digits: Significant digits.
+    """
+    there = parameters_of(chosen.loop)
+    units = {path: "" if there[path][0].unit == "1" else f" {there[path][0].unit}" for path in box}
+    return ", ".join(f"{path} {low:.{digits}g} to {high:.{digits}g}{units[path]}" for path, (low, high) in box.items())

@@ -29,6 +29,7 @@ from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.drive.engine import EngineError
+from diffabs.sweep.sampling import MAX_UINT32
 
 if TYPE_CHECKING:
     from diffabs.sweep import Results, Study
@@ -65,8 +66,8 @@ def sweep(
     Parameters vary as [sweep.over] says. Statistics have confidence intervals."""
     with console.end_on_errors():
         _check_options(engine, on, scheduler, workers, devices, figures)
-        if samples is not None and samples < 1:
-            console.fail(f"--samples {samples} is not positive")
+        if samples is not None and not 1 <= samples <= MAX_UINT32:
+            console.fail(f"--samples {samples} is outside [1, {MAX_UINT32}]")
         if devices:
             jax.config.update("jax_num_cpu_devices", devices)
         chosen = console.load_scenario(

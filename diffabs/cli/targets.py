@@ -2,13 +2,49 @@
 
 import contextlib
 import importlib.util
+import itertools
+import os
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from diffabs.cli.console import fail, need_matplotlib
 from diffabs.runtime import files
+from diffabs.scenario import outside
+from diffabs.scenario.scenario import names
 
 PICTURES = (".png", ".pdf", ".svg")
+OUTPUTS = ("csv", "mat", "out", "plot")  # arguments of commands that name what is written
+INPUTS = {"scenario": "the scenario", "data": "the file of --data", "source": "the result"}  # and what is read
+
+
+def check_distinct(given: Mapping[str, Any]) -> None:
+    """Check that a command writes no file twice, and no file that it reads.
+
+    Args:
+        given: Arguments of the command by name.
+
+    Raises:
+        typer.Exit: Two of the files are the same, or a file cannot be written.
+    """
+    wanted = {f"--{name}": given[name] for name in OUTPUTS if given.get(name)}
+    places = {option: resolve_path(path, option) for option, path in wanted.items()}
+    for one, other in itertools.combinations(places, 2):
+        if places[one] == places[other]:
+            fail(f"{one} and {other} are the same file, {wanted[one]}")
+    for option, (what, source) in itertools.product(places, _find_inputs(given)):
+        if os.path.isfile(source) and places[option].exists() and os.path.samefile(source, places[option]):
+            fail(f"{option} {wanted[option]} is {what} itself")
+
+
+def _find_inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, str | pathlib.Path]]:
+    """Yield word and path of each file that a command reads: its inputs, and the modules with parts from outside."""
+    for name, what in INPUTS.items():
+        is_packaged = name == "scenario" and given.get(name) in names()
+        if given.get(name) and not is_packaged:
+            yield what, given[name]
+    for module in outside.registered_modules():
+        yield f"the module {module.__name__}", getattr(module, "__file__", None) or ""
 
 
 def check_picture(plot: pathlib.Path | None) -> None:

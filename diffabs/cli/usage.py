@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from diffabs.cli import console
+from diffabs.cli import console, targets
 from diffabs.core.types import PyTree, Scalar
 from diffabs.scenario.registry import register_parts
 
@@ -34,8 +34,12 @@ class Group(typer.core.TyperGroup):
         """
         given = more.get("args", args[0] if args else None)
         console.note_command(sys.argv[1:] if given is None else given)
+        console.escape_unencodable_output()
         try:
-            status = super().main(*args, standalone_mode=False, **more)
+            with console.end_on_errors():
+                status = super().main(*args, standalone_mode=False, **more)
+        except typer.Exit as left:
+            status = left.exit_code
         except UsageError as error:
             if type(error).__name__ == "NoArgsIsHelpError":
                 error.show()
@@ -65,6 +69,7 @@ def add_command(app: typer.Typer, function: Callable[..., PyTree], example: str,
         console.quieten(quiet)
         with console.end_on_errors():
             register_parts(parts or ())
+            targets.check_distinct(given)
         return function(*args, **given)
 
     signature = inspect.signature(function)

@@ -31,8 +31,8 @@ class StateFeedback:
     """
 
     gain: Vector = param(default=(-11753.0, -48.0), unit="control/signal/s, control/signal")
-    torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
-    torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
+    torque_min: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
     antiwindup: Part = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:

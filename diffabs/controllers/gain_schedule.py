@@ -39,8 +39,8 @@ class ScheduledFeedback:
     speeds: Vector = param(default=(5 / 3.6, 50 / 3.6), unit="m/s", low=0.0, free=True)
     integral_gains: Vector = param(default=(-11753.0, -11753.0), unit="control/signal/s", free=True)
     gains: Vector = param(default=(-58.0, -158.0), unit="control/signal", free=True)
-    torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
-    torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
+    torque_min: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
     antiwindup: Part = part(default=NoAntiWindup)
 
     start, limits = StateFeedback.start, StateFeedback.limits
@@ -104,8 +104,8 @@ class ProportionalFeedback:
 
     gain: Vector = param(default=(-11753.0, -158.0), unit="control/signal/s, control/signal")
     reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
-    torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
-    torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
+    torque_min: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
     antiwindup: Part = part(default=NoAntiWindup)
 
     start, limits = StateFeedback.start, StateFeedback.limits

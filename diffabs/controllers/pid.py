@@ -51,8 +51,8 @@ class PID:
     ki: Scalar = param(default=0.0, unit="control/signal/s", low=0.0)
     kd: Scalar = param(default=0.0, unit="control s/signal", low=0.0)
     cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
-    low: Scalar = param(default=-np.inf, unit="control", infinite=True)
-    high: Scalar = param(default=np.inf, unit="control", infinite=True)
+    low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
     antiwindup: Part = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:

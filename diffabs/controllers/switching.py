@@ -93,8 +93,8 @@ class SlidingMode:
 
     gain: Scalar = param(default=90.0, unit="control", low=0.0)
     boundary: Scalar = param(default=0.02, unit="signal", above=0.0)
-    low: Scalar = param(default=-np.inf, unit="control", infinite=True)
-    high: Scalar = param(default=np.inf, unit="control", infinite=True)
+    low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
 
     start = no_memory
     flow = no_flow

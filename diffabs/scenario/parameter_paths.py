@@ -156,19 +156,23 @@ def to_canonical_form(table: JsonObject) -> JsonObject:
     return table
 
 
-def forget_replaced_part(table: JsonObject, replaced: str) -> None:
-    """Remove the entries for parameters of a replaced part from the tables with parameter keys.
+def forget_replaced_part(table: JsonObject, replaced: str) -> list[str]:
+    """Remove the entries for parameters of a replaced part from the tables with parameter keys, and return their paths.
 
-    The new part has other parameters.
+    The new part has other parameters. One with the same name may have another meaning, and another range.
 
     Args:
         table: Sections of the scenario, changed in place.
         replaced: Path of the part.
     """
+    removed = []
     for section, name in TABLES:
         inside = table.get(section)
         if isinstance(inside, dict) and isinstance(inside.get(name), dict):
-            inside[name] = {k: v for k, v in inside[name].items() if not k.startswith(f"{canonical_path(replaced)}.")}
+            old = [key for key in inside[name] if key.startswith(f"{canonical_path(replaced)}.")]
+            inside[name] = {key: value for key, value in inside[name].items() if key not in old}
+            removed += [_where(f"{section}.{name}", key) for key in old]
+    return removed
 
 
 def join_path_keys(keys: list[str]) -> list[str]:

@@ -77,6 +77,7 @@ class Scenario:
         design: Section `[design]`.
         tune: Section `[tune]`.
         sweep: Section `[sweep]`.
+        notes: One line for each override that replaces a part and so removes entries of the sections.
     """
 
     name: str
@@ -89,6 +90,7 @@ class Scenario:
     design: section_design.DesignTask = dataclasses.field(default_factory=section_design.DesignTask)
     tune: section_tune.Goal = dataclasses.field(default_factory=section_tune.Goal)
     sweep: section_sweep.SweepSection = dataclasses.field(default_factory=section_sweep.SweepSection)
+    notes: tuple[str, ...] = ()
 
     def key(self) -> jax.Array:
         """Return the random key of a run, `jax.random.key(seed)`."""
@@ -172,15 +174,14 @@ def loads(
     """
     table = _parse(raw, origin)
     before = {family: type_name(table.get(family)) for family in FAMILIES}
-    for override in overrides:
-        _override(table, override)
+    notes = [note for override in overrides if (note := _override(table, override))]
     _refuse(_without_inner(before, table))
     if overrides:
         # The texts of the file may be wrong for other values; a text that an override sets itself stays.
         said = {override.partition("=")[0].strip() for override in overrides}
         texts = {"title": make_printable(f"{name} with {', '.join(overrides)}"), "description": ""}
         table |= {key: text for key, text in texts.items() if key not in said}
-    scenario = _assemble(name, table, folder)
+    scenario = _assemble(name, table, folder, notes)
     asked = (scenario.loop, scenario.solver)
     _refuse(find_mismatches(*asked), find_unstable_step(*asked) if integrated else ())
     return scenario
@@ -210,6 +211,8 @@ def _refuse(*objections: Iterable[str]) -> None:
 
 
 def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
+    if not str(name_or_path):
+        raise ScenarioError("the name of the scenario is empty")
     path, quoted = pathlib.Path(name_or_path), format_given(str(name_or_path), MAX_PATH_LENGTH)
     if str(name_or_path) in names():
         file = importlib.resources.files("diffabs") / "scenarios" / f"{name_or_path}.toml"
@@ -231,9 +234,9 @@ def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
 def _parse(raw: bytes, origin: str) -> JsonObject:
     quoted = format_given(origin, MAX_PATH_LENGTH)
     try:
-        return parameter_paths.to_canonical_form(toml.parse_toml(raw.decode()))
+        return parameter_paths.to_canonical_form(toml.parse_toml(raw.decode("utf-8-sig")))
     except UnicodeDecodeError as error:
-        line = raw.count(b"\n", 0, error.start) + 1
+        line = error.object.count(b"\n", 0, error.start) + 1
         raise ScenarioError(f"{quoted} is not UTF-8 text (at line {line})") from None
     except ScenarioError as error:
         raise ScenarioError(f"{quoted} is not a scenario: {error}") from None
@@ -241,7 +244,8 @@ def _parse(raw: bytes, origin: str) -> JsonObject:
         raise ScenarioError(f"{quoted} is not TOML: {error}") from None
 
 
-def _override(table: JsonObject, override: str) -> None:
+def _override(table: JsonObject, override: str) -> str:
+    """Change the table by an override, and return a note on the entries that it removes; empty for none."""
     path, equals, text = override.partition("=")
     keys = path.strip().split(".")
     if not equals or not all(keys):
@@ -277,8 +281,11 @@ def _override(table: JsonObject, override: str) -> None:
         raise ScenarioError(f"override {format_given(override)}: {error}") from None
     parameter_paths.to_canonical_form(table)
     new = node[place]
-    if isinstance(new, str) or (isinstance(new, dict) and "type" in new):
-        parameter_paths.forget_replaced_part(table, ".".join(keys))
+    part = new.get("type") if isinstance(new, dict) else new
+    removed = parameter_paths.forget_replaced_part(table, ".".join(keys)) if isinstance(part, str) else []
+    if not removed:
+        return ""
+    return f"{'.'.join(keys)}={part} removes {', '.join(removed)} of the replaced part"
 
 
 def _place(node: Any, key: str, path: str) -> Any:
@@ -290,7 +297,7 @@ def _place(node: Any, key: str, path: str) -> Any:
     return int(key)
 
 
-def _assemble(name: str, table: JsonObject, folder: pathlib.Path) -> Scenario:
+def _assemble(name: str, table: JsonObject, folder: pathlib.Path, notes: Iterable[str]) -> Scenario:
     texts = {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
     sections = {key: value for key, value in table.items() if key not in OTHER_SECTIONS}
     if "road" in table:
@@ -320,6 +327,7 @@ def _assemble(name: str, table: JsonObject, folder: pathlib.Path) -> Scenario:
         design=section_design.read_design_section(table.get("design", {}), loop),
         tune=section_tune.read_tune_section(table.get("tune", {}), loop, objectives),
         sweep=section_sweep.read_sweep_section(table.get("sweep", {}), loop, objectives, folder),
+        notes=tuple(notes),
     )
 
 

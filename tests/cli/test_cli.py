@@ -1,5 +1,6 @@
 """The command line as a script sees it: exit status, stdout, stderr, and the files it leaves."""
 
+import io
 import json
 import math
 import os
@@ -16,8 +17,10 @@ import numpy as np
 import pytest
 import typer
 from commands import assert_one_error_line, left_in, run, umask
+from mutants import killed_by
 from project import ROOT
 from seams import replace_seam
+from typer.testing import CliRunner
 
 import diffabs
 from diffabs.cli import main
@@ -338,6 +341,34 @@ def test_show_prints_a_scenario_to_start_from(tmp_path):
     assert first["metrics"] == second["metrics"]
     assert first["parameters"] == second["parameters"]
     assert first["title"] == second["title"] == "slip-lmi with plant.mass=6.2, " + ", ".join(SHORT[1::2])
+
+
+def test_a_removed_entry_is_a_note():
+    changes = ("--set", "controller=relay")
+    note = "note: controller=relay removes tune.free.controller.gain of the replaced part"
+    assert note in run("show", "slip-lmi", *changes).stderr.splitlines()
+    assert run("show", "slip-lmi", *changes, "-q").stderr == ""
+
+
+@killed_by("cli/usage.py", "        console.escape_unencodable_output()\n", "")
+def test_a_title_that_stdout_cannot_encode_is_escaped(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("title = 'ブレーキ'", encoding="utf-8")
+    result = CliRunner(charset="latin-1").invoke(main.app, ["show", str(path)])
+    assert result.exit_code == 0
+    assert r'title = "\u30d6\u30ec\u30fc\u30ad"' in result.stdout
+
+
+def test_help_on_a_full_disk_is_one_error_line(monkeypatch, capsys):
+    class Full(io.StringIO):
+        def write(self, text):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(sys, "stdout", Full())
+    with pytest.raises(SystemExit) as left:
+        main.app(["--help"])
+    assert left.value.code == 1
+    assert capsys.readouterr().err == "error: [Errno 28] No space left on device\n"
 
 
 @pytest.mark.slow

@@ -11,7 +11,9 @@ from commands import run
 from marks import cases
 from mutants import killed_by
 
+from diffabs.cli.show_proofs import show_box_proof
 from diffabs.scenario.outside import lend_modules
+from diffabs.scenario.scenario import load
 
 pytestmark = pytest.mark.usefixtures("native_prover")
 EXAMPLES = pathlib.Path(__file__).parents[2] / "examples"
@@ -72,3 +74,19 @@ def test_the_command_of_the_readme_proves_the_cured_loop() -> None:
     found = json.loads(run(*command.split(), "--json").stdout)
     assert found["verdict"] == "proved"
     assert found["bounds"]["greatest slip"]["high"] <= 0.2017
+
+
+def test_the_table_of_a_proof_has_units_and_no_negative_zero(capsys: pytest.CaptureFixture[str]) -> None:
+    proof = {
+        "verdict": "proved",
+        "over": {"initial.speed": [5.0, 10.0], "reference.slip": [0.1, 0.2]},
+        "bounds": {"least slip": {"low": -0.0, "high": None, "unit": "1"}},
+        "claims": [],
+        "cells": 1,
+        "tried": 1,
+        "seconds": 0.0,
+    }
+    show_box_proof(proof, load("slip-lmi", integrated=False))
+    shown = capsys.readouterr().out
+    assert "proved for every initial.speed 5 to 10 m/s, reference.slip 0.1 to 0.2\n" in shown
+    assert "-0" not in shown

@@ -3,13 +3,19 @@
 A refusal is one line on stderr, nothing on stdout, no file, and nothing dear is computed first."""
 
 import shlex
+import types
+from pathlib import Path
+from typing import get_type_hints
 
 import pytest
-from commands import assert_one_error_line, left_in, run
+import typer
+from commands import assert_one_error_line, run
 from marks import readable_id
 from mutants import killed_by
 from seams import replace_seam
 from small_scenarios import IDENTIFY, MEASUREMENTS, RARE, SWEEP, TUNE
+
+from diffabs.cli import main, targets
 
 FILES = {
     "identify.toml": IDENTIFY,
@@ -35,6 +41,23 @@ REFUSALS = [
     ("design", 2, ["missing argument"]),
     ("simulat", 2, ["Did you mean 'simulate'?"]),
     ("simulate a 'b\nc'", 2, ["unexpected extra argument"]),
+    # files that are inputs or that other options name
+    ("simulate tune.toml --mat ./tune.toml", 2, ["--mat tune.toml is the scenario itself"]),
+    ("design tune.toml --out tune.toml", 2, ["--out tune.toml is the scenario itself"]),
+    ("export tune.toml -o tune.toml", 2, ["--out tune.toml is the scenario itself"]),
+    ("show tune.toml --out tune.toml", 2, ["--out tune.toml is the scenario itself"]),
+    ("tune tune.toml --out tune.toml", 2, ["--out tune.toml is the scenario itself"]),
+    ("sweep sweep.toml --out sweep.toml", 2, ["--out sweep.toml is the scenario itself"]),
+    (
+        "identify identify.toml --data run.csv --free plant.mass --out run.csv",
+        2,
+        ["--out run.csv is the file of --data itself"],
+    ),
+    (
+        "prove slip-lmi --over plant.mass=5:6 --out a.png --plot ./a.png",
+        2,
+        ["--out and --plot are the same file, a.png"],
+    ),
     # prove
     ("prove slip-lmi", 2, ["missing option '--over'"]),
     ("prove slip-lmi --over plant.mass", 2, ['--over "plant.mass" is not of the form path=low:high']),
@@ -44,6 +67,7 @@ REFUSALS = [
     ("prove slip-lmi --over plant.mass=5:6 --claim max_slp=1", 2, ["did you mean max_slip?"]),
     ("prove slip-lmi --over plant.mass=5:6 --claim max_slip=x", 2, ["needs a finite number: max_slip=BOUND"]),
     ("prove slip-lmi --over plant.mass=5:6 --claim overshoot=nan", 2, ["needs a finite number: overshoot=BOUND"]),
+    ("prove slip-lmi --over plant.mass=5:6 --claim overshoot=-1", 2, ["--claim overshoot = -1 is outside [0, inf)"]),
     ("prove slip-lmi --over plant.mass=5:6 --claim no_lock=1", 2, ["no_lock has no bound"]),
     ("prove slip-lmi --over plant.mass=5:6 --budget 0", 2, ["--budget = 0 is outside (0, inf) s"]),
     (
@@ -68,6 +92,7 @@ REFUSALS = [
     # simulate
     ("simulate slip-lim", 2, ["did you mean slip-lmi?"]),
     ("simulate none.toml", 2, ["No such file"]),
+    ("simulate ''", 2, ["the name of the scenario is empty"]),
     ("simulate slip-lmi --set plant.mass=-1", 2, ["plant.mass = -1 is outside (0, inf) kg"]),
     ("simulate slip-lmi --set road.w4=nan", 2, ["road.w4 = nan is outside [0, inf)"]),
     ("simulate slip-lmi --set contrller.gain=1,2", 2, ["did you mean controller?"]),
@@ -170,14 +195,14 @@ REFUSALS = [
         ["design.Q has shape (3,); it needs (2, 2), or its diagonal (2,); the states are"],
     ),
     ("certify slip-lmi --set design.R=1,1", 2, ["design.R has shape (2,); it needs (1, 1)"]),
-    ("certify slip-lmi --set controller=relay", 2, ["controller relay is not linear"]),
+    ("certify slip-lmi -q --set controller=relay", 2, ["controller relay is not linear"]),
     ("certify slip-lmi --set design.over.plant.mas=1,2", 2, ["did you mean plant.mass?"]),
     ("certify slip-lmi --out none/c.json", 2, ["No such file or directory"]),
     ("certify slip-lmi --out .", 2, ["is not a regular file"]),
     # tune
     ("tune tune.toml --set 'tune.free={}'", 2, ["tune.free is empty", '"controller.gain" = ']),
     ("tune tune.toml --set 'tune.objective={}'", 2, ["tune.objective is empty", "iae = 1.0"]),
-    ("tune tune.toml --set controller=relay", 2, ["tune.free is empty"]),
+    ("tune tune.toml -q --set controller=relay", 2, ["tune.free is empty"]),
     (
         "tune tune.toml --set controller.gain=-4000,-70",
         2,
@@ -203,13 +228,13 @@ REFUSALS = [
     ("tune tune.toml --out tuned", 2, ["--out tuned: the name must end in .toml"]),
     ("tune tune.toml --out none/c.toml", 2, ["No such file or directory"]),
     (
-        "tune tune.toml --set tune.decay=9 --set controller=relay --set tune.free.reference.slip=0.1,0.3",
+        "tune tune.toml -q --set tune.decay=9 --set controller=relay --set tune.free.reference.slip=0.1,0.3",
         2,
         ["not linear"],
     ),
     # sweep
-    ("sweep sweep.toml --samples 0", 2, ["--samples 0 is not positive"]),
-    ("sweep sweep.toml --samples -5", 2, ["--samples -5 is not positive"]),
+    ("sweep sweep.toml --samples 0", 2, ["--samples 0 is outside [1, 4294967295]"]),
+    ("sweep sweep.toml --samples -5", 2, ["--samples -5 is outside [1, 4294967295]"]),
     ("sweep sweep.toml --set sweep.samples=-5", 2, ["sweep.samples = -5 is outside [0, 4294967295]"]),
     ("sweep sweep.toml --set sweep.chunk=0", 2, ["sweep.chunk = 0 is outside [1, 1048576]"]),
     ("sweep sweep.toml --seed -1", 2, ["sweep.seed = -1 is outside"]),
@@ -265,6 +290,12 @@ REFUSALS = [
 @killed_by(
     "cli/certificates.py", "    if len(values) != len(states):", "    if False:", case="certify slip-lmi --gain=1,2,3"
 )
+@killed_by(
+    "cli/targets.py",
+    "if os.path.isfile(source) and",
+    "if False and",
+    case="design tune.toml --out tune.toml",
+)
 @pytest.mark.usefixtures("any_step_is_stable")
 @pytest.mark.parametrize(("command", "status", "needed"), REFUSALS, ids=[readable_id(row[0]) for row in REFUSALS])
 def test_a_refusal_is_one_line_and_leaves_nothing(command, status, needed, tmp_path, monkeypatch):
@@ -280,4 +311,37 @@ def test_a_refusal_is_one_line_and_leaves_nothing(command, status, needed, tmp_p
     assert_one_error_line(result)
     for text in needed:
         assert text.lower() in result.stderr.lower()
-    assert left_in(tmp_path) == set(FILES)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == FILES
+
+
+FOLDERS_AND_PROOFS = {"file", "first", "from_sweep", "proof", "second"}  # that no command with an output file reads
+
+
+def test_every_file_of_a_command_is_known_as_read_or_written():
+    for command in main.app.registered_commands:
+        paths = {name for name, hint in get_type_hints(command.callback).items() if hint in (Path, Path | None)}
+        assert paths <= {*targets.OUTPUTS, *targets.INPUTS, *FOLDERS_AND_PROOFS}, command.name
+
+
+def refuse_outputs(capsys: pytest.CaptureFixture, **given: str | Path) -> str:
+    with pytest.raises(typer.Exit):
+        targets.check_distinct(given)
+    return capsys.readouterr().err
+
+
+def test_a_link_to_the_scenario_and_a_module_are_inputs(tmp_path, monkeypatch, capsys):
+    scenario, link, module = (tmp_path / name for name in ("mine.toml", "link.toml", "mine.py"))
+    scenario.write_text("")
+    module.write_text("")
+    link.symlink_to(scenario)
+    assert f"--out {link} is the scenario itself" in refuse_outputs(capsys, scenario=str(scenario), out=link)
+    parts = types.ModuleType("mine")
+    parts.__file__ = str(module)
+    replace_seam(monkeypatch, "outside_named", {"mine": parts})
+    assert f"--csv {module} is the module mine itself" in refuse_outputs(capsys, scenario="slip-lmi", csv=module)
+
+
+def test_a_file_with_a_packaged_name_is_no_input(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("slip-lmi").write_text("old")
+    targets.check_distinct({"scenario": "slip-lmi", "csv": Path("slip-lmi")})

@@ -254,6 +254,18 @@ def test_default_members_of_a_tuple_can_be_changed(file):
     assert s.loop.plant.road.roads[1].c1 == 0.3
 
 
+@killed_by("scenario/scenario.py", "if not removed:", "if True:")
+def test_a_note_names_what_a_replaced_part_takes_along():
+    s = load("slip-lmi", ["road=snow", "plant.mass=6"])
+    assert s.notes == ("road=snow removes sweep.over.road.w4, sweep.over.road.a of the replaced part",)
+    assert not {"plant.road.w4", "plant.road.a"} & s.sweep.over.keys()
+    assert load("slip-lmi", ["sensor=noise"]).notes == ()
+
+
+def test_a_file_may_begin_with_a_byte_order_mark(file):
+    assert load(file("\ufefftitle = 'mine'")).title == "mine"
+
+
 # What a design is for
 
 RANGES = """

@@ -57,6 +57,11 @@ BAD = [
     ("road={type='patches',roads=[{c1=2}]}", "road.roads.0.type is missing", "snow"),
     ("road={type='patches',roads={5={c1=2}}}", "road.roads.5 is not there", "0, 1"),
     ("road={type='scaled',road={type='scaled',scale=11}}", "road.road.scale = 11 is outside (0, 10]"),
+    ("controller={type='state-feedback',torque_max=-inf}", "controller.torque_max = -inf is outside (-inf, inf) N m"),
+    ("controller={type='proportional-feedback',torque_min=inf}", "controller.torque_min = inf is outside (-inf, inf)"),
+    ("controller={type='scheduled-feedback',torque_max=-inf}", "controller.torque_max = -inf is outside (-inf, inf)"),
+    ("controller={type='pid',low=inf}", "controller.low = inf is outside (-inf, inf) N m"),
+    ("controller={type='sliding-mode',high=-inf}", "controller.high = -inf is outside (-inf, inf) N m"),
     ("initial.speed_kmh=-5", "initial.speed_kmh = -5 is outside (0, 720] km/h"),
     ("initial.speed_kmh=fast", 'initial.speed_kmh = "fast" is text', "(0, 720] km/h"),
     ("initial.slip_kmh=5", "initial.slip_kmh is not a field of brake-start"),
@@ -249,6 +254,8 @@ def test_directory(tmp_path):
 def test_not_text(tmp_path):
     path = tmp_path / "binary.toml"
     path.write_bytes(b"title = 'x'\nname = '\xff\xfe'\n")
+    assert "is not UTF-8 text (at line 2)" in message(path)
+    path.write_bytes(b"\xef\xbb\xbftitle = 'x'\n\xff")
     assert "is not UTF-8 text (at line 2)" in message(path)
 
 

@@ -45,7 +45,7 @@ def test_a_mat_file_has_metrics_and_parameters(folder):
     assert (folder / "run.mat").read_bytes()[:19] == b"MATLAB 5.0 MAT-file"
 
 
-@killed_by("cli/main.py", "if places[one] == places[other]:", "if False:")
+@killed_by("cli/targets.py", "if places[one] == places[other]:", "if False:")
 @pytest.mark.parametrize(
     ("words", "said"),
     [
