@@ -204,11 +204,12 @@ def _rejection_reason(found: Design, spec: Spec, scheduled: bool) -> str:
     if missing or not proof.verified_exactly:
         return f"gain {found.gain.tolist()}: not proved: {', '.join(sorted(missing)) or 'its claims'}"
     # `certify` proves the least bounds that it can, not those of the specification.
-    if spec.l2 is not None and spec.l2.bound is not None and not proof.l2_gain <= spec.l2.bound:
-        return f"gain {found.gain.tolist()}: L2 gain {proof.l2_gain:.10g} is above its bound {spec.l2.bound:.10g}"
-    if spec.input is not None and not np.all(proof.input_limit <= spec.input.limit):
-        within = f"inputs within {proof.input_limit.tolist()}, not within {spec.input.limit.tolist()}"
-        return f"gain {found.gain.tolist()}: {within}"
+    bound, gain = spec.l2 and spec.l2.bound, proof.l2_gain
+    if bound is not None and gain is not None and gain > bound:
+        return f"gain {found.gain.tolist()}: L2 gain {gain:.10g} is above its bound {bound:.10g}"
+    allowed, limit = spec.input and spec.input.limit, proof.input_limit
+    if allowed is not None and limit is not None and np.any(limit > allowed):
+        return f"gain {found.gain.tolist()}: inputs within {limit.tolist()}, not within {np.asarray(allowed).tolist()}"
     cost, lower, guaranteed = found.trace_cost, found.lower_bound, proof.guaranteed_cost
     if cost is not None and lower is not None and cost < lower * (1 - GAP):
         return f"cost {cost:.10g} is below its lower bound {lower:.10g}"
