@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 Matrix = list[list[Fraction]]
 # Limits of a file: bytes; states or inputs; vertices, cells or points.
 MAX_CERTIFICATE_BYTES, MAX_STATES_OR_INPUTS, MAX_LIST_ENTRIES = 2**24, 64, 2**12
-MAX_SHOWN_ENTRIES = 64  # of a matrix in a statement; of a larger one the statement shows the sizes
+MAX_STATED_NUMBERS = 64  # of a matrix in a statement; of a larger one the statement shows the sizes
 MAX_SECONDS = 6.0  # s, so that the command answers within 10 s
 _deadline: contextvars.ContextVar[tuple[float, float]] = contextvars.ContextVar(
     "deadline", default=(math.inf, math.inf)
@@ -509,7 +509,7 @@ def _describe_numbers(name: str, value: Any, digits: int = 6) -> str:
     while isinstance(part, list):
         sizes.append(len(part))
         part = part[0]
-    if math.prod(sizes) > MAX_SHOWN_ENTRIES:
+    if math.prod(sizes) > MAX_STATED_NUMBERS:
         return f"{name} of the file ({' by '.join(map(str, sizes))})"
     return f"{name} = {_format_numbers(value, digits)}"
 

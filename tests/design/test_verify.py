@@ -219,7 +219,7 @@ DISTURBED = {"P": np.eye(2), "gamma": 2.5, "Bw": [[[1 / 3], [0.0]]], "C": np.eye
 
 
 @killed_by("design/verify.py", '("Bw", "C", "D"))', '("C", "D"))', case="l2")
-@killed_by("design/verify.py", "if math.prod(sizes) > MAX_SHOWN_NUMBERS:", "if False:", case="large")
+@killed_by("design/verify.py", "if math.prod(sizes) > MAX_STATED_NUMBERS:", "if False:", case="large")
 @pytest.mark.parametrize(
     ("proof", "statement"),
     [

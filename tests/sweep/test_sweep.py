@@ -372,7 +372,7 @@ def test_a_folder_that_cannot_be_written(file):
     scenario = file(SMALL)
     result = run("sweep", scenario, "--out", scenario / "out", status=2)
     assert_one_error_line(result)
-    assert result.stderr == f"error: {scenario / 'out'} cannot be written: Not a directory\n"
+    assert result.stderr == f"error: --out {scenario / 'out'}: cannot be written, Not a directory\n"
 
 
 def test_a_folder_with_something_else_is_left_alone(file, tmp_path):
