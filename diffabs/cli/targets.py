@@ -15,7 +15,8 @@ from diffabs.scenario.scenario import names
 
 PICTURES = (".png", ".pdf", ".svg")
 OUTPUTS = ("csv", "mat", "out", "plot")  # arguments of commands that name what is written
-INPUTS = {"scenario": "the scenario", "data": "the file of --data", "source": "the result"}  # and what is read
+# Arguments of commands that name what is read, and what messages call it.
+INPUTS = {"scenario": "the scenario", "data": "the file of --data", "source": "the result"}
 
 
 def check_distinct(given: Mapping[str, Any]) -> None:
@@ -38,7 +39,7 @@ def check_distinct(given: Mapping[str, Any]) -> None:
 
 
 def _find_inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, str | pathlib.Path]]:
-    """Yield word and path of each file that a command reads: its inputs, and the modules with parts from outside."""
+    """Yield description and path of each file that a command reads: its inputs, and the modules of `--parts`."""
     for name, what in INPUTS.items():
         is_packaged = name == "scenario" and given.get(name) in names()
         if given.get(name) and not is_packaged:

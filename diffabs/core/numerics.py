@@ -66,9 +66,9 @@ def smaller(x: Scalar, y: Scalar) -> Scalar:
 
 
 def invalidate(x: Scalar, invalid: Scalar, inputs: PyTree) -> Scalar:
-    """Return x, or NaN where it is invalid; then its derivatives by every input are NaN, too.
+    """Return x, or NaN where it is invalid; then its derivatives by every finite input are NaN, too.
 
-    A selection alone would give an invalid number the derivative zero.
+    A selection (`jnp.where`) alone would give an invalid number the derivative zero.
 
     Args:
         x: Result.
@@ -76,8 +76,9 @@ def invalidate(x: Scalar, invalid: Scalar, inputs: PyTree) -> Scalar:
         inputs: Pytree of everything that the result may depend on; only its floating-point leaves count.
     """
     leaves = [leaf for leaf in map(jnp.asarray, jax.tree.leaves(inputs)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    # An infinite limit must not make a valid result NaN.
-    total = sum(jnp.sum(jnp.where(jnp.isfinite(leaf), leaf, 0.0)).astype(x.dtype) for leaf in leaves)
+    leaves = [leaf.astype(x.dtype) for leaf in leaves]
+    # An infinite input, such as a limit, must not make a valid result NaN.
+    total = sum(jnp.sum(jnp.where(jnp.isfinite(leaf), leaf, 0.0)) for leaf in leaves)
     one, none = (jnp.where(invalid, jnp.nan, factor).astype(x.dtype) for factor in (1.0, 0.0))
     return one * x + none * total
 

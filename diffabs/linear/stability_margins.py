@@ -7,9 +7,9 @@ imaginary axis are counted while the delay grows from zero. They cross only wher
 On zeroes of some transcendental equations, 1986). Crossings are bracketed on a grid, which is refined until neighbours
 are close, and bisected to rounding.
 
-In continuous time the direct path D is the limit of L at infinite frequency, and it counts as a value of L. A delay
-turns this limit through all angles. With |D| > 1 every delay makes infinitely many unstable poles. With |D| = 1 they
-come arbitrarily close to the imaginary axis, which counts as unstable too.
+In continuous time and without a delay, the direct path D is the limit of L at infinite frequency. It counts as a value
+of L. A delay turns it through all angles. With |D| > 1 every delay makes infinitely many unstable poles. With |D| = 1
+they come arbitrarily close to the imaginary axis, which counts as unstable too.
 """
 
 import math
@@ -76,7 +76,7 @@ class Crossovers(NamedTuple):
 
     Attributes:
         gain_at: Frequencies with |L| = 1 [rad/s]; infinity is one of them if |D| = 1 in continuous time.
-        phases: Phase of L above -pi at these frequencies, in (-pi, pi] [rad].
+        phases: Angle of -L at these frequencies, the phase of L plus pi, in (-pi, pi] [rad].
         phase_at: Frequencies at which L is real and negative [rad/s]. Infinity is one of them in continuous time if
             D < 0, or if there is a delay and D is not zero.
         factors: 1/|L| at the frequencies `phase_at`.
@@ -91,9 +91,9 @@ class Crossovers(NamedTuple):
 def margins(loop: OpenLoop | Transfer) -> Margins:
     """Return the margins of an open loop.
 
-    The delay margin is the smallest (phase lag to -1)/frequency over all crossovers. For a sampled `Transfer` it is at
-    most one period if the loop is unstable with one more period of delay. An `OpenLoop` with a sampled controller is
-    sampled again with each added delay instead, so its delay margin is exact.
+    The delay margin is the smallest (phase lag to -1)/frequency over all crossovers. For a sampled `Transfer` only
+    whole periods have a meaning: it is at most one period if one more period makes the loop unstable. An `OpenLoop`
+    with a sampled controller is sampled again with each added delay instead.
 
     Args:
         loop: Open loop with one input and one output.
@@ -306,7 +306,7 @@ def _sensitivities(system: Transfer, w: np.ndarray) -> tuple[tuple[float, float]
 def _limit_at_infinity(system: Transfer) -> float:
     """Return the limit of L at infinite frequency, in continuous time.
 
-    With a delay the phase turns without end. Of the circle of values the one nearest to -1 is returned.
+    With a delay there is no limit: L circles around 0 with the radius |D|. The value nearest to -1 is returned.
     """
     direct = float(system.D[0, 0])
     return -abs(direct) if system.delay else direct
@@ -343,8 +343,8 @@ def _delay_margin(loop: OpenLoop | Transfer, system: Transfer, found: Crossovers
     delays = (found.phases % (2 * math.pi)) / found.gain_at
     guess = float(delays.min()) if len(delays) else math.inf
     if isinstance(loop, Transfer) and loop.period is not None:
-        # If |L| >= 1 at half the sampling rate, a whole period is too much. The crossovers do not show this, because
-        # e^(-jwd) with a part of a period does not close the Nyquist curve there.
+        # Only whole periods have a meaning here. The crossovers do not show whether one more period is too much where
+        # |L| >= 1 at half the sampling rate, so it is tried.
         late = loop._replace(delay=loop.delay + loop.period)
         return guess if is_stable(late) else min(guess, loop.period)
     if not isinstance(loop, OpenLoop) or loop.period is None or not math.isfinite(guess):

@@ -2,11 +2,11 @@
 
     maximise metric(p),  p in [low, high]
 
-One batch screens up to 64 corners of the box and random points. Gradient ascent starts from the worst of them. Another
-batch runs the ends of the ascents again: a run with derivatives may have other steps (`FixedStep.kinks`). Every metric
-compared is thus that of a plain run.
+One batch screens up to 64 corners of the box and random points. Gradient ascent starts from the worst of them. A run
+with derivatives may end its steps on kinks, so its metrics may differ. Another batch therefore runs the ends of the
+ascents again, without derivatives, and the result has only metrics of such plain runs.
 
-The method is local: a bound exceeded is a proven counterexample, but the worst case found depends on the starts. The
+The method is local: a run that exceeds a bound is a counterexample, but the worst case found depends on the starts. The
 worst case is often a corner; a run of all corners then finds it without a gradient. `WorstCase.report` states how the
 search found the worst case, and whether a certificate covers the box.
 """
@@ -282,7 +282,8 @@ def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[Desce
     )
     none = Multipliers(np.zeros((len(z), 0)), np.ones(len(z)))
     first = jax.device_get(problem.evaluator(1.0)(jnp.asarray(z), none)).evaluation
-    scale = max(abs(float(first.objective[0])), 1e-12)
+    known = first.objective[np.isfinite(first.objective)]
+    scale = max(abs(float(known[0])), 1e-12) if len(known) else 1.0
     loss = problem.loss(scale)
     descent = Descent(
         problem.evaluator(scale),

@@ -18,6 +18,7 @@ from diffabs.objectives import BRAKING
 from diffabs.plants import LabRig
 from diffabs.references import FixedSlip, Setpoint
 from diffabs.scenario.defaults import braking
+from diffabs.simulate.step.outlook import Outlook, find_turns
 from diffabs.stops import NoStop, SpeedReached
 
 
@@ -130,6 +131,28 @@ def swing(depth=5e-3):
     """A mass that is faster than its stop by this share of its greatest speed, for a short time."""
     parts = {"reference": Setpoint(value=0.0), "controller": ConstantTorque(torque=0.0)}
     return d.Loop(plant=Swing(), initial=Start(), stop=Backwards(v=-4.0 * (1 - depth)), **parts)
+
+
+DIPS = {  # cubics that are positive at both ends of a step from 0 to 1
+    "falls from the start": np.poly1d([-7.2, 14.4, -7.2, 1.0]),  # as far as its slope there can make it
+    "rises first": np.poly1d([-0.1, 0.5, 0.9], r=True),
+    "falls at the end": -np.poly1d([0.2, 0.5, 1.4], r=True),
+}
+
+
+@killed_by("simulate/step/outlook.py", "(bend != 0, bend, jnp.inf)", "(bend > 0, bend, jnp.inf)", case="rises first")
+@killed_by("simulate/step/outlook.py", "_EFFECT = 4 / 27", "_EFFECT = 3 / 27", case="falls from the start")
+@pytest.mark.parametrize("name", DIPS)
+def test_a_dip_of_a_cubic_is_found(name):
+    """Its minimum by NumPy; beside it a margin that is infinite, and one that stays positive."""
+    cubic = DIPS[name]
+    ends = [Outlook(jnp.array([np.inf, cubic(x), 1.0]), jnp.array([0.0, cubic.deriv()(x), 0.1])) for x in (0.0, 1.0)]
+    lowest = min((x for x in np.roots(cubic.deriv()).real if 0 < x < 1), key=cubic)
+    assert cubic(0.0) > 0 > cubic(lowest)
+    assert cubic(1.0) > 0
+    turns = find_turns(*ends, jnp.asarray(1.0), jnp.zeros(3, bool))
+    np.testing.assert_allclose(turns.time_since, 1 - lowest, rtol=1e-12)
+    assert not turns.grazes
 
 
 STIFFNESSES = np.linspace(0.3, 2.5, 12)

@@ -17,8 +17,8 @@ from diffabs.simulate.step.attempt import mode_in_step
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import Evaluation, LoopSystem
 
-# A margin grazes if it turns nearer to zero than this fraction of its greater value at the ends of the step, or than
-# its rounding, in multiples of the machine epsilon.
+# A margin grazes if its least magnitude in the step is below this fraction, or this multiple of the machine epsilon, of
+# its greater magnitude at the ends of the step.
 GRAZING_DEPTH_FRACTION, GRAZING_DEPTH_EPS = 1e-6, 32
 # Allowed error of the cubic in the middle of a step, as a fraction of the greatest value at both ends and there.
 MARGIN_TOLERANCE = 1e-6
@@ -29,7 +29,7 @@ class Outlook(NamedTuple):
     """Margins of comparisons and events at an instant.
 
     Attributes:
-        margins: Margins, shape (n,); infinite without a margin.
+        margins: Margins, shape (n,); infinite for an event that cannot happen.
         rates: Their rates [1/s], shape (n,).
     """
 
@@ -50,7 +50,7 @@ class Turns(NamedTuple):
 
 
 def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -> Turns:
-    """Return where margins cross zero twice within a step, which their signs at both ends do not show.
+    """Return when margins first turn back beyond zero within a step, and whether one only grazes zero.
 
     Args:
         starts: Margins at the start.
@@ -68,9 +68,10 @@ def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -
         cubic = Cubic(a, b, da, db)
         c1, c2, c3 = cubic.coefficients()
         square = c2 * c2 - 3.0 * c1 * c3
+        # Of both extrema this is the minimum: there the second derivative is 2 sqrt(square).
         bend = c2 + jnp.sqrt(jnp.where(square > 0, square, 0.0))
-        place = -c1 / jnp.where(bend > 0, bend, jnp.inf)
-        inside = (square > 0) & (bend > 0) & (place > 0) & (place < 1) & (b >= 0) & ~landing
+        place = -c1 / jnp.where(bend != 0, bend, jnp.inf)
+        inside = (square > 0) & (place > 0) & (place < 1) & (b >= 0) & ~landing
         lowest = cubic(place)
         touches = inside & (jnp.abs(lowest) <= undecided)
         # Beyond a landing the margin is continued as a parabola: its depth is slope^2/(2 curvature).
@@ -79,9 +80,9 @@ def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -
         since = jnp.where(inside & (lowest < -undecided), (1.0 - place) * length, 0.0)
         return Turns(jnp.max(since, initial=0.0), jnp.any(touches | shallow))
 
-    # A slope moves a cubic by at most 4/27 of itself, so most steps need no cubic.
+    # A slope at an end lowers the cubic by at most 4/27 of slope times length, so most steps need no cubic.
     reach = MAX_SLOPE_EFFECT * (jnp.maximum(-da, 0.0) + jnp.maximum(db, 0.0))
-    near = landing | (jnp.minimum(a, b) <= reach + undecided)
+    near = landing | (jnp.isfinite(most) & (jnp.minimum(a, b) <= reach + undecided))
     return jax.lax.cond(any_lane(jnp.any(near)), find, lambda: Turns(jnp.zeros_like(length), jnp.asarray(False)))
 
 
@@ -89,18 +90,18 @@ def look_ahead(fresh: Bool, seen: Evaluation) -> Outlook:
     """Return the margins at an instant.
 
     Args:
-        fresh: True if the answers to the comparisons were taken anew, so that none is contradicted.
+        fresh: True if the mode of the next step has just been chosen by the numbers at this instant.
         seen: Dynamics at the instant.
     """
     margins, rates, numbers = _list_margins(seen, 0)
-    # The margin of a new answer has any sign. Within its mode it is positive.
+    # The margin of a newly chosen answer may have any sign. It is turned so that it is positive within the mode.
     surfaces = jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(seen.margins))
     turned = fresh & surfaces & ((margins < 0) | ((margins == 0) & (rates < 0)))
     return Outlook(jnp.where(turned, -margins, margins), jnp.where(turned, -rates, rates))
 
 
 def watch_margins(carry: PyTree, h: Scalar, seen: Evaluation, bit_count: int) -> Turns:
-    """Return where margins turn back in an attempt; nowhere during a search, whose lengths are arbitrary.
+    """Return where margins turn back in an attempt; nowhere in the attempts of a search, before it lands.
 
     Args:
         carry: Carry before the attempt, with an `Outlook` in its forecast.
@@ -117,7 +118,8 @@ def watch_margins(carry: PyTree, h: Scalar, seen: Evaluation, bit_count: int) ->
 def margin_error(system: LoopSystem, carry: PyTree, h: Scalar, seen: Evaluation, state: LoopState) -> Scalar:
     """Return the error of the margins' cubics in the middle of an attempt, as a multiple of the allowed one.
 
-    A margin may depend on time alone, which no error of a state shows. The error is 0 without margins, and in a search.
+    A margin may depend on time alone, and then no error of a state shows its error. The result is 0 without margins,
+    and unless the run is RUNNING.
 
     Args:
         system: Dynamics of the loop and its objectives.

@@ -54,7 +54,7 @@ class StepLog(NamedTuple):
         next_words: Mode of the next step.
         unrestricted: True if the step has no mode.
         lands: Number of the comparison that changes at its end, or -1.
-        begins_at_zero: True if the margin at its end is zero from the beginning of the step, where it does not fall.
+        begins_at_zero: True if it lands on a margin that is zero, with a slope near zero, at its beginning.
         refresh: True for a step of length 0 that evaluates the rates.
         over: True if the run ends there.
     """
@@ -149,7 +149,7 @@ class ReplayStepping:
     def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
         """Return the logged attempt, for the replay `carry` in `system`.
 
-        If the last step ended late, this one is shorter: it ends at the logged time.
+        If the last step ended late, this one is shorter: it aims at the logged time, and `shift_end` may move its end.
         """
         one, k = self.logged, carry.k
         h = jnp.where(one.refresh, 0.0, one.length - carry.control.delay)
@@ -159,8 +159,8 @@ class ReplayStepping:
         strikes = one.k != k
 
         def shift_end(end: Evaluation) -> Scalar:
-            # A margin that is zero from the beginning moves with it. Its slope is near zero: a quotient by the slope
-            # would magnify the rounding of its derivative.
+            # The zero of such a margin moves with the beginning of the step. A quotient by its slope would magnify the
+            # rounding of its derivative.
             with_start = one.begins_at_zero & ~strikes
             return jnp.where(with_start, carry.control.delay, _time_to_event(one, strikes, end))
 
