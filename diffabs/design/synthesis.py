@@ -204,9 +204,9 @@ def _rejection_reason(found: Design, spec: Spec, scheduled: bool) -> str:
     if missing or not proof.verified_exactly:
         return f"gain {found.gain.tolist()}: not proved: {', '.join(sorted(missing)) or 'its claims'}"
     # `certify` proves the least bounds that it can, not those of the specification.
-    bound, gain = spec.l2 and spec.l2.bound, proof.l2_gain
-    if bound is not None and gain is not None and gain > bound:
-        return f"gain {found.gain.tolist()}: L2 gain {gain:.10g} is above its bound {bound:.10g}"
+    bound, l2_gain = spec.l2 and spec.l2.bound, proof.l2_gain
+    if bound is not None and l2_gain is not None and l2_gain > bound:
+        return f"gain {found.gain.tolist()}: L2 gain {l2_gain:.10g} is above its bound {bound:.10g}"
     allowed, limit = spec.input and spec.input.limit, proof.input_limit
     if allowed is not None and limit is not None and np.any(limit > allowed):
         return f"gain {found.gain.tolist()}: inputs within {limit.tolist()}, not within {np.asarray(allowed).tolist()}"

@@ -179,7 +179,7 @@ def worst_case(
         return jax.device_get(run_batch(loop, batch, solver, measured, accepted=True, engine=engine))
 
     runs, screened = run_points(points), len(points)
-    # NaN sorts last: a diverged point is a counterexample of its own, not a start.
+    # NaN sorts last: a diverged point is a counterexample of its own, and a start only if there are too few others.
     worst = np.argsort(-runs.metrics[metric])[:starts]
     # The weight -1 turns the minimisation of Problem into a maximisation.
     problem = Problem(
@@ -214,7 +214,7 @@ def worst_case(
 
 
 def _check_numbers(loop: Loop, objective: Objective, bound: float | None, counts: Mapping[str, int]) -> None:
-    """Raise a ValueError if the bound of the objective is not finite, or a count is no whole number or is negative."""
+    """Raise a ValueError if the bound is not finite, or if a count is negative or no whole number."""
     allowed = ParameterSpec(objective.unit or "1").around(units_of(loop.plant))
     if bound is not None and not allowed.holds(bound):
         raise ValueError(f"bound = {bound:g} is outside {allowed.interval()}")
@@ -224,7 +224,7 @@ def _check_numbers(loop: Loop, objective: Objective, bound: float | None, counts
 
 
 def _find_middle(loop: Loop, over: Mapping[str, Range]) -> dict[str, np.ndarray]:
-    """Return the middle of the box by path, without the paths that are no parameters.
+    """Return the middle of the box by path; a path that is no parameter is left out, for `parameter_space` to refuse.
 
     Raises:
         ValueError: A range is not a pair of finite numbers, or of arrays of the parameter's shape.

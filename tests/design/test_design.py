@@ -368,7 +368,7 @@ MISSED = {
 }
 
 
-@killed_by("design/synthesis.py", "gain > bound", "False", case="L2 gain")
+@killed_by("design/synthesis.py", "l2_gain > bound", "False", case="L2 gain")
 @killed_by("design/synthesis.py", "np.any(limit > allowed)", "False", case="input")
 @pytest.mark.parametrize("name", MISSED)
 def test_a_gain_that_misses_a_bound_is_refused(name):

@@ -181,6 +181,16 @@ def test_its_derivative_is_that_of_the_run():
     np.testing.assert_allclose([time, slope], np.arccos(-0.995) * np.array([1.0, -0.5]), rtol=1e-4)
 
 
+def rest(friction, solver):
+    """The time at rest under the control t: from friction - sqrt(friction^2 - 2) to friction."""
+    parts = {"reference": Setpoint(value=0.5), "controller": Ramp()}
+    loop = d.Loop(plant=Friction(friction=friction), initial=Start(v=1.0), stop=Backwards(), **parts)
+    return d.measure(loop, solver, {"rest": Rest()}).metrics["rest"]
+
+
+FIXED = d.FixedStep(1e-2, 3.0)
+
+
 @killed_by(
     "simulate/step/replay.py",
     "landing & old.search.at_once & (old.search.fall == 0)",
@@ -197,21 +207,22 @@ def test_its_derivative_is_that_of_the_run():
     "solver",
     [
         pytest.param(d.Adaptive(1e-8, 3.0), id="adaptive"),
-        pytest.param(d.FixedStep(1e-2, 3.0), id="fixed", marks=pytest.mark.slow),
+        pytest.param(FIXED, id="fixed", marks=pytest.mark.slow),
     ],
 )
 def test_the_time_at_rest_has_a_derivative(solver):
-    """From f - sqrt(f^2 - 2) to f. The speed leaves zero with the slope zero, so the friction decides when it does."""
-    parts = {"reference": Setpoint(value=0.5), "controller": Ramp()}
-    loop = d.Loop(plant=Friction(), initial=Start(v=1.0), stop=Backwards(), **parts)
-
-    def rest(friction):
-        return d.measure(d.replace(loop, {"plant.friction": friction}), solver, {"rest": Rest()}).metrics["rest"]
-
+    """The speed leaves zero with the slope zero, so the friction decides when it does."""
     frictions = np.linspace(2.003, 2.0293, 12)  # not on the grid of fixed steps
-    times, slopes = jax.jit(jax.vmap(lambda f: jax.jvp(rest, (f,), (1.0,))))(frictions)
+    times, slopes = jax.jit(jax.vmap(lambda f: jax.jvp(lambda f: rest(f, solver), (f,), (1.0,))))(frictions)
     np.testing.assert_allclose(times, np.sqrt(frictions**2 - 2), rtol=1e-7)
     np.testing.assert_allclose(slopes, frictions / np.sqrt(frictions**2 - 2), rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_on_the_grid_a_part_of_it_is_missing():
+    """A limit of fixed steps, which docs/gradients.md names: the derivative 1 of the end of the rest."""
+    slope = jax.jacfwd(lambda friction: rest(friction, FIXED))(2.01)
+    np.testing.assert_allclose(slope, 2.01 / np.sqrt(2.01**2 - 2) - 1, rtol=1e-7)
 
 
 @killed_by("simulate/step/replay.py", "landing & old.search.at_once", "old.search.at_once")

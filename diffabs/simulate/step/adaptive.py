@@ -165,7 +165,8 @@ class AdaptiveStepping:
         rtol: Allowed relative error of a step.
         keeps_last_step: True if the carry keeps the last step, for samples between its ends.
         is_logged: True if the run is logged for a replay with derivatives. Its steps then keep to a mode.
-        watches: True if the run ends where it slides or grazes, and a step where a margin turns. It must be logged.
+        watches: True if the run ends where it slides or grazes, and a step where the margin of a comparison turns. It
+            must be logged.
         smooth: True if nothing switches and no event can happen. The error alone then limits a step, not stability.
     """
 
