@@ -42,7 +42,6 @@ from diffabs.core.validity import find_cautions, find_problems
 from diffabs.objectives import BRAKING, default_objectives
 from diffabs.runtime import files
 from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
-from diffabs.scenario.compatibility import find_misfits
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.registry import (
     FAMILIES,
@@ -55,6 +54,7 @@ from diffabs.scenario.registry import (
     type_name,
 )
 from diffabs.simulate.admissible import find_mismatches, find_unstable_step
+from diffabs.simulate.contracts import find_misfits
 from diffabs.simulate.types import Adaptive, Solver
 
 MAX_SCENARIO_BYTES = 1_000_000  # bytes
@@ -316,7 +316,8 @@ def _assemble(name: str, table: JsonObject, folder: pathlib.Path, notes: Iterabl
         measured[key] = build_part("objective", value, report.get(key), place, units_of(loop.plant))
     objectives = {**report, **measured}
     # First: the sections below need valid parameters.
-    _refuse(_wrong_values(loop, objectives), find_misfits(loop, objectives))
+    named = {join_path("objective", key): one for key, one in objectives.items()}
+    _refuse(_wrong_values(loop, objectives), find_misfits(loop, named))
     return Scenario(
         name=name,
         **texts,

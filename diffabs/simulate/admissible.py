@@ -25,6 +25,7 @@ from diffabs.core.rules import Rule
 from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.core.validity import check_part as check_parts
 from diffabs.core.validity import find_broken, grid_rules, part_rules
+from diffabs.simulate.contracts import refuse_misfits
 from diffabs.simulate.stability import is_step_stable, stable_step
 from diffabs.simulate.types import Adaptive, Solver
 
@@ -68,13 +69,14 @@ def check(part: T, solver: Solver | None = None) -> T:
             step. Otherwise it has no effect.
 
     Raises:
-        ValueError: A field is out of range or breaks a rule between fields. For a loop with a solver also: the start is
-            beyond the stop, or the step is longer than the duration. A run of more than 1e8 steps, a period off the
-            grid and an unstable step raise it, too. The message gives each value with its range and unit. A later check
-            runs only if the earlier ones have passed.
+        ValueError: A field is out of range or breaks a rule between fields. For a loop with a solver also: a part does
+            not fit its contract, or the start is beyond the stop. A step longer than the duration, a run of more than
+            1e8 steps, a period off the grid and an unstable step raise it, too. The message gives each value with its
+            range and unit. A later check runs only if the earlier ones have passed.
     """
     check_parts(part)
     if isinstance(part, Loop) and solver is not None:
+        refuse_misfits(part, {})
         for lines in (find_mismatches(part, solver), find_unstable_step(part, solver)):
             if found := list(lines):
                 raise ValueError("; ".join(found))

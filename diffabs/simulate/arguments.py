@@ -19,6 +19,7 @@ from diffabs.core.types import Params, PyTree
 from diffabs.core.validity import find_broken, find_misshapen, part_rules
 from diffabs.objectives import Variation
 from diffabs.simulate.admissible import find_impossible_values
+from diffabs.simulate.contracts import refuse_misfits
 from diffabs.simulate.step.adaptive import AdaptiveStepping, clip_rtol
 from diffabs.simulate.step.fixed import FixedStepping
 from diffabs.simulate.types import Adaptive, Solver
@@ -79,7 +80,7 @@ def forbid_derivatives(loop: Loop, values: Params) -> dict[str, PyTree]:
 
 
 def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
-    """Check solver, shapes and objectives of a run, independent of the parameters' values.
+    """Check solver, shapes, objectives and contracts of a run, independent of the parameters' values.
 
     Args:
         loop: Closed loop.
@@ -87,8 +88,14 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
         objectives: Objectives by the names of their metrics.
 
     Raises:
-        ValueError: A field of the solver is invalid, a parameter has a wrong shape, or a part is not an objective.
+        ValueError: A field of the solver is invalid, a parameter has a wrong shape, a part is not an objective, or a
+            part does not fit its contract (`find_misfits`).
     """
+    if not isinstance(objectives, Mapping):
+        given = kinds.format_value(objectives)
+        raise ValueError(
+            f'objectives = {given} is no mapping; objectives by name are needed, {{"overshoot": Overshoot()}}'
+        )
     lines = [*find_invalid_fields(solver), *find_misshapen(loop)]
     for name, part in objectives.items():
         if all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
@@ -98,6 +105,7 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
             lines.append(f"objectives.{name} = {kinds.format_value(part)} is no objective: it needs {needed}")
     if lines:
         raise ValueError("; ".join(lines))
+    refuse_misfits(loop, objectives)
 
 
 def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:

@@ -12,8 +12,8 @@ from diffabs import actuators, controllers, objectives
 from diffabs.core import blocks
 from diffabs.core.pytree import parameters, replace
 from diffabs.objectives import BALANCE, BRAKING
-from diffabs.scenario.compatibility import find_misfits
 from diffabs.scenario.defaults import braking
+from diffabs.simulate.contracts import find_misfits
 
 MEASURED = {
     "braking": BRAKING

@@ -1,0 +1,244 @@
+"""Contracts of a loop's parts: whether each method returns what `core.protocols` asks for.
+
+`find_misfits` traces each method of each part once around the loop. So a mistake in a part of the user's own, or a part
+that reads a signal which the plant lacks, gives one line with the part, the method and what is needed. Without this
+check JAX would report the mistake later, in terms of compiled loops and derivatives. No number is computed.
+"""
+
+import dataclasses
+import pathlib
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.config.values import kebab_case
+from diffabs.core import kinds
+from diffabs.core.blocks import offers
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Clock, Ending, Memory, Objective, Sample, Tracking, resting_segment
+from diffabs.core.pytree import canonical_dtypes, stack_lists
+from diffabs.core.types import Part, PyTree
+
+STEP = 1e-3  # [s] any step serves
+NOT_USERS = tuple(
+    pathlib.Path(str(one)).parents[up] for one, up in ((__file__, 1), (jax.__file__, 0), (np.__file__, 0))
+)
+MAX_FITTING = 4096  # structures to remember
+_fitting: dict[Any, None] = {}  # structures whose parts fit
+
+
+class Misfit(Exception):
+    """A method of a part does not fit its contract; the text is the line for the user."""
+
+
+def refuse_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> None:
+    """Check the contracts of all parts.
+
+    Args:
+        loop: Closed loop whose parameters are numbers of the right shapes.
+        objectives: Objectives by the names of their metrics.
+
+    Raises:
+        ValueError: A part does not fit its contract (`find_misfits`).
+    """
+    if lines := list(find_misfits(loop, {f"objectives.{name}": one for name, one in objectives.items()})):
+        raise ValueError("; ".join(lines))
+
+
+def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
+    """Yield one line for each misfit: a method that fails, or that returns something else than its contract asks for.
+
+    A misfit within the loop gives a single line, and objectives are then not checked. Otherwise each objective with a
+    misfit gives a line. Each structure of loop and objectives is traced once, for all values of their parameters.
+
+    Args:
+        loop: Loop to trace once around, and through one instant.
+        objectives: Objectives of its runs by their paths in messages, traced on one sample and one segment.
+    """
+    structure = jax.tree.structure((loop, list(objectives.values())))
+    if structure in _fitting:
+        return
+    lines: list[str] = []
+
+    def trace(loop: Loop, objectives: Mapping[str, Objective]) -> None:
+        try:
+            sample, ending = _follow_loop(loop)
+        except Misfit as error:
+            lines.append(str(error))
+            return
+        for path, objective in objectives.items():
+            try:
+                _follow_objective(path, objective, sample, ending)
+            except Misfit as error:
+                lines.append(str(error))
+
+    jax.eval_shape(trace, *canonical_dtypes((stack_lists(loop), dict(objectives))))
+    yield from lines
+    if not lines:
+        while len(_fitting) >= MAX_FITTING:
+            _fitting.pop(next(iter(_fitting)), None)
+        _fitting[structure] = None
+
+
+def _follow_loop(loop: Loop) -> tuple[Sample, Ending]:
+    """Call each method of the loop's parts once, and return the first sample and an ending of the run."""
+    plant, t = loop.plant, jnp.asarray(0.0)
+    state = _call("plant", plant, "start", loop.initial)
+    _expect_reals("plant.start", state)
+    _expect_like("plant.project", _call("plant", plant, "project", state), state, "the state")
+    output = _call("plant", plant, "output", state)
+    _check_shown(plant, output)
+    measured = _follow_block("sensor", loop.sensor, output)
+    target = _follow_block("reference", loop.reference, measured, is_real=True)
+    setpoint = _call("reference", loop.reference, "setpoint", loop.reference.start(measured))
+    _expect_real("reference.setpoint", setpoint)
+    feedforward = _call("feedforward", loop.feedforward, "input", plant, measured, setpoint)
+    _expect_real("feedforward.input", feedforward)
+    tracking = Tracking(target, measured, feedforward)
+    command = _follow_block("controller", loop.controller, tracking, is_real=True)
+    control = _follow_block("actuator", loop.actuator, command, is_real=True)
+    _expect_like("plant.derivative", _call("plant", plant, "derivative", t, state, control), state, "the state")
+    _expect_real("stop.margin", _call("stop", loop.stop, "margin", output))
+    sample = Sample(t, output, target, setpoint, feedforward, command, control)
+    stopped = jnp.asarray(True)
+    left = _call("stop", loop.stop, "remainder", sample, stopped)
+    if not isinstance(left, tuple) or len(left) != 2:
+        raise Misfit(f"stop.remainder returns {_describe(left)}; (time left [s], distance left [m]) is needed")
+    return sample, Ending(sample, stopped, *left)
+
+
+def _follow_block(name: str, block: Part, signal: PyTree, *, is_real: bool = False) -> Any:
+    """Call each method of a block once, and return its output, which has to be one real number if `is_real`."""
+    t = jnp.asarray(0.0)
+    memory = _call(name, block, "start", signal)
+    _expect_memory(f"{name}.start", memory)
+    _expect_like(f"{name}.flow", _call(name, block, "flow", t, memory, signal), memory.flow, "memory.flow")
+    if offers(block, "tick"):
+        clock = Clock(t, jnp.asarray(STEP), jnp.asarray(0), jax.random.key(0))
+        _expect_like(f"{name}.tick", _call(name, block, "tick", clock, memory, signal), memory, "memory")
+    if offers(block, "margins"):
+        margins = _call(name, block, "margins", t, memory, signal, lambda: jax.tree.map(jnp.zeros_like, signal))
+        if not isinstance(margins, tuple):
+            raise Misfit(f"{name}.margins returns {_describe(margins)}; a tuple of real numbers is needed")
+        for margin in margins:
+            _expect_real(f"{name}.margins", margin)
+        fired = tuple(jnp.asarray(False) for _ in margins)
+        _expect_like(f"{name}.event", _call(name, block, "event", t, memory, signal, fired), memory, "memory")
+    output = _call(name, block, "output", t, memory, signal)
+    if is_real:
+        _expect_real(f"{name}.output", output)
+    return output
+
+
+def _follow_objective(path: str, objective: Objective, sample: Sample, ending: Ending) -> None:
+    """Call each method of an objective once."""
+    memory = _call(path, objective, "start", sample)
+    _expect_memory(f"{path}.start", memory)
+    _expect_like(f"{path}.flow", _call(path, objective, "flow", memory, sample), memory.flow, "memory.flow")
+    segment = resting_segment(sample, jnp.asarray(STEP))
+    _expect_like(f"{path}.update", _call(path, objective, "update", memory, segment), memory.held, "memory.held")
+    _expect_reals(f"{path}.value", _call(path, objective, "value", memory, ending))
+
+
+def _call(path: str, part: Part, method: str, *args: Any) -> Any:
+    """Return the result of a method, or raise a Misfit with the reason why it fails. A ValueError passes."""
+    function: Callable[..., Any] | None = getattr(part, method, None)
+    if not callable(function):
+        raise Misfit(
+            f"{path}: {type(part).__name__} has no method {method}; diffabs.core.protocols lists what it needs"
+        )
+    try:
+        return function(*args)
+    except ValueError:
+        raise  # a part says so itself
+    except AttributeError as error:
+        raise Misfit(f"{_explain_missing(path, method, error)}{_place(error)}") from error
+    except jax.errors.ConcretizationTypeError as error:
+        line = "uses the value of an argument while JAX traces it; replace if by jnp.where, math by jax.numpy"
+        raise Misfit(f"{path}.{method} {line}{_place(error)}") from error
+    except Exception as error:
+        text = next(iter(str(error).splitlines()), "")
+        raise Misfit(f"{path}.{method} fails: {type(error).__name__}: {text}{_place(error)}") from error
+
+
+def _explain_missing(path: str, method: str, error: AttributeError) -> str:
+    """Return a line about an attribute that is missing: which part needs it, and what there is instead."""
+    frames = [frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    part = [one for one in frames if dataclasses.is_dataclass(one)][-1:]
+    there = getattr(error.obj, "_fields", None)
+    if there is None and dataclasses.is_dataclass(error.obj):
+        there = [field.name for field in dataclasses.fields(error.obj)]
+    if there is None or not part or error.obj is part[0]:
+        return f"{path}.{method} fails: {error}"
+    needs = f"{path}: {kebab_case(type(part[0]).__name__)} needs {error.name}"
+    return f"{needs}; there is only {', '.join(there)}: these parts do not fit together"
+
+
+def _place(error: Exception) -> str:
+    """Return the last line of the error in the user's own code, as ` (file, line 7)`; empty without such a line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [one for one in frames if not set(NOT_USERS) & set(pathlib.Path(one.filename).parents)]
+    return f" ({pathlib.Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
+
+
+def _check_shown(plant: Part, output: PyTree) -> None:
+    """Check that a plant's output has real numbers and is of the type that the plant declares, with units."""
+    _expect_reals("plant.output", output)
+    unit, shows = getattr(plant, "control_unit", ""), getattr(plant, "shows", None)
+    if not isinstance(unit, str):
+        raise Misfit(f"plant.control_unit = {kinds.format_value(unit)} is no text, such as 'N m'")
+    if shows is None:
+        return  # a run needs no declaration, only its figures and tables do
+    if not (isinstance(shows, type) and hasattr(shows, "_fields")):
+        raise Misfit(f"plant.shows = {kinds.format_value(shows)} is no NamedTuple type")
+    if missing := [name for name in shows._fields if name not in getattr(shows, "units", {})]:
+        raise Misfit(f"plant.shows: {shows.__name__}.units lacks a unit of {', '.join(missing)}")
+    if not isinstance(output, shows):
+        raise Misfit(f"plant.output returns {_describe(output)}; {shows.__name__}(...) is needed, as plant.shows says")
+
+
+def _expect_memory(path: str, memory: Any) -> None:
+    if not isinstance(memory, Memory):
+        raise Misfit(f"{path} returns {_describe(memory)}; Memory(flow, held) is needed")
+    _expect_reals(f"{path}, in flow,", memory.flow)
+
+
+def _expect_real(path: str, value: Any) -> None:
+    if _describe(value) != "float":
+        raise Misfit(f"{path} returns {_describe(value)}; one real number is needed, of type float")
+
+
+def _expect_reals(path: str, tree: PyTree) -> None:
+    if tree is None or any(not _describe_leaf(leaf).startswith("float") for leaf in jax.tree.leaves(tree)):
+        raise Misfit(f"{path} returns {_describe(tree)}; real numbers are needed, of type float")
+
+
+def _expect_like(path: str, tree: PyTree, like: PyTree, name: str) -> None:
+    """Check that a result has the structure, the shapes and the kinds of numbers of `like`, whose name is given."""
+    same = jax.tree.structure(tree) == jax.tree.structure(like)
+    if not same or list(map(_describe_leaf, jax.tree.leaves(tree))) != list(map(_describe_leaf, jax.tree.leaves(like))):
+        raise Misfit(f"{path} returns {_describe(tree)}; {_describe(like)} is needed, like {name}")
+
+
+class _Word(str):
+    """A text that is shown without quotes."""
+
+    __repr__ = str.__str__
+
+
+def _describe(tree: PyTree) -> str:
+    """Return a result in words: its structure, with kind and shape in place of each number."""
+    return repr(jax.tree.map(lambda leaf: _Word(_describe_leaf(leaf)), tree))
+
+
+def _describe_leaf(leaf: Any) -> str:
+    try:
+        aval = jax.typeof(leaf)
+    except TypeError:
+        return type(leaf).__name__
+    kind = next((word for word in ("float", "int", "bool", "complex") if word in str(aval.dtype)), str(aval.dtype))
+    return kind + (str(list(aval.shape)) if aval.shape else "")
