@@ -91,11 +91,7 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
         ValueError: A field of the solver is invalid, a parameter has a wrong shape, a part is not an objective, or a
             part does not fit its contract (`find_misfits`).
     """
-    if not isinstance(objectives, Mapping):
-        given = kinds.format_value(objectives)
-        raise ValueError(
-            f'objectives = {given} is no mapping; objectives by name are needed, {{"overshoot": Overshoot()}}'
-        )
+    refuse_unnamed(objectives)
     lines = [*find_invalid_fields(solver), *find_misshapen(loop)]
     for name, part in objectives.items():
         if all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
@@ -106,6 +102,20 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
     if lines:
         raise ValueError("; ".join(lines))
     refuse_misfits(loop, objectives)
+
+
+def refuse_unnamed(objectives: Mapping[str, Objective] | None) -> None:
+    """Check that objectives have names.
+
+    Args:
+        objectives: Objectives by the names of their metrics, or None.
+
+    Raises:
+        ValueError: The objectives are no mapping.
+    """
+    if objectives is not None and not isinstance(objectives, Mapping):
+        given = kinds.format_value(objectives)
+        raise ValueError(f'objectives = {given} is no mapping by name, such as {{"overshoot": Overshoot()}}')
 
 
 def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:

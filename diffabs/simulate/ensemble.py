@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core import kinds
 from diffabs.core.compiling import is_traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import replace
 from diffabs.core.types import Array, Bool, Key, PyTree
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
-from diffabs.simulate.arguments import refuse
+from diffabs.simulate.arguments import refuse, refuse_unnamed
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import check_process, resolve_request, run_with_engine
 from diffabs.simulate.drive.packed import EarlyEnd, run_packed
@@ -83,6 +84,9 @@ def run_batch(
         KeyError: A path does not exist.
         RuntimeError: The engine is "auto" or "kernel", in a process that was forked after JAX had started.
     """
+    if not isinstance(batch, Batch):
+        raise ValueError(f"batch = {kinds.format_value(batch)} is no Batch; d.Batch(values by path) is needed")
+    refuse_unnamed(objectives)
     engine = resolve_request(engine)
     if engine != "xla":
         check_process()

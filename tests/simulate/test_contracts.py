@@ -214,8 +214,19 @@ def test_a_mistake_in_an_objective_is_one_line(line):
 
 
 def test_objectives_without_names_are_refused():
-    with pytest.raises(ValueError, match=r"objectives = \[.*\] is no mapping; objectives by name are needed"):
-        d.measure(d.braking(), d.FixedStep(1e-3, 1.0), [objectives.Overshoot()])  # pyright: ignore
+    given, solver = [objectives.Overshoot()], d.FixedStep(1e-3, 1.0)
+    for run in (
+        lambda: d.measure(d.braking(), solver, given),
+        lambda: d.rollout(d.braking(), solver, given),
+        lambda: d.run_batch(d.braking(), d.Batch({"plant.mass": [12.0]}), solver, given),
+    ):
+        with pytest.raises(ValueError, match=r"objectives = \[.*\] is no mapping by name"):
+            run()
+
+
+def test_a_batch_that_is_a_dictionary_is_refused():
+    with pytest.raises(ValueError, match=r"batch = \{.*\} is no Batch; d.Batch\(values by path\) is needed"):
+        d.run_batch(d.braking(), {"plant.mass": [12.0]}, d.FixedStep(1e-3, 1.0))  # pyright: ignore
 
 
 def test_parts_without_mistakes_run():
