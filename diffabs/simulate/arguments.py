@@ -22,7 +22,7 @@ from diffabs.simulate.admissible import find_impossible_values
 from diffabs.simulate.contracts import refuse_misfits
 from diffabs.simulate.step.adaptive import AdaptiveStepping, clip_rtol
 from diffabs.simulate.step.fixed import FixedStepping
-from diffabs.simulate.types import Adaptive, Solver
+from diffabs.simulate.types import Adaptive, FixedStep, Solver
 
 OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
 MAX_COUNTED_STEPS = 2**31 - 8  # greatest number of steps that a 32-bit counter holds, including the landing
@@ -88,13 +88,20 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
         objectives: Objectives by the names of their metrics.
 
     Raises:
-        ValueError: A field of the solver is invalid, a parameter has a wrong shape, a part is not an objective, or a
-            part does not fit its contract (`find_misfits`).
+        ValueError: An argument has a wrong type, a field of the solver is invalid, or a parameter has a wrong shape.
+            Also if a part is not an objective, or does not fit its contract (`find_misfits`).
     """
+    if not isinstance(loop, Loop):
+        raise ValueError(f"loop = {kinds.format_value(loop)} is no Loop; d.Loop(...) or d.braking() is needed")
+    if not isinstance(solver, FixedStep | Adaptive):
+        known = "d.FixedStep(step, duration) or d.Adaptive(step, duration, rtol)"
+        raise ValueError(f"solver = {kinds.format_value(solver)} is no solver; {known} is needed")
     refuse_unnamed(objectives)
     lines = [*find_invalid_fields(solver), *find_misshapen(loop)]
     for name, part in objectives.items():
-        if all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
+        if isinstance(part, type):
+            lines.append(f"objectives.{name} = {part.__name__} is a class; {part.__name__}(...) is needed")
+        elif all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
             lines += find_misshapen(part, f"objectives.{name}.")
         else:
             needed = ", ".join(OBJECTIVE_METHODS)
@@ -111,9 +118,10 @@ def refuse_unnamed(objectives: Mapping[str, Objective] | None) -> None:
         objectives: Objectives by the names of their metrics, or None.
 
     Raises:
-        ValueError: The objectives are no mapping.
+        ValueError: The objectives are no mapping, or a name is no text.
     """
-    if objectives is not None and not isinstance(objectives, Mapping):
+    named = isinstance(objectives, Mapping) and all(isinstance(name, str) for name in objectives)
+    if objectives is not None and not named:
         given = kinds.format_value(objectives)
         raise ValueError(f'objectives = {given} is no mapping by name, such as {{"overshoot": Overshoot()}}')
 

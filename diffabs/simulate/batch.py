@@ -50,8 +50,11 @@ class Batch:
         columns = {**self.values, **{name: column for name, column in others.items() if column is not None}}
         lengths = {name: np.shape(column)[0] if np.ndim(column) else 0 for name, column in columns.items()}
         if len(set(lengths.values())) > 1 or 0 in lengths.values():
-            listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
-            raise ValueError(f"the lanes' values have different lengths, or none: {listed}")
+            said = {
+                name: f"has {n} values" if np.ndim(columns[name]) else "is one number" for name, n in lengths.items()
+            }
+            listed = ", ".join(f"{name} {words}" for name, words in said.items())
+            raise ValueError(f"a batch needs columns of the same length, with one value for each run: {listed}")
         return next(iter(lengths.values()), 1)
 
     def check(self, loop: Part, solver: Solver | None = None) -> "Batch":

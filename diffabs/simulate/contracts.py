@@ -1,19 +1,20 @@
 """Contracts of a loop's parts: whether each method returns what `core.protocols` asks for.
 
-`find_misfits` traces each method of each part once around the loop. So a mistake in a part of the user's own, or a part
-that reads a signal which the plant lacks, gives one line with the part, the method and what is needed. Without this
-check JAX would report the mistake later, in terms of compiled loops and derivatives. No number is computed.
+`find_misfits` traces the methods that a run calls, once each, so no values are computed. A mistake in a part of the
+user's own, or a part that reads a signal which the plant lacks, gives one line with the part, the method and what is
+needed. Without this check JAX would report the mistake later, in terms of compiled loops and derivatives. Of the
+optional methods, only those of ticks and events are traced.
 """
 
 import dataclasses
 import pathlib
+import sysconfig
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from diffabs.config.values import kebab_case
 from diffabs.core import kinds
@@ -23,23 +24,29 @@ from diffabs.core.protocols import Clock, Ending, Memory, Objective, Sample, Tra
 from diffabs.core.pytree import canonical_dtypes, stack_lists
 from diffabs.core.types import Part, PyTree
 
-STEP = 1e-3  # [s] any step serves
-NOT_USERS = tuple(
-    pathlib.Path(str(one)).parents[up] for one, up in ((__file__, 1), (jax.__file__, 0), (np.__file__, 0))
+STEP = 1e-3  # [s] arbitrary: only its type matters
+# folders whose code is not the user's: this package, Python's library, and installed packages such as JAX
+NOT_USERS = (pathlib.Path(__file__).parents[1], pathlib.Path(jax.__file__).parents[1], *map(pathlib.Path, {
+    sysconfig.get_path("stdlib"), sysconfig.get_path("purelib")
+}))  # fmt: skip
+WITHOUT_VALUE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
 )
 MAX_FITTING = 4096  # structures to remember
-_fitting: dict[Any, None] = {}  # structures whose parts fit
+_fitting: dict[Any, None] = {}  # structures that were checked without a misfit, the oldest first
 
 
 class Misfit(Exception):
-    """A method of a part does not fit its contract; the text is the line for the user."""
+    """A method or an attribute of a part breaks its contract; the text is the line for the user."""
 
 
 def refuse_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> None:
     """Check the contracts of all parts.
 
     Args:
-        loop: Closed loop whose parameters are numbers of the right shapes.
+        loop: Closed loop. The types and shapes of its parameters must be correct (`find_misshapen`).
         objectives: Objectives by the names of their metrics.
 
     Raises:
@@ -52,12 +59,15 @@ def refuse_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> None:
 def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
     """Yield one line for each misfit: a method that fails, or that returns something else than its contract asks for.
 
-    A misfit within the loop gives a single line, and objectives are then not checked. Otherwise each objective with a
-    misfit gives a line. Each structure of loop and objectives is traced once, for all values of their parameters.
+    The first misfit of a part of the loop ends the check. If the loop fits, each objective gives at most one line. A
+    structure that fits is not traced again, whatever the values of its parameters.
 
     Args:
-        loop: Loop to trace once around, and through one instant.
-        objectives: Objectives of its runs by their paths in messages, traced on one sample and one segment.
+        loop: Loop to trace, with its ticks and events.
+        objectives: Objectives of its runs, by the path that messages show.
+
+    Raises:
+        ValueError: A packaged part raises it itself.
     """
     structure = jax.tree.structure((loop, list(objectives.values())))
     if structure in _fitting:
@@ -85,7 +95,7 @@ def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[st
 
 
 def _follow_loop(loop: Loop) -> tuple[Sample, Ending]:
-    """Call each method of the loop's parts once, and return the first sample and an ending of the run."""
+    """Call each method of the loop's parts once, and return a sample at t = 0 and an ending made of it."""
     plant, t = loop.plant, jnp.asarray(0.0)
     state = _call("plant", plant, "start", loop.initial)
     _expect_reals("plant.start", state)
@@ -118,7 +128,7 @@ def _follow_block(name: str, block: Part, signal: PyTree, *, is_real: bool = Fal
     _expect_memory(f"{name}.start", memory)
     _expect_like(f"{name}.flow", _call(name, block, "flow", t, memory, signal), memory.flow, "memory.flow")
     if offers(block, "tick"):
-        clock = Clock(t, jnp.asarray(STEP), jnp.asarray(0), jax.random.key(0))
+        clock = Clock(t, jnp.asarray(STEP), jnp.asarray(0), jax.random.key(0), before=signal)
         _expect_like(f"{name}.tick", _call(name, block, "tick", clock, memory, signal), memory, "memory")
     if offers(block, "margins"):
         margins = _call(name, block, "margins", t, memory, signal, lambda: jax.tree.map(jnp.zeros_like, signal))
@@ -145,7 +155,10 @@ def _follow_objective(path: str, objective: Objective, sample: Sample, ending: E
 
 
 def _call(path: str, part: Part, method: str, *args: Any) -> Any:
-    """Return the result of a method, or raise a Misfit with the reason why it fails. A ValueError passes."""
+    """Return the result of a method, or raise a Misfit with the reason why it fails.
+
+    A ValueError of a packaged part is its message to the user, and is raised again unchanged.
+    """
     function: Callable[..., Any] | None = getattr(part, method, None)
     if not callable(function):
         raise Misfit(
@@ -153,49 +166,54 @@ def _call(path: str, part: Part, method: str, *args: Any) -> Any:
         )
     try:
         return function(*args)
-    except ValueError:
-        raise  # a part says so itself
-    except AttributeError as error:
-        raise Misfit(f"{_explain_missing(path, method, error)}{_place(error)}") from error
-    except jax.errors.ConcretizationTypeError as error:
-        line = "uses the value of an argument while JAX traces it; replace if by jnp.where, math by jax.numpy"
-        raise Misfit(f"{path}.{method} {line}{_place(error)}") from error
     except Exception as error:
-        text = next(iter(str(error).splitlines()), "")
-        raise Misfit(f"{path}.{method} fails: {type(error).__name__}: {text}{_place(error)}") from error
+        place = _place(error)
+        if isinstance(error, ValueError) and not place:
+            raise
+        if isinstance(error, WITHOUT_VALUE):
+            why = (
+                " needs a number's value, which JAX traces without; use jnp.where for if, jax.numpy for math and numpy"
+            )
+        elif isinstance(error, AttributeError):
+            raise Misfit(_explain_missing(path, method, error) + place) from error
+        else:
+            why = f" fails: {type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
+        raise Misfit(f"{path}.{method}{why}{place}") from error
 
 
 def _explain_missing(path: str, method: str, error: AttributeError) -> str:
-    """Return a line about an attribute that is missing: which part needs it, and what there is instead."""
+    """Return a line about a missing attribute: which part reads it, and which fields exist."""
     frames = [frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__)]
     part = [one for one in frames if dataclasses.is_dataclass(one)][-1:]
     there = getattr(error.obj, "_fields", None)
     if there is None and dataclasses.is_dataclass(error.obj):
         there = [field.name for field in dataclasses.fields(error.obj)]
     if there is None or not part or error.obj is part[0]:
-        return f"{path}.{method} fails: {error}"
+        return f"{path}.{method} fails: {next(iter(str(error).splitlines()), '')}"
     needs = f"{path}: {kebab_case(type(part[0]).__name__)} needs {error.name}"
     return f"{needs}; there is only {', '.join(there)}: these parts do not fit together"
 
 
 def _place(error: Exception) -> str:
-    """Return the last line of the error in the user's own code, as ` (file, line 7)`; empty without such a line."""
+    """Return the innermost line of the user's code that the error passed, as ` (file.py, line 7)`; empty if none."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [one for one in frames if not set(NOT_USERS) & set(pathlib.Path(one.filename).parents)]
+    own = [one for one in own if not one.filename.startswith("<string")]  # methods that dataclasses generate
     return f" ({pathlib.Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
 
 
 def _check_shown(plant: Part, output: PyTree) -> None:
-    """Check that a plant's output has real numbers and is of the type that the plant declares, with units."""
+    """Check a plant's output, its declared type `shows`, the units of `shows`, and `control_unit`."""
     _expect_reals("plant.output", output)
     unit, shows = getattr(plant, "control_unit", ""), getattr(plant, "shows", None)
     if not isinstance(unit, str):
         raise Misfit(f"plant.control_unit = {kinds.format_value(unit)} is no text, such as 'N m'")
     if shows is None:
-        return  # a run needs no declaration, only its figures and tables do
+        return  # a run does not need it; figures and tables do
     if not (isinstance(shows, type) and hasattr(shows, "_fields")):
-        raise Misfit(f"plant.shows = {kinds.format_value(shows)} is no NamedTuple type")
-    if missing := [name for name in shows._fields if name not in getattr(shows, "units", {})]:
+        raise Misfit(f"plant.shows = {kinds.format_value(shows)} is no class of NamedTuple")
+    units = getattr(shows, "units", {})
+    if missing := [name for name in shows._fields if not isinstance(units, Mapping) or name not in units]:
         raise Misfit(f"plant.shows: {shows.__name__}.units lacks a unit of {', '.join(missing)}")
     if not isinstance(output, shows):
         raise Misfit(f"plant.output returns {_describe(output)}; {shows.__name__}(...) is needed, as plant.shows says")
@@ -205,11 +223,13 @@ def _expect_memory(path: str, memory: Any) -> None:
     if not isinstance(memory, Memory):
         raise Misfit(f"{path} returns {_describe(memory)}; Memory(flow, held) is needed")
     _expect_reals(f"{path}, in flow,", memory.flow)
+    if not all(map(_is_array, jax.tree.leaves(memory.held))):
+        raise Misfit(f"{path}, in held, returns {_describe(memory.held)}; numbers or arrays are needed")
 
 
 def _expect_real(path: str, value: Any) -> None:
     if _describe(value) != "float":
-        raise Misfit(f"{path} returns {_describe(value)}; one real number is needed, of type float")
+        raise Misfit(f"{path} returns {_describe(value)}; one real number is needed, a float without axes")
 
 
 def _expect_reals(path: str, tree: PyTree) -> None:
@@ -218,7 +238,7 @@ def _expect_reals(path: str, tree: PyTree) -> None:
 
 
 def _expect_like(path: str, tree: PyTree, like: PyTree, name: str) -> None:
-    """Check that a result has the structure, the shapes and the kinds of numbers of `like`, whose name is given."""
+    """Check that a result has structure, shapes and kinds of numbers of `like`; `name` stands for it in the message."""
     same = jax.tree.structure(tree) == jax.tree.structure(like)
     if not same or list(map(_describe_leaf, jax.tree.leaves(tree))) != list(map(_describe_leaf, jax.tree.leaves(like))):
         raise Misfit(f"{path} returns {_describe(tree)}; {_describe(like)} is needed, like {name}")
@@ -231,14 +251,22 @@ class _Word(str):
 
 
 def _describe(tree: PyTree) -> str:
-    """Return a result in words: its structure, with kind and shape in place of each number."""
+    """Return the text of a result, with kind and shape in place of each number."""
     return repr(jax.tree.map(lambda leaf: _Word(_describe_leaf(leaf)), tree))
 
 
 def _describe_leaf(leaf: Any) -> str:
-    try:
-        aval = jax.typeof(leaf)
-    except TypeError:
+    """Return kind and shape of a number, such as `float` or `int[3]`; the type's name of anything else."""
+    if not _is_array(leaf):
         return type(leaf).__name__
+    aval = jax.typeof(leaf)
     kind = next((word for word in ("float", "int", "bool", "complex") if word in str(aval.dtype)), str(aval.dtype))
     return kind + (str(list(aval.shape)) if aval.shape else "")
+
+
+def _is_array(leaf: Any) -> bool:
+    try:
+        jax.typeof(leaf)
+    except TypeError:
+        return False
+    return True

@@ -285,8 +285,13 @@ def test_derivatives_are_those_of_single_runs(mode, single):
 @pytest.mark.parametrize(
     ("error", "message", "lanes", "more"),
     [
-        (ValueError, "lengths, or none: plant.mass 2, keys 3", Batch({"plant.mass": [5.0, 6.0]}, [1, 2, 3]), {}),
-        (ValueError, "different lengths, or none: plant.mass 0", Batch({"plant.mass": 5.0}), {}),
+        (ValueError, "plant.mass has 2 values, keys has 3 values", Batch({"plant.mass": [5.0, 6.0]}, [1, 2, 3]), {}),
+        (
+            ValueError,
+            "columns of the same length, with one value for each run: plant.mass is one number",
+            Batch({"plant.mass": 5.0}),
+            {},
+        ),
         (KeyError, "no 'mas' in plant.mas", Batch({"plant.mas": [5.0, 6.0]}), {"accepted": True}),
         (ValueError, r"has shape \(\); it needs \(2,\)", Batch({"controller.gain": [1.0, 2.0]}), {"accepted": True}),
         (ValueError, "enough: lanes that run together", Batch(VALUES), {"enough": Slow(SPEEDS), "trajectories": True}),
@@ -343,8 +348,11 @@ class TestBatch:
         ("batch", "message"),
         [
             (Batch({"plant.mas": [5.0]}), "plant.mas is not a parameter of the loop"),
-            (Batch({"plant.mass": [5.0], "initial.speed": [9.0, 8.0]}), "different lengths, or none: plant.mass 1"),
-            (Batch({"plant.mass": []}), "different lengths, or none"),
+            (
+                Batch({"plant.mass": [5.0], "initial.speed": [9.0, 8.0]}),
+                "same length, with one value for each run: plant.mass has 1 values, initial.speed has 2",
+            ),
+            (Batch({"plant.mass": []}), "plant.mass has 0 values"),
             (Batch({"plant.mass": [5.0, -1.0]}), r"plant.mass = -1 ... 5 leaves \(0, inf\) kg"),
             (Batch({"controller.gain": [1.0, 2.0]}), r"a lane has shape \(\), not \(2,\)"),
             (Batch({"plant.mass": [5.0]}, weights=[0.0]), "weights = 0 ... 0 are not all positive"),

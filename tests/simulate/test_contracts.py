@@ -6,6 +6,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from mutants import killed_by
 
@@ -115,6 +116,12 @@ def numbers(value):
     return lambda self, *given: value
 
 
+def two_states(self, t, x, heat):
+    """The derivative of another plant."""
+    above, rate = x
+    return Temperature(rate - above)
+
+
 MISTAKES = {
     "plant": {
         "plant.start returns Temperature(above=int); real numbers are needed, of type float": {
@@ -129,14 +136,18 @@ MISTAKES = {
         },
         "plant.output returns (float,); Temperature(...) is needed, as plant.shows says": {"output": numbers((0.0,))},
         "plant.shows: Bare.units lacks a unit of above": {"shows": Bare},
-        "plant.shows = 'K' is no NamedTuple type": {"shows": "K"},
+        "plant.shows = 'K' is no class of NamedTuple": {"shows": "K"},
         "plant.control_unit = None is no text, such as 'N m'": {"control_unit": None},
         "plant: Oven has no method output; diffabs.core.protocols lists what it needs": {"output": None},
-        "plant.output uses the value of an argument while JAX traces it; replace if by jnp.where, math by": {
+        "plant.output needs a number's value, which JAX traces without; use jnp.where for if": {
             "output": lambda self, x: x if x.above > 0 else Temperature(0.0)
         },
-        "plant.derivative uses the value of an argument while JAX traces it; replace if by jnp.where": {
+        "plant.derivative needs a number's value, which JAX traces without; use": {
             "derivative": lambda self, t, x, heat: Temperature(math.sqrt(x.above))
+        },
+        "plant.project needs a number's value": {"project": lambda self, x: Temperature(np.maximum(x.above, 0.0))},
+        "plant.derivative fails: ValueError: not enough values to unpack (expected 2, got 1) (test_contracts.py": {
+            "derivative": two_states
         },
         "plant.derivative fails: TypeError: ": {"derivative": lambda self, x, heat: x},
         "plant.derivative fails: 'Oven' object has no attribute 'losses' (test_contracts.py, line ": {
@@ -147,9 +158,10 @@ MISTAKES = {
         "controller: proportional needs slip; there is only above: these parts do not fit together (test": {
             "output": lambda self, t, memory, signal: signal.measured.slip
         },
-        "controller.output returns bool; one real number is needed, of type float": {"output": numbers(True)},
+        "controller.output returns bool; one real number is needed, a float without axes": {"output": numbers(True)},
         "controller.output returns Memory(flow=(), held=()); one real number is needed": {"output": numbers(Memory())},
         "controller.start returns float; Memory(flow, held) is needed": {"start": numbers(0.0)},
+        "controller.start, in held, returns str; numbers or arrays are needed": {"start": numbers(Memory((), "off"))},
         "controller.start, in flow, returns int; real numbers are needed": {"start": numbers(Memory(0))},
         "controller.flow returns (); float is needed, like memory.flow": {"start": numbers(Memory(0.0))},
         "controller.tick returns float; Memory(flow=(), held=()) is needed, like memory": {"tick": numbers(1.0)},
@@ -224,9 +236,26 @@ def test_objectives_without_names_are_refused():
             run()
 
 
+def test_an_objective_that_is_a_class_is_refused():
+    with pytest.raises(ValueError, match=r"objectives.o = Overshoot is a class; Overshoot\(...\) is needed"):
+        d.measure(d.braking(), d.FixedStep(1e-3, 1.0), {"o": objectives.Overshoot})  # pyright: ignore
+
+
 def test_a_batch_that_is_a_dictionary_is_refused():
     with pytest.raises(ValueError, match=r"batch = \{.*\} is no Batch; d.Batch\(values by path\) is needed"):
         d.run_batch(d.braking(), {"plant.mass": [12.0]}, d.FixedStep(1e-3, 1.0))  # pyright: ignore
+
+
+def test_a_tick_may_read_the_signal_before_it():
+    tick = lambda self, clock, memory, signal: Memory((), clock.before.measured.above)  # noqa: E731
+    assert measure("highest", controller=switching(tick=tick)) == measure("highest", controller=switching())
+
+
+def test_a_loop_and_a_solver_of_another_type_are_refused():
+    with pytest.raises(ValueError, match=r"loop = 'slip-lmi' is no Loop"):
+        d.measure("slip-lmi", d.FixedStep(1e-3, 1.0), {})  # pyright: ignore
+    with pytest.raises(ValueError, match=r"solver = 0.001 is no solver; d.FixedStep\(step, duration\)"):
+        d.measure(d.braking(), 1e-3, {})  # pyright: ignore
 
 
 def test_parts_without_mistakes_run():
