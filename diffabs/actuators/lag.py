@@ -16,8 +16,8 @@ from diffabs.core.types import Scalar
 class Limits:
     """control = clamp(command, low, high); by default both limits are infinite."""
 
-    low: Scalar = param(default=-np.inf, unit="control", infinite=True)
-    high: Scalar = param(default=np.inf, unit="control", infinite=True)
+    low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
 
     start = no_memory
     flow = no_flow

@@ -296,8 +296,8 @@ class ShareAtLimit:
     unit = "1"
     physical = (0.0, 1.0)
 
-    low: Scalar = param(default=-math.inf, unit="control", infinite=True)
-    high: Scalar = param(default=math.inf, unit="control", infinite=True)
+    low: Scalar = param(default=-math.inf, unit="control", below=math.inf, infinite=True)
+    high: Scalar = param(default=math.inf, unit="control", above=-math.inf, infinite=True)
 
     start, flow = start_held, no_integral
 

@@ -99,13 +99,15 @@ def prove_box(
         threads: Number of threads; None for one for each core.
 
     Raises:
-        ValueError: A claim is about a quantity that the loop does not have.
+        ValueError: A claim is about a quantity that the loop does not have, or a signal does not exist.
         NoRule: A part, an operation or a parameter of the loop has no sound rule.
         NoCompiler: No C++ compiler of this machine works.
     """
     began = time.monotonic()
     paths = tuple(over)
     equations = derive_equations(loop, paths)
+    if unknown := [name for name in signals if name not in equations.signals]:
+        raise ValueError(f"signals: {unknown[0]!r} is no signal of this loop; there is {', '.join(equations.signals)}")
     _check_claims(claims, equations.signals)
     wanted = tuple(dict.fromkeys([*signals, *(c.quantity.split()[1] for c in claims if " " in c.quantity)]))
     prover = Prover(equations, wanted, horizon)

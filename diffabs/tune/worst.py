@@ -187,7 +187,8 @@ def worst_case(
     )
     problem = problem.with_engine(engine)
     lanes = _ascend(problem, points[worst], iterations) if starts else []
-    price = price or (1 + 1.5 * free.size if problem.mode is DerivativeMode.FORWARD else 6.0)
+    if price is None:
+        price = 1 + 1.5 * free.size if problem.mode is DerivativeMode.FORWARD else 6.0
     ends = _find_ends(free, lanes)
     if len(ends):
         points = np.concatenate([points, ends])

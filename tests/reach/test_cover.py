@@ -204,6 +204,11 @@ def test_a_claim_about_no_quantity_is_refused(quantity: str) -> None:
         prove_box(load("slip-lmi", LIMITED).loop, SMALL, [RunClaim(quantity, 0.34)], horizon=2.0)
 
 
+def test_a_signal_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(ValueError, match="signals: 'slop' is no signal of this loop; there is .*slip, speed"):
+        prove_box(load("slip-lmi", LIMITED).loop, SMALL, signals=("slop",), horizon=2.0)
+
+
 @killed_by("reach/cover.py", "again = now[~fine]\n", "again = now[~fine][1:]\n")
 def test_cells_cover_the_box() -> None:
     worst = max(rig_run(m, v)[0] for m in SMALL["plant.mass"] for v in SMALL["initial.speed"])

@@ -60,6 +60,8 @@ BAD = [
     ("controller={type='state-feedback',torque_max=-inf}", "controller.torque_max = -inf is outside (-inf, inf) N m"),
     ("controller={type='proportional-feedback',torque_min=inf}", "controller.torque_min = inf is outside (-inf, inf)"),
     ("controller={type='scheduled-feedback',torque_max=-inf}", "controller.torque_max = -inf is outside (-inf, inf)"),
+    ("actuator={type='limits',low=inf}", "actuator.low = inf is outside (-inf, inf) N m"),
+    ("actuator={type='limits',high=-inf}", "actuator.high = -inf is outside (-inf, inf) N m"),
     ("controller={type='pid',low=inf}", "controller.low = inf is outside (-inf, inf) N m"),
     ("controller={type='sliding-mode',high=-inf}", "controller.high = -inf is outside (-inf, inf) N m"),
     ("initial.speed_kmh=-5", "initial.speed_kmh = -5 is outside (0, 720] km/h"),
