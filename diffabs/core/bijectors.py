@@ -41,6 +41,10 @@ class Interval:
         """Return the value at `z`, inside (low, high)."""
         return self.low + (self.high - self.low) * jax.nn.sigmoid(z)
 
+    def steepness(self, z: np.ndarray) -> np.ndarray:
+        """Return the slope of the map at `z`, divided by its slope at 0."""
+        return 1.0 / np.cosh(0.5 * z) ** 2
+
     def place(self, value: float) -> float:
         """Return z of a `value`."""
         part = (value - self.low) / (self.high - self.low)
@@ -58,6 +62,10 @@ class Decades:
         """Return the value at `z`, between two numbers of one sign."""
         return self.sign * jnp.exp(self.logarithm.value(z))
 
+    def steepness(self, z: np.ndarray) -> np.ndarray:
+        """Return the slope of the map of the logarithm at `z`, divided by its slope at 0."""
+        return self.logarithm.steepness(z)
+
     def place(self, value: float) -> float:
         """Return z of a `value`."""
         return self.logarithm.place(math.log(self.sign * value))
@@ -74,6 +82,10 @@ class HalfLine:
         """Return the value at `z`, on one side of `end`."""
         return self.end + self.scale * jnp.exp(z)
 
+    def steepness(self, z: np.ndarray) -> np.ndarray:
+        """Return the slope of the map at `z`, divided by its slope at 0, and at most 1."""
+        return np.exp(np.minimum(z, 0.0))
+
     def place(self, value: float) -> float:
         """Return z of a `value`."""
         return math.log((value - self.end) / self.scale)
@@ -89,6 +101,10 @@ class UnboundedLine:
     def value(self, z: AnyArray) -> Scalar:
         """Return the value at `z`."""
         return self.start + self.scale * z
+
+    def steepness(self, z: np.ndarray) -> np.ndarray:
+        """Return 1: the map has the same slope everywhere."""
+        return np.ones_like(z)
 
     def place(self, value: float) -> float:
         """Return z of a `value`."""
@@ -167,6 +183,11 @@ class FreeSpace:
     def at(self, part: T, z: AnyArray) -> T:
         """Return `part` with its free parameters at `z`. Differentiable."""
         return replace(part, self.values(z))
+
+    def steepness(self, z: np.ndarray) -> np.ndarray:
+        """Return how steep the map of each element is at `z` (size,), from 1 in the middle to 0 at a finite end."""
+        maps = [m for entry in self.entries for m in entry.maps]
+        return np.array([float(m.steepness(x)) for m, x in zip(maps, z, strict=True)])
 
     def place(self, part: Part) -> np.ndarray:
         """Return z of the present values of `part`.

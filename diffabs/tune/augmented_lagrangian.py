@@ -5,10 +5,17 @@ A first descent has the multipliers zero. Each round then updates them and desce
     m <- max(0, m + c (g + d))
 
 g are the excesses of the constraints, d is the margin and c the penalty. Each start has its own m and c. The penalty c
-grows if the violation has not shrunk to `MAX_VIOLATION_RATIO` of its earlier value. Rounds end when every constraint
-holds at every start, or after `Method.rounds` of them.
+grows if the violation has not shrunk to `MAX_VIOLATION_RATIO` of its earlier value. A start has converged if all its
+constraints hold, and the update would hardly change its multipliers:
 
-Source: J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4.
+    |max(g + d, -m/c)| <= max(d, MIN_TOLERANCE)
+
+So each constraint is active within the margin, or its multiplier is nearly zero. Without the second condition a search
+would end at the first feasible point, where too great a multiplier has pushed it inside. Rounds end when every start
+has converged, or after `Method.rounds` of them.
+
+Source: J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4; R. Andreani et al., On augmented
+Lagrangian methods with general lower-level constraints, SIAM J. Optim. 18 (2007), for the condition.
 """
 
 import dataclasses
@@ -31,6 +38,7 @@ FIRST_PENALTY = 10.0  # penalty of the first round; the scaled loss is of the or
 PENALTY_GROWTH = 4.0  # factor of the penalty if the violation does not shrink enough
 MAX_VIOLATION_RATIO = 0.3  # violation after a round over the violation after the round before
 MAX_PENALTY = 1e7
+MIN_TOLERANCE = 1e-4  # of the condition that ends the rounds of a start
 
 
 class AugmentedLagrangianSearch:
@@ -92,6 +100,7 @@ class AugmentedLagrangianSearch:
             method.stopping,
             self._report,
             self.stopping,
+            problem.space.steepness,
         )
         descent_states = self._run_rounds(descent)
         usable = [descent_state for descent_state in descent_states if descent_state.reason is not Reason.START]
@@ -129,26 +138,28 @@ class AugmentedLagrangianSearch:
         )
 
     def _run_rounds(self, descent: Descent) -> list[DescentState]:
-        """Run a descent, then rounds of a multiplier update and a descent, until all constraints hold at all starts."""
+        """Run a descent, then rounds of a multiplier update and a descent, until all starts have converged."""
         m = self._multipliers()
         descent_states = descent.run(self.starts, m)
         if not self.problem.excesses:
             return descent_states
-        worst = _violations(descent_states)
-        while self.round < self.method.rounds and not all(w <= 0 for w in worst):
+        before, violations = np.full(len(self.starts), np.inf), _violations(descent_states)
+        while self.round < self.method.rounds and not all(_have_converged(m, descent_states)):
             if self.stopping():
                 break
             self.round += 1
-            m = _raise_multipliers(m, descent_states)
+            m = _raise_penalty(_raise_multipliers(m, descent_states), before, violations)
             self.earlier = [descent_state.history for descent_state in descent_states]
             last, descent_states = (
                 descent_states,
                 descent.run(np.stack([descent_state.z for descent_state in descent_states]), m),
             )
-            for before, descent_state in zip(last, descent_states, strict=True):
-                descent_state.history = _join_histories(before.history, descent_state.history)
-                descent_state.keep(before.kept)
-            m, worst = _raise_penalty(m, worst, _violations(descent_states)), _violations(descent_states)
+            for one, descent_state in zip(last, descent_states, strict=True):
+                descent_state.history = _join_histories(one.history, descent_state.history)
+                descent_state.keep(one.kept)
+            before, violations = violations, _violations(descent_states)
+        for descent_state, converged in zip(descent_states, _have_converged(m, descent_states), strict=True):
+            descent_state.converged = converged
         return descent_states
 
     def _multipliers(self) -> Multipliers:
@@ -192,6 +203,14 @@ class AugmentedLagrangianSearch:
 
 def _violations(descent_states: list[DescentState]) -> np.ndarray:
     return np.array([descent_state.history[-1].violation for descent_state in descent_states])
+
+
+def _have_converged(m: Multipliers, descent_states: list[DescentState]) -> list[bool]:
+    """Return for each start whether its constraints hold and an update would hardly change its multipliers."""
+    aimed = np.stack([descent_state.evaluation.excess for descent_state in descent_states]) + m.margin[:, None]
+    change = np.abs(np.maximum(aimed, -m.values / m.penalty[:, None])).max(axis=1)
+    settled = change <= np.maximum(m.margin, MIN_TOLERANCE)
+    return [bool(one) and worst <= 0 for one, worst in zip(settled, _violations(descent_states), strict=True)]
 
 
 def _raise_multipliers(m: Multipliers, descent_states: list[DescentState]) -> Multipliers:

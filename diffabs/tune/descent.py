@@ -34,6 +34,9 @@ MAX_TRIALS = 12  # of a line search that holds a point with sufficient decrease,
 # gradient gives no information about the jump.
 MAX_JUMPS = 2
 MAX_UPDATE_COMPONENT = 2.0  # greatest |u_i|, in units of z: about half of a finite range
+# Slope of a free parameter by z, relative to the middle of its range, below which the parameter is at a flat end of the
+# range: closer than 0.025 % of its length. Updates that lead back into the range are longer there.
+FLAT = 1e-3
 MAX_IDLE_STEPS = 3  # consecutive accepted steps without a significant change of the loss
 
 
@@ -65,6 +68,7 @@ class DescentState:
         reason: Reason for the end; None while the descent continues.
         history: Start, and the points after the accepted steps.
         kept: Best feasible step so far.
+        converged: Whether the multipliers of the constraints are right at `z`.
     """
 
     z: np.ndarray
@@ -84,6 +88,7 @@ class DescentState:
     reason: Reason | None = None
     history: list[DescentPoint] = dataclasses.field(default_factory=list)
     kept: FeasiblePoint | None = None
+    converged: bool = True
 
     def note(self) -> None:
         """Append the present point to the history, and keep it if it is the best feasible point so far."""
@@ -107,12 +112,18 @@ class DescentState:
             self.kept = other
 
     def go_back(self) -> None:
-        """Go back to the feasible point that was kept, and note it, if the present point violates a constraint."""
-        last = self.history[-1]
-        if self.kept and not last.violation <= 0:
-            self.z, self.evaluation, self.reason = self.kept.z, self.kept.evaluation, Reason.KEPT
-            point = self.kept.point._replace(iteration=last.iteration, evaluations=last.evaluations)
-            self.history.append(point)
+        """Go back to the feasible point that was kept, and note it, if it is better than the present point.
+
+        It is better if the present point violates a constraint. It is also better if it has the lower objective and the
+        multipliers have not converged. A point that has converged is the result, although steps on its way may have had
+        a lower objective within the margin of a constraint.
+        """
+        last, kept = self.history[-1], self.kept
+        if kept and (not last.violation <= 0 or (not self.converged and kept.point.objective < last.objective)):
+            self.z, self.evaluation, self.reason = kept.z, kept.evaluation, Reason.KEPT
+            self.history.append(kept.point._replace(iteration=last.iteration, evaluations=last.evaluations))
+        elif not self.converged and self.reason is not Reason.INTERRUPTED:
+            self.reason = Reason.LIMIT
 
 
 class Optimiser(NamedTuple):
@@ -153,6 +164,7 @@ class Descent:
         stopping: Stopping,
         told: Callable[[list[DescentState]], None],
         interrupted: Callable[[], bool] = lambda: False,
+        steepness: Callable[[np.ndarray], np.ndarray] = np.ones_like,
     ):
         """Set the evaluations and the conditions that end the descent.
 
@@ -164,9 +176,10 @@ class Descent:
             stopping: Conditions that end the descent of a start.
             told: Called with all starts after every evaluation.
             interrupted: Called after `told`; True ends the descent of all starts.
+            steepness: Maps z (p,) to the slope of each free parameter by z, relative to its slope at z = 0.
         """
         self.evaluate, self.steady, self.stopping, self.told = evaluate, steady, stopping, told
-        self.interrupted = interrupted
+        self.interrupted, self.steepness = interrupted, steepness
         self.searches = optimiser.searches
         self._init = jax.jit(jax.vmap(optimiser.transformation.init))
 
@@ -225,8 +238,8 @@ class Descent:
         descent_state.evaluations += 1
         descent_state.trials += 1
         slope = float(descent_state.gradient @ descent_state.update)
-        # At the greatest step no expansion is possible, so the curvature condition is waived there (1e-9: rounding).
-        longest = descent_state.t * np.max(np.abs(descent_state.update)) >= MAX_UPDATE_COMPONENT * (1 - 1e-9)
+        # At the greatest step no expansion is possible, so the curvature condition is waived there.
+        longest = _is_longest(descent_state)
         if fine and not self.searches:
             return z, found
         if not fine or float(found.loss) > descent_state.loss + ARMIJO_FRACTION * descent_state.t * slope:
@@ -247,9 +260,9 @@ class Descent:
 
     def _take(self, descent_state: DescentState, z: np.ndarray, found: LossEvaluation) -> None:
         gained = abs(descent_state.loss - float(found.loss))
-        descent_state.idle = (
-            descent_state.idle + 1 if gained <= self.stopping.change * max(abs(descent_state.loss), 1e-12) else 0
-        )
+        small = gained <= self.stopping.change * max(abs(descent_state.loss), 1e-12)
+        # The greatest step from the flat end of a range hardly changes the loss at first.
+        descent_state.idle = descent_state.idle + 1 if small and not _is_longest(descent_state) else 0
         descent_state.z, descent_state.loss, descent_state.gradient, descent_state.evaluation = (
             z,
             float(found.loss),
@@ -269,13 +282,22 @@ class Descent:
 
     def _finish_reason(self, descent_state: DescentState) -> Reason | None:
         """Return the reason why the descent of this start ends, or None if it continues."""
-        if np.max(np.abs(descent_state.gradient)) <= self.stopping.gradient:
+        z, gradient = descent_state.z, descent_state.gradient
+        # A small derivative at a flat end is no sign of a minimum if the descent leads back into the range: it counts
+        # as it would in the middle of the range.
+        gradient = np.where(gradient * z > 0, gradient / self._steepness_at_ends(z), gradient)
+        if np.max(np.abs(gradient)) <= self.stopping.gradient:
             return Reason.GRADIENT
         if descent_state.idle >= MAX_IDLE_STEPS:
             return Reason.CHANGE
         if descent_state.jumps >= MAX_JUMPS:
             return Reason.JUMP
         return Reason.LIMIT if descent_state.iterations >= self.stopping.iterations else None
+
+    def _steepness_at_ends(self, z: np.ndarray) -> np.ndarray:
+        """Return the steepness of each free parameter at a flat end of its range, and 1 elsewhere, shape (p,)."""
+        steepness = self.steepness(z)
+        return np.where(steepness < FLAT, np.maximum(steepness, 1e-300), 1.0)
 
     def _propose(self, descent_states: list[DescentState], fresh: list[bool]) -> None:
         """Compute new updates for the starts that have moved; the others keep theirs."""
@@ -301,9 +323,18 @@ class Descent:
         self.states = _select_by_start(np.array(fresh), states, self.states)
         for descent_state, update, new in zip(descent_states, updates, fresh, strict=True):
             if new:
+                z, g = descent_state.z, descent_state.gradient
+                leaves = (update * z < 0) & (update * g < 0) & self.searches
+                faster = np.clip(update / self._steepness_at_ends(z), -MAX_UPDATE_COMPONENT, MAX_UPDATE_COMPONENT)
+                update = np.where(leaves, faster, update)
                 descent_state.update = update * min(
                     1.0, MAX_UPDATE_COMPONENT / max(float(np.max(np.abs(update))), 1e-300)
                 )
+
+
+def _is_longest(descent_state: DescentState) -> bool:
+    """Return whether the trial step is the greatest that is allowed (1e-9: rounding)."""
+    return descent_state.t * np.max(np.abs(descent_state.update)) >= MAX_UPDATE_COMPONENT * (1 - 1e-9)
 
 
 def _next_step_factor(descent_state: DescentState, loss: float, slope: float) -> float:

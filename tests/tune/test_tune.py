@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mutants import killed_by
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize
 
 from diffabs import controllers, plants, references
 from diffabs.core.bijectors import Decades, HalfLine, Interval, UnboundedLine, bijection, parameter_space
@@ -246,6 +246,38 @@ class TestDescent:
         assert flat.reason is Reason.CHANGE
 
 
+class TestFlatEnds:
+    """x = s(z) in (0, 1), and the minimum at x = 0.7."""
+
+    @killed_by(
+        "tune/descent.py", "gradient = np.where(gradient * z > 0, gradient", "gradient = np.where(False, gradient"
+    )
+    @killed_by(
+        "tune/descent.py", "update = np.where(leaves, faster, update)", "update = np.where(False, faster, update)"
+    )
+    @pytest.mark.parametrize("share", [1e-2, 1e-4, 1e-6, 1e-8, 1 - 1e-8])
+    def test_a_start_at_a_flat_end_leaves_it(self, share):
+        interval = Interval(0.0, 1.0)
+        evaluate, loss = evaluation(lambda z: (interval.value(z[0]) - 0.7) ** 2)
+        descent = Descent(
+            *(evaluate, loss, lambda z: np.ones(len(z), bool), lbfgs(), Stopping(), lambda lanes: None),
+            steepness=interval.steepness,
+        )
+        (found,) = descent.run(np.array([[interval.place(share)]]), Multipliers(np.zeros((1, 0)), np.ones(1)))
+        assert found.reason is Reason.GRADIENT
+        assert float(interval.value(found.z[0])) == pytest.approx(0.7, abs=1e-5)
+
+    def test_a_minimum_at_an_end_is_approached(self):
+        interval = Interval(0.0, 1.0)
+        evaluate, loss = evaluation(lambda z: interval.value(z[0]))
+        descent = Descent(
+            *(evaluate, loss, lambda z: np.ones(len(z), bool), lbfgs(), Stopping(), lambda lanes: None),
+            steepness=interval.steepness,
+        )
+        (found,) = descent.run(np.zeros((1, 1)), Multipliers(np.zeros((1, 0)), np.ones(1)))
+        assert float(interval.value(found.z[0])) < 1e-5
+
+
 class Constrained:
     """A problem without rollouts: minimise x^2 + 2 y^2 with 1 - x - y <= 0; the minimum is at (2/3, 1/3)."""
 
@@ -253,9 +285,12 @@ class Constrained:
     engine = "xla"
     subject = None
 
-    def __init__(self, start, excess):
+    def __init__(self, start, excess, objective=lambda z: z[0] ** 2 + 2 * z[1] ** 2):
         self.space, self.start, self._excess = self, np.asarray(start, float), excess
-        self._evaluate, self._loss = evaluation(lambda z: z[0] ** 2 + 2 * z[1] ** 2, excess)
+        self._evaluate, self._loss = evaluation(objective, excess)
+
+    def steepness(self, z):
+        return np.ones_like(z)
 
     def place(self, subject):
         return self.start
@@ -296,7 +331,7 @@ class TestConstraints:
         assert found.violation[1] == 0
 
     @killed_by("tune/augmented_lagrangian.py", "np.full(count, self.method.margin)", "np.zeros(count)")
-    @killed_by("tune/augmented_lagrangian.py", "            m = _raise_multipliers(m, descent_states)\n", "")
+    @killed_by("tune/augmented_lagrangian.py", "_raise_penalty(_raise_multipliers(m, descent_states)", "_raise_penalty(m")
     @pytest.mark.parametrize("start", [(2.0, 2.0), (0.1, 0.1), (0.7, 0.7)])
     def test_what_is_met_is_met_without_a_tolerance(self, start):
         """Multipliers come to a bound from outside; the bound stated, not one beside it, holds where they end. With the
@@ -307,6 +342,26 @@ class TestConstraints:
         assert found.reason is not Reason.KEPT
         assert found.values["x"] + found.values["y"] >= 1
         assert found.objective[1] == pytest.approx(2 / 3, rel=5e-3)  # a margin of 1e-3 costs 2e-3 of it
+
+    @killed_by("tune/augmented_lagrangian.py", "    return [bool(one) and worst <= 0", "    return [worst <= 0")
+    @pytest.mark.parametrize("start", [10.0, 2.33, 1.0])
+    def test_it_goes_on_beyond_the_first_feasible_round(self, start):
+        """x' = k (1 - x) - x for 2 s: the least integral of 1 - x with x(2) <= 0.7, from both sides of the bound."""
+        end = lambda k: k / (1 + k) * (1 - jnp.exp(-2 * (1 + k)))  # noqa: E731
+        iae = lambda k: 2 / (1 + k) + k / (1 + k) ** 2 * (1 - jnp.exp(-2 * (1 + k)))  # noqa: E731
+        problem = Constrained(
+            [np.log(start), 0.0], lambda z: jnp.array([end(jnp.exp(z[0])) / 0.7 - 1]), lambda z: iae(jnp.exp(z[0]))
+        )
+        found = AugmentedLagrangianSearch(problem, Method(), None).result()
+        aimed = [brentq(lambda k, share=share: end(k) - 0.7 * share, 1, 5) for share in (1 - 2e-3, 1.0)]
+        assert found.met
+        assert iae(aimed[1]) <= found.objective[1] <= iae(aimed[0])
+
+    def test_rounds_that_run_out_are_said(self):
+        """One round does not settle the multiplier."""
+        problem = Constrained([0.1, 0.1], lambda z: jnp.array([1 - z[0] - z[1]]))
+        found = AugmentedLagrangianSearch(problem, Method(rounds=1, margin=1e-6), None).result()
+        assert found.reason in (Reason.LIMIT, Reason.KEPT)
 
     @killed_by("tune/descent.py", "        if worst <= 0:", "        if False:")
     def test_a_feasible_iterate_is_returned_for_an_infeasible_end(self):

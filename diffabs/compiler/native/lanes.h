@@ -11,7 +11,7 @@
 #ifdef __AVX__
 #include <immintrin.h>
 #endif
-#if defined(__AVX512F__)
+#ifdef WIDE
 #define BYTES 64
 #elif defined(__AVX__)
 #define BYTES 32
