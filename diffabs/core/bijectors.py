@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.kinds import format_value
 from diffabs.core.pytree import ParameterSpec, parameters, replace
 from diffabs.core.types import AnyArray, Part, PyTree, Scalar
 
@@ -230,6 +231,8 @@ def parameter_space(part: Part, free: Sequence[str] | Mapping[str, Range | None]
         ValueError: No path is given. A path is not a parameter, or a run does not depend on it smoothly. A range is
             empty or leaves the declared range. A present value is at an end of its range or outside.
     """
+    if isinstance(free, str):
+        raise ValueError(f"free = {free!r} is text; a list of paths, or ranges by path, is needed")
     given = free if isinstance(free, Mapping) else dict.fromkeys(free)
     if not given:
         raise ValueError("no parameter is free")
@@ -243,7 +246,13 @@ def parameter_space(part: Part, free: Sequence[str] | Mapping[str, Range | None]
 
 
 def _entry(path: str, spec: ParameterSpec, value: np.ndarray, ends: Range | None) -> FreeParameter:
-    low, high = (np.broadcast_to(np.asarray(x, float), value.shape) for x in ends or (spec.low, spec.high))
+    try:
+        a, b = (spec.low, spec.high) if ends is None else ends
+        low, high = (np.broadcast_to(np.asarray(x, float), value.shape) for x in (a, b))
+    except (TypeError, ValueError):
+        shape = f" of shape {value.shape}" if value.shape else ""
+        needed = f"a pair (low, high) of numbers{shape}"
+        raise ValueError(f"{path}: the range {format_value(ends)} is not {needed}") from None
     maps = []
     for a, b, x in zip(low.ravel(), high.ravel(), value.ravel(), strict=True):
         a, b, x = float(a), float(b), float(x)

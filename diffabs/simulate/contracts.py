@@ -175,22 +175,22 @@ def _call(path: str, part: Part, method: str, *args: Any) -> Any:
                 " needs a number's value, which JAX traces without; use jnp.where for if, jax.numpy for math and numpy"
             )
         elif isinstance(error, AttributeError):
-            raise Misfit(_explain_missing(path, method, error) + place) from error
+            raise Misfit(_explain_missing(path, part, method, error) + place) from error
         else:
             why = f" fails: {type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
         raise Misfit(f"{path}.{method}{why}{place}") from error
 
 
-def _explain_missing(path: str, method: str, error: AttributeError) -> str:
+def _explain_missing(path: str, part: Part, method: str, error: AttributeError) -> str:
     """Return a line about a missing attribute: which part reads it, and which fields exist."""
     frames = [frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    part = [one for one in frames if dataclasses.is_dataclass(one)][-1:]
+    reader = ([one for one in frames if dataclasses.is_dataclass(one)] or [part])[-1]
     there = getattr(error.obj, "_fields", None)
     if there is None and dataclasses.is_dataclass(error.obj):
         there = [field.name for field in dataclasses.fields(error.obj)]
-    if there is None or not part or error.obj is part[0]:
+    if there is None or error.obj is reader:
         return f"{path}.{method} fails: {next(iter(str(error).splitlines()), '')}"
-    needs = f"{path}: {kebab_case(type(part[0]).__name__)} needs {error.name}"
+    needs = f"{path}: {kebab_case(type(reader).__name__)} needs {error.name}"
     return f"{needs}; there is only {', '.join(there)}: these parts do not fit together"
 
 

@@ -2,6 +2,8 @@
 
 import dataclasses
 import enum
+import math
+import numbers
 
 import optax
 
@@ -27,6 +29,11 @@ class Stopping:
     change: float = 1e-7
     iterations: int = 100
 
+    def __post_init__(self):
+        _check_whole("iterations", self.iterations, 0)
+        _check_size("gradient", self.gradient)
+        _check_size("change", self.change)
+
 
 @dataclasses.dataclass(frozen=True)
 class Method:
@@ -50,3 +57,19 @@ class Method:
     rounds: int = 12
     margin: float = 1e-3
     memory: int = 10
+
+    def __post_init__(self):
+        _check_whole("starts", self.starts, 1)
+        _check_whole("rounds", self.rounds, 0)
+        _check_whole("memory", self.memory, 1)
+        _check_size("margin", self.margin)
+
+
+def _check_whole(name: str, value: int, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
+        raise ValueError(f"{name} = {value!r} is no whole number in [{least}, inf)")
+
+
+def _check_size(name: str, value: float) -> None:
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not 0 <= value < math.inf:
+        raise ValueError(f"{name} = {value!r} is no number in [0, inf)")

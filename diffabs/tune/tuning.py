@@ -7,11 +7,13 @@ import numpy as np
 
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.bijectors import Range, parameter_space
+from diffabs.core.kinds import find_value_objection, format_value, value_shape
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import get
 from diffabs.core.types import Part
 from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
+from diffabs.simulate.arguments import refuse
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.types import Solver
@@ -90,7 +92,7 @@ def build_problem(
             are few (`Problem.choose_xla`). `Problem.engine` and `Tuned.engine` name the engine.
 
     Raises:
-        ValueError: A path, range, metric or batch does not fit, or a parameter is out of range.
+        ValueError: A path, range, metric, constraint or batch does not fit, or a parameter is out of range.
         EngineError: The engine is "kernel" and the mode is reverse.
 
     >>> import diffabs as d
@@ -107,8 +109,12 @@ def build_problem(
     check_part(subject)
     loop = build_subject_loop(subject)
     measured = default_objectives(loop.plant) if measured is None else measured
+    refuse(loop, solver, measured)
+    if over is not None and not isinstance(over, Batch):
+        raise ValueError(f"over = {format_value(over)} is no Batch; d.Batch(values by path) is needed")
     batch = (over or Batch()).check(loop)
-    _check_metrics(objective, measured, constraints)
+    _check_metrics(objective, measured)
+    _check_constraints(constraints, measured, batch.size)
     free_space = parameter_space(subject, free)
     problem = Problem(
         subject=subject,
@@ -124,13 +130,35 @@ def build_problem(
     return problem.with_engine(engine, mode)
 
 
-def _check_metrics(objective: Mapping[str, float], measured: Mapping[str, Objective], constraints: Any) -> None:
-    wanted = [*objective, *(c.metric for c in constraints if hasattr(c, "metric"))]
+def _check_metrics(objective: Mapping[str, float], measured: Mapping[str, Objective]) -> None:
+    """Raise a ValueError if the objective is no mapping from measured metrics to finite weights."""
+    if not isinstance(objective, Mapping):
+        raise ValueError(f"objective = {format_value(objective)} is no mapping from metrics to weights")
     if not objective:
         raise ValueError("the objective has no metric")
-    for name in wanted:
-        if name not in measured:
-            raise ValueError(f"{name} is not measured; there is {', '.join(measured)}")
     for name, weight in objective.items():
-        if not np.isfinite(weight):
-            raise ValueError(f"objective: the weight of {name} is {weight}, not a finite number")
+        _check_measured(name, measured)
+        if find_value_objection(weight) or not np.isfinite(weight):
+            raise ValueError(f"objective: the weight of {name} is {weight!r}, not a finite number")
+
+
+def _check_constraints(constraints: Any, measured: Mapping[str, Objective], runs: int) -> None:
+    """Raise a ValueError if the constraints are no sequence of constraints, or a bound does not fit the runs."""
+    if isinstance(constraints, str | Mapping) or not all(hasattr(one, "excess") for one in constraints):
+        given = format_value(constraints)
+        raise ValueError(f'constraints = {given} is no list of constraints, such as [AtMost("overshoot", 0.01)]')
+    for one in constraints:
+        if not hasattr(one, "metric"):
+            continue
+        _check_measured(one.metric, measured)
+        bound = one.bound
+        if find_value_objection(bound) or not np.isfinite(np.asarray(bound, float)).all():
+            raise ValueError(f"constraints: the bound of {one.metric} is {bound!r}, not a finite number")
+        if value_shape(bound) not in ((), (runs,)):
+            needed = f"one number, or one for each of {runs} runs, is needed"
+            raise ValueError(f"constraints: the bound of {one.metric} has the shape {value_shape(bound)}; {needed}")
+
+
+def _check_measured(name: str, measured: Mapping[str, Objective]) -> None:
+    if name not in measured:
+        raise ValueError(f"{name} is not measured; there is {', '.join(measured)}")

@@ -331,7 +331,9 @@ class TestConstraints:
         assert found.violation[1] == 0
 
     @killed_by("tune/augmented_lagrangian.py", "np.full(count, self.method.margin)", "np.zeros(count)")
-    @killed_by("tune/augmented_lagrangian.py", "_raise_penalty(_raise_multipliers(m, descent_states)", "_raise_penalty(m")
+    @killed_by(
+        "tune/augmented_lagrangian.py", "_raise_penalty(_raise_multipliers(m, descent_states)", "_raise_penalty(m"
+    )
     @pytest.mark.parametrize("start", [(2.0, 2.0), (0.1, 0.1), (0.7, 0.7)])
     def test_what_is_met_is_met_without_a_tolerance(self, start):
         """Multipliers come to a bound from outside; the bound stated, not one beside it, holds where they end. With the

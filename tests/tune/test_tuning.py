@@ -20,6 +20,7 @@ from diffabs.design.polytopes import Polytope
 from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
+from diffabs.objectives.balance import PeakTorque
 from diffabs.objectives.tracking import keep_memory, no_integral
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.stability import stable_step, stable_steps
@@ -134,7 +135,20 @@ def test_a_start_that_is_not_stable_is_refused():
         ({"objective": {}}, "the objective has no metric"),
         ({"objective": {"iea": 1.0}}, "iea is not measured; there is stop_time"),
         ({"objective": {"iae": np.nan}}, "the weight of iae is nan"),
+        ({"objective": {"iae": "1"}}, "the weight of iae is '1', not a finite number"),
+        ({"objective": ["iae"]}, r"objective = \['iae'\] is no mapping from metrics to weights"),
         ({"constraints": [AtMost("overshot", 0.1)]}, "overshot is not measured"),
+        ({"constraints": [AtMost("iae", np.nan)]}, "the bound of iae is nan, not a finite number"),
+        ({"constraints": [AtMost("iae", "0.7")]}, "the bound of iae is '0.7', not a finite number"),
+        (
+            {"constraints": [AtMost("iae", [0.1, 0.2])]},
+            r"iae has the shape \(2,\); one number, or one for",
+        ),
+        ({"constraints": {"iae": 0.7}}, r"constraints = \{'iae': 0.7\} is no list of constraints"),
+        ({"over": {"plant.mass": [5.0]}}, "over = .* is no Batch"),
+        ({"free": "controller.kp"}, "free = 'controller.kp' is text; a list of paths, or ranges by path"),
+        ({"free": {"plant.mass": 5.0}}, r"plant.mass: the range 5.0 is not a pair \(low, high\) of numbers"),
+        ({"measured": {"iae": PeakTorque()}}, "objectives.iae: peak-torque needs constant; there is only slip"),
         ({"over": d.Batch({"plant.mass": [-1.0]})}, "plant.mass = -1"),
         ({"free": {"plant.mass": (9.0, 10.0)}}, "plant.mass = 5.3 is not inside"),
     ],
@@ -143,6 +157,20 @@ def test_says_what_does_not_fit(change, message):
     given = {"free": GAINS, "objective": {"iae": 1.0}, "solver": SOLVER}
     with pytest.raises(ValueError, match=message):
         tune(build_problem(RIG, **given | change))
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [
+        (Method, {"starts": 0}, r"starts = 0 is no whole number in \[1, inf\)"),
+        (Method, {"starts": 1.5}, r"starts = 1.5 is no whole number in \[1, inf\)"),
+        (Method, {"margin": -0.1}, r"margin = -0.1 is no number in \[0, inf\)"),
+        (Stopping, {"iterations": -1}, r"iterations = -1 is no whole number in \[0, inf\)"),
+    ],
+)
+def test_settings_out_of_range_are_refused(kind, change, message):
+    with pytest.raises(ValueError, match=message):
+        kind(**change)
 
 
 @pytest.mark.slow
