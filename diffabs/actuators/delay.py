@@ -19,9 +19,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.arrays import as_rule_array
 from diffabs.core.cubic import Cubic, HermiteStep
+from diffabs.core.kinds import format_value
 from diffabs.core.log import Log
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree, static
@@ -32,6 +34,7 @@ TIME_ROUNDING = 1e-6  # relative rounding of single precision
 WINDOW_PIECES = 6  # pieces; a step that spans more is cut
 TIME_EPS = 16.0  # in machine epsilons of t: closer instants count as equal
 SMOOTH_CHANGE_SHARE = 0.5  # exponent of the machine epsilon: a smaller relative difference is no jump
+LEAST_CAPACITY = 3  # steps: the delay has at least one step, and at most capacity - 2
 SPARE, CUTS = 16, 4  # room for cut steps: SPARE pieces and one more for every CUTS steps
 
 
@@ -98,7 +101,7 @@ class Delay:
 
     Attributes:
         time: Delay [s], > 0.
-        capacity: Number of steps that the ring holds, without the spare rows.
+        capacity: Number of steps that the ring holds, without the spare rows; an integer >= 3.
     """
 
     time: Scalar = param(default=0.01, unit="s", above=0.0)
@@ -107,7 +110,13 @@ class Delay:
     flow = no_flow
 
     def start(self, signal: Scalar) -> Memory:
-        """Return a memory with one piece: the command 0 until t = 0."""
+        """Return a memory with one piece: the command 0 until t = 0.
+
+        Raises:
+            ValueError: The capacity is no integer, or smaller than 3 steps.
+        """
+        for line in self.problems():
+            raise ValueError(f"Delay.{line}")
         zero = 0.0 * jnp.asarray(signal)
         row = _row(Piece(zero - self.time, zero, Cubic(zero, zero, zero, zero), zero))
         window = jnp.broadcast_to(row, (WINDOW_PIECES, *row.shape))
@@ -201,6 +210,14 @@ class Delay:
     def refined(self, times: int) -> "Delay":
         """Return the same delay with `times` times the capacity, for a step that is `times` times shorter."""
         return dataclasses.replace(self, capacity=times * self.capacity)  # pyright: ignore[reportArgumentType]
+
+    def problems(self) -> Iterator[str]:
+        """Yield a message if the capacity is no integer, or smaller than 3 steps."""
+        if not isinstance(self.capacity, int | np.integer) or isinstance(self.capacity, bool):
+            shown = format_value(self.capacity)
+            yield f"capacity = {shown} is no integer; one in [{LEAST_CAPACITY}, inf) steps is needed"
+        elif self.capacity < LEAST_CAPACITY:
+            yield f"capacity = {self.capacity} is outside [{LEAST_CAPACITY}, inf) steps"
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """Yield the rule step <= time <= (capacity - 2) * step, up to the rounding of single precision."""

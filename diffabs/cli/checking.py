@@ -16,6 +16,7 @@ from diffabs.simulate.run import measure
 from diffabs.simulate.types import Adaptive, Run, Solver, describe_solver, refine_solver
 
 MIN_CHANGE = 1e-6  # of a value; the order of a smaller error does not matter
+ROUNDING = 1e-12  # in the metric's unit; a smaller error of a value near 0 is rounding
 FINEST = 4  # the shortest step of the check is the scenario's divided by this
 CLOSER = 16  # `rtol` of the run with adaptive steps is divided by this for the comparison
 LOOSE, LEAST = 100, 0.01  # a change above LOOSE * rtol * max(|metric|, LEAST) is reported
@@ -103,7 +104,8 @@ def describe_check(found: JsonObject) -> list[str]:
     if found["comparable"] and not found["ended alike"]:
         lines.append("accuracy unknown: with a shorter step the run ends differently")
     rows = found["metrics"].items()
-    loose = [name for name, row in rows if not row["converges"] and row["error"] > MIN_CHANGE * abs(row["value"])]
+    least = {name: max(MIN_CHANGE * abs(row["value"]), ROUNDING) for name, row in rows}
+    loose = [name for name, row in rows if not row["converges"] and row["error"] > least[name]]
     if found["comparable"] and loose:
         lines.append(f"shorter steps do not converge for {', '.join(loose)}: the error is a guess")
     return lines

@@ -21,6 +21,7 @@ from rich.console import Console
 from diffabs.cli import progress
 from diffabs.config.values import ScenarioError
 from diffabs.core.types import Int, JsonObject
+from diffabs.roads.sign import find_wrong_sign
 from diffabs.runtime import files, interrupt, provenance, stopwatch
 from diffabs.scenario import outside
 from diffabs.scenario.model import describe_model
@@ -230,7 +231,8 @@ def end_on_errors() -> Iterator[None]:
     except BrokenPipeError:
         raise
     except OSError as error:
-        fail(" ".join(str(error).split()), FAILED)
+        where = "standard output: " if error.filename is None and _is_output_refused() else ""
+        fail(where + " ".join((error.strerror or str(error) if where else str(error)).split()), FAILED)
     except MemoryError:
         fail("out of memory", FAILED)
     except KeyboardInterrupt:
@@ -240,6 +242,16 @@ def end_on_errors() -> Iterator[None]:
         if not (line := outside.describe_outside_error(error)):
             raise
         fail(line)
+
+
+def _is_output_refused() -> bool:
+    """Return True if standard output cannot be written, as on a full disk."""
+    try:
+        sys.stdout.write("")
+        sys.stdout.flush()
+    except OSError:
+        return True
+    return False
 
 
 class InterruptibleEnd:
@@ -347,9 +359,13 @@ def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: b
         integrated: Also check that the step is stable for the loop.
 
     Raises:
-        ScenarioError: As in `load`.
+        ScenarioError: As in `load`. Also raised if the friction of a road has not the sign of the slip, where there are
+            parts from outside.
     """
     chosen = run_with_progress(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
+    road = getattr(chosen.loop.plant, "road", None) if outside.registered_modules() else None
+    if road is not None and (line := run_with_progress(lambda: find_wrong_sign(road), "checking the road")):
+        raise ScenarioError(f"road: {line}")
     for line in chosen.notes:
         say(f"note: {line}")
     for line in chosen.cautions():

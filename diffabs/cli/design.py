@@ -26,9 +26,10 @@ def design(
     as_json: console.Json = False,
     out: Out = None,
 ) -> None:
-    """Find the gain with the least guaranteed cost.
+    """Find the gain with the least cost that one common P proves together with all specifications.
 
-    The gain is a state feedback for all systems within the ranges of [design.over]. A certificate proves its cost."""
+    The gain is a state feedback for all systems within the ranges of [design.over].
+    Its certificate proves the cost with a P of its own, so the guaranteed cost may be lower."""
     with console.end_on_errors(), certificates.report_design_errors():
         with targets.new_target_file(out, "--out") as file:
             task = _prepare(scenario, changes or (), weighed=True)
@@ -81,7 +82,8 @@ def verify(
         pathlib.Path, typer.Argument(metavar="FILE.json", help="Certificate written by design, certify or prove.")
     ],
     seconds: Annotated[
-        float, typer.Option(help="Limit of the computing time [s]; an undecided file is refused after it.")
+        float,
+        typer.Option(help="Of a file of design or certify: limit of the computing time [s]; then not proved."),
     ] = 6.0,
     share: Annotated[
         float, typer.Option(help="Of a file of prove: share of its cells to check, drawn at random.")
@@ -91,7 +93,7 @@ def verify(
     """Prove a saved certificate again: of design and certify in exact fractions, of prove in Arb's balls.
 
     The code is independent of the code that made the certificate.
-    Exit status: 0 proved, 1 not proved, 2 no certificate."""
+    Exit status: 0 proved, or not refuted where --share leaves cells unchecked; 1 not proved, 2 no certificate."""
     from diffabs.design.verify import verify_file as verified
 
     with console.end_on_errors():

@@ -182,10 +182,10 @@ def _fit(
     solver, columns = _solver(chosen.solver, readings), readings.columns
 
     def fit_traces(
-        noise: Mapping[str, float], starts: Sequence[PyTree] = ()
+        noise: Mapping[str, float], starts: Sequence[PyTree] = (), absolute: bool = bool(given)
     ) -> tuple["Identified", dict[str, np.ndarray]]:
         traces = Traces(t=readings.t, columns=columns, sigma=noise)
-        options = {"solver": solver, "absolute": bool(given), "starts": starts}
+        options = {"solver": solver, "absolute": absolute, "starts": starts}
         found = identify(chosen.loop, traces, dict(ranges), **options, progress=told, stopping=stopping)
         return found, traces.residuals(found)
 
@@ -197,11 +197,13 @@ def _fit(
     for _ in range(0 if len(given) == len(columns) else ROUNDS - 1):
         if stopping():
             break
-        noise = {
-            name: given.get(name) or max(_root_mean_square(residuals[name]), MIN_RELATIVE_NOISE * spread[name])
-            for name in columns
-        }
-        found, residuals = fit_traces(noise, [found.values])
+        least = {name: MIN_RELATIVE_NOISE * size for name, size in spread.items()}
+        left = {name: _root_mean_square(values) for name, values in residuals.items()}
+        noise = {name: given.get(name) or max(left[name], least[name]) for name in columns}
+        # Residuals below the bound are errors of the solver and of the search, not noise: they do not scale the bound.
+        exact = any(left[name] < least[name] for name in columns if name not in given)
+        # A value at an end of its range cannot be moved from there: the scenario's own values are the start again.
+        found, residuals = fit_traces(noise, [] if found.ends else [found.values], bool(given) or exact)
         evaluations += found.evaluations
     return dataclasses.replace(found, evaluations=evaluations), noise
 
@@ -237,6 +239,7 @@ def _result(
             for j in range(i)
             if abs(known.correlation[i, j]) > HIGH_CORRELATION
         ],
+        "notes": found.describe_limits().splitlines(),
         "undetermined": [
             {"direction": one.describe(), "spread": one.spread, "components": one.components}
             for one in known.undetermined_directions()
@@ -266,8 +269,9 @@ def _scalar_values(
         for at in np.ndindex(values.shape):
             name = ".".join([path, *map(str, at)])
             numbers = {"before": before[at], "value": values[at], "low": low[at], "high": high[at]}
-            deviation = found.uncertainty.deviations[name]
-            rows[name] = {k: float(x) for k, x in numbers.items()} | {"deviation": deviation, "unit": specs[path].unit}
+            known = found.describe_deviation(name)
+            deviation = {"deviation": None, "why": known} if isinstance(known, str) else {"deviation": known}
+            rows[name] = {k: float(x) for k, x in numbers.items()} | deviation | {"unit": specs[path].unit}
     return rows
 
 

@@ -173,11 +173,14 @@ def _show(result: JsonObject, chosen: Scenario, nominal: "System", found: "Band 
     columns = [f"worst of {len(found.systems)}", "where"] if worst and found else []
     table = Table("margin", "here", *columns)
     for name, words in MARGIN_NAMES.items():
-        row = [_format_margin(name, here[name])]
+        row = [_format_margin(name, here[name], nominal.margins.stable)]
         if columns:
             one = worst.get(name)
             row += (
-                [_format_margin(name, margin_numbers(one.margins)[name]), _format_place(one.values, chosen)]
+                [
+                    _format_margin(name, margin_numbers(one.margins)[name], one.margins.stable),
+                    _format_place(one.values, chosen),
+                ]
                 if one
                 else ["", ""]
             )
@@ -190,9 +193,9 @@ def _show(result: JsonObject, chosen: Scenario, nominal: "System", found: "Band 
     show.show_files(result)
 
 
-def _format_margin(name: str, value: float) -> str:
+def _format_margin(name: str, value: float, stable: bool) -> str:
     if math.isnan(value):
-        return "none"
+        return "undecided" if name == "delay" and stable else "none"
     return "no limit" if value == math.inf else f"{value * SHOWN_IN.get(name, 1.0):.4g}"
 
 

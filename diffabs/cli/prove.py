@@ -134,7 +134,10 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
 
     far = [""]
     try:
-        chosen = loads(str(document.get("scenario")).encode(), file.stem, str(file), integrated=False)
+        text = document.get("scenario")
+        if not isinstance(text, str):
+            raise ValueError("scenario is missing or no text; the TOML text of a scenario is needed")
+        chosen = loads(text.encode(), file.stem, "scenario", integrated=False)
         box = read_proof(document).over
         derive_equations(chosen.loop, box)  # refuses a loop or a box without rules before anything is simulated
         # The runs that would show a false bound are looked for, and their cells are proved again.
@@ -150,7 +153,8 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
     except (NoRule, ValueError) as error:
         console.fail(f"{file}: {' '.join(str(error).split())}")
     proved, whole = not found.reason, found.checked == found.cells
-    cells = f"{found.checked:,} of {found.cells:,} cells proved again{'' if whole else '; --share 1 proves all'}"
+    cells = f"{found.checked:,} of {found.cells:,} cells proved again"
+    cells += "; --share 1 proves all" if proved and not whole else ""
     views.show_verification({
         "file": str(file),
         "proved": proved,

@@ -70,9 +70,11 @@ def _read_failure(text: str, chosen: Scenario) -> tuple[str, float]:
     if metric not in chosen.objectives:
         raise unknown_name_error(f"{metric} is not a metric of this scenario", metric, chosen.objectives)
     if equals:
-        return metric, read_number(
-            parse_value(bound.strip()), ParameterSpec(unit_of(chosen.objectives[metric], chosen.loop.plant)), metric
-        )
+        spec = ParameterSpec(unit_of(chosen.objectives[metric], chosen.loop.plant))
+        value = read_number(parse_value(bound.strip()), spec, metric)
+        if not math.isfinite(value):
+            raise ScenarioError(f"{metric} = {value:g} is outside {spec.interval()}")
+        return metric, value
     if metric not in chosen.sweep.failures:
         raise ScenarioError(f"{metric} has no bound in [sweep.failures]: say {metric}=BOUND")
     return metric, chosen.sweep.failures[metric]
@@ -125,6 +127,7 @@ def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str,
         "note": found.note,
         "reason": found.reason.value,
         "levels": [level._asdict() for level in found.levels],
+        "first level alone": found.plain._asdict(),
         "subset simulation": found.subset._asdict(),
         "importance sampling": found.importance.estimate._asdict() if found.importance else None,
         "failures": {path: column.tolist() for path, column in rows.items()},

@@ -23,10 +23,15 @@ from diffabs.simulate.types import Trajectory
 
 BOUND_SHARE = 1e-3  # of its range: a tuned number this close to a bound counts as on it
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
-COSTS = (
-    "trace cost bounds the sum of the costs x'Px of runs from 1 in each single state. guaranteed cost is this bound,"
-    " proved in exact fractions. lower bound: no common gain costs less. gap: greatest relative saving of another gain."
-)
+COSTS = {
+    "trace_cost": "trace cost bounds the sum of the costs x'Px of runs from 1 in each single state.",
+    "guaranteed_cost": "guaranteed cost bounds the same sum for this gain, proved in exact fractions.",
+    "lower_bound": "lower bound: no common gain costs less.",
+    "gap": (
+        "The gain minimises the trace cost, for which one P proves all specifications. gap bounds the relative saving"
+        " by another gain. The guaranteed cost has a P of its own and may be lower."
+    ),
+}
 
 
 def as_json(value: Scalar) -> None:
@@ -180,8 +185,8 @@ def show_proof(result: JsonObject, title: str, units: Mapping[str, str], verdict
         if result[name] is not None:
             numbers.add_row(name.replace("_", " "), f"{result[name]:.8g}", unit)
     show_titled_table("proof", numbers)
-    if result["guaranteed_cost"] is not None:
-        open_console().print(COSTS)
+    if said := [sentence for name, sentence in COSTS.items() if result[name] is not None]:
+        open_console().print(" ".join(said))
     corners = result["corners"] or [{} for _ in result["poles"]]
     discrete = result["period"] is not None
     names = [f"{name} [{units[name]}]" for name in corners[0]]
@@ -197,15 +202,18 @@ def show_proof(result: JsonObject, title: str, units: Mapping[str, str], verdict
 def show_verification(result: JsonObject, json_wanted: bool) -> None:
     """Show a line for each claim, or the JSON document.
 
+    A claim is "proved", "NOT PROVED", or "not refuted" if only a sample of the cells was proved again.
+
     Args:
-        result: JSON document of the verification.
+        result: JSON document of the verification; without the key "complete" it is complete.
         json_wanted: True for JSON.
     """
     if json_wanted:
         return as_json(result)
     console = open_console()
+    proved = "proved" if result.get("complete", True) else "not refuted"
     for claim in result["claims"]:
-        line = f"{'proved' if claim['proved'] else 'NOT PROVED'}  {claim['kind']}: {claim['says']}"
+        line = f"{proved if claim['proved'] else 'NOT PROVED'}  {claim['kind']}: {claim['says']}"
         console.print(line, soft_wrap=not console.is_terminal)
     return None
 
@@ -265,9 +273,8 @@ def show_identification(result: JsonObject) -> None:
     """
     values = Table("parameter", "before", "identified", "standard deviation", "unit")
     for name, row in result["values"].items():
-        values.add_row(
-            name, format_brief(row["before"]), format_brief(row["value"]), f"{row['deviation']:.3g}", row["unit"]
-        )
+        deviation = row["why"] if row["deviation"] is None else f"{row['deviation']:.3g}"
+        values.add_row(name, format_brief(row["before"]), format_brief(row["value"]), deviation, row["unit"])
     show_titled_table(f"{result['scenario']}: identified from {result['data']['samples']} instants", values)
     left = Table("column", "sigma", "rms", "mean", "largest", "unit")
     for name, row in result["residuals"].items():
@@ -275,6 +282,8 @@ def show_identification(result: JsonObject) -> None:
     show_titled_table("simulated minus measured", left)
     for row in result["correlations"]:
         say(f"note: {row['between'][0]} and {row['between'][1]} are correlated by {row['correlation']:.4f}")
+    for line in result["notes"]:
+        say(f"note: {line}")
     say(f"it ended because {result['reason']}, after {result['evaluations']} evaluations")
     show_files(result)
 

@@ -1,5 +1,6 @@
 """Tables of the commands on many samples: a sweep, a small probability, a comparison of two sweeps."""
 
+import math
 from typing import TYPE_CHECKING
 
 from rich.table import Table
@@ -110,11 +111,13 @@ def show_rare_event(result: JsonObject, chosen: Scenario) -> None:
         f"{chosen.title or chosen.name}: {result['metric']} >= {result['bound']:g} {result['unit']}", levels
     )
     estimates = Table("estimate", "probability", "low", "high", "coefficient of variation")
-    for name in ("subset simulation", "importance sampling"):
+    for name in ("first level alone", "subset simulation", "importance sampling"):
         if row := result[name]:
-            estimates.add_row(name, *(f"{x:.4g}" for x in (row["probability"], *row["interval"], row["cov"])))
+            numbers = (f"{x:.4g}" for x in (*row["interval"], row["cov"]))
+            estimates.add_row(name, _format_probability(row["probability"]), *numbers)
     low, high = result["interval"]
-    show_titled_table(f"probability {result['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}", estimates)
+    probability = _format_probability(result["probability"])
+    show_titled_table(f"probability {probability}, 95 % interval {low:.3g} to {high:.3g}", estimates)
     count = len(next(iter(result["failures"].values()), ()))
     failures = Table("likeliest failures", *map(str, range(1, count + 1)))
     for path, column in result["failures"].items():
@@ -123,6 +126,10 @@ def show_rare_event(result: JsonObject, chosen: Scenario) -> None:
         show_titled_table("", failures)
     say(f"{result['note']}; {result['reason']}")
     say(f"{result['runs']} runs and {result['gradients']} gradients; {result['diverged']} diverged")
+
+
+def _format_probability(probability: float) -> str:
+    return "undecided" if math.isnan(probability) else f"{probability:.4g}"
 
 
 def show_comparison(result: JsonObject) -> None:

@@ -45,7 +45,7 @@ class Group(typer.core.TyperGroup):
                 error.show()
             else:
                 text = " ".join(error.format_message().split()).removesuffix(".")
-                text = re.sub(r"^Invalid value for '(.*?)': ", r"\1: ", text)
+                text = re.sub(r"^Invalid value for '(.*?)': (Value error, )?", r"\1: ", text)
                 where = error.ctx.command_path if error.ctx else "diffabs"
                 console.say(f"error: {text[:1].lower()}{text[1:]} ({where} --help)")
             status = error.exit_code

@@ -5,6 +5,7 @@ their type. A reader takes the given value and its path for messages, and return
 """
 
 import dataclasses
+import datetime
 import difflib
 import json
 import re
@@ -60,6 +61,8 @@ def format_given(value: Scalar, most: int = 60) -> str:
         value: Any value.
         most: Greatest number of characters.
     """
+    if isinstance(value, datetime.date | datetime.time):
+        return value.isoformat()
     if isinstance(value, float) or (isinstance(value, int) and abs(value) < 10**15):
         return f"{value:.15g}" if not isinstance(value, bool) else str(value).lower()
     try:

@@ -104,7 +104,7 @@ class UnboundedLine:
         return self.start + self.scale * z
 
     def steepness(self, z: np.ndarray) -> np.ndarray:
-        """Return 1: the map has the same slope everywhere."""
+        """Return 1 at every `z`: the map has the same slope everywhere."""
         return np.ones_like(z)
 
     def place(self, value: float) -> float:
@@ -186,7 +186,7 @@ class FreeSpace:
         return replace(part, self.values(z))
 
     def steepness(self, z: np.ndarray) -> np.ndarray:
-        """Return how steep the map of each element is at `z` (size,), from 1 in the middle to 0 at a finite end."""
+        """Return the steepness of each element's map at `z` (size,): 1 in the middle, towards 0 at a finite end."""
         maps = [m for entry in self.entries for m in entry.maps]
         return np.array([float(m.steepness(x)) for m, x in zip(maps, z, strict=True)])
 

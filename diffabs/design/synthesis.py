@@ -51,11 +51,13 @@ class Design:
     Attributes:
         gain: Gain K of u = K x, shape (m, n), or (N + 1, m, n) at the nodes of a schedule of N cells.
         certificate: Proof of the specifications.
-        trace_cost: Trace Z in floats, the smallest guaranteed cost; for a schedule its mean over the nodes. None
-            without Q, R.
+        trace_cost: Trace Z in floats: the least bound of the cost for which one P proves all specifications. The
+            certificate proves the cost with a P of its own, so its `guaranteed_cost` may be lower. For a schedule, the
+            mean over the nodes. None without Q, R.
         lower_bound: Largest trace of the vertices' own Riccati solutions, which no common gain can beat. None without
             Q, R, and for a schedule.
-        gap: Bound [1] on (objective - optimum)/objective.
+        gap: Bound [1] on (objective - optimum)/objective, where the objective is `trace_cost`, or the L2 gain without
+            Q, R. It says nothing about the `guaranteed_cost` of other gains.
         residual: Largest eigenvalue over the vertices of He[P(A + BK)] + K'RK + Q, relative to that of Q + K'RK. Both
             are taken in coordinates with P = I. At the active vertices it is 0 up to rounding. None where `lower_bound`
             is.
@@ -72,7 +74,10 @@ class Design:
 
 
 def design(system: Polytope | Schedule, spec: Spec) -> Design:
-    """Return the gain that minimises the guaranteed cost (with Q, R), or else the L2 gain, under all specifications.
+    """Return the gain that minimises the bound of the cost (with Q, R), or else the L2 gain, under all specifications.
+
+    One matrix P proves the bound and all specifications. With more specifications than the cost, another gain may thus
+    have a lower cost that is proved with a P for the cost alone.
 
     Exactly one objective is needed: Q and R, or an `L2Gain` without a bound. An `L2Gain` beside Q and R needs a bound.
     A schedule needs Q, R and `rates` in continuous time, and accepts no other specification but a decay.

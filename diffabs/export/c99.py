@@ -82,7 +82,8 @@ class _Text:
         yield (
             f"   Call {self.name}_start once with the first measurements, then {self.name}_step at every sample,\n"
             f"   the first among them, both with parameters: {self.name}_defaults, or a changed copy.\n"
-            "   A sample with a NaN, or that leads to one, is not used: memory and command stay, and held is true.\n"
+            "   A sample with a NaN, or that leads to one, is not used: the controller's memory and the command stay,\n"
+            "   and held is true. Time and a moving target go on. Parameters are not checked: keep each in its range.\n"
             "   Nothing is allocated and nothing changes that is global; two states are two controllers. */"
         )
         yield "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>\n"

@@ -109,7 +109,8 @@ class ComputerProgram:
     Attributes:
         start: start(parts, input) -> state before the first sample.
         step: step(parts, state, input) -> (controller's memory, samples, command, held). `held` is true if the sample
-            cannot be used. Memory and command then stay the same, but `samples` counts it.
+            cannot be used. The controller's memory and the command then stay, but `samples` counts it and `move`
+            advances the reference.
         move: move(parts, state, i) -> reference's memory after the i-th simulation step, for i = 0, 1, ..., moves - 1.
         moves: Number of calls of `move` after each sample; 0 for a reference without continuous memory.
         units: Units of the inputs by name.
@@ -169,7 +170,8 @@ def computer_program(
         count = max(round(period / step) if step else 1, 1)
         if count > MAX_STEPS_PER_SAMPLE:
             raise NotExported(
-                f"the period of {period:g} s is {count} steps of the solver; {MAX_STEPS_PER_SAMPLE} are the most"
+                f"the period of {period:g} s is {count} steps of the solver, more than {MAX_STEPS_PER_SAMPLE}: choose a"
+                f" solver.step of at least {period / MAX_STEPS_PER_SAMPLE:g} s"
             )
         work = _Work(typed, count, given_target, shapes)
         state = jax.eval_shape(work.start, parts, shapes)

@@ -85,7 +85,7 @@ class _Block:
             yield f"  {self.names[INPUTS, path]} : {self.real}; (* [{comment_text(units.get(path, '1'))}] *)"
         yield "  reset : BOOL; (* begin anew, with what is measured now *)\nEND_VAR"
         yield f"VAR_OUTPUT\n  command : {self.real}; (* [{comment_text(self.device.control_unit)}] *)"
-        yield "  held : BOOL; (* whether the last sample could not be used: memory and command stay *)\nEND_VAR"
+        yield "  held : BOOL; (* whether the last sample could not be used *)\nEND_VAR"
         if program.used:
             yield from ["VAR (* parameters *)", *self._parameters(), "END_VAR"]
         yield "VAR"
@@ -111,7 +111,8 @@ class _Block:
             f"{self.name}: the controller, to be called every {self.device.period:g} s{delay}.",
             *self.notes,
             *map(str, self.device.numbers),
-            "A sample with a NaN, or that leads to one, is not used: memory and command stay, and held is TRUE.",
+            "A sample with a NaN, or that leads to one, is not used: the controller's memory and the command stay,",
+            "and held is TRUE. Time and a moving target go on.",
             "Nothing is global: two instances are two controllers.",
         ]
         text = "\n   ".join(map(comment_text, lines))

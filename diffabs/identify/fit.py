@@ -20,6 +20,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
+from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
 from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
@@ -27,6 +28,9 @@ from diffabs.core.validity import check_part
 from diffabs.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
 from diffabs.runtime.summary import Summary, round_for_table
+
+END_COORDINATE = 7.0  # |z| beyond which a value may be held: exp(-7) of the range, or of the start's distance
+MAX_END_DISTANCE = 0.01  # of a held value from its end, in standard deviations that the parameter would have alone
 
 SCIPY_REASONS = {0: Reason.LIMIT, 1: Reason.GRADIENT, 2: Reason.CHANGE, 3: Reason.CHANGE, 4: Reason.CHANGE}
 
@@ -67,6 +71,8 @@ class Identified:
         start: Values at the start by path.
         starts: Fits from all usable starts, in their order.
         diverged: Values by path of each start that could not be used.
+        ends: End of the range by name, for each parameter that the end holds. Such a parameter has no standard
+            deviation.
     """
 
     part: Part
@@ -82,15 +88,48 @@ class Identified:
     start: JsonObject
     starts: tuple["Identified", ...] = ()
     diverged: tuple[JsonObject, ...] = ()
+    ends: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def table(self) -> Summary:
-        """Return a table of the parameters before and after the fit, with their standard deviations."""
-        deviations = self.uncertainty.deviations
-        rows = tuple((name, self.start.get(name), value, deviations.get(name)) for name, value in self.values.items())
+        """Return a table of the parameters before and after the fit, with their standard deviations.
+
+        A parameter without a meaningful deviation has a word instead: "end of range" or "undetermined". The note below
+        the table explains it.
+        """
+        numbers = zip(
+            *(np.concatenate([np.ravel(x) for x in at.values()]) for at in (self.start, self.values)), strict=True
+        )
+        names = self.uncertainty.names
+        rows = tuple((name, *pair, self.describe_deviation(name)) for name, pair in zip(names, numbers, strict=True))
         title = (
             f"Identified from {len(self.residuals)} residuals, chi2 = {round_for_table(self.chi2)}: {self.reason.value}"
         )
-        return Summary(title, ("parameter", "before", "identified", "standard deviation"), rows)
+        return Summary(title, ("parameter", "before", "identified", "standard deviation"), rows, self.describe_limits())
+
+    def describe_deviation(self, name: str) -> float | str:
+        """Return the standard deviation of a parameter, or "end of range" or "undetermined" if it has none.
+
+        Args:
+            name: Name of the parameter, as in `uncertainty.names`.
+        """
+        if name in self.ends:
+            return "end of range"
+        return (
+            "undetermined" if name in self.uncertainty.undetermined_parameters() else self.uncertainty.deviations[name]
+        )
+
+    def describe_limits(self) -> str:
+        """Return one line for each parameter at an end of its range and each undetermined direction; or nothing."""
+        ends = [
+            f"{name} is at the end {round_for_table(end)} of its range: no standard deviation holds there, and those of"
+            " the others are for this value"
+            for name, end in self.ends.items()
+        ]
+        open_ = [
+            f"the data do not determine {direction.describe()} (relative changes)"
+            for direction in self.uncertainty.undetermined_directions()
+        ]
+        return "\n".join([*ends, *open_])
 
     def __repr__(self) -> str:
         """Return the table as text."""
@@ -148,6 +187,7 @@ def fit(
         ValueError: No start can be used: at each one a residual or derivative is not finite, or `usable` returns False.
     """
     part = canonical_dtypes(check_part(part))
+    _check_ranges(free)
     where = parameter_space(part, free)
     points = [where.place(check_part(replace(part, dict(start)))) for start in starts] or [where.place(part)]
     problem = FitProblem(where, part, residuals, data, as_partial(prior), norm, usable)
@@ -179,6 +219,23 @@ def fit(
         raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
     diverged = tuple(_values_by_path(where, z) for z, one in zip(points, fits, strict=False) if one is None)
     return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
+
+
+def _check_ranges(free: Sequence[str] | Mapping[str, Range | None]) -> None:
+    """Check that each given range is a pair of numbers.
+
+    Raises:
+        ValueError: A range is text, has not two ends, or an end is no number.
+    """
+    for path, ends in free.items() if isinstance(free, Mapping) else ():
+        if ends is None:
+            continue
+        # As objects: one end may be a number and the other an array.
+        if np.asarray(ends, object).shape[:1] != (2,):
+            raise ValueError(f"{path}: the range is {format_value(ends)}; it must be a pair of numbers (low, high)")
+        for end in ends:
+            if line := find_value_objection(end):
+                raise ValueError(f"{path}: the end {format_value(end)} of the range {line}; it must be a number")
 
 
 class _FitInterrupted(Exception):
@@ -244,6 +301,7 @@ def _fit_start(
     evaluations = problem.evaluations
     watch.before += evaluations
     seen = _accepted_evaluation(problem, end)
+    known, ends = _parameter_uncertainty(problem.space, end, seen, sigma, estimated)
     return Identified(
         part=jax.tree.map(np.asarray, problem.space.at(problem.part, jnp.asarray(end))),
         values=_values_by_path(problem.space, end),
@@ -251,11 +309,12 @@ def _fit_start(
         sigma=sigma,
         chi2=float(np.sum((seen.residuals / sigma) ** 2)),
         cost=float(np.sum(problem.vector(seen, sigma) ** 2)),
-        uncertainty=_parameter_uncertainty(problem.space, end, seen, sigma, estimated),
+        uncertainty=known,
         history=history,
         evaluations=evaluations,
         reason=reason,
         start=_values_by_path(problem.space, start),
+        ends=ends,
     )
 
 
@@ -273,22 +332,42 @@ def _accepted_evaluation(problem: FitProblem, z: np.ndarray) -> ResidualEvaluati
 
 def _parameter_uncertainty(
     free: FreeSpace, z: np.ndarray, seen: ResidualEvaluation, sigma: np.ndarray, estimated: bool
-) -> Uncertainty:
-    """Return the uncertainty in the parameters themselves.
+) -> tuple[Uncertainty, dict[str, float]]:
+    """Return the uncertainty in the parameters themselves, and the end by name of each parameter that an end holds.
 
-    Each parameter has its own z, so dr/dp = dr/dz / (dp/dz). A parameter at the end of its range has dp/dz = 0 and
-    counts as not determined.
+    Each parameter has its own z, so dr/dp = dr/dz / (dp/dz).
     """
     maps = [m for entry in free.entries for m in entry.maps]
     slope = np.array([float(jax.grad(m.value)(x)) for m, x in zip(maps, z, strict=True)])
     values = np.concatenate([np.ravel(x) for x in _values_by_path(free, z).values()])
     chi2 = float(np.sum((seen.residuals / sigma) ** 2))
-    scale = float(np.sqrt(chi2 / (len(sigma) - free.size))) if estimated else 1.0
+    # An exact fit has s = 0; the smallest normal number avoids 0/0 below.
+    scale = (float(np.sqrt(chi2 / (len(sigma) - free.size))) if estimated else 1.0) or float(np.finfo(float).tiny)
     size = np.maximum(np.abs(values), np.abs(slope))
     over = np.divide(1.0, slope, out=np.zeros_like(slope), where=slope != 0)
     data, prior = seen.slopes[0] / sigma[:, None] * over, seen.slopes[1] * over
-    # An exact fit has s = 0; the smallest normal number avoids 0/0 below.
-    return uncertainty(free.names, size, data, prior, scale or float(np.finfo(float).tiny))
+    ends = _find_ends(free, z, values, np.linalg.norm(np.concatenate([data / scale, prior]), axis=0))
+    return uncertainty(free.names, size, data, prior, scale, held=ends), ends
+
+
+def _find_ends(free: FreeSpace, z: np.ndarray, values: np.ndarray, slopes: np.ndarray) -> dict[str, float]:
+    """Return the end of the range by name, for each parameter that the end holds.
+
+    The coordinate z goes far out, and the end is within a hundredth of the deviation that the parameter has alone. An
+    interior minimum meets both conditions only if its interval extends past the end by half.
+
+    Args:
+        free: Free parameters.
+        z: Coordinates, shape (p,).
+        values: Values, shape (p,).
+        slopes: Inverse of the standard deviation of each parameter with the others fixed, shape (p,).
+    """
+    found = {}
+    for name, place, value, slope, limits in zip(free.names, z, values, slopes, free.ranges, strict=True):
+        end = min(limits, key=lambda x: abs(x - value))
+        if abs(place) > END_COORDINATE and abs(value - end) * slope < MAX_END_DISTANCE:
+            found[name] = float(end)
+    return found
 
 
 def _values_by_path(free: FreeSpace, z: np.ndarray) -> JsonObject:

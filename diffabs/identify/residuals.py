@@ -11,6 +11,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from diffabs.core.bijectors import FreeSpace
+from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.pytree import get
 from diffabs.core.types import AnyArray, Part, PyTree, Scalar
 
@@ -39,9 +40,14 @@ def gaussian(known: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
         known: Parameters as {path: (mean, standard deviation)}.
 
     Raises:
-        ValueError: A standard deviation is not positive.
+        ValueError: A mean is not finite, or a standard deviation is not positive.
     """
-    for path, (_, deviation) in known.items():
+    for path, (mean, deviation) in known.items():
+        for name, value in (("mean", mean), ("standard deviation", deviation)):
+            if line := find_value_objection(value):
+                raise ValueError(f"{path}: the prior's {name} = {format_value(value)} {line}; it must be a number")
+        if not np.isfinite(np.asarray(mean, float)).all():
+            raise ValueError(f"{path}: the prior's mean is {format_value(mean)}; it must be finite")
         if not (np.asarray(deviation, float) > 0).all():
             raise ValueError(f"{path}: the prior's standard deviation is {np.min(deviation):g}; it must be positive")
     # np.float64 gives every number one strong type: an int or a weak Python float would compile again.

@@ -130,7 +130,8 @@ class Traces:
                 raise ValueError(f"sigma: needed to weigh {', '.join(self.columns)} against each other")
             return
         if set(self.sigma) != set(self.columns):
-            raise ValueError(f"sigma is that of {', '.join(self.sigma)}; the columns are {', '.join(self.columns)}")
+            named = ", ".join(self.sigma) or "no column"
+            raise ValueError(f"sigma is that of {named}; the columns are {', '.join(self.columns)}")
         for name, value in self.sigma.items():
             if np.shape(value) not in ((), self.shape[1:], self.shape):
                 raise ValueError(f"sigma.{name} has shape {np.shape(value)}, not () or {self.shape}")

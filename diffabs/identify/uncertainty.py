@@ -5,6 +5,9 @@
 with s = 1 if sigma is known absolutely. The model is linearised at the identified parameters. The covariance therefore
 does not cover other minima. It does not cover errors of the model either, which s^2 only averages.
 
+A parameter held at an end of its range has no standard deviation: the data would move it past the end. Its numbers are
+NaN, and those of the others are for this parameter fixed there.
+
 The directions are the right singular vectors of A diag(size)/s, from the data alone. A relative change by 1/(singular
 value) along a direction changes the residuals by one standard deviation.
 
@@ -14,7 +17,7 @@ of the width.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,16 +57,18 @@ class Uncertainty:
 
     Attributes:
         names: Names of the parameters, p of them.
+        sizes: Sizes of the parameters, shape (p,), in their units.
         covariance: Covariance from data and prior, shape (p, p), in the parameters' units. A direction that neither
-            determines has a huge, finite variance.
-        deviations: Standard deviations by name, in the parameters' units.
-        correlation: Correlation from data and prior, shape (p, p).
+            determines has a huge, finite variance. The row and column of a held parameter are NaN.
+        deviations: Standard deviations by name, in the parameters' units; NaN for a held parameter.
+        correlation: Correlation from data and prior, shape (p, p); NaN for a held parameter.
         scale: Factor s of the residuals' standard deviations; 1 if these are known absolutely.
         degrees: Degrees of freedom n - p.
-        directions: p directions from the data alone, the best determined first.
+        directions: A direction from the data alone for each parameter that is not held, the best determined first.
     """
 
     names: Sequence[str]
+    sizes: np.ndarray
     covariance: np.ndarray
     deviations: dict[str, float]
     correlation: np.ndarray
@@ -75,13 +80,24 @@ class Uncertainty:
         """Return the directions that the data leave open: their spread is larger than `beyond`, by default 100 %."""
         return [one for one in self.directions if not one.spread <= beyond]
 
+    def undetermined_parameters(self, beyond: float = MAX_RELATIVE_SPREAD) -> list[str]:
+        """Return the names of the parameters that data and prior leave open.
+
+        Their standard deviation is larger than `beyond` times their size. The number is then meaningless.
+        """
+        return [
+            name for name, size in zip(self.names, self.sizes, strict=True) if self.deviations[name] > beyond * size
+        ]
+
     @property
     def singular(self) -> np.ndarray:
-        """Singular values, shape (p,), descending."""
+        """Singular values of the directions, descending."""
         return np.array([one.singular for one in self.directions])
 
 
-def uncertainty(names: Sequence[str], size: np.ndarray, data: Any, prior: Any, scale: float) -> Uncertainty:
+def uncertainty(
+    names: Sequence[str], size: np.ndarray, data: Any, prior: Any, scale: float, held: Collection[str] = ()
+) -> Uncertainty:
     """Return covariance, correlation and directions from scaled Jacobians.
 
     Args:
@@ -90,21 +106,25 @@ def uncertainty(names: Sequence[str], size: np.ndarray, data: Any, prior: Any, s
         data: Jacobian A of residual/sigma by the parameters, shape (n, p).
         prior: Jacobian P of the prior by the parameters, shape (k, p).
         scale: Factor s of the residuals' standard deviations.
+        held: Names of the parameters that an end of their range holds.
     """
-    degrees, known = len(data) - len(names), data * size / scale
+    free = [i for i, name in enumerate(names) if name not in held]
+    known = (data * size / scale)[:, free]
     # An SVD of the Jacobian avoids the normal equations, whose condition number is squared.
-    _, values, vectors = _padded_svd(np.concatenate([known, prior * size]))
+    _, values, vectors = _padded_svd(np.concatenate([known, (prior * size)[:, free]]))
     spread = vectors.T / np.maximum(values, _zero_threshold(values, len(data)))  # a root of the relative covariance
-    covariance = size[:, None] * (spread @ spread.T) * size
+    covariance = np.full((len(names), len(names)), np.nan)
+    covariance[np.ix_(free, free)] = size[free, None] * (spread @ spread.T) * size[free]
     deviations = np.sqrt(np.diag(covariance))
     return Uncertainty(
         names=names,
+        sizes=size,
         covariance=covariance,
         deviations=dict(zip(names, deviations.tolist(), strict=True)),
         correlation=covariance / np.outer(deviations, deviations),
         scale=scale,
-        degrees=degrees,
-        directions=_directions(names, known),
+        degrees=len(data) - len(names),
+        directions=_directions([names[i] for i in free], known),
     )
 
 
@@ -127,4 +147,6 @@ def _padded_svd(matrix: np.ndarray) -> tuple[PyTree, np.ndarray, np.ndarray]:
 
 def _zero_threshold(values: np.ndarray, rows: int) -> float:
     """Return the threshold below which a singular value counts as zero, positive even if all are zero."""
-    return max(float(values[0]) * max(rows, len(values)) * np.finfo(float).eps, float(np.finfo(float).tiny))
+    return max(
+        float(np.max(values, initial=0.0)) * max(rows, len(values)) * np.finfo(float).eps, float(np.finfo(float).tiny)
+    )

@@ -27,10 +27,11 @@ from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.tracing import depends_on_signal
 from diffabs.core.types import Matrix, Part, PyTree, Scalar
-from diffabs.linear.linearization import StateSpace, independent_components
+from diffabs.core.validity import check_part
+from diffabs.linear.linearization import independent_components
 from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
-from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer
-from diffabs.linear.zero_order_hold import discretise_held_input
+from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer, check_transfer
+from diffabs.linear.zero_order_hold import hold_input
 
 # Relative offsets of the target for the first Newton step of a controller, in the directions that leave a limit.
 TARGET_OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)
@@ -57,17 +58,39 @@ class OpenLoop(NamedTuple):
     def transfer(self, more: float = 0.0) -> Transfer:
         """Return the open loop L from the command to minus the controller's command, so the feedback is negative.
 
-        With a sampled controller L is discrete. States that do not influence its output are left out. `more` [s] adds
-        to the delay.
+        With a sampled controller L is discrete. States that do not influence its output are left out.
+
+        Args:
+            more: Added delay [s]; the sum with the loop's own delay is at least 0.
+
+        Raises:
+            ValueError: The whole delay is negative, or a half has a field that `check_transfer` refuses.
         """
         delay = self.delay + more
+        if not 0 <= delay < np.inf:
+            raise ValueError(f"delay = {delay:g} s is outside [0, inf) s")
+        _check_halves(self)
         if self.period is None:
             return _drop_unobserved_states(_series(self.plant, self.controller)._replace(delay=delay))
         # Whole periods become shifts in `Transfer`. The rest of the delay is sampled exactly.
         whole = int(np.floor(delay / self.period + WHOLE_PERIOD_TOLERANCE))
         rest = max(delay - whole * self.period, 0.0)
-        plant = _sample_plant(self.plant, self.period, rest if rest > WHOLE_PERIOD_TOLERANCE * self.period else 0.0)
+        plant = sample_plant(self.plant, self.period, rest if rest > WHOLE_PERIOD_TOLERANCE * self.period else 0.0)
         return _drop_unobserved_states(_series(plant, self.controller)._replace(delay=whole * self.period))
+
+
+def _check_halves(loop: OpenLoop) -> None:
+    """Raise ValueError if the two halves do not fit each other."""
+    plant, controller = check_transfer(loop.plant), check_transfer(loop.controller)
+    if plant.period is not None:
+        raise ValueError(f"plant: period = {plant.period:g} s; the plant is in continuous time: None")
+    if plant.D.any():
+        raise ValueError(f"plant: D = {plant.D[plant.D != 0][0]:g} is outside [0, 0]: no direct path is allowed")
+    for name, half in (("plant", plant), ("controller", controller)):
+        if half.delay:
+            raise ValueError(f"{name}: delay = {half.delay:g} s is outside [0, 0] s: give the delay to the OpenLoop")
+    if len(plant.C) != controller.B.shape[1]:
+        raise ValueError(f"controller: B has {controller.B.shape[1]} columns; the plant has {len(plant.C)} outputs")
 
 
 def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
@@ -79,10 +102,13 @@ def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
             that searches for its target has no setpoint yet: give the value that it will find.
 
     Raises:
-        ValueError: A block acts at instants (a relay, a controller that computes in every step but is not `Sampled`);
-            or the plant does not come to rest at the setpoint; or the command does not respond to a measured signal
-            there, for example at a limit.
+        ValueError: A part has a parameter that `check` refuses, or the target is not finite. A block acts at instants
+            (a relay, a controller that computes in every step but is not `Sampled`); or the plant does not come to rest
+            at the setpoint; or the command does not respond to a measured signal there, for example at a limit.
     """
+    check_part(loop)
+    if target is not None and not np.isfinite(target):
+        raise ValueError(f"target = {float(target):g} is outside (-inf, inf), in the unit of the first signal")
     rational, delay = _split_off_delays(loop)
     _check_continuous(rational)
     found = jax.device_get(
@@ -300,17 +326,22 @@ def _series(first: Transfer, second: Transfer) -> Transfer:
     return Transfer(a, b, c, np.zeros((len(c), b.shape[1])), second.period)
 
 
-def _sample_plant(plant: Transfer, period: float, delay: float) -> Transfer:
-    """Return the plant sampled with `period`, for an input that is held and changes `delay` after each instant."""
+def sample_plant(plant: Transfer, period: float, delay: float) -> Transfer:
+    """Return the plant sampled with `period`, for an input that is held and changes `delay` after each instant.
+
+    Args:
+        plant: System in continuous time without a direct path.
+        period: Sampling period [s].
+        delay: Time from an instant to the change of the input [s], 0 to `period`.
+    """
     n, m = np.shape(plant.B)
-    a, b = (np.asarray(x) for x in _discretise_compiled(StateSpace(plant.A, plant.B), period, delay))
-    c = np.hstack([plant.C, np.zeros((len(plant.C), m))])
+    (a, _, after), (whole, late, early) = hold_input(plant.A, plant.B, np.array([period, delay, period - delay]))
     if not delay:
-        a, b, c = a[:n, :n], b[:n], plant.C
-    return Transfer(a, b, c, plant.D, period)
-
-
-_discretise_compiled = jax.jit(discretise_held_input)
+        return Transfer(a, whole, plant.C, plant.D, period)
+    # The state is followed by the input before the instant, which acts until `delay`.
+    a = np.block([[a, after @ late], [np.zeros((m, n + m))]])
+    b = np.concatenate([early, np.eye(m)])
+    return Transfer(a, b, np.hstack([plant.C, np.zeros((len(plant.C), m))]), plant.D, period)
 
 
 def _drop_unobserved_states(system: Transfer) -> Transfer:

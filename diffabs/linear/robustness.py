@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -20,7 +21,8 @@ BADNESS: Mapping[str, Callable[[Margins], float]] = {
     "gain_up": lambda m: -m.gain[1],
     "gain_down": lambda m: m.gain[0],
     "phase": lambda m: -m.phase,
-    "delay": lambda m: -m.delay,
+    # NaN: the search for a delay that makes the loop unstable ended first. That is better than any number found.
+    "delay": lambda m: -sys.float_info.max if math.isnan(m.delay) else -m.delay,
     "modulus": lambda m: m.sensitivity,
     "sensitivity": lambda m: m.sensitivity,
     "complementary": lambda m: m.complementary,

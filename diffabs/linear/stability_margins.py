@@ -2,10 +2,11 @@
 
     L  the open loop, of one input and one output, with feedback u = -L v;   S = 1/(1 + L),   T = L/(1 + L)
 
-The poles decide whether the closed loop is stable. With a pure delay in continuous time, the poles that cross the
-imaginary axis are counted while the delay grows from zero. They cross only where |L| = 1 (Cooke and van den Driessche,
-On zeroes of some transcendental equations, 1986). Crossings are bracketed on a grid, which is refined until neighbours
-are close, and bisected to rounding.
+The poles decide whether the closed loop is stable. With a pure delay, the poles that cross the stability boundary are
+counted while the delay grows from zero. They cross only where |L| = 1 (Cooke and van den Driessche, On zeroes of some
+transcendental equations, 1986). Crossings are bracketed on a grid, which is refined until neighbours are close, and
+bisected to rounding. The grid separates all frequencies with |L| = 1, which are eigenvalues of a Hamiltonian matrix
+(Boyd, Balakrishnan and Kabamba, A bisection method for computing the H-infinity norm, 1989).
 
 In continuous time and without a delay, the direct path D is the limit of L at infinite frequency. It counts as a value
 of L. A delay turns it through all angles. With |D| > 1 every delay makes infinitely many unstable poles. With |D| = 1
@@ -19,8 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.core.types import Matrix, Scalar
+from diffabs.linear.delay_steps import LEAST_DISTANCE, REACHING, DelayedLoop
 from diffabs.linear.opened_loop import OpenLoop
-from diffabs.linear.transfer import Transfer, check_delay
+from diffabs.linear.transfer import Transfer, check_transfer
 
 GRID_DECADES, PER_DECADE = 4, 60  # beyond the slowest and the fastest pole; points of the grid before it is refined
 NEIGHBOUR_DISTANCE, MAX_GRID_REFINEMENTS = 0.05, 14  # relative distance of neighbours; how often the grid is refined
@@ -29,8 +31,12 @@ SMALL_LOOP_GAIN, DELAY_TURN_ANGLE = 1e-3, 0.2
 MAX_GRID_FREQUENCIES = 200_000  # points of a grid
 ROOT_BISECTIONS, GOLDEN = 70, (math.sqrt(5) - 1) / 2
 REAL_TOLERANCE = 1e-9  # relative: |L(0)| and L at half the sampling rate are real but for rounding
-# Search for the delay margin of a sampled loop: steps up to the first guess, and its largest multiple to try.
-DELAY_SEARCH_STEPS, MAX_DELAY_MULTIPLE = 40, 4.0
+# Longest delay to try with a sampled loop: in periods, and in multiples of the margin without a new sampling. The most
+# steps of the delay, each as long as is safe, before the search gives up.
+MAX_DELAY_PERIODS, MAX_DELAY_MULTIPLE = 1000, 4.0
+MAX_DELAY_STEPS = 3000
+WATCHED_DISTANCE = 10 * LEAST_DISTANCE  # distance of L from -1 below which the poles are looked at after each step
+MAX_SHIFTS = 30  # periods of delay that become states; the poles of more are counted by crossings
 
 
 class Margins(NamedTuple):
@@ -45,7 +51,8 @@ class Margins(NamedTuple):
         gain_at: Frequencies (low, high) at which the factors bring L to -1 [rad/s]; NaN without a limit.
         phase: Phase margin [rad]: the smallest angle, lag or lead, that reaches -1; infinity without a crossover.
         phase_at: Its frequency [rad/s].
-        delay: Delay margin [s]; infinity without a limit, 0 if every delay makes the loop unstable.
+        delay: Delay margin [s], the smallest added delay that makes the loop unstable; 0 if every delay does. Infinity
+            says that no delay does. NaN says that the search ended first: see `margins`.
         sensitivity: Ms, the largest |S|; 1/Ms is the modulus margin.
         sensitivity_at: Its frequency [rad/s].
         complementary: Mt, the largest |T|.
@@ -76,6 +83,7 @@ class Crossovers(NamedTuple):
 
     Attributes:
         gain_at: Frequencies with |L| = 1 [rad/s]; infinity is one of them if |D| = 1 in continuous time.
+        falls: Whether |L| falls there, with growing frequency.
         phases: Angle of -L at these frequencies, the phase of L plus pi, in (-pi, pi] [rad].
         phase_at: Frequencies at which L is real and negative [rad/s]. Infinity is one of them in continuous time if
             D < 0, or if there is a delay and D is not zero.
@@ -83,6 +91,7 @@ class Crossovers(NamedTuple):
     """
 
     gain_at: np.ndarray
+    falls: np.ndarray
     phases: np.ndarray
     phase_at: np.ndarray
     factors: np.ndarray
@@ -91,20 +100,31 @@ class Crossovers(NamedTuple):
 def margins(loop: OpenLoop | Transfer) -> Margins:
     """Return the margins of an open loop.
 
-    The delay margin is the smallest (phase lag to -1)/frequency over all crossovers. For a sampled `Transfer` only
-    whole periods have a meaning: it is at most one period if one more period makes the loop unstable. An `OpenLoop`
-    with a sampled controller is sampled again with each added delay instead.
+    In continuous time the delay margin is the smallest (phase lag to -1)/frequency over all crossovers. For a sampled
+    `Transfer` only whole periods have a meaning: it is the fewest periods that make the loop unstable. An `OpenLoop`
+    with a sampled controller is sampled again with each added delay. An unstable range of delays in which L passes -1
+    by less than 1e-5 may be missed there.
+
+    For a sampled loop the search ends at 1000 periods, or at 4 times (phase lag to -1)/frequency if that is more. For
+    an `OpenLoop` it also ends after 3000 steps of the delay. The delay margin is NaN if it ends without a delay that
+    makes the loop unstable. It is infinite only if no delay at all does, because |L| < 1 at all frequencies with all
+    delays (|L| < 0.99 for an `OpenLoop`, as a peak may be between points).
 
     Args:
         loop: Open loop with one input and one output.
 
     Raises:
-        ValueError: The system has several inputs or outputs, or a negative delay.
+        ValueError: The loop is no open loop, has several inputs or outputs, or has a field that `check_transfer`
+            refuses.
     """
-    system = loop.transfer() if isinstance(loop, OpenLoop) else loop
+    if not isinstance(loop, OpenLoop | Transfer):
+        raise ValueError(
+            f"loop = {type(loop).__name__} is no OpenLoop or Transfer: open_loop(loop) makes one of a Loop"
+        )
+    loop = check_transfer(loop) if isinstance(loop, Transfer) else loop
+    system = check_transfer(loop.transfer()) if isinstance(loop, OpenLoop) else loop
     if np.shape(system.D) != (1, 1):
         raise ValueError(f"margins are of one input and one output; the system has {np.shape(system.D)[::-1]}")
-    check_delay(system)
     w = frequency_grid(system)
     found = find_crossovers(system, w)
     crossover = float(found.gain_at.max()) if len(found.gain_at) else math.nan
@@ -116,7 +136,7 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
     gain, gain_at = _gain_margins(found)
     ms, mt = _sensitivities(system, w)
     angle = (float(phase), float(phase_at))
-    return Margins(True, gain, gain_at, *angle, _delay_margin(loop, system, found), *ms, *mt, crossover)
+    return Margins(True, gain, gain_at, *angle, _delay_margin(loop, system, w, found), *ms, *mt, crossover)
 
 
 def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers:
@@ -127,9 +147,9 @@ def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers
         w: Grid of frequencies [rad/s]; by default `frequency_grid(system)`.
     """
     w = frequency_grid(system) if w is None else w
-    gain_at = _roots(lambda w: np.log(np.abs(_response(system, w))), w)
+    gain_at, falls = _roots(lambda w: np.log(np.abs(_response(system, w))), w)
     phases = np.angle(-_response(system, gain_at))
-    phase_at = _roots(lambda w: _response(system, w).imag, w)
+    phase_at, _ = _roots(lambda w: _response(system, w).imag, w)
     ends = [0.0, *([math.pi / system.period] if system.period else [])]
     phase_at = np.union1d(phase_at, [end for end in ends if _is_real(system, end)])
     values = _response(system, phase_at).real
@@ -140,9 +160,10 @@ def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers
         far = _limit_at_infinity(system)
         if abs(far) == 1:
             gain_at, phases = np.append(gain_at, math.inf), np.append(phases, np.angle(-far))
+            falls = np.append(falls, True)
         if far < 0:
             phase_at, factors = np.append(phase_at, math.inf), np.append(factors, -1 / far)
-    return Crossovers(gain_at, phases, phase_at, factors)
+    return Crossovers(gain_at, falls, phases, phase_at, factors)
 
 
 def is_stable(system: Transfer) -> bool:
@@ -156,22 +177,30 @@ def is_stable(system: Transfer) -> bool:
     Raises:
         ValueError: The delay is negative, or no whole number of periods if sampled.
     """
-    check_delay(system)
-    if system.period is not None or not system.delay:
+    system = check_transfer(system)
+    whole = 0 if system.period is None else system.count_periods()
+    if not system.delay or 0 < whole <= MAX_SHIFTS:
         return unstable_poles(system.without_delay()) == 0
     if _is_unstable_with_any_delay(system):
         return False
-    # The poles of the delay-free loop, and the crossings of |L| = 1. A pair crosses to the right where |L| falls and to
-    # the left where |L| rises, again and again with each further turn of the delay, 2 pi/w.
-    count = unstable_poles(system._replace(delay=0.0))
-    turning = find_crossovers(system._replace(delay=0.0))
-    for w, phase in zip(turning.gain_at, turning.phases, strict=True):
-        first = (phase % (2 * math.pi)) / w  # the delay at which a pair of poles is at +-jw
-        if system.delay > first:
-            times = 1 + math.floor((system.delay - first) * w / (2 * math.pi))
-            falling = abs(_rational_response(system, w * 1.0001)) < abs(_rational_response(system, w * 0.9999))
-            count += 2 * times if falling else -2 * times
-    return count == 0
+    return unstable_poles(system._replace(delay=0.0)) + int(_poles_gained(system, np.array([system.delay]))[0]) == 0
+
+
+def _poles_gained(system: Transfer, delays: np.ndarray) -> np.ndarray:
+    """Return how many more unstable poles the closed loop has with each delay (k,) [s] than without a delay."""
+    system = system._replace(delay=0.0)
+    found = find_crossovers(system)
+    gained = np.zeros(len(delays))
+    # A pair crosses outwards where |L| falls and inwards where |L| rises, again and again with each further turn of the
+    # delay, 2 pi/w. `first` is the delay at which a pair of poles is at +-jw, or at the angle +-wT.
+    for w, falls, phase in zip(found.gain_at, found.falls, found.phases, strict=True):
+        first = (phase % (2 * math.pi)) / w
+        times = np.where(delays > first, 1 + np.floor((delays - first) * w / (2 * math.pi)), 0)
+        gained += 2 * times if falls else -2 * times
+    if system.period is not None and abs(_response(system, math.pi / system.period)[0]) >= 1:
+        # Each period brings a pole outside the circle near z = -1, where |L| > 1 joins the ends of the axis.
+        gained += np.round(delays / system.period)
+    return gained
 
 
 def unstable_poles(system: Transfer) -> int:
@@ -226,7 +255,30 @@ def frequency_grid(system: Transfer) -> np.ndarray:
     if len(large):
         count = min(MAX_GRID_FREQUENCIES, int(large[-1] * system.delay / DELAY_TURN_ANGLE) + 2)
         w = np.union1d(w, np.linspace(w[0], large[-1], count))
-    return _refine_grid(system, w)
+    w = _refine_grid(system, w)
+    between = _between_crossovers(system)
+    return np.union1d(w, between[between < half])
+
+
+def _between_crossovers(system: Transfer) -> np.ndarray:
+    """Return a frequency between each two neighbours with |L| = 1 [rad/s], and some others.
+
+    The frequencies with |L| = 1 are eigenvalues jw of the Hamiltonian matrix. All eigenvalues above the real axis are
+    used, so that no tolerance has to say which are imaginary. Nothing is returned if |L| = 1 at the end of the axis.
+    """
+    a, b, c, d = (np.asarray(x, float) for x in system[:4])
+    try:
+        if system.period is not None:  # s = (z - 1)/(z + 1) maps the unit circle to the imaginary axis
+            inverse = np.linalg.inv(a + np.eye(len(a)))
+            a, b, c, d = inverse @ (a - np.eye(len(a))), 2 * inverse @ b, c @ inverse, d - c @ inverse @ b
+        short = 1 - d[0, 0] ** 2
+        f = a + b @ c * d[0, 0] / short
+        s = np.linalg.eigvals(np.block([[f, b @ b.T / short], [-c.T @ c / short, -f.T]]))
+    except (np.linalg.LinAlgError, ZeroDivisionError):
+        return np.zeros(0)
+    w = np.sort(s.imag[s.imag > 0])
+    w = np.sqrt(w[1:] * w[:-1])
+    return w if system.period is None else 2 * np.arctan(w) / system.period
 
 
 def _refine_grid(system: Transfer, w: np.ndarray) -> np.ndarray:
@@ -260,17 +312,24 @@ def _complementary_sensitivity(values: np.ndarray) -> np.ndarray:
         return np.where(np.isfinite(values), values / (1 + values), 1.0)
 
 
-def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> np.ndarray:
-    """Return the places where a function changes its sign between neighbours of a grid, bisected to rounding."""
+def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places where a function changes its sign between neighbours of a grid, bisected to rounding; and
+    whether it falls there. Zero counts as negative.
+    """
+
+    def sign(w: np.ndarray) -> np.ndarray:
+        values = function(w)
+        return np.where(values == 0, -1.0, np.sign(values))
+
     with np.errstate(all="ignore"):
-        sign = np.sign(function(w))
-        here = np.flatnonzero((sign[1:] * sign[:-1] < 0) | (sign[1:] == 0))
-        low, high, before = w[here], w[here + 1], sign[here]
+        signs = sign(w)
+        here = np.flatnonzero(signs[1:] * signs[:-1] < 0)
+        low, high, before = w[here], w[here + 1], signs[here]
         for _ in range(ROOT_BISECTIONS if len(here) else 0):
             middle = 0.5 * (low + high)
-            left = np.sign(function(middle)) == before
+            left = sign(middle) == before
             low, high = np.where(left, middle, low), np.where(left, high, middle)
-    return 0.5 * (low + high)
+    return 0.5 * (low + high), before > 0
 
 
 def _peak(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[float, float]:
@@ -336,25 +395,54 @@ def _gain_margins(found: Crossovers) -> tuple[tuple[float, float], tuple[float, 
     return (low, high), (low_at, high_at)
 
 
-def _delay_margin(loop: OpenLoop | Transfer, system: Transfer, found: Crossovers) -> float:
-    """Return the delay margin of a stable loop [s]; `system` is its transfer function."""
+def _delay_margin(loop: OpenLoop | Transfer, system: Transfer, w: np.ndarray, found: Crossovers) -> float:
+    """Return the delay margin of a stable loop [s]; `system` is its transfer function on the grid `w`."""
     if _is_unstable_with_any_delay(system):
         return 0.0
     delays = (found.phases % (2 * math.pi)) / found.gain_at
     guess = float(delays.min()) if len(delays) else math.inf
-    if isinstance(loop, Transfer) and loop.period is not None:
-        # Only whole periods have a meaning here. The crossovers do not show whether one more period is too much where
-        # |L| >= 1 at half the sampling rate, so it is tried.
-        late = loop._replace(delay=loop.delay + loop.period)
-        return guess if is_stable(late) else min(guess, loop.period)
-    if not isinstance(loop, OpenLoop) or loop.period is None or not math.isfinite(guess):
+    if loop.period is None:
         return guess
-    step, low = max(guess, loop.period) / DELAY_SEARCH_STEPS, 0.0
-    while is_stable(loop.transfer(low + step)):
-        low += step
-        if low > MAX_DELAY_MULTIPLE * max(guess, loop.period):
-            return math.inf
-    high = low + step
+    end = max(MAX_DELAY_PERIODS * loop.period, MAX_DELAY_MULTIPLE * guess if len(delays) else 0.0)
+    return _find_margin(loop, w, end) if isinstance(loop, OpenLoop) else _count_margin(loop, len(delays) > 0, end)
+
+
+def _count_margin(loop: Transfer, crosses: bool, end: float) -> float:
+    """Return the fewest whole periods that make a stable sampled loop unstable [s].
+
+    It is infinity if |L| < 1 everywhere, and NaN if no delay up to `end` suffices. `crosses`: whether |L| = 1 anywhere.
+    """
+    period = float(loop.period or math.nan)
+    if not crosses and abs(_response(loop, math.pi / period)[0]) < 1:
+        return math.inf
+    more = np.arange(1, math.ceil(end / period) + 1) * period
+    now, *late = _poles_gained(loop, np.append(0.0, more) + loop.delay)
+    unstable = np.flatnonzero(np.array(late) > now)
+    return float(more[unstable[0]]) if len(unstable) else math.nan
+
+
+def _find_margin(loop: OpenLoop, w: np.ndarray, end: float) -> float:
+    """Return the smallest added delay that makes a stable loop with a sampled controller unstable [s].
+
+    It is infinity if |L| < 0.99 with every delay. It is NaN if no delay up to `end` suffices, or the steps run out.
+    """
+    delayed = DelayedLoop(loop, w)
+    if delayed.largest < REACHING:
+        return math.inf
+    low = 0.0
+    for _ in range(MAX_DELAY_STEPS):
+        if low >= end:
+            break
+        step = delayed.step(loop.delay + low)
+        high = low + step.size
+        if step.distance < WATCHED_DISTANCE and not is_stable(loop.transfer(high)):
+            return _bisect_delay(loop, low, high)
+        low = high
+    return math.nan
+
+
+def _bisect_delay(loop: OpenLoop, low: float, high: float) -> float:
+    """Return the added delay between a stable and an unstable one at which the loop turns unstable [s]."""
     while high - low > 1e-12 * high:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if is_stable(loop.transfer(middle)) else (low, middle)

@@ -60,28 +60,65 @@ class Transfer(NamedTuple):
             ValueError: The system has a delay in continuous time, or one that is negative or no whole number of
                 periods.
         """
-        check_delay(self)
+        check_transfer(self)
         if self.period is None:
             if self.delay:
                 raise ValueError(f"delay = {self.delay:g} s: in continuous time a pure delay has no finite state")
             return self
-        shifts = self.delay / self.period
-        if abs(shifts - round(shifts)) > WHOLE_PERIOD_TOLERANCE:
-            raise ValueError(f"delay = {self.delay:g} s is no whole number of periods of {self.period:g} s")
         system = self
-        for _ in range(round(shifts)):
+        for _ in range(self.count_periods()):
             system = _delay_one_period(system)
         return system._replace(delay=0.0)
 
+    def count_periods(self) -> int:
+        """Return the delay of a sampled system in periods.
 
-def check_delay(system: Transfer) -> None:
-    """Raise ValueError for a delay that is negative or not finite.
+        Raises:
+            ValueError: The system is not sampled, or the delay is no whole number of periods.
+        """
+        if self.period is None:
+            raise ValueError("period = None: a system in continuous time has no periods to count")
+        shifts = self.delay / self.period
+        if abs(shifts - round(shifts)) > WHOLE_PERIOD_TOLERANCE * max(1.0, shifts):
+            raise ValueError(f"delay = {self.delay:g} s is no whole number of periods of {self.period:g} s")
+        return round(shifts)
+
+
+def check_transfer(system: Transfer) -> Transfer:
+    """Return a system with its matrices as arrays if its fields fit each other.
 
     Args:
         system: System with any number of inputs and outputs.
+
+    Raises:
+        ValueError: A matrix is not finite or does not fit the others, the period is not positive, or the delay is
+            negative.
     """
+    matrices = {name: _as_matrix(name, getattr(system, name)) for name in "ABCD"}
+    n, (p, m) = len(matrices["A"]), matrices["D"].shape
+    for name, shape in {"A": (n, n), "B": (n, m), "C": (p, n)}.items():
+        if matrices[name].shape != shape:
+            raise ValueError(
+                f"{name} has shape {matrices[name].shape}; it needs {shape}, as A has {n} rows and D {p, m}"
+            )
+    if system.period is not None and not 0 < system.period < math.inf:
+        raise ValueError(f"period = {system.period:g} s is outside (0, inf) s")
     if not 0 <= system.delay < math.inf:
         raise ValueError(f"delay = {system.delay:g} s is outside [0, inf) s")
+    return system._replace(**matrices)
+
+
+def _as_matrix(name: str, value: Matrix) -> np.ndarray:
+    """Return a finite matrix as an array."""
+    try:
+        matrix = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is no matrix of real numbers") from None
+    if matrix.ndim != 2:
+        raise ValueError(f"{name} has shape {matrix.shape}; it needs two dimensions")
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{name} = {matrix[~np.isfinite(matrix)][0]:g} is outside (-inf, inf)")
+    return matrix
 
 
 def _solve_or_infinite(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:

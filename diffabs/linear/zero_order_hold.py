@@ -1,7 +1,10 @@
 """Discretisation of a linear system whose input is held over a period, with a computing delay."""
 
+import math
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.types import AnyArray, Scalar
 from diffabs.linear.linearization import StateSpace
@@ -26,6 +29,30 @@ def discretise_held_input(system: StateSpace, period: Scalar, delay: Scalar) -> 
     before, after = (_exponential(with_input * s) for s in (delay, period - delay))
     both = jnp.zeros_like(with_input).at[:n].set(after[:n, :n] @ before[:n])
     return StateSpace(both, jnp.concatenate([after[:n, n:], jnp.eye(m, dtype=a.dtype)]))
+
+
+def hold_input(a: np.ndarray, b: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return e^(A t) (k, n, n) and the response of the state to a held input, G(t) (k, n, m), in NumPy and float64.
+
+        G(t) = integral of e^(A r) B over r in [0, t]
+
+    Args:
+        a: State matrix A (n, n).
+        b: Input matrix B (n, m).
+        times: Times t (k,) [s], at least 0.
+    """
+    (n, m), times = np.shape(b), np.asarray(times, float)
+    rates = np.zeros((n + m, n + m))
+    rates[:n, :n], rates[:n, n:] = a, b
+    norm = float(np.max(np.sum(np.abs(rates), axis=1), initial=0.0)) * float(np.max(times, initial=0.0))
+    halvings = max(0, math.ceil(math.log2(max(norm, 0.25))) + 1)
+    scaled, one = rates * (times[:, None, None] * 2.0**-halvings), np.eye(n + m)
+    found = np.broadcast_to(one, scaled.shape)
+    for i in range(TERMS):
+        found = one + scaled @ found / (TERMS - i)
+    for _ in range(halvings):
+        found = found @ found
+    return found[:, :n, :n], found[:, :n, n:]
 
 
 def _exponential(a: Scalar) -> AnyArray:

@@ -13,6 +13,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
+from diffabs.config.values import format_given
 from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject
 from diffabs.reach.certificate import FORMAT, proved_ends
@@ -92,29 +93,70 @@ def read_proof(document: JsonObject) -> ProofFile:
         raise ValueError(f'not a proof\'s file: its "format" is not {FORMAT!r}')
     if document.get("verdict") != "proved":
         raise ValueError(f"nothing to verify: the file's verdict is {document.get('verdict')}, not proved")
+    pair = "a pair [low, high] of finite numbers"
+    over = _read_entries(document, "over", dict, lambda ends: tuple(_pair(ends)), pair)
+    cells = _read_entries(document, "cells", list, lambda cell: list(map(_pair, cell)), f"a list, each entry {pair},")
+    claims = _read_entries(
+        document, "claims", list, lambda x: RunClaim(str(x["quantity"]), _number(x["bound"])),
+        '{"quantity": name, "bound": finite number}',
+    )  # fmt: skip
+    bounds = _read_entries(document, "bounds", dict, _open_pair, "a pair [low, high] of finite numbers or null")
     try:
-        over = {path: (_number(low), _number(high)) for path, (low, high) in document["over"].items()}
-        cells = [[[_number(low), _number(high)] for low, high in cell] for cell in document["cells"]]
-        claims = tuple(RunClaim(str(x["quantity"]), _number(x["bound"])) for x in document["claims"])
-        bounds = {
-            name: (None if low is None else _number(low), None if high is None else _number(high))
-            for name, (low, high) in document["bounds"].items()
-        }
-        horizon = _number(document["horizon"])
-    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise ValueError(f"not a proof's file: {type(error).__name__} {error}") from None
+        horizon = _number(document.get("horizon"))
+    except (ValueError, OverflowError):
+        raise ValueError(f"horizon = {format_given(document.get('horizon'))}; a finite number [s] is needed") from None
     if not over:
         raise ValueError("over: the box has no parameter")
-    if any(len(cell) != len(over) for cell in cells):
+    if any(len(cell) != len(over) for cell in cells.values()):
         raise ValueError("not a proof's file: a cell has not one pair of numbers for each parameter of the box")
     for name, ends in bounds.items():
         for word, end, proved in zip(("low", "high"), ends, proved_ends(name), strict=True):
             if end is not None and not proved:
                 raise ValueError(f"bounds: the checker proves no {word} end of {name}, and the file has {end:.9g}")
-    for claim in claims:
+    for claim in claims.values():
         if claim.quantity not in bounds:
             raise ValueError(f"claims: {claim.quantity} has no bound in the file")
-    return ProofFile(over, cells, claims, bounds, horizon)
+    return ProofFile(over, list(cells.values()), tuple(claims.values()), bounds, horizon)
+
+
+def _read_entries(
+    document: JsonObject, name: str, kind: type, read: Callable[[Any], Any], needed: str
+) -> dict[Any, Any]:
+    """Return each entry of a member as `read` returns it, by its key or index.
+
+    Args:
+        document: JSON document of the file.
+        name: Name of the member.
+        kind: Type of the member, dict or list.
+        read: Function that returns the value of an entry, or raises an error if the entry is wrong.
+        needed: What an entry has to be, in words.
+
+    Raises:
+        ValueError: The member is missing or of another type, or an entry is wrong.
+    """
+    given = document.get(name)
+    if not isinstance(given, kind):
+        word = "a table" if kind is dict else "a list"
+        raise ValueError(f"{name} is missing" if given is None else f"{name} = {format_given(given)} is not {word}")
+    found = {}
+    for key, entry in given.items() if isinstance(given, dict) else enumerate(given or ()):
+        try:
+            found[key] = read(entry)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            raise ValueError(f"{name}.{key} = {format_given(entry)}; {needed} is needed") from None
+    return found
+
+
+def _pair(given: Any) -> list[float]:
+    """Return a pair of finite numbers of a document. Raises TypeError or ValueError for anything else."""
+    low, high = given
+    return [_number(low), _number(high)]
+
+
+def _open_pair(given: Any) -> tuple[float | None, float | None]:
+    """Return a pair of finite numbers or None. Raises TypeError or ValueError for anything else."""
+    low, high = given
+    return None if low is None else _number(low), None if high is None else _number(high)
 
 
 def _number(given: Any) -> float:

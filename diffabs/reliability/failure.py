@@ -22,8 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.types import Params, PyTree, Scalar, Table
+from diffabs.core.units import resolve_unit, units_of
 from diffabs.reliability.importance_sampling import DESIGN_POINT_STARTS, Gradient
-from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
+from diffabs.reliability.subset_simulation import RareEvent, check_number, subset_simulation
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import describe_engine, log_kernel, log_xla_reason, resolve_request
@@ -51,8 +52,8 @@ def failure_probability(
         options: Keyword arguments of `subset_simulation`, such as `samples` and the `seed` of the draws.
 
     Raises:
-        ValueError: The metric is not measured, the study draws parts, the bound is not finite, or a drawn point cannot
-            be run.
+        ValueError: The metric is not measured, the study draws parts, the bound is no finite number, or a drawn point
+            cannot be run.
         importance_sampling.DivergenceError: Too many runs diverge.
 
     >>> import diffabs as d
@@ -68,6 +69,9 @@ def failure_probability(
     study.check()
     if metric not in study.objectives:
         raise ValueError(f"{metric} is not measured; there is {', '.join(study.objectives)}")
+    check_number(
+        "bound", bound, resolve_unit(getattr(study.objectives[metric], "unit", ""), units_of(study.loop.plant))
+    )
     if study.parts:
         raise ValueError(f"{', '.join(study.parts)}: alternatives of parts have no normal coordinates")
 

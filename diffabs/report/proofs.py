@@ -42,8 +42,9 @@ def design_section(document: Document) -> Section:
         f"{path} {low:.6g} to {high:.6g}{_unit(units.get(path))}" for path, (low, high) in content["over"].items()
     )
     designed = content["lower_bound"] is not None
-    question = "Which state feedback u = K x has the least guaranteed cost, and what is proved of it" if designed else \
-        "What is proved of the state feedback u = K x"  # fmt: skip
+    question = "What is proved of the state feedback u = K x"
+    if designed:
+        question = "Which state feedback u = K x costs least by one P for all specifications, and what is proved of it"
     return Section(
         title=f"{'Design for' if designed else 'Certificate of a gain of'} {content['scenario']}",
         question=f"{question}, over {ranges}?",

@@ -183,15 +183,17 @@ def rare_section(document: Document) -> Section:
     ]
     estimates = [
         [name, row["probability"], *row["interval"], row["cov"]]
-        for name in ("subset simulation", "importance sampling")
-        if (row := content[name])
+        for name in ("first level alone", "subset simulation", "importance sampling")
+        if (row := content.get(name))
     ]
     failing = [[path, *column] for path, column in content["failures"].items()]
+    # JSON has no NaN: null stands for a probability that is undecided, as no sample failed.
+    probability = "undecided" if content["probability"] is None else f"{content['probability']:.3g}"
     most = max((len(row) for row in failing), default=1) - 1
     return Section(
         title=f"A rare failure of {content['scenario']}",
         question=f"How probable is {failure}, while what [sweep.over] names varies?",
-        answer=[f"{content['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}."],
+        answer=[f"{probability}, 95 % interval {low:.3g} to {high:.3g}."],
         verdicts=[ReportVerdict("ended", content["reason"])],
         model=model_tables(content.get("model")),
         model_note="" if content.get("model") else UNKNOWN_ORIGIN,

@@ -8,7 +8,10 @@ from jax.tree_util import Partial
 
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
 from diffabs.core.rules import Rule
-from diffabs.core.types import Scalar
+from diffabs.core.types import Part, Scalar
+
+SPEED = 10.0  # m/s, at which the sign of a road's friction is checked
+MAX_FRICTION_AT_REST = 1e-6  # |mu| at slip 0, more than rounding
 
 # At smaller slips a fitted polynomial may be negative by a millionth, as the rig's is.
 SLIPS = np.linspace(0.05, 1.0, 20)
@@ -47,6 +50,29 @@ def stays_below(friction: Partial, limit: Scalar, name: str, then: str) -> Rule:
         return f"friction = {float(mu[worst]):.3g} at slip {SLIPS[worst]:g} is not below {name} = {limit:.3g}: {then}"
 
     return Rule((mu < limit).all(), f"friction is not below {name} at some slip: {then}", says)
+
+
+def find_wrong_sign(road: Part) -> str:
+    """Return a line about the first slip at which friction has not the sign of the slip; empty if there is none.
+
+    20 slips from 0.05 to 1, their negatives and 0 are checked, at 10 m/s and distance 0.
+
+    Args:
+        road: Road, with concrete parameters.
+    """
+    slips = np.concatenate([SLIPS, -SLIPS, [0.0]])
+    mu = np.asarray(_along(Partial(_friction_of, road), slips.astype(jnp.result_type(float))))
+    right = np.where(slips == 0, abs(mu) <= MAX_FRICTION_AT_REST, mu * slips >= 0)  # NaN is wrong
+    if right.all():
+        return ""
+    first = int(np.argmin(right))
+    slip = slips[first]
+    needed = "0 is needed" if slip == 0 else f"at {'most' if slip < 0 else 'least'} 0 is needed: such a road drives"
+    return f"friction = {mu[first]:.3g} at slip {slip:g}; {needed}"
+
+
+def _friction_of(road: Part, slip: Scalar) -> Scalar:
+    return road.friction(slip, SPEED, 0.0)
 
 
 def _at_slips(friction: Partial) -> Scalar:

@@ -6,6 +6,7 @@ module: a file from somebody else must not import code.
 
 import contextlib
 import dataclasses
+import difflib
 import importlib
 import importlib.metadata
 import os
@@ -17,9 +18,22 @@ from functools import cache
 from types import ModuleType
 from typing import Any
 
-from diffabs.core.types import PyTree
+import numpy as np
+
+from diffabs.core import protocols
+from diffabs.core.types import Part, PyTree
 
 ENTRY_POINT_GROUP = "diffabs.parts"
+CONTRACTS = {
+    "a plant": protocols.Plant,
+    "a road": protocols.Road,
+    "a sensor, controller or actuator": protocols.Block,
+    "a reference": protocols.Reference,
+    "a feedforward": protocols.Feedforward,
+    "a stop": protocols.Stop,
+    "an objective": protocols.Objective,
+}
+MIN_LIKENESS = 0.6  # least likeness of two names, of which one is probably a misspelling of the other
 
 _named: dict[str, ModuleType] = {}
 
@@ -33,15 +47,21 @@ def register_modules(names: Iterable[str]) -> None:
         names: Dotted names of the modules.
 
     Raises:
-        ValueError: A name is not that of a Python module, or the module cannot be imported.
+        ValueError: A name is not that of a Python module, or the module cannot be imported. Its classes lack methods,
+            so none is a part, or the friction of a road is no number.
     """
     for name in names:
+        if name.endswith(".py"):
+            raise ValueError(f"--parts {name} is a file; give the module's name, without folder and .py")
         if not all(word.isidentifier() for word in name.split(".")):
             raise ValueError(f"--parts {name} is not the name of a Python module, such as dc_servo")
         here = os.getcwd()
         if here not in sys.path:
             sys.path.append(here)  # at the end, so that no file here hides a module of the standard library
-        _named[name] = _import_module(name, f"--parts {name}")
+        module = _import_module(name, f"--parts {name}")
+        if fault := _find_incomplete_class(module) or _find_wrong_friction(module):
+            raise ValueError(f"--parts {name}: {fault}")
+        _named[name] = module
 
 
 @contextlib.contextmanager
@@ -124,6 +144,69 @@ def describe_outside_error(error: BaseException, names: Iterable[str] | None = N
     ]
     said = [type(error).__name__, " ".join(str(error).split())]
     return ": ".join([frames[-1], *filter(None, said)]) if frames else ""
+
+
+def _find_incomplete_class(module: ModuleType) -> str:
+    """Return what the first class of a module lacks to be a part; empty if the module has a part, or no class."""
+    classes = [item for item in vars(module).values() if isinstance(item, type) and item.__module__ == module.__name__]
+    parts = [item if isinstance(item, type) else type(item) for _, item in exported_parts(module)]
+    if any(getattr(cls, "family", None) or not _missing_methods(cls)[1] for cls in parts):
+        return ""
+    if parts:
+        cls = parts[0]
+        kind, missing = _missing_methods(cls)
+        own = ", ".join(sorted(_public_methods(cls)))
+        return (
+            f"there is no part in this module: class {cls.__name__} lacks {', '.join(missing)} of {kind}; it has {own}"
+        )
+    made = [cls for cls in classes if _public_methods(cls)]
+    return f"there is no part in this module: class {made[0].__name__} is not made with @pytree" if made else ""
+
+
+def _missing_methods(cls: type) -> tuple[str, list[str]]:
+    """Return the kind of part whose contract is nearest to a class, and the methods that the class lacks of it.
+
+    The nearest contract has the most methods in common, misspelled ones included, and then the fewest missing. A class
+    without methods lacks none: it is an initial state.
+    """
+    own = _public_methods(cls)
+    if not own or "rate" in own:  # `rate` alone is the contract of an anti-windup
+        return "", []
+
+    def distance(contract: frozenset[str]) -> tuple[int, int]:
+        close = [name for name in contract if difflib.get_close_matches(name, own, cutoff=MIN_LIKENESS)]
+        return -len(close), len(contract - own)
+
+    needed = {kind: _public_methods(contract) for kind, contract in CONTRACTS.items()}
+    if any(contract <= own for contract in needed.values()):
+        return "", []
+    kind = min(needed, key=lambda kind: distance(needed[kind]))
+    return kind, sorted(needed[kind] - own)
+
+
+def _public_methods(cls: type) -> frozenset[str]:
+    return frozenset(name for name in dir(cls) if not name.startswith("_") and callable(getattr(cls, name)))
+
+
+def _find_wrong_friction(module: ModuleType) -> str:
+    """Return a line about the first road of a module whose friction is no number, empty if there is none.
+
+    A friction that raises an error gives no line: the check of a loop with this road reports it.
+    """
+    for name, item in exported_parts(module):
+        try:
+            with contextlib.redirect_stdout(sys.stderr):
+                road: Part = item() if isinstance(item, type) else item
+                if not hasattr(road, "friction"):
+                    continue
+                mu = road.friction(0.1, 10.0, 0.0)
+            value = np.asarray(mu)
+        except (Exception, SystemExit):
+            continue
+        if value.shape or value.dtype.kind in "OSU":
+            found = f"values of shape {value.shape}" if value.shape else repr(mu)
+            return f"{name}.friction returns {found}; one number is needed"
+    return ""
 
 
 def _import_module(name: str, whose: str) -> ModuleType:

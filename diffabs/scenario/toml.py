@@ -25,6 +25,10 @@ def parse_toml(text: str) -> JsonObject:
         table = tomllib.loads(text)
     except RecursionError:
         raise ScenarioError("its values are nested too deeply") from None
+    except ValueError as error:
+        if "integer string conversion" in str(error):  # the limit of digits that Python converts
+            raise ScenarioError("a whole number is outside [-2^63, 2^63)") from None
+        raise
     # A loop with its own stack: recursion would fail on the deep nesting that it must refuse.
     pending: list[tuple[str, int, PyTree]] = [(key, 1, item) for key, item in table.items()]
     while pending:

@@ -8,8 +8,10 @@ from diffabs.core.protocols import BalanceOutput, BrakeOutput, Sample
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Bool, PyTree, Scalar
 
-EXTRAPOLATED = "stop_time and stop_distance are extrapolated with the last deceleration"
 LEAST_DECELERATION = 1e-3  # m/s^2; a car that only rolls gets a finite, very long stopping distance
+EXTRAPOLATED = (
+    f"stop_time and stop_distance are extrapolated with the last deceleration, at least {LEAST_DECELERATION:g} m/s^2"
+)
 
 
 @pytree

@@ -40,10 +40,15 @@ class Store:
     def lock(self) -> Iterator[None]:
         """Hold the lock of the folder, which is created if it does not exist.
 
+        A ValueError in the `with` block, such as a scheduler that does not answer, leaves nothing new in the folder
+        unless a chunk is finished.
+
         Raises:
             SweepError: Another process has the lock, or the folder cannot be written.
         """
         try:
+            created = [path for path in (self.folder, *self.folder.parents) if not path.exists()]
+            before = set() if created else {path.name for path in self.folder.iterdir()}
             self.folder.mkdir(parents=True, exist_ok=True)
             lock = filelock.FileLock(self.folder / LOCK_FILE, timeout=0)
             lock.acquire()
@@ -53,8 +58,26 @@ class Store:
             raise SweepError(f"{self.folder} cannot be written: {error.strerror}") from None
         try:
             yield
+        except ValueError:
+            self._remove_new(before, created)  # while the lock is held
+            raise
         finally:
             lock.release()
+
+    def _remove_new(self, before: set[str], created: list[pathlib.Path]) -> None:
+        """Remove what a sweep without a finished chunk has written.
+
+        Args:
+            before: Names in the folder before the sweep.
+            created: Folders that the sweep has created, the innermost first.
+        """
+        with contextlib.suppress(OSError):  # a folder that is not empty stays
+            if CHUNKS_FOLDER not in before and self.chunks.exists():
+                self.chunks.rmdir()
+            for name in {MANIFEST_NAME, LOCK_FILE} - before:
+                (self.folder / name).unlink(missing_ok=True)
+            for folder in created:
+                folder.rmdir()
 
     def begin(self, manifest: Table, *, resume: bool) -> None:
         """Write the `manifest`, or compare it with the existing one if `resume` is set.

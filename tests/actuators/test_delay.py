@@ -361,3 +361,20 @@ def test_nobody_looks_for_the_ends_of_smooth_pieces():
 
     jax.eval_shape(traced)
     assert comparisons == [0]
+
+
+@killed_by("actuators/delay.py", "for line in self.problems():", "for line in ():")
+@pytest.mark.parametrize(
+    ("capacity", "message"),
+    [
+        (100.0, r"capacity = 100.0 is no integer; one in \[3, inf\) steps is needed"),
+        (-5, r"capacity = -5 is outside \[3, inf\) steps"),
+        (2, r"capacity = 2 is outside \[3, inf\) steps"),
+    ],
+)
+def test_a_ring_without_room_is_refused_by_its_name(capacity, message):
+    given = loop(RAMP, Delay(time=3 * H, capacity=capacity))
+    with pytest.raises(ValueError, match=f"^actuator.{message}$"):
+        d.check(given)
+    with pytest.raises(ValueError, match=f"^Delay.{message}"):
+        d.rollout(given, d.FixedStep(H, 10 * H))

@@ -9,9 +9,11 @@ import jax
 import numpy as np
 import pytest
 from commands import assert_one_error_line, run
+from mutants import killed_by
 from sweeping import SCENARIO
 
 import diffabs as d
+from diffabs.cli.checking import describe_check
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import load, loads
 from diffabs.sweep import Results, sweep
@@ -120,6 +122,15 @@ def test_lanes_that_are_no_result_are_not_drawn():
     del columns["refused"]
     assert _choose_samples(study, table, 100).tolist() == [3, 4, 5, 6, 7]
     assert len(_choose_samples(study, table, 2)) == 2
+
+
+@killed_by("cli/checking.py", 'max(MIN_CHANGE * abs(row["value"]), ROUNDING)', 'MIN_CHANGE * abs(row["value"])')
+def test_no_order_of_rounding_is_not_said():
+    row = {"value": 8.9e-16, "converges": False, "error": 1.7e-14}
+    found = {"reasons": [], "comparable": True, "ended alike": True, "metrics": {"final_slip_error": row}}
+    assert describe_check(found) == []
+    row["error"] = 1e-9
+    assert describe_check(found) == ["shorter steps do not converge for final_slip_error: the error is a guess"]
 
 
 def test_what_is_said():

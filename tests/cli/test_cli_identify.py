@@ -29,6 +29,7 @@ KEYS = [
         "data",
         "values",
         "correlations",
+        "notes",
         "undetermined",
         "residuals",
         "chi2",
@@ -162,9 +163,7 @@ def test_the_arguments_reach_the_fit(small, csv, invented):
     assert asked["solver"].duration == pytest.approx(0.302)
 
 
-@killed_by(
-    "cli/identify.py", "max(_root_mean_square(residuals[name]), MIN_RELATIVE_NOISE * spread[name])", "spread[name]"
-)
+@killed_by("cli/identify.py", "max(left[name], least[name])", "spread[name]")
 def test_noise_that_is_not_known_is_taken_from_the_residuals(small, csv, invented):
     document = json.loads(run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, "--json").stdout)
     first, *others = (asked["data"].sigma for asked in invented)
@@ -231,12 +230,28 @@ def test_what_simulate_wrote_is_found_again(small, tmp_path):
     assert exact["values"]["plant.mass"]["value"] == pytest.approx(6.0, rel=1e-8)
     assert exact["values"]["plant.road.w4"]["value"] == pytest.approx(0.38, rel=1e-8)
     assert load(out).loop.plant.mass == exact["values"]["plant.mass"]["value"]
+    # Without noise, the deviation is that of the least noise, and not of the errors that the search leaves.
+    assert exact["scale"] == 1.0
+    assert abs(exact["values"]["plant.mass"]["value"] - 6.0) < exact["values"]["plant.mass"]["deviation"]
     noisy = json.loads(run("identify", small, "--data", tmp_path / "noisy.csv", *FREE, "--json").stdout)
     for name, value in (("plant.mass", 6.0), ("plant.road.w4", 0.38)):
         row = noisy["values"][name]
         assert 1e-6 < row["deviation"] < 0.5
         assert abs(row["value"] - value) < 4 * row["deviation"]  # 1 in 16,000 would be further off by chance
     assert noisy["residuals"]["wheel_speed"]["sigma"] == pytest.approx(0.02, rel=0.25)  # 60 instants: 9 %
+
+
+@pytest.mark.slow
+@killed_by("cli/identify.py", "[] if found.ends else [found.values]", "[found.values]")
+def test_a_value_at_an_end_of_its_range_has_no_deviation(small, tmp_path):
+    run("simulate", small, "--csv", tmp_path / "run.csv", "--set", "plant.mass=5")
+    args = ("--data", tmp_path / "run.csv", "--column", "slip", "--free", "plant.mass=5.2:8")
+    document = json.loads(run("identify", small, *args, "--json").stdout)
+    row = document["values"]["plant.mass"]
+    assert row["value"] == pytest.approx(5.2, rel=1e-4)
+    assert (row["deviation"], row["why"]) == (None, "end of range")
+    assert document["notes"][0].startswith("plant.mass is at the end 5.2 of its range")
+    assert "end of range" in run("identify", small, *args).stdout
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from commands import run
 from marks import cases
 from mutants import killed_by
 
+from diffabs.cli.show import show_verification
 from diffabs.cli.show_proofs import show_box_proof
 from diffabs.scenario.outside import lend_modules
 from diffabs.scenario.scenario import load
@@ -90,3 +91,16 @@ def test_the_table_of_a_proof_has_units_and_no_negative_zero(capsys: pytest.Capt
     shown = capsys.readouterr().out
     assert "proved for every initial.speed 5 to 10 m/s, reference.slip 0.1 to 0.2\n" in shown
     assert "-0" not in shown
+
+
+@killed_by("cli/show.py", 'if result.get("complete", True) else', "if True else")
+@pytest.mark.parametrize(
+    ("proved", "complete", "word"),
+    [(True, True, "proved  "), (True, False, "not refuted  "), (False, False, "NOT PROVED  ")],
+)
+def test_a_sample_of_the_cells_proves_nothing(
+    proved: bool, complete: bool, word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    claim = {"kind": "greatest slip <= 0.3", "says": "1 of 2 cells proved again", "proved": proved}
+    show_verification({"claims": [claim], "complete": complete}, json_wanted=False)
+    assert capsys.readouterr().out.startswith(word)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, run
 from marks import cases
+from mutants import killed_by
 from project import ROOT
 from scipy.stats import norm
 from seams import replace_seam
@@ -54,6 +55,18 @@ def test_tables_for_a_person(scenario, runs, monkeypatch):
     assert "stop_distance >= 2.8 m" in text
     assert re.search(rf"probability {NUMBER}, 95 % interval {NUMBER} to {NUMBER}", text)
     assert re.search(r"initial\.speed +\S +\d", text)
+
+
+@killed_by("cli/show_samples.py", '"undecided" if math.isnan(probability) else ', "")
+def test_without_a_failure_the_probability_is_undecided(scenario, monkeypatch):
+    replace_seam(monkeypatch, "measure_metric", lambda study, metric, at: np.tanh(at["initial.speed"]))
+    text = run("rare", scenario, "stop_distance=2.8", "--samples", 200, "--seed", 5)
+    # Clopper and Pearson for 0 of 200: 1 - 0.025^(1/200)
+    assert "probability undecided, 95 % interval 0 to 0.0183" in text.stdout
+    assert "no sample failed" in text.stderr
+    document = json.loads(run("rare", scenario, "stop_distance=2.8", "--samples", 200, "--seed", 5, "--json").stdout)
+    assert document["probability"] is None
+    assert document["interval"] == [0, pytest.approx(1 - 0.025 ** (1 / 200))]
 
 
 @pytest.mark.slow

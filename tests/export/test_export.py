@@ -405,6 +405,7 @@ def test_the_command_writes_a_file_that_compiles(tmp_path):
     assert float(rows[2][1]) == pytest.approx(-17300.0)
 
 
+@killed_by("export/device.py", "{period / MAX_STEPS_PER_SAMPLE:g} s", "{step:g} s")
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -420,6 +421,7 @@ def test_the_command_writes_a_file_that_compiles(tmp_path):
         (["slip-lmi", "--to", "st"], "controller StateFeedback runs in continuous time"),
         (["slip-cured", "--to", "table", "--float32"], "are for --to c and --to st"),
         (["slip-cured", "--to", "fortran"], "fortran"),
+        (["lab-rig-measured"], "80 steps of the solver, more than 64: choose a solver.step of at least 0.00015625 s"),
     ],
 )
 def test_the_command_refuses_in_one_line(arguments, words, tmp_path):

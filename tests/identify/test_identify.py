@@ -35,6 +35,14 @@ class Decay:
     c: Scalar = param(default=0.1, unit="1", low=-1.0, high=1.0)
 
 
+@pytree
+class Line:
+    """a + c x."""
+
+    a: Scalar = param(default=1.0, unit="1")
+    c: Scalar = param(default=0.1, unit="1")
+
+
 def decay(x, a, k, c):
     return a * np.exp(-k * x) + c
 
@@ -76,8 +84,8 @@ class TestFit:
 
     @killed_by(
         "identify/uncertainty.py",
-        "degrees, known = len(data) - len(names), data * size / scale",
-        "degrees, known = len(data) - len(names), data * size",
+        "known = (data * size / scale)[:, free]",
+        "known = (data * size)[:, free]",
         case="False",
     )
     @pytest.mark.parametrize("absolute", [True, False])
@@ -114,7 +122,9 @@ class TestFit:
         assert found.start == {"a": 1.0, "k": 0.5, "c": pytest.approx(0.1)}
 
     @killed_by(
-        "identify/uncertainty.py", "np.concatenate([known, prior * size])", "np.concatenate([known, 0 * prior * size])"
+        "identify/uncertainty.py",
+        "np.concatenate([known, (prior * size)[:, free]])",
+        "np.concatenate([known, (0 * prior)[:, free]])",
     )
     def test_a_gaussian_prior_has_the_closed_form(self):
         prior = gaussian({"c": (0.2, 0.05)})
@@ -149,6 +159,71 @@ class TestFit:
         assert k > 0
         assert found.uncertainty.correlation[0, 1] == pytest.approx(-1.0, abs=1e-6)
         assert found.uncertainty.singular[-1] < 1e-9 * found.uncertainty.singular[0]
+
+    @killed_by("identify/fit.py", "zip(free.names, z, values, slopes, free.ranges, strict=True)", "()")
+    @pytest.mark.parametrize(("low", "high"), [(0.5, 1.0), (0.5, 50.0), (0.5, np.inf)])
+    def test_a_value_at_an_end_of_its_range_has_no_deviation(self, low, high):
+        """The best slope is about 0.4, below the range: c stays at 0.5, and a is the mean of the rest of the line."""
+        found = fit(Line(c=0.8), {"a": None, "c": (low, high)}, line_residuals, data=LINE, sigma=SIGMA)
+        weight = 1 / SIGMA**2
+        assert found.ends == {"c": 0.5}
+        np.testing.assert_allclose(found.values["c"], 0.5, rtol=1e-8)
+        np.testing.assert_allclose(found.values["a"], np.average(LINE[1] - 0.5 * X, weights=weight), rtol=1e-6)
+        assert np.isnan(found.uncertainty.deviations["c"])
+        np.testing.assert_allclose(found.uncertainty.deviations["a"], np.sum(weight) ** -0.5, rtol=1e-9)
+        np.testing.assert_array_equal(np.isnan(found.uncertainty.covariance), [[False, True], [True, True]])
+        assert [one.components.keys() for one in found.uncertainty.directions] == [{"a"}]
+        assert "c          0.8     0.5         end of range" in str(found)
+        assert "c is at the end 0.5 of its range: no standard deviation holds there" in str(found)
+
+    @killed_by("identify/fit.py", "abs(value - end) * slope < MAX_END_DISTANCE", "True")
+    def test_far_from_a_start_is_not_at_an_end(self):
+        """0.4 is 4e-6 of the start's distance from the end 0, but many standard deviations away from it."""
+        best, found = (fit(Line(c=c), {"c": (0.0, np.inf)}, line_residuals, data=LINE, sigma=SIGMA) for c in (0.5, 1e5))
+        assert found.ends == {}
+        np.testing.assert_allclose(found.values["c"], best.values["c"], rtol=1e-6)
+        np.testing.assert_allclose(found.uncertainty.deviations["c"], best.uncertainty.deviations["c"], rtol=1e-6)
+
+    @killed_by("identify/fit.py", "abs(place) > END_COORDINATE and", "")
+    def test_a_value_without_influence_is_undetermined_and_not_at_an_end(self):
+        found = fit(Decay(), {"a": None, "k": (0.1, 10.0)}, line_residuals, data=LINE, sigma=SIGMA)
+        assert found.ends == {}
+        assert found.describe_deviation("k") == "undetermined"
+
+    def test_a_value_that_is_held_alone_and_one_near_an_end_by_a_true_minimum(self):
+        held = fit(Decay(c=0.8), {"c": (0.7, 1.0)}, line_residuals, data=LINE, sigma=SIGMA)
+        assert held.ends == {"c": 0.7}
+        assert held.uncertainty.directions == []
+        best = fit(Decay(), ["c"], line_residuals, data=LINE, sigma=SIGMA)
+        near = float(best.values["c"]) - 0.1 * best.uncertainty.deviations["c"]
+        inside = fit(Decay(c=0.8), {"c": (near, 1.0)}, line_residuals, data=LINE, sigma=SIGMA)
+        assert inside.ends == {}
+        np.testing.assert_allclose(inside.uncertainty.deviations["c"], best.uncertainty.deviations["c"], rtol=1e-4)
+
+    def test_ranges_of_lists_may_have_a_number_as_one_end(self):
+        @pytree
+        class Pair:
+            x: Scalar = param(default=(1.0, 2.0), unit="1")
+
+        found = fit(Pair(), {"x": (0.0, np.array([3.0, 4.0]))}, lambda part: part.x - jnp.array([2.0, 9.0]), sigma=1.0)
+        assert found.ends == {"x.1": 4.0}
+        assert str(found).count("x.") == 3  # two rows and a note
+        np.testing.assert_allclose(found.uncertainty.deviations["x.0"], 1.0, rtol=1e-9)
+
+    @killed_by("identify/fit.py", "in self.uncertainty.undetermined_parameters()", "in ()")
+    def test_the_table_says_what_is_undetermined(self):
+        def product(part, x, y):
+            return part.a * part.k * jnp.exp(-x) + part.c - y
+
+        found = fit(Decay(a=2.0), ["a", "k", "c"], product, data=DATA, sigma=SIGMA)
+        assert found.uncertainty.undetermined_parameters() == ["a", "k"]
+        assert str(found).count(" undetermined") == 2
+        (open_,) = found.uncertainty.undetermined_directions()
+        assert f"the data do not determine {open_.describe()} (relative changes)" in str(found)
+        prior = gaussian({"a": (2.0, 0.1)})
+        known = fit(Decay(a=2.0), ["a", "k", "c"], product, data=DATA, sigma=SIGMA, prior=prior)
+        assert known.uncertainty.undetermined_parameters() == []
+        assert "the data do not determine" in str(known)  # the prior does
 
     def test_a_step_into_nowhere_is_shortened(self):
         tried = []
@@ -226,6 +301,9 @@ class TestFit:
                 "the run diverges, or its step is not stable, at each of the 1 starts",
             ),
             ({"free": ["q"]}, "q is not a parameter; there is a, k, c"),
+            ({"free": {"k": "1:5"}}, r"k: the range is '1:5'; it must be a pair of numbers \(low, high\)"),
+            ({"free": {"k": 5.0}}, "k: the range is 5.0; it must be a pair of numbers"),
+            ({"free": {"k": ("1", 5.0)}}, "k: the end '1' of the range is text; it must be a number"),
             ({"starts": [{"k": -1.0}]}, r"k = -1 is outside \(0, inf\)"),
         ],
     )
@@ -234,9 +312,19 @@ class TestFit:
         with pytest.raises(ValueError, match=message):
             fit(Decay(), residuals=decay_residuals, **arguments)
 
-    def test_a_prior_without_width_is_an_error(self):
-        with pytest.raises(ValueError, match="a: the prior's standard deviation is 0; it must be positive"):
-            gaussian({"a": (1.0, 0.0)})
+    @killed_by("identify/residuals.py", "if not np.isfinite(np.asarray(mean, float)).all()", "if False")
+    @pytest.mark.parametrize(
+        ("known", "message"),
+        [
+            ((1.0, 0.0), "a: the prior's standard deviation is 0; it must be positive"),
+            ((1.0, np.nan), "a: the prior's standard deviation is nan; it must be positive"),
+            ((np.nan, 0.1), "a: the prior's mean is nan; it must be finite"),
+            (("1", 0.1), "a: the prior's mean = '1' is text; it must be a number"),
+        ],
+    )
+    def test_a_prior_without_width_or_place_is_an_error(self, known, message):
+        with pytest.raises(ValueError, match=message):
+            gaussian({"a": known})
 
 
 ROAD = roads.Scaled(road=roads.MagicFormula(), scale=1.0)
@@ -322,6 +410,7 @@ class TestTraces:
             ({"t": T + 0.3}, r"t = 0.3 ... 0.7992 s leaves \[0, 0.6\] s, the solver's duration"),
             ({"sigma": {"speed": -0.1}}, r"sigma.speed = -0.1 is outside \(0, inf\) m/s"),
             ({"sigma": {"slip": 0.1}}, "sigma is that of slip; the columns are speed"),
+            ({"sigma": {}}, "sigma is that of no column; the columns are speed"),
             ({"columns": {"speed": T, "slip": T}, "sigma": None}, "sigma: needed to weigh speed, slip"),
             ({"over": {"plant.mess": np.ones(2)}}, "plant.mess is not a parameter of the loop"),
             ({"over": {"plant.inertia": np.ones(1)}}, "plant.inertia: both free and given for each run"),

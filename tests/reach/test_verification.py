@@ -2,16 +2,19 @@
 
 import copy
 import json
+import math
 import os
 import pathlib
+import re
 from collections.abc import Callable
 
 import pytest
-from commands import run
+from commands import assert_one_error_line, run
 from mutants import killed_by
 
 from diffabs.core.types import JsonObject
-from diffabs.reach.verification import CELL_HALVINGS, FileVerdict, _choose_sides, _map_cells, verify_box
+from diffabs.reach.certificate import FORMAT
+from diffabs.reach.verification import CELL_HALVINGS, FileVerdict, _choose_sides, _map_cells, read_proof, verify_box
 from diffabs.scenario.scenario import loads
 
 pytest.importorskip("flint")
@@ -83,6 +86,52 @@ def test_a_file_that_is_no_proof_is_refused(tmp_path: pathlib.Path, proof: pathl
         broken = tmp_path / f"{key}.json"
         broken.write_text(json.dumps({name: value for name, value in document.items() if name != key}))
         run("verify", broken, status=2)
+
+
+@killed_by("reach/verification.py", "if not isinstance(given, kind):", "if False:")
+@pytest.mark.parametrize(
+    ("changed", "line"),
+    [
+        ({"over": [1, 2]}, "over = [1, 2] is not a table"),
+        ({"over": None}, "over is missing"),
+        ({"over": {"plant.mass": [5, 6, 7]}}, "over.plant.mass = [5, 6, 7]; a pair [low, high] of finite numbers is"),
+        ({"cells": [[[5, 6]], [[5, "a"]]]}, "cells.1 = [[5, 'a']]; a list, each entry a pair [low, high] of finite"),
+        ({"claims": [{"quantity": "slip"}]}, "claims.0 = {'quantity': 'slip'}; {\"quantity\": name, \"bound\""),
+        ({"bounds": {"greatest slip": [None, math.nan]}}, "bounds.greatest slip = [None, nan]; a pair [low, high] of"),
+        ({"horizon": "long"}, 'horizon = "long"; a finite number [s] is needed'),
+    ],
+)
+def test_a_wrong_member_of_a_file_is_named(changed: JsonObject, line: str) -> None:
+    document = {"format": FORMAT, "verdict": "proved", "over": {"plant.mass": [5, 6]}, "cells": [], "claims": []}
+    with pytest.raises(ValueError, match=re.escape(line)):
+        read_proof({**document, "bounds": {}, "horizon": 1.0, **changed})
+
+
+@killed_by("cli/prove.py", "if not isinstance(text, str):", "if False:")
+@pytest.mark.parametrize(
+    ("changed", "line"),
+    [
+        ({}, "scenario is missing or no text; the TOML text of a scenario is needed"),
+        ({"scenario": 3}, "scenario is missing or no text"),
+        ({"scenario": "hello"}, '"scenario" is not TOML: '),
+    ],
+)
+def test_a_file_without_a_scenario_is_refused_by_name(changed: JsonObject, line: str, tmp_path: pathlib.Path) -> None:
+    file = tmp_path / "p.json"
+    file.write_text(json.dumps({"format": FORMAT, "verdict": "proved", **changed}))
+    assert_one_error_line(result := run("verify", file, status=2))
+    assert line in result.stderr
+
+
+@killed_by("cli/prove.py", "if proved and not whole", "if not whole")
+def test_a_refuted_file_has_no_hint_to_check_more(proof: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    document = json.loads(proof.read_text())
+    shorter_duration(document)
+    file = tmp_path / "p.json"
+    file.write_text(json.dumps(document))
+    result = run("verify", file, "--share", "1", status=1)
+    assert "NOT PROVED" in result.stdout
+    assert "proves all" not in result.stdout
 
 
 @killed_by("reach/verification.py", "why = readers[i % count].recv()", "why = ''")

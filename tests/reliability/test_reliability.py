@@ -91,3 +91,7 @@ def test_the_probability_of_a_slippery_road():
 def test_what_is_not_there_is_said():
     with pytest.raises(ValueError, match="overshoot is not measured; there is max_slip, stop_distance"):
         failure_probability(STUDY, "overshoot", 0.5)
+    with pytest.raises(ValueError, match=r"bound = '0.9' is text; a number in \(-inf, inf\) m is needed"):
+        failure_probability(STUDY, "stop_distance", "0.9")
+    with pytest.raises(ValueError, match=r"bound = nan is outside \(-inf, inf\) m"):
+        failure_probability(STUDY, "stop_distance", np.nan)

@@ -97,6 +97,11 @@ def test_bytes_that_are_no_text(change):
     assert refused("simulate", "slip-lmi", "--set", change).endswith("is not UTF-8 text\n")
 
 
+def test_more_digits_than_python_converts(file):
+    said = refused("simulate", file(f"[plant]\nmass = {'9' * 5000}\n"))
+    assert said.endswith("is not a scenario: a whole number is outside [-2^63, 2^63)\n")
+
+
 def test_a_certificate_with_huge_numbers_and_depths(tmp_path):
     """JSON has no hexadecimal numbers; thousands of decimal digits are no finite float."""
     for text in (HEX, "9" * 4400, DEEP, '{"format": ' * 5000):

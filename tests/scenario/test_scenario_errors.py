@@ -24,6 +24,7 @@ BAD = [
     ("plnt.mass=1", "plnt is not a section", "did you mean plant?"),
     ("plant.mas=1", "plant.mas is not a field of quarter-car", "did you mean mass?"),
     ("plant.type=quarter-cart", 'plant.type = "quarter-cart" is unknown', "did you mean quarter-car?", "lab-rig"),
+    ("plant.mass=1979-05-27", "plant.mass = 1979-05-27 is a date or time; a number in (0, inf) kg is needed"),
     ("road=snw", "road.type", '"snw"', "did you mean snow?"),
     ("road.c9=1", "road.c9 is not a field", "there is slip, mu"),
     ("controller=sampled", "controller.controller is missing: sampled encloses another controller"),

@@ -343,6 +343,7 @@ def test_a_scheduler_that_cannot_be_reached(scenario, tmp_path, impatient, where
     result = by_command(scenario, tmp_path / "out", where, status=2)
     assert_one_error_line(result)
     assert f"the scheduler at {where} cannot be reached: " in result.stderr
+    assert left_in(tmp_path) <= {scenario.name}
 
 
 @killed_by("sweep/cluster.py", "if where is self.scheduler:", "if False:")

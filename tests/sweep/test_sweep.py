@@ -26,6 +26,7 @@ from diffabs.objectives import Effort
 from diffabs.simulate.run import measure, rollout
 from diffabs.sweep import Categorical, Local, Normal, Results, Space, SweepError, Uniform, sweep
 from diffabs.sweep.seal import tables_digest
+from diffabs.sweep.store import Store
 from diffabs.sweep.trajectories import write_trajectories
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
@@ -382,7 +383,7 @@ def test_a_folder_with_something_else_is_left_alone(file, tmp_path):
     result = run("sweep", scenario, "--out", tmp_path, status=2)
     assert_one_error_line(result)
     assert f"{tmp_path} is no sweep, but holds mine.toml; choose a folder that is new or empty" in result.stderr
-    assert left_in(tmp_path) == {".lock", "mine.toml", "summary.json", "notes.tmp"}
+    assert left_in(tmp_path) == {"mine.toml", "summary.json", "notes.tmp"}
 
 
 def test_a_sweep_is_not_begun_again_over_another(file, swept):
@@ -483,3 +484,34 @@ def test_a_study_has_a_table_of_plain_values(study):
     table = dataclasses.replace(study, failures=failures).check().table()
     assert json.loads(json.dumps(table)) == table
     assert (table["failures"], table["success"]) == ({"locked_time": 0.0, "overshoot": 0.5}, True)
+
+
+def refuse_later(store, *chunks):
+    """Begin a sweep that is refused after these chunks."""
+    with store.lock():
+        store.begin({"format": 1}, resume=False)
+        for name in chunks:
+            (store.chunks / name).write_text("")
+        raise SweepError("the scheduler does not answer")
+
+
+@killed_by("sweep/store.py", "            self._remove_new(before, created)", "            pass")
+@pytest.mark.parametrize("there", [None, {}, {"notes.tmp": "mine"}])
+def test_a_refused_sweep_leaves_a_folder_as_it_was(tmp_path, there):
+    store = Store(tmp_path / "out" / "sweep")
+    if there is not None:
+        store.folder.mkdir(parents=True)
+    for name, text in (there or {}).items():
+        (store.folder / name).write_text(text)
+    with pytest.raises(SweepError):
+        refuse_later(store)
+    assert left_in(tmp_path) == (set() if there is None else {"out"})
+    assert there is None or left_in(store.folder) == set(there)
+
+
+@killed_by("sweep/store.py", "self.chunks.rmdir()", "pass")
+def test_a_finished_chunk_stays_when_a_sweep_ends_with_an_error(tmp_path):
+    store = Store(tmp_path / "out")
+    with pytest.raises(SweepError):
+        refuse_later(store, "part-0.parquet")
+    assert left_in(store.folder) == {".lock", "manifest.json", "chunks"}
