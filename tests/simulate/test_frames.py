@@ -167,7 +167,7 @@ def test_a_tuning_has_a_table():
     assert "<table>" in found._repr_html_()
 
 
-@killed_by("identify/fit.py", "deviations.get(name))", "0.0)")
+@killed_by("identify/fit.py", "else self.uncertainty.deviations[name]", "else 0.0")
 @pytest.mark.slow
 def test_an_identification_has_a_table(run):
     frame = run.pandas()
