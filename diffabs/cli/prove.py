@@ -171,7 +171,8 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
         console.fail(f"{file}: not proved: {found.reason}", console.FAILED)
     if not as_json:
         said = show_proofs.describe_box(box, chosen, digits=9)
-        console.say(f"for every {said} of the scenario in the file, whatever its title says")
+        where = "" if whole else "in the cells proved again only: "
+        console.say(f"{where}for every {said} of the scenario in the file, whatever its title says")
 
 
 def _describe_claim(claim: "RunClaim") -> str:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
-from diffabs.core.bijectors import FreeSpace, Range, parameter_space
+from diffabs.core.bijectors import FreeSpace, HalfLine, Range, parameter_space
 from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
@@ -30,7 +30,7 @@ from diffabs.identify.uncertainty import Uncertainty, uncertainty
 from diffabs.runtime.summary import Summary, round_for_table
 
 END_COORDINATE = 7.0  # |z| beyond which a value may be held: exp(-7) of the range, or of the start's distance
-MAX_END_DISTANCE = 0.01  # of a held value from its end, in standard deviations that the parameter would have alone
+MAX_END_DISTANCE = 0.01  # of a held value from its end, in standard deviations with the others fixed
 
 SCIPY_REASONS = {0: Reason.LIMIT, 1: Reason.GRADIENT, 2: Reason.CHANGE, 3: Reason.CHANGE, 4: Reason.CHANGE}
 
@@ -121,7 +121,7 @@ class Identified:
     def describe_limits(self) -> str:
         """Return one line for each parameter at an end of its range and each undetermined direction; or nothing."""
         ends = [
-            f"{name} is at the end {round_for_table(end)} of its range: no standard deviation holds there, and those of"
+            f"{name} is at the end {round_for_table(end)} of its range, so it has no standard deviation; those of"
             " the others are for this value"
             for name, end in self.ends.items()
         ]
@@ -353,8 +353,9 @@ def _parameter_uncertainty(
 def _find_ends(free: FreeSpace, z: np.ndarray, values: np.ndarray, slopes: np.ndarray) -> dict[str, float]:
     """Return the end of the range by name, for each parameter that the end holds.
 
-    The coordinate z goes far out, and the end is within a hundredth of the deviation that the parameter has alone. An
-    interior minimum meets both conditions only if its interval extends past the end by half.
+    The coordinate z goes far out to the side of the end. The end is within a hundredth of the deviation that the
+    parameter has with the others fixed. An interior minimum counts as held only if almost half of its interval lies
+    beyond the end.
 
     Args:
         free: Free parameters.
@@ -363,9 +364,14 @@ def _find_ends(free: FreeSpace, z: np.ndarray, values: np.ndarray, slopes: np.nd
         slopes: Inverse of the standard deviation of each parameter with the others fixed, shape (p,).
     """
     found = {}
-    for name, place, value, slope, limits in zip(free.names, z, values, slopes, free.ranges, strict=True):
+    maps = [m for entry in free.entries for m in entry.maps]
+    for name, m, place, value, slope, limits in zip(free.names, maps, z, values, slopes, free.ranges, strict=True):
         end = min(limits, key=lambda x: abs(x - value))
-        if abs(place) > END_COORDINATE and abs(value - end) * slope < MAX_END_DISTANCE:
+        # On a half line z goes to -inf at the end, and the scale is the distance of the start from it.
+        far = -place if isinstance(m, HalfLine) else abs(place)
+        size = abs(m.scale) if isinstance(m, HalfLine) else limits[1] - limits[0]
+        # Without influence on the data any value is as good: that is no end which holds.
+        if far > END_COORDINATE and slope * size > 1 and abs(value - end) * slope < MAX_END_DISTANCE:
             found[name] = float(end)
     return found
 

@@ -1,14 +1,14 @@
-"""How much delay a sampled loop certainly bears: steps of the delay that cannot reach the stability boundary.
+"""How much delay a sampled loop bears: steps of the delay that do not reach the stability boundary, on a fine grid.
 
 A held input that arrives late by d = n T + f gives the open loop, with z = e^(j w T),
 
     L(w, d) = -K(z) C (z I - e^(A T))^-1 z^-n [ (1 - 1/z) G(T - f) + G(T)/z ]
     G(s) = integral of e^(A r) B over r in [0, s]
 
-L is continuous in d, also where n changes. A closed-loop pole is on the unit circle only where L = -1. A delay of s
-more moves L at a frequency by at most R s. R is the largest rate |dL/dd| over all fractions f. Within the period it is
-also at most |dL/dd| s + M s^2/2, where M is the largest second derivative. As long as one of these is below |1 + L| at
-all frequencies, no pole changes its side.
+L is continuous in d, also where n changes. A closed-loop pole is on the unit circle only where L = -1. At each
+frequency, s seconds of extra delay move L by at most R s. R is the largest rate |dL/dd| over all fractions f. If n does
+not change, the movement is also at most |dL/dd| s + M s^2/2, where M is the largest second derivative. As long as one
+of these is below |1 + L| at all frequencies, no pole changes its side. The maxima are those of a grid, with a reserve.
 
 Whole periods only turn L. So where |L| < 1 for all fractions, no delay at all reaches -1.
 """
@@ -21,7 +21,7 @@ from diffabs.linear.opened_loop import OpenLoop, sample_plant
 from diffabs.linear.transfer import Transfer
 from diffabs.linear.zero_order_hold import hold_input
 
-# Fractions of a period at which the largest |L| and its rates are taken: in all, per turn of the fastest pole, at most.
+# Fractions of a period for the largest |L| and its rates: at least, per turn of the fastest pole, at most.
 FRACTIONS, FRACTIONS_PER_TURN, MAX_FRACTIONS = 16, 32, 512
 NEIGHBOUR_DISTANCE, MAX_REFINEMENTS = 0.05, 12  # distance of neighbours relative to max(1, |L|); how often halved
 # Largest |L| over all fractions from which L may reach -1. It is below 1, because the peak may be between the points.
@@ -29,7 +29,8 @@ REACHING = 0.99
 RATE_RESERVE = 1.1  # for rates between the points of the grids
 TURN_BETWEEN = 0.1  # angle by which the delay turns L between neighbours [rad]
 NEAR, PIECES = 0.05, 16  # distance from -1 below which a chord is divided; into how many pieces
-LEAST_DISTANCE = 1e-5  # distance from -1 that a step takes for granted, so that the search goes on
+HUGE = 1e3  # |1 + L| of neighbours between which L has a pole, or nearly
+LEAST_DISTANCE = 1e-5  # smallest distance used for a step, also if L is nearer to -1: otherwise the search would stall
 
 
 class DelayStep(NamedTuple):
@@ -37,7 +38,7 @@ class DelayStep(NamedTuple):
 
     Attributes:
         size: Delay that may be added [s].
-        distance: Distance of L from -1 where the step is bound.
+        distance: Smallest distance of L from -1 where L may reach -1 with a delay.
     """
 
     size: float
@@ -91,14 +92,13 @@ class DelayedLoop:
         far = self._reaching & (distances >= NEAR)
         steps, distances = steps[far], distances[far]
         if len(near):
-            # A chord cuts the corner of the curve, so it is divided where that counts.
+            # The curve may be nearer to -1 than its chord, so chords near -1 are divided.
             w = self._curve.w
             pieces = (w[near, None] + (w[near + 1] - w[near])[:, None] * np.linspace(0, 1, PIECES + 1)).ravel()
             fine = self._bound(self._trace(pieces)[0], delay)
             inner = np.arange(1, len(pieces)) % (PIECES + 1) != 0
             steps, distances = np.append(steps, fine[0][inner]), np.append(distances, fine[1][inner])
-        i = int(np.nanargmin(steps))
-        return DelayStep(float(steps[i]), float(distances[i]))
+        return DelayStep(float(np.nanmin(steps)), float(np.nanmin(distances)))
 
     def _rests(self) -> np.ndarray:
         """Return remaining times T - f of a period; they are dense near 0, where fast poles still act."""
@@ -114,7 +114,7 @@ class DelayedLoop:
         return -(self.loop.controller.rational_response(w) @ states)[:, 0]
 
     def _respond(self, w: np.ndarray, row: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """Return L (k, m) for less than a period of delay, after which the inputs (n, m) are what is left to act."""
+        """Return L (k, m) with less than a period of delay f, for `inputs` G(T - f) of shape (n, m)."""
         back = np.exp(-1j * w * self.period)[:, None]
         return (1 - back) * (row @ inputs) + back * (row @ self._plant.B)
 
@@ -161,10 +161,23 @@ class DelayedLoop:
         with np.errstate(all="ignore"):
             values = 1 + self._respond(w, row, held)[:, 0] * np.exp(-1j * w * (self.period * whole))
             now = RATE_RESERVE * np.abs((1 - np.exp(-1j * w * self.period)) * (row @ (power @ plant.B))[:, 0])
-            rate, bend, now = (np.maximum(x[1:], x[:-1]) for x in (rate, bend, now))
             start, along = values[:-1], np.diff(values)
             at = np.clip(np.nan_to_num(-(start * along.conj()).real / np.abs(along) ** 2), 0, 1)
             distances = np.abs(start + at * along)
-            room = np.maximum(distances, LEAST_DISTANCE)
-            within = 2 * room / (now + np.sqrt(now**2 + 2 * bend * room))  # now s + bend s^2/2 = room
-            return np.maximum(room / rate, np.minimum(within, rest)), distances
+            largest = [np.maximum(x[1:], x[:-1]) for x in (rate, bend, now)]
+            steps = _safe_step(np.maximum(distances, LEAST_DISTANCE), *largest, rest)
+            # Between two huge values the curve passes a pole at infinity, and its chord may pass 0. The values count.
+            sizes = np.abs(values)
+            alone = _safe_step(sizes, rate, bend, now, rest)
+            huge = ~((sizes[1:] < HUGE) | (sizes[:-1] < HUGE))
+            steps = np.where(huge, np.fmin(alone[1:], alone[:-1]), steps)
+            return steps, np.where(huge, np.fmin(sizes[1:], sizes[:-1]), distances)
+
+
+def _safe_step(room: np.ndarray, rate: np.ndarray, bend: np.ndarray, now: np.ndarray, rest: float) -> np.ndarray:
+    """Return the largest delay that moves L by at most `room`, with the rates of `_Curve` and the rate now.
+
+    `rest` is what is left of the period [s]; up to there the second derivative bounds the change of the rate.
+    """
+    within = 2 * room / (now + np.sqrt(now**2 + 2 * bend * room))  # now s + bend s^2/2 = room
+    return np.maximum(room / rate, np.minimum(within, rest))

@@ -52,7 +52,7 @@ class Margins(NamedTuple):
         phase: Phase margin [rad]: the smallest angle, lag or lead, that reaches -1; infinity without a crossover.
         phase_at: Its frequency [rad/s].
         delay: Delay margin [s], the smallest added delay that makes the loop unstable; 0 if every delay does. Infinity
-            says that no delay does. NaN says that the search ended first: see `margins`.
+            says that no delay does. NaN: the closed loop is unstable, or the search ended first (see `margins`).
         sensitivity: Ms, the largest |S|; 1/Ms is the modulus margin.
         sensitivity_at: Its frequency [rad/s].
         complementary: Mt, the largest |T|.

@@ -113,7 +113,7 @@ class RareEvent:
         levels: The levels of subset simulation.
         subset: Estimate of subset simulation.
         plain: Estimate of the first level alone, plain Monte Carlo, with the interval of Clopper and Pearson. It needs
-            no assumption on the failure regions.
+            no assumption on the failure regions. Runs that diverge count as not failing.
         importance: Result of importance sampling, or None if nothing was drawn for it.
         note: Name of the better estimate, the reason for the choice, and what the interval assumes.
         failing: Different failures (k, d) of subset simulation, distributed as phi on F, the most likely first; at most
@@ -169,7 +169,7 @@ def subset_simulation(
     ended. The interval is then that of the first level alone.
 
     With several levels the interval assumes that the chains entered every failure region. With a late second region it
-    covers the truth less often than in 95 % of the seeds:
+    may cover the truth in far fewer than 95 % of the seeds (first two rows):
 
         score                                    threshold  P        covered  deviation of P  claimed
         max(z0 - 0.5, 3 (z1 - 3))                3.5        4.7e-5   55 %     17 %            5 %

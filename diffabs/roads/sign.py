@@ -53,7 +53,7 @@ def stays_below(friction: Partial, limit: Scalar, name: str, then: str) -> Rule:
 
 
 def find_wrong_sign(road: Part) -> str:
-    """Return a line about the first slip at which friction has not the sign of the slip; empty if there is none.
+    """Return a line about the first slip at which friction has the opposite sign or is NaN; empty without such a slip.
 
     20 slips from 0.05 to 1, their negatives and 0 are checked, at 10 m/s and distance 0.
 

@@ -47,8 +47,8 @@ def register_modules(names: Iterable[str]) -> None:
         names: Dotted names of the modules.
 
     Raises:
-        ValueError: A name is not that of a Python module, or the module cannot be imported. Its classes lack methods,
-            so none is a part, or the friction of a road is no number.
+        ValueError: A name is not that of a Python module, or the module cannot be imported. Also if no class in it is a
+            complete part, or if the friction of a road is no number.
     """
     for name in names:
         if name.endswith(".py"):

@@ -6,13 +6,12 @@ A first descent has the multipliers zero. Each round then updates them and desce
 
 g are the excesses of the constraints, d is the margin and c the penalty. Each start has its own m and c. The penalty c
 grows if the violation has not shrunk to `MAX_VIOLATION_RATIO` of its earlier value. A start has converged if all its
-constraints hold, and the update would hardly change its multipliers:
+constraints hold, and the update would change each multiplier by at most c times a tolerance:
 
     |max(g + d, -m/c)| <= max(d, MIN_TOLERANCE)
 
-So each constraint is active within the margin, or its multiplier is nearly zero. Without the second condition a search
-would end at the first feasible point, where too great a multiplier has pushed it inside. Rounds end when every start
-has converged, or after `Method.rounds` of them.
+Otherwise a search could end far inside a bound, because its multiplier is still too great. Rounds end when every start
+that can be used has converged, or after `Method.rounds` of them.
 
 Source: J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4; R. Andreani et al., On augmented
 Lagrangian methods with general lower-level constraints, SIAM J. Optim. 18 (2007), for the condition.
@@ -206,11 +205,14 @@ def _violations(descent_states: list[DescentState]) -> np.ndarray:
 
 
 def _have_converged(m: Multipliers, descent_states: list[DescentState]) -> list[bool]:
-    """Return for each start whether its constraints hold and an update would hardly change its multipliers."""
+    """Return for each start whether it has converged; a start that cannot be used counts as converged."""
     aimed = np.stack([descent_state.evaluation.excess for descent_state in descent_states]) + m.margin[:, None]
     change = np.abs(np.maximum(aimed, -m.values / m.penalty[:, None])).max(axis=1)
     settled = change <= np.maximum(m.margin, MIN_TOLERANCE)
-    return [bool(one) and worst <= 0 for one, worst in zip(settled, _violations(descent_states), strict=True)]
+    return [
+        descent_state.reason is Reason.START or (bool(one) and descent_state.history[-1].violation <= 0)
+        for one, descent_state in zip(settled, descent_states, strict=True)
+    ]
 
 
 def _raise_multipliers(m: Multipliers, descent_states: list[DescentState]) -> Multipliers:

@@ -68,7 +68,8 @@ class DescentState:
         reason: Reason for the end; None while the descent continues.
         history: Start, and the points after the accepted steps.
         kept: Best feasible step so far.
-        converged: Whether the multipliers of the constraints are right at `z`.
+        converged: Whether the constraints hold and their multipliers pass the test of `augmented_lagrangian`; True
+            without constraints.
     """
 
     z: np.ndarray
@@ -114,12 +115,13 @@ class DescentState:
     def go_back(self) -> None:
         """Go back to the feasible point that was kept, and note it, if it is better than the present point.
 
-        It is better if the present point violates a constraint. It is also better if it has the lower objective and the
-        multipliers have not converged. A point that has converged is the result, although steps on its way may have had
-        a lower objective within the margin of a constraint.
+        It is better if the present point violates a constraint. If the present point is no minimum, because the
+        multipliers have not converged or the iterations ran out, the lower objective decides. A converged minimum is
+        the result, although steps on its way may have had a lower objective within the margin of a constraint.
         """
         last, kept = self.history[-1], self.kept
-        if kept and (not last.violation <= 0 or (not self.converged and kept.point.objective < last.objective)):
+        is_minimum = self.converged and self.reason is not Reason.LIMIT
+        if kept and (not last.violation <= 0 or (not is_minimum and kept.point.objective < last.objective)):
             self.z, self.evaluation, self.reason = kept.z, kept.evaluation, Reason.KEPT
             self.history.append(kept.point._replace(iteration=last.iteration, evaluations=last.evaluations))
         elif not self.converged and self.reason is not Reason.INTERRUPTED:
@@ -261,7 +263,7 @@ class Descent:
     def _take(self, descent_state: DescentState, z: np.ndarray, found: LossEvaluation) -> None:
         gained = abs(descent_state.loss - float(found.loss))
         small = gained <= self.stopping.change * max(abs(descent_state.loss), 1e-12)
-        # The greatest step from the flat end of a range hardly changes the loss at first.
+        # A greatest step from a flat end of a range may hardly change the loss: it does not count as idle.
         descent_state.idle = descent_state.idle + 1 if small and not _is_longest(descent_state) else 0
         descent_state.z, descent_state.loss, descent_state.gradient, descent_state.evaluation = (
             z,
@@ -283,8 +285,7 @@ class Descent:
     def _finish_reason(self, descent_state: DescentState) -> Reason | None:
         """Return the reason why the descent of this start ends, or None if it continues."""
         z, gradient = descent_state.z, descent_state.gradient
-        # A small derivative at a flat end is no sign of a minimum if the descent leads back into the range: it counts
-        # as it would in the middle of the range.
+        # At a flat end, a derivative that leads back into the range counts as it would in the middle.
         gradient = np.where(gradient * z > 0, gradient / self._steepness_at_ends(z), gradient)
         if np.max(np.abs(gradient)) <= self.stopping.gradient:
             return Reason.GRADIENT
@@ -300,7 +301,11 @@ class Descent:
         return np.where(steepness < FLAT, np.maximum(steepness, 1e-300), 1.0)
 
     def _propose(self, descent_states: list[DescentState], fresh: list[bool]) -> None:
-        """Compute new updates for the starts that have moved; the others keep theirs."""
+        """Compute new updates for the starts that have moved; the others keep theirs.
+
+        A component that leaves a flat end is divided by the steepness there. No component exceeds
+        `MAX_UPDATE_COMPONENT`.
+        """
         if not any(fresh):
             return
         z, g = (
@@ -326,7 +331,7 @@ class Descent:
                 z, g = descent_state.z, descent_state.gradient
                 leaves = (update * z < 0) & (update * g < 0) & self.searches
                 faster = np.clip(update / self._steepness_at_ends(z), -MAX_UPDATE_COMPONENT, MAX_UPDATE_COMPONENT)
-                update = np.where(leaves, faster, update)
+                update = np.where(leaves & (np.abs(faster) > np.abs(update)), faster, update)
                 descent_state.update = update * min(
                     1.0, MAX_UPDATE_COMPONENT / max(float(np.max(np.abs(update))), 1e-300)
                 )

@@ -293,5 +293,6 @@ def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[Desce
         lbfgs(),
         Stopping(iterations=iterations),
         lambda lanes: None,
+        steepness=problem.space.steepness,
     )
     return descent.run(z, none)

@@ -290,6 +290,12 @@ def resonance(w, damping):
 
 SUM = [[-1, 0, 0], [0, 0, 1], [0, -((23 * math.pi) ** 2), -0.46 * math.pi]]  # a lag beside a resonance
 HELD = {
+    # |L| is infinite at 5 rad/s
+    "no damping": (
+        held_loop(resonance(5.0, 0.0), [[0], [1]], [[0, 1]], 0.5, 0.1),
+        0.2490334,
+        [0.01, 0.1, 0.2, 0.249, 0.2491, 0.26],
+    ),
     # |L| < 1 without an added delay, and above 1 with a sixth of a period
     "small gain at first": (
         held_loop(resonance(10 * math.pi, 0.05), [[0], [1]], [[0, 1]], 5.0, 0.1),
@@ -307,6 +313,7 @@ HELD = {
 
 @killed_by("linear/stability_margins.py", "if delayed.largest < REACHING:", "if True:", case="small gain at first")
 @killed_by("linear/delay_steps.py", "np.minimum(within, rest)", "5 * np.minimum(within, rest)", case="short window")
+@killed_by("linear/delay_steps.py", "np.where(huge, np.fmin(alone[1:], alone[:-1]), steps)", "steps", case="no damping")
 @pytest.mark.parametrize("name", HELD)
 def test_the_delay_margin_of_a_sampled_loop_is_the_first_delay_that_destabilises(name):
     loop, wanted, delays = HELD[name]

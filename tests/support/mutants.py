@@ -81,10 +81,11 @@ def judge(mutant: Mutant, folder: pathlib.Path, limit: float = LIMIT_S) -> str:
         path.write_text(source, encoding="utf-8")
 
 
-def run_tests(tests: list[str], folder: pathlib.Path, limit: float | None = None) -> str:
+def run_tests(tests: list[str], folder: pathlib.Path, limit: float | None = None, *, must_pass: bool = False) -> str:
     """Return "SURVIVES" if all tests pass against the package in `folder`, "dies" if one fails, or "dies: no end".
 
-    limit: time for all of them [s]; raises RuntimeError if pytest could not run them"""
+    limit: time for all of them [s]; raises RuntimeError, with the output, if pytest could not run them, or if one fails
+    that must pass"""
     environment = {
         **os.environ,
         "PYTHONPATH": str(folder),
@@ -101,6 +102,8 @@ def run_tests(tests: list[str], folder: pathlib.Path, limit: float | None = None
         finally:
             with contextlib.suppress(ProcessLookupError):  # what the test has started ends with it
                 os.killpg(running.pid, signal.SIGKILL)
+    if must_pass and running.returncode == 1:
+        raise RuntimeError(f"a test fails without its mutant:\n{output[-4000:]}")
     if running.returncode > 1:  # neither passed nor failed: the test does not exist, or nothing could be imported
         raise RuntimeError(output)
     return "dies" if running.returncode else "SURVIVES"
@@ -136,9 +139,8 @@ def run_mutants(mutants: list[Mutant], jobs: int) -> int:
                 folders.put(folder)
 
         tests = sorted({mutant.test for mutant in mutants})
-        shares = [functools.partial(run_tests, tests[job::jobs]) for job in range(jobs) if tests[job::jobs]]
-        if any(verdict != "SURVIVES" for verdict in pool.map(use_folder, shares)):
-            raise RuntimeError("a test fails without its mutant")
+        shares = [tests[job::jobs] for job in range(jobs) if tests[job::jobs]]
+        list(pool.map(use_folder, [functools.partial(run_tests, share, must_pass=True) for share in shares]))
         survivors = 0
         verdicts = pool.map(use_folder, [functools.partial(judge, mutant) for mutant in mutants])
         for mutant, verdict in zip(mutants, verdicts, strict=True):

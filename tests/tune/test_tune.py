@@ -252,9 +252,7 @@ class TestFlatEnds:
     @killed_by(
         "tune/descent.py", "gradient = np.where(gradient * z > 0, gradient", "gradient = np.where(False, gradient"
     )
-    @killed_by(
-        "tune/descent.py", "update = np.where(leaves, faster, update)", "update = np.where(False, faster, update)"
-    )
+    @killed_by("tune/descent.py", "update = np.where(leaves & ", "update = np.where(False & ")
     @pytest.mark.parametrize("share", [1e-2, 1e-4, 1e-6, 1e-8, 1 - 1e-8])
     def test_a_start_at_a_flat_end_leaves_it(self, share):
         interval = Interval(0.0, 1.0)
@@ -345,7 +343,7 @@ class TestConstraints:
         assert found.values["x"] + found.values["y"] >= 1
         assert found.objective[1] == pytest.approx(2 / 3, rel=5e-3)  # a margin of 1e-3 costs 2e-3 of it
 
-    @killed_by("tune/augmented_lagrangian.py", "    return [bool(one) and worst <= 0", "    return [worst <= 0")
+    @killed_by("tune/augmented_lagrangian.py", "(bool(one) and descent_state", "(descent_state")
     @pytest.mark.parametrize("start", [10.0, 2.33, 1.0])
     def test_it_goes_on_beyond_the_first_feasible_round(self, start):
         """x' = k (1 - x) - x for 2 s: the least integral of 1 - x with x(2) <= 0.7, from both sides of the bound."""
