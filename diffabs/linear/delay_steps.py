@@ -164,8 +164,8 @@ class DelayedLoop:
             start, along = values[:-1], np.diff(values)
             at = np.clip(np.nan_to_num(-(start * along.conj()).real / np.abs(along) ** 2), 0, 1)
             distances = np.abs(start + at * along)
-            largest = [np.maximum(x[1:], x[:-1]) for x in (rate, bend, now)]
-            steps = _safe_step(np.maximum(distances, LEAST_DISTANCE), *largest, rest)
+            fastest, sharpest, fast = (np.maximum(x[1:], x[:-1]) for x in (rate, bend, now))
+            steps = _safe_step(np.maximum(distances, LEAST_DISTANCE), fastest, sharpest, fast, rest)
             # Between two huge values the curve passes a pole at infinity, and its chord may pass 0. The values count.
             sizes = np.abs(values)
             alone = _safe_step(sizes, rate, bend, now, rest)
