@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.kinds import format_value
+from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.pytree import ParameterSpec, parameters, replace
 from diffabs.core.types import AnyArray, Part, PyTree, Scalar
 
@@ -247,8 +247,10 @@ def parameter_space(part: Part, free: Sequence[str] | Mapping[str, Range | None]
 
 def _entry(path: str, spec: ParameterSpec, value: np.ndarray, ends: Range | None) -> FreeParameter:
     try:
-        a, b = (spec.low, spec.high) if ends is None else ends
-        low, high = (np.broadcast_to(np.asarray(x, float), value.shape) for x in (a, b))
+        pair = (spec.low, spec.high) if ends is None else ends
+        if any(map(find_value_objection, pair)):  # NumPy would parse text
+            raise ValueError
+        low, high = (np.broadcast_to(np.asarray(x, float), value.shape) for x in pair)
     except (TypeError, ValueError):
         shape = f" of shape {value.shape}" if value.shape else ""
         needed = f"a pair (low, high) of numbers{shape}"

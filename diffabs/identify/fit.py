@@ -20,7 +20,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from diffabs.core.bijectors import FreeSpace, HalfLine, Range, parameter_space
-from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
 from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
@@ -187,7 +186,6 @@ def fit(
         ValueError: No start can be used: at each one a residual or derivative is not finite, or `usable` returns False.
     """
     part = canonical_dtypes(check_part(part))
-    _check_ranges(free)
     where = parameter_space(part, free)
     points = [where.place(check_part(replace(part, dict(start)))) for start in starts] or [where.place(part)]
     problem = FitProblem(where, part, residuals, data, as_partial(prior), norm, usable)
@@ -219,23 +217,6 @@ def fit(
         raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
     diverged = tuple(_values_by_path(where, z) for z, one in zip(points, fits, strict=False) if one is None)
     return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
-
-
-def _check_ranges(free: Sequence[str] | Mapping[str, Range | None]) -> None:
-    """Check that each given range is a pair of numbers.
-
-    Raises:
-        ValueError: A range is text, has not two ends, or an end is no number.
-    """
-    for path, ends in free.items() if isinstance(free, Mapping) else ():
-        if ends is None:
-            continue
-        # As objects: one end may be a number and the other an array.
-        if np.asarray(ends, object).shape[:1] != (2,):
-            raise ValueError(f"{path}: the range is {format_value(ends)}; it must be a pair of numbers (low, high)")
-        for end in ends:
-            if line := find_value_objection(end):
-                raise ValueError(f"{path}: the end {format_value(end)} of the range {line}; it must be a number")
 
 
 class _FitInterrupted(Exception):
@@ -370,7 +351,7 @@ def _find_ends(free: FreeSpace, z: np.ndarray, values: np.ndarray, slopes: np.nd
         # On a half line z goes to -inf at the end, and the scale is the distance of the start from it.
         far = -place if isinstance(m, HalfLine) else abs(place)
         size = abs(m.scale) if isinstance(m, HalfLine) else limits[1] - limits[0]
-        # Without influence on the data any value is as good: that is no end which holds.
+        # Without influence on the data any value is as good, so the end does not hold it.
         if far > END_COORDINATE and slope * size > 1 and abs(value - end) * slope < MAX_END_DISTANCE:
             found[name] = float(end)
     return found

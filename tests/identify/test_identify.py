@@ -302,9 +302,9 @@ class TestFit:
                 "the run diverges, or its step is not stable, at each of the 1 starts",
             ),
             ({"free": ["q"]}, "q is not a parameter; there is a, k, c"),
-            ({"free": {"k": "1:5"}}, r"k: the range is '1:5'; it must be a pair of numbers \(low, high\)"),
-            ({"free": {"k": 5.0}}, "k: the range is 5.0; it must be a pair of numbers"),
-            ({"free": {"k": ("1", 5.0)}}, "k: the end '1' of the range is text; it must be a number"),
+            ({"free": {"k": "1:5"}}, r"k: the range '1:5' is not a pair \(low, high\) of numbers"),
+            ({"free": {"k": 5.0}}, "k: the range 5.0 is not a pair"),
+            ({"free": {"k": ("1", 5.0)}}, r"k: the range \('1', 5.0\) is not a pair \(low, high\) of numbers"),
             ({"starts": [{"k": -1.0}]}, r"k = -1 is outside \(0, inf\)"),
         ],
     )
