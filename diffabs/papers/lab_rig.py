@@ -104,7 +104,7 @@ STEP_STARTS: tuple[Params, ...] = tuple(
 NOTES = [
     "The readings come from the figures of the manual, so a pixel limits them: 10 ms, 5.3 rpm and 0.004 of slip.",
     "The radii are those of the driver's perimeters, 0.0956 and 0.0985 m. With the radii of the manual's table a "
-    "rolling wheel would slip by -2.5 %.",
+    "rolling wheel would slip by -3.6 %.",
     "A run starts at the sample of the first command, with the drum at 1,700 rpm and the wheel rolling. The relay "
     "reads the slip of the encoders every 10 ms.",
     "The standard deviations come from the model linearised at the fit. The residuals estimate their scale. They do "
