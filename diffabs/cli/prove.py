@@ -21,6 +21,7 @@ from diffabs.scenario.scenario import Scenario, dump, loads
 if TYPE_CHECKING:
     from diffabs.plot.proofs import ProofMap
     from diffabs.reach import BoxProof, RunClaim
+    from diffabs.reach.equations import Equations
 
 SEARCHED = (9, 17)  # runs along the first and the other parameters, among which the worst is looked for
 MOST_BYTES = 2**28  # of a file that is read; some million cells
@@ -66,8 +67,7 @@ def prove(
         box = {side.path: side.ends for side in sides}
         if plot:
             _choose_axes(sides)  # refuses other boxes before anything is proved
-        claims = [_read_claim(text, chosen) for text in claim or ()]
-        if "slip" not in chosen.loop.plant.shows._fields and not claims:
+        if "slip" not in chosen.loop.plant.shows._fields and not claim:
             raise ScenarioError(
                 f"--claim is needed: the plant has no slip; it has {', '.join(chosen.loop.plant.shows._fields)}"
             )
@@ -75,7 +75,8 @@ def prove(
         far = [""]
         with targets.new_target_file(out, "--out") as file, targets.new_target_file(plot, "--plot") as picture:
             try:
-                derive_equations(chosen.loop, box)  # refuses a loop without rules before anything is simulated
+                equations = derive_equations(chosen.loop, box)  # refuses before anything is simulated
+                claims = [_read_claim(text, chosen, equations) for text in claim or ()]
                 known, where = _extreme_runs(chosen, box)
                 proof = console.run_with_progress(
                     lambda: prove_box(
@@ -263,7 +264,7 @@ def _map_of_proof(
     )
 
 
-def _read_claim(text: str, chosen: Scenario) -> "RunClaim":
+def _read_claim(text: str, chosen: Scenario, equations: "Equations") -> "RunClaim":
     """Return a claim about a signal, the stop time or the stop distance. Raises ScenarioError."""
     from diffabs.reach import RunClaim
 
@@ -286,8 +287,16 @@ def _read_claim(text: str, chosen: Scenario) -> "RunClaim":
     if name == OVERSHOOT:
         if bound < 0:  # the metric is 0 for every run below its target
             raise ScenarioError(f"--claim {OVERSHOOT} = {bound:g} is outside [0, inf)")
+        from diffabs.objectives.tracking import MIN_SETPOINT
+
+        setpoint = equations.operations[equations.signals["setpoint"]]
+        if setpoint.name != "const" or setpoint.value < 0:
+            raise ScenarioError(
+                f"--claim {OVERSHOOT} needs one target for all runs; here it changes in a run or over the box: "
+                "--claim max_slip=BOUND"
+            )
         below = 1 - 2.0**-50  # the product is rounded, and the target may be a rounded decimal
-        return RunClaim("greatest slip", (1 + bound) * _target(chosen) * below)
+        return RunClaim("greatest slip", (setpoint.value + bound * max(setpoint.value, MIN_SETPOINT)) * below)
     if name in TIMES:
         return RunClaim(name, bound)
     word, _, signal = name.partition("_")
@@ -300,12 +309,6 @@ def _unit_of(quantity: str, chosen: Scenario) -> str:
     return units.get(quantity.split()[-1], "")
 
 
-def _target(chosen: Scenario) -> float:
-    """Return the target slip of the reference."""
-    loop = chosen.loop
-    return float(loop.reference.setpoint(loop.start().reference))
-
-
 def _extreme_runs(
     chosen: Scenario, box: dict[str, tuple[float, float]]
 ) -> tuple[dict[str, tuple[float, float]], dict[str, list[float]]]:
@@ -314,7 +317,7 @@ def _extreme_runs(
     """
     import diffabs as d
     from diffabs.core.protocols import BrakeOutput
-    from diffabs.objectives import Overshoot, StopDistance, StopTime
+    from diffabs.objectives import MaxSlip, StopDistance, StopTime
     from diffabs.stops import SpeedReached
 
     if chosen.loop.plant.shows is not BrakeOutput:
@@ -323,13 +326,10 @@ def _extreme_runs(
     axes = [np.linspace(low, high, n)[:: max(1, (n - 1))] if low == high else np.linspace(low, high, n)
             for (low, high), n in zip(box.values(), counts, strict=True)]  # fmt: skip
     points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], 1)
-    metrics = {"overshoot": Overshoot(), "stop_time": StopTime(), "stop_distance": StopDistance()}
+    metrics = {"greatest slip": MaxSlip(), "stop_time": StopTime(), "stop_distance": StopDistance()}
     batch = d.Batch(dict(zip(box, points.T, strict=True)))
     runs = d.run_batch(chosen.loop, batch, chosen.solver, metrics)
     found = {name: np.asarray(column) for name, column in runs.metrics.items()}
-    overshoot = found.pop("overshoot")
-    # An overshoot of 0 says only that the slip stays below its target.
-    found["greatest slip"] = np.where(overshoot > 0, (1 + overshoot) * _target(chosen), np.nan)
     if not isinstance(chosen.loop.stop, SpeedReached):
         # These metrics extrapolate to rest; the proof is about the stop's own speed.
         del found["stop_time"], found["stop_distance"]
@@ -379,6 +379,7 @@ def _document(
         reason = f"{100 * shares.sum():.3g} % of the box is left in {cells}"
         reason += f" ({proof.failure})" if proof.failure else ""
         reason += "; a greater --budget goes on" if len(proof.cells) else ""
+        reason = reason if len(proof.left) else proof.failure
     else:
         reason = ""
     return {

@@ -1057,6 +1057,8 @@ class _Check:
             middle = t.mid()
             y = _at(values, middle) + sum((_symmetric(x) for x in _at(slopes, middle).coeffs()), ZERO)
             y += _at(rates, t) * (t - middle) + rest * t**order + slack
+            if not y.is_finite():
+                raise _Undefined("a signal without bounds")
             lows.append(y.lower())
             highs.append(y.upper())
         return min(lows), max(highs)

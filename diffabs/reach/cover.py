@@ -25,6 +25,7 @@ SMALLEST = 2.0**-40  # of the box's side: a smaller cell is not halved again
 PROBE_SIZES = (1e-3, 1e-4, 1e-5)  # sizes of the cell that shows how much each parameter matters, in sides of the box
 SPEED_COST = 3.0
 CLOSE = 5e-4  # a bound is refined while it is farther than this from the worst run found, relative
+RUN_ERROR = 1e-3  # of a value found in a run, relative: a run farther beyond a proved bound contradicts it
 
 Box = dict[str, tuple[float, float]]
 
@@ -93,7 +94,8 @@ def prove_box(
         signals: Further signals whose range is wanted, by name.
         horizon: Duration after which a run that has not stopped is no longer followed [s].
         budget: Computing time [s].
-        known: Least and greatest value of a quantity in runs that were found: bounds are not refined beyond them.
+        known: Least and greatest value of a quantity in runs that were found: bounds are not refined beyond them. A
+            bound that such a run violates by more than 0.1 % proves nothing: either it or the run is wrong.
         suspects: Points of the box whose runs may violate a claim; each is tried first, as a cell of one run.
         progress: Called with a line about how far the proof is.
         threads: Number of threads; None for one for each core.
@@ -165,6 +167,8 @@ def prove_box(
         raise AssertionError("the cells do not cover the box")
     bounds = quantities.over_all(merged) if covered and merged is not None else quantities.unbounded
     verdict = "refuted" if refuting is not None else "proved" if covered else "undecided"
+    if verdict == "proved" and (contradiction := _find_contradiction(bounds, known or {})):
+        verdict, failure, bounds = "undecided", contradiction, quantities.unbounded
     return BoxProof(
         *(verdict, bounds, cells, merged, left, refuting, failure if verdict == "undecided" else "", tried),
         *(time.monotonic() - began, equations, prover),
@@ -242,6 +246,16 @@ def _find_violation(
         if wrong.any():
             return cells[np.flatnonzero(wrong)[0]]
     return None
+
+
+def _find_contradiction(bounds: Mapping[str, tuple[float, float]], known: Mapping[str, tuple[float, float]]) -> str:
+    """Return what a run violates by more than the errors of runs, empty if nothing."""
+    for name, (least, greatest) in known.items():
+        low, high = bounds.get(name, (-math.inf, math.inf))
+        for run, bound, beyond in ((least, low, low - least), (greatest, high, greatest - high)):
+            if beyond > RUN_ERROR * abs(run):
+                return f"a simulated run has {name} = {run:.6g}, beyond the bound {bound:.6g}: one of the two is wrong"
+    return ""
 
 
 def _select(found: CellBounds, which: np.ndarray) -> CellBounds:

@@ -123,8 +123,7 @@ class CellBounds(NamedTuple):
     """Proved bounds of cells of parameters, one row for each.
 
     Attributes:
-        status: 1 if every run of the cell ends, 2 if it is proved up to the horizon (to 1e-12 of it), 0 if nothing is
-            proved.
+        status: 1 if every run of the cell ends, 2 if it is proved up to the horizon, 0 if nothing is proved.
         time: Stop time, low and high [s].
         distance: Stop distance, low and high [m].
         least: Lower bounds of the signals.

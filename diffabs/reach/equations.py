@@ -3,9 +3,11 @@
     z(0) = start(p),   z := tick(z) every period,   dz/dt = flow(z) between ticks,   p: the parameters of a box
 
 `jax.make_jaxpr` traces `Loop.start`, `Loop.change` and `Loop.flow`, and the lowering rules of `compiler` reduce them to
-single numbers. The operations mean real numbers. Nothing is folded unless it is exact. A constant stands for the double
-and for the decimal that its shortest text shows. Three forms are recognised, because their floating-point form says
-less than their meaning: powers, limits, and the slip of a braked wheel.
+single numbers. The operations mean real numbers. Nothing is folded unless it is exact, and numbers of the loop enter as
+constants, so NumPy computes none. A constant stands for the double and for the decimal that its shortest text shows.
+Three forms are recognised, because their floating-point form says less than their meaning: powers, limits, and the slip
+of a braked wheel. A number that has no value, such as 1/0, leaves a proof undecided, also where the program asks
+whether it is NaN.
 
 A braked wheel is described by slip and speed instead of two angular speeds. In a set of runs both speeds vary together,
 and only with the slip as a state does an enclosure keep that. `check_slip_chart` proves the change of coordinates.
@@ -20,6 +22,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel
 from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr, scalar_array
@@ -32,10 +35,11 @@ from diffabs.core.pytree import parameters, replace
 from diffabs.core.types import PyTree, Scalar
 from diffabs.plants import BrakeStart
 
-LEAVES, STATE, TIME = "leaf", "state", "t"
+LEAVES, STATE, OWN, GRID, TIME = "leaf", "state", "own", "grid", "t"
 FUNCTIONS = ("exp", "log", "sin", "cos", "atan", "power")
 COMPARISONS = ("lt", "le", "eq", "ne")
 LOGIC = ("and", "or", "not")
+PARTIAL = ("div", "sqrt", "log", "log1p", "tan")  # operations of a program that have no value for some operands
 CHART_TRIALS = 20  # random rational points; a rational function that is not the identity passes none, nearly surely
 SLOWEST, FASTEST = Fraction(2, 100), Fraction(200)  # speeds [m/s] at which the chart is checked, ends included
 CHART_DECADES = 6.0  # by which parameters of the box are changed, up and down
@@ -102,14 +106,26 @@ class Equations:
 class RealGraph(Graph):
     """A graph that means real numbers: it folds and simplifies only what is exact."""
 
+    def __init__(self) -> None:
+        """Create an empty graph."""
+        super().__init__()
+        self._valued: dict[int, bool] = {}
+
+    def has_value(self, node: Node) -> bool:
+        """Return whether a number has a value for all values of the inputs; False if that is unknown."""
+        if node.id not in self._valued:
+            partial = node.op in PARTIAL and not (node.op == "div" and _is_nonzero(node.args[1]))
+            self._valued[node.id] = not partial and all(map(self.has_value, node.args))
+        return self._valued[node.id]
+
     def op(self, name: str, *args: Node) -> Node:
         """Return a node for the operation `name` on `args`; see `Graph.op`."""
-        if name in ("ne", "eq") and args[0] is args[1]:
-            return self.const(name == "eq")  # a real number equals itself
-        if name == "is_finite":
-            return self.const(True)
         real = all(np.issubdtype(arg.dtype, np.floating) for arg in args)
-        if not real or name in ("lt", "le", "gt", "ge", "eq", "ne"):
+        if name in ("is_finite", "ne", "eq") and real and args[0] is args[-1] and args[0].op != "const":
+            # A real number is finite and equals itself, if it has a value: `convert` asks whether it does.
+            finite = self._make("is_finite", args[:1], bool)
+            return self.op("not", finite) if name == "ne" else finite
+        if not real or name in ("is_finite", "lt", "le", "gt", "ge", "eq", "ne"):
             return super().op(name, *args)
         if all(arg.op == "const" and np.isfinite(arg.attr) for arg in args) and name in ("add", "sub", "mul", "neg"):
             exact = {
@@ -124,8 +140,17 @@ class RealGraph(Graph):
         found = _simplify(self, name, args)
         return self._make(name, args, args[0].dtype) if found is None else found
 
+    def any(self, which: Node) -> Node:
+        """Return the condition itself: a result of a branch that no lane takes is a placeholder only in a kernel."""
+        return which
 
-def _simplify(graph: Graph, name: str, args: tuple[Node, ...]) -> Node | None:
+
+def _is_nonzero(node: Node) -> bool:
+    """Return whether a node is a finite constant other than 0."""
+    return node.op == "const" and bool(np.isfinite(node.attr)) and not node.is_number(0)
+
+
+def _simplify(graph: RealGraph, name: str, args: tuple[Node, ...]) -> Node | None:
     """Return an equal, simpler node for an operation on real numbers, or None."""
     x, y = args if len(args) == 2 else (args[0], args[0])
 
@@ -136,24 +161,42 @@ def _simplify(graph: Graph, name: str, args: tuple[Node, ...]) -> Node | None:
         case "add":
             return y if zero(x) else x if zero(y) else None
         case "sub":
-            return x if zero(y) else graph.const(0.0, x.dtype) if x is y else graph.op("neg", y) if zero(x) else None
+            if x is y and graph.has_value(x):
+                return graph.const(0.0, x.dtype)
+            return x if zero(y) else graph.op("neg", y) if zero(x) else None
         case "mul":
-            if zero(x) or zero(y):
+            if (zero(x) and graph.has_value(y)) or (zero(y) and graph.has_value(x)):
                 return graph.const(0.0, x.dtype)
             return y if x.is_number(1) else x if y.is_number(1) else None
         case "div":
-            return graph.const(0.0, x.dtype) if zero(x) else x if y.is_number(1) else None
+            return graph.const(0.0, x.dtype) if zero(x) and _is_nonzero(y) else x if y.is_number(1) else None
         case "neg":
             return x.args[0] if x.op == "neg" else None
     return None
 
 
-class _Tick(Clock):
-    """The clock at a tick of every block."""
+def tick_clock(own: float, t: Scalar, h: Scalar, k: Scalar) -> Clock:
+    """Return the clock at a tick of every block, whose number is k; a block of another period has no rule.
 
-    def ticks(self, period: PyTree = None) -> tuple[PyTree, PyTree]:
-        """Return that the block ticks now, and the number of the tick."""
-        return jnp.asarray(True), self.k
+    Args:
+        own: Period of the loop's clock [s].
+        t: Time [s].
+        h: Step of the integration grid, traced [s].
+        k: Number of the tick, traced.
+    """
+
+    class Tick(Clock):
+        def ticks(self, period: PyTree = None) -> tuple[PyTree, PyTree]:
+            # Without a period a block ticks with `h`: the controller in a sampled one, with each of its samples.
+            if period is None and isinstance(self.h, Tracer):
+                raise NoRule("a block ticks with the integration grid, which a proof has not")
+            if isinstance(period, Tracer):
+                raise NoRule("the parameter for the period of a block has a name that does not end in period")
+            if period is not None and float(period) != own:
+                raise NoRule(f"clocks of different periods: {own:g} s, {float(period):g} s")
+            return jnp.asarray(True), self.k
+
+    return Tick(t, h, k, None)
 
 
 def derive_equations(loop: Loop, over: Iterable[str]) -> Equations:
@@ -181,7 +224,7 @@ class _Derivation:
         for path in paths:
             if path not in known:
                 raise NoRule(f"{path} is not a parameter of the loop")
-            if path.split(".")[0] in BLOCKS and path.split(".")[-1] in ("period", "delay"):
+            if path.split(".")[0] in BLOCKS and path.endswith(("period", "delay")):
                 raise NoRule(f"{path}: the proof has no rule for a range of periods or delays")
         self.period = _clock_of(self.loop)
         self.given = [self.graph.input(np.float64, UpdateLevel.UNIFORM, (LEAVES, i)) for i in range(len(paths))]
@@ -192,15 +235,25 @@ class _Derivation:
         self.operations: list[RealOperation] = []
         self.known: dict[Any, int] = {}
 
-    def with_params(self, values: PyTree) -> Loop:
-        return replace(self.loop, dict(zip(self.paths, values, strict=True)))
-
     def lower(self, function: Callable[..., Any], *groups: list[Node]) -> list[Node]:
-        """Return the results of a function of lists of numbers as nodes, one for each number."""
-        shapes = [[jax.ShapeDtypeStruct((), np.float64)] * len(group) for group in groups]
-        closed = jax.make_jaxpr(function)(*shapes)
+        """Return the results of a function of a loop and lists of numbers as nodes, one for each number.
+
+        The loop has the parameters of the box and all its numbers as inputs, so that Python computes with none.
+        """
+        shown, made = jax.tree_util.tree_flatten_with_path(self.loop)
+        fixed = [x for path, x in shown if _is_traced(path, x)]
+
+        def call(numbers: list[Any], values: list[Any], *rest: PyTree) -> PyTree:
+            given = iter(numbers)
+            leaves = [next(given) if _is_traced(path, x) else x for path, x in shown]
+            loop = replace(jax.tree.unflatten(made, leaves), dict(zip(self.paths, values, strict=True)))
+            return function(loop, *rest)
+
+        shapes = [[jax.ShapeDtypeStruct((), node.dtype) for node in group] for group in (self.given, *groups)]
+        closed = jax.make_jaxpr(call)([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in fixed], *shapes)
         constants = [constant_array(self.graph, np.asarray(x)) for x in closed.consts]
-        inputs: list[Array] = [scalar_array(node) for group in groups for node in group]
+        inputs: list[Array] = [constant_array(self.graph, x) for x in fixed]
+        inputs += [scalar_array(node) for group in (self.given, *groups) for node in group]
         try:
             return [x for array in lower_jaxpr(self.graph, closed.jaxpr, constants, inputs) for x in array.flat]
         except Unsupported as error:
@@ -209,7 +262,7 @@ class _Derivation:
     def equations(self) -> Equations:
         """Return the equations; the states are those of the loop's memory, in its order, then the time."""
         start, rates, after, show = self.programs()
-        first = jax.eval_shape(lambda values: self.chart(self.with_params(values)), [0.0] * len(self.paths))
+        first = jax.eval_shape(self.chart, self.loop)
         shown, made = jax.tree_util.tree_leaves_with_path(first), jax.tree.structure(first)
         names: list[str] = []
         for path, leaf in shown:
@@ -230,14 +283,16 @@ class _Derivation:
         def flat(tree: PyTree) -> list[Any]:
             return [jnp.asarray(x, float) for leaf in jax.tree.leaves(tree) for x in jnp.ravel(leaf)]
 
-        begun = self.lower(lambda values: flat(start(self.with_params(values))), self.given)
-        moved = self.lower(
-            lambda values, z: flat(rates(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes
-        )
-        shows = self.lower(
-            lambda values, z: flat(show(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes
-        )
-        slip, speed, travelled = (names.index(f"plant.{x}") if self.charted else -1 for x in _Chart._fields)
+        begun = self.lower(lambda loop: flat(start(loop)))
+        moved = self.lower(lambda loop, z: flat(rates(loop, state_of(z[:-1]), z[-1])), nodes)
+        shows = self.lower(lambda loop, z: flat(show(loop, state_of(z[:-1]), z[-1])), nodes)
+        slip, speed, travelled = chart = [names.index(f"plant.{x}") if self.charted else -1 for x in _Chart._fields]
+        if self.charted:
+            own = self.lower(lambda loop, z: flat(self.loop_state(loop, state_of(z[:-1])).plant), nodes)
+            rates_of_own = [moved[i] for i in sorted(chart)]
+            shown_rates = self.chart_rates(own, rates_of_own, _Chart(*(nodes[i] for i in chart)))
+            for i, rate in zip(chart, shown_rates, strict=True):
+                moved[i] = rate
         # The slip and the speed that the plant computes from its own states are the states of the chart.
         same = {shows[0].id: ("state", slip), shows[1].id: ("state", speed)} if self.charted else {}
         initial = {name: self.initial_node(name) for name in ("slip", "speed")} if self.charted else {}
@@ -249,9 +304,11 @@ class _Derivation:
         signal_names = [*self.loop.plant.shows._fields, "target", "command", "control", "setpoint"]
         ticked: list[int] = []
         if self.period is not None:
-            ticks = self.lower(
-                lambda values, z: flat(after(self.with_params(values), state_of(z[:-1]), z[-1])), self.given, nodes
-            )
+            grid = [self.graph.input(x, UpdateLevel.STEP, (GRID, i)) for i, x in enumerate((np.float64, np.int64))]
+            ticks = self.lower(lambda loop, z, c: flat(after(loop, state_of(z[:-1]), z[-1], *c)), nodes, grid)
+            for name, root in zip(names, ticks, strict=False):
+                if not _nodes_below(root).isdisjoint(grid):
+                    raise NoRule(f"{name} depends on the number of its tick or on the step of the integration grid")
             ticked = [self.convert(x, same) for x in ticks] + [self.make("state", (), n)]
             for i in (slip, speed, travelled) if self.charted else ():
                 ticked[i] = self.make("state", (), i)  # a tick does not move the plant
@@ -271,37 +328,30 @@ class _Derivation:
             speed=speed, clock=n, paced=paced,
         )  # fmt: skip
 
+    def loop_state(self, loop: Loop, state: PyTree) -> LoopState:
+        """Return the loop's own state, from one in the coordinates of the proof."""
+        if not self.charted:
+            return state
+        x = loop.plant.start(BrakeStart(speed=state.plant.speed, slip=state.plant.slip))
+        return state._replace(plant=x._replace(distance=state.plant.distance))
+
     def programs(self) -> tuple[Any, Any, Any, Any]:
         """Return the functions start(loop), rates(loop, state, t), after(loop, state, t) and show(loop, state, t)."""
 
-        def loop_state(loop: Loop, state: PyTree) -> LoopState:
-            if not self.charted:
-                return state
-            x = loop.plant.start(BrakeStart(speed=state.plant.speed, slip=state.plant.slip))
-            return state._replace(plant=x._replace(distance=state.plant.distance))
-
         def rates(loop: Loop, state: PyTree, t: Scalar) -> PyTree:
-            whole = loop_state(loop, state)
+            whole = self.loop_state(loop, state)
             flow = loop.flow(t, whole, loop.signals(t, whole))
-            moved = jax.tree.map(jnp.zeros_like, whole).with_flow(flow)
-            if not self.charted:
-                return moved
+            return jax.tree.map(jnp.zeros_like, whole).with_flow(flow)
 
-            def speeds(x: PyTree) -> tuple[Scalar, Scalar]:
-                y = loop.plant.output(x)
-                return y.speed, y.wheel_speed
+        period = self.period or 0.0
 
-            _, (dv, dw) = jax.jvp(speeds, (whole.plant,), (moved.plant,))
-            slip, speed, _ = state.plant
-            return moved._replace(plant=_Chart(((1 - slip) * dv - dw) / speed, dv, moved.plant.distance))
-
-        def after(loop: Loop, state: PyTree, t: Scalar) -> PyTree:
-            whole = loop_state(loop, state)
-            clock = _Tick(t, jnp.asarray(self.period), 0, None)
+        def after(loop: Loop, state: PyTree, t: Scalar, h: Scalar, k: Scalar) -> PyTree:
+            whole = self.loop_state(loop, state)
+            clock = tick_clock(period, t, h, k)
             return loop.change(clock, whole, loop.signals(t, whole), {}, {}, None)._replace(plant=state.plant)
 
         def show(loop: Loop, state: PyTree, t: Scalar) -> PyTree:
-            whole = loop_state(loop, state)
+            whole = self.loop_state(loop, state)
             sample = loop.signals(t, whole).sample
             return [
                 *sample.output,
@@ -313,6 +363,30 @@ class _Derivation:
             ]
 
         return self.chart, rates, after, show
+
+    def chart_rates(self, own: list[Node], rates: list[Node], chart: "_Chart") -> list[Node]:
+        """Return the rates of slip, speed and distance from those of the plant's own states.
+
+        The graph of the speeds v and w in the plant's output is differentiated here: a derivative that a part declares
+        need not be that of its values.
+
+        Args:
+            own: States of the plant, in its own order.
+            rates: Their rates.
+            chart: Nodes of slip, speed and distance.
+        """
+        graph, made = self.graph, jax.tree.structure(self.loop.start().plant)
+        inputs = [graph.input(np.float64, UpdateLevel.STEP, (OWN, i)) for i in range(len(own))]
+
+        def speeds(loop: Loop, x: list[Any]) -> list[Any]:
+            y = loop.plant.output(jax.tree.unflatten(made, x))
+            return [jnp.asarray(y.speed, float), jnp.asarray(y.wheel_speed, float)]
+
+        known = {x.id: rate for x, rate in zip(inputs, rates, strict=True)}
+        put = {x.id: state for x, state in zip(inputs, own, strict=True)}
+        dv, dw = (self.at_once(_tangent(graph, root, known), put) for root in self.lower(speeds, inputs))
+        loss = graph.op("sub", graph.op("mul", graph.op("sub", graph.const(1.0), chart.slip), dv), dw)
+        return [graph.op("div", loss, chart.speed), dv, jax.tree.unflatten(made, rates).distance]
 
     def chart(self, loop: Loop) -> PyTree:
         """Return the start of the loop in the coordinates of the proof."""
@@ -453,12 +527,19 @@ class _Derivation:
                 return make("select", (args[0], number(0.0), number(1.0)))
             case "convert" if node.args[0].op == "const":
                 return number(float(node.args[0].attr))
-            case "lt" | "le" | "eq" | "ne" | "and" | "or" | "not":
+            case "lt" | "le" | "eq" | "ne":
                 return make(node.op, tuple(args))
+            case "and" | "or" | "not":
+                return self.logic(node.op, args)
+            case "is_finite" if self.has_value(args[0]):
+                return make("truth", (), True)
+            case "is_finite":  # 0 x < 1 is true, and has no value where x has none
+                return make("lt", (make("mul", (args[0], number(0.0))), number(1.0)))
             case "rint":
                 return make("round", (args[0],))
             case "sqrt":
-                return self.power(args[0], number(0.5), 0.5)
+                negative, no_value = make("lt", (args[0], number(0.0))), make("inv", (number(0.0),))
+                return make("select", (negative, self.power(args[0], number(0.5), 0.5), no_value))
             case "exp" | "log" | "sin" | "cos" | "atan":
                 return self.function(node.op, args[0])
             case "tan":
@@ -472,6 +553,29 @@ class _Derivation:
             case "expm1":
                 return make("sub", (self.function("exp", args[0]), number(1.0)))
         raise NoRule(f"{node.op}: the proof has no sound rule for this operation")
+
+    def has_value(self, i: int) -> bool:
+        """Return whether an operation has a value for all values of its operands; False if that is unknown."""
+        operation = self.operations[i]
+        match operation.name:
+            case "log":
+                return False
+            case "inv":
+                below = self.operations[operation.args[0]]
+                return below.name == "const" and below.value != 0
+            case "exp" | "sin" | "cos" | "atan" | "power":  # the others are factors of derivatives
+                return self.has_value(operation.args[0])
+        return all(self.has_value(a) for a in operation.args if a >= 0)
+
+    def logic(self, name: str, args: list[int]) -> int:
+        """Return a logical operation; one that a known truth decides is that truth."""
+        truths = [self.operations[a].value if self.operations[a].name == "truth" else None for a in args]
+        if name == "not":
+            return self.make(name, tuple(args)) if truths[0] is None else self.make("truth", (), not truths[0])
+        decides = name == "or"
+        if decides in truths:
+            return self.make("truth", (), decides)
+        return self.make(name, tuple(args)) if truths == [None, None] else args[truths[0] is not None]
 
     def division(self, x: int, y: int) -> int:
         """Return x/y; k u/(u + c) becomes k (1 - c/(u + c)), in which u occurs once: the slopes then do not cancel."""
@@ -505,6 +609,8 @@ class _Derivation:
         """Return a selection; the form x < low ? low : min(x, high) is a limit."""
         if no == yes:
             return no
+        if self.operations[which].name == "truth":
+            return yes if self.operations[which].value else no
         asked, other = self.operations[which], self.operations[no]
         if asked.name == "lt" and asked.args[1] == yes and self.operations[yes].name == "const":
             x, low = asked.args
@@ -539,16 +645,22 @@ def _power_of(node: Node) -> tuple[Node, Node] | None:
     ):
         return None
     base, inner = node.args[0].args[1], node.args[2]
-    if inner.op == "select" and inner.args[0].op == "ne" and inner.args[1].is_number(0):
-        inner = inner.args[2]
+
+    def chosen(x: Node, otherwise: float) -> Node:
+        """Return y of the form base^2 != 0 ? y : otherwise, else x itself."""
+        if x.op != "select" or x.args[0].op != "ne" or not x.args[1].is_number(otherwise):
+            return x
+        sides = x.args[0].args
+        is_asked = any(y.op == "mul" and y.args == (base, base) for y in sides) and any(y.is_number(0) for y in sides)
+        return x.args[2] if is_asked else x
+
+    inner = chosen(inner, 0)
     if inner.op != "exp" or inner.args[0].op != "mul":
         return None
     for exponent, rest in (inner.args[0].args, inner.args[0].args[::-1]):
         if rest.op == "mul" and any(x.is_number(0.5) for x in rest.args):
             log = next(x for x in rest.args if not x.is_number(0.5))
-            square = log.args[0] if log.op == "log" else log
-            if square.op == "select" and square.args[1].is_number(1):
-                square = square.args[2]
+            square = chosen(log.args[0], 1) if log.op == "log" else log
             if log.op == "log" and square.op == "mul" and square.args == (base, base):
                 return base, exponent
     return None
@@ -578,6 +690,54 @@ def _clock_of(loop: Loop) -> float | None:
     return next(iter(periods), None)
 
 
+def _is_traced(path: PyTree, leaf: np.ndarray) -> bool:
+    """Return whether a number of the loop is an input of its programs. A clock's period and delay are constants."""
+    return leaf.dtype.kind == "f" and not _text(path).endswith(("period", "delay"))
+
+
+def _tangent(graph: Graph, root: Node, tangents: dict[int, Node]) -> Node:
+    """Return the derivative of a node along the given derivatives of other nodes, by their number.
+
+    Raises:
+        NoRule: An operation has no rule.
+    """
+    zero, op, found = graph.const(0.0), graph.op, dict(tangents)
+
+    def of(node: Node) -> Node:
+        if node.id not in found:
+            found[node.id] = derive(node)
+        return found[node.id]
+
+    def derive(node: Node) -> Node:
+        x, y = node.args[0] if node.args else node, node.args[-1] if node.args else node
+        match node.op:
+            case "const" | "input":
+                return zero
+            case "add" | "sub":
+                return op(node.op, of(x), of(y))
+            case "neg":
+                return op("neg", of(x))
+            case "mul":
+                return op("add", op("mul", of(x), y), op("mul", x, of(y)))
+            case "div":
+                return op("div", op("sub", of(x), op("mul", node, of(y))), y)
+            case "select" if node.dtype == np.float64:
+                return graph.select(x, of(node.args[1]), of(y))
+        raise NoRule(f"{node.op}: the proof has no derivative of it in the speeds of the plant")
+
+    return of(root)
+
+
+def _nodes_below(root: Node) -> set[Node]:
+    """Return a node, its operands, their operands, and so on."""
+    seen, left = {root}, [root]
+    while left:
+        new = set(left.pop().args) - seen
+        seen |= new
+        left += new
+    return seen
+
+
 def _text(path: PyTree) -> str:
     """Return a path of a pytree as dotted text, without the words flow and held."""
     words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
@@ -587,9 +747,10 @@ def _text(path: PyTree) -> str:
 def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
     """Check that the plant's slip is 1 - w/v and its start has the slip and the speed asked for, in exact arithmetic.
 
-    Both sides are evaluated in fractions, at speeds from 2 cm/s to 200 m/s and slips from 0 to almost 1. The points are
-    random, spread evenly over the decades of speed, and the ends of both ranges are among them. Parameters of the plant
-    in `over` are multiplied by factors from 1e-6 to 1e6, both ends included.
+    Both sides are evaluated in fractions, at speeds from 2 cm/s to 200 m/s, slips from 0 to almost 1, and distances up
+    to 10 km. The points are random, spread evenly over the decades of speed, and the ends of the ranges of speed and
+    slip are among them. Parameters of the plant in `over` are multiplied by factors from 1e-6 to 1e6, both ends
+    included.
 
     A wrong rational function agrees at a random point with a probability of nearly 0. A function with branches, such as
     max(v, 0.01), is wrong between two thresholds: it passes only if no point lies between them.
@@ -602,11 +763,11 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
         NoRule: They differ.
     """
     graph, paths = RealGraph(), [path for path in over if path.startswith("plant.")]
-    inputs = [graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(2 + len(paths))]
+    inputs = [graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(3 + len(paths))]
 
-    def show(speed: Scalar, slip: Scalar, *values: Scalar) -> Scalar:
+    def show(speed: Scalar, slip: Scalar, distance: Scalar, *values: Scalar) -> Scalar:
         plant = replace(loop, dict(zip(paths, values, strict=True))).plant
-        y = plant.output(plant.start(BrakeStart(speed=speed, slip=slip)))
+        y = plant.output(plant.start(BrakeStart(speed=speed, slip=slip))._replace(distance=distance))
         return y.slip, y.speed, y.wheel_speed
 
     closed = jax.make_jaxpr(show)(*[jax.ShapeDtypeStruct((), np.float64)] * len(inputs))
@@ -621,7 +782,8 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
         points.append((speed, Fraction(draw.randint(0, 10**6 - 1), 10**6), [draw.uniform(*ends) for _ in paths]))
     for speed, slip, decades in points:
         values = [there[path] * Fraction(10.0**x) for path, x in zip(paths, decades, strict=True)]
-        if _exact_values(roots, [speed, slip, *values]) != [slip, speed, (1 - slip) * speed]:
+        distance = Fraction(draw.randint(0, 10**7), 1000)
+        if _exact_values(roots, [speed, slip, distance, *values]) != [slip, speed, (1 - slip) * speed]:
             raise NoRule(f"plant {type(loop.plant).__name__}: its slip is not 1 - w/v at {float(speed):.3g} m/s")
 
 

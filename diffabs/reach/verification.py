@@ -95,6 +95,9 @@ def read_proof(document: JsonObject) -> ProofFile:
         raise ValueError(f"nothing to verify: the file's verdict is {document.get('verdict')}, not proved")
     pair = "a pair [low, high] of finite numbers"
     over = _read_entries(document, "over", dict, lambda ends: tuple(_pair(ends)), pair)
+    for path, (low, high) in over.items():
+        if low > high:
+            raise ValueError(f"over.{path} = [{low:.9g}, {high:.9g}]; low must not exceed high")
     cells = _read_entries(document, "cells", list, lambda cell: list(map(_pair, cell)), f"a list, each entry {pair},")
     claims = _read_entries(
         document, "claims", list, lambda x: RunClaim(str(x["quantity"]), _number(x["bound"])),

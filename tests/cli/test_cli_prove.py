@@ -55,6 +55,24 @@ def test_a_bound_of_the_overshoot_is_never_rounded_up() -> None:
         assert exact * (1 - Fraction(1, 10**14)) < Fraction(claim["bound"]) <= exact
 
 
+LIMITED = [word for change in ("torque_min=0", "torque_max=9.03") for word in ("--set", f"controller.{change}")]
+
+
+@killed_by("cli/prove.py", 'setpoint.name != "const" or', "False or")
+def test_an_overshoot_needs_one_target_for_all_runs() -> None:
+    """With a target of 0.149 the slip of one run is 73 % above it, which is 72 % above 0.15."""
+    over = ("--over", "reference.slip=0.149:0.15", "--claim", "overshoot=0.725")
+    assert "needs one target for all runs" in run("prove", "slip-lmi", *LIMITED, *over, status=2).stderr
+
+
+@killed_by("cli/prove.py", "bound * max(setpoint.value, MIN_SETPOINT)", "bound * setpoint.value")
+def test_an_overshoot_of_a_small_target_is_that_of_the_metric() -> None:
+    """Below a target of 0.01 the metric divides by 0.01."""
+    words = ("--set", "reference.slip=0.004", "--over", "plant.mass=5.5:5.5", "--claim", "overshoot=0.01", "--json")
+    found = json.loads(run("prove", "slip-lmi", *LIMITED, *words, status=1).stdout)
+    assert found["claims"][0]["bound"] == pytest.approx(0.0041)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("road", cases(["burckhardt", "magic-formula"], "magic-formula"))
 def test_a_pid_quarter_car_on_other_roads(road: str, file) -> None:

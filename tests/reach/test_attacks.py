@@ -101,6 +101,8 @@ EDITS: dict[str, Callable[[JsonObject], object]] = {
     "a bound as text": lambda f: f["bounds"].update(stop_time=[None, "1.4"]),
     "a bound that is a truth": lambda f: f["bounds"].update(stop_distance=[None, True]),
     "a bound of 400 digits": lambda f: f["bounds"].update(stop_time=[None, 10**400]),
+    "an inverted box": lambda f: f.update(
+        over={"p": [1.0, 0.5], "q": [0.75, 0.75]}, cells=[[[1.0, 0.5], [0.75, 0.75]]]),
     "an infinite box": lambda f: f["over"].update(p=[1.0, INF]),
     "a cell without numbers": lambda f: f["cells"].__setitem__(0, [[NAN, NAN], [NAN, NAN]]),
     "no horizon": lambda f: f.update(horizon=NAN),
@@ -141,6 +143,7 @@ EDITS: dict[str, Callable[[JsonObject], object]] = {
 
 @killed_by("reach/verification.py", " or not math.isfinite(given)", "", case="a claim that is not a number")
 @killed_by("reach/verification.py", "isinstance(given, bool) or ", "", case="a bound that is a truth")
+@killed_by("reach/verification.py", "        if low > high:", "        if False:", case="an inverted box")
 @killed_by("reach/verification.py", "most <= high", "most <= high + 1e-3 * abs(high)", case="a bound slightly too low")
 @killed_by("reach/verification.py", "least >= low", "least >= low * 0.999", case="a bound slightly too high")
 @killed_by(

@@ -249,6 +249,25 @@ def test_random_runs_lie_within_their_cells(name: str, changes: list[str], claim
             assert ends[0] - 1e-6 <= runs.metrics[column][i] <= ends[1] + 1e-6
 
 
+@killed_by("reach/cover.py", "if beyond > RUN_ERROR * abs(run):", "if False:")
+def test_a_run_beyond_a_proved_bound_makes_the_proof_undecided() -> None:
+    """Either the proof or the run is wrong; a stop after 20 s is."""
+    loop, claims = load("slip-lmi", LIMITED).loop, [RunClaim("greatest slip", 0.9)]
+
+    def prove(known):
+        return prove_box(loop, {"plant.mass": (5.5, 5.5)}, claims, horizon=2.5, known=known)
+
+    alone = prove({})
+    assert alone.verdict == "proved"
+    low, high = alone.bounds["stop_time"]
+    assert prove({"stop_time": (low, high)}).verdict == "proved"
+    for run in ((low, 20.0), (0.1, high)):
+        found = prove({"stop_time": run})
+        assert found.verdict == "undecided"
+        assert "a simulated run has stop_time = " in found.failure
+        assert not np.isfinite(found.bounds["stop_time"]).any()
+
+
 def test_parts_without_a_rule_are_refused_by_name() -> None:
     with pytest.raises(NoRule, match="events"):
         derive_equations(d.braking(controller=d.controllers.Relay()), ["plant.mass"])

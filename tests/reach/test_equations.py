@@ -1,11 +1,27 @@
 """What the equations of a proof take for granted about a loop, and refuse where it does not hold."""
 
+import math
+import operator
+from fractions import Fraction
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from mutants import killed_by
 
+import diffabs as d
+from diffabs.core.protocols import BrakeOutput
+from diffabs.core.pytree import param, pytree, static
+from diffabs.core.types import PyTree, Scalar
+from diffabs.plants import BrakeStart, QuarterCar
 from diffabs.reach import NoRule
-from diffabs.reach.equations import derive_equations
+from diffabs.reach.equations import Equations, derive_equations
+from diffabs.references import Setpoint
 from diffabs.scenario.scenario import load
+from diffabs.stops import NoStop
 
 
 @killed_by("reach/equations.py", "for speed in (SLOWEST, FASTEST)", "for speed in (FASTEST,)")
@@ -25,9 +41,211 @@ def test_a_parameter_of_the_box_must_not_change_the_slip() -> None:
         derive_equations(load("slip-lmi").loop, ["plant.crawl_speed"])
 
 
-@killed_by("reach/equations.py", 'in ("period", "delay"):', 'in ("delay",):', case="controller.period")
+@killed_by(
+    "reach/equations.py", 'path.endswith(("period", "delay")):', 'path.endswith("delay"):', case="controller.period"
+)
 @pytest.mark.parametrize("path", ["controller.period", "controller.delay"])
 def test_a_range_of_periods_or_delays_is_refused(path: str) -> None:
     """The equations have one period, that of the scenario."""
     with pytest.raises(NoRule, match="range of periods or delays"):
         derive_equations(load("slip-cured").loop, [path])
+
+
+# What a program says beside its values: derivatives that a part declares, the number of a tick, tests for NaN.
+
+
+def value_at(equations: Equations, root: int, params: list[float], states: list[float]) -> float | bool:
+    """Return the value of an operation in floats, NaN where it has none."""
+
+    rules = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg}
+    rules |= {"lt": operator.lt, "le": operator.le, "ne": operator.ne, "exp": math.exp, "log": math.log}
+    rules |= {"inv": lambda x: 1 / x if x else math.nan, "meet": lambda x: x}
+
+    def of(i: int) -> float | bool:
+        o = equations.operations[i]
+        if not o.args:
+            return {"param": params, "state": states}[o.name][o.value] if o.name in ("param", "state") else o.value
+        if o.name == "select":
+            asked = of(o.args[0])
+            return asked if math.isnan(asked) else of(o.args[2 if asked else 1])
+        x = [of(a) for a in (o.args[:1] if o.name in ("exp", "log", "power", "meet", "clamp") else o.args)]
+        if any(map(math.isnan, x)):
+            return math.nan
+        if o.name == "clamp":
+            low, high = (of(a) if a >= 0 else end for a, end in zip(o.args[1:], (-math.inf, math.inf), strict=True))
+            return min(max(x[0], low), high)
+        return max(x[0], 0.0) ** of(o.args[2]) if o.name == "power" else rules[o.name](*x)
+
+    return of(root)
+
+
+@pytree
+class StoppedQuarterCar(QuarterCar):
+    """The same values; the derivatives that it declares of its speeds are 0."""
+
+    def output(self, state: PyTree) -> BrakeOutput:
+        return QuarterCar.output(self, jax.lax.stop_gradient(state))
+
+
+@pytree
+class MomentumQuarterCar(QuarterCar):
+    """Its states are a fourth of the speeds, so its output divides."""
+
+    def start(self, initial: BrakeStart) -> PyTree:
+        x = QuarterCar.start(self, initial)
+        return x._replace(speed=x.speed * 0.25, spin=x.spin * 0.25)
+
+    def plain(self) -> QuarterCar:
+        names = ("mass", "radius", "inertia", "crawl_speed", "road")
+        return QuarterCar(**{name: getattr(self, name) for name in names})
+
+    def full(self, state: PyTree) -> PyTree:
+        return state._replace(speed=state.speed / 0.25, spin=state.spin / 0.25)
+
+    def derivative(self, t: Scalar, state: PyTree, control: Scalar) -> PyTree:
+        moved = self.plain().derivative(t, self.full(state), control)
+        return moved._replace(speed=moved.speed * 0.25, spin=moved.spin * 0.25)
+
+    def output(self, state: PyTree) -> BrakeOutput:
+        return self.plain().output(self.full(state))
+
+
+@killed_by("reach/equations.py", 'op("sub", of(x), op("mul", node, of(y)))', "y", case="MomentumQuarterCar")
+@killed_by("reach/equations.py", "zip(inputs, rates, strict=True)", "zip(inputs, own, strict=True)")
+@pytest.mark.parametrize("plant", [StoppedQuarterCar, MomentumQuarterCar])
+def test_rates_come_from_the_values_of_the_output(plant: type[QuarterCar]) -> None:
+    """Not from the derivatives that a part declares, and whatever its states are."""
+    e, other = (
+        derive_equations(d.braking(plant=one(road=d.roads.DRY_ASPHALT)), ["plant.mass"]) for one in (QuarterCar, plant)
+    )
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        point = [rng.uniform(0.02, 0.6), rng.uniform(2.0, 30.0), *rng.uniform(0.0, 5.0, len(e.states) - 2)]
+        for one, two in zip(e.flow, other.flow, strict=True):
+            rate = value_at(e, one, [12.0], point)
+            assert value_at(other, two, [12.0], point) == pytest.approx(rate, rel=1e-12, abs=1e-12)
+        assert abs(value_at(e, e.flow[0], [12.0], point)) > 1e-6
+
+
+NUMBERED = {
+    "a played noise": load(
+        "slip-cured", ["sensor=played-wheel-noise", "sensor.period=0.001", "sensor.noise=[0.0,0.1]"]
+    ).loop,
+    "an encoder": load("slip-cured", ["sensor=encoder-slip", "sensor.period=0.001"]).loop,
+    "a played command": d.braking(controller=d.controllers.PlayedCommand(period=0.01, commands=np.zeros(3))),
+}
+
+
+@killed_by("reach/equations.py", "if not _nodes_below(root).isdisjoint(grid):", "if False:", case="a played noise")
+@pytest.mark.parametrize("name", NUMBERED)
+def test_a_block_that_counts_its_ticks_is_refused(name: str) -> None:
+    """The equations have one tick for all instants."""
+    with pytest.raises(NoRule, match="number of its tick"):
+        derive_equations(NUMBERED[name], ["plant.mass"])
+
+
+@killed_by("reach/equations.py", "period is not None and float(period) != own", "False")
+def test_an_inner_block_with_another_period_is_refused() -> None:
+    inner = d.controllers.PlayedCommand(period=0.05)
+    with pytest.raises(NoRule, match=r"different periods: 0\.01 s, 0\.05 s"):
+        derive_equations(d.braking(controller=d.controllers.Sampled(controller=inner, period=0.01)), ["plant.mass"])
+
+
+class OneOutput(NamedTuple):
+    """A position [m]."""
+
+    position: Scalar
+
+    units = MappingProxyType({"position": "m"})
+
+
+@pytree
+class OneStart:
+    """A position."""
+
+    position: Scalar = param(default=0.5, unit="m")
+
+
+@pytree
+class OddPlant:
+    """x' = formula(x, a, b, c)."""
+
+    formula: Any = static(default=None)
+    a: Scalar = param(default=1.0, unit="1")
+    b: Scalar = param(default=1.0, unit="1")
+    c: Scalar = param(default=1.0, unit="1")
+
+    shows = OneOutput
+    control_unit = "1"
+
+    def start(self, initial: OneStart) -> OneOutput:
+        return OneOutput(initial.position)
+
+    def project(self, state: OneOutput) -> OneOutput:
+        return state
+
+    def output(self, state: OneOutput) -> OneOutput:
+        return state
+
+    def holding(self, output: OneOutput, target: Scalar) -> Scalar:
+        return 0.0 * target
+
+    def derivative(self, t: Scalar, state: OneOutput, control: Scalar) -> OneOutput:
+        return OneOutput(self.formula(state.position, self.a, self.b, self.c))
+
+
+def odd_loop(formula: Any, **values: float) -> d.Loop:
+    """A loop in which nothing acts on the plant."""
+    return d.Loop(
+        plant=OddPlant(formula=formula, **values), initial=OneStart(), reference=Setpoint(),
+        controller=d.controllers.ConstantTorque(), stop=NoStop(),
+    )  # fmt: skip
+
+
+def rate_of(formula: Any, x: float, **values: float) -> float | bool:
+    """Return the rate of x' = formula(x, a, b, c) that the equations have, NaN where they have none."""
+    e = derive_equations(odd_loop(formula, **values), ["plant.a"])
+    return value_at(e, e.flow[0], [values.get("a", 1.0)], [x, 0.0, 0.0, 0.0])
+
+
+@killed_by("reach/equations.py", 'make("select", (negative, self.power(args[0], number(0.5), 0.5), no_value))',
+           "self.power(args[0], number(0.5), 0.5)", case="root")  # fmt: skip
+@killed_by("reach/equations.py", 'make("lt", (make("mul", (args[0], number(0.0))), number(1.0)))',
+           'make("truth", (), True)', case="test")  # fmt: skip
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda x, a, b, c: jnp.sqrt(a - x),
+        lambda x, a, b, c: jnp.where(jnp.isnan(jnp.sqrt(a - x)), 1.0, 2.0),
+        lambda x, a, b, c: 0.0 * (1 / (x - 2)),
+        lambda x, a, b, c: jnp.where(jnp.isfinite(1 / (x - 2)), 1.0, 2.0),
+    ],
+    ids=["root", "test", "zero", "finite"],
+)
+def test_a_number_without_a_value_has_none(formula: Any) -> None:
+    """At x = 2 the root is of -1, and the division is by 0."""
+    assert math.isfinite(rate_of(formula, 0.5))
+    assert math.isnan(rate_of(formula, 2.0))
+
+
+@killed_by("reach/equations.py", "return x.args[2] if is_asked else x", "return x.args[2]")
+def test_a_power_with_another_condition_is_no_power() -> None:
+    """The form of `core.numerics.power`, whose inner condition asks something else."""
+
+    def gate(x: Scalar, a: Scalar, b: Scalar, c: Scalar) -> Scalar:
+        return jnp.where(x > 0, jnp.where(a != 0, jnp.exp(b * (0.5 * jnp.log(x * x))), 0.0), 0.0)
+
+    assert rate_of(gate, 0.7, a=0.0, b=3.0) == 0.0
+    assert rate_of(gate, 0.7, a=1.0, b=3.0) == pytest.approx(0.7**3)
+
+
+@killed_by("reach/equations.py", 'leaf.dtype.kind == "f" and not', "False and not")
+def test_numbers_of_the_loop_are_not_rounded_by_numpy() -> None:
+    """In doubles a b - c is 0; exactly it is 0.18."""
+    a, b, c = 94906267.3, 94906271.1, 9007199933462864.0
+    exact = float(Fraction(a) * Fraction(b) - Fraction(c))
+    assert a * b - c == 0.0 < exact
+    loop = odd_loop(lambda x, a, b, c: a * b - c, a=a, b=b, c=c)
+    names = [o.name for o in derive_equations(loop, ["initial.position"]).operations]
+    assert "mul" in names
+    assert "sub" in names

@@ -656,7 +656,7 @@ struct Group {
       end.captured |= capture;
     }
     M is_over = alive & end.captured & (margin.h < 0);
-    M late = alive & ~is_over & (M)(time_now().low() >= task.horizon * (1 - 1e-12));
+    M late = alive & ~is_over & (M)(time_now().low() >= task.horizon);
     timed |= late, done |= is_over | late, alive &= ~(is_over | late);
   }
 
@@ -733,7 +733,7 @@ struct Group {
     out[0] = fine ? (timed[lane] ? 2 : 1) : 0;
     out[1] = stopped ? -T.n[lane] : 0, out[2] = stopped ? T.h[lane] : INFINITY;
     bool moved = stopped && task.travelled >= 0;
-    out[3] = moved ? -W.n[lane] : 0, out[4] = moved ? W.h[lane] : INFINITY;
+    out[3] = moved ? -W.n[lane] : task.travelled >= 0 ? 0 : -INFINITY, out[4] = moved ? W.h[lane] : INFINITY;
     out[5] = reached[lane], out[6] = (double)steps, out[7] = (double)across;
     double* signal = out + 8;
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = fine ? -bottom[s][lane] : -INFINITY, signal[1] = fine ? top[s][lane] : INFINITY;
