@@ -646,21 +646,21 @@ def _power_of(node: Node) -> tuple[Node, Node] | None:
         return None
     base, inner = node.args[0].args[1], node.args[2]
 
-    def chosen(x: Node, otherwise: float) -> Node:
-        """Return y of the form base^2 != 0 ? y : otherwise, else x itself."""
+    def unguard(x: Node, otherwise: float) -> Node:
+        """Return y if x has the form base^2 != 0 ? y : otherwise, else x itself."""
         if x.op != "select" or x.args[0].op != "ne" or not x.args[1].is_number(otherwise):
             return x
         sides = x.args[0].args
         is_asked = any(y.op == "mul" and y.args == (base, base) for y in sides) and any(y.is_number(0) for y in sides)
         return x.args[2] if is_asked else x
 
-    inner = chosen(inner, 0)
+    inner = unguard(inner, 0)
     if inner.op != "exp" or inner.args[0].op != "mul":
         return None
     for exponent, rest in (inner.args[0].args, inner.args[0].args[::-1]):
         if rest.op == "mul" and any(x.is_number(0.5) for x in rest.args):
             log = next(x for x in rest.args if not x.is_number(0.5))
-            square = chosen(log.args[0], 1) if log.op == "log" else log
+            square = unguard(log.args[0], 1) if log.op == "log" else log
             if log.op == "log" and square.op == "mul" and square.args == (base, base):
                 return base, exponent
     return None
