@@ -3,14 +3,15 @@
     z(0) = start(p),   z := tick(z) every period,   dz/dt = flow(z) between ticks,   p: the parameters of a box
 
 `jax.make_jaxpr` traces `Loop.start`, `Loop.change` and `Loop.flow`, and the lowering rules of `compiler` reduce them to
-single numbers. The operations mean real numbers. Nothing is folded unless it is exact, and numbers of the loop enter as
-constants, so NumPy computes none. A constant stands for the double and for the decimal that its shortest text shows.
+single numbers. The operations mean real numbers, and a number is folded only if that is exact. The numbers of the loop
+are inputs of these programs, so NumPy does not round them; only periods and delays are not. A constant stands for the
+double and for the decimal that its shortest text shows; the provers enclose both.
+
 Three forms are recognised, because their floating-point form says less than their meaning: powers, limits, and the slip
-of a braked wheel. A number that has no value, such as 1/0, leaves a proof undecided, also where the program asks
-whether it is NaN.
+of a braked wheel. A number that has no value, such as 1/0, leaves a proof undecided. So does `isfinite` of it.
 
 A braked wheel is described by slip and speed instead of two angular speeds. In a set of runs both speeds vary together,
-and only with the slip as a state does an enclosure keep that. `check_slip_chart` proves the change of coordinates.
+and only with the slip as a state does an enclosure keep that. `check_slip_chart` tests the change of coordinates.
 """
 
 import dataclasses
@@ -35,12 +36,18 @@ from diffabs.core.pytree import parameters, replace
 from diffabs.core.types import PyTree, Scalar
 from diffabs.plants import BrakeStart
 
-LEAVES, STATE, OWN, GRID, TIME = "leaf", "state", "own", "grid", "t"
+# Inputs: parameters of the box, states of the proof, states of the plant's own, and a tick's grid step and number.
+PARAM, STATE, OWN, GRID = "param", "state", "own", "grid"
+TIME = "t"
 FUNCTIONS = ("exp", "log", "sin", "cos", "atan", "power")
 COMPARISONS = ("lt", "le", "eq", "ne")
 LOGIC = ("and", "or", "not")
-PARTIAL = ("div", "sqrt", "log", "log1p", "tan")  # operations of a program that have no value for some operands
-CHART_TRIALS = 20  # random rational points; a rational function that is not the identity passes none, nearly surely
+# Operations of a program whose result is a number for all numbers.
+TOTAL = (
+    *("input", "add", "sub", "mul", "neg", "abs", "min", "max", "lower", "higher", "select", "any", "gate", "convert"),
+    *("lt", "le", "eq", "ne", "and", "or", "not", "rint", "exp", "sin", "cos", "atan", "tanh", "is_finite"),
+)
+CHART_TRIALS = 20  # random rational points; a wrong rational function is right at one with a probability of nearly 0
 SLOWEST, FASTEST = Fraction(2, 100), Fraction(200)  # speeds [m/s] at which the chart is checked, ends included
 CHART_DECADES = 6.0  # by which parameters of the box are changed, up and down
 CHART_SLIPS = (Fraction(0), Fraction(1, 2), Fraction(999_999, 10**6))  # slips that go with both ends
@@ -51,14 +58,15 @@ class NoRule(ValueError):
 
 
 class RealOperation(NamedTuple):
-    """One number: an operation on earlier ones.
+    """One number: an operation on other ones.
 
     Attributes:
-        name: `const`, `truth`, `param`, `state`, arithmetic, `clamp`, `round`, `select`, `meet`, comparisons, logic,
-            functions.
-        args: Indices of the operands. `select` has (condition, if false, if true). A function y of u has (u, g) with
-            dy = g du, where g is another operation.
-        value: Of `const` the number, of `param` and `state` its index, of `clamp` its limits, of `power` its exponent.
+        name: `const`, `truth`, `param`, `state`, `add`, `sub`, `mul`, `neg`, `inv`, `clamp`, `round`, `select`, `meet`,
+            comparisons, logic, functions.
+        args: Indices of the operands. `select` has (condition, if false, if true), `clamp` (number, low, high) with -1
+            for a missing limit. A function y of u has (u, g), where dy = g du and g may come after y. `power` has its
+            exponent in addition.
+        value: Of `const` the number, of `truth` the truth, of `param` and `state` its index.
     """
 
     name: str
@@ -71,7 +79,7 @@ class Equations:
     """A closed loop as operations on real numbers.
 
     Attributes:
-        operations: Operations, operands first.
+        operations: Operations; operands come first, except the factors g of functions.
         params: Paths of the parameters of the box.
         states: Names of the states.
         start: Operation of each state at t = 0, a function of the parameters alone.
@@ -114,8 +122,8 @@ class RealGraph(Graph):
     def has_value(self, node: Node) -> bool:
         """Return whether a number has a value for all values of the inputs; False if that is unknown."""
         if node.id not in self._valued:
-            partial = node.op in PARTIAL and not (node.op == "div" and _is_nonzero(node.args[1]))
-            self._valued[node.id] = not partial and all(map(self.has_value, node.args))
+            total = node.op in TOTAL or _is_finite(node) or (node.op == "div" and _is_nonzero(node.args[1]))
+            self._valued[node.id] = total and all(map(self.has_value, node.args))
         return self._valued[node.id]
 
     def op(self, name: str, *args: Node) -> Node:
@@ -127,13 +135,10 @@ class RealGraph(Graph):
             return self.op("not", finite) if name == "ne" else finite
         if not real or name in ("is_finite", "lt", "le", "gt", "ge", "eq", "ne"):
             return super().op(name, *args)
-        if all(arg.op == "const" and np.isfinite(arg.attr) for arg in args) and name in ("add", "sub", "mul", "neg"):
-            exact = {
-                "add": lambda x, y: x + y,
-                "sub": lambda x, y: x - y,
-                "mul": lambda x, y: x * y,
-                "neg": lambda x: -x,
-            }
+        if name == "neg" and _is_finite(args[0]):
+            return self.const(-args[0].attr)
+        if all(map(_is_decimal, args)) and name in ("add", "sub", "mul"):
+            exact = {"add": lambda x, y: x + y, "sub": lambda x, y: x - y, "mul": lambda x, y: x * y}
             value = exact[name](*(Fraction(float(arg.attr)) for arg in args))
             if abs(value) < 2**1000 and Fraction(float(value)) == value:
                 return self.const(float(value), args[0].dtype)
@@ -145,9 +150,19 @@ class RealGraph(Graph):
         return which
 
 
+def _is_finite(node: Node) -> bool:
+    """Return whether a node is a finite constant."""
+    return node.op == "const" and bool(np.isfinite(node.attr))
+
+
 def _is_nonzero(node: Node) -> bool:
     """Return whether a node is a finite constant other than 0."""
-    return node.op == "const" and bool(np.isfinite(node.attr)) and not node.is_number(0)
+    return _is_finite(node) and not node.is_number(0)
+
+
+def _is_decimal(node: Node) -> bool:
+    """Return whether a node is a finite constant whose double is exactly the decimal that its shortest text shows."""
+    return _is_finite(node) and Fraction(repr(float(node.attr))) == Fraction(float(node.attr))
 
 
 def _simplify(graph: RealGraph, name: str, args: tuple[Node, ...]) -> Node | None:
@@ -191,7 +206,7 @@ def tick_clock(own: float, t: Scalar, h: Scalar, k: Scalar) -> Clock:
             if period is None and isinstance(self.h, Tracer):
                 raise NoRule("a block ticks with the integration grid, which a proof has not")
             if isinstance(period, Tracer):
-                raise NoRule("the parameter for the period of a block has a name that does not end in period")
+                raise NoRule("a block whose period is not its parameter `period`")
             if period is not None and float(period) != own:
                 raise NoRule(f"clocks of different periods: {own:g} s, {float(period):g} s")
             return jnp.asarray(True), self.k
@@ -220,20 +235,23 @@ class _Derivation:
     def __init__(self, loop: Loop, paths: tuple[str, ...]):
         self.loop = jax.tree.map(lambda x: np.asarray(x, float) if np.asarray(x).dtype.kind == "f" else x, loop)
         self.paths, self.graph = paths, RealGraph()
-        known = {path for path, _, _ in parameters(self.loop)}
+        known = {path: value for path, _, value in parameters(self.loop)}
         for path in paths:
             if path not in known:
                 raise NoRule(f"{path} is not a parameter of the loop")
-            if path.split(".")[0] in BLOCKS and path.endswith(("period", "delay")):
+            if np.ndim(known[path]):
+                raise NoRule(f"{path} is a list; a proof varies single numbers")
+            if path.split(".")[0] in BLOCKS and path.split(".")[-1] in ("period", "delay"):
                 raise NoRule(f"{path}: the proof has no rule for a range of periods or delays")
         self.period = _clock_of(self.loop)
-        self.given = [self.graph.input(np.float64, UpdateLevel.UNIFORM, (LEAVES, i)) for i in range(len(paths))]
+        self.given = [self.graph.input(np.float64, UpdateLevel.UNIFORM, (PARAM, i)) for i in range(len(paths))]
         state = loop.start().plant
         fields = set(getattr(state, "_fields", ()))
         self.charted = loop.plant.shows is BrakeOutput and isinstance(loop.initial, BrakeStart)
         self.charted &= "distance" in fields and len(fields) == len(_Chart._fields)
         self.operations: list[RealOperation] = []
         self.known: dict[Any, int] = {}
+        self.converted: dict[Any, dict[int, int]] = {}
 
     def lower(self, function: Callable[..., Any], *groups: list[Node]) -> list[Node]:
         """Return the results of a function of a loop and lists of numbers as nodes, one for each number.
@@ -286,6 +304,9 @@ class _Derivation:
         begun = self.lower(lambda loop: flat(start(loop)))
         moved = self.lower(lambda loop, z: flat(rates(loop, state_of(z[:-1]), z[-1])), nodes)
         shows = self.lower(lambda loop, z: flat(show(loop, state_of(z[:-1]), z[-1])), nodes)
+        signal_names = [*self.loop.plant.shows._fields, "target", "command", "control", "setpoint"]
+        if not (len(begun) == len(moved) == n and len(shows) == len(signal_names) + 1):
+            raise NoRule("a memory whose rate has another shape, or a signal that is no single number")
         slip, speed, travelled = chart = [names.index(f"plant.{x}") if self.charted else -1 for x in _Chart._fields]
         if self.charted:
             own = self.lower(lambda loop, z: flat(self.loop_state(loop, state_of(z[:-1])).plant), nodes)
@@ -299,14 +320,13 @@ class _Derivation:
         at_start = (
             {begun[i].id: initial[name] for i, name in ((slip, "slip"), (speed, "speed"))} if self.charted else {}
         )
-        starts = [self.convert(self.at_once(x, at_start), {}) for x in begun]
+        starts = [self.convert(self.substitute(x, at_start), {}) for x in begun]
         names = [*names, TIME]
-        signal_names = [*self.loop.plant.shows._fields, "target", "command", "control", "setpoint"]
         ticked: list[int] = []
         if self.period is not None:
             grid = [self.graph.input(x, UpdateLevel.STEP, (GRID, i)) for i, x in enumerate((np.float64, np.int64))]
             ticks = self.lower(lambda loop, z, c: flat(after(loop, state_of(z[:-1]), z[-1], *c)), nodes, grid)
-            for name, root in zip(names, ticks, strict=False):
+            for name, root in zip(names[:-1], ticks, strict=True):
                 if not _nodes_below(root).isdisjoint(grid):
                     raise NoRule(f"{name} depends on the number of its tick or on the step of the integration grid")
             ticked = [self.convert(x, same) for x in ticks] + [self.make("state", (), n)]
@@ -317,8 +337,8 @@ class _Derivation:
         paced = self.charted and self.period is None
         if paced:
             flow = [self.pace_rate(x, speed) for x in flow]
-        signals = {name: self.convert(x, same) for name, x in zip(signal_names, shows, strict=False)}
-        margin = self.convert(shows[len(signal_names)], same)
+        signals = {name: self.convert(x, same) for name, x in zip(signal_names, shows[:-1], strict=True)}
+        margin = self.convert(shows[-1], same)
         if self.charted:
             check_slip_chart(self.loop, self.paths)
         return Equations(
@@ -336,7 +356,10 @@ class _Derivation:
         return state._replace(plant=x._replace(distance=state.plant.distance))
 
     def programs(self) -> tuple[Any, Any, Any, Any]:
-        """Return the functions start(loop), rates(loop, state, t), after(loop, state, t) and show(loop, state, t)."""
+        """Return the functions start(loop), rates(loop, state, t), after(loop, state, t, h, k), show(loop, state, t).
+
+        h and k are the step of the integration grid and the number of the tick.
+        """
 
         def rates(loop: Loop, state: PyTree, t: Scalar) -> PyTree:
             whole = self.loop_state(loop, state)
@@ -384,7 +407,7 @@ class _Derivation:
 
         known = {x.id: rate for x, rate in zip(inputs, rates, strict=True)}
         put = {x.id: state for x, state in zip(inputs, own, strict=True)}
-        dv, dw = (self.at_once(_tangent(graph, root, known), put) for root in self.lower(speeds, inputs))
+        dv, dw = (self.substitute(_tangent(graph, root, known), put) for root in self.lower(speeds, inputs))
         loss = graph.op("sub", graph.op("mul", graph.op("sub", graph.const(1.0), chart.slip), dv), dw)
         return [graph.op("div", loss, chart.speed), dv, jax.tree.unflatten(made, rates).distance]
 
@@ -403,13 +426,12 @@ class _Derivation:
             return self.given[self.paths.index(path)]
         return self.graph.const(float(getattr(self.loop.initial, name)))
 
-    def at_once(self, node: Node, same: dict[int, Node]) -> Node:
-        """Return the node with the nodes in `same` replaced."""
-        if node.id in same:
-            return same[node.id]
-        if not node.args:
-            return node
-        return self.graph.again(node, [self.at_once(arg, same) for arg in node.args])
+    def substitute(self, node: Node, known: dict[int, Node]) -> Node:
+        """Return a node with other nodes in place of those in `known`, by number; it adds what it finds."""
+        if node.id not in known:
+            args = [self.substitute(arg, known) for arg in node.args]
+            known[node.id] = self.graph.again(node, args) if args else node
+        return known[node.id]
 
     def make(self, name: str, args: tuple[int, ...], value: Any = None) -> int:
         """Return the index of an operation, a new one only if there is none."""
@@ -456,7 +478,7 @@ class _Derivation:
         return at
 
     def power(self, u: int, exponent: int, value: float) -> int:
-        """Return u^e of u >= 0. The factor of its derivative is e u^(e-1), as long as that is finite at u = 0."""
+        """Return u^e of u >= 0. The factor of its derivative is e u^(e-1), which for e < 1 has no value at u = 0."""
         if value < 1:
             key = ("power", u, exponent)
             if key not in self.known:
@@ -473,9 +495,9 @@ class _Derivation:
         less = self.power(u, self.make("sub", (exponent, self.number(1.0))), value - 1)
         return self.make("power", (u, self.make("mul", (exponent, less)), exponent))
 
-    def convert(self, node: Node, same: dict[int, tuple[str, int]], done: dict[int, int] | None = None) -> int:
+    def convert(self, node: Node, same: dict[int, tuple[str, int]]) -> int:
         """Return the index of a node's operation; `same` has the nodes that are a state of the chart."""
-        memory = self.__dict__.setdefault("converted", {}).setdefault(tuple(sorted(same.items())), {})
+        memory = self.converted.setdefault(tuple(sorted(same.items())), {})
         stack = [node]
         while stack:
             top = stack[-1]
@@ -503,12 +525,14 @@ class _Derivation:
     def operation(self, node: Node, args: list[int]) -> int:
         """Return the operation of a node whose operands are converted."""
         make, number = self.make, self.number
+        if node.dtype not in (np.float64, np.bool_) and node.op != "const":
+            raise NoRule(f"{node.op}: the proof has no rule for numbers of the type {node.dtype}")
         match node.op:
             case "const":
                 return make("truth", (), bool(node.attr)) if node.dtype == bool else number(node.attr)
             case "input":
                 kind, index = node.attr
-                return make("param" if kind == LEAVES else "state", (), index)
+                return make("param" if kind == PARAM else "state", (), index)
             case "add" | "sub" | "mul":
                 return make(node.op, tuple(args))
             case "neg":
@@ -531,7 +555,7 @@ class _Derivation:
                 return make(node.op, tuple(args))
             case "and" | "or" | "not":
                 return self.logic(node.op, args)
-            case "is_finite" if self.has_value(args[0]):
+            case "is_finite" if self.is_total(args[0]):
                 return make("truth", (), True)
             case "is_finite":  # 0 x < 1 is true, and has no value where x has none
                 return make("lt", (make("mul", (args[0], number(0.0))), number(1.0)))
@@ -554,18 +578,20 @@ class _Derivation:
                 return make("sub", (self.function("exp", args[0]), number(1.0)))
         raise NoRule(f"{node.op}: the proof has no sound rule for this operation")
 
-    def has_value(self, i: int) -> bool:
-        """Return whether an operation has a value for all values of its operands; False if that is unknown."""
+    def is_total(self, i: int) -> bool:
+        """Return whether an operation has a value for all parameters and states; False if that is unknown."""
         operation = self.operations[i]
         match operation.name:
+            case "const":
+                return bool(np.isfinite(operation.value))
             case "log":
                 return False
             case "inv":
                 below = self.operations[operation.args[0]]
                 return below.name == "const" and below.value != 0
-            case "exp" | "sin" | "cos" | "atan" | "power":  # the others are factors of derivatives
-                return self.has_value(operation.args[0])
-        return all(self.has_value(a) for a in operation.args if a >= 0)
+            case "exp" | "sin" | "cos" | "atan" | "power":  # the other operand is the factor of the derivative
+                return self.is_total(operation.args[0])
+        return all(self.is_total(a) for a in operation.args if a >= 0)
 
     def logic(self, name: str, args: list[int]) -> int:
         """Return a logical operation; one that a known truth decides is that truth."""
@@ -633,7 +659,7 @@ class _Chart(NamedTuple):
 
 
 def _power_of(node: Node) -> tuple[Node, Node] | None:
-    """Return base and exponent of a power as `core.numerics.power` writes it, for base >= 0; else None.
+    """Return base and exponent of a power as `core.numerics.power` writes it, which is 0 for base <= 0; else None.
 
     The form is base > 0 ? (base^2 != 0 ? exp(e (0.5 log(base^2 != 0 ? base^2 : 1))) : 0) : 0.
     """
@@ -671,7 +697,7 @@ def _clock_of(loop: Loop) -> float | None:
     periods = set()
     for name in BLOCKS:
         block = getattr(loop, name)
-        if isinstance(block, Sampled):
+        if type(block) is Sampled:  # a subclass may have events that count
             if float(block.delay) not in (0.0, float(block.period)):
                 raise NoRule(f"{name}.delay = {float(block.delay):g} s: only 0 and the whole period have a rule")
         elif offers(block, "margins"):
@@ -691,8 +717,9 @@ def _clock_of(loop: Loop) -> float | None:
 
 
 def _is_traced(path: PyTree, leaf: np.ndarray) -> bool:
-    """Return whether a number of the loop is an input of its programs. A clock's period and delay are constants."""
-    return leaf.dtype.kind == "f" and not _text(path).endswith(("period", "delay"))
+    """Return whether a number of the loop is an input of its programs. Periods and delays of blocks are not."""
+    words = _text(path).split(".")
+    return np.asarray(leaf).dtype.kind == "f" and not (words[0] in BLOCKS and words[-1] in ("period", "delay"))
 
 
 def _tangent(graph: Graph, root: Node, tangents: dict[int, Node]) -> Node:

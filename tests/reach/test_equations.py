@@ -212,6 +212,8 @@ def rate_of(formula: Any, x: float, **values: float) -> float | bool:
            "self.power(args[0], number(0.5), 0.5)", case="root")  # fmt: skip
 @killed_by("reach/equations.py", 'make("lt", (make("mul", (args[0], number(0.0))), number(1.0)))',
            'make("truth", (), True)', case="test")  # fmt: skip
+@killed_by("reach/equations.py", "return bool(np.isfinite(operation.value))", "return True", case="infinite")
+@killed_by("reach/equations.py", "node.op in TOTAL or _is_finite(node)", "node.op in (*TOTAL, 'const')", case="times")
 @pytest.mark.parametrize(
     "formula",
     [
@@ -219,11 +221,13 @@ def rate_of(formula: Any, x: float, **values: float) -> float | bool:
         lambda x, a, b, c: jnp.where(jnp.isnan(jnp.sqrt(a - x)), 1.0, 2.0),
         lambda x, a, b, c: 0.0 * (1 / (x - 2)),
         lambda x, a, b, c: jnp.where(jnp.isfinite(1 / (x - 2)), 1.0, 2.0),
+        lambda x, a, b, c: jnp.where(jnp.isfinite(jnp.where(x > 1, jnp.inf, x)), 1.0, 2.0),
+        lambda x, a, b, c: 0.0 * jnp.where(x > 1, jnp.inf, x),
     ],
-    ids=["root", "test", "zero", "finite"],
+    ids=["root", "test", "zero", "finite", "infinite", "times"],
 )
 def test_a_number_without_a_value_has_none(formula: Any) -> None:
-    """At x = 2 the root is of -1, and the division is by 0."""
+    """At x = 2 the root is of -1, the division is by 0, and the infinite number is no real one."""
     assert math.isfinite(rate_of(formula, 0.5))
     assert math.isnan(rate_of(formula, 2.0))
 
@@ -239,7 +243,7 @@ def test_a_power_with_another_condition_is_no_power() -> None:
     assert rate_of(gate, 0.7, a=1.0, b=3.0) == pytest.approx(0.7**3)
 
 
-@killed_by("reach/equations.py", 'leaf.dtype.kind == "f" and not', "False and not")
+@killed_by("reach/equations.py", 'np.asarray(leaf).dtype.kind == "f" and not', "False and not")
 def test_numbers_of_the_loop_are_not_rounded_by_numpy() -> None:
     """In doubles a b - c is 0; exactly it is 0.18."""
     a, b, c = 94906267.3, 94906271.1, 9007199933462864.0
@@ -249,3 +253,19 @@ def test_numbers_of_the_loop_are_not_rounded_by_numpy() -> None:
     names = [o.name for o in derive_equations(loop, ["initial.position"]).operations]
     assert "mul" in names
     assert "sub" in names
+
+
+@killed_by("reach/equations.py", "return _is_finite(node) and Fraction(repr(float(node.attr)))",
+           "return _is_finite(node) and Fraction(float(node.attr))")  # fmt: skip
+def test_a_difference_of_two_decimals_is_not_folded() -> None:
+    """0.3 - 0.2 is exact in doubles, 0.09999999999999998; the decimals have the difference 0.1."""
+    e = derive_equations(odd_loop(lambda x, a, b, c: a - b, a=0.3, b=0.2), ["initial.position"])
+    assert e.operations[e.flow[0]].name == "sub"
+
+
+@killed_by("reach/equations.py", "if node.dtype not in (np.float64, np.bool_) and", "if False and")
+def test_integers_are_refused() -> None:
+    """An unsigned 0 - 1 is 255."""
+    loop = odd_loop(lambda x, a, b, c: ((x > 1).astype(jnp.uint8) - jnp.uint8(1)).astype(float))
+    with pytest.raises(NoRule, match="type uint8"):
+        derive_equations(loop, ["initial.position"])
