@@ -14,7 +14,7 @@ class Canvas:
         """Put a chart with these `options` and CSS `classes` into the open element; `name` is its data-id."""
         self.element = ui.echart(options).classes(classes)
         if name:
-            self.element.props(f"data-id={name}")
+            self.element.props["data-id"] = name
 
     def change(self, option: JsonObject, edit: int = 0) -> None:
         """Apply the change `option` to the chart.

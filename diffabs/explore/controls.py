@@ -1,6 +1,5 @@
 """The left column: choice of scenario, road and controller, and a slider and a field for each number."""
 
-import html
 import pathlib
 from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
@@ -11,25 +10,27 @@ from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `ex
 from diffabs.core.types import JsonObject, Scalar
 from diffabs.explore.knobs import SLIDER_STEPS, Knob, unit_words
 from diffabs.explore.panels import Fan
-from diffabs.explore.session import AS_GIVEN, EXCHANGEABLE_FAMILIES, Session
+from diffabs.explore.session import AS_GIVEN, EXCHANGEABLE_FAMILIES, Basis, Session, load_basis
 from diffabs.scenario.scenario import names
 
 CHANGE_INTERVAL_S = 0.016  # interval between events of a slider, one frame of the screen
 MASS, ROAD = "mass", "road"
 
 Turned = Callable[[str, Any, int], None]
-Replaced = Callable[[Callable[[], None]], Awaitable[None]]
+Replaced = Callable[[Callable[[], Basis]], Awaitable[None]]
+Widened = Callable[[str, Any], bool]
 
 
 class Controls:
     """Sliders and fields of a session's numbers.
 
-    `turned` is called for each changed number, `replaced` for a change that rebuilds all numbers.
+    `turned` is called for each changed number, and `replaced` for a change that rebuilds all numbers. `widened` is
+    called for another spread of the fan, and returns whether it is valid.
     """
 
-    def __init__(self, session: Session, turned: Turned, replaced: Replaced):
-        """Prepare the controls of a `session` with the callbacks `turned` and `replaced`; the page stays unchanged."""
-        self.session, self._change, self._replaced = session, turned, replaced
+    def __init__(self, session: Session, turned: Turned, replaced: Replaced, widened: Widened):
+        """Prepare the controls of a `session` with their callbacks; the page stays unchanged."""
+        self.session, self._change, self._replaced, self._widen = session, turned, replaced, widened
         self.fields: JsonObject = {}
         self.sliders: JsonObject = {}
         self.sources = list(dict.fromkeys([session.source, *names()]))
@@ -83,17 +84,10 @@ class Controls:
         with self.inside:
             # A choice of scenario, road or controller replaces all numbers.
             labels = {source: pathlib.Path(source).name for source in self.sources}
-            look = "dense outlined options-dense"
-            source = ui.select(labels, value=self.session.source, label="scenario").classes("w-full chooser")
-            source.props(f"{look} data-id=scenario").on_value_change(
-                lambda event: self._replaced(partial(self.session.open, event.value))
-            )
+            self._chooser("scenario", labels, self.session.source, load_basis)
             for family in EXCHANGEABLE_FAMILIES:
                 if there := self.session.choices(family):
-                    part = ui.select(there, value=self.session.parts[family], label=family).classes("w-full chooser")
-                    part.props(f"{look} data-id={family}").on_value_change(
-                        lambda event, family=family: self._replaced(partial(self.session.choose, family, event.value))
-                    )
+                    self._chooser(family, there, self.session.parts[family], partial(self.session.load_part, family))
             # How far the members of the fan spread around the current values.
             ui.label("fan of 200 runs").classes("group")
             words = {MASS: "masses differ by ±", ROAD: "friction differs by ±"}
@@ -102,8 +96,8 @@ class Controls:
                 with ui.element("div").classes("spread"):
                     ui.label(words[name])
                     field = ui.input(value=f"{100 * getattr(self.session.spread, name):g}").props("dense outlined")
-                    field.props(f"data-id=fan-{name}")
-                    field.on("change", lambda _, name=name, field=field: self._widened(name, field.value))
+                    field.props["data-id"] = f"fan-{name}"
+                    field.on("change", lambda _, name=name, field=field: self._take_spread(name, field))
                     ui.label("%").classes("unit")
             self.made = ui.label().classes("note").props("data-id=fan")
             # Few numbers at first, to keep the page light: rows of the others are built when they are first opened.
@@ -121,8 +115,19 @@ class Controls:
 
             more.on_value_change(open_rest)
 
-    async def _widened(self, name: str, given: Any) -> None:
-        await self._replaced(partial(self.session.widen, name, given))
+    def _chooser(self, name: str, there: Any, value: str, load: Callable[[str], Basis]) -> None:
+        """Add a list of choices, `there`; `load` loads a chosen one."""
+        field = (
+            ui.select(there, value=value, label=name).classes("w-full chooser").props("dense outlined options-dense")
+        )
+        field.props["data-id"] = name
+        field.on_value_change(lambda event: self._replaced(partial(load, event.value)))
+
+    def _take_spread(self, name: str, field: Any) -> None:
+        if self._widen(name, field.value):
+            field.props(remove="error")
+        else:
+            field.props("error")
 
     def _rows(self, keys: Iterable[str]) -> None:
         group = ""
@@ -138,13 +143,13 @@ class Controls:
         with ui.element("div").classes("knob"):
             ui.label(knob.label).classes("name").tooltip(f"{knob.name} in {knob.spec.interval()}")
             field = ui.input(value=knob.text(value)).props("dense outlined hide-bottom-space")
-            field.props(f'data-field="{html.escape(key)}" aria-label="{html.escape(knob.name)}"')
+            field.props["data-field"], field.props["aria-label"] = key, knob.name
             field.on("change", lambda _: self._change(key, str(field.value), 0))
             self.fields[key] = field
             ui.label(unit_words(knob.spec.unit)).classes("unit")
             if knob.low is not None:
                 slider = ui.slider(min=0, max=SLIDER_STEPS, step=1, value=knob.place_of(value)).props("dense")
-                slider.props(f'data-slider="{html.escape(key)}" aria-label="{html.escape(knob.name)}"')
+                slider.props["data-slider"], slider.props["aria-label"] = key, knob.name
                 slider.on(
                     "update:model-value",
                     lambda event: self._take_slider(key, *event.args),

@@ -73,6 +73,10 @@ class Knob:
         """Return a `value` [SI] as text in the displayed unit."""
         return f"{value * self.scale:.6g}"
 
+    def words(self, value: float) -> str:
+        """Return a `value` [SI] as text in the displayed unit, followed by the unit."""
+        return f"{self.text(value)} {unit_words(self.spec.unit)}".rstrip()
+
     def place_of(self, value: float) -> float:
         """Return the slider position, 0 to `SLIDER_STEPS`, of a `value` [SI].
 

@@ -16,17 +16,17 @@ from diffabs.explore import charts, curves, stability
 from diffabs.explore.canvas import Canvas, encode_change
 from diffabs.explore.controls import Controls
 from diffabs.explore.header import add_header
+from diffabs.explore.knobs import Knob
 from diffabs.explore.look import SCRIPT, STYLE
 from diffabs.explore.panels import Curves, Fan
 from diffabs.explore.results import ResultsPanel
 from diffabs.explore.saver import Saver
-from diffabs.explore.session import NOT_PROVED, ProofVerdict, Session, Tools, objections
+from diffabs.explore.session import NOT_PROVED, Basis, ProofVerdict, Session, Tools, check_edit, objections
 from diffabs.explore.tuner import Tuner
 from diffabs.explore.work import NewestJobThread
 from diffabs.scenario.scenario import Scenario
 
 QUICK_JOB_S = 0.05  # s; quicker computations are repeated during a drag
-TICK = 0.004  # s between two checks for the curve
 REST = 0.15  # s without a change before all results are computed
 PROVING = 0.35  # s without a change before a proof is attempted
 
@@ -43,15 +43,16 @@ class Page:
         self.session, self.tools = session, tools
         self.client, self.server = ui.context.client, asyncio.get_running_loop()
         self.version, self.turned_at = 0, 0.0
-        self.since = 0  # first version of this scenario; results of earlier ones are dropped
+        self.since = 0  # results of earlier versions are dropped: they are of another scenario, or of replaced numbers
+        self.drawn = 0  # version of the shown curve
         self.costs: dict[str, float] = {}
         self.shown: Curves | None = None
-        self.objected = 0  # version after a refusal, whose message stays
-        self.drawn = 0  # newest version with a curve or a refusal
+        self.objected = 0  # version of a refusal, whose message stays
+        self.switching = asyncio.Lock()  # scenario and parts change one after the other
         self.around: stability.CornerLoops | None = None  # corners computed last
         self.surrounded = False  # whether they belong to the current loop
         self.drawer, self.thinker = (NewestJobThread(thread, self._report_failure) for _ in range(2))
-        self.controls = Controls(session, self._change, self._replaced)
+        self.controls = Controls(session, self._change, self._replaced, self._widen)
         self.results = ResultsPanel()
         self.saver = Saver(session, folder)
         self.tuner = Tuner(self, thread)
@@ -86,19 +87,17 @@ class Page:
         self.tuner.begin()
         self.redraw()
 
-    def redraw(self, edit: int = 0, key: str = "") -> None:
-        """Compute everything again from the current values.
-
-        `edit` is the browser's number of the user's edit. `key` is the edited number if it is not yet checked, else "".
-        """
+    def redraw(self, edit: int = 0) -> None:
+        """Compute everything again from the current values; `edit` is the browser's number of the user's edit."""
         self.version += 1
         self.turned_at = time.monotonic()
-        now = self.session.scenario()
+        now, edited = self.session.scenario(), self.session.edited
+        if edited is None:
+            self.since = self.version
         self.results.wait()
         if self.tools.judge:
             self.results.proved_box(self.tools.judge(self.session))
-        self.drawer.ask(partial(self._draw, now, self.version, edit, key))
-        self.thinker.ask(partial(self._think, now, self.version))
+        self.drawer.ask(partial(self._draw, now, self.version, edit, edited))
 
     def later(self, show: Callable[..., None], *given: PyTree) -> None:
         """Call show(*given) in the server's thread; for use in worker threads."""
@@ -123,7 +122,9 @@ class Page:
             self.chart.change(charts.change_time_axis(None if whole else curves.transient_end(self.shown)))
 
     def show_refusal(self, error: Exception | None) -> None:
-        """Show the message of an `error`; None hides it."""
+        """Show the message of an `error`, which stays until the next change; None hides it."""
+        if error is not None:
+            self.objected = self.version
         self.controls.show_refusal("" if error is None else _sentence(error))
 
     def reset(self) -> None:
@@ -150,7 +151,17 @@ class Page:
             self.controls.wrong(key)
             return
         self.controls.show(key)
-        self.redraw(edit, key)
+        self.redraw(edit)
+
+    def _widen(self, name: str, given: PyTree) -> bool:
+        """Apply another spread of the fan, and return whether it is valid."""
+        try:
+            self.session.widen(name, given)
+        except ScenarioError as error:
+            self.show_refusal(error)
+            return False
+        self.redraw()
+        return True
 
     def _withdraw_edit(self, key: str, error: ScenarioError, version: int) -> None:
         """Refuse a number whose loop must not be run, and return to the last accepted numbers.
@@ -159,36 +170,38 @@ class Page:
         """
         if version != self.version:
             return
-        self.show_refusal(error)
-        self.controls.wrong(key)
         for other in self.session.withdraw():
             if other != key:
                 self.controls.show(other)
-        if self.tools.judge:
-            self.results.proved_box(self.tools.judge(self.session))
-        # A new version discards pending results of the refused number.
-        self.version += 1
-        self.objected = self.drawn = self.version
-        if self.shown is not None and not self.shown.draft:
-            self.results.metrics(self.shown.metrics, fresh=True)
-        self.thinker.ask(partial(self._think, self.session.scenario(), self.version))
+        self.redraw()
+        self.show_refusal(error)
+        self.controls.wrong(key)
 
-    async def _replaced(self, change: Callable[[], None]) -> None:
-        """Apply a change of scenario, part or fan, and build the controls again."""
-        try:
-            await asyncio.to_thread(change)
-        except ScenarioError as error:
-            self.show_refusal(error)
-            self.controls.rebuild()
-            return
-        with self.client:
-            self.show_refusal(None)
-            self.controls.rebuild()
-            self.begin()
+    async def _replaced(self, load: Callable[[], Basis]) -> None:
+        """Load another scenario or part, switch to it, and build the controls again.
+
+        Only the loading runs in another thread: the user goes on to edit meanwhile.
+        """
+        basis, refusal = None, None
+        async with self.switching:
+            try:
+                basis = await asyncio.to_thread(load)
+            except ScenarioError as error:
+                refusal = error
+            if self.client.is_deleted:
+                return
+            with self.client:
+                if basis:
+                    self.session.switch(basis)
+                self.controls.rebuild()
+                if basis:
+                    self.begin()
+                self.show_refusal(refusal)
 
     def _show_curves(self, found: Curves, now: Scenario, change: str, version: int, edit: int) -> None:
-        if version < self.since:
+        if version < max(self.since, self.drawn):
             return
+        self.drawn = version
         self.session.accept(now.loop)
         if self.chart is None:
             with self.place:
@@ -208,13 +221,16 @@ class Page:
         if self.shown is None:
             self.end_line.set_text("no run")
 
-    def _show_fan(self, found: Fan | None, change: str) -> None:
+    def _show_fan(self, found: Fan | None, change: str, version: int) -> None:
+        if version < self.since:
+            return
         if self.chart is not None:
             self.chart.send(change)
         self.controls.fan(found)
 
     def _show_stability(self, found: stability.Stability | str, version: int, whole: bool) -> None:
-        self.results.stability(found, fresh=whole and version == self.version)
+        if version >= self.since:
+            self.results.stability(found, fresh=whole and version == self.version)
 
     def _show_verdict(self, found: ProofVerdict, version: int) -> None:
         if version == self.version:
@@ -225,26 +241,25 @@ class Page:
         """Show an unexpected error once; its job ends."""
         self.later(self._gave_up, error)
 
-    def _draw(self, now: Scenario, version: int, edit: int, key: str) -> None:
-        """Compute and send the curve, after a check of the edited number `key`."""
+    def _draw(self, now: Scenario, version: int, edit: int, edited: Knob | None) -> None:
+        """Compute and send the curve, after a check of the `edited` number, and then have the rest computed."""
+        if edited is not None:
+            try:
+                check_edit(edited, now)
+            except ScenarioError as error:
+                self.later(self._withdraw_edit, edited.key, error, version)
+                return
         try:
-            if key:
-                self.session.judge(key, now)
             self._send(curves.run_curves(now, curves.draft_solver(now)), now, version, edit)
-        except ScenarioError as error:
-            self.later(self._withdraw_edit, key, error, version)
         finally:
-            # Also after an error: `_think` waits for this version.
-            self.drawn = version
+            # The curve comes first. Also after an error: poles and verdict may exist without a run.
+            self.thinker.ask(partial(self._think, now, version))
 
     def _send(self, found: Curves, now: Scenario, version: int, edit: int = 0) -> None:
         self.later(self._show_curves, found, now, encode_change(charts.change_curves(found)), version, edit)
 
     def _think(self, now: Scenario, version: int) -> None:
         """Compute everything except the curve: quick results during a drag, the others after a rest."""
-        # The curve comes first, from another thread.
-        while version == self.version and self.drawn < version:
-            time.sleep(TICK)
         if version != self.version:
             return
         steps = {"poles": self._poles, "fan": self._fan}
@@ -298,7 +313,7 @@ class Page:
 
     def _fan(self, now: Scenario, version: int) -> bool:
         found = curves.run_fan(now, self.session.spread)
-        self.later(self._show_fan, found, encode_change(charts.change_fan(found)))
+        self.later(self._show_fan, found, encode_change(charts.change_fan(found)), version)
         return True
 
 

@@ -10,6 +10,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.pytree import get, parameters, replace
 from diffabs.core.types import JsonObject
 from diffabs.explore import friction
+from diffabs.explore.knobs import unit_words
 from diffabs.explore.session import CERTIFIED, NOT_PROVED, ProofVerdict, Session
 from diffabs.reach.verification import ProofFile, read_proof
 from diffabs.scenario.scenario import Scenario, loads
@@ -81,8 +82,8 @@ def _find_difference(here: Loop, there: Loop, over: dict[str, tuple[float, float
     for path, spec, value in parameters(here):
         other = get(there, path)
         if path not in over and not np.array_equal(np.asarray(value, float), np.asarray(other, float)):
-            unit = "" if spec.unit in ("", "1") else f" {spec.unit}"
-            return f"{path} = {_text(other)}{unit}, here it is {_text(value)}{unit}"
+            given, shown = (f"{_text(one)} {unit_words(spec.unit)}".rstrip() for one in (other, value))
+            return f"{path} = {given}, here it is {shown}"
     same = (
         np.array_equal(a, b)
         for a, b in zip(*map(jax.tree.leaves, (replace(here, fixed), replace(there, fixed))), strict=True)
@@ -103,10 +104,10 @@ def _text(value: object) -> str:
 def _show(session: Session, path: str, value: float) -> str:
     """Return a parameter with its value in the displayed unit."""
     knob = session.knobs.get(path)
-    return f"{path} = {knob.text(value)} {knob.spec.unit}" if knob else f"{path} = {value:.6g}"
+    return f"{path} = {knob.words(value)}" if knob else f"{path} = {value:.6g}"
 
 
 def _range(session: Session, path: str, low: float, high: float) -> str:
     """Return a range in the displayed unit."""
     knob = session.knobs.get(path)
-    return f"{knob.text(low)} to {knob.text(high)} {knob.spec.unit}" if knob else f"{low:.6g} to {high:.6g}"
+    return f"{knob.text(low)} to {knob.words(high)}" if knob else f"{low:.6g} to {high:.6g}"

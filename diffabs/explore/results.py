@@ -56,10 +56,9 @@ class ResultsPanel:
                 ui.label(words).classes("head" if words == "margins" else "head number")
             for name, words in MARGINS.items():
                 ui.label(words)
-                cells = [
-                    ui.label(NO_VALUE).classes("number").props(f"data-margin={name}{end}") for end in ("", "-worst")
-                ]
-                self.margin_cells[name] = (cells[0], cells[1])
+                here, worst = (ui.label(NO_VALUE).classes("number") for _ in range(2))
+                here.props["data-margin"], worst.props["data-margin"] = name, f"{name}-worst"
+                self.margin_cells[name] = (here, worst)
         with ui.element("div").classes("card-title"):
             ui.label("measured on the run")
             self.measuring = ui.label("computing …").classes("busy")
@@ -80,7 +79,8 @@ class ResultsPanel:
         with self.numbers:
             for name, unit in self.units.items():
                 ui.label(name.replace("_", " "))
-                self.cells[name] = ui.label("").classes("number").props(f"data-metric={name}")
+                self.cells[name] = ui.label("").classes("number")
+                self.cells[name].props["data-metric"] = name
                 ui.label(unit_words(unit)).classes("note")
 
     def wait(self) -> None:

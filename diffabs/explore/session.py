@@ -1,11 +1,12 @@
 """A session of the explorer: a scenario, the edited values, and the scenario that follows. Independent of any page.
 
-`turn`, `choose` and `adopt` change a session. `scenario()` is a value: threads can compute with it during further
-edits.
+`put`, `switch` and `adopt` change a session, in one thread only. `scenario()` and a `Basis` are values: other threads
+can compute with them during further edits.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +50,43 @@ class Tools(NamedTuple):
     judge: "Callable[[Session], ProofVerdict] | None" = None
 
 
+class Basis(NamedTuple):
+    """A loaded scenario with its adjustable numbers, from which a session starts.
+
+    Attributes:
+        source: Path or name of the scenario.
+        parts: Chosen part of each exchangeable family, or `AS_GIVEN`.
+        given: Scenario as loaded.
+        base: The same with a friction factor.
+        knobs: Numbers by key.
+        first: Keys of the numbers that the page shows at once.
+    """
+
+    source: str
+    parts: dict[str, str]
+    given: Scenario
+    base: Scenario
+    knobs: dict[str, Knob]
+    first: list[str]
+
+
+def load_basis(source: str, parts: Mapping[str, str] = MappingProxyType({})) -> Basis:
+    """Return the basis of a session, which may be run as it is.
+
+    Args:
+        source: Path or name of the scenario.
+        parts: Name of a part by exchangeable family; a family that is missing, or `AS_GIVEN`, keeps the scenario's own.
+
+    Raises:
+        ScenarioError: The scenario cannot be loaded, or a part does not fit.
+    """
+    chosen = dict.fromkeys(EXCHANGEABLE_FAMILIES, AS_GIVEN) | dict(parts)
+    given = load(source, [f"{family}={part}" for family, part in chosen.items() if part != AS_GIVEN])
+    base = friction.with_factor(given)
+    known = knobs.knobs(base)
+    return Basis(source, chosen, given, base, known, knobs.first_knobs(base, known))
+
+
 class Session:
     """A scenario with edited numbers."""
 
@@ -59,32 +97,29 @@ class Session:
             ScenarioError: The scenario cannot be loaded.
         """
         self.spread = Spread()
-        self.open(source)
+        self._begin(load_basis(source))
 
-    def open(self, source: str) -> None:
-        """Start again with another scenario, from the path or name `source`.
+    def load_part(self, family: str, part: str) -> Basis:
+        """Return this session's scenario with another road or controller, `family`; the session stays unchanged.
 
-        Raises:
-            ScenarioError: The scenario cannot be loaded; the session stays unchanged.
-        """
-        self._begin(source, {}, load(source))
-
-    def choose(self, family: str, part: str) -> None:
-        """Replace the road or the controller, `family`, by `part`: a name, or `AS_GIVEN` for the scenario's own.
-
-        The new part has its default values. Edits of all other numbers are kept.
+        `part` is a name, or `AS_GIVEN` for the scenario's own. The new part has its default values.
 
         Raises:
-            ScenarioError: The part does not fit; the session stays unchanged.
+            ScenarioError: The part does not fit.
         """
-        chosen = {**self.parts, family: part}
-        overrides = [f"{name}={kind}" for name, kind in chosen.items() if kind != AS_GIVEN]
-        turned = self._changed_values()
-        self._begin(self.source, chosen, load(self.source, overrides))
-        for key, value in turned.items():
-            if key in self.knobs and not key.startswith((f"{family}.", f"plant.{family}.")):
+        return load_basis(self.source, {**self.parts, family: part})
+
+    def switch(self, basis: Basis) -> None:
+        """Start again from another `basis`.
+
+        If it is the same scenario with another part, edits of all other numbers are kept. `check_edit` must follow.
+        """
+        changed = self._changed_values() if basis.source == self.source else {}
+        replaced = [family for family, part in basis.parts.items() if part != self.parts[family]]
+        self._begin(basis)
+        for key, value in changed.items():
+            if key in self.knobs and not key.removeprefix("plant.").startswith(tuple(f"{one}." for one in replaced)):
                 self._put(key, value)
-        self.accept(self.scenario().loop)
 
     def choices(self, family: str) -> list[str]:
         """Return the parts of a `family` that can be chosen, the scenario's own first.
@@ -94,46 +129,17 @@ class Session:
         there = family == "controller" or hasattr(self.given.loop.plant, family)
         return [AS_GIVEN, *sorted(registry.family_types(family))] if there else []
 
-    def turn(self, key: str, given: PyTree) -> float:
-        """Set the number `key` to a value `given` in its displayed unit, and return it in SI.
+    def put(self, key: str, given: PyTree) -> None:
+        """Set the number `key` to `given` in its displayed unit; the loop is not checked.
 
-        Raises:
-            ScenarioError: The value is refused; the message names the field and the session stays unchanged.
-        """
-        value = self.put(key, given)
-        now = self.scenario()
-        try:
-            self.judge(key, now)
-        except ScenarioError:
-            self.withdraw()
-            raise
-        self.accept(now.loop)
-        return value
-
-    def put(self, key: str, given: PyTree) -> float:
-        """Set the number `key` to `given` in its displayed unit, and return it in SI; the loop is not checked.
-
-        `judge` checks the loop and takes some milliseconds. `accept` or `withdraw` must follow it.
+        `check_edit` checks the loop and takes some milliseconds. `accept` or `withdraw` must follow it.
 
         Raises:
             ScenarioError: The loop has no such number, or the value is not in its range.
         """
         if key not in self.knobs:
             raise unknown_name_error(f"{key!r} is no number of this loop", key, self.knobs)
-        value = self.knobs[key].read(given)
-        self._put(key, value)
-        return value
-
-    def judge(self, key: str, chosen: Scenario) -> None:
-        """Check that the scenario `chosen` of this session may be run.
-
-        Raises:
-            ScenarioError: It must not be run; the message names the last edited number, `key`.
-        """
-        if lines := objections(chosen):
-            knob = self.knobs[key]
-            text = knob.text(_value(get(chosen.loop, knob.path), knob))
-            raise ScenarioError(f"{knob.name} = {text} {knob.spec.unit}: {lines[0]}".replace(" 1:", ":"))  # no unit "1"
+        self._put(key, self.knobs[key].read(given))
 
     def accept(self, loop: Loop) -> None:
         """Store the numbers of the `loop` as the state to which `withdraw` returns."""
@@ -161,13 +167,11 @@ class Session:
 
     def adopt(self, loop: Loop) -> None:
         """Set all numbers to those of another `loop` with the same parts, and accept them."""
-        self.accept(loop)
-        self._values = {knob.path: np.asarray(get(loop, knob.path), float) for knob in self.knobs.values()}
+        self._start(loop, {knob.path: np.asarray(get(loop, knob.path), float) for knob in self.knobs.values()})
 
     def reset(self) -> None:
         """Return to the numbers of the scenario."""
-        self._values = {}
-        self.accept(self._base.loop)
+        self._start(self._base.loop, {})
 
     def scenario(self) -> Scenario:
         """Return the scenario with the current numbers."""
@@ -192,14 +196,14 @@ class Session:
         value = self._values.get(knob.path)
         return _value(get(self._base.loop, knob.path) if value is None else value, knob)
 
-    def _begin(self, source: str, parts: Mapping[str, str], given: Scenario) -> None:
-        self.source, self.given = source, given
-        self.parts = dict.fromkeys(EXCHANGEABLE_FAMILIES, AS_GIVEN) | dict(parts)
-        self._base = friction.with_factor(given)
-        self.knobs: dict[str, Knob] = knobs.knobs(self._base)
-        self.first = knobs.first_knobs(self._base, self.knobs)
-        self._values: dict[str, np.ndarray] = {}
-        self.accept(self._base.loop)
+    def _begin(self, basis: Basis) -> None:
+        self.source, self.parts, self.given, self._base, self.knobs, self.first = basis
+        self.reset()
+
+    def _start(self, accepted: Loop, values: dict[str, np.ndarray]) -> None:
+        self.accept(accepted)
+        self._values = values
+        self.edited: Knob | None = None  # number edited last since then
 
     def _put(self, key: str, value: float) -> None:
         knob = self.knobs[key]
@@ -207,7 +211,7 @@ class Session:
         new = np.array(get(self._base.loop, knob.path) if there is None else there, float)
         new[() if knob.place is None else knob.place] = value
         # A new dict and a new array: threads may still use the old ones.
-        self._values = {**self._values, knob.path: new}
+        self._values, self.edited = {**self._values, knob.path: new}, knob
 
     def _changed_values(self) -> dict[str, float]:
         """Return the values [SI] that differ from the scenario's, by key."""
@@ -218,6 +222,20 @@ class Session:
 
 def _value(value: Scalar, knob: Knob) -> float:
     return float(np.asarray(value, float)[() if knob.place is None else knob.place])
+
+
+def check_edit(knob: Knob, chosen: Scenario) -> None:
+    """Check that a scenario may be run.
+
+    Args:
+        knob: Number edited last, for the message.
+        chosen: Scenario with its current numbers.
+
+    Raises:
+        ScenarioError: The scenario must not be run.
+    """
+    if lines := objections(chosen):
+        raise ScenarioError(f"{knob.name} = {knob.words(_value(get(chosen.loop, knob.path), knob))}: {lines[0]}")
 
 
 def objections(chosen: Scenario) -> list[str]:

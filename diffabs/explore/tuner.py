@@ -1,11 +1,12 @@
 """The dialog and the card of a tuning: free parameters, progress, and values before and after."""
 
-import html
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.config.values import ScenarioError
+from diffabs.core.pytree import get
 from diffabs.core.types import PyTree, Scalar
 from diffabs.explore import curves, tuning
 from diffabs.explore.canvas import Canvas
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from diffabs.explore.page import Page
 
 Fields = tuple[Any, Any, tuple[str, str]]  # fields of the lower and the upper bound, and their initial texts
-MAX_LABEL_LENGTH = 20  # ratio of the largest to the smallest loss above which the axis is logarithmic
+LOGARITHMIC_LOSS_RATIO = 20  # ratio of the largest to the smallest loss above which the axis is logarithmic
 LOSS = {
     "animation": False,
     "grid": {"left": 52, "right": 8, "top": 8, "bottom": 18},
@@ -105,10 +106,8 @@ class Tuner:
                 for key, pair in ends.items():
                     ui.label(known[key].name)
                     shown = (f"{pair[0]:.6g}", f"{pair[1]:.6g}")
-                    low, high = (
-                        ui.input(value=text).props(f'dense outlined data-bound="{html.escape(key)}-{side}"')
-                        for text, side in zip(shown, ("low", "high"), strict=True)
-                    )
+                    low, high = (ui.input(value=text).props("dense outlined") for text in shown)
+                    low.props["data-bound"], high.props["data-bound"] = f"{key}-low", f"{key}-high"
                     fields[key] = (low, high, shown)
                     ui.label(unit_words(known[key].spec.unit)).classes("note")
 
@@ -168,7 +167,7 @@ class Tuner:
         self.bar.set_value(min(1.0, len(self.points) / most))
         data = [(i, point) for i, (_, point) in enumerate(self.points)]
         losses = [loss for _, loss in data]
-        wide = min(losses) > 0 and max(losses) > MAX_LABEL_LENGTH * min(losses)
+        wide = min(losses) > 0 and max(losses) > LOGARITHMIC_LOSS_RATIO * min(losses)
         axis = {"type": "log" if wide else "value"}
         self.loss.change({"yAxis": [axis], "series": [{"id": "loss", "data": data}]})
 
@@ -219,10 +218,6 @@ class Tuner:
 
     @staticmethod
     def _values(one: Scenario, knobs: Any) -> Any:
-        import numpy as np
-
-        from diffabs.core.pytree import get
-
         for key, knob in knobs.items():
             value = np.asarray(get(one.loop, knob.path), float)
             yield key, float(value if knob.place is None else value[knob.place])

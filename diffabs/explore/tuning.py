@@ -25,13 +25,11 @@ class TuningFound(NamedTuple):
 
     Attributes:
         after: Tuned scenario.
-        losses: Loss at each iteration.
         met: Whether all constraints are met.
         reason: Reason for the end, in words.
     """
 
     after: Scenario
-    losses: tuple[float, ...]
     met: bool
     reason: str
 
@@ -160,8 +158,7 @@ def tune_scenario(
         progress=lambda progress: told(progress.point.iteration, progress.point.loss),
         stopping=stopping,
     )
-    losses = tuple(float(point.loss) for point in found.history)
-    return TuningFound(dataclasses.replace(chosen, loop=found.loop), losses, found.met, found.reason.value)
+    return TuningFound(dataclasses.replace(chosen, loop=found.loop), found.met, found.reason.value)
 
 
 def _range(
@@ -176,8 +173,6 @@ def _range(
     for key, (low, high) in read.items():
         if not low < high:
             knob = known[key]
-            raise ScenarioError(
-                f"tune.free.{knob.name}: {knob.text(low)} is not below {knob.text(high)} {knob.spec.unit}"
-            )
+            raise ScenarioError(f"tune.free.{knob.name}: {knob.text(low)} is not below {knob.words(high)}")
     low, high = zip(*read.values(), strict=True)
     return (low, high) if np.shape(get(chosen.loop, path)) else (low[0], high[0])

@@ -26,10 +26,6 @@ class NewestJobThread:
             self._job = job
             self._there.notify()
 
-    def has_waiting_job(self) -> bool:
-        """Return whether a job waits, so that the current job can end early."""
-        return self._job is not None
-
     def end(self) -> None:
         """End the thread after the current job."""
         with self._there:

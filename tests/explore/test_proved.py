@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from commands import assert_one_error_line, run
 from mutants import killed_by
-from test_explore import SHORT
+from test_explore import SHORT, turn
 
 from diffabs.config.values import ScenarioError
 from diffabs.explore.proved import ProvedBox, judge_values, load_proved_box
@@ -54,14 +54,24 @@ def test_values_in_the_box_are_covered(session: Session, proved: ProvedBox) -> N
         "greatest slip <= 0.4, greatest slip <= 0.35, stop_time >= 0.1 for plant.mass 5.3 to 6.2 kg,"
         " initial.speed 20 to 30 km/h, by p.json; verify with diffabs verify p.json",
     )
-    session.turn("plant.mass", "6.2")
-    session.turn("initial.speed", "20")
+    turn(session, "plant.mass", "6.2")
+    turn(session, "initial.speed", "20")
     assert judge_values(proved, session).word == CERTIFIED
-    session.turn("plant.mass", "6.21")
+    turn(session, "plant.mass", "6.21")
     assert judge_values(proved, session) == (
         NOT_PROVED,
         "outside of the proved box: plant.mass = 6.21 kg is not in 5.3 to 6.2 kg, by p.json",
     )
+
+
+@killed_by("explore/proved.py", '{knob.words(value)}" if', '{knob.text(value)} {knob.spec.unit}" if')
+@killed_by("explore/proved.py", "to {knob.words(high)}", "to {knob.text(high)} {knob.spec.unit}")
+def test_a_plain_number_is_named_without_a_unit(session: Session, document: dict[str, Any]) -> None:
+    box = [*BOX, [0.15, 0.19]]
+    over = document["over"] | {"reference.slip": box[-1]}
+    proved = load_proved_box(pathlib.Path("p.json"), document | {"over": over, "cells": [box]})
+    said = "outside of the proved box: reference.slip = 0.2 is not in 0.15 to 0.19, by p.json"
+    assert judge_values(proved, session) == (NOT_PROVED, said)
 
 
 @killed_by("explore/proved.py", "if path not in over and not np.array_equal", "if False and not np.array_equal")
@@ -75,7 +85,7 @@ def test_values_in_the_box_are_covered(session: Session, proved: ProvedBox) -> N
     ],
 )
 def test_another_value_is_not_covered(session: Session, proved: ProvedBox, key: str, given: str, said: str) -> None:
-    session.turn(key, given)
+    turn(session, key, given)
     assert judge_values(proved, session) == (NOT_PROVED, f"p.json is about {said}")
     session.reset()
     assert judge_values(proved, session).word == CERTIFIED
