@@ -37,9 +37,10 @@ def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
         count: Largest number of runs to repeat.
     """
     samples = _choose_samples(study, found, count)
+    rows = np.searchsorted(found.column("sample"), samples)  # missing chunks have no rows
     half = {name: np.full(len(samples), np.nan) for name in found.metrics}
     alike, fine = np.zeros(len(samples), bool), np.zeros(len(samples), bool)
-    stopped = found.column("stopped")[samples]
+    stopped = found.column("stopped")[rows]
     loops, keys = zip(*map(study.lane, samples.tolist()), strict=True) if len(samples) else ((), ())
 
     def rerun(loop: Part, key: Key) -> tuple[Run, PyTree]:
@@ -55,10 +56,11 @@ def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
             column[places] = run.metrics[name]
         fine[places] = known
         alike[places] = ~np.asarray(run.diverged) & (np.asarray(run.stopped) == stopped[places])
-    rows = samples[fine & alike]
-    changes = {n: _summarise_changes(found.column(n)[rows], column[fine & alike], rows) for n, column in half.items()}
+    same = fine & alike
+    compared, rows = samples[same], rows[same]
+    changes = {n: _summarise_changes(found.column(n)[rows], column[same], compared) for n, column in half.items()}
     return {
-        "samples": rows.tolist(),
+        "samples": compared.tolist(),
         "step": study.solver.step / 2,
         "solver": describe_solver(study.solver),
         "ended otherwise": int((fine & ~alike).sum()),
@@ -89,8 +91,8 @@ def accuracy_warnings(result: JsonObject) -> list[str]:
 
 
 def _choose_samples(study: Study, found: Results, count: int) -> np.ndarray:
-    """Return numbers of samples, which are also their rows in the table."""
-    good = np.flatnonzero(~np.any([_has_flag(found, flag) for flag in EXCLUDED_FLAGS], axis=0))
+    """Return the numbers of at most `count` samples with metrics, in ascending order."""
+    good = found.column("sample")[~np.any([_has_flag(found, flag) for flag in EXCLUDED_FLAGS], axis=0)]
     random = np.random.default_rng([study.seed, ACCURACY_STREAM])
     return np.sort(random.choice(good, min(count, len(good)), replace=False))
 

@@ -21,8 +21,8 @@ def read_column(path: pathlib.Path, column: str) -> np.ndarray:
         column: Name of the column.
 
     Raises:
-        ValueError: The file cannot be read, the column does not exist, or an entry is not a finite number. The message
-            is one line.
+        ValueError: The file cannot be read, the column does not exist or is there twice, or an entry is not a finite
+            number. The message is one line.
     """
     if path.suffix.lower() not in TABLE_READERS:
         raise ValueError(f"{path} is neither {' nor '.join(TABLE_READERS)}")
@@ -35,6 +35,8 @@ def read_column(path: pathlib.Path, column: str) -> np.ndarray:
         raise ValueError(f"{path} is no {path.suffix[1:]} file: {str(error).splitlines()[0]}") from None
     if column not in table.column_names:
         raise unknown_name_error(f"{path} has no column {column}", column, table.column_names)
+    if (count := table.column_names.count(column)) > 1:
+        raise ValueError(f"{path} has {count} columns called {column}; one is needed")
     values, where = table.column(column), f"{path}, column {column}"
     if len(values) == 0:
         raise ValueError(f"{where} is empty")

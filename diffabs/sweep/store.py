@@ -197,7 +197,9 @@ def read_chunk(path: pathlib.Path) -> bytes:
 
 
 def describe_differences(there: Any, wanted: PyTree, path: str = "") -> Iterator[str]:
-    """Yield one line for each difference between two documents.
+    """Yield one line for each difference between two documents, also of the order of equal entries.
+
+    The order of the variables decides their samples.
 
     Args:
         there: Existing document, of JSON values.
@@ -205,10 +207,13 @@ def describe_differences(there: Any, wanted: PyTree, path: str = "") -> Iterator
         path: Path of both documents, for messages.
     """
     if isinstance(there, dict) and isinstance(wanted, dict):
-        for key in [*there, *(key for key in wanted if key not in there)]:
-            inner = f"{path}.{key}" if path else str(key)
-            yield from describe_differences(there.get(key), wanted.get(key), inner)
-    elif there != wanted:
+        keys = [*there, *(key for key in wanted if key not in there)]
+        inner = {key: f"{path}.{key}" if path else str(key) for key in keys}
+        lines = [line for key in keys for line in describe_differences(there.get(key), wanted.get(key), inner[key])]
+        if not lines and list(there) != list(wanted):
+            lines = [f"{path} has the entries {', '.join(there)} there, {', '.join(wanted)} here"]
+        yield from lines
+    elif json.dumps(there) != json.dumps(wanted):  # as digests do: NaN is NaN, and 1 is not 1.0
         yield f"{path} is {_abbreviate(there)} there, {_abbreviate(wanted)} here"
 
 

@@ -20,7 +20,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, parameters, replace
 from diffabs.core.types import Bool, Int, JsonObject, Params, Table
-from diffabs.core.units import resolve_unit, units_of
+from diffabs.core.units import resolve_unit, unit_at, units_of
 from diffabs.core.validity import find_problems
 from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import find_solver_faults
@@ -82,7 +82,11 @@ class Study:
     def units(self) -> dict[str, str]:
         """Return the units of the varying parameters and of the metrics, by name, where they are known."""
         loop = units_of(self.loop.plant)
-        declared = {path: spec.unit for path, spec, _ in parameters(self.loop, units=loop)}
+        declared = {
+            ".".join([path, *map(str, at)]): unit_at(spec.unit, place, np.size(value))
+            for path, spec, value in parameters(self.loop)
+            for place, at in enumerate(np.ndindex(np.shape(value)))
+        }
         varied = {path: declared[path] for path in self.space.paths if path in declared}
         measured = {name: resolve_unit(getattr(one, "unit", ""), loop) for name, one in self.objectives.items()}
         return {**varied, **{name: unit for name, unit in measured.items() if unit}}

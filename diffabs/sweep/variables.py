@@ -21,11 +21,11 @@ from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import AnyArray, JsonObject, Matrix, Params, PyTree, Table
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.discrete import Rows as Rows
-from diffabs.sweep.distributions import Distribution, Normal, describe_out_of_range
+from diffabs.sweep.distributions import Distribution, describe_out_of_range
 from diffabs.sweep.sampling import Grid, LatinHypercube, Random, SamplingDesign, Sobol
 
 MIN_CORRELATION_EIGENVALUE = 1e-10  # below it, the Cholesky factor of a correlation matrix loses its digits
-CORRELATION_TOLERANCE = 1e-9  # relative tolerance of entries that must be equal
+CORRELATION_TOLERANCE = 1e-9  # of entries that must be equal
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,25 +43,6 @@ class Correlation:
 
     paths: tuple[str, ...]
     matrix: Matrix = table_field(list_reader(list_reader(read_any_number)))
-
-    @staticmethod
-    def from_covariance(paths: tuple[str, ...], covariance: AnyArray, variables: Table | None = None) -> "Correlation":
-        """Return the correlation of the variables `paths` with a `covariance` matrix.
-
-        Raises:
-            ValueError: A variance is not positive; or its root is not the deviation of a normal variable in
-                `variables`.
-        """
-        variances = np.diag(np.asarray(covariance, float))
-        for path, variance in zip(paths, variances, strict=True):
-            if not variance > 0:
-                raise ValueError(f"covariance: the variance of {path} = {variance:g} is not positive")
-            marginal = (variables or {}).get(path)
-            if isinstance(marginal, Normal) and abs(marginal.deviation / np.sqrt(variance) - 1) > CORRELATION_TOLERANCE:
-                root = f"{np.sqrt(variance):g}, the root of its variance in the covariance"
-                raise ValueError(f"{path}: deviation = {marginal.deviation:g} is not {root}")
-        matrix = covariance / np.sqrt(np.outer(variances, variances))
-        return Correlation(tuple(paths), tuple(map(tuple, matrix.tolist())))
 
     def correlate(self, z: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return L z, correlated normals, for independent standard normals z by path."""

@@ -77,6 +77,10 @@ def written(folder, text):
         (lambda f: written(f, "mass [kg],b\n5.5,1\n,2\n"), "column mass [kg]: None in row 2 is no finite number"),
         (lambda f: written(f, "mass [kg]\n5.5\ninf\n"), "column mass [kg]: inf in row 2 is no finite number"),
         (lambda f: written(f, "mass [kg]\n"), "column mass [kg] is empty"),
+        (
+            lambda f: written(f, "mass [kg],mass [kg]\n5,6\n"),
+            "masses.csv has 2 columns called mass [kg]; one is needed",
+        ),
         (lambda f: written(f, ""), "masses.csv is no csv file: "),
         (lambda f: written(f, "mass [kg],b\n1,2\n1,2,3\n"), "masses.csv is no csv file: "),
         (lambda f: written(f, "mass [kg]\n-5.5\n6\n"), "reaches [-5.5, 6], outside (0, inf) kg"),

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 
@@ -18,13 +19,15 @@ from marks import cases, readable_id
 from mutants import killed_by
 from seams import replace_seam
 from small_scenarios import SWEEP as SMALL
-from sweeping import described
+from sweeping import described, manifest
 
 import diffabs as d
 from diffabs import roads
 from diffabs.objectives import Effort
+from diffabs.scenario.defaults import balancing
 from diffabs.simulate.run import measure, rollout
-from diffabs.sweep import Categorical, Local, Normal, Results, Space, SweepError, Uniform, sweep
+from diffabs.sweep import Categorical, Local, Normal, Results, Space, Study, SweepError, Uniform, sweep
+from diffabs.sweep.checking import check_accuracy
 from diffabs.sweep.seal import tables_digest
 from diffabs.sweep.store import Store
 from diffabs.sweep.trajectories import write_trajectories
@@ -134,6 +137,17 @@ def test_diverged_runs_are_counted_and_keep_their_row(study, swept):
     assert np.isfinite(swept.column("iae")[~bad]).all()
 
 
+@killed_by("sweep/study.py", "unit_at(spec.unit, place, np.size(value))", "spec.unit")
+def test_entries_of_lists_have_their_own_units(study, swept):
+    """A gain of slip for its integral and itself; of angles and their rates for a balancing robot."""
+    known = {"controller.gain.0": "N m/s", "controller.gain.1": "N m", "plant.mass": "kg"}
+    for units in (study.units(), swept.units):
+        assert {path: units[path] for path in known} == known
+    entries = {f"controller.gain.{i}": Uniform(-1.0, 1.0) for i in range(6)}
+    robot = Study(loop=balancing(), space=Space(entries), samples=8, solver=d.FixedStep(1e-3, 0.1))
+    assert [robot.units()[path] for path in entries] == 3 * ["V/rad"] + 3 * ["V s/rad"]
+
+
 @pytest.mark.slow
 def test_failures_are_counted_while_it_runs(study, swept, tmp_path):
     told = []
@@ -201,6 +215,19 @@ def test_stopped_and_continued_is_the_same_to_the_bit(study, swept, tmp_path):
     assert (told[0].samples, told[-1].here) == (64, 86)
     assert whole.complete
     assert whole.digest == swept.digest
+
+
+@killed_by("sweep/checking.py", 'np.searchsorted(found.column("sample"), samples)', "samples")
+@pytest.mark.slow
+def test_a_half_step_of_a_sweep_with_a_gap(study, swept, tmp_path):
+    """Its samples are those of the other chunks, and each change is that of the sample's own row."""
+    shutil.copytree(swept.folder, tmp_path / "out")
+    (tmp_path / "out" / swept.files[0].relative_to(swept.folder)).unlink()
+    found = check_accuracy(study, Results(tmp_path / "out"), 40)
+    assert len(found["samples"]) == 40 - found["ended otherwise"] - found["not comparable"]
+    assert min(found["samples"]) >= 64
+    assert max(found["samples"]) > 86  # the number of rows
+    assert found["metrics"]["iae"]["largest"] < 1e-3
 
 
 def test_a_finished_sweep_is_not_computed_again(study, swept):
@@ -411,6 +438,32 @@ def test_a_sweep_without_a_chunk_is_begun_anew(study, tmp_path):
     with pytest.raises(SweepError, match="nobody computes"):
         sweep(dataclasses.replace(study, seed=study.seed + 1), tmp_path, on=Absent())
     assert sweep(study, tmp_path).manifest["study"]["seed"] == study.seed
+
+
+ORDERED = {"a": 1, "b": 2.0, "c": math.nan}
+
+
+@killed_by("sweep/store.py", "if not lines and list(there) != list(wanted):", "if False:")
+@killed_by("sweep/store.py", "json.dumps(there) != json.dumps(wanted)", "there != wanted")
+@pytest.mark.parametrize(
+    ("other", "line"),
+    [
+        (ORDERED, ""),
+        (dict(reversed(ORDERED.items())), "study.loop has the entries a, b, c there, c, b, a here"),
+        (ORDERED | {"a": 1.0}, "study.loop.a is 1 there, 1.0 here"),
+        (ORDERED | {"b": 2}, "study.loop.b is 2.0 there, 2 here"),
+    ],
+    ids=["the same", "order", "float", "int"],
+)
+def test_only_the_same_digest_is_the_same_sweep(tmp_path, other, line):
+    """Before a chunk is computed, which belongs to the digest: the order counts, and NaN is NaN."""
+    Store(tmp_path).begin(manifest(2, 1, loop=ORDERED), resume=False)
+    wanted = manifest(2, 1, loop=other)
+    if not line:
+        Store(tmp_path).begin(wanted, resume=True)
+        return
+    with pytest.raises(SweepError, match=f"holds another sweep: {re.escape(line)}$"):
+        Store(tmp_path).begin(wanted, resume=True)
 
 
 @pytest.mark.parametrize(

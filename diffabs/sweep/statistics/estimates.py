@@ -236,6 +236,24 @@ def quantile(values: PyTree, level: float, *, confidence: float = 0.95) -> Inter
     return _quantile(np.sort(as_column(values)), level, confidence)
 
 
+def quantile_between(ordered: np.ndarray, level: float, low: int, high: int, confidence: float) -> IntervalEstimate:
+    """Return a quantile by linear interpolation, between the order statistics of two ranks.
+
+    Args:
+        ordered: Ascending samples, shape (n,).
+        level: Fraction of the law at or below the quantile, in (0, 1).
+        low: Rank of the lower end, counted from 1; with 0 the end is infinite.
+        high: Rank of the upper end; with n + 1 the end is infinite.
+        confidence: Confidence of the interval, in (0, 1).
+    """
+    n = len(ordered)
+    bottom = float(ordered[low - 1]) if low > 0 else -math.inf
+    top = float(ordered[high - 1]) if high <= n else math.inf
+    # Interpolation can leave the interval for extreme levels and few samples.
+    value = min(max(float(np.quantile(ordered, level)), bottom), top)
+    return IntervalEstimate(value, bottom, top, confidence, n)
+
+
 def cvar(
     values: PyTree, level: float, *, confidence: float = 0.95, replicates: int = BOOTSTRAP_REPLICATES, seed: int = 0
 ) -> IntervalEstimate:
@@ -259,25 +277,10 @@ def cvar(
     return _cvar(np.sort(as_column(values)), level, confidence, replicates, seed)
 
 
-def mean_of_replicates(estimates: Any, *, confidence: float = 0.95) -> IntervalEstimate:
-    """Return the mean of estimates from independent randomisations (scrambled Sobol' points), with a t interval.
-
-    Args:
-        estimates: One estimate for each randomisation, shape (n,).
-        confidence: Confidence, in (0, 1).
-
-    Raises:
-        ValueError: There are fewer than two estimates.
-    """
-    return Moments.of(estimates).mean(confidence=confidence)
-
-
 def summarise_column(
     values: PyTree, confidence: float = 0.95, levels: Sequence[float] = (0.05, 0.5, 0.95), tail: float = 0.95
-) -> dict[str, dict[str, float]]:
-    """Return the fields of each `IntervalEstimate` by its name.
-
-    The names are `mean`, `deviation`, `quantile 0.05` and so on, and `cvar 0.95`.
+) -> dict[str, IntervalEstimate]:
+    """Return each estimate by its name: `mean`, `deviation`, `quantile 0.05` and so on, and `cvar 0.95`.
 
     Args:
         values: Samples, shape (n,).
@@ -293,7 +296,7 @@ def summarise_column(
     found = {"mean": moments.mean(confidence=confidence), "deviation": moments.deviation(confidence=confidence)}
     found |= {f"quantile {level:g}": _quantile(ordered, level, confidence) for level in levels}
     found[f"cvar {tail:g}"] = _cvar(ordered, tail, confidence, BOOTSTRAP_REPLICATES, 0)
-    return {name: one.table() for name, one in found.items()}
+    return found
 
 
 def _quantile(ordered: np.ndarray, level: float, confidence: float) -> IntervalEstimate:
@@ -301,11 +304,7 @@ def _quantile(ordered: np.ndarray, level: float, confidence: float) -> IntervalE
         raise ValueError(f"level = {level:g} is outside (0, 1)")
     n, top = len(ordered), upper_level(confidence)
     r, s = int(stats.binom.ppf(1 - top, n, level)), int(stats.binom.isf(1 - top, n, level)) + 1
-    low = float(ordered[r - 1]) if r > 0 else -math.inf
-    high = float(ordered[s - 1]) if s <= n else math.inf
-    # Interpolation can leave the interval for extreme levels and few samples.
-    value = min(max(float(np.quantile(ordered, level)), low), high)
-    return IntervalEstimate(value, low, high, confidence, n)
+    return quantile_between(ordered, level, r, s, confidence)
 
 
 def _cvar(ordered: np.ndarray, level: float, confidence: float, replicates: int, seed: int) -> IntervalEstimate:

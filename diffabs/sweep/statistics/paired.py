@@ -16,7 +16,6 @@ import numpy as np
 
 from diffabs.core.types import Scalar
 from diffabs.sweep.statistics.estimates import Count, IntervalEstimate, Moments, as_column, quantile
-from diffabs.sweep.statistics.sensitivity import pearson
 
 
 class PairedComparison(NamedTuple):
@@ -27,7 +26,6 @@ class PairedComparison(NamedTuple):
         median: Median of a - b.
         less: Probability that a < b; a tie counts as not less.
         ties: Number of samples with a = b.
-        correlation: Pearson correlation of a with b.
         reduction: (var a + var b)/var(a - b); infinite for a constant difference, NaN if both are constant.
     """
 
@@ -35,7 +33,6 @@ class PairedComparison(NamedTuple):
     median: IntervalEstimate
     less: IntervalEstimate
     ties: int
-    correlation: IntervalEstimate
     reduction: float
 
 
@@ -61,6 +58,5 @@ def compare_pairs(a: Scalar, b: Scalar, *, confidence: float = 0.95) -> PairedCo
         median=quantile(difference, 0.5, confidence=confidence),
         less=less.probability(confidence=confidence),
         ties=int(np.count_nonzero(one == other)),
-        correlation=pearson(one, other, confidence=confidence),
         reduction=apart / together if together > 0 else math.inf if apart > 0 else math.nan,
     )

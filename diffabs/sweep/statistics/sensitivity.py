@@ -1,28 +1,25 @@
 """Sensitivity of an output to the inputs: correlations of a sweep, and Sobol' indices from two designs and their
 mixtures.
 
-    Pearson    tanh(atanh r -+ z/sqrt(n-3))                            Fisher (1921)
-    Spearman   tanh(atanh r -+ z sqrt((1 + r^2/2)/(n-3)))              Bonett and Wright (2000)
-    first      S_j = mean(f(B) (f(AB_j) - f(A)))/V                     Saltelli et al. (2010), table 2 (b)
-    total      T_j = mean((f(A) - f(AB_j))^2)/(2 V)                    Jansen (1999)
+    Pearson, Spearman    tanh(atanh r -+ z sd(p)/(1 - r^2)/sqrt(n - 3))
+    first                S_j = mean(f(B) (f(AB_j) - f(A)))/V           Saltelli et al. (2010), table 2 (b)
+    total                T_j = mean((f(A) - f(AB_j))^2)/(2 V)          Jansen (1999)
 
 AB_j is the design A with the j-th column of B. V is the variance of f(A) and f(B) together. S_j is the share of V that
 vanishes if input j is known. T_j is the share that remains if all other inputs are known. The indices have percentile
 bootstrap intervals over rows. They are functions of sums of a few features of each row, so a resample is a product of
 counts with features.
 
-The intervals of both correlations hold for binormal columns. For other laws they can fail: with y = x + x^2 and normal
-x, they cover 67 and 83 % instead of 95 %. `binormal=False` takes the standard error from the influence of each sample:
+The interval of a correlation takes the standard error from the influence of each sample:
 
-    p_i = u_i v_i - r (u_i^2 + v_i^2)/2,   sd(p)/(1 - r^2)/sqrt(n-3)  in place of  1/sqrt(n-3)
+    p_i = u_i v_i - r (u_i^2 + v_i^2)/2
 
 u and v are standardised. For Spearman's correlation, of ranks, the influence includes the effect of a sample on the
-ranks of the others.
+ranks of the others. Formulas for binormal columns (sd(p) = 1 - r^2 for Pearson's) fail for other laws. With y = x + x^2
+and normal x, they cover 67 and 83 % instead of 95 %.
 
-Sources: D. G. Bonett and T. A. Wright, Sample size requirements for estimating Pearson, Kendall and Spearman
-correlations, Psychometrika 65 (2000). A. Saltelli et al., Variance based sensitivity analysis of model output, Comput.
-Phys. Commun. 181 (2010). M. J. W. Jansen, Analysis of variance designs for model output, Comput. Phys. Commun. 117
-(1999).
+Sources: A. Saltelli et al., Variance based sensitivity analysis of model output, Comput. Phys. Commun. 181 (2010).
+M. J. W. Jansen, Analysis of variance designs for model output, Comput. Phys. Commun. 117 (1999).
 """
 
 import math
@@ -69,7 +66,7 @@ class SobolIndices(NamedTuple):
     total: list[IntervalEstimate]
 
 
-def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95, binormal: bool = True) -> Correlations:
+def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95) -> Correlations:
     """Return the correlations of each column of x with y, in the order of the columns.
 
     If one of the two is constant, the value is NaN with the ends -1 and 1.
@@ -78,7 +75,6 @@ def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95, binormal: bo
         x: Inputs, shape (n, d).
         y: Output, shape (n,).
         confidence: Confidence of the intervals, in (0, 1).
-        binormal: Whether both columns are jointly normal; False estimates the standard error from the data.
 
     Raises:
         ValueError: There are fewer than four samples, the lengths differ, or a value is not finite.
@@ -89,31 +85,10 @@ def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95, binormal: bo
     ranked = stats.rankdata(outputs)
     found = Correlations([], [])
     for values in inputs.T:
-        found.pearson.append(pearson(values, outputs, confidence=confidence, binormal=binormal))
-        found.spearman.append(_spearman(stats.rankdata(values), ranked, confidence, binormal))
+        values = as_column(values)
+        found.pearson.append(_pearson(values, outputs, confidence))
+        found.spearman.append(_spearman(stats.rankdata(values), ranked, confidence))
     return found
-
-
-def pearson(x: Scalar, y: Scalar, *, confidence: float = 0.95, binormal: bool = True) -> IntervalEstimate:
-    """Return the Pearson correlation of two columns.
-
-    If one of the two is constant, the value is NaN with the ends -1 and 1.
-
-    Args:
-        x: First column, shape (n,).
-        y: Second column, shape (n,).
-        confidence: Confidence of the interval, in (0, 1).
-        binormal: Whether both columns are jointly normal; False estimates the standard error from the data.
-
-    Raises:
-        ValueError: There are fewer than four samples, the lengths differ, or a value is not finite.
-    """
-    one, other = as_column(x, least=4), as_column(y)
-    if one.shape != other.shape:
-        raise ValueError(f"{len(one)} and {len(other)} values are not pairs: leave a lane out of both")
-    u, v = _standardise(one), _standardise(other)
-    r = float(np.clip(np.mean(u * v), -1.0, 1.0))
-    return _fisher_interval(r, 1.0 if binormal else _atanh_deviation(_influence(u, v, r), r), confidence, len(u))
 
 
 def sobol_indices(
@@ -158,15 +133,23 @@ def sobol_indices(
     return SobolIndices(each[:d], each[d:])
 
 
-def _spearman(x: np.ndarray, y: np.ndarray, confidence: float, binormal: bool) -> IntervalEstimate:
+def _pearson(x: np.ndarray, y: np.ndarray, confidence: float) -> IntervalEstimate:
+    u, v = _standardise(x), _standardise(y)
+    r = _product_moment(u, v)
+    return _fisher_interval(r, _influence(u, v, r), confidence)
+
+
+def _spearman(x: np.ndarray, y: np.ndarray, confidence: float) -> IntervalEstimate:
     """Return the Spearman correlation from ranks."""
     u, v = _standardise(x), _standardise(y)
-    r = float(np.clip(np.mean(u * v), -1.0, 1.0))
-    if binormal:
-        return _fisher_interval(r, math.sqrt(1 + r * r / 2), confidence, len(u))
+    r = _product_moment(u, v)
     # The effect of a sample on the ranks of the others.
     others = _sum_above(x, v - r * u) / np.std(x) + _sum_above(y, u - r * v) / np.std(y)
-    return _fisher_interval(r, _atanh_deviation(_influence(u, v, r) + others, r), confidence, len(u))
+    return _fisher_interval(r, _influence(u, v, r) + others, confidence)
+
+
+def _product_moment(u: np.ndarray, v: np.ndarray) -> float:
+    return float(np.clip(np.mean(u * v), -1.0, 1.0))
 
 
 def _standardise(x: np.ndarray) -> np.ndarray:
@@ -184,15 +167,14 @@ def _sum_above(x: np.ndarray, w: np.ndarray) -> np.ndarray:
     return (sums.sum() - np.cumsum(sums) + sums / 2)[place]
 
 
-def _atanh_deviation(influence: np.ndarray, r: float) -> float:
-    """Return the standard deviation of sqrt(n) atanh r; zero for columns that determine each other."""
-    return float(np.std(influence)) / (1 - r * r) if r * r < 1 else 0.0
-
-
-def _fisher_interval(r: float, spread: float, confidence: float, n: int) -> IntervalEstimate:
-    half = float(stats.norm.ppf(upper_level(confidence))) * spread / math.sqrt(n - 3)
+def _fisher_interval(r: float, influence: np.ndarray, confidence: float) -> IntervalEstimate:
+    """Return a correlation with the interval of its atanh; NaN between -1 and 1 if a column is constant."""
+    n = len(influence)
     if math.isnan(r):
         return IntervalEstimate(r, -1.0, 1.0, confidence, n)
+    # The deviation of sqrt(n) atanh r is zero for columns that determine each other.
+    spread = float(np.std(influence)) / (1 - r * r) if r * r < 1 else 0.0
+    half = float(stats.norm.ppf(upper_level(confidence))) * spread / math.sqrt(n - 3)
     with np.errstate(divide="ignore"):
         centre = np.arctanh(r)
     return IntervalEstimate(r, float(np.tanh(centre - half)), float(np.tanh(centre + half)), confidence, n)
