@@ -8,10 +8,10 @@ import dataclasses
 import itertools
 import pathlib
 from collections.abc import Iterator, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from diffabs.cli import console
@@ -38,7 +38,8 @@ FROM_PROOF = ("quadratically_stable", "stable", "verified_exactly", "decay_rate"
               "guaranteed_cost", "worst_vertex", "margins", "claims")  # fmt: skip
 FROM_DESIGN = ("lower_bound", "gap", "residual")
 SCHEDULE_CELLS = 8  # cells of the speed range; the Lyapunov matrix is linear in the speed in each cell
-SLIPS, MARGIN = 2001, 1.01  # samples of the friction curve, and a factor for a maximum between two samples
+# Samples of the friction curve and of the speed, and a factor for a maximum between two samples.
+SLIPS, SPEEDS, MARGIN = 2001, 33, 1.01
 VERDICT_WORDS = {True: "proved", False: "disproved", None: "undecided"}
 
 Box = dict[str, tuple[float, float]]
@@ -92,7 +93,7 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
 
     reduced, wanted = reduce_loop(chosen.loop), chosen.design
     states = reduced.model.states
-    values = reduced.gain if gain is None else _read_gain(gain, states)
+    typed = None if gain is None else _read_gain(gain, states)  # refused before anything is computed
     spec = Spec(Q=wanted.Q, R=wanted.R, decay=wanted.decay, damping=wanted.damping)
     try:
         spec = spec.check(len(states), 1)
@@ -100,6 +101,7 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
         raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
     solver.solvers()  # fails early if no SDP solver is installed
     reduced, model, over = _follow_speed(chosen.loop, reduced, wanted.box(chosen.loop))
+    values = reduced.gain if typed is None else typed
     systems = grid_polytope(model, over) if isinstance(model, BalanceModel) else polytope(model, over)
     return ProofTask(chosen, reduced, values, model, tuple(model.states), over, systems, spec)
 
@@ -107,37 +109,52 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
 def _follow_speed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoop", PyTree, Box]:
     """Return the linear model and its box; for a gain that follows the speed, the model in which it is one gain.
 
-    A proof for that model covers every fall of the speed that friction allows.
+    A proof for that model covers every fall of the speed that friction and resistances allow.
     """
     controller = inner_controller(loop.controller)
     if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):
         return reduced, reduced.model, box
     from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
+    from diffabs.design.state_feedback import feedback_gain
 
     model = SpeedScaled(model=reduced.model, reference_speed=controller.reference_speed)
     if model.period is None:
         raise ValueError("controller proportional-feedback: only sampled it can be brought to one gain")
-    slowest = box.get("speed", (float(reduced.model.speed),))[0]
-    # Conservative: the greatest deceleration over the box at the slowest speed, where the relative fall is greatest.
-    falls = (0.0, greatest_speed_fall(_greatest_deceleration(loop.plant, box, slowest), slowest, float(model.period)))
+    decelerations = _greatest_decelerations(loop.plant, box, speeds := _speeds(box, float(reduced.model.speed)))
+    # The relative fall grows with a/v: friction makes that greatest at the slowest speed, air drag at the fastest.
+    i = int(np.argmax(decelerations / speeds))
+    falls = (0.0, greatest_speed_fall(float(decelerations[i]), float(speeds[i]), float(model.period)))
     neglected = tuple(line for line in reduced.neglected if "fall of the speed" not in line)
     over = {f"model.{path}": ends for path, ends in box.items()} | {"fall": falls}
-    return reduced._replace(neglected=neglected), model, over
+    gain = np.asarray(feedback_gain(loop, model.states), float)  # at the reference speed
+    return reduced._replace(gain=gain, neglected=neglected), model, over
 
 
-def _greatest_deceleration(plant: Plant, box: Box, speed: float) -> float:
-    """Return an upper bound of the deceleration [m/s^2] by friction at a speed, over the corners of the box.
+def _speeds(box: Box, speed: float) -> np.ndarray:
+    """Return the ends of the box in the speed [m/s] and speeds between them, shape (SPEEDS,).
+
+    The ends suffice for friction and air drag: a = f + c v^2 and a/v are convex. Friction may depend on the speed.
+    """
+    return np.linspace(*box.get("speed", (speed, speed)), SPEEDS)
+
+
+def _greatest_decelerations(plant: Plant, box: Box, speeds: np.ndarray) -> np.ndarray:
+    """Return an upper bound of the deceleration [m/s^2] at each speed, over the corners of the box.
 
     The maximum over `SLIPS` slips times `MARGIN` allows for a greater value between two slips.
     """
     inside = {path.removeprefix("plant."): ends for path, ends in box.items() if path.startswith("plant.")}
 
-    def deceleration(plant: Plant, slip: Scalar) -> Any:
-        return plant.output(plant.start(BrakeStart(speed=speed, slip=slip))).deceleration
+    @jax.jit
+    def greatest(plant: Plant) -> Any:
+        def deceleration(speed: Scalar, slip: Scalar) -> Any:
+            return plant.output(plant.start(BrakeStart(speed=speed, slip=slip))).deceleration
 
-    slips = np.linspace(0.0, 1.0, SLIPS)
+        every = jax.vmap(jax.vmap(deceleration, (None, 0)), (0, None))
+        return jnp.max(every(speeds, np.linspace(0.0, 1.0, SLIPS)), axis=1)
+
     plants = (replace(plant, dict(zip(inside, corner, strict=True))) for corner in itertools.product(*inside.values()))
-    return MARGIN * max(float(np.max(jax.vmap(partial(deceleration, one))(slips))) for one in plants)
+    return MARGIN * np.max([np.asarray(greatest(one)) for one in plants], axis=0)
 
 
 def certify_gain(task: ProofTask) -> "Certificate":
@@ -177,8 +194,9 @@ class FurtherFindings(NamedTuple):
 
     Attributes:
         frozen: Poles of the closed loops at fixed parameters.
-        fall: Greatest fall of the speed [m/s^2] that friction allows, if stability is proved for all falls up to it.
-            The proof uses a Lyapunov matrix that depends on the speed. None if it fails or does not apply.
+        fall: Greatest fall of the speed [m/s^2] that friction and resistances allow, if stability is proved for all
+            falls up to it. The proof uses a Lyapunov matrix that depends on the speed. None if it fails or does not
+            apply.
     """
 
     frozen: "FrozenLoops"
@@ -205,7 +223,7 @@ def find_further(task: ProofTask, proof: "Certificate") -> FurtherFindings | Non
 
 
 def _permitted_fall(task: ProofTask) -> float | None:
-    """Return the greatest fall of the speed [m/s^2] that friction allows, if stability is proved for it; else None.
+    """Return the greatest fall of the speed [m/s^2] in the box, if stability is proved for it; else None.
 
     The Lyapunov matrix of the proof is piecewise linear in the speed.
     """
@@ -215,7 +233,7 @@ def _permitted_fall(task: ProofTask) -> float | None:
     low, high = task.over.get("speed", (0.0, 0.0))
     if not 0 < low < high or task.polytope.period is not None:
         return None
-    fall = _greatest_deceleration(task.chosen.loop.plant, task.over, low)
+    fall = float(_greatest_decelerations(task.chosen.loop.plant, task.over, _speeds(task.over, low)).max())
     cells = schedule(task.model, task.over, along="speed", nodes=SCHEDULE_CELLS)
     return fall if analysis.certify(task.gain, cells, Spec(rates=(-fall, 0.0))).stable else None
 

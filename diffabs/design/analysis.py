@@ -22,9 +22,11 @@ from diffabs.design.bounds import BOUND_LOOSENINGS, Bounds, decrease_matrix
 from diffabs.design.polytopes import Polytope, Schedule, as_gain_matrix
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
+from diffabs.design.proof.dyadic import RELATIVE_ERROR_BITS
+from diffabs.design.proof.exact import he
 from diffabs.design.sdp import solver
 from diffabs.design.sdp.scaling import analysis_frame, lyapunov_frame
-from diffabs.design.sdp.solver import Unknowns, he
+from diffabs.design.sdp.solver import Unknowns
 from diffabs.design.spec import Spec
 
 MAX_FRAMES = 4  # attempts, each in the frame of the last P
@@ -84,6 +86,10 @@ class _Analysis:
         self.closed = system.closed_loop(k)
         self.discrete = system.period is not None
         self.frame = analysis_frame(self.closed, discrete=self.discrete)
+        # Entries of A and B may be off by 2^-40, so no proof goes below: a deadbeat loop has a rate that is finite.
+        terms = np.abs(system.A) + np.abs(system.B) @ np.abs(k)
+        known = 2.0 ** (2 - RELATIVE_ERROR_BITS) * np.abs(np.linalg.eigvals(terms)).max()
+        self.least_factor = max(known, np.finfo(float).tiny)
 
     def claims(self, fastest: bool) -> Iterator[Claim]:
         """Yield the claims whose proof succeeds; `fastest` asks for the largest decay rate."""
@@ -147,7 +153,8 @@ class _Analysis:
         step = self.system.period or 1 / self.frame.tau
         # Each inequality is divided by the size of its vertex, so that one margin t is comparable over slow and fast
         # vertices.
-        sizes = np.linalg.norm(scaled, axis=(1, 2)) + 1.0 if self.discrete else np.linalg.norm(scaled, axis=(1, 2))
+        sizes = np.linalg.norm(scaled, axis=(1, 2))
+        sizes += 1.0 if self.discrete else sizes == 0
         one = np.eye(n)
         decreases = [
             unknowns.affine(
@@ -199,19 +206,22 @@ class _Analysis:
             if high - low <= DECAY_TOLERANCE * high:
                 break
             self.frame = lyapunov_frame(p, self.closed, np.eye(1), discrete=self.discrete)
-            better, _, w = self._common((low + high) / 2)
+            middle = (low + high) / 2
+            better, _, w = self._common(middle)
             if better is None:
                 break
-            high = min(high, self._least_refuted_rate(w))
-            if self._proved_rate(better) > low:
-                p, low = better, self._proved_rate(better)
+            high, rate = min(high, self._least_refuted_rate(w)), self._proved_rate(better)
+            if rate > low:
+                p, low = better, rate
+            else:  # beyond the solver's accuracy: the same program again would say the same
+                high = min(high, middle)
         return self._decay_claim(p, self.spec.decay) or claim
 
     def _slowest_mode(self) -> float:
         """Return the decay rate [1/s] of the slowest mode of all vertices."""
         modes = np.linalg.eigvals(self.closed)
         if self.discrete:
-            return -math.log(np.abs(modes).max()) / (self.system.period or 1.0)
+            return self._rate_of_factor(np.abs(modes).max())
         return -float(modes.real.max())
 
     def _least_refuted_rate(self, w: np.ndarray) -> float:
@@ -220,7 +230,7 @@ class _Analysis:
         if self.discrete:
             spread = (self.closed @ w @ np.swapaxes(self.closed, 1, 2)).sum(axis=0)
             least = np.linalg.eigvalsh(root @ spread @ root.T)[0]
-            return -math.log(max(least, 1e-300)) / 2 / (self.system.period or 1.0)
+            return self._rate_of_factor(least) / 2
         return -float(np.linalg.eigvalsh(root @ he(self.closed @ w).sum(axis=0) @ root.T)[0]) / 2
 
     def _proved_rate(self, p: np.ndarray) -> float:
@@ -231,8 +241,11 @@ class _Analysis:
             return -math.inf
         c = root @ self.closed @ np.linalg.inv(root)
         if self.discrete:
-            return -math.log(np.linalg.norm(c, ord=2, axis=(1, 2)).max()) / (self.system.period or 1.0)
+            return self._rate_of_factor(np.linalg.norm(c, ord=2, axis=(1, 2)).max())
         return -float(np.linalg.eigvalsh(he(c)).max()) / 2
+
+    def _rate_of_factor(self, factor: float) -> float:
+        return -math.log(max(factor, self.least_factor)) / (self.system.period or 1.0)
 
     def _rate_data(self, rate: float) -> dict[str, float]:
         """Return the rate as claim data: `rate` [1/s], or in discrete time a safely rounded `factor` per step."""

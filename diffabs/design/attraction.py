@@ -152,7 +152,7 @@ def classify_starts(
         Outcomes, each of shape (runs,). `unstable` is False everywhere with a band.
 
     Raises:
-        ValueError: A loop with a part for which no ellipsoid is known, and no band.
+        ValueError: A loop with a part for which no ellipsoid is known, and no band; or a band outside (0, inf).
     """
     starts = {path: np.asarray(column) for path, column in starts.items()}
     count = len(next(iter(starts.values())))
@@ -212,7 +212,7 @@ def region_of_attraction(
         Basin with outcomes of shape (n, m) for n and m cells.
 
     Raises:
-        ValueError: A loop with a part for which no ellipsoid is known, and no band.
+        ValueError: A loop with a part for which no ellipsoid is known, and no band; or a band outside (0, inf).
     """
     grid = np.meshgrid(first.centres, second.centres, indexing="ij")
     starts = {path: axis.ravel() for path, axis in zip(paths, grid, strict=True)}
@@ -285,10 +285,15 @@ def recoverable_multiple(
         engine: Engine of the runs, as in `run_batch`.
 
     Raises:
-        ValueError: A path outside the initial state, or a loop with a part for which no ellipsoid is known and no band.
+        ValueError: A path outside the initial state, no path, or a loop with a part for which no ellipsoid is known
+            and no band. Also `most` or a band that is not positive and finite.
     """
     if others := [path for path in direction if not path.startswith(INITIAL_PREFIX)]:
         raise ValueError(f"{', '.join(others)}: a direction is one of the initial state")
+    if not direction:
+        raise ValueError("direction = {}: it needs a value of the initial state")
+    if not 0 < most < np.inf:
+        raise ValueError(f"most = {most:g} is outside (0, inf)")
     alike = {path: np.full(SEARCH_POINTS, value) for path, value in direction.items()}
     # All starts of the search share one system, so its ellipsoid is computed once.
     inside = _system_ellipsoids(loop, alike, SEARCH_POINTS) if band is None else _ball_as_ellipsoid(band, SEARCH_POINTS)
@@ -322,5 +327,7 @@ def _system_ellipsoids(loop: Loop, starts: Mapping[str, np.ndarray], count: int)
 
 
 def _ball_as_ellipsoid(radius: float, count: int) -> _Ellipsoids:
-    """Return the ball |x| <= radius as the ellipsoid of all runs."""
+    """Return the ball |x| <= radius as the ellipsoid of all runs; raise ValueError for a radius that is no band."""
+    if not 0 < radius < np.inf:
+        raise ValueError(f"band = {radius:g} is outside (0, inf)")
     return _Ellipsoids(np.eye(6)[None] / radius, np.zeros(1, bool), np.zeros(count, int))

@@ -9,9 +9,10 @@ from diffabs.core.types import Matrix, PyTree, Scalar
 from diffabs.design.polytopes import Polytope
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Claim
+from diffabs.design.proof.exact import he
 from diffabs.design.sdp import solver
 from diffabs.design.sdp.scaling import Frame, analysis_frame, whitening_matrix
-from diffabs.design.sdp.solver import Unknowns, group_blocks, he, symmetric_from_blocks
+from diffabs.design.sdp.solver import Unknowns, group_blocks, symmetric_from_blocks
 from diffabs.design.spec import Spec
 
 # Relative amounts by which a bound is loosened, in this order, until its proof succeeds.

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.design.sdp.solver import he
+from diffabs.design.proof.exact import he
 
 MAX_PAIRED_VERTICES = 64  # no pairs are tried above this number of vertices
 RANGE_EXTENSION = 1e3  # factor by which a range extends beyond the last change of sign

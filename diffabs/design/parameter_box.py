@@ -10,6 +10,7 @@ inside. The systems between the checked points have no proof of coverage.
 
 import difflib
 import itertools
+import numbers
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -62,7 +63,8 @@ def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9,
     vertices. The factor is inf if the systems leave the plane of the corners (a curved dependence on one parameter).
     `corners` of such a polytope is empty.
 
-    Vertices inside the hull of the others are dropped. Coverage holds to 1e-9 of the range of an entry.
+    Vertices inside the hull of the others are dropped. Coverage holds to 1e-9 of the range of an entry. An entry that
+    varies by less than 1e-10 of its size counts as constant, and keeps its value at the first corner.
 
     Args:
         model: Model with `matrices()`, `states` and `period`.
@@ -119,7 +121,8 @@ def schedule(
     if along not in over:
         raise ValueError(f"along = '{along}' is not a parameter of the box; there is {', '.join(over) or 'nothing'}")
     low, high = (bound[along] for bound in check_box_bounds(model, over))
-    if isinstance(nodes, int):
+    if isinstance(nodes, numbers.Integral) and not isinstance(nodes, bool):
+        nodes = int(nodes)
         if nodes < 1:
             raise ValueError(f"nodes = {nodes} cells; it needs at least 1")
         at = np.geomspace(low, high, nodes + 1) if low > 0 else np.linspace(low, high, nodes + 1)
@@ -127,7 +130,9 @@ def schedule(
         at = np.array(nodes, float)
     fits = at.ndim == 1 and len(at) > 1 and bool(np.all(np.diff(at) > 0))
     if not (fits and np.allclose(at[[0, -1]], [low, high], rtol=1e-12, atol=0)):
-        raise ValueError(f"nodes = {at.tolist()} do not increase from {low:g} to {high:g}, the ends of {along}")
+        raise ValueError(
+            f"nodes = {at.tolist() if at.ndim else nodes} do not increase from {low:g} to {high:g}, the ends of {along}"
+        )
     cells = [polytope(model, {**over, along: (a, b)}, **options) for a, b in itertools.pairwise(at.tolist())]
     return Schedule(along, at, tuple(cells))
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.types import AnyArray, Matrix
 
 MAX_VERTICES = 2**12  # each vertex adds an LMI
@@ -72,6 +73,8 @@ class Polytope:
             raise ValueError(f"a polytope of {a[0]} vertices is outside [1, {MAX_VERTICES}]: an LMI for each")
         if not (np.isfinite(self.A).all() and np.isfinite(self.B).all()):
             raise ValueError("a vertex of the polytope has an entry that is not finite")
+        if self.period is not None and (objection := find_value_objection(self.period)):
+            raise ValueError(f"period = {format_value(self.period)} {objection}")
         if self.period is not None and not 0 < self.period < math.inf:
             raise ValueError(f"period = {self.period:g} is outside (0, inf) s")
 
@@ -109,7 +112,8 @@ class Schedule:
         cells: Polytopes; `cells[i]` holds between `nodes[i]` and `nodes[i + 1]`.
 
     Raises:
-        ValueError: Nodes that do not increase or do not fit the cells, or cells that differ in order, inputs or period.
+        ValueError: Nodes that are not finite, do not increase or do not fit the cells. Also cells that differ in order,
+            inputs or period.
     """
 
     parameter: str
@@ -117,9 +121,10 @@ class Schedule:
     cells: tuple[Polytope, ...]
 
     def __post_init__(self) -> None:
-        """Convert the nodes to float64; check that they increase, and that one cell lies between two of them."""
+        """Convert the nodes to float64; check that they are finite, increase, and have one cell between two of them."""
         object.__setattr__(self, "nodes", np.array(self.nodes, float))
-        if len(self.nodes) != len(self.cells) + 1 or not self.cells or not (np.diff(self.nodes) > 0).all():
+        rising = np.isfinite(self.nodes).all() and (np.diff(self.nodes) > 0).all()
+        if len(self.nodes) != len(self.cells) + 1 or not self.cells or not rising:
             raise ValueError(f"a schedule of {len(self.cells)} cells needs one node more, increasing: {self.nodes}")
         if len({(cell.order, cell.inputs, cell.period) for cell in self.cells}) != 1:
             raise ValueError("the cells of a schedule differ in order, inputs or period")

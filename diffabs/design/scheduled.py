@@ -20,9 +20,10 @@ from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
 from diffabs.design.polytopes import Schedule, as_gain_matrix
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
+from diffabs.design.proof.exact import he
 from diffabs.design.sdp import solver
 from diffabs.design.sdp.scaling import Frame, analysis_frame
-from diffabs.design.sdp.solver import Unknowns, group_blocks, he
+from diffabs.design.sdp.solver import Unknowns, group_blocks
 from diffabs.design.spec import Spec
 
 SCHEDULE_DECAY_TOLERANCE = 0.01  # relative width at which the search for the fastest decay stops
@@ -47,7 +48,7 @@ def certify_schedule(gain: AnyArray, system: Schedule, spec: Spec, *, fastest: b
         ModuleNotFoundError: cvxpy is not installed.
     """
     first = system.cells[0]
-    spec = spec.check(first.order, first.inputs)
+    spec = spec.check(first.order, first.inputs, scheduled=True)
     if spec.rates is None or first.period is not None:
         raise ValueError("a schedule needs rates, the bounds of its parameter's derivative, and continuous time")
     if spec.damping or spec.l2 or spec.input:

@@ -38,8 +38,8 @@ class L2Gain:
 
     Attributes:
         output: C, shape (z, n).
-        feedthrough: D, shape (z, m); None stands for 0.
-        disturbance: E, shape (n, w); None lets w act at the input, E = B.
+        feedthrough: D, shape (z, m), or a vector for one input or one output; None stands for 0.
+        disturbance: E, shape (n, w), or (n,) for one disturbance; None lets w act at the input, E = B.
         bound: Bound of the gain that `design` keeps. None lets `design` minimise the gain, which excludes Q and R.
             `certify` ignores it and proves the smallest gain.
     """
@@ -73,8 +73,10 @@ class Spec:
     l2: L2Gain | None = None
     rates: tuple[float, float] | None = None
 
-    def check(self, order: int, inputs: int) -> "Spec":
+    def check(self, order: int, inputs: int, *, scheduled: bool = False) -> "Spec":
         """Return the specification with full matrices, for a system of `order` states and `inputs` inputs.
+
+        Only a schedule (`scheduled`) has rates.
 
         Raises:
             ValueError: A field that does not fit; the message names it, its value and the allowed range.
@@ -91,6 +93,8 @@ class Spec:
         _check_number("damping", self.damping, DAMPING_RANGE)
         if self.rates is not None:
             _check_rates(self.rates)
+            if not scheduled:
+                raise ValueError("rates belong to a schedule: a polytope admits every rate, so a spec of it has none")
         limit, gain = self.input, self.l2
         if limit:
             values, points = np.atleast_1d(np.array(limit.limit, float)), np.atleast_2d(np.array(limit.points, float))
@@ -102,20 +106,24 @@ class Spec:
             limit = InputLimit(values, points)
         if gain:
             c = np.atleast_2d(np.array(gain.output, float))
-            d = np.zeros((len(c), inputs))
-            if gain.feedthrough is not None:
-                d = np.array(gain.feedthrough, float).reshape(len(c), -1)
-            e = None if gain.disturbance is None else np.array(gain.disturbance, float).reshape(order, -1)
+            d = np.zeros((len(c), inputs)) if gain.feedthrough is None else _as_matrix(gain.feedthrough, len(c))
+            e = None if gain.disturbance is None else _as_matrix(gain.disturbance, order)
             fits = c.shape[1:] == (order,) and d.shape == (len(c), inputs)
             if not (fits and np.isfinite(c).all() and np.isfinite(d).all()):
                 needed = f"finite ones of ({len(c)}, {order}) and ({len(c)}, {inputs}) are needed"
                 raise ValueError(f"L2 output C {c.shape} and feedthrough D {d.shape}: {needed}")
-            if e is not None and not np.isfinite(e).all():
-                raise ValueError("the L2 disturbance matrix has an entry that is not finite")
+            if e is not None and not (e.ndim == 2 and len(e) == order and e.size and np.isfinite(e).all()):
+                raise ValueError(f"L2 disturbance E {e.shape}: a finite one of ({order}, w) is needed")
             if gain.bound is not None:
                 _check_number("L2 bound", gain.bound, L2_RANGE)
             gain = L2Gain(c, d, e, gain.bound)
         return dataclasses.replace(self, **weights, input=limit, l2=gain)
+
+
+def _as_matrix(value: Matrix, rows: int) -> np.ndarray:
+    """Return a matrix unchanged; a number or a vector becomes one column of so many rows, or else one row."""
+    array = np.array(value, float)
+    return array if array.ndim > 1 else array.reshape((rows, 1) if array.size == rows else (1, -1))
 
 
 def _check_number(name: str, value: Scalar, allowed: ParameterSpec) -> None:

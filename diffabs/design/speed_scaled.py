@@ -57,8 +57,7 @@ class SpeedScaled:
 def greatest_speed_fall(deceleration: float, speed: float, period: float) -> float:
     """Return v/v+ - 1 [1] for a speed v that falls at a constant deceleration over one period.
 
-    The lower the speed, the larger the result. It has no meaning unless `speed` exceeds deceleration times period, and
-    the function does not check this.
+    The lower the speed, the larger the result.
 
     Args:
         deceleration: Greatest deceleration [m/s^2].
@@ -66,8 +65,11 @@ def greatest_speed_fall(deceleration: float, speed: float, period: float) -> flo
         period: Sampling period [s].
 
     Raises:
-        ZeroDivisionError: The speed falls to exactly 0 within the period.
+        ValueError: The speed falls to 0 within the period.
     """
+    if not deceleration * period < speed:
+        needed = f"a speed above {deceleration * period:g} m/s is needed"
+        raise ValueError(f"speed = {speed:g} m/s ends in a period of {period:g} s at {deceleration:g} m/s^2: {needed}")
     return deceleration * period / (speed - deceleration * period)
 
 

@@ -46,7 +46,7 @@ class ReducedLoop(NamedTuple):
 
     Attributes:
         model: Linear model of the plant, the actuator and the filter.
-        gain: Gain K, shape (n,).
+        gain: Gain K, shape (n,), at the speed of the model.
         exact: Whether the model with this gain is the loop's own linearisation near the target, at a frozen speed.
             Limits do not count against it, because they are inactive there. A delay does, and so does a sensor with
             dynamics or rounding.
@@ -92,6 +92,8 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
         integral=integral != 0,
     )
     gain = np.asarray(feedback_gain(loop, check_part(model).states), float)
+    if isinstance(controller, ProportionalFeedback):
+        gain = gain * (model.speed / float(controller.reference_speed))
     units = units_of(loop.plant)
     left_out = (*_controller_omissions(controller), *by_actuator, *_loop_omissions(loop))
     neglected = tuple(insert_unit(line, units) for line in left_out)

@@ -25,10 +25,10 @@ import numpy as np
 from diffabs.design.analysis import certify
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof.certificate import Certificate
+from diffabs.design.proof.exact import he
 from diffabs.design.sdp import solver as lmi
 from diffabs.design.sdp.program import DesignProgram
 from diffabs.design.sdp.scaling import Frame, design_frames
-from diffabs.design.sdp.solver import he
 from diffabs.design.spec import Spec
 
 GAP = 1e-6  # largest relative distance of an answer from the optimum
@@ -130,7 +130,7 @@ def pool_vertices(system: Polytope | Schedule) -> Polytope:
 
 
 def _check_specification(system: Polytope | Schedule, whole: Polytope, spec: Spec) -> Spec:
-    spec = spec.check(whole.order, whole.inputs)
+    spec = spec.check(whole.order, whole.inputs, scheduled=isinstance(system, Schedule))
     if spec.Q is None and (spec.l2 is None or spec.l2.bound is not None):
         raise ValueError("nothing to minimise: give the weights Q and R, or an L2 gain without a bound")
     if spec.Q is not None and spec.l2 is not None and spec.l2.bound is None:

@@ -60,7 +60,9 @@ def as_weight_matrix(name: str, value: Scalar, size: int, *, definite: bool) -> 
     if not is_symmetric(array):
         raise ValueError(f"{name} = {array.tolist()} is not symmetric")
     lowest, largest = np.linalg.eigvalsh(array)[[0, -1]]
-    if lowest < -1e-13 * max(largest, 0.0) or largest < 0 or (definite and lowest <= 0):
+    # Rounding makes an eigenvalue of a product negative, but no entry on the diagonal.
+    negative = lowest < -1e-13 * max(largest, 0.0) or largest < 0 or (np.diag(array) < 0).any()
+    if negative or (definite and lowest <= 0):
         kind, allowed = ("definite", "(0, inf)") if definite else ("semidefinite", "[0, inf)")
         raise ValueError(f"{name} is not positive {kind}: an eigenvalue is {lowest:g}, outside {allowed}")
     return (array + array.T) / 2

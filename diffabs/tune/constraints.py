@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from diffabs.core.loop import Loop
 from diffabs.core.types import Params, PyTree, Scalar
-from diffabs.design.interior.differentiable import certified_decay
+from diffabs.design.interior.decay_rate import certified_decay
 from diffabs.design.polytopes import Polytope
 from diffabs.design.state_feedback import feedback_gain
 
@@ -102,7 +102,7 @@ class CertifiedDecay:
     """The constraint that a common Lyapunov matrix proves a minimum decay rate at every vertex.
 
     The proof holds for a system that varies arbitrarily fast between the vertices (`certified_decay` of
-    `design.interior.differentiable`). The gain is the same as in `Poles`. The computation uses floating point: apply
+    `design.interior.decay_rate`). The gain is the same as in `Poles`. The computation uses floating point: apply
     `certify` to the result for a rigorous proof.
 
     Attributes:

@@ -4,6 +4,7 @@ import json
 import pathlib
 import subprocess
 import sys
+import types
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,12 +14,14 @@ from mutants import killed_by
 from project import ROOT
 from seams import replace_seam
 
+from diffabs.cli import certificates
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Scalar
 from diffabs.design import Certificate, DesignError
 from diffabs.design.frozen import analyse_frozen_loops
 from diffabs.design.sdp import solver
 from diffabs.linear.linearization import StateSpace
+from diffabs.scenario.scenario import load
 
 CHECKER = ROOT / "experiments" / "check_certificate.py"
 KEYS = [
@@ -244,6 +247,68 @@ def test_what_is_known_besides_of_the_published_gain():
     assert rows["common Lyapunov matrix"] == "disproved"
     assert rows["systems of the ranges, each fixed"] == "289 of 289 stable"
     assert rows["proved stable for a speed falling by no more than"] == "7.918"
+
+
+VEHICLE = """
+[plant]
+type = "road-vehicle"
+[road]
+type = "magic-formula"
+D = 0.3
+[initial]
+speed_kmh = 180.0
+slip = 0.0
+[reference]
+type = "fixed-slip"
+slip = 0.1
+[feedforward]
+type = "holding-input"
+[controller]
+type = "sampled"
+period = 1e-3
+[controller.controller]
+type = "proportional-feedback"
+gain = [-50000.0, -9000.0]
+[design.over]
+"initial.speed_kmh" = [144.0, 198.0]
+"""
+ONE_GAIN = ("proportional-feedback", "state-feedback")
+
+
+def greatest_deceleration(speed):
+    """[m/s^2] on the friction curve's peak, 0.3: friction, air drag and rolling resistance."""
+    return (4316.4 * 0.3 + 0.856 * speed**2) / 440.0 + 0.01 * 9.81
+
+
+@killed_by("cli/certificates.py", "i = int(np.argmax(decelerations / speeds))", "i = 0")
+@killed_by("design/speed_scaled.py", "if not deceleration * period < speed:", "if False:")
+def test_the_relative_fall_counts_air_drag_at_every_speed(tmp_path):
+    path = tmp_path / "vehicle.toml"
+    path.write_text(VEHICLE)
+    task = certificates.build_proof_task(load(path))
+    fall = 1.01e-3 * greatest_deceleration(55.0)
+    np.testing.assert_allclose(task.over["fall"][1], fall / (55.0 - fall), rtol=1e-4)
+    assert task.gain.tolist() == [-50000.0, -9000.0, 0.0]  # at the controller's reference speed
+    path.write_text(VEHICLE.replace("[144.0, 198.0]", "[0.01, 198.0]"))
+    with pytest.raises(ValueError, match=r"speed = 0.00277778 m/s ends in a period of 0.001 s"):
+        certificates.build_proof_task(load(path))
+
+
+@killed_by("cli/certificates.py", "_speeds(task.over, low)).max()", "_speeds(task.over, low)).min()")
+@pytest.mark.slow
+def test_the_greatest_fall_is_at_one_end_of_the_speeds(tmp_path, monkeypatch):
+    path = tmp_path / "vehicle.toml"
+    path.write_text(VEHICLE.replace("[144.0, 198.0]", "[18.0, 198.0]"))
+    fall = 1.01e-3 * greatest_deceleration(5.0)
+    np.testing.assert_allclose(
+        certificates.build_proof_task(load(path)).over["fall"][1], fall / (5.0 - fall), rtol=1e-4
+    )
+    continuous = VEHICLE.replace('type = "sampled"\nperiod = 1e-3\n[controller.controller]\n', "").replace(*ONE_GAIN)
+    path.write_text(continuous)
+    task, proof = certificates.build_proof_task(load(path)), types.SimpleNamespace(quadratically_stable=None)
+    replace_seam(monkeypatch, "certify", lambda gain, cells, spec: types.SimpleNamespace(stable=True))
+    found = certificates.find_further(task, proof)
+    np.testing.assert_allclose(found.fall, 1.01 * greatest_deceleration(55.0), rtol=1e-4)
 
 
 @killed_by("design/frozen.py", "int((rates > 0).sum())", "len(grid)")

@@ -131,6 +131,19 @@ def test_the_largest_multiple_that_is_recovered(voltage):
     assert not arm_stays_up(HANGING, GAIN, (found.multiple + 1e-4) * START, voltage)
 
 
+@killed_by("design/attraction.py", "if not 0 < radius < np.inf:", "if False:")
+@killed_by("design/attraction.py", "if not 0 < most < np.inf:", "if False:")
+def test_no_band_and_no_search_without_a_size():
+    for band in (0.0, -0.1, np.nan):
+        with pytest.raises(ValueError, match=rf"band = {band:g} is outside \(0, inf\)"):
+            classify_starts(closed(), {"initial.theta": np.zeros(2)}, SOLVER, band=band)
+    for most in (-1.0, 0.0, np.inf):
+        with pytest.raises(ValueError, match=rf"most = {most:g} is outside \(0, inf\)"):
+            recoverable_multiple(closed(), DIRECTION, SOLVER, most=most)
+    with pytest.raises(ValueError, match=r"direction = \{\}: it needs a value of the initial state"):
+        recoverable_multiple(closed(), {}, SOLVER)
+
+
 @pytest.mark.slow
 def test_nothing_and_all_can_be_recovered():
     assert recoverable_multiple(closed(), DIRECTION, SOLVER, most=0.01) == (0.01, False)

@@ -22,6 +22,7 @@ from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
 from diffabs.design.spec import L2Gain, Spec
+from diffabs.design.verify import verify_file
 
 OUTSIDERS = ROOT / "experiments" / "check_certificate.py"
 spec = importlib.util.spec_from_file_location("check_certificate", OUTSIDERS)
@@ -755,9 +756,33 @@ def test_large_files_and_systems_are_refused(tmp_path):
     (tmp_path / "x.json").write_text(" " * (2**24 + 1))
     with pytest.raises(ValueError, match="larger than"):
         Certificate.load(tmp_path / "x.json")
-    Certificate(Polytope(np.zeros((1, 64, 64)), np.zeros((1, 64, 1))), np.zeros((1, 64)), ()).save(tmp_path / "y.json")
-    with pytest.raises(ValueError, match="more than 64 states and inputs"):
+
+
+@killed_by("design/proof/serialise.py", "max(cell.order, cell.inputs) >", "cell.order + cell.inputs >")
+@killed_by("design/proof/serialise.py", "if len(content) > MAX_CERTIFICATE_BYTES:", "if False:")
+def test_what_is_saved_is_read_by_both_readers(tmp_path):
+    """Up to 64 states and 64 inputs; what a reader refuses is not written."""
+
+    def save(states, inputs, vertices=1):
+        system = Polytope(np.full((vertices, states, states), 1 / 3), np.zeros((vertices, states, inputs)))
+        Certificate(system, np.zeros((inputs, states)), ()).save(tmp_path / "y.json")
+
+    save(40, 30)
+    assert Certificate.load(tmp_path / "y.json").gain.shape == (30, 40)
+    assert verify_file(tmp_path / "y.json") == []
+    for too_many in ((65, 1), (1, 65)):
+        with pytest.raises(ValueError, match="more than 64 states or inputs"):
+            save(*too_many)
+    with pytest.raises(ValueError, match=r"the certificate is larger than 16777216 bytes"):
+        save(64, 1, vertices=170)
+    given = json.loads((tmp_path / "y.json").read_text())
+    given["gain"], system = [[0.0]] * 65, given["system"]
+    system["A"], system["B"] = [[[0.0]]], [[[0.0] * 65]]
+    (tmp_path / "y.json").write_text(json.dumps(given))
+    with pytest.raises(ValueError, match="more than 64 states or inputs"):
         Certificate.load(tmp_path / "y.json")
+    with pytest.raises(ValueError, match="more than 64 states or inputs"):
+        verify_file(tmp_path / "y.json")
 
 
 def test_claims_that_do_not_fit_the_time_are_refused():
@@ -805,6 +830,7 @@ def test_costs_are_rounded_up_and_only_claimed_until_proved():
 
 @killed_by("design/spec.py", "if find_value_objection(value) or np.ndim(value):", "if False:", case="text")
 @killed_by("design/spec.py", "np.shape(rates) != (2,)", "False", case="one rate")
+@killed_by("design/spec.py", "if not scheduled:", "if False:", case="of a polytope")
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -816,6 +842,7 @@ def test_costs_are_rounded_up_and_only_claimed_until_proved():
         pytest.param({"rates": (1.0, "2")}, r"rates = \(1.0, '2'\) is not a pair", id="rate of text"),
         pytest.param({"rates": (2.0, 1.0)}, r"rates = \(2.0, 1.0\) is not a pair", id="inverted"),
         pytest.param({"rates": (0.0, math.nan)}, r"rates = \(0.0, nan\) is not a pair", id="nan"),
+        pytest.param({"rates": (-1.0, 0.0)}, "rates belong to a schedule", id="of a polytope"),
     ],
 )
 def test_a_specification_says_what_does_not_fit(given, message):

@@ -13,7 +13,7 @@ from seams import replace_seam
 from diffabs.actuators import Lag
 from diffabs.core.pytree import param, pytree, replace
 from diffabs.design.parameter_box import polytope, schedule
-from diffabs.design.polytopes import Polytope
+from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.plants import MirroredRig
@@ -230,6 +230,7 @@ def test_schedule():
     for low, high, cell in zip(chain.nodes[:-1], chain.nodes[1:], chain.cells, strict=True):
         assert {c["speed"] for c in cell.corners} == {low, high}
         assert cell.vertices == 4
+    assert len(schedule(SlipModel(), PAPER, "speed", np.int64(2), grid=2).cells) == 2
     given = schedule(SlipModel(), PAPER, "speed", [SPEED[0], 3.0, SPEED[1]], grid=3)
     assert given.nodes.tolist() == [SPEED[0], 3.0, SPEED[1]]
     linear = schedule(made(lambda p, q: scalars(p, q)), UNIT, "p", 2, grid=3)
@@ -243,6 +244,7 @@ def test_schedule():
         ("speed", 0, "nodes = 0 cells; it needs at least 1"),
         ("speed", [2.0, 3.0], r"nodes = \[2.0, 3.0\] do not increase from 1.38889 to 13.8889, the ends of speed"),
         ("speed", [SPEED[0], 9.0, 8.0, SPEED[1]], "do not increase from"),
+        ("speed", True, "nodes = True do not increase from"),
     ],
 )
 def test_schedule_errors(along, nodes, message):
@@ -296,6 +298,14 @@ def test_errors(model, over, message):
 def test_a_period_that_is_not_positive_is_refused(period):
     with pytest.raises(ValueError, match=rf"period = {period:g} is outside \(0, inf\) s"):
         Polytope([[[0.5]]], [[[1.0]]], period)
+
+
+def test_nodes_are_finite_and_a_period_is_a_number():
+    cell = Polytope([[[-1.0]]], [[[1.0]]])
+    with pytest.raises(ValueError, match=r"needs one node more, increasing: .*inf"):
+        Schedule("v", [0.0, np.inf], (cell,))
+    with pytest.raises(ValueError, match="period = True is a truth value"):
+        Polytope([[[0.5]]], [[[1.0]]], True)
 
 
 def test_matrices_that_are_not_finite():

@@ -267,6 +267,39 @@ def test_decay_of_one_system_is_that_of_its_slowest_mode():
         np.testing.assert_allclose(by_gain, slope, rtol=1e-4, atol=1e-6 * np.abs(slope).max())
 
 
+CHAIN = {n: (jnp.eye(n, k=1)[None], jnp.eye(n)[None, :, -1:]) for n in (1, 2, 3)}  # companion matrices with K below
+
+
+@killed_by("design/interior/decay_rate.py", "jnp.where(possible, new, old)", "new")
+@killed_by("design/interior/decay_rate.py", "path.settled >= FINAL_CENTRE_STEPS, jnp", "path.settled >= 0, jnp")
+def test_decay_at_a_multiple_pole_is_just_below_it():
+    """(s + p)^n, or (z - p)^n: no P proves the rate of the pole itself."""
+    at_poles = (((-1.0, -2.0), 1.0), ((-4.0, -4.0), 2.0), ((-1e4, -200.0), 100.0), ((0.0, 0.0), 0.0))
+    for gain, truth in at_poles:
+        rate, slope = decay(jnp.array(gain), *CHAIN[2])
+        assert truth * (1 - 1e-6) - 1e-12 <= rate < truth
+        assert np.isnan(slope).all()
+    rate, slope = decay(jnp.array((-0.25, 1.0)), *CHAIN[2], 2.0)  # period 2 s, poles 0.5
+    assert (1 - 1e-6) * np.log(2) / 2 <= rate < np.log(2) / 2
+    assert np.isnan(slope).all()
+    assert 1 - 1e-4 <= decay(jnp.array((-1.0, -3.0, -3.0)), *CHAIN[3])[0] < 1
+    near = 1e-8  # the poles of (s + 1)^2 + near s
+    rate = decay(jnp.array((-1.0, -2.0 - near)), *CHAIN[2])[0]
+    np.testing.assert_allclose(rate, 1 + near / 2 - np.sqrt(near + near**2 / 4), rtol=1e-8)
+
+
+@killed_by("design/interior/decay_rate.py", "(s * jnp.abs(jnp.log(s)), jnp.minimum(size, s))", "(jnp.abs(s - 1), size)")
+def test_decay_of_a_fast_sampled_loop_is_that_of_its_pole():
+    for pole in (0.9, 1e-2, 1e-3, 1e-5, 1e-12):
+        rate, slope = decay(jnp.array([pole]), *CHAIN[1], 0.5)
+        np.testing.assert_allclose(rate, -np.log(pole) / 0.5, rtol=1e-8)
+        np.testing.assert_allclose(slope, -1 / pole / 0.5, rtol=1e-5)
+    for states in (1, 2):  # deadbeat: every rate is proved by some P, and none is the largest
+        rate, slope = decay(jnp.zeros(states), *CHAIN[states], 0.5)
+        assert 50 < rate < np.inf
+        assert np.isnan(slope).all()
+
+
 @pytest.mark.slow
 def test_decay_of_any_gain_has_a_derivative():
     """Stable or not, over ten decades, compiled and batched; and in the vertices."""

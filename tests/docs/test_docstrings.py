@@ -164,7 +164,7 @@ def is_a_place(place):
     return any(home.is_dir() or any(home.parent.glob(f"{home.name}.*")) for home in homes)
 
 
-@killed_by("tune/constraints.py", "`design.interior.differentiable`", "`design.sensitivity`")
+@killed_by("tune/constraints.py", "`design.interior.decay_rate`", "`design.sensitivity`")
 def test_what_is_named_is_there():
     """In the text of the package and on the pages: dotted names, and places such as `simulate/batch`."""
     for path in [*HOME.rglob("*.py"), *(HOME.parent / "docs").rglob("*.md")]:

@@ -16,6 +16,7 @@ from diffabs.controllers import (
     BackCalculation,
     ConstantTorque,
     HoldingInput,
+    ProportionalFeedback,
     Relay,
     Sampled,
     SlidingMode,
@@ -287,6 +288,10 @@ def modes(matrix):
 
 CONTROLLERS = {
     "state feedback": (StateFeedback(), ["integral of slip error", "slip error"]),
+    "proportional": (  # to the speed, here 9 m/s
+        ProportionalFeedback(gain=np.array([-8000.0, -200.0])),
+        ["integral of slip error", "slip error"],
+    ),
     "p": (PID(kp=300.0, high=np.inf, low=0.0), ["slip error"]),
     "pi": (PID(kp=300.0, ki=900.0, low=0.0, high=90.0), ["integral of slip error", "slip error"]),
     "pd": (PID(kp=300.0, kd=4.0, low=0.0, high=90.0), ["slip error", "filtered slip error"]),
@@ -300,6 +305,9 @@ CONTROLLERS = {
 CASES = [("rig", name, Direct()) for name in CONTROLLERS] + [("rig", "pid", RateLimit()), ("car", "pid", Lag())]
 
 
+@killed_by(
+    "design/state_feedback.py", "gain = gain * (model.speed / float(controller.reference_speed))", "gain = 1.0 * gain"
+)
 @pytest.mark.parametrize(("plant", "name", "actuator"), CASES)
 def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
     """The real loop's flow in the coordinates (slip, speed, distance): held exactly, the slip's rate is zero at any

@@ -1,8 +1,8 @@
 """The fastest decay that a common Lyapunov matrix proves for a gain, differentiable in the gain. Pure JAX.
 
-    minimise s   subject to   S_i = s X - L_i(X) >= 0,  X > 0        L(X) = He[C X],  or C X C' - X in discrete time
+    minimise s   subject to   S_i = s X - L_i(X) >= 0,  X > 0        L(X) = He[C X],  or C X C' in discrete time
 
-P = X^-1; the rate is -s/2, or -ln(1 + s)/(2 period). The problem is quasiconvex (s X is a product). With W_i = S_i^-1,
+P = X^-1; the rate is -s/2, or -ln(s)/(2 period). The problem is quasiconvex (s X is a product). With W_i = S_i^-1,
 the central path is the curve
 
     sum trace(W_i X) = 1/mu,      sum [s W_i - L_i*(W_i)] + X^-1 = (V + 1) n M/trace(M X)
@@ -69,14 +69,14 @@ def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -
 
     The first inequality is for continuous time, the second for discrete time. The rate also holds while the system
     varies. It is negative if no common P proves stability. It is below the largest rate by at most 1e-8 of itself, up
-    to rounding.
+    to rounding. This accuracy and the derivative need float64.
 
     The function works under jit, vmap and both modes of differentiation, to first order only. The derivative uses the
     multipliers W_i of the optimum: sum <W_i, d left side> = 0.
 
     If the optimum is not unique (two modes equally slow), the derivative is one of the possible ones. If the optimum is
-    not attained (a double pole, no feedback at all), the rate is one that some P proves. It is then smaller than the
-    largest, and the derivative is large. The result is NaN for input that is not finite.
+    not attained (a double pole, a deadbeat loop, whose largest rate is infinite), the rate is one that some P proves.
+    It is then below the largest, and the derivative is NaN. The rate is NaN for input that is not finite.
 
     Args:
         gain: Gain K of u = K x, shape (m, n) or (n,).
@@ -86,7 +86,7 @@ def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -
     """
     A, B, K = as_float_arrays(A, B, jnp.atleast_2d(jnp.asarray(gain)))
     shift = _least_shift(period is not None, A + B @ K)
-    return -shift / 2 if period is None else -jnp.log1p(shift) / 2 / period
+    return -shift / 2 if period is None else -jnp.log(shift) / 2 / period
 
 
 # The implicit derivative at the optimum, instead of one through some hundred iterations.
@@ -110,7 +110,10 @@ def _least_shift_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -> Matri
 
 @partial(jax.jit, static_argnums=0)
 def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree]:
-    """Return s, T with T T' = X, and the multipliers W (V, n, n) at X = I, at the path's end."""
+    """Return s, T with T T' = X, and the multipliers W (V, n, n) at X = I, at the path's end.
+
+    W is NaN if the path did not settle at an optimum; s then still satisfies the inequalities with X.
+    """
     vertices, n, _ = closed.shape
     one = jnp.eye(n, dtype=closed.dtype)
     units = _balancing_units(jnp.mean(jnp.abs(closed), 0))
@@ -129,8 +132,11 @@ def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree
         scaled = inverse[:, None] * path.T
         c, m = _transform_loops(closed, path.T), scaled.T @ scaled / jnp.sum(scaled**2)
         T, s, decrement = _step(c, path, m, discrete)
-        size = _largest_norm(_lyapunov_operator(_transform_loops(closed, T), one, discrete))
-        end = jnp.maximum(SHIFT_GAP * jnp.abs(s), ROUNDING_SHIFT_GAP * size) / (vertices + 1) / n
+        left = _lyapunov_operator(_transform_loops(closed, T), one, discrete)
+        size = _largest_norm(left - one if discrete else left)
+        # A change ds of s changes the rate times 2 period by ds/s: near s = 0 only small ones leave the rate accurate.
+        unit, size = (s * jnp.abs(jnp.log(s)), jnp.minimum(size, s)) if discrete else (jnp.abs(s), size)
+        end = jnp.maximum(SHIFT_GAP * unit, ROUNDING_SHIFT_GAP * size) / (vertices + 1) / n
         last = path.mu <= 1.01 * end
         # Without an attained optimum P degenerates and the decrement stays large: after MAX_STEPS_PER_MU steps mu falls
         # anyway.
@@ -141,11 +147,13 @@ def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree
 
     path = lax.while_loop(goes_on, advance, start)
     slack = path.s * one - _lyapunov_operator(_transform_loops(closed, path.T), one, discrete)
-    return jnp.where(jnp.isfinite(path.decrement), path.s, jnp.nan), path.T, jnp.linalg.inv(slack)
+    weights = jnp.where(path.settled >= FINAL_CENTRE_STEPS, jnp.linalg.inv(slack), jnp.nan)
+    # The first decrement is 0 times the size of the loops: NaN if they are not finite.
+    return path.s + start.decrement, path.T, weights
 
 
 def _step(c: Scalar, path: _DecayPathState, m: Scalar, discrete: bool) -> tuple[PyTree, PyTree, PyTree]:
-    """Return T and s after a step, and the decrement before it.
+    """Return T and s after a step, and the decrement before it; NaN for the decrement if no step is possible.
 
     `c` and `m` = M/trace M are in the coordinates of the point.
     """
@@ -170,8 +178,12 @@ def _step(c: Scalar, path: _DecayPathState, m: Scalar, discrete: bool) -> tuple[
     # With s X in place of s X0: finite exactly where the new point satisfies the true inequality.
     admitted = logdet(model + (t[:, None, None] * x)[:, None]).sum(-1)
     values = t / path.mu - logdet(model).sum(-1) - logdet(one + x) + degree * jnp.log1p(jnp.sum(m * x, (1, 2)))
-    best = jnp.argmin(jnp.where(jnp.isfinite(values + admitted), values, jnp.inf))
-    return path.T @ jnp.linalg.cholesky(one + x[best]), s + t[best], decrement
+    values = jnp.where(jnp.isfinite(values + admitted), values, jnp.inf)
+    best = jnp.argmin(values)
+    possible, point = jnp.isfinite(values[best]), (path.T @ jnp.linalg.cholesky(one + x[best]), s + t[best])
+    # Without a possible length the path ends where it is, at the last point whose inequality holds.
+    T, s = (jnp.where(possible, new, old) for new, old in zip(point, (path.T, s), strict=True))
+    return T, s, jnp.where(possible, decrement, jnp.nan)
 
 
 def _newton_step_in_plane(gradient: Matrix, hessian: Matrix, normal: Matrix) -> tuple[PyTree, PyTree]:
@@ -187,7 +199,7 @@ def _newton_step_in_plane(gradient: Matrix, hessian: Matrix, normal: Matrix) -> 
 
 def _lyapunov_operator(c: Scalar, x: Scalar, discrete: bool) -> Matrix:
     """Return L(X), for one X or a stack."""
-    return c @ x @ jnp.swapaxes(c, -1, -2) - x if discrete else he(c @ x)
+    return c @ x @ jnp.swapaxes(c, -1, -2) if discrete else he(c @ x)
 
 
 def _transform_loops(closed: Matrix, T: Matrix) -> Matrix:

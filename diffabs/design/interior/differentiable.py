@@ -1,12 +1,12 @@
-"""Derivatives through a robust design, and through a robustness proof: for tuning by gradients, inside compiled code.
+"""Derivatives through a robust design, for tuning by gradients, inside compiled code.
 
-    robust_gain       the gain of `synthesis` with the smallest guaranteed cost, differentiable in the weights
-    robust_design     the same from matrices, with P, differentiable in the vertices too
-    certified_decay   the fastest decay that a common P proves for a gain, differentiable in the gain
+    robust_gain     the gain of `synthesis` with the smallest guaranteed cost, differentiable in the weights
+    robust_design   the same from matrices, with P, differentiable in the vertices too
 
-All are pure JAX. They follow the central path of `central_path` and end with Newton's method. They can be compiled and
-batched, and the implicit function theorem gives their derivatives instead of the iterations. The results are floating
-point and not proved; `design` and `certify` prove them.
+`decay_rate.certified_decay` has the derivative of a robustness proof. All three are pure JAX. They follow the central
+path of `central_path` and end with Newton's method. They can be compiled and batched, and the implicit function theorem
+gives their derivatives instead of the iterations. The results are floating point and not proved; `design` and `certify`
+prove them.
 """
 
 from functools import partial
@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
 from diffabs.design.interior import central_path
 from diffabs.design.interior.central_path import CentralPathState, GuaranteedCostProblem, PathPoint
-from diffabs.design.interior.decay_rate import certified_decay as certified_decay
 from diffabs.design.polytopes import Polytope
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.riccati import care, dare

@@ -283,6 +283,7 @@ class Certificate:
 
         Raises:
             OSError: The file cannot be written.
+            ValueError: A certificate that is too large for its readers.
         """
         claims = ((claim.kind, claim.data) for claim in self.claims)
         files.write_file(pathlib.Path(path), serialise.format_certificate(self.system, self.gain, claims).encode())

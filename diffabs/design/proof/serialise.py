@@ -12,7 +12,7 @@ from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.runtime import files
 
 CERTIFICATE_FORMAT, CERTIFICATE_VERSION = "diffabs certificate", 1
-MAX_CERTIFICATE_BYTES, MAX_STATES_PLUS_INPUTS = 2**24, 64  # bytes; states and inputs together
+MAX_CERTIFICATE_BYTES, MAX_STATES_OR_INPUTS = 2**24, 64  # as in `design.verify`, so that both read what is written
 
 
 def convert_to_list(value: float | np.ndarray) -> Matrix:
@@ -109,7 +109,11 @@ def format_certificate(system: Polytope | Schedule, gain: np.ndarray, claims: It
         system: A polytope or a schedule.
         gain: Gain of the certificate.
         claims: Kind and data of each claim.
+
+    Raises:
+        ValueError: A certificate that is too large for its readers.
     """
+    check_cell_size(system.cells[0] if isinstance(system, Schedule) else system, "system")
     data = {
         "format": CERTIFICATE_FORMAT,
         "version": CERTIFICATE_VERSION,
@@ -117,7 +121,10 @@ def format_certificate(system: Polytope | Schedule, gain: np.ndarray, claims: It
         "gain": gain.tolist(),
         "claims": [{"kind": kind, "data": {k: convert_to_list(v) for k, v in data.items()}} for kind, data in claims],
     }
-    return json.dumps(data, allow_nan=False, indent=1) + "\n"
+    content = json.dumps(data, allow_nan=False, indent=1) + "\n"
+    if len(content) > MAX_CERTIFICATE_BYTES:
+        raise ValueError(f"the certificate is larger than {MAX_CERTIFICATE_BYTES} bytes: fewer vertices are needed")
+    return content
 
 
 def read_certificate(
@@ -211,6 +218,16 @@ def read_polytope(value: Scalar, where: str) -> Polytope:
     system = Polytope(read_numbers(A, f"{where}.A"), read_numbers(B, f"{where}.B"), period, states)
     if len(corners) not in (0, system.vertices) or len(states) not in (0, system.order):
         raise ValueError(f"{where}.corners and {where}.states must be empty or one for each vertex and each state")
-    if system.order + system.inputs > MAX_STATES_PLUS_INPUTS:
-        raise ValueError(f"{where} has more than {MAX_STATES_PLUS_INPUTS} states and inputs")
+    check_cell_size(system, where)
     return system
+
+
+def check_cell_size(cell: Polytope, where: str) -> None:
+    """Raise ValueError for a polytope that is too large for a certificate's file.
+
+    Args:
+        cell: Polytope.
+        where: Name of the polytope for messages.
+    """
+    if max(cell.order, cell.inputs) > MAX_STATES_OR_INPUTS:
+        raise ValueError(f"{where} has more than {MAX_STATES_OR_INPUTS} states or inputs")

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.design.sdp.solver import he, symmetric_from_blocks
+from diffabs.design.proof.exact import he
+from diffabs.design.sdp.solver import symmetric_from_blocks
 
 Matrix = Any  # (r, c), or a stack of them
 

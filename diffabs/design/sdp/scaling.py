@@ -178,7 +178,8 @@ def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | N
         else:
             # An unstable loop is shifted until its slowest mode is just stable: only then has the Lyapunov equation a
             # solution P > 0.
-            a = a - (max(0.0, 1.02 * modes.real.max()) + 1e-6 * np.abs(modes).max() + 1e-300) * np.eye(n)
+            size = np.abs(modes).max() or np.linalg.norm(a) or 1.0
+            a = a - (max(0.0, 1.02 * modes.real.max()) + 1e-6 * size) * np.eye(n)
         a = a * units / units[:, None]
         q = np.eye(n) if weight is None else weight * units * units[:, None]
         p = solve_discrete_lyapunov(a.T, q) if discrete else solve_continuous_lyapunov(a.T, -q)

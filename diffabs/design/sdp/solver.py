@@ -105,15 +105,6 @@ def _units(shape: tuple[int, int] | int) -> np.ndarray:
     return units
 
 
-def he(m: np.ndarray) -> np.ndarray:
-    """Return He[M] = M + M'.
-
-    Args:
-        m: Square matrices, shape (..., n, n).
-    """
-    return m + np.swapaxes(m, -1, -2)
-
-
 def symmetric_from_blocks(rows: list[list[PyTree]]) -> np.ndarray:
     """Return a symmetric matrix, or a stack of them, from the blocks on and below its diagonal.
 
