@@ -9,11 +9,13 @@ gap shorter than fall - rise.
 `Delay` is for a command that changes smoothly; its rise and fall are delayed equally.
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from diffabs.actuators.delay import find_wrong_capacity
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree, static
 from diffabs.core.types import PyTree, Scalar
@@ -46,7 +48,7 @@ class DeadTime:
     Attributes:
         rise: Dead time of an increase [s], > 0.
         fall: Dead time of a decrease [s], > 0.
-        capacity: Greatest number of switches on their way.
+        capacity: Greatest number of switches on their way; an integer >= 1.
     """
 
     rise: Scalar = param(default=0.02, unit="s", above=0.0)
@@ -56,7 +58,13 @@ class DeadTime:
     flow = no_flow
 
     def start(self, signal: Scalar) -> Memory:
-        """Return the memory for the control 0, with no switch on its way."""
+        """Return the memory for the control 0, with no switch on its way.
+
+        Raises:
+            ValueError: The capacity is no integer, or smaller than 1 switch.
+        """
+        for line in self.problems():
+            raise ValueError(f"DeadTime.{line}")
         zero = 0.0 * jnp.asarray(signal)
         none = jnp.broadcast_to(zero, (self.capacity,))
         return Memory(held=DeadTimeMemory(zero, zero, none + jnp.inf, none))
@@ -96,3 +104,7 @@ class DeadTime:
         values = jnp.concatenate([m.values[1:], m.values[-1:]])
         arrived = DeadTimeMemory(m.values[0], m.newest, due, values)
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(fired[0], a, b), arrived, m))
+
+    def problems(self) -> Iterator[str]:
+        """Yield a message if the capacity is no integer, or smaller than 1 switch."""
+        yield from find_wrong_capacity(self.capacity, 1, "switches")

@@ -213,11 +213,7 @@ class Delay:
 
     def problems(self) -> Iterator[str]:
         """Yield a message if the capacity is no integer, or smaller than 3 steps."""
-        if not isinstance(self.capacity, int | np.integer) or isinstance(self.capacity, bool):
-            shown = format_value(self.capacity)
-            yield f"capacity = {shown} is no integer; one in [{LEAST_CAPACITY}, inf) steps is needed"
-        elif self.capacity < LEAST_CAPACITY:
-            yield f"capacity = {self.capacity} is outside [{LEAST_CAPACITY}, inf) steps"
+        yield from find_wrong_capacity(self.capacity, LEAST_CAPACITY, "steps")
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """Yield the rule step <= time <= (capacity - 2) * step, up to the rounding of single precision."""
@@ -243,6 +239,20 @@ class _InEvents(Delay):
         m = Delay._at_once(self, m, t - 4 * _time_tolerance(t))
         late = jnp.where(m.last + 1 < m.known, t + _time_tolerance(t) - (m.until + self.time), 0.0)
         return m._replace(until=m.until + jnp.maximum(jax.lax.stop_gradient(late), 0.0))
+
+
+def find_wrong_capacity(capacity: Int, least: int, unit: str) -> Iterator[str]:
+    """Yield a message if the capacity of an actuator's memory is no integer, or smaller than the least one.
+
+    Args:
+        capacity: The capacity.
+        least: Least capacity.
+        unit: What it counts, in the plural.
+    """
+    if not isinstance(capacity, int | np.integer) or isinstance(capacity, bool):
+        yield f"capacity = {format_value(capacity)} is no integer; one in [{least}, inf) {unit} is needed"
+    elif capacity < least:
+        yield f"capacity = {capacity} is outside [{least}, inf) {unit}"
 
 
 def _row(piece: Piece) -> Any:

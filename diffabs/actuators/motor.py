@@ -19,3 +19,7 @@ class VoltageLimit:
         """Return the voltage at the motor [V]."""
         del t, memory
         return clamp(signal, -self.voltage_max, self.voltage_max)
+
+    def limits(self) -> tuple[Scalar, Scalar]:
+        """Return the lower and the upper limit of the control."""
+        return -self.voltage_max, self.voltage_max

@@ -49,10 +49,6 @@ class IntegratingValve:
         del t, signal
         return clamp(memory.flow, self.low, self.high)
 
-    def limits(self) -> tuple[Scalar, Scalar]:
-        """Return the lower and the upper limit of the control."""
-        return self.low, self.high
-
     def rules(self) -> Iterator[Rule]:
         """Yield the rule low < high."""
         yield order_rule(("low", self.low), ("high", self.high), "{control}", equal=False)

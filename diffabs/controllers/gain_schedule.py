@@ -67,13 +67,14 @@ class ScheduledFeedback:
         Raises:
             ValueError: `speeds`, `integral_gains` and `gains` differ in shape.
         """
-        shapes = [np.shape(x) for x in (self.speeds, self.integral_gains, self.gains)]
-        if len(set(shapes)) != 1:
-            raise ValueError(f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes))}")
-        rise = interval_shares(signal.measured.speed, jnp.asarray(self.speeds))
-        rows = (interpolate_shares(rise, jnp.asarray(gains)) for gains in (self.integral_gains, self.gains))
+        speeds, *rows = map(jnp.asarray, (self.speeds, self.integral_gains, self.gains))
+        if any(row.shape != speeds.shape for row in rows):
+            shapes = ", ".join(str(x.shape) for x in (speeds, *rows))
+            raise ValueError(f"speeds, integral_gains and gains have shapes {shapes}")
+        rise = interval_shares(signal.measured.speed, speeds)
+        gain = jnp.stack([interpolate_shares(rise, row) for row in rows])
         limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
-        return StateFeedback(gain=jnp.stack(list(rows)), **limits, antiwindup=self.antiwindup)
+        return StateFeedback(gain=gain, **limits, antiwindup=self.antiwindup)
 
     def problems(self) -> Iterator[str]:
         """Yield a message if `speeds`, `integral_gains` and `gains` differ in shape, or are empty."""

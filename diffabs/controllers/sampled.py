@@ -180,7 +180,7 @@ class Sampled:
         return inner.tick(clock, memory, signal) if offers(inner, "tick") else memory
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rules that the delay is at most the period and that a derivative filter is stable."""
+        """Yield the rules that the delay is at most the period, and that filter and anti-windup are stable."""
         yield from within_period(self.controller, self.delay, self.period)
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
@@ -220,7 +220,7 @@ def inner_controller(controller: Part) -> PyTree:
 
 
 def within_period(controller: Part, delay: Scalar, period: Scalar) -> Iterator[Rule]:
-    """Yield the rules delay <= period and, for a controller with a `cutoff`, cutoff < 2 / period.
+    """Yield the rules delay <= period, cutoff < 2 / period and tracking time > period / 2, for a controller with these.
 
     Args:
         controller: Inner controller.
@@ -230,6 +230,8 @@ def within_period(controller: Part, delay: Scalar, period: Scalar) -> Iterator[R
     yield delay_within(delay, period)
     if hasattr(controller, "cutoff"):
         yield filter_within(controller.cutoff, period)
+    if hasattr(getattr(controller, "antiwindup", None), "tracking_time"):
+        yield tracking_within(controller.antiwindup.tracking_time, period)
 
 
 def delay_within(delay: Scalar, period: Scalar) -> Rule:
@@ -259,5 +261,24 @@ def filter_within(cutoff: Scalar, period: Scalar) -> Rule:
         lambda: (
             f"controller.cutoff = {cutoff:g} rad/s is outside (0, {2 / period:g}) rad/s: sampled every {period:g} s, a"
             " faster filter is not stable"
+        ),
+    )
+
+
+def tracking_within(tracking_time: Scalar, period: Scalar) -> Rule:
+    """Return the rule that back-calculation is stable: tracking_time > period / 2.
+
+    At a limit, one sample multiplies the excess over the limit by 1 - period / tracking_time.
+
+    Args:
+        tracking_time: Tracking time of the anti-windup [s].
+        period: Sampling period [s].
+    """
+    return Rule(
+        as_rule_array(period) < 2 * as_rule_array(tracking_time),
+        "controller.antiwindup.tracking_time is too short for the period",
+        lambda: (
+            f"controller.antiwindup.tracking_time = {tracking_time:g} s is outside ({period / 2:g}, inf) s: sampled"
+            f" every {period:g} s, a faster back-calculation is not stable"
         ),
     )

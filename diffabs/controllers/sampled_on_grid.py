@@ -99,7 +99,7 @@ class SampledOnGrid:
         return Memory(held=m._replace(applied=jnp.where(clock.ticks()[0], applied, m.applied)))
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rules that the delay is at most the period and that a derivative filter is stable."""
+        """Yield the rules that the delay is at most the period, and that filter and anti-windup are stable."""
         yield from within_period(self.controller, self.delay, self.sampling_period)
 
     def grid_rules(self, step: float) -> Iterator[Rule]:

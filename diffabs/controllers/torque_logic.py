@@ -19,15 +19,15 @@ analysis of limit cycles in hybrid anti-lock braking systems, Int. J. Control 82
 
     u' = growth u  for slip < slip_low,   u' = -decay u  for slip > slip_high,   else u' = 0
 
-Inside a `sampled` controller of period T, one sample multiplies u by 1 + growth T or by 1 - decay T, as the usual
-programs with this rule do.
+At torque_max the growth stops. Inside a `sampled` controller of period T, one sample multiplies u by 1 + growth T or by
+1 - decay T, as the usual programs with this rule do.
 """
 
 from collections.abc import Iterator
 
 import jax.numpy as jnp
 
-from diffabs.core.numerics import clamp
+from diffabs.core.numerics import clamp, smaller
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule, order_rule
@@ -123,15 +123,16 @@ class BandLogic:
     jumps = True
 
     def start(self, signal: Tracking) -> Memory:
-        """Return the torque at the start."""
-        return Memory(flow=self.torque + 0.0 * signal.measured[0])
+        """Return the torque at the start, at most `torque_max`."""
+        return Memory(flow=smaller(self.torque, self.torque_max) + 0.0 * signal.measured[0])
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the rate of the torque [control/s]."""
+        """Return the rate of the torque [control/s]: no growth at `torque_max`, from which it thus falls at once."""
         del t
         slip = signal.measured[0]
         above = jnp.where(slip > self.slip_high, -self.decay, 0.0)
-        return memory.flow * jnp.where(slip < self.slip_low, self.growth, above)
+        grows = (slip < self.slip_low) & (memory.flow < self.torque_max)
+        return memory.flow * jnp.where(grows, self.growth, above)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return the torque [N m]."""

@@ -192,6 +192,8 @@ class Overshoot:
 
     The floor 0.01, in the unit of y, avoids a division by 0 where a reference ends at slip 0. If the first setpoint is
     negative, -y and -r take the places of y and r. A run without overshoot has derivative 0.
+
+    The first value counts, too: a run that starts beyond r, as before a step down, has no overshoot in the usual sense.
     """
 
     unit = "1"
@@ -320,7 +322,8 @@ def at_limits(loop: Part) -> ShareAtLimit:
     """Return the `ShareAtLimit` whose limits are those of a loop's controller and actuator.
 
     The tightest limits count, also those of controllers inside a controller. Without limits they are infinite. The two
-    torques of a relay are levels and not limits.
+    torques of a relay are levels and not limits. The limits bound the command. An `IntegratingValve`, whose command is
+    a rate, has none.
 
     Args:
         loop: Loop. A part gives its limits by a method `limits()`.
@@ -329,9 +332,9 @@ def at_limits(loop: Part) -> ShareAtLimit:
         >>> import diffabs as d
         >>> from diffabs.objectives import at_limits
         >>> loop = d.braking()
-        >>> run = d.measure(loop, d.FixedStep(1e-3, 4.0), {"at a limit": at_limits(loop)})
+        >>> run = d.measure(loop, d.FixedStep(1e-4, 4.0), {"at a limit": at_limits(loop)})
         >>> print(f"{run.metrics['at a limit']:.2f}")
-        0.00
+        0.31
     """
     low, high = -math.inf, math.inf
     pending = [loop.controller, loop.actuator]

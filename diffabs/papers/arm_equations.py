@@ -1,11 +1,8 @@
-"""Fumita's equations (1)-(10) as printed, and the equations of motion that follow from the printed Lagrangian (7).
+"""Fumita's potential energies (2), (4), (6) and equations of motion (8)-(10) as printed, and what is wrong in them.
 
 Each is a function of angles q, rates v and accelerations a, shape (3,). Every misprint is thus a difference of two
 functions.
 """
-
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,32 +12,8 @@ from diffabs.core.types import AnyArray, JsonObject, Scalar
 from diffabs.papers import record
 from diffabs.plants import ArmBalance
 
-Energy = Callable[[ArmBalance, Any, Any], Any]
 # Half the length of a uniform rod with the inertia of each body.
 RODS = {"body": "body_height", "arm": "arm_length", "rider": "rider_height"}
-
-
-def kinetic(p: ArmBalance, q: AnyArray, v: Scalar) -> Scalar:
-    """Return the kinetic energy, the sum of eqs. (1), (3), (5) [J].
-
-    Args:
-        p: Machine.
-        q: Angles (3,) [rad].
-        v: Rates (3,) [rad/s].
-    """
-    _, t2, t3 = q
-    v1, v2, v3 = v
-    l, lg, hg, m2, m3 = p.mount_height, p.arm_length, p.rider_height, p.arm_mass, p.rider_mass
-    k1 = 0.5 * (p.body_inertia + p.body_mass * p.body_height**2) * v1**2
-    k2 = 0.5 * (p.arm_inertia + m2 * (l**2 + lg**2) + 2 * m2 * l * lg * jnp.cos(t2)) * v1**2
-    k2 = (
-        k2
-        + 0.5 * (p.arm_inertia + m2 * lg**2) * v2**2
-        + (p.arm_inertia + m2 * (lg**2 + l * lg * jnp.cos(t2))) * v1 * v2
-    )
-    k3 = 0.5 * (p.rider_inertia + m3 * (l**2 + hg**2) + 2 * m3 * l * hg * jnp.cos(t3)) * v1**2
-    k3 = k3 + 0.5 * (p.rider_inertia + m3 * hg**2) * v3**2
-    return k1 + k2 + k3 + (p.rider_inertia + m3 * (hg**2 + l * hg * jnp.cos(t3))) * v1 * v3
 
 
 def potentials(p: ArmBalance, q: AnyArray) -> Scalar:
@@ -57,34 +30,6 @@ def potentials(p: ArmBalance, q: AnyArray) -> Scalar:
     u2 = p.arm_mass * p.mount_height * jnp.cos(t1) + p.arm_mass * p.arm_length * p.gravity * jnp.cos(t1 - t2)
     u3 = p.rider_mass * p.mount_height * jnp.cos(t1) + p.rider_mass * p.rider_height * p.gravity * jnp.cos(t1 - t3)
     return jnp.stack([u1, u2, u3])
-
-
-def lagrangian(p: ArmBalance, q: AnyArray, v: Scalar) -> Scalar:
-    """Return eq. (7) [J] as printed: its kinetic energy uses theta1 + theta2, but its potential theta1 - theta2.
-
-    Args:
-        p: Machine.
-        q: Angles (3,) [rad].
-        v: Rates (3,) [rad/s].
-    """
-    t1, t2, t3 = q
-    b1 = p.body_mass * p.body_height + (p.arm_mass + p.rider_mass) * p.mount_height
-    heights = b1 * jnp.cos(t1) + p.arm_mass * p.arm_length * jnp.cos(t1 - t2)
-    return kinetic(p, q, v) - p.gravity * (heights + p.rider_mass * p.rider_height * jnp.cos(t1 - t3))
-
-
-def euler_lagrange(energy: Energy, p: ArmBalance, q: AnyArray, v: Scalar, a: Scalar) -> Scalar:
-    """Return d/dt(dL/dv) - dL/dq, shape (3,), by automatic differentiation.
-
-    Args:
-        energy: Lagrangian as a function of (p, q, v).
-        p: Machine.
-        q: Angles (3,) [rad].
-        v: Rates (3,) [rad/s].
-        a: Accelerations (3,) [rad/s^2].
-    """
-    by_rate = jax.grad(energy, 2)
-    return jax.jvp(lambda q, v: by_rate(p, q, v), (q, v), (v, a))[1] - jax.grad(energy, 1)(p, q, v)
 
 
 def printed_equations(p: ArmBalance, q: AnyArray, v: Scalar, a: Scalar) -> Scalar:

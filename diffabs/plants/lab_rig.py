@@ -124,8 +124,8 @@ class LabRig:
         wheel = jnp.where(rests, 0.0, wheel)  # exactly 0: from rounding a stuck wheel would turn
         drum = -quotient(self._drum_torque(state.drum, normal * mu), self.drum_inertia)
         u = clamp(control, 0.0, 1.0)
-        brake = larger(self.brake_gain * u + self.brake_offset, 0.0)  # a brake does not drive
-        target = jnp.where(u >= self.brake_threshold, brake, 0.0)
+        brake = larger(0.0, self.brake_gain * u + self.brake_offset)  # a brake does not drive
+        target = jnp.where(u < self.brake_threshold, 0.0, brake)  # NaN for a command of NaN
         return LabRigState(
             halt_at_zero(state.wheel, wheel),
             halt_at_zero(state.drum, drum),
@@ -172,16 +172,18 @@ class LabRig:
         """Return the brake command [1] whose steady torque keeps the slip at `target` while both wheels slow down.
 
         The condition is omega1' = (1 - slip) (r2/r1) omega2'. The command is not clamped to [0, 1] and ignores the
-        threshold.
+        threshold. It is infinite where no torque holds the slip, because the friction grows as fast as the torque.
         """
         drum = output.speed / self.drum_radius
         spin = (1 - target) * output.speed / self.wheel_radius
         mu = self.road.friction(target, output.speed, output.distance)
         arm = self.lever * (jnp.sin(self.lever_angle) - mu * jnp.cos(self.lever_angle))
         k = self.wheel_inertia * (1 - target) * self.drum_radius / (self.wheel_radius * self.drum_inertia)
-        pull = mu * (self.wheel_radius + k * self.drum_radius) / arm
+        grip = mu * (self.wheel_radius + k * self.drum_radius)
         drag = k * (self.drum_friction * drum + self.drum_stiction)
-        brake = (pull * self.weight_torque + drag) / (1 - pull) - self.wheel_stiction - self.wheel_friction * spin
+        spare = larger(arm - grip, 0.0)
+        torque = quotient(grip * self.weight_torque + drag * arm, spare)
+        brake = torque - self.wheel_stiction - self.wheel_friction * spin
         return (brake - self.brake_offset) / self.brake_gain
 
     def audit(self, initial: BrakeStart) -> BrakeAudit:

@@ -32,7 +32,7 @@ class PeakMemory(NamedTuple):
     """Memory of the running maximum.
 
     Attributes:
-        latched: 1 once latched, else 0.
+        latched: In `PeakRobust`, 1 once latched, else 0.
         greatest: Greatest |a| so far; in `PeakRobust`, of the signed filtered deceleration [m/s^2].
         slip: Slip at this maximum [1]; in `PeakLiteral`, the first slip.
         target: Target slip [1].
@@ -130,8 +130,7 @@ class PeakLatch:
         """Return the memory after the event: if it has fired, target and maximum are the present slip and |a|."""
         del t
         m: PeakMemory = _record_peak(memory.held, fired[0], _size(signal), signal.slip)
-        latched = jnp.where(fired[0], 1.0, m.latched)
-        return Memory(held=m._replace(latched=latched, target=jnp.where(fired[0], signal.slip, m.target)))
+        return Memory(held=m._replace(target=jnp.where(fired[0], signal.slip, m.target)))
 
 
 class FilterMemory(NamedTuple):

@@ -28,7 +28,8 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     it.
 
     Two Newton steps s - mu'/mu'' polish it and carry its derivative by the implicit function theorem. Slip and mu are
-    thus differentiable in every parameter of the road.
+    thus differentiable in every parameter of the road. At a kink between straight lines the derivative is that of their
+    crossing. A maximum at more than one slip has the derivative NaN.
 
     >>> from diffabs.roads import DRY_ASPHALT, peak
     >>> slip, mu = peak(DRY_ASPHALT)
@@ -49,7 +50,7 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
 
     grid = jnp.linspace(0.0, 1.0, GRID + 1)
     values = jax.lax.stop_gradient(jax.vmap(mu)(grid))
-    falls = values[1:] < values[:-1]
+    falls = (values[1:] < values[:-1]) & (values[:-1] > 0)  # a fitted curve may dip below 0 next to slip 0
     inside = jnp.any(falls)
     top = jnp.argmax(falls)  # the first fall is after the top grid point
 
@@ -60,11 +61,31 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
         return jnp.where(rising, middle, low), jnp.where(rising, high, middle)
 
     bracket = (grid[jnp.maximum(top - 1, 0)], grid[top + 1])
-    low, high = jax.lax.fori_loop(0, BISECTIONS, halve, bracket)
-    s0 = jax.lax.stop_gradient(0.5 * (low + high))
-    curvature = jax.lax.stop_gradient(jax.jvp(slope, (s0,), (jnp.ones_like(s0),))[1])
-    near = s0 - ratio(slope(s0), curvature)
+    low, high = jax.lax.stop_gradient(jax.lax.fori_loop(0, BISECTIONS, halve, bracket))
+    s0 = 0.5 * (low + high)
+    curvature = jax.jvp(slope, (s0,), (jnp.ones_like(s0),))[1]
+    curved = jnp.not_equal(curvature, 0)
+
+    def residual(s: Scalar) -> Any:
+        left, right = (mu(end) + slope(end) * (s - end) for end in (low, high))
+        gap = left - right
+        return jnp.where(curved, slope(s), gap - jax.lax.stop_gradient(gap))  # bisection alone places a kink
+
+    rate = jax.lax.stop_gradient(jnp.where(curved, curvature, slope(low) - slope(high)))
+    rate = jnp.where(inside, rate, 1.0)
     # The bracket carries no derivative. The first Newton step gives the first derivative of the maximum, and the second
     # step doubles the order of derivatives that are exact.
-    best = jnp.where(inside, clamp(near - ratio(slope(near), curvature), 0.0, 1.0), 1.0)
+    near = s0 - _newton_step(residual(s0), rate)
+    best = jnp.where(inside, clamp(near - _newton_step(residual(near), rate), 0.0, 1.0), 1.0)
     return Peak(best, mu(best))
+
+
+@jax.custom_jvp
+def _newton_step(residual: Scalar, rate: Scalar) -> Any:
+    """Return residual/rate for a constant rate; where it is 0, the step is 0 and its derivative NaN."""
+    return ratio(residual, rate)
+
+
+@_newton_step.defjvp
+def _step_slope(at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
+    return _newton_step(*at), moves[0] / jnp.where(at[1] == 0, jnp.nan, at[1])

@@ -52,15 +52,16 @@ class Patches:
         Raises:
             ValueError: The number of edges is not the number of roads minus one.
         """
-        if np.shape(self.edges) != (len(self.roads) - 1,):
-            raise ValueError(f"edges has shape {np.shape(self.edges)}; {len(self.roads)} roads need one less")
+        edges = jnp.asarray(self.edges)
+        if edges.shape != (len(self.roads) - 1,):
+            raise ValueError(f"edges has shape {edges.shape}; {len(self.roads)} roads need one less")
         mus = [road.friction(slip, speed, distance) for road in self.roads]
         # A width of 0 is replaced by 1: a division by 0 in the branch not taken would put NaN into the derivatives.
         smooth = jnp.greater(self.width, 0)
         width = jnp.where(smooth, self.width, 1.0)
         total = mus[0]
         for i, (before, after) in enumerate(pairwise(mus)):
-            beyond = distance - jnp.asarray(self.edges)[i]
+            beyond = distance - edges[i]
             y = clamp(beyond / width + 0.5, 0.0, 1.0)
             weight = jnp.where(smooth, y * y * (3 - 2 * y), jnp.where(beyond >= 0, 1.0, 0.0))
             total = total + weight * (after - before)

@@ -48,6 +48,22 @@ def test_several_switches_are_on_their_way():
     np.testing.assert_allclose(run.metrics["mean"][1], (expected - 0.0) / LENGTH, rtol=1e-5)
 
 
+@killed_by("actuators/dead_time.py", "for line in self.problems():", "for line in ():")
+@pytest.mark.parametrize(
+    ("capacity", "message"),
+    [
+        (0, r"capacity = 0 is outside \[1, inf\) switches"),
+        (2.5, r"capacity = 2.5 is no integer; one in \[1, inf\) switches is needed"),
+    ],
+)
+def test_no_place_for_a_switch_is_refused_by_its_name(capacity, message):
+    given = loop(PlayedCommand(), DeadTime(capacity=capacity))
+    with pytest.raises(ValueError, match=f"^actuator.{message}$"):
+        d.check(given)
+    with pytest.raises(ValueError, match=f"^DeadTime.{message}"):
+        d.measure(given, d.FixedStep(H, 10 * H), {})
+
+
 @pytest.mark.slow
 def test_more_switches_than_its_capacity_are_a_run_that_diverged():
     commands = [0.0, 1.0] * 9

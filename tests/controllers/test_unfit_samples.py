@@ -5,11 +5,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 
 import diffabs as d
-from diffabs.controllers import PID, ConstantInput, Sampled, SampledOnGrid
+from diffabs.controllers import PID, BackCalculation, ConstantInput, Sampled, SampledOnGrid
 from diffabs.core.protocols import no_flow, no_memory
 from diffabs.core.pytree import param, pytree
+from diffabs.core.validity import find_problems
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FixedSlip
 from diffabs.scenario.defaults import braking
@@ -105,3 +107,25 @@ def test_a_comparison_does_not_hide_that_a_sample_is_lost():
     np.testing.assert_array_equal(commands[LOST], commands[LOST.start - 1])
     assert set(commands) == {1.0, 3.0}
     assert commands[LOST.start] == 3.0
+
+
+@killed_by(
+    "controllers/sampled.py",
+    "as_rule_array(period) < 2 * as_rule_array(tracking_time)",
+    "as_rule_array(period) < 200 * as_rule_array(tracking_time)",
+)
+@pytest.mark.parametrize(("tracking", "holds"), [(5.1e-3, True), (4.9e-3, False)])
+def test_a_back_calculation_too_fast_for_its_samples(tracking, holds):
+    """The oracle is the computer's own recursion at a constant error, written out: does it stay at its limit of 20?"""
+    period, kp, ki, error, integral, said = 0.01, 500.0, 5000.0, 0.2, 0.0, []
+    for _ in range(3000):
+        raw = kp * error + ki * integral
+        said.append(min(max(raw, 0.0), 20.0))
+        integral += period * (error + (said[-1] - raw) / (ki * tracking))
+    assert (min(said[-100:]) == 20.0) == holds
+    pid = PID(kp=kp, ki=ki, low=0.0, high=20.0, antiwindup=BackCalculation(tracking_time=tracking))
+    for computer in (Sampled(controller=pid, period=period), SampledOnGrid(controller=pid, sampling_period=period)):
+        line = f"controller.antiwindup.tracking_time = {tracking:g} s is outside (0.005, inf) s: sampled every 0.01 s"
+        problems = list(find_problems(computer))
+        assert len(problems) == (not holds)
+        assert all(one.startswith(line) for one in problems)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import commands
 import numpy as np
 import pytest
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, references, stops
@@ -78,6 +79,15 @@ def test_a_run_says_for_how_long_its_control_is_at_a_limit():
     limits = at_limits(pulled(controllers.Sampled(controller=pid), actuator=actuators.Limits(low=-50.0)))
     assert (limits.low, limits.high) == (-50.0, 1200.0)
     assert at_limits(pulled(controllers.Relay())).high == np.inf  # levels, not limits
+
+
+@killed_by("actuators/motor.py", "return -self.voltage_max, self.voltage_max", "return -1e9, 1e9")
+def test_the_limits_are_those_of_the_command():
+    """Of a motor's supply. A valve's command is a rate, which its limits do not bound."""
+    limits = at_limits(pulled(WEAK, actuator=actuators.VoltageLimit(voltage_max=24.0)))
+    assert (limits.low, limits.high) == (-24.0, 24.0)
+    limits = at_limits(pulled(WEAK, actuator=actuators.IntegratingValve()))
+    assert (limits.low, limits.high) == (-np.inf, np.inf)
 
 
 def test_a_run_settles_within_a_share_of_its_step_or_never():

@@ -260,6 +260,34 @@ def test_the_nearest_explanation_of_the_gain(rig):
 # [arm]
 
 
+def kinetic(p, q, v):
+    """Eqs. (1), (3), (5), in sum."""
+    _, t2, t3 = q
+    v1, v2, v3 = v
+    l, lg, hg, m2, m3 = p.mount_height, p.arm_length, p.rider_height, p.arm_mass, p.rider_mass
+    k1 = 0.5 * (p.body_inertia + p.body_mass * p.body_height**2) * v1**2
+    k2 = 0.5 * (p.arm_inertia + m2 * (l**2 + lg**2) + 2 * m2 * l * lg * jnp.cos(t2)) * v1**2
+    k2 = k2 + 0.5 * (p.arm_inertia + m2 * lg**2) * v2**2
+    k2 = k2 + (p.arm_inertia + m2 * (lg**2 + l * lg * jnp.cos(t2))) * v1 * v2
+    k3 = 0.5 * (p.rider_inertia + m3 * (l**2 + hg**2) + 2 * m3 * l * hg * jnp.cos(t3)) * v1**2
+    k3 = k3 + 0.5 * (p.rider_inertia + m3 * hg**2) * v3**2
+    return k1 + k2 + k3 + (p.rider_inertia + m3 * (hg**2 + l * hg * jnp.cos(t3))) * v1 * v3
+
+
+def lagrangian(p, q, v):
+    """Eq. (7) as printed: its kinetic energy uses theta1 + theta2, but its potential theta1 - theta2."""
+    t1, t2, t3 = q
+    b1 = p.body_mass * p.body_height + (p.arm_mass + p.rider_mass) * p.mount_height
+    heights = b1 * jnp.cos(t1) + p.arm_mass * p.arm_length * jnp.cos(t1 - t2)
+    return kinetic(p, q, v) - p.gravity * (heights + p.rider_mass * p.rider_height * jnp.cos(t1 - t3))
+
+
+def euler_lagrange(energy, p, q, v, a):
+    """d/dt(dL/dv) - dL/dq."""
+    by_rate = jax.grad(energy, 2)
+    return jax.jvp(lambda q, v: by_rate(p, q, v), (q, v), (v, a))[1] - jax.grad(energy, 1)(p, q, v)
+
+
 def points(count=20):
     return np.random.default_rng(3).uniform(-2, 2, (count, 3, 3))
 
@@ -268,7 +296,7 @@ def test_the_kinetic_energies_of_the_arms_paper_are_right():
     """Eqs. (1), (3), (5), against `ArmBalance`, which is checked against the bodies' places in test_arm.py."""
     for q, v, _ in points():
         expected = ARM.kinetic_energy(ArmState(*q, *v))
-        np.testing.assert_allclose(arm_equations.kinetic(ARM, q, v), expected, rtol=1e-13)
+        np.testing.assert_allclose(kinetic(ARM, q, v), expected, rtol=1e-13)
 
 
 def test_equations_4_and_6_lack_gravity():
@@ -278,9 +306,7 @@ def test_equations_4_and_6_lack_gravity():
     assert float(upright[1]) == pytest.approx(20 * 0.7 + 20 * 9.81 * 0.5)
     assert float(upright[2]) == pytest.approx(50 * 0.7 + 50 * 9.81 * 0.6)
     for q, v, _ in points():
-        missing = arm_equations.lagrangian(ARM, q, v) - (
-            arm_equations.kinetic(ARM, q, v) - jnp.sum(arm_equations.potentials(ARM, q))
-        )
+        missing = lagrangian(ARM, q, v) - (kinetic(ARM, q, v) - jnp.sum(arm_equations.potentials(ARM, q)))
         np.testing.assert_allclose(missing, -(9.81 - 1) * 70 * 0.7 * np.cos(q[0]), rtol=1e-11)
 
 
@@ -291,9 +317,7 @@ def test_the_printed_equations_miss_terms_of_their_lagrangian():
     b2, b3, c2, c3, g = 10.0, 30.0, 7.0, 21.0, 9.81
     for q, v, a in points():
         t1, t2, t3 = q
-        missing = arm_equations.euler_lagrange(
-            arm_equations.lagrangian, ARM, q, v, a
-        ) - arm_equations.printed_equations(ARM, q, v, a)
+        missing = euler_lagrange(lagrangian, ARM, q, v, a) - arm_equations.printed_equations(ARM, q, v, a)
         expected = [
             -(c2 - b2) * np.sin(t2) * v[1] ** 2,
             2 * c2 * np.sin(t2) * v[0] ** 2 + 2 * b2 * g * np.sin(t1 - t2),
@@ -311,12 +335,12 @@ def test_equation_7_is_the_lagrangian_of_another_machine():
         heights = ARM.lumps()
         t1, t2, t3 = q
         u = heights.b1 * jnp.cos(t1) + heights.b2 * jnp.cos(t1 + t2) + heights.b3 * jnp.cos(t1 + t3)
-        return arm_equations.kinetic(p, q, v) - p.gravity * u
+        return kinetic(p, q, v) - p.gravity * u
 
     for q, v, _ in points(5):
         a = np.array(free.accelerations(ArmState(*q, *v), 0.0))
-        np.testing.assert_allclose(arm_equations.euler_lagrange(with_sums, ARM, q, v, a), 0, atol=1e-9)
-        assert np.max(np.abs(arm_equations.euler_lagrange(arm_equations.lagrangian, ARM, q, v, a))) > 1
+        np.testing.assert_allclose(euler_lagrange(with_sums, ARM, q, v, a), 0, atol=1e-9)
+        assert np.max(np.abs(euler_lagrange(lagrangian, ARM, q, v, a))) > 1
 
 
 @pytest.mark.slow
@@ -325,7 +349,7 @@ def test_printed_gravity_comes_from_no_potential():
     stiffness = arm_equations.gravity_stiffness(ARM)
     np.testing.assert_allclose((stiffness - stiffness.T)[0, 1:], 2 * 9.81 * np.array([10.0, 30.0]), rtol=1e-12)
     zero = jnp.zeros(3)
-    of_7 = jax.jacfwd(lambda q: arm_equations.euler_lagrange(arm_equations.lagrangian, ARM, q, zero, zero))(zero)
+    of_7 = jax.jacfwd(lambda q: euler_lagrange(lagrangian, ARM, q, zero, zero))(zero)
     np.testing.assert_allclose(of_7, of_7.T, atol=1e-9)
 
 

@@ -188,6 +188,36 @@ def test_a_lever_that_locks_itself_further_on_is_no_run():
     assert np.isfinite(rig.derivative(0.0, ahead._replace(distance=1.0), 0.9).drum)
 
 
+@killed_by("plants/lab_rig.py", "larger(arm - grip, 0.0)", "arm - grip")
+@pytest.mark.parametrize("mu", [0.4, 1.0, 1.4])
+def test_no_command_holds_a_lab_wheel_that_no_torque_holds(mu):
+    """Both wheels' torque balances are linear in torque and normal force; slip is kept if omega1' = ratio omega2'."""
+    rig, slip, speed = LabRig(road=Burckhardt(c1=mu, c2=1e9, c3=0.0, c4=0.0)), 0.2, 10.0
+    r1, r2, j1, j2 = rig.wheel_radius, rig.drum_radius, rig.wheel_inertia, rig.drum_inertia
+    ratio, spin, drum = (1 - slip) * r2 / r1, (1 - slip) * speed / r1, speed / r2
+    arm = rig.lever * (np.sin(rig.lever_angle) - mu * np.cos(rig.lever_angle))
+    bearing, drag = rig.wheel_friction * spin + rig.wheel_stiction, rig.drum_friction * drum + rig.drum_stiction
+    # T - arm Fn = -Mg - bearing;  -T/J1 + (r1/J1 + ratio r2/J2) mu Fn = bearing/J1 - ratio drag/J2
+    matrix = [[1.0, -arm], [-1 / j1, (r1 / j1 + ratio * r2 / j2) * mu]]
+    torque, normal = np.linalg.solve(matrix, [-rig.weight_torque - bearing, bearing / j1 - ratio * drag / j2])
+    command = (torque - rig.brake_offset) / rig.brake_gain
+    assert (normal > 0) == (mu < 1.1)
+    np.testing.assert_allclose(rig.holding(output(slip, speed), slip), command if normal > 0 else np.inf, rtol=1e-9)
+
+
+@killed_by("plants/lab_rig.py", "target = jnp.where(u < self.brake_threshold, 0.0, brake)", "target = brake")
+@killed_by("plants/lab_rig.py", "larger(0.0, self.brake_gain", "larger(-1e9, self.brake_gain")
+def test_the_lab_brake_by_hand():
+    """Below its threshold and its offset it releases; a command of NaN brakes with NaN, and the run has diverged."""
+    state = LabRigState(100.0, 140.0, 2.0, 0.0)
+    for threshold, command, target in (
+        *((0.5, 0.45, 0.0), (0.3, 0.35, 0.0), (0.5, 0.6, 0.6 * 15.24 - 6.21), (0.5, 1.5, 9.03)),
+        (0.5, np.nan, np.nan),
+    ):
+        rate = LabRig(brake_threshold=threshold).derivative(0.0, state, command).brake
+        np.testing.assert_allclose(rate, 20.37 * (target - 2.0), rtol=1e-12)
+
+
 @killed_by("plants/lab_rig.py", "held = arm > self.wheel_radius * mu", "held = arm > -jnp.inf")
 def test_a_lab_wheel_that_no_torque_holds_turns_again():
     """Friction between 1.34 and tan phi: the road's torque grows faster than the brake's, whatever the brake does."""

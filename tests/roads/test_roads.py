@@ -262,6 +262,12 @@ def test_patches_on_either_side_and_between():
     np.testing.assert_allclose(mu, [a, a, quarter, (a + b) / 2, b, b, (b + c) / 2, c, c], rtol=1e-14, atol=0)
 
 
+@killed_by("roads/patches.py", "edges = jnp.asarray(self.edges)", "edges = np.asarray(self.edges)")
+def test_traced_edges_may_be_a_tuple_or_a_list():
+    for edges in ((5.0,), [5.0]):
+        np.testing.assert_allclose(curve(Patches(edges=edges), GRID, 0.0, 9.0), curve(SNOW, GRID), rtol=1e-12)
+
+
 @killed_by("roads/patches.py", "y * y * (3 - 2 * y)", "y")
 def test_patches_are_c1():
     """Slope zero at both ends of the ramp, 3/2 (after - before)/width in its middle."""
@@ -294,6 +300,41 @@ def test_monotone_curve_is_best_locked():
     slope = jacobian(found, ice)
     assert np.all(np.isfinite(slope))
     np.testing.assert_allclose(slope[:, 0], 0.0, rtol=0, atol=0)
+
+
+@killed_by("roads/optimum.py", " & (values[:-1] > 0)", "")
+@pytest.mark.parametrize("a", [0.001, 0.01, 0.1])
+def test_a_dip_below_zero_is_no_peak(a):
+    """The rational curve dips below 0 next to slip 0. Against the first maximum of a fine grid in NumPy, from there."""
+    road = RationalCurve(a=a)
+    s = np.linspace(0.02, 1.0, 98001)
+    mu = road.w4 * s**road.q / (a + s**road.q) + np.polyval([road.w3, road.w2, road.w1, 0.0], s)
+    falls = np.flatnonzero(np.diff(mu) < 0)
+    first = falls[0] if len(falls) else -1
+    np.testing.assert_allclose(best(canonical_dtypes(road)), (s[first], mu[first]), rtol=0, atol=1e-5)
+
+
+LINE_SLIPS = np.array([0.0, 0.07, 0.12, 0.151, 1.0])
+
+
+@killed_by("roads/optimum.py", "gap - jax.lax.stop_gradient(gap)", "0.0 * gap")
+def test_peak_of_straight_lines_moves_with_its_knot():
+    """At a knot, where the slope jumps: slip and mu are those of the knot."""
+    road = PiecewiseLinear(slip=LINE_SLIPS, mu=np.array([0.0, 0.7, 0.85, 0.88, 0.66]))
+    np.testing.assert_allclose(best(canonical_dtypes(road)), (0.151, 0.88), rtol=1e-12)
+    expected = np.zeros((10, 2))
+    expected[3, 0] = expected[5 + 3, 1] = 1.0
+    np.testing.assert_allclose(jacobian(found, road), expected, rtol=1e-9, atol=1e-12)
+
+
+@killed_by("roads/optimum.py", "jnp.where(at[1] == 0, jnp.nan, at[1])", "jnp.where(at[1] == 0, 1.0, at[1])")
+def test_peak_on_a_plateau_has_no_derivative():
+    """Any slip from 0.07 to 0.151 is best."""
+    road = PiecewiseLinear(slip=LINE_SLIPS, mu=np.array([0.0, 0.88, 0.88, 0.88, 0.66]))
+    slip, mu = best(canonical_dtypes(road))
+    assert 0.07 <= slip <= 0.151
+    np.testing.assert_allclose(mu, 0.88, rtol=1e-12)
+    assert np.all(np.isnan(jacobian(found, road)[:, 0]))
 
 
 @pytest.mark.slow
