@@ -21,11 +21,9 @@ import typer
 from diffabs.cli import console, progress, report, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.config.values import ScenarioError, unknown_name_error
-from diffabs.core.pytree import elements
 from diffabs.core.types import JsonObject, PyTree
 from diffabs.runtime import files
 from diffabs.scenario import section_sweep
-from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.drive.engine import EngineError
@@ -252,7 +250,10 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: 
 def _result(
     found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool, check: int
 ) -> JsonObject:
-    """Return the JSON document, which is also written into the folder."""
+    """Return the JSON document, which is also written into the folder: at first without the names of other files.
+
+    A picture that cannot be drawn then loses no statistics.
+    """
     from diffabs.sweep.checking import check_accuracy
     from diffabs.sweep.statistics.summary import summarise_sweep
     from diffabs.sweep.trajectories import write_trajectories
@@ -263,6 +264,7 @@ def _result(
         said = summarise_sweep(found)
     accuracy = halved.result() if halved else None
     result = {"out": str(out), **said, "accuracy": accuracy, "made": console.describe_run(), "files": {}}
+    _write_summary(out, result)
     if kept:
         result["files"]["trajectories"] = str(write_trajectories(study, out, kept))
     if figures:
@@ -270,12 +272,16 @@ def _result(
 
         folder = out / FIGURES
         folder.mkdir(exist_ok=True)
-        units = {path: spec.unit for path, spec in elements(study.loop).items()}
-        units |= {name: unit_of(objective, study.loop.plant) for name, objective in study.objectives.items()}
-        result["files"]["figures"] = [str(path) for path in draw_sweep(found, result, folder, units)]
+        result["files"]["figures"] = [str(path) for path in draw_sweep(found, result, folder, study.units())]
         result["files"]["report"] = str(out / report.DEFAULT_NAME)
-    document = json.dumps(show.replace_infinite(result), indent=1, allow_nan=False)
-    files.write_durably(out / SUMMARY, document.encode())
+    if result["files"]:
+        _write_summary(out, result)
     if figures:
         report.write_report_file([out], out / report.DEFAULT_NAME)
     return result
+
+
+def _write_summary(out: pathlib.Path, result: JsonObject) -> None:
+    # The sweep's lock is released by now: another --resume of a complete sweep may write the same file.
+    document = json.dumps(show.replace_infinite(result), indent=1, allow_nan=False)
+    files.write_synced(out / SUMMARY, document.encode())

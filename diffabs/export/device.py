@@ -25,6 +25,7 @@ from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import ParameterSpec, arrays, parameters, prepare_parts
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
 from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.core.units import unit_at
 from diffabs.simulate.step.runge_kutta import rk4_step
 
 MAX_STEPS_PER_SAMPLE = 64  # simulation steps in a period, for a target that moves by itself
@@ -93,10 +94,10 @@ class DeviceParameter(NamedTuple):
         """Yield, for each number of the value, its name in `Lowered.numbers` and a description (unit and range)."""
         # Twice: the controller stands within `Sampled`, which itself is the loop's controller.
         path = self.path.removeprefix("controller.").removeprefix("controller.")
-        units = [unit.strip() for unit in self.spec.unit.split(",")]
+        spec = dataclasses.replace(self.spec, unit="1")
         for k, at in enumerate(np.ndindex(self.value.shape)):
-            spec = dataclasses.replace(self.spec, unit="1")
-            yield ".".join([path, *map(str, at)]), f"[{units[min(k, len(units) - 1)]}] in {spec.interval()}"
+            unit = unit_at(self.spec.unit, k, self.value.size)
+            yield ".".join([path, *map(str, at)]), f"[{unit}] in {spec.interval()}"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, live_nodes
 from diffabs.compiler.lower.labels import Labelled, source_label
 from diffabs.compiler.lower.rules import constant_array, lower_jaxpr
 from diffabs.core.types import PyTree
-from diffabs.export.device import ComputerProgram
+from diffabs.export.device import ComputerProgram, NotExported
 
 MEMORY, INPUTS, NUMBERS = "s", "in", "p"  # origins of the graph's inputs, the first entry of a node's `attr`
 
@@ -46,6 +46,7 @@ class Lowered:
 
         Raises:
             Unsupported: An operation has no lowering rule.
+            NotExported: Two numbers have the same name.
         """
         self.device = found
         graph = Labelled()
@@ -101,13 +102,20 @@ def number_leaves(shape: PyTree, graph: Graph, where: str, flat: PyTree) -> dict
         shape: Pytree of shapes and types.
         graph: Graph that receives the nodes.
         where: Origin of the inputs, the first entry of a node's `attr`.
-        flat: Function path -> name; a path such as measured.slip or gain.0.
+        flat: Function path -> name; a path such as measured.slip or gain.0. A number whose name another one has is
+            called by its path.
+
+    Raises:
+        NotExported: Two numbers have the same name even so.
     """
     found: dict[str, Node] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(shape):
         words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
         for at in np.ndindex(leaf.shape):
-            name = flat(".".join([*words, *map(str, at)]))
+            full = ".".join([*words, *map(str, at)])
+            name = flat(full) if flat(full) not in found else full
+            if name in found:
+                raise NotExported(f"two numbers are called {name}: rename a field of one of their parts")
             found[name] = graph.input(leaf.dtype, UpdateLevel.UNIFORM, (where, name))
     return found
 

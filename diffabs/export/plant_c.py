@@ -19,6 +19,7 @@ from diffabs.compiler.lower.rules import Unsupported
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, canonical_dtypes, parameters, prepare_parts
 from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.core.units import unit_at
 from diffabs.export.device import NotExported
 from diffabs.export.lowered import fill_shapes, number_leaves, trace_outputs
 from diffabs.simulate.step.runge_kutta import rk4_step
@@ -89,9 +90,8 @@ def _variables(loop: Loop) -> tuple[FmuVariable, ...]:
     for where, part in (("plant", plant), ("initial", loop.initial)):
         for path, spec, value in parameters(part):
             numbers = np.asarray(value, float)
-            units = [unit.strip() for unit in spec.unit.split(",")]
             for k, at in enumerate(np.ndindex(numbers.shape)):
-                unit = units[min(k, len(units) - 1)]
+                unit = unit_at(spec.unit, k, numbers.size)
                 name = ".".join([where, path, *map(str, at)])
                 found.append(FmuVariable(name, "parameter", float(numbers[at]), unit, *_limits(spec)))
     return tuple(found)

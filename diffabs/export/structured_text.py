@@ -49,7 +49,7 @@ def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()
     Raises:
         NotExported: The name is no identifier, an operation has no translation, or a constant is NaN.
     """
-    if not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in ST_KEYWORDS:
+    if not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in ST_KEYWORDS | OWN:
         raise NotExported(f"{name!r} is no name that Structured Text has for a block: letters, digits and single _")
     with jax.enable_x64(True):
         try:
@@ -66,7 +66,7 @@ class _Block:
         self.device, self.name, self.notes = found, name, notes
         self.program = program = Lowered(found)
         self.real = "REAL" if found.dtype == np.float32 else "LREAL"
-        self.taken = taken = set(OWN)
+        self.taken = taken = OWN | {name.lower()}
         self.names = {(INPUTS, path): _fresh(path, taken) for path in program.read}
         self.names |= {(NUMBERS, path): _fresh(path, taken) for path in program.used}
         self.names |= {(MEMORY, path): _fresh(f"m_{path}", taken) for path in program.kept if path != "command"}

@@ -16,10 +16,8 @@ from diffabs.plot.runs import figure_for as figure_for
 from diffabs.plot.runs import shade_region as shade_region
 from diffabs.plot.style import COLOURS as COLOURS
 from diffabs.plot.style import DASHES as DASHES
-from diffabs.plot.style import DPI as DPI
 from diffabs.plot.style import GREY as GREY
 from diffabs.plot.style import KMH as KMH
-from diffabs.plot.style import TITLE_SIZE as TITLE_SIZE
 from diffabs.plot.style import control_label as control_label
 from diffabs.plot.style import label_axes as label_axes
 from diffabs.plot.style import make_logarithmic as make_logarithmic

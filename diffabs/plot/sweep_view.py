@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.types import Scalar
 from diffabs.plot.style import KMH
 from diffabs.sweep.results import Results
+from diffabs.sweep.statistics.rows import RowMasks
 
 # Fewest and most cells of a map along one variable. A variable with fewer different values has one cell for each.
 CELL_COUNTS = (4, 24)
@@ -40,6 +42,7 @@ class SweepView:
         units: Units by the name of a column.
         bounds: Bounds of a failure by metric.
         design: Type of the sampling design.
+        period: Number of runs in a group of a Saltelli design, else 1.
         accepted: Mask of the samples that were not refused.
         good: Mask of the accepted runs that did not diverge.
         rows: Mask of the good runs that statistics use: of a Saltelli design one of each group, else all of them.
@@ -50,12 +53,9 @@ class SweepView:
     def __init__(self, found: Results, units: Mapping[str, str] = {}):
         """Select the rows and metrics of the sweep `found`; `units` are by the name of a column."""
         self.found, self.units, self.bounds = found, units, found.study["failures"]
-        self.design, self.good = found.study["space"]["design"]["type"], ~found.column("diverged")
-        self.accepted = found.accepted
-        self.good &= self.accepted
-        # A Saltelli design repeats blocks (A, B, AB_1, ..., AB_p). Only A is an independent sample for the statistics.
-        period = len(found.study["space"]["variables"]) + 2 if self.design == "saltelli" else 1
-        self.rows = self.good & (found.column("sample") % period == 0)
+        masks = RowMasks(found)
+        self.design, self.period, self.accepted, self.good = masks.design, masks.period, masks.accepted, masks.good
+        self.rows = masks.good & masks.rows
         least = LEVEL_ROUNDING_EPS * np.finfo(found.study["dtype"]).eps
         columns = ((name, found.column(name)[self.rows]) for name in found.metrics if self.rows.any())
         finite = ((name, x[np.isfinite(x)]) for name, x in columns)
@@ -77,18 +77,16 @@ class SweepView:
     def label(self, name: str) -> str:
         """Return the column's `name` with its unit."""
         unit = self.units.get(name, "")
-        if ", " in unit:  # units of a list's entries: the last part of the name is the index
-            unit = unit.split(", ")[int(name.rpartition(".")[2])]
         return f"{name} [{unit}]" if unit else name
 
-    def title(self, what: str, rows: np.ndarray) -> str:
-        """Return a title: name of the scenario, the words `what`, and the number of runs in the mask `rows`.
+    def title(self, what: str, count: Scalar) -> str:
+        """Return a title: name of the scenario, the words `what`, and the number of runs `count`.
 
         The numbers of diverged and refused runs follow in brackets.
         """
         name, bad = self.found.manifest.get("source", {}).get("name"), np.sum(self.accepted & ~self.good)
         refused = np.sum(~self.accepted)
-        runs = f"{np.sum(rows):,} runs" + (f" ({bad:,} diverged)" if bad else "")
+        runs = f"{count:,} runs" + (f" ({bad:,} diverged)" if bad else "")
         runs += f" ({refused:,} refused)" if refused else ""
         return f"{name}: {what} {runs}" if name else f"{what} {runs}"
 

@@ -11,7 +11,18 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.types import Scalar, Table
-from diffabs.plot.style import COLOURS, GREY, Axes, Figure, label_axes, make_logarithmic, save_figure, sheet
+from diffabs.plot.style import (
+    COLOURS,
+    GREY,
+    Axes,
+    Figure,
+    ListedColormap,
+    Patch,
+    label_axes,
+    make_logarithmic,
+    save_figure,
+    sheet,
+)
 from diffabs.plot.sweep_view import AxisVariable, SweepView, assign_cells
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail
@@ -53,7 +64,7 @@ def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure 
         units: Units by the name of a column.
     """
     view = SweepView(found, units)
-    figure, axes = _panels(view.varying, view.title("distributions of", view.rows))
+    figure, axes = _panels(view.varying, view.title("distributions of", np.sum(view.rows)))
     for ax, name in zip(axes, view.varying, strict=True):
         values = found.column(name)[view.known_rows(name, view.rows)]
         low, middle, high = np.quantile(values, (0.05, 0.5, 0.95))
@@ -84,7 +95,7 @@ def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: f
     """
     view = SweepView(found, units)
     band = f"{100 * confidence:g} % band" + ("" if view.design == "random" else " (as if independent)")
-    figure, axes = _panels(view.varying, view.title("how often a value is exceeded in", view.rows))
+    figure, axes = _panels(view.varying, view.title("how often a value is exceeded in", np.sum(view.rows)))
     for ax, name in zip(axes, view.varying, strict=True):
         values = np.sort(found.column(name)[view.known_rows(name, view.rows)])
         n, limits = len(values), _limits(ax, values[0], values[-1], view.bounds.get(name))
@@ -127,7 +138,7 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
     # Later points cover earlier ones: ascending values keep the worst run of a place visible.
     shown = shown[np.argsort(values[shown], kind="stable")]
     x, y = ones[0].values, ones[1].values if ones[1:] else values
-    figure, (ax,) = sheet(title=view.title(f"greatest {metric} of", good), size=(8.4, 4.8))
+    figure, (ax,) = sheet(title=view.title(f"greatest {metric} of", np.sum(good)), size=(8.4, 4.8))
     dots = ax.scatter(x[shown], y[shown], 10, values[shown], cmap="viridis", linewidths=0)
     bar = figure.colorbar(dots, ax=ax, label=view.label(metric))
     if bound is not None and values.min() < bound < values.max():
@@ -156,7 +167,8 @@ def draw_sensitivity(found: Results, document: Table) -> Figure | None:
     paths = dict.fromkeys(path for rows in table.values() for path in rows)
     great = {path: max(abs(rows[path][kinds[-1]]["value"] or 0.0) for rows in table.values()) for path in paths}
     most = sorted((path for path in paths if great[path]), key=lambda path: -great[path])
-    title = view.title(f"{what} with {100 * document['confidence']:g} % intervals,", view.good)
+    used = max((rows[path][kinds[-1]]["samples"] for rows in table.values() for path in rows), default=0) * view.period
+    title = view.title(f"{what} with {100 * document['confidence']:g} % intervals,", used)
     names, height = list(table) if most else [], 1.3 + 0.3 * len(most) * len(kinds)
     figure, axes = _panels(names, title, (4.4, height), sharey=True)
     for ax, (name, rows) in zip(axes, table.items(), strict=False):
@@ -175,7 +187,8 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
 
     The variables are the two that influence failure most. With fewer than ten failed runs, or fewer than ten others,
     they are the two that influence the metric of `draw_worst` most. If no run failed, the colour is the largest value
-    of that metric in a cell. Cells without a run are grey.
+    of that metric in a cell. Cells with a run of infinite value (never) have a colour of their own. Cells without a run
+    are grey.
 
     The function returns None if no variable varies, and if no run failed and no metric varies.
 
@@ -197,7 +210,7 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
     shape = [len(edge) - 1 for edge in edges]
     cell = np.ravel_multi_index(places, shape)
     lanes, bad = (np.bincount(cell, w, np.prod(shape)).reshape(shape[0], -1) for w in (None, failed))
-    figure, (ax,) = sheet(title=view.title(f"{np.sum(failed):,} failed of", every), size=(7.4, 5.0))
+    figure, (ax,) = sheet(title=view.title(f"{np.sum(failed):,} failed of", np.sum(every)), size=(7.4, 5.0))
     if failed.any():
         table, words = bad / np.maximum(lanes, 1), "share of failed runs [1]"
         colours = {"cmap": "Oranges", "vmin": 0, "vmax": np.max(table)}
@@ -207,8 +220,13 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
         table, bound = greatest.reshape(lanes.shape), view.bounds.get(view.leading)
         words = f"greatest {view.label(view.leading)}" + ("" if bound is None else f", fails beyond {bound:g}")
         colours = {"cmap": "viridis"}
-    mesh = ax.pcolormesh(*[*edges, [0, 1]][:2], np.ma.masked_where(lanes == 0, table).T, **colours)
+    ends = [*edges, [0, 1]][:2]
+    mesh = ax.pcolormesh(*ends, np.ma.masked_where(lanes == 0, table).T, **colours)
     figure.colorbar(mesh, ax=ax, label=words)
+    if (never := (lanes > 0) & ~np.isfinite(table)).any():  # pcolormesh draws no infinite value
+        ax.pcolormesh(*ends, np.ma.masked_where(~never, never).T, cmap=ListedColormap([COLOURS[1]]))
+        worst = Patch(color=COLOURS[1], label=f"{view.leading}: never in a run")
+        figure.legend(handles=[worst], loc="outside lower center", frameon=False)
     ax.set_facecolor("#BBBBBB")
     ax.yaxis.set_visible(len(ones) > 1)
     _name_axes(ax, ones)

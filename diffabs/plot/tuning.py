@@ -1,10 +1,10 @@
-"""Figures of a tuning: convergence, runs before and after, the front of two objectives, and the worst case."""
+"""Figures of a tuning: convergence, runs before and after, and the front of two objectives."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from diffabs.core.types import PyTree, Scalar, Table
+from diffabs.core.types import PyTree, Scalar
 from diffabs.plot.style import (
     COLOURS,
     DASHES,
@@ -24,26 +24,13 @@ MAX_DECADES = 5.0  # an objective that falls by less is easier to read on a line
 SETTLED_MULTIPLE = 1.5  # length of the time axis, in transients
 
 
-def draw_history(points: Sequence[PyTree], *, title: str = "") -> Figure:
-    """Return a figure of objective, violation and gradient over the number of computed gradients.
-
-    Args:
-        points: Points of the iteration with `evaluations`, `objective`, `gradient` and `violation`.
-        title: Title of the figure.
-    """
-    figure, axes = sheet(1, 2, title=title, size=(5.2, 3.4))
-    _objective(axes[0], points)
-    _gradient(axes[1], points)
-    return figure
-
-
 def draw_tuning(
     points: Sequence[PyTree], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
 ) -> Figure:
     """Return the figure of `diffabs tune`: convergence above, the runs before and after below.
 
     Args:
-        points: Points of the iteration, as in `draw_history`.
+        points: Points of the iteration with `evaluations`, `objective`, `gradient` and `violation`.
         runs: Trajectories of one run of the batch by name.
         title: Title of the figure.
         lane: Description of this run, the worst of the batch.
@@ -108,31 +95,6 @@ def pareto_front(x: Scalar, y: Scalar) -> np.ndarray:
     return np.array(kept, int)
 
 
-def draw_worst_case(
-    nominal: Trajectory, worst: Trajectory, parameters: Table, *, metric: str = "", title: str = ""
-) -> Figure:
-    """Return a figure of the nominal and the worst braking run, with the parameters of the worst run.
-
-    Args:
-        nominal: Trajectory of the nominal run.
-        worst: Trajectory of the worst run.
-        parameters: Parameters of the worst run by path.
-        metric: Metric with its worst value, such as `overshoot = 0.31`.
-        title: Title of the figure.
-    """
-    found = ", ".join(f"{path} = {_short(value)}" for path, value in parameters.items())
-    heading = "\n".join(line for line in (title, f"{metric} at {found}" if metric else found) if line)
-    figure, axes = sheet(1, 3, title=heading, size=(4.6, 3.4))
-    runs = {"nominal": nominal, "worst case": worst}
-    _runs(axes[0], axes[1], runs)
-    for i, (name, seen) in enumerate(runs.items()):
-        distance, speed = np.asarray(seen.sample.output.distance), np.asarray(seen.sample.output.speed)
-        axes[2].plot(distance, 3.6 * speed, DASHES[i], color=COLOURS[i], label=f"{name}: {distance[-1]:.2f} m")
-        axes[2].plot(distance[-1:], 3.6 * speed[-1:], "o", color=COLOURS[i], markersize=4.5)
-    label_axes(axes[2], "distance [m]", "speed [km/h]")
-    return figure
-
-
 def _objective(ax: Axes, points: Sequence[PyTree]) -> None:
     """Draw the objective and, on an axis of its own, the largest violation of a constraint."""
     n, values = [p.evaluations for p in points], np.array([p.objective for p in points])
@@ -183,8 +145,3 @@ def _arrival_time(runs: Mapping[str, Trajectory]) -> float:
         ends.append(float(t[away[-1]]) if len(away) else 0.0)
     whole = max(float(np.asarray(seen.sample.t)[-1]) for seen in runs.values())
     return min(whole, SETTLED_MULTIPLE * max(ends)) or whole
-
-
-def _short(value: Scalar) -> str:
-    array = np.asarray(value, float)
-    return f"{float(array):.4g}" if array.ndim == 0 else f"[{', '.join(f'{x:.4g}' for x in array.ravel())}]"

@@ -120,7 +120,11 @@ class RealGraph(Graph):
         self._valued: dict[int, bool] = {}
 
     def has_value(self, node: Node) -> bool:
-        """Return whether a number has a value for all values of the inputs; False if that is unknown."""
+        """Return whether a number has a value for all values of the inputs; False if that is unknown.
+
+        Args:
+            node: Number.
+        """
         if node.id not in self._valued:
             total = node.op in TOTAL or _is_finite(node) or (node.op == "div" and _is_nonzero(node.args[1]))
             self._valued[node.id] = total and all(map(self.has_value, node.args))
@@ -146,7 +150,11 @@ class RealGraph(Graph):
         return self._make(name, args, args[0].dtype) if found is None else found
 
     def any(self, which: Node) -> Node:
-        """Return the condition itself: a result of a branch that no lane takes is a placeholder only in a kernel."""
+        """Return the condition itself: a result of a branch that no lane takes is a placeholder only in a kernel.
+
+        Args:
+            which: Condition.
+        """
         return which
 
 

@@ -14,6 +14,7 @@ from diffabs.report.page import (
     Section,
     describe_origin,
     embed_named,
+    format_known,
     format_pairs,
     join_words,
     model_tables,
@@ -34,14 +35,14 @@ def tuning_section(document: Document) -> Section:
         KeyError: The document lacks a key.
     """
     content = document.content
-    before, after = (content["objective"][when] for when in ("before", "after"))
+    before, after = (format_known(content["objective"][when]) for when in ("before", "after"))
     limits = [row["name"] for row in content["constraints"]]
     under = f", so that {join_words(limits)} keep{'s' if len(limits) == 1 else ''} the bound" if limits else ""
     lanes = f"{content['lanes']} run{'s' if content['lanes'] != 1 else ''}"
     return Section(
         title=f"Tuning of {content['scenario']}",
         question=f"Which values of {join_words(content['free'])} make the objective least over {lanes}{under}?",
-        answer=[f"The objective went from {before:.6g} to {after:.6g}; it ended because {content['reason']}."],
+        answer=[f"The objective went from {before} to {after}; it ended because {content['reason']}."],
         verdicts=[_constraint_row(row) for row in content["constraints"]],
         model=model_tables(content.get("model")),
         model_note="Before the tuning." if content.get("model") else UNKNOWN_ORIGIN,
@@ -58,8 +59,8 @@ def tuning_section(document: Document) -> Section:
 
 
 def _constraint_row(row: Table) -> ReportVerdict:
-    after = "not known" if row["after"] is None else f"{row['after']:.6g}"
-    return ReportVerdict("met" if row["met"] else "not met", f"{row['name']}: {after}, bound {row['bound']:.6g}")
+    after, bound = (format_known(row[key]) for key in ("after", "bound"))
+    return ReportVerdict("met" if row["met"] else "not met", f"{row['name']}: {after}, bound {bound}")
 
 
 def _figures(document: Document) -> Iterator[Figure]:
@@ -110,7 +111,7 @@ def identification_section(document: Document) -> Section:
         title=f"Identification of {content['scenario']}",
         question=f"Which values of {join_words(content['values'])} explain {data['samples']:,} measured instants of"
         f" {join_words(data['columns'])} until {data['until']:g} s, and how well do these determine them?",
-        answer=[f"chi2 = {content['chi2']:.6g} with {content['degrees']} degrees of freedom; it ended because"
+        answer=[f"chi2 = {format_known(content['chi2'])} with {content['degrees']} degrees of freedom; it ended because"
                 f" {content['reason']}."],
         verdicts=[ReportVerdict("not determined", row["direction"]) for row in content["undetermined"]]
         or [ReportVerdict("determined", "every parameter that was free")],

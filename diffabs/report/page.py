@@ -223,6 +223,16 @@ def original_command(content: Table, otherwise: str = "") -> list[str]:
     return [str(line)] if line else []
 
 
+def format_known(value: float | None, digits: int = 6) -> str:
+    """Return a number with so many digits, "not known" for None, which stands for NaN and infinity in JSON.
+
+    Args:
+        value: Number, or None.
+        digits: Number of significant digits.
+    """
+    return "not known" if value is None else f"{value:.{digits}g}"
+
+
 def join_words(words: Iterable[PyTree]) -> str:
     """Return words joined by commas and "and"; "nothing" without words.
 

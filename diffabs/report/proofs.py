@@ -1,5 +1,8 @@
 """Designs, certificates with their claims, and proofs over a box as sections of a report."""
 
+import shlex
+from typing import Any
+
 from diffabs.core.types import Table
 from diffabs.design.verify import verify_file
 from diffabs.report.documents import Document
@@ -11,6 +14,7 @@ from diffabs.report.page import (
     Section,
     describe_origin,
     embed_named,
+    format_known,
     join_words,
     model_tables,
     original_command,
@@ -56,7 +60,7 @@ def design_section(document: Document) -> Section:
         certificate_tables=proof_tables(content, content),
         notes=_notes(content),
         provenance=describe_origin(content),
-        again=[*original_command(content), *(f"diffabs verify {path}" for path in content["files"].values())],
+        again=[*original_command(content), *map(_verify_command, content["files"].values())],
     )  # fmt: skip
 
 
@@ -81,6 +85,10 @@ def proof_verdicts(proof: Table) -> list[ReportVerdict]:
     if proof.get("reason"):
         found.append(ReportVerdict("note", proof["reason"]))
     return found
+
+
+def _verify_command(path: Any) -> str:
+    return shlex.join(["diffabs", "verify", str(path)])
 
 
 def _value(kind: str, proof: Table) -> str:
@@ -154,7 +162,7 @@ def certificate_section(document: Document) -> Section:
         certificate=[ReportVerdict("not proved" if one.reason else "proved",
                              f"{one.kind}: {one.says}{one.reason and f' ({one.reason})'}") for one in proved],
         provenance=describe_origin(content),
-        again=[f"diffabs verify {document.path}"],
+        again=[_verify_command(document.path)],
     )  # fmt: skip
 
 
@@ -207,11 +215,11 @@ def box_section(document: Document) -> Section:
         provenance=describe_origin(content),
         again=[
             *original_command(content),
-            *([f"diffabs verify {files['certificate']}"] if verdict == "proved" and "certificate" in files else []),
+            *([_verify_command(files["certificate"])] if verdict == "proved" and "certificate" in files else []),
         ],
     )
 
 
 def _describe_claim(claim: Table) -> str:
     relation = ">=" if claim["quantity"].startswith("least") else "<="
-    return f"{claim['quantity'].replace('_', ' ')} {relation} {claim['bound']:.6g}"
+    return f"{claim['quantity'].replace('_', ' ')} {relation} {format_known(claim['bound'])}"

@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import shlex
 from collections.abc import Iterator, Mapping
 
 from diffabs.core.types import JsonObject, Table
@@ -14,6 +15,7 @@ from diffabs.report.page import (
     Section,
     describe_origin,
     embed_image,
+    format_known,
     format_pairs,
     join_words,
     model_tables,
@@ -50,12 +52,11 @@ def sweep_section(document: Document) -> Section:
     manifest = json.loads(files.read_content(document.folder / MANIFEST, MAX_DOCUMENT_BYTES))
     study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
     found, note = _scenario_model(source, document.folder)
-    varied = list(next(iter(content["sensitivity"].values()), {})) or list(units)
-    percent = f"{100 * content['confidence']:g} %"
+    varied, percent = join_words(study["space"]["variables"]), f"{100 * content['confidence']:g} %"
     return Section(
         title=f"Sweep of {source.get('name') or document.folder.name}",
-        question=f"How do {join_words(content['metrics'])} spread while {join_words(varied)} vary, and how probable"
-        " is a failure?",
+        question=f"How do {join_words(content['metrics'])} spread while {varied} vary, and how probable is a"
+        " failure?",
         answer=[_failure_tables(content, percent)],
         model=[*model_tables(found), _space(study["space"], units)],
         model_note=note,
@@ -106,8 +107,11 @@ def _failure_tables(content: Table, percent: str) -> str:
     lost = content["diverged"]["count"]
     line = f"{content['samples']:,} runs; {lost:,} diverged, {content['refused']['count']:,} were refused."
     if one and one["value"] is not None:
-        line += f" {one['count']:,} failed: a probability of {one['value']:.4g} ({percent} interval {one['low']:.4g} to"
-        line += f" {one['high']:.4g})."
+        among = f" of {one['samples']:,}" if "samples" in one else ""  # documents of earlier versions lack it
+        line += f" {one['count']:,}{among} failed: a probability of {one['value']:.4g}"
+        # A grid and corners are not random, so their documents have no interval.
+        known = None not in (one["low"], one["high"])
+        line += f" ({percent} interval {one['low']:.4g} to {one['high']:.4g})." if known else "."
     return line
 
 
@@ -162,7 +166,8 @@ def _notes(content: Table) -> Iterator[str]:
 
 def _sample(content: Table, folder: pathlib.Path) -> list[str]:
     worst = next((rows[0]["sample"] for rows in content["worst"].values() if rows), None)
-    return [] if worst is None else [f"diffabs simulate --from-sweep {folder} --sample {worst}"]
+    command = ["diffabs", "simulate", "--from-sweep", str(folder), "--sample", str(worst)]
+    return [] if worst is None else [shlex.join(command)]
 
 
 def rare_section(document: Document) -> Section:
@@ -175,7 +180,7 @@ def rare_section(document: Document) -> Section:
         KeyError: The document lacks a key.
     """
     content = document.content
-    low, high = content["interval"]
+    low, high = (format_known(end, 3) for end in content["interval"])
     failure = f"{content['metric']} >= {content['bound']:g} {content['unit']}"
     levels = [
         [i, row["threshold"], row["share"], row["cov"], row["acceptance"], row["diverged"]]
@@ -193,7 +198,7 @@ def rare_section(document: Document) -> Section:
     return Section(
         title=f"A rare failure of {content['scenario']}",
         question=f"How probable is {failure}, while what [sweep.over] names varies?",
-        answer=[f"{probability}, 95 % interval {low:.3g} to {high:.3g}."],
+        answer=[f"{probability}, 95 % interval {low} to {high}."],
         verdicts=[ReportVerdict("ended", content["reason"])],
         model=model_tables(content.get("model")),
         model_note="" if content.get("model") else UNKNOWN_ORIGIN,

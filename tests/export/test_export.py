@@ -22,6 +22,7 @@ from diffabs.controllers import (
     BackCalculation,
     Clamping,
     ConstantInput,
+    FourPhase,
     HoldingInput,
     ObserverFeedback,
     ProportionalFeedback,
@@ -72,6 +73,7 @@ LOOPS = {
     "holding command, table of friction": rig(SlidingMode(gain=0.2, low=0.0, high=90.0), feedforward=HoldingInput(),
         plant=LabRig(road=Tabulated())),
     "observer": balancing(controller=Sampled(controller=observer(), period=0.01)),
+    "four phases": rig(FourPhase(torque_low=3.0, torque_high=9.0, rate=900.0)),
 }  # fmt: skip
 
 
@@ -318,16 +320,19 @@ def test_a_compiler_without_nan_is_refused(tmp_path):
     'np.format_float_positional(x, precision=7, trim="0")',
 )
 @needs_cc
-def test_a_whole_run_is_what_the_exported_controller_does(tmp_path):
-    """slip-cured, sample by sample: what it measured goes in, what it commanded comes out."""
-    chosen = load("slip-cured", ["initial.speed_kmh=40"])
-    period = float(chosen.loop.controller.period)
-    every = round(period / chosen.solver.step)
-    run = d.rollout(chosen.loop, d.FixedStep(chosen.solver.step, 0.4, every=every), chosen.objectives)
+@pytest.mark.parametrize("name", ["slip-cured", "literature-four-phase"])
+def test_a_whole_run_is_what_the_exported_controller_does(name, tmp_path):
+    """Sample by sample: what it measured goes in, what it commanded comes out."""
+    chosen = load(name, ["initial.speed_kmh=40"], integrated=False)
+    loop = chosen.loop
+    if not isinstance(loop.controller, Sampled):
+        loop = dataclasses.replace(loop, controller=Sampled(controller=loop.controller, period=1e-3))
+    every = round(float(loop.controller.period) / chosen.solver.step)
+    run = d.rollout(loop, d.FixedStep(chosen.solver.step, 0.8, every=every), chosen.objectives)
     count = int(run.trajectory.running.sum())
     seen = jax.tree.map(lambda x: np.asarray(x)[:count], run.trajectory.sample.output)
-    found = computer_program(chosen.loop, step=chosen.solver.step)
-    result = commands_of_c(found, c_source(found, "cured"), "cured", seen, tmp_path)
+    found = computer_program(loop, step=chosen.solver.step)
+    result = commands_of_c(found, c_source(found, "unit"), "unit", seen, tmp_path)
     assert count > 300
     np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
 
@@ -475,6 +480,62 @@ def test_inputs_are_what_the_plant_shows():
     assert found.period == pytest.approx(0.01)
     assert math.isclose(found.delay, 0.0)
     assert isinstance(LOOPS["observer"].plant, ArmBalance)
+
+
+@killed_by("export/lowered.py", "flat(full) if flat(full) not in found else full", "flat(full)")
+@needs_cc
+def test_two_memories_of_one_controller_have_two_names(tmp_path):
+    """The torque and the phase of the four-phase logic, against the automaton of its module's head in Python."""
+    low, high, below, above, step = 3.0, 9.0, 0.08, 0.35, 0.9  # N m in each sample
+    logic = FourPhase(torque_low=low, torque_high=high, slip_low=below, slip_high=above, rate=1e3 * step)
+    slips = 0.2 + 0.19 * np.sin(0.2 * np.arange(200.0))
+    torque, phase, wanted, phases = 0.0, 0, [], set()
+    for slip in slips:
+        if phase == 0 and torque > high:
+            torque, phase = high, 1
+        elif phase == 1 and slip > above:
+            phase = 2
+        elif phase == 2 and torque < low:
+            torque, phase = low, 3
+        elif phase == 3 and slip < below:
+            phase = 0
+        wanted.append(min(max(torque, 0.0), high))
+        torque += {0: step, 2: -step}.get(phase, 0.0)
+        phases.add(phase)
+    assert phases == {0, 1, 2, 3}
+    found = computer_program(rig(logic))
+    program = compiled(c_source(found, "unit"), "unit", tmp_path)
+    lines = "".join(f"{slip!r}\n" for slip in slips.tolist())
+    said = subprocess.run([program], input=lines, capture_output=True, text=True, check=True).stdout
+    np.testing.assert_allclose([*map(float, said.split())], wanted, rtol=1e-12)
+    block = Block(structured_text(found, "Unit"))
+    np.testing.assert_allclose([block(slip=slip) for slip in slips], wanted, rtol=1e-12)
+
+
+@killed_by("export/lowered.py", "if name in found:", "if False:")
+def test_numbers_that_would_have_one_name_are_refused():
+    """A part of the controller that is called as the loop's reference is."""
+
+    @d.core.pytree.pytree
+    class Copy:
+        start, flow = d.core.protocols.no_memory, d.core.protocols.no_flow
+        reference: FixedSlip = d.core.pytree.part(default=FixedSlip)
+
+        def output(self, t, memory, signal):
+            return self.reference.slip - signal.measured.slip
+
+    with pytest.raises(NotExported, match=r"two numbers are called reference\.slip"):
+        c_source(computer_program(rig(Copy())), "unit")
+
+
+@killed_by("export/device.py", "unit_at(self.spec.unit, k, self.value.size)", "unit_at(self.spec.unit, 0, 1)")
+def test_each_number_of_a_list_has_its_own_unit():
+    """The six gains of a two-wheeler are of three angles and of their rates; declared are only two units."""
+    found = computer_program(LOOPS["observer"])
+    wanted = ["V/rad"] * 3 + ["V s/rad"] * 3
+    c, st = c_source(found, "unit"), structured_text(found, "Unit")
+    assert re.findall(r"^  unit_real gain_\d; /\* \[(.*?)\] in", c, re.MULTILINE) == wanted
+    assert re.findall(r"^  gain_\d : LREAL := .*?; \(\* \[(.*?)\] in", st, re.MULTILINE) == wanted
 
 
 @killed_by(
@@ -641,11 +702,21 @@ def test_structured_text_knows_every_kind_of_operation():
     np.testing.assert_allclose(result, wanted, rtol=1e-12, atol=1e-13)
 
 
-@killed_by("export/structured_text.py", "or name.lower() in ST_KEYWORDS:", "or False:", case="step")
-@pytest.mark.parametrize("name", ["2fast", "a b", "a__b", "Function_Block", "step"])
+@killed_by("export/structured_text.py", "or name.lower() in ST_KEYWORDS | OWN:", "or False:", case="step")
+@pytest.mark.parametrize("name", ["2fast", "a b", "a__b", "Function_Block", "step", "Held"])
 def test_a_name_that_structured_text_does_not_have_is_refused(name):
     with pytest.raises(NotExported, match="no name that Structured Text has"):
         structured_text(computer_program(LOOPS["state feedback"]), name)
+
+
+@killed_by("export/structured_text.py", "OWN | {name.lower()}", "set(OWN)")
+def test_no_variable_of_a_block_has_its_name():
+    """Identifiers of this language ignore case, and a block's name is one of them."""
+    loop, wanted, _ = limited()
+    text = structured_text(computer_program(loop), "Kp")
+    assert "FUNCTION_BLOCK Kp\n" in text
+    assert "kp" not in {name.strip().lower() for name in re.findall(r"^  (\w+) :", text, re.MULTILINE)}
+    assert Block(text)(slip=0.1) == pytest.approx(wanted[0], rel=1e-12)
 
 
 def test_what_structured_text_cannot_say_is_named():

@@ -20,7 +20,9 @@ from structured_text import Block
 import diffabs as d
 from diffabs.compiler.runtime.toolchain import COMPILER
 from diffabs.controllers import PID, ConstantInput, ConstantTorque, Sampled
+from diffabs.core.types import Vector
 from diffabs.export import NotExported, build_fmu, computer_program, structured_text
+from diffabs.export.plant_c import plant_source
 from diffabs.plants import MirroredRig
 from diffabs.references import FixedSlip
 from diffabs.scenario.defaults import braking
@@ -155,6 +157,18 @@ def test_who_asks_for_another_is_given_none(tmp_path):
     path = tmp_path / "plant.fmu"
     path.write_bytes(build_fmu(PLANTS["mirrored rig"], "plant", step=STEP))
     assert Fmu(path, tmp_path / "a", guid="{no}").instance.value is None
+
+
+@killed_by("export/plant_c.py", "unit_at(spec.unit, k, numbers.size)", "unit_at(spec.unit, 0, numbers.size)")
+def test_a_number_of_a_list_has_its_own_unit():
+    """Each of two units is for a half of the list."""
+
+    @d.core.pytree.pytree
+    class Laden(MirroredRig):
+        loads: Vector = d.core.pytree.param(default=(1.0, 2.0, 3.0, 4.0), unit="kg, m")
+
+    found = {one.name: one.unit for one in plant_source(braking(plant=Laden())).variables}
+    assert [found[f"plant.loads.{k}"] for k in range(4)] == ["kg", "kg", "m", "m"]
 
 
 @killed_by("export/mockup.py", "enumerate(plant.variables, 1)", "enumerate(plant.variables)")

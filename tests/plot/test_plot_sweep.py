@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from mutants import killed_by
 from scipy.stats import beta
@@ -11,7 +12,9 @@ from seams import replace_seam
 from sweeping import manifest
 
 from diffabs.plot import sweeps as plots
-from diffabs.sweep import Results
+from diffabs.scenario.defaults import balancing
+from diffabs.simulate.types import FixedStep
+from diffabs.sweep import Results, Space, Study, Uniform
 from diffabs.sweep.manifest import Seals
 from diffabs.sweep.seal import encode_chunk as chunk
 from diffabs.sweep.statistics.summary import summarise_sweep
@@ -200,11 +203,11 @@ DOCUMENT = {
     "confidence": 0.9,
     "sensitivity": {
         "effort": {
-            "a": {"spearman": {"value": 0.1, "low": -0.1, "high": 0.3}},
-            "b": {"spearman": {"value": -0.8, "low": -0.9, "high": -0.7}},
-            "c": {"spearman": {"value": None, "low": None, "high": None}},
+            "a": {"spearman": {"value": 0.1, "low": -0.1, "high": 0.3, "samples": N}},
+            "b": {"spearman": {"value": -0.8, "low": -0.9, "high": -0.7, "samples": N}},
+            "c": {"spearman": {"value": None, "low": None, "high": None, "samples": N}},
         },
-        "locked_time": {path: {"spearman": {"value": None, "low": None, "high": None}} for path in "abc"},
+        "locked_time": {path: {"spearman": {"value": None, "low": None, "high": None, "samples": N}} for path in "abc"},
     },
 }
 
@@ -220,8 +223,20 @@ def test_rank_correlations_have_bars_and_intervals(made):
     assert drawn == [[[-0.9, centres[0]], [-0.7, centres[0]]], [[-0.1, centres[1]], [0.3, centres[1]]]]
 
 
+@killed_by("plot/sweeps.py", "default=0) * view.period", "default=0)", case="saltelli-2,700")
+@killed_by("plot/sweeps.py", 'kinds[-1]]["samples"] for', "kinds[-1]] and 1200 for", case="random-900")
+@pytest.mark.parametrize(("design", "runs"), [("random", "900"), ("saltelli", "2,700")])
+def test_the_title_counts_the_runs_behind_the_bars(made, design, runs):
+    """Correlations may be of fewer runs than there are; an index is of groups of a variable's three runs."""
+    one = {"value": 0.5, "low": 0.4, "high": 0.6, "samples": 900}
+    table = {"effort": {"a": {"spearman": one, "first": one, "total": one}}}
+    sweep = made({"a": A}, {"effort": A}, design=design)
+    title = plots.draw_sensitivity(sweep, {"confidence": 0.9, "sensitivity": table}).get_suptitle()
+    assert " ".join(title.split()).endswith(f"with 90 % intervals, {runs} runs")
+
+
 def test_sobol_bars_have_no_interval_if_there_is_none(made):
-    one = {"value": 0.6, "low": 0.5, "high": 0.7}
+    one = {"value": 0.6, "low": 0.5, "high": 0.7, "samples": N // 4}
     rows = {"a": {"first": one, "total": {**one, "value": 0.9}}, "b": {"first": one, "total": {**one, "low": None}}}
     sweep = made({"a": A, "b": B}, {"effort": A}, design="saltelli")
     figure = plots.draw_sensitivity(sweep, {"confidence": 0.95, "sensitivity": {"effort": rows}})
@@ -299,6 +314,26 @@ def test_cells_without_a_run_are_empty(made):
     assert table[4, 1] == table[5, 0] == 1
 
 
+@killed_by("plot/sweeps.py", "(lanes > 0) & ~np.isfinite(table)", "(lanes < 0) & ~np.isfinite(table)", case="some")
+@pytest.mark.parametrize("cells", ["some", "all"])
+def test_cells_of_runs_that_never_settle_have_a_colour(made, cells):
+    """On a triangle of levels, so that other cells have no run and stay grey."""
+    x, y = (np.repeat(level, 4) for level in np.tril_indices(6))
+    settling = np.where((x == 5) & (y == 2) | (cells == "all") & (np.arange(x.size) % 4 == 0), np.inf, 1 + x + 0.5 * y)
+    figure = plots.draw_failure_map(made({"x": x + 0.0, "y": y + 0.0}, {"settling_time": settling}))
+    figure.draw_without_rendering()
+    colours = {}
+    for drawn in figure.axes[0].collections:
+        for place, colour in zip(np.ndindex(6, 6), drawn.get_facecolors(), strict=True):  # row by row upward
+            if colour[3] > 0:
+                colours[place[::-1]] = to_hex(colour)
+    (entry,) = figure.legends[0].get_patches()
+    assert figure.legends[0].get_texts()[0].get_text() == "settling_time: never in a run"
+    assert set(colours) == set(zip(x.tolist(), y.tolist(), strict=True))
+    own = {place for place, colour in colours.items() if colour == to_hex(entry.get_facecolor())}
+    assert own == ({(5, 2)} if cells == "some" else set(colours))
+
+
 @killed_by("plot/sweeps.py", "np.maximum.at(greatest, cell, values)", "greatest[:] = values.max()")
 def test_a_map_without_failures_shows_the_strongest_inputs(found, made):
     metrics = {"overshoot": OVERSHOOT, "effort": 5 + A}
@@ -337,9 +372,14 @@ def test_with_one_variable_the_map_is_a_strip(made):
 
 
 def test_a_number_of_a_list_has_its_own_unit(made):
-    sweep = made({"gain.0": A, "gain.1": B}, {"effort": A + 2 * B})
-    ax = plots.draw_worst(sweep, dict.fromkeys(("gain.0", "gain.1"), "N m/s, N m")).axes[0]
-    assert {ax.get_xlabel(), ax.get_ylabel()} == {"gain.0 [N m/s]", "gain.1 [N m]"}
+    """Of the gains of six states, three are of angles and three of rates; there are only two units for them."""
+    gains = [f"controller.gain.{k}" for k in range(6)]
+    space = Space({gain: Uniform(0.0, 1.0) for gain in gains})
+    units = Study(loop=balancing(), space=space, samples=8, solver=FixedStep(1e-3, 1.0)).units()
+    assert [units[gain] for gain in gains] == ["V/rad"] * 3 + ["V s/rad"] * 3
+    sweep = made({gains[1]: A, gains[3]: B}, {"effort": A + 2 * B})
+    ax = plots.draw_worst(sweep, units).axes[0]
+    assert {ax.get_xlabel(), ax.get_ylabel()} == {f"{gains[1]} [V/rad]", f"{gains[3]} [V s/rad]"}
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ def trajectory(rate: float) -> Trajectory:
 
 
 SLOW, FAST = trajectory(10.0), trajectory(40.0)
+RUNS = {"before": SLOW, "after": FAST}
 
 
 def lines(ax):
@@ -29,8 +30,8 @@ def lines(ax):
 
 
 def test_history_is_over_the_gradients_computed(tmp_path):
-    figure = plots.draw_history(HISTORY)
-    objective, gradient, violation = figure.axes
+    figure = plots.draw_tuning(HISTORY, RUNS)
+    objective, gradient, _, _, violation = figure.axes
     np.testing.assert_array_equal(objective.get_lines()[0].get_data(), [[1, 3, 5, 7, 9], [10, 1, 0.1, 0.01, 0.001]])
     np.testing.assert_allclose(gradient.get_lines()[0].get_data()[1], 10.0 ** -np.arange(5.0), rtol=1e-15)
     np.testing.assert_allclose(violation.get_lines()[0].get_data()[1], [0.2, 0.1, 0, 0, 0], rtol=0, atol=1e-15)
@@ -42,12 +43,13 @@ def test_history_is_over_the_gradients_computed(tmp_path):
 def test_an_objective_of_either_sign_has_a_linear_axis():
     little = [point._replace(objective=40 + point.gradient, violation=0.0) for point in HISTORY]
     negative = [point._replace(objective=point.objective - 1) for point in HISTORY]
-    assert [plots.draw_history(points).axes[0].get_yscale() for points in (little, negative)] == ["linear"] * 2
-    assert len(plots.draw_history(little).axes) == 2
+    drawn = [plots.draw_tuning(points, RUNS).axes for points in (little, negative)]
+    assert [axes[0].get_yscale() for axes in drawn] == ["linear"] * 2
+    assert len(drawn[0]) == 4  # without an axis for the violation
 
 
 def test_tuning_has_history_and_both_runs():
-    axes = plots.draw_tuning(HISTORY, {"before": SLOW, "after": FAST}, title="T", lane="plant.mass = 6").axes
+    axes = plots.draw_tuning(HISTORY, RUNS, title="T", lane="plant.mass = 6").axes
     slip, torque = axes[2], axes[3]
     np.testing.assert_array_equal(lines(slip)["after"], [FAST.sample.t, FAST.sample.output.slip])
     np.testing.assert_array_equal(lines(torque)["before"], [SLOW.sample.t, SLOW.sample.control])
@@ -56,7 +58,7 @@ def test_tuning_has_history_and_both_runs():
 
 def test_runs_are_shown_until_they_have_settled():
     """To 2 % after ln(50)/10 s."""
-    for ax in plots.draw_tuning(HISTORY, {"before": SLOW, "after": FAST}).axes[2:4]:
+    for ax in plots.draw_tuning(HISTORY, RUNS).axes[2:4]:
         assert ax.get_xlim()[1] == pytest.approx(1.5 * np.log(50) / 10, abs=0.02)
 
 
@@ -82,11 +84,3 @@ def test_pareto_joins_the_front_and_shows_the_rest():
     np.testing.assert_array_equal(lines(ax)["published"], [[2], [4]])
     assert "stopping distance" in ax.get_ylabel()
     assert "effort" in ax.get_xlabel()
-
-
-def test_the_worst_case_says_where_it_is():
-    found = {"plant.mass": 6.2, "controller.gain": np.array([-9000.0, -60.0])}
-    figure = plots.draw_worst_case(SLOW, FAST, found, metric="overshoot = 0.31", title="rig")
-    assert figure.get_suptitle() == "rig\novershoot = 0.31 at plant.mass = 6.2, controller.gain = [-9000, -60]"
-    np.testing.assert_array_equal(lines(figure.axes[0])["worst case"][1], FAST.sample.output.slip)
-    assert "nominal: 24.00 m" in lines(figure.axes[2])

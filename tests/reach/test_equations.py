@@ -42,7 +42,7 @@ def test_a_parameter_of_the_box_must_not_change_the_slip() -> None:
 
 
 @killed_by(
-    "reach/equations.py", 'path.endswith(("period", "delay")):', 'path.endswith("delay"):', case="controller.period"
+    "reach/equations.py", '"delay"):\n                raise', "):\n                raise", case="controller.delay"
 )
 @pytest.mark.parametrize("path", ["controller.period", "controller.delay"])
 def test_a_range_of_periods_or_delays_is_refused(path: str) -> None:

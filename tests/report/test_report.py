@@ -4,15 +4,17 @@ import base64
 import itertools
 import json
 import math
+import shlex
 
 import invented
+import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in
 from commands import run as command
 from marks import cases
 from reports import Page
 from seams import replace_seam
-from sweeping import SCENARIO, tune_section
+from sweeping import SCENARIO, manifest, tune_section
 from terminal import Terminal, assert_fits, assert_orderly
 
 pytest.importorskip("jinja2")
@@ -24,6 +26,11 @@ from diffabs.cli import report as reporting
 from diffabs.report import ReportError, build_report, find_documents
 from diffabs.report.charts import draw_lines
 from diffabs.report.writing import SECTION_BY_KIND
+from diffabs.sweep import Results as SweepResults
+from diffabs.sweep.manifest import Seals
+from diffabs.sweep.seal import encode_chunk
+from diffabs.sweep.statistics.summary import summarise_sweep
+from diffabs.sweep.store import Store
 
 TUNED = tune_section(2, 1.0)
 HOSTILE = '<script>alert("x")</script><img src=http://x.test/a.png onerror=alert(1)>'
@@ -131,7 +138,7 @@ SAID = {
     "rare": ["levels", "failures"],
     "sweep": ["failures", "metrics"],
 }
-OWN = {"sweep": {"least", "greatest"}, "rare": {"spread"}, "tune": {"missed"}}  # that only the document has
+OWN = {"sweep": {"least", "greatest", "samples"}, "rare": {"spread"}, "tune": {"missed"}}  # that only the document has
 
 
 @killed_by("report/page.py", "repr(value))]", "round_for_table(value))]", case="tune")
@@ -278,6 +285,75 @@ def test_a_sweep_with_figures_writes_its_report(results):
     text = (results / "sweep" / "report.html").read_text(encoding="utf-8")
     assert Page(text).numbers == page(results, "sweep").numbers
     assert json.loads((results / "sweep.json").read_text())["files"]["report"].endswith("report.html")
+
+
+def invented_sweep(folder, design, variables=("plant.mass", "plant.road.w4"), n=64):
+    """The page of a sweep that was never run; a run fails if its metric is negative, as one in four is."""
+    metric = np.where(np.arange(n) % 16 < 4, -1.0, 1.0 + np.arange(n) % 5)
+    table = manifest(n, n, variables, ["margin"], success=True)
+    table["study"]["space"]["design"] = design
+    columns = {"sample": np.arange(n), **{path: np.linspace(0.0, 1.0, n) for path in variables}, "margin": metric}
+    columns |= {"stopped": metric > 0, "diverged": np.zeros(n, bool), "refused": np.full(n, "", object)}
+    store = Store(folder)
+    folder.mkdir()
+    store.begin(table, resume=False)
+    store.write(0, encode_chunk(columns, Seals(table).of(0)))
+    content = summarise_sweep(SweepResults(folder))
+    (folder / "summary.json").write_text(json.dumps(content))
+    return content, Page(build_report(find_documents(folder))).text
+
+
+@killed_by("report/studies.py", 'None not in (one["low"], one["high"])', "True")
+@killed_by("report/studies.py", "return [] if worst is None else [shlex.join(command)]", 'return [" ".join(command)]')
+def test_a_grid_has_a_report_without_intervals(tmp_path):
+    _, text = invented_sweep(tmp_path / "my $sweep", {"type": "grid", "levels": 8})
+    assert "failed: a probability of 0.25." in text
+    assert "spread while plant.mass and plant.road.w4 vary, and how" in text
+    line = text[text.index("diffabs simulate") :]
+    assert shlex.split(line)[:4] == ["diffabs", "simulate", "--from-sweep", str(tmp_path / "my $sweep")]
+
+
+def test_of_a_saltelli_design_the_failures_are_among_the_rows_a(tmp_path):
+    """Every fourth row is a row A, and of these every fourth fails."""
+    content, text = invented_sweep(tmp_path / "s", {"type": "saltelli"})
+    assert content["failures"]["any"]["count"] == 4
+    assert "64 runs; 0 diverged, 0 were refused. 4 of 16 failed: a probability of 0.25 (95 % interval" in text
+
+
+@killed_by("cli/sweep.py", "    _write_summary(out, result)\n    if kept:", "    if kept:")
+@pytest.mark.slow
+def test_a_sweep_whose_figure_fails_keeps_its_summary(tmp_path, monkeypatch):
+    def fail(figure, path):
+        raise OSError(28, "No space left on device")
+
+    replace_seam(monkeypatch, "save_figure", fail)
+    (tmp_path / "small.toml").write_text(SCENARIO)
+    out, words = tmp_path / "out", ("--samples", 8, "--engine", "xla", "--figures")
+    result = command("sweep", tmp_path / "small.toml", *words, "--out", out, status=1)
+    assert "No space left" in result.stderr
+    assert json.loads((out / "summary.json").read_text())["samples"] == 8
+
+
+@killed_by("report/page.py", '"not known" if value is None', '"0" if value is None')
+def test_what_json_has_no_number_for_is_not_known(results, tmp_path):
+    """The own start of a tuning may diverge, and a bound may be infinite."""
+    content = json.loads((results / "tune.json").read_text())
+    content["objective"]["before"] = content["constraints"][0]["bound"] = None
+    (tmp_path / "x.json").write_text(json.dumps(content))
+    text = Page(build_report(find_documents(tmp_path / "x.json"))).text
+    assert f"The objective went from not known to {content['objective']['after']:.6g};" in text
+    assert "bound not known" in text
+
+
+@killed_by("report/proofs.py", 'shlex.join(["diffabs", "verify", str(path)])', 'f"diffabs verify {path}"')
+def test_commands_of_a_report_can_be_pasted(results, tmp_path):
+    """By a shell's own rules each is one command with the file's name as one word."""
+    path = tmp_path / "my $files" / "certificate.json"
+    path.parent.mkdir()
+    path.write_text((results / "certificate.json").read_text())
+    text = Page(build_report(find_documents(path))).text
+    line = text[text.index("diffabs verify") :]
+    assert shlex.split(line)[:3] == ["diffabs", "verify", str(path)]
 
 
 @pytest.mark.parametrize(
