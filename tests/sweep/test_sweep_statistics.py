@@ -237,7 +237,7 @@ class TestReplicates:
         """Means of the replicates."""
         return [values[r == self.PLACES].mean() for r in range(8)]
 
-    @killed_by("sweep/statistics/replicated.py", "self.count / (self.count - 1) * np.square", "np.square")
+    @killed_by("sweep/statistics/replicated.py", " / (1 - np.square(shares).sum())", "")
     def test_the_mean_has_the_t_interval_of_the_replicates(self):
         theirs = stats.ttest_1samp(self.blocks(self.X), 0.0).confidence_interval(0.9)
         found = self.BY.mean(self.X)
@@ -253,6 +253,14 @@ class TestReplicates:
         found = Replicates(places, 8, 0.9).mean(x)
         half = stats.t.ppf(0.95, 7) * jackknife
         np.testing.assert_allclose(ends(found), [x.mean() - half, x.mean() + half], rtol=0, atol=0.05 * half)
+
+    @killed_by("sweep/statistics/replicated.py", "np.square(shares).sum()", "1 / self.count")
+    def test_the_error_of_unequal_replicates_is_not_too_small(self):
+        """Of independent samples, its square is 1/n on average."""
+        random, by = np.random.default_rng(43), Replicates(np.arange(200) // 180, 2)
+        found = [by.mean(x) for x in random.normal(size=(2000, 200))]
+        errors = np.array([one.high - one.value for one in found]) / stats.t.ppf(0.975, 1)
+        assert np.square(errors).mean() == pytest.approx(1 / 200, rel=0.15)
 
     @killed_by("sweep/statistics/replicated.py", "n * (level + above)", "n * level")
     @killed_by("sweep/statistics/replicated.py", "n * (level - below)", "n * level")
@@ -282,13 +290,19 @@ class TestReplicates:
         np.testing.assert_allclose(ends(found), theirs, rtol=1e-12, atol=0)
 
     @killed_by("sweep/statistics/replicated.py", "MIN_TAIL_SAMPLES <= failures", "1 <= failures")
-    @killed_by("sweep/statistics/replicated.py", "if not (0 < half < math.inf", "if not (-1 < half < math.inf")
-    @pytest.mark.parametrize("failed", [[], [5], [5, 6], range(0, 1024, 64)], ids=["none", "one", "two", "one each"])
-    def test_rare_failures_have_clopper_and_pearsons_interval(self, failed):
+    @killed_by("sweep/statistics/replicated.py", "if equal or", "if half == 0 or", case="three each")
+    @pytest.mark.parametrize(
+        ("failed", "n"),
+        [([], 1024), ([5], 1024), ([5, 6], 1024), (range(0, 1024, 64), 1024), (np.arange(1000) % 100 < 3, 1000)],
+        ids=["none", "one", "two", "one each", "three each"],
+    )
+    def test_rare_failures_have_clopper_and_pearsons_interval(self, failed, n):
         """Also equal shares: they have no spread, and the share of the law is not certain."""
-        places, mask = np.arange(1024) // 64, np.isin(np.arange(1024), failed)
-        theirs = stats.binomtest(int(mask.sum()), 1024).proportion_ci()
-        np.testing.assert_allclose(ends(Replicates(places, 16).probability(mask)), theirs, rtol=0, atol=1e-8)
+        mask = failed if isinstance(failed, np.ndarray) else np.isin(np.arange(n), failed)
+        theirs = stats.binomtest(int(mask.sum()), n).proportion_ci()
+        size = 64 if n == 1024 else 100
+        found = Replicates(np.arange(n) // size, n // size).probability(mask)
+        np.testing.assert_allclose(ends(found), theirs, rtol=0, atol=1e-8)
 
     @killed_by("sweep/statistics/replicated.py", "max(share - half, 0.0)", "share - half")
     def test_a_probability_lies_between_0_and_1(self):

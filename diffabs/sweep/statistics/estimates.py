@@ -311,7 +311,7 @@ def _cvar(ordered: np.ndarray, level: float, confidence: float, replicates: int,
     if not 0 <= level < 1:
         raise ValueError(f"level = {level:g} is outside [0, 1)")
     n, place = len(ordered), percentile_index(replicates, confidence)
-    share = n * (1 - level)
+    share = round(n * (1 - level), 9)  # 100 (1 - 0.9) is 10
     # Samples that a resample's tail can reach: 8 standard deviations of a count above its mean.
     reach = min(n, math.ceil(share + 8 * math.sqrt(share)) + MIN_TAIL_SAMPLES)
     tail = ordered[n - reach :][::-1]

@@ -8,14 +8,14 @@
 m is the mean of all n values, and t a quantile of Student's law with R - 1 degrees of freedom for R replicates. The
 standard error of m comes from the sums over each replicate:
 
-    e(x)^2 = R/(R - 1) sum_r (sum_(i in r) (x_i - m)/n)^2
+    e(x)^2 = sum_r (sum_(i in r) (x_i - m)/n)^2 / (1 - sum_r (n_r/n)^2)       n_r samples in replicate r
 
-No estimate is a mean of the quantiles of replicates. The quantile of few samples is biased towards the median, and
-stratified replicates have nearly equal quantiles: an interval from their spread excludes the quantile of the law. Here
-each statistic, or the level of each end, is a mean over samples, which has no such bias.
+Each estimate is one of all samples together. A mean of the quantiles of replicates would be biased: the quantile of few
+samples is nearer to the median, and stratified replicates have nearly equal ones.
 
 The coverage of 95 % intervals was measured for 600 seeds of scrambled Sobol' sequences (200 for 4,096 samples), three
-laws, and sums of 1, 2 and 5 variables. The lowest and highest of 15 to 30 cases, in %:
+laws, and sums of 1, 2 and 5 variables. The lowest and highest of 15 to 30 cases, in %, each with a standard error of
+1 to 1.5:
 
     samples, replicates    quantiles 0.05, 0.5, 0.95    probabilities 0.002 to 0.5    mean         CVaR 0.95
     256, 8                 96 to 100                    96 to 100                     90 to 100    88 to 95
@@ -50,7 +50,8 @@ from diffabs.sweep.statistics.estimates import (
 class Replicates:
     """The replicates of n samples. Each estimate is that of all samples together.
 
-    Ends of intervals are infinite if a replicate has no sample, because others have diverged, for example.
+    Ends of intervals are infinite if a replicate has no sample, because others have diverged, for example; those of a
+    probability are then of independent samples.
 
     Attributes:
         places: Replicate of each sample, counted from 0, shape (n,).
@@ -75,15 +76,17 @@ class Replicates:
     def probability(self, failed: PyTree) -> IntervalEstimate:
         """Return the share of `failed` samples, a mask of shape (n,).
 
-        The interval is that of Clopper and Pearson, which is too wide, with fewer than 10 failures or successes, and
-        where all replicates have equal shares. A t interval needs a spread.
+        The interval is that of Clopper and Pearson with fewer than 10 failures or successes, with equal shares in all
+        replicates, and with an empty replicate.
 
         Raises:
             ValueError: There are no samples.
         """
         x = as_column(failed)
         n, failures, half = len(x), int(np.count_nonzero(x)), self._half_width(x)
-        if not (0 < half < math.inf and MIN_TAIL_SAMPLES <= failures <= n - MIN_TAIL_SAMPLES):
+        sizes, counts = (np.bincount(self.places, w, self.count) for w in (None, x))
+        equal = (counts * n == failures * sizes).all()
+        if equal or half == math.inf or not MIN_TAIL_SAMPLES <= failures <= n - MIN_TAIL_SAMPLES:
             return Count(failures, n).probability(confidence=self.confidence)
         share, half = failures / n, half + 1 / n
         return IntervalEstimate(share, max(share - half, 0.0), min(share + half, 1.0), self.confidence, n)
@@ -141,20 +144,23 @@ class Replicates:
         if np.bincount(self.places, minlength=self.count).min() == 0:
             return math.inf
         sums = np.bincount(self.places, x - x.mean(), self.count) / len(x)
-        error = math.sqrt(self.count / (self.count - 1) * np.square(sums).sum())
+        shares = np.bincount(self.places, minlength=self.count) / len(x)
+        error = math.sqrt(np.square(sums).sum() / (1 - np.square(shares).sum()))
         return float(stats.t.ppf(upper_level(self.confidence), self.count - 1)) * error
 
     def _quantile(self, x: np.ndarray, ordered: np.ndarray, level: float) -> IntervalEstimate:
+        if not 0 < level < 1:
+            raise ValueError(f"level = {level:g} is outside (0, 1)")
         n, value = len(x), np.quantile(ordered, level)
         # Of equal values, the lower end needs the share below them, the upper end the share up to them.
         below, above = (self._half_width(mask.astype(float)) for mask in (x < value, x <= value))
-        r, s = max(n * (level - below), 0.0), min(n * (level + above), float(n))
-        return quantile_between(ordered, level, math.floor(r), math.ceil(s) + 1, self.confidence)
+        low, high = max(n * (level - below), 0.0), min(n * (level + above), float(n))
+        return quantile_between(ordered, level, math.floor(low), math.ceil(high) + 1, self.confidence)
 
     def _cvar(self, x: np.ndarray, ordered: np.ndarray, level: float) -> IntervalEstimate:
         if not 0 <= level < 1:
             raise ValueError(f"level = {level:g} is outside [0, 1)")
-        share = len(x) * (1 - level)
+        share = round(len(x) * (1 - level), 9)
         edge = ordered[max(math.ceil(len(x) * level) - 1, 0)]
         found = self.mean(edge + np.maximum(x - edge, 0.0) / (1 - level))
         return found if share >= MIN_TAIL_SAMPLES else found._replace(low=-math.inf, high=math.inf)

@@ -189,7 +189,8 @@ def _sum_group_features(a: np.ndarray, b: np.ndarray, mixed: np.ndarray, random:
     n = len(a)
     groups = min(n, MAX_ROW_GROUPS)
     group = random.permutation(n) % groups if groups < n else np.arange(n)
-    mean = (a.mean() + b.mean()) / 2
+    # Of a constant, no rounding may be left: it would count as a variance.
+    mean = (a.mean() + b.mean()) / 2 if np.ptp(np.concatenate([a, b])) > 0 else a[0]
     a, b = a - mean, b - mean
     sums = [np.bincount(group, one) for one in (np.ones(n), a + b, a * a + b * b)]
     for values in mixed:
@@ -210,5 +211,5 @@ def _indices_from_sums(sums: np.ndarray) -> np.ndarray:
     mean, square = sums[:, 1:2] / (2 * n), sums[:, 2:3] / (2 * n)
     products, squares = sums[:, 3::2] / n, sums[:, 4::2] / n
     variance = square - mean**2
-    variance = np.where(variance > 0, variance, np.nan)
+    variance = np.where(variance > 0, variance, np.nan)  # a constant output has no indices
     return np.concatenate([products, squares / 2], axis=1) / variance

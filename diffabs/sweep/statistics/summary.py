@@ -5,9 +5,9 @@ read one at a time, so that ten million rows fit into memory. The design decides
 
     random                      of independent samples
     sobol, replicates > 1       from the spread between the replicates (`replicated`)
-    sobol, latin-hypercube      of independent samples, which are too wide
+    sobol, latin-hypercube      as of independent samples, usually too wide
     grid, corners               none: nothing is random; limits of intervals are null
-    saltelli                    of its rows A, too wide as those of Sobol' sequences; Sobol' indices from all
+    saltelli                    of its rows A, as of one Sobol' sequence; Sobol' indices by a bootstrap of all groups
 """
 
 import math
@@ -28,10 +28,10 @@ MAX_LISTED_SAMPLES = 10
 MIN_SAMPLES = 4  # smallest number of samples with statistics
 INTERVAL_NOTES = {
     "random": "independent samples",
-    "sobol": "spread between replicates; rare failures as of independent samples",
-    "one sobol": "as of independent samples: too wide for a Sobol' sequence",
-    "latin-hypercube": "as of independent samples: too wide for a Latin hypercube",
-    "saltelli": "as of independent samples, rows A only: too wide for a Sobol' sequence",
+    "sobol": "spread between replicates; rare failures and correlations as of independent samples",
+    "one sobol": "as of independent samples: usually too wide for a Sobol' sequence",
+    "latin-hypercube": "as of independent samples: usually too wide for a Latin hypercube",
+    "saltelli": "as of independent samples, rows A only: usually too wide; indices by a bootstrap",
     "grid": "none: a grid is not random",
     "corners": "none: corners are not random",
 }
@@ -89,7 +89,7 @@ def _list_samples(view: RowMasks, rows: np.ndarray) -> JsonObject:
 def _list_never(found: Results, view: RowMasks, name: str) -> JsonObject:
     """Return the number and the first samples of runs with an infinite value, which never reach the measured event.
 
-    No other statistic includes them.
+    They violate every bound of the metric. Its other statistics are of the finite values only.
     """
     return _list_samples(view, view.good & view.rows & np.isinf(found.column(name)))
 
