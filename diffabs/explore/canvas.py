@@ -25,7 +25,7 @@ class Canvas:
         self.send(encode_change(option), edit)
 
     def send(self, change: str, edit: int = 0) -> None:
-        """Apply a `change` encoded by `encode_change`, from any thread; `edit` is as in `change`."""
+        """Apply a `change` encoded by `encode_change`; `edit` is as in `change`."""
         ui.run_javascript(f"explorer.change({self.element.id}, {change}, {int(edit)})")
 
 

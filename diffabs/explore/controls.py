@@ -33,6 +33,7 @@ class Controls:
         self.session, self._change, self._replaced, self._widen = session, turned, replaced, widened
         self.fields: JsonObject = {}
         self.sliders: JsonObject = {}
+        self.refused: dict[str, Callable[[], None]] = {}  # by name of a marked field: shows its valid value again
         self.sources = list(dict.fromkeys([session.source, *names()]))
 
     def build(self) -> None:
@@ -42,18 +43,23 @@ class Controls:
         self.inside = ui.element("div").classes("rows")
         self._fill()
 
-    def rebuild(self) -> None:
-        """Fill the column again from the session: with other numbers, or with the old choice after a refused one."""
+    def rebuild(self, fan: str = "") -> None:
+        """Fill the column again from the session: with other numbers, or with the old choice after a refused one.
+
+        `fan` is the line about the fan.
+        """
         self.inside.clear()
         self._fill()
+        self.made.set_text(fan)
 
     def show(self, key: str) -> None:
         """Show the current value of the number `key` in its field and slider."""
         knob, value = self.session.knobs[key], self.session.value(key)
+        self.refused.pop(key, None)
         if key in self.fields:
             self.fields[key].props(remove="error")
             self.fields[key].set_value(knob.text(value))
-        if key in self.sliders and abs(self.sliders[key].value - knob.place_of(value)) > 1e-6:
+        if key in self.sliders and abs(self.sliders[key].value - knob.place_of(value)) > 0.5:
             self.sliders[key].set_value(knob.place_of(value))
 
     def show_all(self) -> None:
@@ -62,14 +68,18 @@ class Controls:
             self.show(key)
 
     def show_refusal(self, line: str) -> None:
-        """Show why an input was refused; an empty `line` hides the message."""
+        """Show why an input was refused; an empty `line` hides the message and the refused values."""
         self.message.set_text(line)
         self.message.set_visibility(bool(line))
+        if not line:
+            for show_valid in [*self.refused.values()]:
+                show_valid()
 
     def wrong(self, key: str) -> None:
         """Mark the field of the refused number `key`."""
         if key in self.fields:
             self.fields[key].props("error")
+            self.refused[key] = partial(self.show, key)
 
     def fan(self, found: Fan | None) -> None:
         """Show the number of runs in the fan `found`, and the parameters that differ between them."""
@@ -80,7 +90,7 @@ class Controls:
         self.made.set_text(f"{found.members} runs, {found.words}{lost}")
 
     def _fill(self) -> None:
-        self.fields, self.sliders = {}, {}
+        self.fields, self.sliders, self.refused = {}, {}, {}
         with self.inside:
             # A choice of scenario, road or controller replaces all numbers.
             labels = {source: pathlib.Path(source).name for source in self.sources}
@@ -95,7 +105,7 @@ class Controls:
             for name in wanted:
                 with ui.element("div").classes("spread"):
                     ui.label(words[name])
-                    field = ui.input(value=f"{100 * getattr(self.session.spread, name):g}").props("dense outlined")
+                    field = ui.input(value=self._spread(name)).props("dense outlined")
                     field.props["data-id"] = f"fan-{name}"
                     field.on("change", lambda _, name=name, field=field: self._take_spread(name, field))
                     ui.label("%").classes("unit")
@@ -123,11 +133,20 @@ class Controls:
         field.props["data-id"] = name
         field.on_value_change(lambda event: self._replaced(partial(load, event.value)))
 
+    def _spread(self, name: str) -> str:
+        return f"{100 * getattr(self.session.spread, name):g}"
+
     def _take_spread(self, name: str, field: Any) -> None:
         if self._widen(name, field.value):
-            field.props(remove="error")
+            self._show_spread(name, field)
         else:
             field.props("error")
+            self.refused[name] = partial(self._show_spread, name, field)
+
+    def _show_spread(self, name: str, field: Any) -> None:
+        self.refused.pop(name, None)
+        field.props(remove="error")
+        field.set_value(self._spread(name))
 
     def _rows(self, keys: Iterable[str]) -> None:
         group = ""

@@ -102,7 +102,8 @@ class Knob:
         if part in (0.0, 1.0):
             return (self.high if part else self.low) / self.scale
         on = self._line(self.low) * (1 - part) + self._line(self.high) * part
-        shown = math.copysign(math.exp(abs(on) if self.low > 0 else -on), self.low) if self._logarithmic else on
+        sign = math.copysign(1.0, self.low)
+        shown = sign * math.exp(sign * on) if self._logarithmic else on
         return float(f"{shown:.5g}") / self.scale  # rounded, so that the displayed value is the simulated one
 
     @property
@@ -114,7 +115,7 @@ class Knob:
 
     def _line(self, shown: float) -> float:
         """Return the coordinate of a displayed value in which the slider is linear."""
-        return math.copysign(math.log(abs(shown)), shown) if self._logarithmic else shown
+        return math.copysign(1.0, shown) * math.log(abs(shown)) if self._logarithmic else shown
 
 
 def knobs(chosen: Scenario) -> dict[str, Knob]:

@@ -72,9 +72,9 @@ SCRIPT = """
 window.explorer = {
   edit: 0, at: {}, times: [], last: 0,
   edited() { this.at[++this.edit] = performance.now(); return this.edit; },
-  change(id, option, edit) {
+  change(id, option, edit, tries = 500) {
     const chart = getElement(id)?.chart;
-    if (!chart) { setTimeout(() => this.change(id, option, edit), 20); return; }
+    if (!chart) { if (tries) setTimeout(() => this.change(id, option, edit, tries - 1), 20); return; }
     chart.setOption(option);
     if (edit) this.shown(edit);
   },
@@ -85,7 +85,7 @@ window.explorer = {
   },
   painted(edit, now) {
     if (!(edit in this.at)) return;
-    this.times.push(now - this.at[edit]);
+    this.times = [...this.times.slice(-9999), now - this.at[edit]];
     this.last = edit;
     for (const other of Object.keys(this.at)) if (+other <= edit) delete this.at[other];
     const recent = this.times.slice(-25).sort((a, b) => a - b);

@@ -1,10 +1,11 @@
 """The page of one tab: sliders on the left, curves in the middle, verdict, poles and metrics on the right."""
 
 import asyncio
+import contextlib
 import math
 import pathlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -43,15 +44,14 @@ class Page:
         self.session, self.tools = session, tools
         self.client, self.server = ui.context.client, asyncio.get_running_loop()
         self.version, self.turned_at = 0, 0.0
-        self.since = 0  # results of earlier versions are dropped: they are of another scenario, or of replaced numbers
+        self.oldest_valid = 0  # earlier results are dropped: they are of another scenario, or of replaced numbers
         self.drawn = 0  # version of the shown curve
-        self.costs: dict[str, float] = {}
         self.shown: Curves | None = None
-        self.objected = 0  # version of a refusal, whose message stays
+        self.refused_version = 0  # version of a refusal, whose message stays
         self.switching = asyncio.Lock()  # scenario and parts change one after the other
-        self.around: stability.CornerLoops | None = None  # corners computed last
-        self.surrounded = False  # whether they belong to the current loop
-        self.drawer, self.thinker = (NewestJobThread(thread, self._report_failure) for _ in range(2))
+        self.learned: dict[str, Any] = {}  # of this scenario: seconds of each step, and the corners computed last
+        self.corners_current = False  # whether the poles shown last had the corners of their own loop
+        self.drawer, self.thinker = (NewestJobThread(thread) for _ in range(2))
         self.controls = Controls(session, self._change, self._replaced, self._widen)
         self.results = ResultsPanel()
         self.saver = Saver(session, folder)
@@ -73,11 +73,12 @@ class Page:
                 with ui.element("section").classes("right"):
                     self.tuner.build()
                     self.results.build()
+            self.saver.build()
         self.begin()
 
     def begin(self) -> None:
         """Show a scenario from its beginning."""
-        self.since, self.around = self.version + 1, None
+        self.oldest_valid, self.learned = self.version + 1, {}
         self.shown = None
         self.title.set_text(self.session.given.title or self.session.given.name)
         self.end_line.set_text("compiling …")
@@ -93,21 +94,20 @@ class Page:
         self.turned_at = time.monotonic()
         now, edited = self.session.scenario(), self.session.edited
         if edited is None:
-            self.since = self.version
+            self.oldest_valid = self.version
         self.results.wait()
         if self.tools.judge:
-            self.results.proved_box(self.tools.judge(self.session))
+            self.results.proved_box(_verdict(self.tools.judge, self.session))
         self.drawer.ask(partial(self._draw, now, self.version, edit, edited))
 
     def later(self, show: Callable[..., None], *given: PyTree) -> None:
-        """Call show(*given) in the server's thread; for use in worker threads."""
+        """Call show(*given) in the server's thread; workers change elements through `later` only."""
 
         def do() -> None:
             if not self.client.is_deleted:
                 with self.client:
                     show(*given)
 
-        # The page's elements may be changed in the server's thread only.
         self.server.call_soon_threadsafe(do)
 
     def pin(self, found: Curves | None) -> None:
@@ -124,7 +124,7 @@ class Page:
     def show_refusal(self, error: Exception | None) -> None:
         """Show the message of an `error`, which stays until the next change; None hides it."""
         if error is not None:
-            self.objected = self.version
+            self.refused_version = self.version
         self.controls.show_refusal("" if error is None else _sentence(error))
 
     def reset(self) -> None:
@@ -163,7 +163,7 @@ class Page:
         self.redraw()
         return True
 
-    def _withdraw_edit(self, key: str, error: ScenarioError, version: int) -> None:
+    def _withdraw_edit(self, key: str, error: Exception, version: int) -> None:
         """Refuse a number whose loop must not be run, and return to the last accepted numbers.
 
         Edits after the last accepted numbers were not checked on their own; they are withdrawn, too.
@@ -186,20 +186,20 @@ class Page:
         async with self.switching:
             try:
                 basis = await asyncio.to_thread(load)
-            except ScenarioError as error:
+            except Exception as error:  # also an error in a user's part
                 refusal = error
             if self.client.is_deleted:
                 return
             with self.client:
                 if basis:
                     self.session.switch(basis)
-                self.controls.rebuild()
+                self.controls.rebuild("" if basis else self.controls.made.text)
                 if basis:
                     self.begin()
                 self.show_refusal(refusal)
 
     def _show_curves(self, found: Curves, now: Scenario, change: str, version: int, edit: int) -> None:
-        if version < max(self.since, self.drawn):
+        if version < max(self.oldest_valid, self.drawn):
             return
         self.drawn = version
         self.session.accept(now.loop)
@@ -209,27 +209,34 @@ class Page:
         else:
             self.chart.send(change, edit)
         self.shown = found
-        if version == self.version != self.objected:
+        if version == self.version != self.refused_version:
             self.show_refusal(None)
         self.end_line.set_text(f"{self.session.given.name} {found.end}")
         if not found.draft:
             self.results.metrics(found.metrics, fresh=version == self.version)
 
-    def _gave_up(self, error: Exception) -> None:
+    def _gave_up(self, what: str, error: Exception, version: int) -> None:
+        if version != self.version:
+            return
         self.show_refusal(error)
-        self.results.stop_waiting()
-        if self.shown is None:
-            self.end_line.set_text("no run")
+        if what == "run":
+            self.results.measuring.set_visibility(False)
+            if self.shown is None:
+                self.end_line.set_text("no run")
+
+    def _learn(self, name: str, found: PyTree, version: int) -> None:
+        if version >= self.oldest_valid:
+            self.learned[name] = found
 
     def _show_fan(self, found: Fan | None, change: str, version: int) -> None:
-        if version < self.since:
+        if version < self.oldest_valid:
             return
         if self.chart is not None:
             self.chart.send(change)
         self.controls.fan(found)
 
     def _show_stability(self, found: stability.Stability | str, version: int, whole: bool) -> None:
-        if version >= self.since:
+        if version >= self.oldest_valid:
             self.results.stability(found, fresh=whole and version == self.version)
 
     def _show_verdict(self, found: ProofVerdict, version: int) -> None:
@@ -237,23 +244,26 @@ class Page:
             self.results.verdict(found)
 
     # Methods that run in worker threads. They reach the page through `later` only.
-    def _report_failure(self, error: Exception) -> None:
-        """Show an unexpected error once; its job ends."""
-        self.later(self._gave_up, error)
+    @contextlib.contextmanager
+    def _report_error(self, what: str, version: int) -> Iterator[None]:
+        """Show an unexpected error of the computation `what`, and go on after it."""
+        try:
+            yield
+        except Exception as error:
+            self.later(self._gave_up, what, error, version)
 
     def _draw(self, now: Scenario, version: int, edit: int, edited: Knob | None) -> None:
         """Compute and send the curve, after a check of the `edited` number, and then have the rest computed."""
         if edited is not None:
             try:
                 check_edit(edited, now)
-            except ScenarioError as error:
+            except Exception as error:  # a check that fails is no permission
                 self.later(self._withdraw_edit, edited.key, error, version)
                 return
-        try:
+        with self._report_error("run", version):
             self._send(curves.run_curves(now, curves.draft_solver(now)), now, version, edit)
-        finally:
-            # The curve comes first. Also after an error: poles and verdict may exist without a run.
-            self.thinker.ask(partial(self._think, now, version))
+        # The curve comes first. Also after an error: poles and verdict may exist without a run.
+        self.thinker.ask(partial(self._think, now, version))
 
     def _send(self, found: Curves, now: Scenario, version: int, edit: int = 0) -> None:
         self.later(self._show_curves, found, now, encode_change(charts.change_curves(found)), version, edit)
@@ -263,31 +273,29 @@ class Page:
         if version != self.version:
             return
         steps = {"poles": self._poles, "fan": self._fan}
-        done = [name for name in steps if self.costs.get(name, math.inf) < QUICK_JOB_S]
+        done = [name for name in steps if self.learned.get(name, math.inf) < QUICK_JOB_S]
         for name in done:
             self._time_step(name, steps[name], now, version)
         if not self._wait_for_rest(REST, version):
             return
         if curves.draft_solver(now):
-            self._send(curves.run_curves(now), now, version)
+            with self._report_error("run", version):
+                self._send(curves.run_curves(now), now, version)
         for name in steps:
             if name not in done and version == self.version:
                 self._time_step(name, steps[name], now, version)
-        if version == self.version and not self.surrounded:
+        if version == self.version and not self.corners_current:
             self._poles(now, version, corners=True)
         if self._wait_for_rest(PROVING, version):
-            try:
-                found = self.tools.prove(now)
-            except Exception as error:  # the card shows every error, and the thread goes on
-                found = ProofVerdict(NOT_PROVED, _sentence(error))
-            self.later(self._show_verdict, found, version)
+            self.later(self._show_verdict, _verdict(self.tools.prove, now), version)
         objections(now)  # compiles the check now, before the next edit needs it
 
     def _time_step(self, name: str, step: Callable[[Scenario, int], bool], now: Scenario, version: int) -> None:
         begun = time.monotonic()
-        useful = step(now, version)
-        # Without a result the step counts as slow, so that a drag does not repeat it.
-        self.costs[name] = time.monotonic() - begun if useful else math.inf
+        with self._report_error(name, version):
+            useful = step(now, version)
+            # Without a result the step counts as slow, so that a drag does not repeat it.
+            self.later(self._learn, name, time.monotonic() - begun if useful else math.inf, version)
 
     def _wait_for_rest(self, seconds: float, version: int) -> bool:
         """Wait until nothing has changed for some seconds, and return whether this version is still the newest."""
@@ -301,20 +309,30 @@ class Page:
         The corners are the cached ones, or with `corners` they are computed for this loop.
         """
         found: Any
+        around = self.learned.get("corners")
         try:
             if corners:
-                self.around = stability.linearise_corners(now, self.around)
-            found = stability.linear_stability(now, self.around)
-            self.surrounded = self.around is not None and self.around.of == stability.corners_of(now)
+                around = stability.linearise_corners(now, around)
+                self.later(self._learn, "corners", around, version)
+            found = stability.linear_stability(now, around)
+            self.corners_current = around is not None and around.of == stability.corners_of(now)
         except Exception as error:  # the card shows every error, and the thread goes on
-            found, self.surrounded = _sentence(error), True
-        self.later(self._show_stability, found, version, self.surrounded)
+            found, self.corners_current = _sentence(error), True
+        self.later(self._show_stability, found, version, self.corners_current)
         return not isinstance(found, str)
 
     def _fan(self, now: Scenario, version: int) -> bool:
         found = curves.run_fan(now, self.session.spread)
         self.later(self._show_fan, found, encode_change(charts.change_fan(found)), version)
         return True
+
+
+def _verdict(judge: Callable[..., ProofVerdict], given: Scenario | Session) -> ProofVerdict:
+    """Return the verdict on a scenario or session; the card shows every error as the reason for no verdict."""
+    try:
+        return judge(given)
+    except Exception as error:
+        return ProofVerdict(NOT_PROVED, _sentence(error))
 
 
 def _sentence(error: Exception) -> str:
@@ -340,8 +358,8 @@ async def show(source: str, tools: Tools, folder: pathlib.Path, thread: str) -> 
     await client.connected()
     try:
         session = await asyncio.to_thread(Session, source)
-    except ScenarioError as error:  # the file has changed since the command started
-        waiting.set_text(str(error))
+    except Exception as error:  # for example, the file has changed since the command started
+        waiting.set_text(_sentence(error))
         return
     if client.is_deleted:
         return

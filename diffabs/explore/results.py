@@ -89,11 +89,6 @@ class ResultsPanel:
             busy.set_visibility(True)
         self.verdict_box.classes(add="stale")
 
-    def stop_waiting(self) -> None:
-        """Remove the marks of computations that have ended."""
-        for busy in (self.proving, self.solving, self.measuring):
-            busy.set_visibility(False)
-
     def metrics(self, found: dict[str, float], *, fresh: bool) -> None:
         """Show the metrics `found`; `fresh` says that they belong to the current numbers."""
         self.measuring.set_visibility(not fresh)

@@ -2,7 +2,6 @@
 
 import pathlib
 import shlex
-from typing import Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
@@ -18,10 +17,15 @@ class Saver:
         """Prepare the dialog for a `session`, whose files are written into `folder`; the page stays unchanged."""
         self.session, self.folder = session, folder
 
+    def build(self) -> None:
+        """Put the closed dialog on the page."""
+        self.dialog = ui.dialog()
+
     def ask(self) -> None:
         """Open the dialog."""
         name = saving.free_name(self.folder, f"{self.session.given.name}-explored")
-        with ui.dialog() as dialog, ui.card().style("min-width: 440px").props("data-id=saving"):
+        self.dialog.clear()
+        with self.dialog, ui.card().style("min-width: 440px").props("data-id=saving"):
             ui.label("Save the scenario with these numbers").style("font-weight:600; font-size:15px")
             ui.label(f"in {self.folder}").classes("note")
             self.name = ui.input("file", value=name).classes("w-full").props("dense outlined data-id=file")
@@ -29,11 +33,11 @@ class Saver:
             self.told = ui.label("").classes("refused").props("data-id=save-refused")
             self.told.set_visibility(False)
             with ui.row().classes("w-full justify-end"):
-                ui.button("cancel", on_click=dialog.close).props("flat no-caps")
-                ui.button("save", on_click=lambda: self._save(dialog)).props("unelevated no-caps data-id=write")
-        dialog.open()
+                ui.button("cancel", on_click=self.dialog.close).props("flat no-caps")
+                ui.button("save", on_click=self._save).props("unelevated no-caps data-id=write")
+        self.dialog.open()
 
-    def _save(self, dialog: Any) -> None:
+    def _save(self) -> None:
         try:
             chosen = self.session.to_save()
             path = saving.save_scenario(chosen, self.folder, str(self.name.value), replacing=bool(self.replacing.value))
@@ -41,7 +45,7 @@ class Saver:
             self.told.set_text(str(error))
             self.told.set_visibility(True)
             return
-        dialog.close()
+        self.dialog.close()
         ui.notify(
             f"written: {path}; run it with: diffabs simulate {shlex.quote(path.name)}",
             type="positive",

@@ -35,19 +35,21 @@ class Tuner:
     def __init__(self, page: "Page", thread: str):
         """Prepare the tuner of a `page`; `thread` is the name of its thread. The page stays unchanged."""
         self.page = page
-        self.worker = NewestJobThread(thread, self._report_failure)
+        self.worker = NewestJobThread(thread)
         self.stopping, self.running = False, False
         self.origin: Scenario | None = None
 
     def build(self) -> None:
-        """Put the hidden card into the open column."""
+        """Put the hidden card into the open column, and the closed dialog on the page."""
+        self.dialog = ui.dialog()
         self.card = ui.element("div").classes("tuning").props("data-id=tuning")
         self.card.set_visibility(False)
 
     def begin(self) -> None:
-        """Stop the tuning and hide its card, for another scenario."""
+        """Stop the tuning, and hide its card and the dialog, for another scenario."""
         self.stopping = True
         self.origin = None
+        self.dialog.close()
         self.card.set_visibility(False)
 
     def end(self) -> None:
@@ -62,7 +64,8 @@ class Tuner:
             return
         now = self.page.session.scenario()
         paths, metric = tuning.default_tuning(now)
-        with ui.dialog() as dialog, ui.card().style("min-width: 460px").props("data-id=ask-tuning"):
+        self.dialog.clear()
+        with self.dialog, ui.card().style("min-width: 460px").props("data-id=ask-tuning"):
             ui.label("Tune from here").style("font-weight:600; font-size:15px")
             free = ui.select(tuning.tunable_parameters(now), value=paths, label="free parameters", multiple=True).props(
                 "dense outlined"
@@ -77,17 +80,19 @@ class Tuner:
             small.classes("w-full").props("data-id=metric")
             ui.label(self._about(now)).classes("note")
             with ui.row().classes("w-full justify-end"):
-                ui.button("cancel", on_click=dialog.close).props("flat no-caps")
+                ui.button("cancel", on_click=self.dialog.close).props("flat no-caps")
 
                 def start() -> None:
-                    dialog.close()
+                    if not self.dialog.value:
+                        return  # a second click, while the dialog closes
+                    self.dialog.close()
                     typed = {key: (low.value, high.value) for key, (low, high, _) in fields.items()}
                     # Unchanged texts are rounded; the exact bounds are used instead.
                     bounded = {key: pair for key, pair in typed.items() if pair != fields[key][2]}
                     self._start(list(free.value or ()), str(small.value), bounded)
 
                 ui.button("start", on_click=start).props("unelevated no-caps data-id=start")
-        dialog.open()
+        self.dialog.open()
 
     def _bounds(self, place: Scalar, now: Scenario, paths: list[str], fields: dict[str, Fields]) -> None:
         """Show fields for the lower and upper bound of each free number."""
@@ -124,7 +129,7 @@ class Tuner:
         session = self.page.session
         try:
             chosen = tuning.scenario_with_goal(session.scenario(), paths, metric, session.knobs, bounded)
-        except ScenarioError as error:
+        except Exception as error:  # also an unexpected one says why nothing starts
             self.page.show_refusal(error)
             return
         self.page.show_refusal(None)
@@ -146,16 +151,18 @@ class Tuner:
 
     # Methods that run in the tuning's thread.
     def _tune(self, chosen: Scenario) -> None:
-        posed = self.page.tools.pose(chosen)
-        before = curves.run_curves(chosen)
-        found = tuning.tune_scenario(
-            chosen, posed, lambda i, loss: self.page.later(self._show_progress, i, loss), lambda: self.stopping
-        )
-        after = curves.run_curves(found.after)
-        self.page.later(self._show_result, chosen, found, before, after)
-
-    def _report_failure(self, error: Exception) -> None:
-        self.page.later(self._gave_up, error)
+        later = self.page.later
+        try:
+            posed = self.page.tools.pose(chosen)
+            before = curves.run_curves(chosen)
+            found = tuning.tune_scenario(
+                chosen, posed, lambda i, loss: later(self._show_progress, i, loss), lambda: self.stopping
+            )
+            after = curves.run_curves(found.after)
+        except Exception as error:  # the message shows every error
+            later(self._gave_up, error)
+        else:
+            later(self._show_result, chosen, found, before, after)
 
     # Methods that run in the server's thread.
     def _show_progress(self, iteration: int, loss: float) -> None:
@@ -173,6 +180,8 @@ class Tuner:
 
     def _gave_up(self, error: Exception) -> None:
         self.running = False
+        if self.origin is None:
+            return
         self.card.set_visibility(False)
         self.page.show_refusal(error)
 

@@ -43,7 +43,10 @@ def tunable_parameters(chosen: Scenario) -> list[str]:
     there = [
         path
         for path, spec, value in parameters(chosen.loop)
-        if spec.tunable and path.startswith(("controller.", "reference.")) and np.isfinite(value).all()
+        if spec.tunable
+        and path.startswith(("controller.", "reference."))
+        and np.ndim(value) < 2  # a matrix has no numbers on the page
+        and np.isfinite(value).all()
     ]
     return list(dict.fromkeys([*chosen.tune.free, *there]))
 
@@ -78,8 +81,8 @@ def bounds_on_page(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> di
     """
     mine = {key: knob for key, knob in known.items() if knob.path == path}
     given = chosen.tune.free.get(path)
-    if given is None and any(knob.low is None or knob.high is None for knob in mine.values()):
-        raise ScenarioError(f"tune.free.{path} has no range: it is not finite here")
+    if given is None and not (mine and all(knob.low is not None for knob in mine.values())):
+        raise ScenarioError(f"tune.free.{path} has no range: it is a matrix, or not finite here")
 
     def end(knob: Knob, side: int) -> float:
         if given is None:
@@ -163,7 +166,7 @@ def tune_scenario(
 
 def _range(
     chosen: Scenario, path: str, known: Mapping[str, Knob], bounded: Mapping[str, tuple[PyTree, PyTree]]
-) -> tuple[PyTree, PyTree]:
+) -> tuple[PyTree, PyTree] | None:
     """Return the lower and the upper bound of a parameter in SI, in its shape."""
     ends = {
         **bounds_on_page(chosen, path, known),
@@ -174,5 +177,7 @@ def _range(
         if not low < high:
             knob = known[key]
             raise ScenarioError(f"tune.free.{knob.name}: {knob.text(low)} is not below {knob.words(high)}")
+    if not read:
+        return chosen.tune.free[path]  # of a matrix
     low, high = zip(*read.values(), strict=True)
     return (low, high) if np.shape(get(chosen.loop, path)) else (low[0], high[0])

@@ -1,5 +1,6 @@
 """A worker thread that runs only the newest of the waiting jobs."""
 
+import contextlib
 import threading
 from collections.abc import Callable
 
@@ -9,15 +10,14 @@ Job = Callable[[], None]
 class NewestJobThread:
     """A thread that runs jobs one after the other.
 
-    A new job replaces a job that still waits, so at most one job waits.
+    A new job replaces a job that still waits, so at most one job waits. A job reports its own errors.
     """
 
-    def __init__(self, name: str, failed: Callable[[Exception], None]):
-        """Start a thread with this `name`; `failed` is called with the exception of a job."""
+    def __init__(self, name: str):
+        """Start a thread with this `name`."""
         self._job: Job | None = None
         self._ended = False
         self._there = threading.Condition()
-        self._failed = failed
         threading.Thread(target=self._work, name=name, daemon=True).start()
 
     def ask(self, job: Job) -> None:
@@ -34,10 +34,8 @@ class NewestJobThread:
 
     def _work(self) -> None:
         while (job := self._next()) is not None:
-            try:
+            with contextlib.suppress(Exception):  # an error must not end the thread
                 job()
-            except Exception as error:  # an error must not end the thread
-                self._failed(error)
 
     def _next(self) -> Job | None:
         with self._there:

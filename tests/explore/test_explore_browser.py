@@ -284,6 +284,15 @@ def test_the_time_axis_fits_the_transient_then_the_run(tabs):
 
 
 @needs_browser
+def test_a_change_of_a_deleted_chart_is_given_up(tabs):
+    tries = """() => new Promise(done => { const get = window.getElement; let n = 0;
+      window.getElement = id => { n += id === -1; return get(id); };
+      explorer.change(-1, {}, 0, 3);
+      setTimeout(() => { window.getElement = get; done(n); }, 500); })"""
+    assert tabs().evaluate(tries) == 4
+
+
+@needs_browser
 def test_another_scenario_and_another_road(tabs):
     page = tabs()
     page.click("[data-id=scenario]")

@@ -11,8 +11,8 @@ from mutants import killed_by
 from seams import replace_seam
 from test_explore import SHORT
 
-from diffabs.explore import curves
-from diffabs.explore.session import CERTIFIED, ProofVerdict, Session, Tools
+from diffabs.explore import curves, stability
+from diffabs.explore.session import AS_GIVEN, CERTIFIED, ProofVerdict, Session, Tools
 
 nicegui = pytest.importorskip("nicegui")
 from nicegui.page import page as route  # noqa: E402  # pyright: ignore[reportMissingImports]
@@ -39,6 +39,7 @@ class Jobs:
 
     def run(self):
         job, self.job = self.job, None
+        assert job
         job()
 
 
@@ -59,8 +60,11 @@ class OpenPage:
             self.page.build()
         self.session = self.page.session
 
+    def elements(self, name, kind="data-id"):
+        return [one for one in self.client.elements.values() if one.props.get(kind) == name]
+
     def find(self, name, kind="data-id"):
-        (one,) = (one for one in self.client.elements.values() if one.props.get(kind) == name)
+        (one,) = self.elements(name, kind)
         return one
 
     def click(self, name):
@@ -179,7 +183,7 @@ def test_a_wider_fan_leaves_chart_and_tuning(visit, monkeypatch):
     visit(user)
 
 
-@killed_by("explore/page.py", "version < max(self.since, self.drawn)", "version < self.since")
+@killed_by("explore/page.py", "version < max(self.oldest_valid, self.drawn)", "version < self.oldest_valid")
 def test_a_final_curve_never_hides_a_newer_draft(visit, monkeypatch):
     async def user(opened):
         page, late = opened.page, []
@@ -209,7 +213,7 @@ def test_a_final_curve_never_hides_a_newer_draft(visit, monkeypatch):
     visit(user)
 
 
-@killed_by("explore/page.py", "            self.since = self.version\n", "            pass\n")
+@killed_by("explore/page.py", "            self.oldest_valid = self.version\n", "            pass\n")
 def test_a_late_curve_does_not_return_after_a_reset(visit):
     async def user(opened):
         await opened.draw()
@@ -226,7 +230,7 @@ def test_a_late_curve_does_not_return_after_a_reset(visit):
 
 @killed_by(
     "explore/page.py",
-    "        if version < self.since:\n            return\n        if self.chart is not None:\n",
+    "        if version < self.oldest_valid:\n            return\n        if self.chart is not None:\n",
     "        if self.chart is not None:\n",
 )
 def test_a_late_fan_does_not_return_after_a_reset(visit, monkeypatch):
@@ -235,12 +239,18 @@ def test_a_late_fan_does_not_return_after_a_reset(visit, monkeypatch):
         monkeypatch.setattr(curves, "run_fan", lambda *given: None)
         monkeypatch.setattr(page, "_poles", lambda *given, **more: True)
         await opened.draw()
+
+        def reset(show, *given):
+            if show == page._show_fan:
+                late.append(given)
+                opened.click("reset")
+
         with monkeypatch.context() as patch:
-            patch.setattr(page, "later", lambda show, *given: (late.append((show, given)), opened.click("reset")))
+            patch.setattr(page, "later", reset)
             page.thinker.run()
-        ((show, given),) = late
+        (given,) = late
         with opened.client:
-            show(*given)
+            page._show_fan(*given)
         assert page.controls.made.text == ""
 
     visit(user)
@@ -270,5 +280,302 @@ def test_two_quick_choices_both_hold(visit, monkeypatch):
         await settled(opened, lambda: opened.session.parts == {"road": "snow", "controller": "relay"})
         assert opened.session.value("plant.mass") == 5.5
         assert opened.find("plant.mass", "data-field").value == "5.5"
+
+    visit(user)
+
+
+def broken(*given, **more):
+    """In place of a function with a defect, for example in a user's part."""
+    raise TypeError("broken part")
+
+
+@killed_by(
+    "explore/page.py",
+    "            return\n        self.show_refusal(error)\n        if what",
+    "            pass\n        self.show_refusal(error)\n        if what",
+)
+@pytest.mark.parametrize("action", ["edit", "scenario"])
+def test_an_error_of_an_old_run_is_not_shown(visit, monkeypatch, action):
+    async def user(opened):
+        page = opened.page
+        opened.enter("plant.mass", "6")
+        with monkeypatch.context() as patch:
+            patch.setattr(curves, "run_curves", broken)
+            page.drawer.run()
+        with opened.client:
+            page.begin() if action == "scenario" else opened.enter("plant.mass", "6.2")
+        await asyncio.sleep(0)
+        assert not page.controls.message.visible
+        assert page.results.measuring.visible
+        with monkeypatch.context() as patch:
+            patch.setattr(curves, "run_curves", broken)
+            page.drawer.run()
+        await asyncio.sleep(0)
+        assert page.controls.message.text == "TypeError: broken part"
+        assert not page.results.measuring.visible
+
+    visit(user)
+
+
+@killed_by(
+    "explore/page.py", "Exception as error:  # a check that fails", "ScenarioError as error:  # a check that fails"
+)
+def test_an_error_in_the_check_withdraws_the_number(visit, monkeypatch):
+    async def user(opened):
+        await opened.draw()
+        opened.enter("plant.mass", "6")
+        with monkeypatch.context() as patch:
+            patch.setattr(diffabs.explore.page, "check_edit", broken)
+            await opened.draw()
+        assert opened.session.value("plant.mass") == 5.3
+        assert opened.page.controls.message.text == "TypeError: broken part"
+        opened.page.thinker.job = None
+        await opened.draw()
+        assert opened.page.thinker.job
+
+    visit(user)
+
+
+@killed_by(
+    "explore/page.py",
+    'with self._report_error("run", version):\n                self._send',
+    "if True:\n                self._send",
+    case="run",
+)
+@killed_by("explore/page.py", "with self._report_error(name, version):", "if True:", case="fan")
+@pytest.mark.parametrize("failing", ["run", "fan"])
+def test_an_error_stops_no_other_result(visit, monkeypatch, failing):
+    async def user(opened):
+        page, asked = opened.page, []
+        monkeypatch.setattr(curves, "draft_solver", curves.drawing_solver)
+        await opened.draw()
+        monkeypatch.setattr(curves, "run_fan", broken if failing == "fan" else lambda *given: None)
+        monkeypatch.setattr(page, "_poles", lambda *given, corners=False: asked.append(corners))
+        if failing == "run":
+            monkeypatch.setattr(curves, "run_curves", broken)
+        page.thinker.run()
+        await asyncio.sleep(0)
+        assert asked == [False, True]
+        assert len(opened.proved) == 1
+        assert page.controls.message.text == "TypeError: broken part"
+        assert not page.results.proving.visible
+        assert not page.results.measuring.visible
+
+    visit(user)
+
+
+@killed_by("explore/page.py", "_verdict(self.tools.judge, self.session)", "self.tools.judge(self.session)")
+def test_an_error_in_a_proof_file_is_on_its_card(visit):
+    async def user(opened):
+        opened.page.tools = opened.page.tools._replace(judge=broken)
+        opened.page.drawer.job = None
+        opened.page.redraw()
+        assert opened.page.drawer.job
+        assert opened.page.results.box_why.text == "TypeError: broken part"
+
+    visit(user)
+
+
+@killed_by("explore/page.py", "Exception as error:  # also an error in", "ScenarioError as error:  # also an error in")
+@killed_by("explore/page.py", '"" if basis else self.controls.made.text', '""')
+def test_a_part_with_a_defect_changes_nothing(visit, monkeypatch):
+    async def user(opened):
+        page, asked = opened.page, threading.Event()
+        page.controls.made.set_text("200 runs")
+        monkeypatch.setattr(opened.session, "load_part", lambda *given: (asked.set(), broken()))
+        page.controls.rebuild(page.controls.made.text)
+        with opened.client:
+            opened.find("controller").set_value("relay")
+        await settled(opened, lambda: asked.is_set() and not page.switching.locked())
+        assert page.controls.message.text == "TypeError: broken part"
+        assert opened.session.parts["controller"] == opened.find("controller").value == AS_GIVEN
+        assert page.controls.made.text == "200 runs"
+
+    visit(user)
+
+
+@killed_by(
+    "explore/page.py",
+    "Exception as error:  # for example, the file",
+    "ScenarioError as error:  # for example, the file",
+)
+def test_a_new_tab_shows_every_error(monkeypatch, tmp_path):
+    async def connected(self):
+        pass
+
+    async def body():
+        nicegui.core.loop = asyncio.get_running_loop()
+        monkeypatch.setattr(diffabs.explore.page, "Session", broken)
+        monkeypatch.setattr(nicegui.Client, "connected", connected)
+        client = nicegui.Client(route("/"), request=None)
+        with client, contextlib.suppress(TypeError):
+            await diffabs.explore.page.show("mine.toml", Tools(broken, broken), tmp_path, "page's test")
+        texts = [getattr(one, "text", "") for one in client.elements.values()]
+        assert "TypeError: broken part" in texts
+
+    asyncio.run(body())
+
+
+@killed_by("explore/tuner.py", "if not self.dialog.value:", "if False:")
+@killed_by("explore/tuner.py", "        self.dialog.close()\n        self.card", "        self.card")
+def test_a_tuning_starts_once_and_from_an_open_dialog(visit):
+    async def user(opened):
+        tuner = opened.page.tuner
+        opened.click("tune")
+        start = opened.find("start")
+        opened.click("start")
+        first = tuner.worker.job
+        assert first
+        UserInteraction(opened, {start}, None).click()
+        assert tuner.worker.job is first
+        tuner.running, tuner.worker.job = False, None
+        opened.click("tune")
+        with opened.client:
+            opened.page.begin()  # a road that was loaded meanwhile
+        opened.click("start")
+        assert not tuner.worker.job
+
+    visit(user)
+
+
+@killed_by(
+    "explore/tuner.py", "Exception as error:  # also an unexpected", "ScenarioError as error:  # also an unexpected"
+)
+def test_a_tuning_that_cannot_start_says_why(visit, monkeypatch):
+    async def user(opened):
+        opened.click("tune")
+        monkeypatch.setattr(diffabs.explore.tuner.tuning, "scenario_with_goal", broken)
+        with contextlib.suppress(TypeError):
+            opened.click("start")
+        assert opened.page.controls.message.text == "TypeError: broken part"
+
+    visit(user)
+
+
+@killed_by(
+    "explore/tuner.py",
+    "            return\n        self.card.set_visibility(False)\n        self.page.show_refusal(error)\n",
+    "            pass\n        self.card.set_visibility(False)\n        self.page.show_refusal(error)\n",
+    case="True",
+)
+@killed_by(
+    "explore/tuner.py",
+    "except Exception as error:  # the message",
+    "except OSError as error:  # the message",
+    case="False",
+)
+@pytest.mark.parametrize("left", [False, True])
+def test_a_failed_tuning_is_told_to_its_own_scenario(visit, left):
+    async def user(opened):
+        opened.page.tools = opened.page.tools._replace(pose=broken)
+        opened.click("tune")
+        opened.click("start")
+        if left:
+            with opened.client:
+                opened.page.begin()
+        with contextlib.suppress(TypeError):
+            opened.page.tuner.worker.run()
+        await asyncio.sleep(0)
+        assert not opened.page.tuner.running
+        assert opened.page.controls.message.text == ("" if left else "TypeError: broken part")
+
+    visit(user)
+
+
+@killed_by(
+    "explore/page.py",
+    "        if version >= self.oldest_valid:\n            self.learned",
+    "        if True:\n            self.learned",
+)
+def test_no_corners_of_the_scenario_before(visit, monkeypatch):
+    async def user(opened):
+        page, shown = opened.page, []
+
+        def linearise(now, known):
+            with opened.client:
+                page.begin()  # while the thinker is at the old scenario
+            return stability.CornerLoops((), None, {}, 0, 0)
+
+        monkeypatch.setattr(curves, "run_fan", lambda *given: None)
+        monkeypatch.setattr(stability, "linear_stability", lambda now, around: shown.append(around) or "none")
+        await opened.draw()
+        with monkeypatch.context() as patch:
+            patch.setattr(stability, "linearise_corners", linearise)
+            page.thinker.run()
+        await asyncio.sleep(0)
+        shown.clear()
+        monkeypatch.setattr(stability, "linearise_corners", broken)
+        await opened.draw()
+        page.thinker.run()
+        assert shown == [None]
+
+    visit(user)
+
+
+@killed_by("explore/page.py", "self.version + 1, {}", "self.version + 1, self.learned")
+def test_a_quick_fan_is_slow_in_another_scenario(visit, monkeypatch):
+    async def user(opened):
+        page, done = opened.page, []
+        for name in ("poles", "fan"):
+            monkeypatch.setattr(page, f"_{name}", lambda *given, **more: done.append(1) or True)
+        await opened.draw()
+        page.thinker.run()
+        await asyncio.sleep(0)
+        monkeypatch.setattr(page, "_wait_for_rest", lambda *given: False)  # a drag
+        for begin, quick in ((page.redraw, 2), (page.begin, 0)):
+            done.clear()
+            with opened.client:
+                begin()
+            await opened.draw()
+            page.thinker.run()
+            assert len(done) == quick
+
+    visit(user)
+
+
+@killed_by("explore/tuner.py", "        self.dialog.clear()\n", "", case="tune-ask-tuning")
+@killed_by("explore/saver.py", "        self.dialog.clear()\n", "", case="save-saving")
+@pytest.mark.parametrize(("button", "dialog"), [("tune", "ask-tuning"), ("save", "saving")])
+def test_a_page_keeps_one_dialog(visit, button, dialog):
+    async def user(opened):
+        counts = []
+        for _ in range(3):
+            opened.click(button)
+            counts.append(len(opened.client.elements))
+        assert len(opened.elements(dialog)) == 1
+        assert counts == [counts[0]] * 3
+
+    visit(user)
+
+
+@killed_by("explore/controls.py", "knob.place_of(value)) > 0.5", "knob.place_of(value)) > 1e-6")
+def test_a_dragged_slider_is_not_pushed_back(visit):
+    async def user(opened):
+        slider = opened.find("plant.mass", "data-slider")
+        slider.set_value(333)
+        with opened.client:
+            opened.page.controls._take_slider("plant.mass", 333, 1)
+        assert opened.session.value("plant.mass") != 5.3
+        assert slider.value == 333
+        opened.enter("plant.mass", "5.3")
+        assert slider.value == pytest.approx(opened.session.knobs["plant.mass"].place_of(5.3))
+
+    visit(user)
+
+
+@killed_by("explore/controls.py", "        if not line:\n", "        if False:\n")
+def test_the_next_edit_clears_refused_fields(visit):
+    async def user(opened):
+        refused = {"plant.mass": ("data-field", "-1", "5.3"), "fan-mass": ("data-id", "91", "10")}
+        await opened.draw()
+        for name, (kind, text, _) in refused.items():
+            opened.enter(name, text, kind)
+            assert opened.find(name, kind).props["error"]
+            assert opened.find(name, kind).value == text
+        opened.enter("initial.speed", "25")
+        await opened.draw()
+        for name, (kind, _, valid) in refused.items():
+            assert "error" not in opened.find(name, kind).props
+            assert opened.find(name, kind).value == valid
 
     visit(user)
