@@ -5,6 +5,7 @@ of a lane once when it starts, and the rest in every step.
 """
 
 import enum
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -186,6 +187,8 @@ class Graph:
         if x.dtype == dtype:
             return x
         if x.op == "const":
+            if dtype.kind in "iu" and x.dtype.kind == "f":
+                return self.const(_bounded_integer(float(x.attr), dtype), dtype)
             with np.errstate(all="ignore"):
                 return self.const(np.asarray(x.attr).astype(dtype)[()])
         if dtype.kind == "b":
@@ -199,8 +202,14 @@ class Graph:
         return self.const(x.attr.view(dtype)) if x.op == "const" else self._make("bits", (x,), dtype)
 
     def table(self, index: Node, column: tuple[Node, ...]) -> Node:
-        """Return the entry of `column` at `index` (in range); all entries are uniform or constant."""
-        return self._make("table", (index, *column), column[0].dtype)
+        """Return the entry of `column` at `index` (in range), by comparisons if the entries differ between lanes."""
+        if len(column) > 2 and all(x.level < UpdateLevel.LANE for x in column):
+            return self._make("table", (index, *column), column[0].dtype)
+        entries = list(column)
+        found = entries.pop()  # needs no comparison, because the index is in range
+        for i, x in reversed([*enumerate(entries)]):
+            found = self.select(self.op("eq", index, self.const(i, index.dtype)), found, x)
+        return found
 
     def again(self, node: Node, args: list[Node]) -> Node:
         """Return the operation of `node`, which may belong to another graph, on the operands `args` of this graph."""
@@ -339,6 +348,14 @@ def _eq(graph: Graph, x: Node, y: Node) -> Node | None:
 
 def _shift_by_zero(graph: Graph, x: Node, y: Node) -> Node | None:
     return x if y.is_number(0) else None
+
+
+def _bounded_integer(value: float, dtype: np.dtype) -> int:
+    """Return a real number as an integer, as XLA does: NaN is 0, and the ends of the type's range bound the others."""
+    ends = np.iinfo(dtype)
+    if math.isnan(value):
+        return 0
+    return int(ends.min) if value <= ends.min else int(ends.max) if value >= ends.max else int(value)
 
 
 _SIMPLIFICATIONS: dict[str, Callable[..., Node | None]] = {

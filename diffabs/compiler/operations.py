@@ -37,7 +37,7 @@ class Operation(NamedTuple):
 
 def _divide_towards_zero(x: PyTree, y: PyTree) -> PyTree:
     """Return the integer quotient x / y, rounded towards zero as in C; NumPy's // rounds down."""
-    return (np.abs(x) // np.abs(y)) * np.sign(x) * np.sign(y)
+    return x // y + ((x % y != 0) & ((x < 0) != (y < 0)))
 
 
 def _function(name: str, st: str | None = None, *, arity: int = 1, fold: PyTree = None) -> Operation:

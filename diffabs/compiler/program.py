@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, is_real
+from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, is_real, live_nodes
 from diffabs.compiler.lower.random import key_shape
 from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr
 from diffabs.compiler.trace import TracedFunctions
-from diffabs.core.types import PyTree
 
 RUNNING_FUNCTION = "running"  # name of the function that says whether a lane goes on
+NUMBER_TYPES = ("bool", "int32", "int64", "uint32", "uint64", "float32", "float64")
 MAX_OPERATIONS = 60_000  # nodes of a program; a compiler takes minutes for more
 
 
@@ -37,7 +37,6 @@ class ScalarProgram:
     Attributes:
         inputs: Input nodes by place; in each level array by array, entry by entry.
         results: Output nodes by the name of the function. `renew` and `step` have one for each input of the carry.
-        uniform: Values of the uniform arrays; `run_lanes` passes them as arguments and leaves this empty.
         sizes: For each level, the number of entries of each array in one lane.
         dtype: Type of the real numbers.
         tangents: Number of tangent directions in a program of `replicate_tangents`, else 0.
@@ -45,7 +44,6 @@ class ScalarProgram:
 
     inputs: dict[InputPlace, Node]
     results: dict[str, list[Node]]
-    uniform: list[PyTree]
     sizes: dict[UpdateLevel, list[int]]
     dtype: np.dtype
     tangents: int = 0
@@ -62,8 +60,8 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
         functions: Traced functions.
 
     Raises:
-        Unsupported: A function uses an operation without a lowering rule, there are too many operations, or the carry's
-            real numbers do not share one type, float32 or float64.
+        Unsupported: A function uses an operation without a lowering rule or a type that is not of `NUMBER_TYPES`, there
+            are too many operations, or the carry's real numbers do not share one type, float32 or float64.
     """
     graph, inputs = Graph(), {}
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in functions.types}
@@ -84,7 +82,10 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
         shared = [given[UpdateLevel.UNIFORM][i] for i in closed] + [constant_array(graph, x) for x in constants]
         outs = lower_jaxpr(graph, jaxpr, shared, [*given[UpdateLevel.LANE], *given[UpdateLevel.STEP]])
         results[name] = [node for array in outs for node in array.flat]
-    found = ScalarProgram(inputs, results, functions.uniform, sizes, _real_type(inputs))
+    for node in live_nodes([node for nodes in results.values() for node in nodes]):
+        if node.dtype.name not in NUMBER_TYPES:
+            raise Unsupported(node.op, f"on numbers of the type {node.dtype}")
+    found = ScalarProgram(inputs, results, sizes, _real_type(inputs))
     return check_size(found, len(graph.nodes))
 
 

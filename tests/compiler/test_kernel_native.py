@@ -1,5 +1,7 @@
 """Elementary functions of a kernel against 80-bit ones, and every rule against JAX's own operation."""
 
+import platform
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ from kernels import FOLDER, applied
 from mutants import killed_by
 from seams import replace_seam
 
+from diffabs.compiler.pipeline import run_lanes
 from diffabs.compiler.runtime import library_cache, toolchain
 
 pytestmark = pytest.mark.xdist_group("kernel")
@@ -87,7 +90,8 @@ def test_ends_of_functions(plain, monkeypatch):
             np.testing.assert_array_equal(np.signbit(found[name][zeros]), np.signbit(expected[zeros]), err_msg=name)
 
 
-KEY = jax.random.key(3)
+KEY, LEAST = jax.random.key(3), np.int32(-(2**31))
+TABLE, PLACE = jnp.array([3.0, 1.0, 4.0, 1.5, 9.0]), jnp.asarray(2)
 
 
 def _table(x):
@@ -100,6 +104,7 @@ RULES = {
     "chosen": lambda x, y, k: jnp.where(jnp.isfinite(x), jnp.where(x > y, x, 2.0), y),
     "chosen truths": lambda x, y, k: jnp.where(x > y, y > 0, k > 2),
     "extremes": lambda x, y, k: jnp.stack([jnp.maximum(x, y), jnp.minimum(x, y)]),
+    "whole powers": lambda x, y, k: jnp.abs(x) ** k,
     "powers": lambda x, y, k: jnp.stack([x**2, x**3, x**-2, jnp.square(y)]),
     "rests": lambda x, y, k: jnp.stack([jnp.fmod(x, 0.7), jnp.remainder(y, 0.7)]),
     "whole rests": lambda x, y, k: jnp.stack([k % 5, -k % 7, k // 3, -k // 4, k // (k - 3), k % (k - 3)]),
@@ -123,9 +128,19 @@ RULES = {
     "products": lambda x, y, k: (x * jnp.arange(6.0).reshape(2, 3)) @ jnp.arange(3.0) + jnp.ones(2) @ jnp.ones((2, 2)),
     "moved": lambda x, y, k: jnp.concatenate([jnp.flip(x * jnp.arange(3.0)), jnp.stack([y])])[1:4:2],
     "padded": lambda x, y, k: jax.lax.pad(x * jnp.arange(1.0, 7.0).reshape(2, 3), y, [(1, 0, 2), (-1, 2, 0)]),
+    "cropped": lambda x, y, k: jnp.concatenate(
+        [jax.lax.pad(x * jnp.arange(1.0, 4.0), y, [(low, high, 0)]) for low, high in ((-4, 2), (2, -4), (-1, -1))]
+    ),
     "diagonal": lambda x, y, k: jnp.diag(jnp.stack([x, y])),
     "turned": lambda x, y, k: (x * jnp.arange(6.0).reshape(2, 3)).T.reshape(2, 3),
     "table": lambda x, y, k: _table(x),
+    "uniform table": lambda x, y, k: TABLE[PLACE] * x,
+    "folded": lambda x, y, k: jnp.stack(
+        [
+            jax.jit(jax.lax.div)(LEAST, np.int32(2)),
+            *(jax.jit(lambda v: v.astype(np.int32))(v) for v in (1e20, -1e20, 7.9)),
+        ]
+    ),
     "own table": lambda x, y, k: jnp.stack([x, y, x + y])[jnp.clip(k, 0, 2)],
     "part": lambda x, y, k: jax.lax.dynamic_slice(x * jnp.arange(5.0), (k,), (2,)),
     "written": lambda x, y, k: jnp.zeros(4).at[k].set(x),
@@ -154,6 +169,10 @@ RULES = {
     'better = graph.op("not", graph.op(beyond, best, x))',
 )
 @killed_by("compiler/lower/random.py", "for i in range(5):", "for i in range(4):")
+@killed_by("compiler/emit/cpp.py", "yield from self._fill_column(item, indent)", "pass")
+@killed_by("compiler/ir.py", "if value <= ends.min", "if value < -1e30")
+@killed_by("compiler/operations.py", "return x // y + ((x % y != 0)", "return x // y + ((x % y == 0)")
+@killed_by("compiler/lower/arrays.py", "padded[first : max(first, last)]", "padded[first:]")
 @killed_by("compiler/lower/elementwise.py", "x, 0, 0x33333333", "x, 0, 0x13333333")
 def test_rules_are_those_of_jax():
     """Every rule in one kernel, NaN and infinite arguments among them."""
@@ -170,11 +189,41 @@ def test_rules_are_those_of_jax():
 
 
 @killed_by("compiler/native/lanes.h", "0x4530000080000000ull", "0x4530000000000000ull")
-def test_whole_numbers_of_64_bits_are_rounded_once():
+def test_whole_numbers_of_64_bits_are_rounded_once(monkeypatch):
     """On a processor without AVX-512 the conversion is ours."""
+    if platform.machine() == "x86_64":
+        replace_seam(monkeypatch, "cpp_flags", (*toolchain.CPP_FLAGS, "-mno-avx512f"))
     rng, most = np.random.default_rng(7), np.iinfo(np.int64).max
     near = [s * (1 << e) + d for e in range(64) for d in (-1025, -513, -1, 0, 1, 511, 1023) for s in (1, -1)]
     ends = np.array([k for k in near if -most - 1 <= k <= most], np.int64)
     k = np.concatenate([ends, rng.integers(-most - 1, most, 4000, endpoint=True)])
     found = applied({"real": lambda x, y, k: k.astype(float)}, np.zeros(len(k)), np.zeros(len(k)), k)
     np.testing.assert_array_equal(found["real"], k.astype(np.float64))
+
+
+def _long(x):
+    """A function of so many operations that a conditional around it becomes a jump."""
+    for k in range(30):
+        x = x * (1 + 1e-3 * k) + jnp.sin(x)
+    return x
+
+
+@pytest.mark.slow
+@killed_by("compiler/emit/cpp.py", "and x is not branch.which and", "and")
+@killed_by("compiler/emit/cpp.py", "self.rare = program, shape, RareNumbers({}, {})", "_ = program, shape, 0")
+def test_a_conditional_may_ask_a_parameter_or_a_carried_truth():
+    """The condition is known before a run, or the step reads it for nothing else."""
+    x, flag, which = np.linspace(0.1, 0.9, 7), np.arange(7) % 2 == 0, np.arange(7) % 3.0
+
+    def run(x, flag, which):
+        def step(lane, carry):
+            flag, x, _ = carry
+            asked = jax.lax.cond(lane > 0.5, lambda: _long(lane), lambda: lane)
+            return flag, jax.lax.cond(flag, lambda: _long(x), lambda: x), asked
+
+        same, over = (lambda lane, carry: carry), (lambda lane, carry: jnp.asarray(False))
+        return run_lanes(same, step, over, which, (flag, x, x), steps=1, rounds=1)
+
+    _, found, asked = jax.device_get(jax.jit(run)(x, flag, which))
+    np.testing.assert_allclose(found, np.where(flag, jax.vmap(_long)(x), x), rtol=1e-14)
+    np.testing.assert_allclose(asked, np.where(which > 0.5, jax.vmap(_long)(which), which), rtol=1e-14)

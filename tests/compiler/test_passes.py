@@ -14,7 +14,6 @@ from project import ROOT
 from diffabs.compiler.emit.cpp import LaunchShape, emit_cpp
 from diffabs.compiler.passes import find_lane_calls, list_pass
 from diffabs.compiler.pipeline import run_lanes
-from diffabs.core.lanes import any_lane
 
 TEXTS = ROOT / "tests" / "data" / "passes"
 
@@ -28,7 +27,7 @@ def braking_step(lane, carry):
     def roll_out(v, x):
         return jnp.zeros_like(v), x + v * v / (2.0 * gain)
 
-    v_end, x_end = jax.lax.cond(any_lane(v_next < 0.5), roll_out, lambda v, x: (v_next, x + 0.01 * v), v, x)
+    v_end, x_end = jax.lax.cond(v_next < 0.5, roll_out, lambda v, x: (v_next, x + 0.01 * v), v, x)
     return {"speed": v_end, "distance": x_end}
 
 

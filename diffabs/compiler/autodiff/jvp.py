@@ -166,7 +166,7 @@ def replicate_tangents(
         ]
         for name, arrays in ends.items()
     }
-    return check_size(ScalarProgram(inputs, results, functions.uniform, sizes, old.dtype, many), len(graph.nodes))
+    return check_size(ScalarProgram(inputs, results, sizes, old.dtype, many), len(graph.nodes))
 
 
 def _array_index(functions: TracedFunctions, one: DerivativeProgram, key: ArrayKey) -> int:

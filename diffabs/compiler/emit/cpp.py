@@ -94,7 +94,9 @@ def find_rare_numbers(block: ScheduleBlock, nodes: Sequence[Node], changed: Sequ
         inside = {*stored, *(node.id for node in branch.yes.nodes())}
         read = {x.id: x for node in nodes if node.id in inside for x in node.args if x.op == "input"}
         found.loaded[branch.gates[0].id] = [
-            x for x in read.values() if x.level == UpdateLevel.STEP and readers[x.id] <= inside and x.id not in results
+            x
+            for x in read.values()
+            if x.level == UpdateLevel.STEP and readers[x.id] <= inside and x is not branch.which and x.id not in results
         ]
         found.stored.update(stored)
     return found
@@ -128,7 +130,7 @@ class Text:
             program: Operations and results.
             shape: Loop structure of the launch.
         """
-        self.program, self.shape = program, shape
+        self.program, self.shape, self.rare = program, shape, RareNumbers({}, {})
         self.roots = [node for nodes in program.results.values() for node in nodes]
         nodes = live_nodes(self.roots)
         self.alive = {node.id for node in nodes}
@@ -202,9 +204,8 @@ class Text:
         yield from self._lines(schedule_nodes(wanted, UpdateLevel.UNIFORM), ONE_VECTOR, "  ")
         for node in self.shared:
             yield f"  s.v{node.id} = first(v{node.id});"
-        for name, node in self.columns.values():
-            for i, x in enumerate(node.args[1:]):
-                yield f"  s.{name}[{i}] = first({self._name(x, 0)});"
+        for _, node in self.columns.values():
+            yield from self._fill_column(node, "  ")
         yield "}"
 
     def _begin(self) -> Iterator[str]:
@@ -296,9 +297,17 @@ class Text:
             if isinstance(item, Branch):
                 yield from self._branch(item, vectors, indent)
             else:
+                if item.op == "table" and item.level == UpdateLevel.UNIFORM:  # read where its entries are computed
+                    yield from self._fill_column(item, indent)
                 for q in vectors:
                     declared = f"{indent}const {vector_type(item.dtype)} {self._name(item, q)}"
                     yield f"{declared} = {self._expression(item, q)};"
+
+    def _fill_column(self, table: Node, indent: str) -> Iterator[str]:
+        """Yield the lines that write the entries of a table, which are uniform, into its column."""
+        name, _ = self.columns[tuple(x.id for x in table.args[1:])]
+        for i, x in enumerate(table.args[1:]):
+            yield f"{indent}s.{name}[{i}] = first({self._name(x, 0)});"
 
     def _branch(self, branch: Branch, vectors: range, indent: str) -> Iterator[str]:
         """Yield a conditional: the false branch, then the true branch, within a jump if `branch_jumps`.

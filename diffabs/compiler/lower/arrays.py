@@ -51,8 +51,9 @@ def _pad(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
         wide = np.full((max(0, len(rows) + between * (len(rows) - 1)), *rows.shape[1:]), value, object)
         wide[:: between + 1] = rows
         ends = [np.full((max(0, n), *rows.shape[1:]), value, object) for n in (low, high)]
-        wide = wide[max(0, -low) : len(wide) - max(0, -high)]
-        x = np.moveaxis(np.concatenate([ends[0], wide, ends[1]]), 0, axis)
+        padded = np.concatenate([ends[0], wide, ends[1]])
+        first, last = max(0, -low), len(padded) - max(0, -high)
+        x = np.moveaxis(padded[first : max(first, last)], 0, axis)
     return [x]
 
 
@@ -124,6 +125,8 @@ def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 def _cumsum(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     order = slice(None, None, -1 if eqn.params["reverse"] else 1)
     # A reversed sum runs over the flipped rows, and the result is flipped back.
+    if not ins[0].size:
+        return ins
     rows = list(np.moveaxis(ins[0], eqn.params["axis"], 0)[order])
     for i in range(1, len(rows)):
         rows[i] = map_entries(lambda a, b: graph.op("add", a, b), rows[i - 1], rows[i])
@@ -158,6 +161,8 @@ def _dot(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     (left, right), batch = eqn.params["dimension_numbers"]
     if any(batch):
         raise Unsupported("dot_general", "of stacked arrays")
+    if len({x.aval.dtype for x in (*eqn.invars, *eqn.outvars)}) > 1 or not ins[0].size:
+        raise Unsupported("dot_general", "of nothing, or of two types")
     count = math.prod(ins[0].shape[i] for i in left)
     a = np.moveaxis(ins[0], left, range(len(left))).reshape(count, -1)
     b = np.moveaxis(ins[1], right, range(len(right))).reshape(count, -1)

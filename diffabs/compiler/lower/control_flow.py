@@ -79,6 +79,8 @@ def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         raise Unsupported("scan", f"of {p['length']} steps within a step; {MAX_UNROLLED_STEPS} are the most")
     constants, many = _scan_input_counts(p, len(ins))
     fixed, carry, rows = ins[:constants], ins[constants : constants + many], ins[constants + many :]
+    if not p["length"] and len(eqn.outvars) > many:
+        raise Unsupported("scan", "of no steps with outputs")
     order = range(p["length"])[:: -1 if p["reverse"] else 1]
     seen: dict[int, list[Array]] = {}
     for i in order:

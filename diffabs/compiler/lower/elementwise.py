@@ -22,6 +22,8 @@ def _elementwise(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         raise Unsupported(name, f"its result is to be {eqn.params['out_dtype']}")
     if name == "div" and not is_real(eqn.outvars[0].aval.dtype):
         return [map_entries(lambda x, y: _integer_quotient(graph, x, y), *ins)]
+    if name == "pow" and not is_real(eqn.invars[1].aval.dtype):
+        ins = [ins[0], map_entries(lambda y: graph.convert(y, eqn.invars[0].aval.dtype), ins[1])]
     return [map_entries(lambda *x: graph.op(name, *x), *ins)]
 
 

@@ -44,16 +44,10 @@ def _part(graph: Graph, x: Array, axis: int, place: Node, size: int) -> Array:
 
 
 def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
-    """Return the entry of a column at an index, as a table if the column is uniform, else by comparisons."""
-    if len(column) > 2 and all(x.level < UpdateLevel.LANE for x in column):
-        return graph.table(index, column)
-    if len(column) > MAX_COMPARED_ENTRIES:
+    """Return the entry of a column at an index; too many entries that differ between lanes are refused."""
+    if len(column) > MAX_COMPARED_ENTRIES and any(x.level >= UpdateLevel.LANE for x in column):
         raise Unsupported("dynamic_slice", f"of {len(column)} entries that differ between lanes")
-    # The last entry needs no comparison, because the index is valid.
-    (_, found), *others = reversed([*enumerate(column)])
-    for i, x in others:
-        found = graph.select(graph.op("eq", index, graph.const(i, index.dtype)), found, x)
-    return found
+    return graph.table(index, column)
 
 
 @lowering_rule("gather", "dimension_numbers slice_sizes indices_are_sorted unique_indices mode fill_value")

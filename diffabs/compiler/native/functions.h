@@ -1,5 +1,5 @@
 /* Elementary functions of vectors, without branches, accurate to about one unit in the last place
-   (tests/kernel/test_kernel_native.py). Polynomials are Taylor's, so that their coefficients can be checked by eye.
+   (tests/compiler/test_kernel_native.py). Polynomials are Taylor's, so that their coefficients can be checked by eye.
    Only the inverse tangent and the logarithm in single precision have Chebyshev polynomials. */
 #pragma once
 #include "lanes.h"
