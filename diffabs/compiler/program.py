@@ -12,7 +12,7 @@ from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxp
 from diffabs.compiler.trace import TracedFunctions
 
 RUNNING_FUNCTION = "running"  # name of the function that says whether a lane goes on
-NUMBER_TYPES = ("bool", "int32", "int64", "uint32", "uint64", "float32", "float64")
+LOWERED_TYPES = ("bool", "int32", "int64", "uint32", "uint64", "float32", "float64")
 MAX_OPERATIONS = 60_000  # nodes of a program; a compiler takes minutes for more
 
 
@@ -60,8 +60,8 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
         functions: Traced functions.
 
     Raises:
-        Unsupported: A function uses an operation without a lowering rule or a type that is not of `NUMBER_TYPES`, there
-            are too many operations, or the carry's real numbers do not share one type, float32 or float64.
+        Unsupported: A function uses an operation without a lowering rule, or a type outside `LOWERED_TYPES`. There are
+            too many operations, or the carry's real numbers do not share one type, float32 or float64.
     """
     graph, inputs = Graph(), {}
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in functions.types}
@@ -83,7 +83,7 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
         outs = lower_jaxpr(graph, jaxpr, shared, [*given[UpdateLevel.LANE], *given[UpdateLevel.STEP]])
         results[name] = [node for array in outs for node in array.flat]
     for node in live_nodes([node for nodes in results.values() for node in nodes]):
-        if node.dtype.name not in NUMBER_TYPES:
+        if node.dtype.name not in LOWERED_TYPES:
             raise Unsupported(node.op, f"on numbers of the type {node.dtype}")
     found = ScalarProgram(inputs, results, sizes, _real_type(inputs))
     return check_size(found, len(graph.nodes))

@@ -78,9 +78,9 @@ def invalidate(x: Scalar, invalid: Scalar, inputs: PyTree) -> Scalar:
     leaves = [leaf for leaf in map(jnp.asarray, jax.tree.leaves(inputs)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     leaves = [leaf.astype(x.dtype) for leaf in leaves]
     # An infinite input, such as a limit, must not make a valid result NaN.
-    total = sum(jnp.sum(jnp.where(jnp.isfinite(leaf), leaf, 0.0)) for leaf in leaves)
     one, none = (jnp.where(invalid, jnp.nan, factor).astype(x.dtype) for factor in (1.0, 0.0))
-    return one * x + none * total
+    # The products come before the sum: the sum of large inputs would overflow, and 0 * inf is NaN.
+    return one * x + sum(jnp.sum(none * jnp.where(jnp.isfinite(leaf), leaf, 0.0)) for leaf in leaves)
 
 
 @jax.custom_jvp

@@ -16,7 +16,9 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
+from diffabs.core import kinds
 from diffabs.core.arrays import as_array
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once, is_traced
 from diffabs.core.loop import Loop
@@ -27,7 +29,7 @@ from diffabs.core.validity import check_part as check_parts
 from diffabs.core.validity import find_broken, grid_rules, part_rules
 from diffabs.simulate.contracts import refuse_misfits
 from diffabs.simulate.stability import is_step_stable, stable_step
-from diffabs.simulate.types import Adaptive, Solver
+from diffabs.simulate.types import Adaptive, FixedStep, Solver
 
 MAX_SOLVER_STEPS = 1e8
 T = TypeVar("T")
@@ -70,9 +72,9 @@ def check(part: T, solver: Solver | None = None) -> T:
 
     Raises:
         ValueError: A field is out of range or breaks a rule between fields. For a loop with a solver also: a part does
-            not fit its contract, or the start is beyond the stop. A step longer than the duration, a run of more than
-            1e8 steps, a period off the grid and an unstable step raise it, too. The message gives each value with its
-            range and unit. A later check runs only if the earlier ones have passed.
+            not fit its contract, or the start is beyond the stop. An invalid solver (`find_solver_faults`), a period
+            off the grid and an unstable step raise it, too. The message gives each value with its range and unit. A
+            later check runs only if the earlier ones have passed.
     """
     check_parts(part)
     if isinstance(part, Loop) and solver is not None:
@@ -119,20 +121,44 @@ def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
 
 
 def find_solver_faults(solver: Solver) -> list[str]:
-    """Return one line if the step is longer than the duration or if there are too many steps; otherwise an empty list.
+    """Return one line for each fault of a solver, independent of the loop; an empty list if there is none.
 
-    At most `MAX_SOLVER_STEPS` steps are allowed.
+    Each field must be a positive, finite number, and `rtol` below 1. The step must not be longer than the duration. At
+    most `MAX_SOLVER_STEPS` steps are allowed.
 
     Args:
         solver: Solver to check.
     """
+    if not isinstance(solver, FixedStep | Adaptive):
+        known = "d.FixedStep(step=..., duration=...) or d.Adaptive(rtol=..., duration=...)"
+        return [f"solver = {kinds.format_value(solver)} is no solver; {known} is needed"]
+    names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
+    if lines := [f"solver.{name} {line}" for name in names if (line := _find_field_fault(name, getattr(solver, name)))]:
+        return lines
     step, duration = solver.step, solver.duration
     if step > duration:
-        return [f"solver.step = {step:g} s is outside (0, {duration:g}] s: longer than solver.duration"]
+        return [
+            f"solver.step = {step:g} s is outside (0, {duration:g}] s: longer than solver.duration = {duration:g} s"
+        ]
     if duration / step > MAX_SOLVER_STEPS:
         least = duration / MAX_SOLVER_STEPS
         return [f"solver.step = {step:g} s is outside [{least:g}, {duration:g}] s: too many steps"]
     return []
+
+
+def _find_field_fault(name: str, value: Any) -> str:
+    """Return what is wrong with the value of one field of a solver, or an empty string."""
+    if isinstance(value, Tracer):
+        return "is traced; a number that is known before the trace is needed"
+    if line := kinds.find_value_objection(value) or (
+        kinds.value_shape(value) and f"has shape {kinds.value_shape(value)}"
+    ):
+        return f"= {kinds.format_value(value)} {line}; a number is needed"
+    if not 0 < value < math.inf:
+        return f"= {value} is not positive and finite"
+    if name == "rtol" and value >= 1:
+        return f"= {value} is outside (0, 1)"
+    return f"= {value} is no whole number" if name == "every" and value != int(value) else ""
 
 
 def find_unstable_step(loop: Loop, solver: Solver) -> Iterator[str]:
@@ -169,7 +195,7 @@ def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Ad
         solver: Solver of all runs.
 
     Raises:
-        ValueError: The step is longer than the duration, or there are too many steps (`find_solver_faults`).
+        ValueError: The solver is invalid (`find_solver_faults`).
     """
     if lines := find_solver_faults(solver):
         raise ValueError(lines[0])

@@ -1,7 +1,6 @@
 """Arguments of a run: what is refused, and their preparation for a compiled program."""
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -18,14 +17,13 @@ from diffabs.core.pytree import canonical_dtypes, parameters, replace, stack_lis
 from diffabs.core.types import Params, PyTree
 from diffabs.core.validity import find_broken, find_misshapen, part_rules
 from diffabs.objectives import Variation
-from diffabs.simulate.admissible import find_impossible_values
+from diffabs.simulate.admissible import find_impossible_values, find_solver_faults
 from diffabs.simulate.contracts import refuse_misfits
 from diffabs.simulate.step.adaptive import AdaptiveStepping, clip_rtol
 from diffabs.simulate.step.fixed import FixedStepping
-from diffabs.simulate.types import Adaptive, FixedStep, Solver
+from diffabs.simulate.types import Adaptive, Solver
 
 OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
-MAX_COUNTED_STEPS = 2**31 - 8  # greatest number of steps that a 32-bit counter holds, including the landing
 
 
 def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, PyTree, PyTree]:
@@ -93,11 +91,8 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
     """
     if not isinstance(loop, Loop):
         raise ValueError(f"loop = {kinds.format_value(loop)} is no Loop; d.Loop(...) or d.braking() is needed")
-    if not isinstance(solver, FixedStep | Adaptive):
-        known = "d.FixedStep(step, duration) or d.Adaptive(step, duration, rtol)"
-        raise ValueError(f"solver = {kinds.format_value(solver)} is no solver; {known} is needed")
     refuse_unnamed(objectives)
-    lines = [*find_invalid_fields(solver), *find_misshapen(loop)]
+    lines = [*find_solver_faults(solver), *find_misshapen(loop)]
     for name, part in objectives.items():
         if isinstance(part, type):
             lines.append(f"objectives.{name} = {part.__name__} is a class; {part.__name__}(...) is needed")
@@ -146,34 +141,6 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     ]
     if lines:
         raise ValueError("; ".join(lines))
-
-
-def find_invalid_fields(solver: Solver) -> Iterator[str]:
-    """Yield one line for each invalid field of the solver.
-
-    Args:
-        solver: Solver of the run.
-    """
-    names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
-    lines = [f"solver.{name} {line}" for name in names if (line := _find_number_fault(solver, name))]
-    if lines:
-        yield from lines
-    elif solver.step > solver.duration:
-        yield f"solver.step = {solver.step} s is longer than solver.duration = {solver.duration} s"
-    elif solver.duration / solver.step > MAX_COUNTED_STEPS:
-        yield f"solver.step = {solver.step} s takes more than {MAX_COUNTED_STEPS} steps of {solver.duration} s"
-
-
-def _find_number_fault(solver: Solver, name: str) -> str:
-    """Return what is wrong with one field of the solver, or an empty string."""
-    value = getattr(solver, name)
-    if line := kinds.find_value_objection(value) or (
-        kinds.value_shape(value) and f"has shape {kinds.value_shape(value)}"
-    ):
-        return f"= {kinds.format_value(value)} {line}; a number is needed"
-    if not 0 < value < math.inf:
-        return f"= {value} is not positive and finite"
-    return f"= {value} is no whole number" if name == "every" and value != int(value) else ""
 
 
 def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: PyTree) -> None:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.pytree import get, parameters, replace, stack_lists
+from diffabs.core.pytree import canonical_dtypes, get, parameters, replace, stack_lists
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.types import Solver
@@ -107,16 +107,19 @@ class Batch:
         """Return function(loop, key) for every run, stacked along a leading axis (runs,), by `jax.vmap`;
         differentiable.
 
-        An empty batch calls the function once, with the key None; its result has a leading axis (1,).
+        The values get the floating-point type of the loop. A batch without values and keys calls the function once,
+        with the key None, and repeats its result.
 
         Args:
             loop: Loop that the runs have in common.
             function: Function of the loop and the key of one run. The key is None in a batch without keys.
-            lanes: Numbers of the runs to include; None for all runs. It has no effect in an empty batch.
+            lanes: Numbers of the runs to include; None for all runs.
         """
-        columns = {path: jnp.asarray(column, float) for path, column in self.values.items()}, self._keys()
-        if not jax.tree.leaves(columns):
-            return jax.tree.map(lambda x: jnp.asarray(x)[None], function(loop, None))
+        if not self.values and self.keys is None:
+            count = self.size if lanes is None else len(lanes)
+            return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), function(loop, None))
+        dtype = jax.tree.leaves(canonical_dtypes(loop))[0].dtype
+        columns = {path: jnp.asarray(column, dtype) for path, column in self.values.items()}, self._keys()
         if lanes is not None:
             columns = jax.tree.map(lambda column: column[lanes], columns)
         return jax.vmap(lambda values, key: function(replace(loop, values), key))(*columns)

@@ -14,7 +14,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import replace
 from diffabs.core.types import Array, Bool, Key, PyTree
-from diffabs.simulate.admissible import batch_admissibility, first_refusal
+from diffabs.simulate.admissible import batch_admissibility, find_impossible_values, find_unstable_step
 from diffabs.simulate.arguments import refuse, refuse_unnamed
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import check_process, resolve_request, run_with_engine
@@ -59,7 +59,7 @@ def run_batch(
             batch uses True under XLA. Runs of a kernel never step together.
         accepted: Runs to execute, shape (runs,), or True for all. The others have `diverged`, and their metrics are
             NaN, also where they step together with the rest. None means the runs that `batch_admissibility` accepts, or
-            all if the call is traced.
+            all if the call is traced. A batch without values has no accepted run if the step is not stable.
         enough: Condition that ends runs early. Such a run has neither stopped, timed out nor diverged. Not
             for runs that step together.
         engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine, which needs a
@@ -79,7 +79,8 @@ def run_batch(
 
     Raises:
         ValueError: Columns have different lengths, `measure` rejects the arguments, or `enough` is given for runs that
-            step together. Also if engine "kernel" is impossible; `simulate.drive.kernel.kernel_objection` returns
+            step together. Also if a batch without values has a loop that `measure` rejects, if `accepted` has a wrong
+            shape, or if engine "kernel" is impossible; `simulate.drive.kernel.kernel_objection` returns
             the reason without a run.
         KeyError: A path does not exist.
         RuntimeError: The engine is "auto" or "kernel", in a process that was forked after JAX had started.
@@ -120,13 +121,14 @@ def _dispatch_batch(
     refuse(replace(loop, {path: _first_member(column) for path, column in batch.values.items()}), solver, objectives)
     # Traced values cannot be checked. A traced batch runs every member, also an impossible one.
     live = is_traced(loop, dict(batch.values), dict(objectives))
-    if accepted is None:
-        asked = bool(batch.values) and not live
-        accepted = (
-            batch_admissibility(loop, batch.values, solver).accepted
-            if asked
-            else live or not first_refusal(loop, {}, solver)
-        )
+    if accepted is None and (live or batch.values):
+        accepted = live or batch_admissibility(loop, batch.values, solver).accepted
+    elif accepted is None:
+        if lines := find_impossible_values(loop, solver.step):  # all runs are the same loop
+            raise ValueError("; ".join(lines))
+        accepted = not any(find_unstable_step(loop, solver))
+    elif np.shape(accepted) not in ((), (count,)):
+        raise ValueError(f"accepted has shape {np.shape(accepted)}; ({count},) is needed, one value for each run")
     given = (
         loop,
         batch.values,

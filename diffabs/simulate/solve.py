@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax._src.source_info_util import summarize  # JAX has no public function that names the line of an operation
 from jax.core import Tracer
+from jax.sharding import AbstractMesh, Mesh
 from jax.typing import DTypeLike
 
 from diffabs.core import kinds
@@ -39,19 +40,22 @@ from diffabs.core.numerics import invalidate
 from diffabs.core.protocols import Clock, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
 from diffabs.core.types import AnyArray, Array, Bool, Part, PyTree, Scalar
-from diffabs.simulate.arguments import build_stepping, find_invalid_fields
+from diffabs.simulate.admissible import find_solver_faults
+from diffabs.simulate.arguments import build_stepping
 from diffabs.simulate.drive.engine import EngineError, resolve_request
 from diffabs.simulate.drive.loops import log_run, round_up_capacity
 from diffabs.simulate.run import RunCapacity, run_differentiable
 from diffabs.simulate.step.adaptive import AdaptiveStepping
+from diffabs.simulate.step.attempt import Point
 from diffabs.simulate.step.comparisons import SwitchedProgram
 from diffabs.simulate.step.fixed import FixedStepping
 from diffabs.simulate.step.inner_functions import HOST_CALLS
 from diffabs.simulate.step.replay import log_attempt, log_capacity
-from diffabs.simulate.step.status import RunStatus
+from diffabs.simulate.step.status import RunStatus, end_unfinished
 from diffabs.simulate.step.system import UNCONSTRAINED, build_system
 from diffabs.simulate.types import Adaptive, FixedStep, Solver
 
+MAX_TIME_LOSS = 1e-4  # rounding of t0 and t1, as a fraction of the span
 MAX_EVENTS = 24  # kinds of events of a solution: the log of a run has one bit for each
 # Fractions of the span. A landing is at most `LANDING_FRACTION` from the zero of its condition. Events that follow
 # each other within it have no end, after `MAX_QUICK_EVENTS` of them. A save belongs to the step after an event that
@@ -60,8 +64,6 @@ LANDING_FRACTION, MAX_QUICK_EVENTS, COINCIDENCE_FRACTION = 1e-7, 8, 1e-10
 # The lift: time in which the condition moves as far, as a fraction of the span, and multiples of the rounding.
 LIFT_FRACTION, LIFT_EPS = 1e-12, 32
 
-MAX_ACCEPTED = 256  # functions that are known to be valid
-_accepted: dict[Any, "Function"] = {}
 SWITCH_SOLVER = Adaptive(1e-6)
 # By the function that hides a comparison: what to write instead.
 REFUSAL_ADVICE = (
@@ -98,7 +100,8 @@ class Event:
         condition: Function of (t, y, args): a continuous number. It falls along the run, so backwards in time if
             t1 < t0. A start at exactly zero counts as positive.
         reset: Function of (t, y, args) that returns the state after the event; None leaves the state.
-        terminal: True if the event ends the solution, without a reset.
+        terminal: True if the event ends the solution, without a reset. It happens, too, where the reset of another
+            event makes its condition negative.
     """
 
     condition: Field
@@ -162,6 +165,7 @@ class EventMemory(NamedTuple):
         last: Time of the last event in units of the span.
         quick: Number of events that followed their predecessor at once.
         fault: `SolutionStatus` that ends the run, as a float; 0 for none.
+        ends: Number of the terminal event that a reset has made happen, from 1, as a float; 0 for none.
     """
 
     counts: Array
@@ -170,6 +174,7 @@ class EventMemory(NamedTuple):
     last: Scalar
     quick: Scalar
     fault: Scalar
+    ends: Scalar
 
 
 class FieldOutput(NamedTuple):
@@ -181,10 +186,10 @@ class FieldOutput(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Function:
-    """A function of the user, of (t, y, args): equal to another one of the same function.
+    """A function of the user, of (t, y, args): equal to another one that computes the same.
 
     Attributes:
-        key: The function, or its identity if it has no hash; the other attributes follow from it.
+        key: Operations and constants of the function, as they are at this call of `solve`.
         call: The function, of (t, y, args), or of (t, y, args, constants) with the constants of its closure.
         place: Place of its constants in the list of all; None if it closes over nothing that is traced.
     """
@@ -239,7 +244,7 @@ class FieldLoop:
     """A field with its events, as the engine reads a loop (`core.loop.Loop`), in the time s.
 
     Attributes:
-        given: Pytree of y0, t0, span = t1 - t0, args, and the constants of the functions.
+        given: Pytree of y0, t0, t1, args, and the constants of the functions.
         code: The functions.
         kept: Number of times that are kept of each event.
     """
@@ -249,6 +254,15 @@ class FieldLoop:
     kept: int = static()
     plant = FieldPlant()
     ticks, jumps, recorders = False, True, ()
+
+    @property
+    def span(self) -> Scalar:
+        """t1 - t0."""
+        return self.given["t1"] - self.given["t0"]
+
+    def time(self, s: Scalar) -> Scalar:
+        """Return the time at `s`, exactly t0 and t1 at 0 and 1."""
+        return self.given["t0"] * (1.0 - s) + self.given["t1"] * s
 
     @property
     def changes(self) -> bool:
@@ -266,7 +280,7 @@ class FieldLoop:
         count = len(self.code.inner)
         none = jnp.zeros(count, zero.dtype)
         times = jnp.full((count, self.kept), jnp.nan, zero.dtype)
-        held = EventMemory(none, times, none, zero - 1.0, zero, zero)
+        held = EventMemory(none, times, none, zero - 1.0, zero, zero, zero)
         return LoopState(y0, Memory(), Memory(), Memory((), held), Memory())
 
     def signals(self, t: Scalar, state: LoopState) -> Signals:
@@ -327,11 +341,12 @@ class FieldLoop:
         happens = fired["events"]
         return jax.lax.cond(
             any_lane(jnp.any(jnp.stack(happens))),
-            lambda: self._change(clock.t, state, margins["events"], happens),
+            lambda: self._change(clock.t, state, margins, happens),
             lambda: state,
         )
 
-    def _change(self, t: Scalar, state: LoopState, was: Sequence[Scalar], fired: Sequence[Bool]) -> LoopState:
+    def _change(self, t: Scalar, state: LoopState, margins: Margins, fired: Sequence[Bool]) -> LoopState:
+        was, stops = margins["events"], margins["stop"][1:]
         y, held = state.plant, state.controller.held
         moved, happened = False, []
         for i, (one, happens) in enumerate(zip(self.code.inner, fired, strict=True)):
@@ -348,11 +363,15 @@ class FieldLoop:
         quick, last = select(jnp.any(events), (quick, t), (held.quick, held.last))
         fault = jnp.max(jnp.stack([held.fault, *faults]))
         fault = jnp.where((fault == 0) & (quick >= MAX_QUICK_EVENTS), float(SolutionStatus.CROWDED), fault)
+        ends = held.ends
+        for i, one in reversed(list(enumerate(self.code.terminal))):
+            ends = jnp.where((stops[i] >= 0) & (self._call(one.condition, t, y) < 0), i + 1.0, ends)
+        fault = jnp.where((fault == 0) & (ends > 0), float(SolutionStatus.TERMINATED), fault)
         held = EventMemory(
             held.counts + events,
             jnp.where(now & events[:, None], t, held.times),
             jnp.stack(lifts),
-            *(last, quick, fault),
+            *(last, quick, fault, ends),
         )
         return state._replace(plant=y, controller=Memory((), jax.tree.map(lambda x: jnp.asarray(x, t.dtype), held)))
 
@@ -385,11 +404,22 @@ class FieldLoop:
 
     def _call(self, function: Callable, t: Scalar, y: PyTree) -> PyTree:
         """Return the result of a function at the time `t` in units of the span."""
-        given = self.given
-        return function(given["t0"] + given["span"] * t, y, given["args"], given["constants"])
+        return function(self.time(t), y, self.given["args"], self.given["constants"])
 
     def _rate(self, t: Scalar, y: PyTree) -> PyTree:
-        return jax.tree.map(lambda x: self.given["span"] * x, self._call(self.code.field, t, y))
+        return jax.tree.map(lambda x: self.span * x, self._call(self.code.field, t, y))
+
+    def distance(self, condition: Callable, point: Point) -> Scalar:
+        """Return the time from the end of a run to the zero of a condition, zero within rounding.
+
+        Args:
+            condition: Condition of an event.
+            point: End of the run.
+        """
+        t, y = jax.lax.stop_gradient((point.t, point.state.plant))
+        margin, rate = self._follow(condition, t, y)
+        away = jnp.where(rate < 0, jnp.abs(margin) / jnp.where(rate < 0, -rate, 1.0), jnp.inf)
+        return jnp.where(away <= COINCIDENCE_FRACTION, 0.0, away)
 
     def _follow(self, condition: Callable, t: Scalar, y: PyTree) -> tuple[Scalar, Scalar]:
         """Return a condition and its rate along the field, from the state `y` at `t` on."""
@@ -402,6 +432,7 @@ class Saves:
     """An objective that keeps the state at given times, from the cubic of each step."""
 
     places: Array = param(unit="1", free=True)  # of the span, shape (n,)
+    times: Array = param(unit="1", free=True)  # the same in the time of the field
 
     def start(self, sample: Sample) -> Memory:
         """Return the first state for each time."""
@@ -454,7 +485,7 @@ def solve(
     Every comparison in the field that depends on t or y is a switch: steps end where it changes, so that values keep
     the order of the method, and derivatives are right. `switches` lists them. The function works under `jax.jit`,
     `jax.vmap` and both modes of differentiation, by y0, t0, t1, args, `save` and whatever the functions close over. It
-    is compiled once for each `field`, so pass parameters by `args`.
+    is compiled again where a constant of a function has changed, so pass parameters by `args`.
 
     Args:
         field: Pure function of (t, y, args) that returns dy/dt, with the structure and shapes of y.
@@ -464,7 +495,8 @@ def solve(
         args: Anything that the functions need, a pytree of arrays and numbers.
         solver: `FixedStep` or `Adaptive`. Only `step` or `rtol` is read: t0 and t1 replace the duration, and `save` the
             stride. Fixed steps are shortened to a whole number.
-        events: Events; several at one instant happen in this order. One exactly at t1 does not happen.
+        events: Events; several at one instant happen in this order. One exactly at t1 does not happen. A terminal
+            event at the instant of others may come before or after them; after it, none happens.
         save: Times between t0 and t1 at which the state is returned, shape (n,); None for the state at the end.
         engine: "xla", or "kernel": a program of this machine for a batch by `jax.vmap`, with forward derivatives.
             "auto" is that of $DIFFABS_ENGINE, or else "xla", which has both modes.
@@ -486,12 +518,14 @@ def solve(
         0.367879
     """
     engine = resolve_request(engine)
+    if not isinstance(events, list | tuple):
+        raise ValueError(f"events = {kinds.format_value(events)} is no list of d.Event")
     events = tuple(events)
     if len(events) > MAX_EVENTS:
         raise ValueError(f"events has {len(events)} entries; at most {MAX_EVENTS} are possible")
-    if not isinstance(kept_events, int) or kept_events < 1:
+    if isinstance(kept_events, bool) or not isinstance(kept_events, int | np.integer) or kept_events < 1:
         raise ValueError(f"kept_events = {kept_events!r} is no whole number of at least 1")
-    loop, places = _build_loop(field, y0, t0, t1, args, events, save, kept_events)
+    loop, kept = _build_loop(field, y0, t0, t1, args, events, save, int(kept_events))
     asked: Any = solver
     method, count = _read_solver(asked, t0, t1, loop.given["t0"].dtype)
     program = _trace_program(loop)
@@ -504,7 +538,7 @@ def solve(
     if not switched:
         lean = {"is_logged": False, "smooth": True} if isinstance(method, AdaptiveStepping) else {"kinks": False}
         method = dataclasses.replace(method, watches=False, **lean)
-    saves = {} if places is None else {"saves": Saves(places=places)}
+    saves = {} if kept is None else {"saves": kept}
     if engine == "kernel":
         return _solve_by_kernel(loop, saves, method)
     capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, asked)
@@ -581,11 +615,14 @@ def _list_flips(loop: Part, solver: Adaptive) -> list[tuple[float, int]]:
         key: Any = None
         start = method.start(loop, {}, key)
         step, renew = partial(method.step, loop, {}, key), partial(method.renew, loop)
-        return log_run(step, renew, log_attempt, start, round_up_capacity(log_capacity(loop, solver)))[1]
+        carry, log = log_run(step, renew, log_attempt, start, round_up_capacity(log_capacity(loop, solver)))
+        return finish_solution(loop, {}, end_unfinished(carry))[0].status, log
 
-    log = run(loop)
+    status, log = run(loop)
+    if status != SolutionStatus.FINISHED:
+        raise ValueError(f"t1: the run has no end, its status is {SolutionStatus(int(status)).name}")
     lands = np.ravel(log.lands)
-    times = np.ravel(loop.given["t0"] + loop.given["span"] * log.t)
+    times = np.ravel(loop.time(log.t))
     return [(float(times[i]), int(lands[i])) for i in np.flatnonzero(np.ravel(log.taken) & (lands >= 0))]
 
 
@@ -598,23 +635,35 @@ def _build_loop(
     events: tuple[Event, ...],
     save: AnyArray | None,
     kept: int,
-) -> tuple[Any, Array | None]:
-    """Return the field as a `FieldLoop`, and the times `save` in units of the span.
+) -> tuple[Any, Saves | None]:
+    """Return the field as a `FieldLoop`, and the objective of the times `save`.
 
     Raises:
         ValueError: An argument is invalid.
     """
     _read_times(t0, t1, save)
     _refuse_leaves("y0", y0)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(args):
+        try:
+            jax.typeof(leaf)
+        except TypeError:
+            place = jax.tree_util.keystr(path)
+            raise ValueError(f"args{place} = {kinds.format_value(leaf)} is no number or array") from None
     save = jnp.asarray(save) if isinstance(save, list | tuple) else save
     y0, t0, t1, save = canonical_dtypes((y0, t0, t1, save))
     if not jax.tree.leaves(y0):
         raise ValueError("y0 has no number; a state of at least one is needed")
-    span = t1 - t0
+    if not _is_traced(t0, t1):
+        start, end, eps = float(t0), float(t1), float(jnp.finfo(t0.dtype).eps)
+        if eps * max(abs(start), abs(end)) > MAX_TIME_LOSS * abs(end - start):
+            raise ValueError(
+                f"t1 - t0 is lost in the rounding of t0 = {start:.10g} and t1 = {end:.10g} as {t0.dtype}: shift the"
+                ' time, or call jax.config.update("jax_enable_x64", True)'
+            )
     dynamics, found, constants = _read_functions(field, events, t0, y0, args)
-    given = {"y0": y0, "t0": t0, "span": span, "args": args, "constants": constants}
+    given = {"y0": y0, "t0": t0, "t1": t1, "args": args, "constants": constants}
     loop = FieldLoop(given=given, code=FieldCode(dynamics, found), kept=kept)
-    return loop, None if save is None else (save - t0) / span
+    return loop, None if save is None else Saves(places=(save - t0) / (t1 - t0), times=jnp.asarray(save))
 
 
 def _trace_program(loop: Part) -> SwitchedProgram:
@@ -648,7 +697,7 @@ def finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree
         objectives: The states to save, or nothing.
         carry: Carry of any stepping method at the end of the run.
     """
-    point, held, t0, span = carry.point, carry.point.state.controller.held, loop.given["t0"], loop.given["span"]
+    point, held = carry.point, carry.point.state.controller.held
     known = {
         RunStatus.TIMED_OUT: SolutionStatus.FINISHED,
         RunStatus.STOPPED: SolutionStatus.TERMINATED,
@@ -662,23 +711,32 @@ def finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree
     lost: Scalar = (status == SolutionStatus.DIVERGED) & (held.fault > 0)
     status = jnp.where(lost, held.fault.astype(status.dtype), status)
     check = partial(invalidate, invalid=status > SolutionStatus.TERMINATED, inputs=loop.given)
-    t, y = point.t, point.state.plant
+    t, y = loop.time(point.t), point.state.plant
     if objectives:
-        over = objectives["saves"].places > jax.lax.stop_gradient(t) - COINCIDENCE_FRACTION
-        rows = jax.tree.map(lambda x: jnp.expand_dims(over, range(1, 1 + jnp.ndim(x))), y)
-        y = jax.tree.map(jnp.where, rows, y, point.accumulators["saves"].held)
-        t = objectives["saves"].places
+        t, places = objectives["saves"].times, objectives["saves"].places
+        over = places > jax.lax.stop_gradient(point.t) - COINCIDENCE_FRACTION
+        # At t1 the state moves with its own time. After a terminal event it is repeated.
+        late = jnp.where(over & (status == SolutionStatus.FINISHED), places - point.t, 0.0)
+        late -= jax.lax.stop_gradient(late)
+        outside = jnp.where(jnp.abs(places - 0.5) <= 0.5 + COINCIDENCE_FRACTION, 1.0, jnp.nan)
+
+        def pick(y: Array, rate: Array, kept: Array) -> Array:
+            shape = (-1, *(jnp.ndim(y) * [1]))
+            moved = y + jnp.reshape(late, shape) * rate
+            return jnp.reshape(outside, shape) * jnp.where(jnp.reshape(over, shape), moved, kept)
+
+        y = jax.tree.map(pick, y, point.rates[0][0], point.accumulators["saves"].held)
     events = _count_events(loop, carry, status == SolutionStatus.TERMINATED)
-    times = check(t0 + span * events.times)
-    return Solution(check(t0 + span * t), jax.tree.map(check, y), events._replace(times=times), status), None
+    times = check(loop.time(events.times))
+    return Solution(check(t), jax.tree.map(check, y), events._replace(times=times), status), None
 
 
 def _count_events(loop: FieldLoop, carry: PyTree, terminated: Bool) -> SolutionEvents:
     """Return times, in units of the span, and counts of all events in their order."""
     point, held = carry.point, carry.point.state.controller.held
-    # The condition that has ended the solution is zero to rounding.
-    distances = [jnp.abs(margin) for margin in point.margins["stop"][1:]]
+    distances = [loop.distance(one.condition, point) for one in loop.code.terminal]
     last = jnp.argmin(jnp.stack(distances)) if distances else 0
+    last = jnp.where(held.ends > 0, held.ends - 1.0, last)
     never = jnp.full(loop.kept, jnp.nan, point.t.dtype)
     inner, ends, rows = iter(range(len(loop.code.inner))), iter(range(len(distances))), []
     for one in loop.code.events:
@@ -746,7 +804,7 @@ def _read_solver(solver: Any, t0: Scalar, t1: Scalar, dtype: DTypeLike) -> tuple
         raise ValueError("solver.kinks = False: d.solve locates all switches; leave it out")
     else:
         solver = dataclasses.replace(solver, duration=abs(float(t1) - float(t0)), every=1)
-    if lines := list(find_invalid_fields(solver)):
+    if lines := find_solver_faults(solver):
         raise ValueError("; ".join(lines).replace("solver.duration =", "t1 - t0 ="))
     if isinstance(solver, FixedStep):
         count = solver.steps
@@ -764,22 +822,20 @@ def _read_functions(
         ValueError: A function or what it returns is invalid, or the field has a switch that cannot be located.
     """
     constants: list[PyTree] = []
-    leaves, tree = jax.tree.flatten((t, y, args))
-    given = tree, tuple(map(jax.typeof, leaves))
 
     def read(function: Any, name: str, like: PyTree) -> Function:
         if not callable(function):
             raise ValueError(f"{name} = {kinds.format_value(function)} is no function of (t, y, args)")
-        known = _hashable(function), jax.tree.structure(like), given
-        if known in _accepted:
-            return _accepted[known]
-        program, found = jax.make_jaxpr(function, return_shape=True)(t, y, args)
+        # What a function closes over may have changed. A new wrapper makes JAX trace it again.
+        program, found = jax.make_jaxpr(lambda *given: function(*given), return_shape=True)(t, y, args)
         _check_result(name, found, like)
-        if not any(map(_is_traced, program.consts)):
-            while len(_accepted) >= MAX_ACCEPTED:
-                _accepted.pop(next(iter(_accepted)), None)
-            _accepted[known] = Function(_hashable(function), function)
-            return _accepted[known]
+        traced = any(map(_is_traced, program.consts))
+        hidden: list[Any] = []
+        key = _describe((program.jaxpr, [jax.typeof(x) if traced else x for x in program.consts]), hidden)
+        if hidden:  # a derivative rule, which shows neither its operations nor its tracers
+            key = key, object() if traced else _hashable(function)
+        if not traced:
+            return Function(key, function)
 
         # The compiled programs of the engine know no tracer from outside: the closure becomes an argument.
         def call(t: Scalar, y: PyTree, args: PyTree, given: PyTree) -> PyTree:
@@ -787,7 +843,7 @@ def _read_functions(
             return jax.tree.unflatten(jax.tree.structure(found), run(*jax.tree.leaves((t, y, args))))
 
         constants.append(list(program.consts))
-        return Function(call, call, len(constants) - 1)
+        return Function(key, call, len(constants) - 1)
 
     dynamics, found = read(field, "field", y), []
     for i, one in enumerate(events):
@@ -813,6 +869,40 @@ def _check_result(name: str, found: PyTree, like: PyTree) -> None:
             raise ValueError(f"{name} returns shape {a.shape}{place and f' at {place}'}; {b.shape} is needed")
         if line := kinds.find_value_objection(a):
             raise ValueError(f"{name} returns a number that {line}{place and f' at {place}'}; a real one is needed")
+
+
+def _describe(x: Any, hidden: list[Any]) -> Any:
+    """Return what is equal for equal programs or parameters of them; `hidden` gets the parameters that are not read."""
+    if isinstance(x, jex.ClosedJaxpr):
+        return _describe((x.jaxpr, x.consts), hidden)
+    if isinstance(x, jex.Jaxpr):
+        numbers: dict[Any, int] = {}
+
+        def read(atoms: Sequence[Any]) -> tuple:
+            return tuple(
+                (one.aval, _describe(one.val, hidden))
+                if isinstance(one, jex.Literal)
+                else numbers.setdefault(one, len(numbers))
+                for one in atoms
+            )
+
+        begins = [(one.aval, *read([one])) for one in (*x.constvars, *x.invars)]
+        rows = [(one.primitive, _describe(one.params, hidden), read(one.invars), read(one.outvars)) for one in x.eqns]
+        return tuple(begins), tuple(rows), read(x.outvars)
+    if isinstance(x, dict):
+        return tuple((name, _describe(one, hidden)) for name, one in sorted(x.items()))
+    if isinstance(x, list | tuple):
+        return type(x), tuple(_describe(one, hidden) for one in x)
+    if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+        x = jax.random.key_data(x)
+    if isinstance(x, jax.Array | np.ndarray | np.generic | float):
+        x = np.asarray(x)
+        return x.dtype, x.shape, x.tobytes()
+    unread = callable(x) or hasattr(x, "call_wrapped")  # JAX wraps a derivative rule anew each time
+    if _hashable(x) is x and (not unread or isinstance(x, type | np.dtype | Mesh | AbstractMesh)):
+        return x
+    hidden.append(x)
+    return type(x), str(getattr(x, "debug_info", None))
 
 
 def _hashable(function: Any) -> Any:

@@ -172,10 +172,6 @@ class Study:
             yield f"dtype = {self.dtype} is neither {' nor '.join(DTYPES)}"
         if self.engine not in REQUESTABLE_ENGINES:
             yield f"engine = {self.engine} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}"
-        for name in ("step", "duration"):
-            if not 0 < getattr(self.solver, name) < np.inf:
-                yield f"solver.{name} = {getattr(self.solver, name)} is not positive and finite"
-                return
         yield from find_solver_faults(self.solver)
         for name in {"sample", *FLAG_COLUMNS, *self.space.paths} & self.objectives.keys():
             yield f"objectives.{name}: another column of the table has this name"

@@ -131,7 +131,7 @@ def test_objectives_are_looked_at_too():
 @pytest.mark.parametrize(
     ("solver", "message"),
     [
-        (d.FixedStep(1.0, 0.5), "solver.step = 1.0 s is longer than solver.duration = 0.5 s"),
+        (d.FixedStep(1.0, 0.5), "solver.step = 1 s is outside (0, 0.5] s: longer than solver.duration = 0.5 s"),
         (d.FixedStep("1e-3", 0.5), "solver.step = '1e-3' is text"),
         (d.FixedStep(1e-3, None), "solver.duration = None is of type NoneType"),
         (d.FixedStep(True, 2.0), "solver.step = True is a truth value"),
@@ -141,12 +141,26 @@ def test_objectives_are_looked_at_too():
         (d.FixedStep(1e-3, 0.5, 0), "solver.every = 0 is not positive and finite"),
         (d.FixedStep(-1e-3, 0.5), "solver.step = -0.001 is not positive and finite"),
         (d.FixedStep(1e-3, float("nan")), "solver.duration = nan is not positive and finite"),
-        (d.FixedStep(1e-12, 1e6), "takes more than 2147483640 steps"),
+        (d.FixedStep(0.0, 0.5), "solver.step = 0.0 is not positive and finite"),
+        (d.FixedStep(1e-9, 0.5), "solver.step = 1e-09 s is outside [5e-09, 0.5] s: too many steps"),
+        (d.Adaptive(-1.0), "solver.rtol = -1.0 is not positive and finite"),
+        (d.Adaptive(50.0), "solver.rtol = 50.0 is outside (0, 1)"),
+        ((1e-3, 0.5), "solver = (0.001, 0.5) is no solver; d.FixedStep(step=..., duration=...) or d.Adaptive(rtol="),
     ],
 )
+@killed_by("simulate/admissible.py", "if not 0 < value < math.inf:", "if False:")
+@killed_by("simulate/admissible.py", '"rtol" and value >= 1', '"rtol" and value >= 99')
 def test_a_solver_that_no_run_can_have(solver, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        iae(RIG, solver)
+    """A run, a check of one loop, and a check of a batch say the same."""
+    batch = d.Batch({"plant.mass": [5.3]})
+    for use in (lambda: iae(RIG, solver), lambda: d.check(RIG, solver), lambda: batch.check(RIG, solver)):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            use()
+
+
+def test_a_solver_of_traced_numbers_is_named():
+    with pytest.raises(ValueError, match=r"solver.rtol is traced; a number that is known before the trace is needed"):
+        jax.jit(lambda rtol: iae(RIG, d.Adaptive(rtol, 0.25)))(1e-5)
 
 
 def test_one_step_may_be_the_whole_run():

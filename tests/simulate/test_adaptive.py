@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import random_loops
 from mutants import killed_by
+from scipy.optimize import brentq
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references, roads, stops
@@ -412,12 +413,27 @@ def test_there_is_room_for_smaller_steps():
         ({"rtol": 0.0}, "solver.rtol = 0.0 is not positive and finite"),
         ({"rtol": "1e-5"}, "solver.rtol = '1e-5'"),
         ({"duration": -1.0}, "solver.duration = -1.0 is not positive and finite"),
-        ({"step": 20.0}, "solver.step = 20.0 s is longer than solver.duration = 10.0 s"),
+        ({"step": 20.0}, "solver.step = 20 s is outside (0, 10] s: longer than solver.duration = 10 s"),
     ],
 )
 def test_a_solver_that_no_run_can_have_is_refused(change, line):
     with pytest.raises(ValueError, match=re.escape(line)):
         d.measure(rig().loop, dataclasses.replace(d.Adaptive(), **change), {})
+
+
+@killed_by("simulate/step/adaptive.py", "jnp.where(limit > 0, limit, self.h * self.steps)", "limit")
+def test_a_field_of_infinite_slope_at_its_start_is_solved():
+    """A tank that fills, y' = q - sqrt(y): with s = sqrt(y), the time from a to b is the integral of 2 s/(q - s)."""
+
+    def field(t, y, args):
+        return jnp.where(t < 0.5, args, 0.3) - jnp.sqrt(jnp.maximum(y, 0.0))
+
+    def time(a, b, q):
+        return 2 * (a - b + q * np.log((q - a) / (q - b)))
+
+    full = brentq(lambda s: time(0.0, s, 1.0) - 0.5, 0.0, 0.99)
+    found = d.solve(field, 0.0, 0.0, 2.0, 1.0, solver=d.Adaptive(1e-6))
+    assert time(full, np.sqrt(found.y), 0.3) == pytest.approx(1.5, rel=1e-6)
 
 
 def test_steps_that_find_themselves_are_never_unstable():

@@ -253,8 +253,8 @@ def iae_of_one(gain, speed):
 
 @killed_by(
     "simulate/batch.py",
-    "columns = {path: jnp.asarray(column, float) for",
-    "columns = {path: jax.lax.stop_gradient(jnp.asarray(column, float)) for",
+    "columns = {path: jnp.asarray(column, dtype) for",
+    "columns = {path: jax.lax.stop_gradient(jnp.asarray(column, dtype)) for",
     case="jacfwd",
 )
 @pytest.mark.parametrize(
@@ -294,12 +294,42 @@ def test_derivatives_are_those_of_single_runs(mode, single):
         ),
         (KeyError, "no 'mas' in plant.mas", Batch({"plant.mas": [5.0, 6.0]}), {"accepted": True}),
         (ValueError, r"has shape \(\); it needs \(2,\)", Batch({"controller.gain": [1.0, 2.0]}), {"accepted": True}),
+        (
+            ValueError,
+            r"accepted has shape \(2,\); \(3,\) is needed",
+            Batch(keys=[1, 2, 3]),
+            {"accepted": [True, False]},
+        ),
         (ValueError, "enough: lanes that run together", Batch(VALUES), {"enough": Slow(SPEEDS), "trajectories": True}),
     ],
 )
 def test_says_what_cannot_be_run(error, message, lanes, more):
     with pytest.raises(error, match=message):
         d.run_batch(QUIET, lanes, SOLVER, MEASURED, **more)
+
+
+@killed_by("simulate/ensemble.py", "if lines := find_impossible_values(loop, solver.step):", "if lines := []:")
+@pytest.mark.parametrize("batch", [Batch(), Batch(keys=[1, 2])], ids=["empty", "keys"])
+def test_a_loop_that_no_run_may_have_is_named_without_values(batch):
+    with pytest.raises(ValueError, match=r"plant.mass = -1 is outside \(0, inf\) kg"):
+        d.run_batch(replace(QUIET, {"plant.mass": -1.0}), batch, SOLVER, MEASURED)
+
+
+@killed_by("simulate/batch.py", "jnp.asarray(column, dtype)", "jnp.asarray(column, float)")
+def test_results_have_the_precision_of_the_loop():
+    loop = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), QUIET)
+    for together in (True, False):
+        run = d.run_batch(loop, Batch({"plant.mass": [5.0, 6.0]}), SOLVER, MEASURED, together=together, engine="xla")
+        assert {column.dtype for column in run.metrics.values()} == {np.dtype(np.float32)}, together
+
+
+@killed_by("simulate/batch.py", "(count, *jnp.shape(x))", "(1, *jnp.shape(x))")
+@pytest.mark.parametrize("column", ["weights", "durations"])
+def test_a_batch_without_values_has_one_result_for_each_run(column):
+    batch = Batch(**{column: [0.5, 0.5, 0.1]})
+    run = d.run_batch(QUIET, batch, SOLVER, MEASURED)
+    assert batch.size == 3
+    assert {np.shape(x) for x in jax.tree.leaves((run.metrics, run.stopped, run.diverged, run.timed_out))} == {(3,)}
 
 
 class TestStacked:

@@ -254,7 +254,7 @@ def test_a_tick_may_read_the_signal_before_it():
 def test_a_loop_and_a_solver_of_another_type_are_refused():
     with pytest.raises(ValueError, match=r"loop = 'slip-lmi' is no Loop"):
         d.measure("slip-lmi", d.FixedStep(1e-3, 1.0), {})  # pyright: ignore
-    with pytest.raises(ValueError, match=r"solver = 0.001 is no solver; d.FixedStep\(step, duration\)"):
+    with pytest.raises(ValueError, match=r"solver = 0.001 is no solver; d.FixedStep\(step=..., duration=...\)"):
         d.measure(d.braking(), 1e-3, {})  # pyright: ignore
 
 

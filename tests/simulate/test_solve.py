@@ -270,6 +270,106 @@ def test_a_closure_and_the_times_have_derivatives():
     assert abs(final(0.3, 1.0, 0.0) - np.exp(0.3)) < 1e-6  # backwards
 
 
+class Decay:
+    """A field that is a method: its rate changes between calls."""
+
+    def __init__(self, rate):
+        self.rate = rate
+
+    def field(self, t, y, args):
+        return -self.rate * y
+
+
+@pytest.mark.slow
+@killed_by("simulate/solve.py", "return x.dtype, x.shape, x.tobytes()", "return x.dtype, x.shape")
+def test_a_changed_closure_is_noticed():
+    decay = Decay(1.0)
+
+    def final(rate):
+        decay.rate = rate
+        return d.solve(decay.field, 1.0, 0.0, 1.0, solver=ADAPTIVE).y
+
+    for rate in (1.0, 2.0, np.array(3.0), 1.0):
+        assert abs(final(rate) - np.exp(-rate)) < 1e-8
+        assert abs(jax.grad(final)(float(rate)) + np.exp(-rate)) < 1e-8
+
+
+def decay(t, y, args):
+    return -y
+
+
+@pytest.mark.slow
+@killed_by("simulate/solve.py", "< 0), i + 1.0, ends)", "< 0), ends, ends)")
+def test_a_reset_makes_a_terminal_event_happen():
+    never = d.Event(lambda t, y, args: 9.0 - y, terminal=True)
+    dose = d.Event(lambda t, y, args: args - t, lambda t, y, args: y + 1.0)
+    full = d.Event(lambda t, y, args: 1.2 - y, terminal=True)
+
+    def end(at, save=None):
+        return d.solve(decay, 1.0, 0.0, 2.0, at, solver=ADAPTIVE, events=[never, dose, full], save=save)
+
+    found = end(0.5)
+    assert found.status == SolutionStatus.TERMINATED
+    assert found.events.counts.tolist() == [0, 1, 1]
+    np.testing.assert_allclose([found.t, found.events.times[2, 0], found.y], [0.5, 0.5, 1 + np.exp(-0.5)], atol=1e-8)
+    np.testing.assert_allclose(end(0.5, [0.2, 1.0]).y, [np.exp(-0.2), 1 + np.exp(-0.5)], atol=1e-8)
+    slopes = jax.jacfwd(lambda at: (end(at).t, end(at).y))(0.5)
+    np.testing.assert_allclose(slopes, [1.0, -np.exp(-0.5)], atol=1e-8)
+
+
+@pytest.mark.slow
+@killed_by("simulate/solve.py", "jnp.abs(margin) / jnp.where(rate < 0, -rate, 1.0)", "jnp.abs(margin)")
+def test_the_scale_of_a_condition_does_not_matter():
+    small = d.Event(lambda t, y, args: 1e-20 * (10.0 - y), terminal=True)
+    first = d.Event(lambda t, y, args: 3.7 - y * jnp.exp(0.01 * t), terminal=True)
+    found = d.solve(lambda t, y, args: 1.0 + 0.1 * jnp.sin(t), 0.1, 0.0, 20.0, solver=ADAPTIVE, events=[small, first])
+    assert found.events.counts.tolist() == [0, 1]
+
+
+@pytest.mark.slow
+@killed_by("simulate/solve.py", "late -= jax.lax.stop_gradient(late)", "late *= 0.0")
+@killed_by("simulate/solve.py", "COINCIDENCE_FRACTION, 1.0, jnp.nan)", "COINCIDENCE_FRACTION, 1.0, 1.0)")
+def test_saves_at_the_end_and_beyond():
+    def saved(save, end=2.0):
+        return d.solve(decay, 1.0, 0.0, end, solver=ADAPTIVE, save=save).y
+
+    save = jnp.array([0.0, 1.0, 2.0])
+    np.testing.assert_allclose(saved(save), np.exp(-save), atol=1e-8)
+    np.testing.assert_allclose(jax.jacrev(saved)(save), -np.diag(np.exp(-save)), atol=1e-7)
+    np.testing.assert_allclose(jax.jacfwd(saved, argnums=1)(save, 2.0), np.zeros(3), atol=1e-7)
+    outside = jax.jit(saved)(jnp.array([-1.0, 1.0, 3.0, jnp.nan]))
+    np.testing.assert_allclose(outside, [np.nan, np.exp(-1.0), np.nan, np.nan], atol=1e-8)
+
+
+@pytest.mark.slow
+@killed_by(
+    "simulate/solve.py", 'self.given["t0"] * (1.0 - s) + self.given["t1"] * s', 'self.given["t0"] + self.span * s'
+)
+def test_an_event_at_the_end_does_not_happen():
+    last = d.Event(lambda t, y, end: end - t, lambda t, y, end: y + 1.0)
+    starts, save = np.linspace(0.0, 0.8, 30), np.array([0.83, 0.85, 0.9])
+    found = jax.vmap(lambda t0: d.solve(decay, 1.0, t0, 0.9, 0.9, solver=ADAPTIVE, events=[last], save=save))(starts)
+    np.testing.assert_allclose(found.y[:, -1], np.exp(starts - 0.9), atol=1e-8)
+    np.testing.assert_array_equal(found.t, np.tile(save, (30, 1)))
+
+
+@pytest.mark.slow
+@killed_by("simulate/solve.py", "if status != SolutionStatus.FINISHED:", "if False:")
+def test_the_flips_of_an_unfinished_run_are_refused():
+    def stiff(t, y, args):
+        return -3000.0 * (y - jnp.where(jnp.sin(t) > 0, 1.0, -1.0))
+
+    with pytest.raises(ValueError, match="t1: the run has no end, its status is DIVERGED"):
+        d.switches(stiff, 0.01, 0.0, t1=40.0)
+
+
+@killed_by("simulate/solve.py", "if eps * max(", "if 0 * max(")
+def test_a_span_below_the_rounding_of_time_is_refused():
+    for start, end in ((1e9, 1e9 + 1), (-1e9 - 1, -1e9)):
+        with pytest.raises(ValueError, match=r"t1 - t0 is lost in .* as float32: shift the time"):
+            d.solve(decay, jnp.float32(1.0), start, end, solver=ADAPTIVE)
+
+
 @pytest.mark.slow
 def test_integers_in_args_and_many_states():
     def field(t, y, args):
@@ -294,7 +394,7 @@ TERMINAL_RESET = d.Event(fall, fall, terminal=True)
 REFUSED = {
     "solver = 3 is no solver": {"solver": 3},
     r"solver.rtol = -1.0 is not positive": {"solver": d.Adaptive(-1.0)},
-    "solver.step = 5 s is longer than t1 - t0 = 1.0 s": {"solver": d.FixedStep(5)},
+    r"solver.step = 5 s is outside \(0, 1\] s: longer than t1 - t0 = 1 s": {"solver": d.FixedStep(5)},
     "solver.kinks = False": {"solver": d.FixedStep(1e-2, kinks=False)},
     "t1 = 0.0 is equal to t0": {"t1": 0.0},
     "t1 = nan is not finite": {"t1": float("nan")},
@@ -321,6 +421,8 @@ REFUSED = {
     "events.0 = 1 is no d.Event": {"events": [1]},
     "events.0 is terminal and has a reset": {"events": [TERMINAL_RESET]},
     r"events.0.condition returns shape \(3,\)": {"events": [d.Event(lambda t, y, args: jnp.ones(3))]},
+    "events = Event.* is no list of d.Event": {"events": TERMINAL_RESET},
+    "args.'f'. = <function fall .* is no number or array": {"args": {"f": fall}},
     "kept_events = 0 is no whole number": {"kept_events": 0},
     "float32 cannot locate": {"field": lambda t, y, args: -jnp.abs(y - 0.5), "y0": jnp.float32(1.0)},
     "float32 cannot .* and give float64 numbers": {

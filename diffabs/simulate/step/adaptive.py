@@ -197,7 +197,7 @@ class AdaptiveStepping:
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)
         scale = error_scales(state, point.sample)
-        limit = self.h * self.steps if self.smooth else spectral_step_limit(loop, point.t, state, scale)
+        limit = self.h * self.steps if self.smooth else self._find_stability_limit(loop, point.t, state, scale)
         left = self._next_strike(loop, zero) * self.h
         length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), left, self.least)
         last = span_step(point, point) if self.keeps_last_step else ()
@@ -219,7 +219,7 @@ class AdaptiveStepping:
         due = carry.running & (control.tries - control.tries_at_renewal >= ATTEMPTS_PER_RENEWAL)
 
         def renew_due() -> Scalar:
-            new = spectral_step_limit(loop, at.t, at.state, control.scale)
+            new = self._find_stability_limit(loop, at.t, at.state, control.scale)
             return jnp.where(due, new, control.limit)
 
         # One condition for the whole batch: `cond` with one for each run would execute both branches.
@@ -323,7 +323,7 @@ class AdaptiveStepping:
         if self.is_logged:
             grown = jnp.minimum(STABILITY_FRACTION_GROWTH * fraction, 1.0)
             fraction = jnp.where(taken, jnp.where(new, grown, INITIAL_STABILITY_FRACTION), fraction)
-        longest = jnp.minimum(error_limited, fraction * control.limit)
+        longest = jnp.maximum(jnp.minimum(error_limited, fraction * control.limit), self.least)
         left = (self._next_strike(system.loop, after.k) - after.k) * self.h - after.since
         length, strikes = plan_step(longest, self._ahead(after.point), left, self.least)
         # A comparison changed inside the step: the next attempt ends there.
@@ -383,6 +383,14 @@ class AdaptiveStepping:
         passed = (carry.status == RunStatus.RUNNING) & (report.past_crossing > 0) & (carry.length <= self.least)
         status = jnp.where(report.grazes | passed, RunStatus.GRAZED, status)
         return jnp.where(unrestricted, RunStatus.SLID, status)
+
+    def _find_stability_limit(self, loop: Loop, t: Scalar, state: LoopState, scale: Scalar) -> Scalar:
+        """Return the longest stable step [s]; the whole span if the Jacobian of the `loop` is not finite.
+
+        `t` [s], `state` and `scale` are those of `spectral_step_limit`.
+        """
+        limit = spectral_step_limit(loop, t, state, scale)
+        return jnp.where(limit > 0, limit, self.h * self.steps)  # False also for NaN
 
     def _ahead(self, point: Point) -> Scalar:
         """Return the predicted time [s] to the first change of an answer."""

@@ -1,0 +1,25 @@
+"""Elementary functions against their definitions, at the ends of the range of their numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mutants import killed_by
+
+from diffabs.core.numerics import invalidate
+
+LARGEST = np.finfo(float).max
+
+
+@killed_by("core/numerics.py", "jnp.sum(none * jnp.where(jnp.isfinite(leaf), leaf, 0.0))", "none * jnp.sum(leaf)")
+@pytest.mark.parametrize("inputs", [[LARGEST, LARGEST], [np.inf, 1.0], [-np.inf, np.inf]])
+def test_a_valid_number_stays_with_inputs_of_any_size(inputs):
+    value, slope = jax.value_and_grad(lambda x: invalidate(3.0 * x[0], False, x[1:]))(jnp.array([2.0, *inputs]))
+    assert value == 6.0
+    np.testing.assert_array_equal(slope, [3.0, 0.0, 0.0])
+
+
+def test_an_invalid_number_has_no_derivative():
+    value, slope = jax.value_and_grad(lambda x: invalidate(3.0 * x[0], True, x[1:]))(jnp.array([2.0, LARGEST, 1.0]))
+    assert np.isnan(value)
+    assert np.isnan(slope).all()
