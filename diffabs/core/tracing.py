@@ -137,6 +137,29 @@ def read_leaves(
     return tree.unflatten([atom in needed for atom in program.invars[-len(leaves) :]])
 
 
+def scan_input_counts(params: Any, inputs: int) -> tuple[int, int]:
+    """Return how many inputs of a scan are constants and how many are carried.
+
+    Until JAX 0.10 these are numbers. Later versions store a structure with three groups of inputs, in their order.
+
+    Args:
+        params: Parameters of the primitive scan.
+        inputs: Number of its inputs.
+
+    Raises:
+        ValueError: The parameters are not known.
+    """
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    try:
+        groups = [list(group) for group in params["ft_in"].update(range(inputs)).unpack()]
+    except (AssertionError, AttributeError, KeyError, TypeError, ValueError):
+        groups = []
+    if len(groups) != 3 or [i for group in groups for i in group] != [*range(inputs)]:
+        raise ValueError("its parameter ft_in is not known")
+    return len(groups[0]), len(groups[1])
+
+
 def _zero(step: Scalar) -> bool:
     """Return whether an equation of a jaxpr multiplies by a literal zero."""
     return step.primitive.name == "mul" and any(np.all(v.val == 0) for v in step.invars if hasattr(v, "val"))

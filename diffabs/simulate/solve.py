@@ -831,7 +831,7 @@ def _read_functions(
         _check_result(name, found, like)
         traced = any(map(_is_traced, program.consts))
         hidden: list[Any] = []
-        key = _describe((program.jaxpr, [jax.typeof(x) if traced else x for x in program.consts]), hidden)
+        key = _describe_program(program, [jax.typeof(x) if traced else x for x in program.consts], hidden)
         if hidden:  # a derivative rule, which shows neither its operations nor its tracers
             key = key, object() if traced else _hashable(function)
         if not traced:
@@ -871,24 +871,27 @@ def _check_result(name: str, found: PyTree, like: PyTree) -> None:
             raise ValueError(f"{name} returns a number that {line}{place and f' at {place}'}; a real one is needed")
 
 
+def _describe_program(program: jex.ClosedJaxpr | jex.Jaxpr, constants: Sequence[Any], hidden: list[Any]) -> Any:
+    """Return what is equal for programs of equal operations and constants; see `_describe`."""
+    x, numbers = getattr(program, "jaxpr", program), dict[Any, int]()
+
+    def read(atoms: Sequence[Any]) -> tuple:
+        return tuple(
+            (one.aval, _describe(one.val, hidden))
+            if isinstance(one, jex.Literal)
+            else numbers.setdefault(one, len(numbers))
+            for one in atoms
+        )
+
+    begins = [(one.aval, *read([one])) for one in (*x.constvars, *x.invars)]
+    rows = [(one.primitive, _describe(one.params, hidden), read(one.invars), read(one.outvars)) for one in x.eqns]
+    return tuple(begins), tuple(rows), read(x.outvars), _describe(list(constants), hidden)
+
+
 def _describe(x: Any, hidden: list[Any]) -> Any:
     """Return what is equal for equal programs or parameters of them; `hidden` gets the parameters that are not read."""
-    if isinstance(x, jex.ClosedJaxpr):
-        return _describe((x.jaxpr, x.consts), hidden)
-    if isinstance(x, jex.Jaxpr):
-        numbers: dict[Any, int] = {}
-
-        def read(atoms: Sequence[Any]) -> tuple:
-            return tuple(
-                (one.aval, _describe(one.val, hidden))
-                if isinstance(one, jex.Literal)
-                else numbers.setdefault(one, len(numbers))
-                for one in atoms
-            )
-
-        begins = [(one.aval, *read([one])) for one in (*x.constvars, *x.invars)]
-        rows = [(one.primitive, _describe(one.params, hidden), read(one.invars), read(one.outvars)) for one in x.eqns]
-        return tuple(begins), tuple(rows), read(x.outvars)
+    if isinstance(x, jex.ClosedJaxpr | jex.Jaxpr):
+        return _describe_program(x, getattr(x, "consts", ()), hidden)
     if isinstance(x, dict):
         return tuple((name, _describe(one, hidden)) for name, one in sorted(x.items()))
     if isinstance(x, list | tuple):

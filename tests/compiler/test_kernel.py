@@ -238,7 +238,7 @@ class TestObjections:
         with pytest.raises(Unsupported, match=line.replace("(", r"\(")):
             applied({"f": function}, np.ones(3))
 
-    @killed_by("compiler/lower/control_flow.py", "if len(groups) != 3 or", "if False and")
+    @killed_by("core/tracing.py", "if len(groups) != 3 or", "if False and")
     @pytest.mark.parametrize("structure", [None, (1, 1, 1), {}])
     def test_of_a_scan_whose_inputs_are_told_otherwise(self, structure):
         """As JAX 0.11 began to do: a still later one may do so again."""

@@ -15,6 +15,7 @@ from diffabs.compiler.lower.rules import (
     map_entries,
     scalar_array,
 )
+from diffabs.core.tracing import scan_input_counts
 
 MAX_UNROLLED_STEPS = 64  # bound on the length of a scan, because its steps are unrolled
 
@@ -77,7 +78,10 @@ def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     p = eqn.params
     if p["length"] > MAX_UNROLLED_STEPS:
         raise Unsupported("scan", f"of {p['length']} steps within a step; {MAX_UNROLLED_STEPS} are the most")
-    constants, many = _scan_input_counts(p, len(ins))
+    try:
+        constants, many = scan_input_counts(p, len(ins))
+    except ValueError as error:
+        raise Unsupported("scan", str(error)) from None
     fixed, carry, rows = ins[:constants], ins[constants : constants + many], ins[constants + many :]
     if not p["length"] and len(eqn.outvars) > many:
         raise Unsupported("scan", "of no steps with outputs")
@@ -88,19 +92,3 @@ def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         carry, seen[i] = outs[:many], outs[many:]
     # A reversed scan fills its outputs from the end, so they are sorted by index.
     return [*carry, *(np.stack(column) for column in zip(*(seen[i] for i in sorted(seen)), strict=True))]
-
-
-def _scan_input_counts(params: Any, inputs: int) -> tuple[int, int]:
-    """Return how many inputs of a scan are constants and how many are carried.
-
-    Until JAX 0.10 these are numbers. Later versions store a structure with three groups of inputs, in their order.
-    """
-    if "num_carry" in params:
-        return params["num_consts"], params["num_carry"]
-    try:
-        groups = [list(group) for group in params["ft_in"].update(range(inputs)).unpack()]
-    except (AssertionError, AttributeError, TypeError, ValueError):
-        groups = []
-    if len(groups) != 3 or [i for group in groups for i in group] != [*range(inputs)]:
-        raise Unsupported("scan", "its parameter ft_in is not known")
-    return len(groups[0]), len(groups[1])

@@ -15,6 +15,7 @@ import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 
+from diffabs.core.tracing import scan_input_counts
 from diffabs.core.types import Array, PyTree
 from diffabs.simulate.step.modes import WORD_BITS
 
@@ -159,8 +160,8 @@ def _list_bodies(eqn: Equation, moves: list[bool]) -> Iterator[tuple[jex.Jaxpr, 
     if name == "cond":
         yield from ((_close(one).jaxpr, moves[1:]) for one in params["branches"])
     elif name == "scan":
-        body, fixed = _close(params["jaxpr"]).jaxpr, params["num_consts"]
-        end = fixed + params["num_carry"]
+        body, (fixed, many) = _close(params["jaxpr"]).jaxpr, scan_input_counts(params, len(moves))
+        end = fixed + many
         yield body, [*moves[:fixed], *_follow_carry(body, moves[:fixed], moves[fixed:end], moves[end:]), *moves[end:]]
     elif name == "while":
         ask, body = (_close(params[one]).jaxpr for one in ("cond_jaxpr", "body_jaxpr"))
