@@ -536,8 +536,8 @@ def solve(
             ' jax.config.update("jax_enable_x64", True), and give float64 numbers'
         )
     if not switched:
-        lean = {"is_logged": False, "smooth": True} if isinstance(method, AdaptiveStepping) else {"kinks": False}
-        method = dataclasses.replace(method, watches=False, **lean)
+        lean = {"is_logged": False} if isinstance(method, AdaptiveStepping) else {"kinks": False}
+        method = dataclasses.replace(method, watches=False, smooth=True, **lean)
     saves = {} if kept is None else {"saves": kept}
     if engine == "kernel":
         return _solve_by_kernel(loop, saves, method)

@@ -14,6 +14,9 @@ from mutants import killed_by
 from project import ROOT
 
 import diffabs as d
+from diffabs.compiler.ir import UpdateLevel
+from diffabs.compiler.passes import find_lane_calls
+from diffabs.compiler.schedule import schedule_nodes
 from diffabs.interop import field_of
 from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.solve import SolutionStatus
@@ -500,6 +503,42 @@ def test_a_kernel_solves_a_batch():
     np.testing.assert_allclose(jax.vmap(jax.jacfwd(final))(levels), [-1.0, -1.0], atol=1e-8)
     with pytest.raises(ValueError, match="a kernel has no reverse mode"):
         jax.grad(final)(0.5)
+
+
+@killed_by("simulate/step/advance.py", "none, UNCONSTRAINED, taken & last)", "none, UNCONSTRAINED, taken)")
+@killed_by("simulate/step/fixed.py", "self.h, strike * self.h, self.h", "self.h, carry.k * self.h, self.h")
+def test_fixed_steps_of_a_smooth_field_are_rk4():
+    """Values of RK4 by NumPy, backwards in time; where they overflow, the solution has diverged."""
+
+    def field(t, y, args):
+        return args * y * y + t
+
+    def rk4(y, h, args):
+        for t in 2.0 + h * np.arange(20):
+            a = field(t, y, args)
+            b = field(t + h / 2, y + h / 2 * a, args)
+            c = field(t + h / 2, y + h / 2 * b, args)
+            y += h / 6 * (a + 2 * b + 2 * c + field(t + h, y + h * c, args))
+        return y
+
+    found = jax.vmap(lambda args: d.solve(field, 0.5, 2.0, 1.0, args, solver=d.FixedStep(0.05)))(jnp.array([0.3, -1e9]))
+    np.testing.assert_allclose(found.y, [rk4(0.5, -0.05, 0.3), np.nan], rtol=1e-13)
+    assert found.status.tolist() == [SolutionStatus.FINISHED, SolutionStatus.DIVERGED]
+
+
+@killed_by("simulate/solve.py", "watches=False, smooth=True", "watches=False, smooth=False")
+def test_a_smooth_field_pays_for_no_event():
+    def lorenz(t, y, rho):
+        a, b, c = y
+        return 10.0 * (b - a), a * (rho - c) - b, a * b - 8 / 3 * c
+
+    def final(rho):
+        return d.solve(lorenz, (1.0, 0.0, 0.0), 0.0, 1.0, rho, solver=d.FixedStep(1e-3), engine="kernel").y
+
+    (call,) = find_lane_calls(jax.make_jaxpr(jax.vmap(final))(jnp.linspace(0.0, 21.0, 4)))
+    operations = list(schedule_nodes(call.program().results["step"], UpdateLevel.STEP).nodes())
+    by_hand = 4 * 9 + 3 * (3 * 2 + 4 * 2)  # four fields; for each number three stages and the sum of four rates
+    assert len(operations) < 1.5 * by_hand
 
 
 def test_a_field_without_a_translation_is_refused_by_a_kernel():

@@ -31,9 +31,9 @@ def build_target(made: ScalarProgram, shape: cpp.LaunchShape) -> str:
     # Tangents are independent of each other too and hide latency, so they replace vectors of the block.
     shape = shape._replace(vectors=max(1, shape.vectors // max(1, made.tangents)))
     source = cpp.emit_cpp(made, shape)
-    while cpp.count_operations(source) * shape.vectors > MAX_STEP_LINES and shape.vectors > 1:
-        shape = shape._replace(vectors=shape.vectors // 2)
-        source = cpp.emit_cpp(made, shape)
+    vectors = max(1, MAX_STEP_LINES // max(1, cpp.count_operations(source)))
+    if vectors < shape.vectors:
+        source = cpp.emit_cpp(made, shape._replace(vectors=vectors))
     return register_library(toolchain.build_library(source))
 
 

@@ -290,6 +290,8 @@ class AdaptiveStepping:
         scale = jax.tree.map(jnp.maximum, carry.control.scale, error_scales(state, sample))
         off = midpoint_error(self.tableau, error[0], seen.rates[0], h)
         relative = error_norm(system.loop, state, off, scale, sample) / self.rtol
+        if self.smooth:
+            return AdaptiveReport(relative, scale, jnp.zeros_like(h), jnp.asarray(False), None)
         surface = find_surface_crossing(seen, carry.search.which, h) if self.is_logged else None
         turns = watch_margins(carry, h, self._select_watched(seen), system.bit_count)
         past_crossing = jnp.maximum(time_since_crossing(seen.surfaces, changed, h), turns.time_since)
@@ -309,7 +311,7 @@ class AdaptiveStepping:
         fine = jnp.isfinite(error)  # the maximum over all states: one NaN makes it NaN
         exact = fine & (((error <= 1) & (past_crossing <= 0)) | (carry.length <= self.least))
         last = request.strikes & (request.strike >= self.steps)
-        return decide_attempt(system, carry, attempt, active, fine, exact, last=last, frozen=self.is_logged)
+        return decide_attempt(self, system, carry, attempt, active, fine, exact, last=last, frozen=self.is_logged)
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
         """Return the carry `after` an `attempt` with length and status of the next attempt.
@@ -394,10 +396,12 @@ class AdaptiveStepping:
 
     def _ahead(self, point: Point) -> Scalar:
         """Return the predicted time [s] to the first change of an answer."""
-        return point.forecast[0]
+        return jnp.full_like(self.h, jnp.inf) if self.smooth else point.forecast[0]
 
     def _look_ahead(self, error_limited: Scalar, unrestricted: Bool, fresh: Bool, seen: Evaluation) -> PyTree:
-        """Return the forecast; `fresh` is True if the answers were taken anew."""
+        """Return the forecast, nothing if `smooth`; `fresh` is True if the answers were taken anew."""
+        if self.smooth:
+            return ()
         return self._forecast_crossing(error_limited, unrestricted, seen), look_ahead(fresh, self._select_watched(seen))
 
     def _select_watched(self, seen: Evaluation) -> Evaluation:
@@ -416,9 +420,10 @@ class AdaptiveStepping:
         """Return True if an attempt by the run of `carry` aimed at a surface and has more than the allowed error.
 
         Then a rate jumps at the surface. A stage beyond it has the rate of the other side, and the weights of the
-        stages are not all positive: the step may even go away from the surface. Always False if the run is logged.
+        stages are not all positive: the step may even go away from the surface. Always False if the run is logged, or
+        `smooth`.
         """
-        if self.is_logged:  # all stages keep to one mode
+        if self.is_logged or self.smooth:  # all stages keep to one mode, or there is none
             return jnp.asarray(False)
         aimed = (carry.status == RunStatus.RUNNING) & (carry.length == self._ahead(carry.point))
         return aimed & decision.fine & ~decision.taken & (report.error > 1) & (report.past_crossing <= 0)

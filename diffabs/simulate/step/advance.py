@@ -324,6 +324,7 @@ def propose_step(stepping: Stepping, system: LoopSystem, carry: Carry, strike: I
 
 
 def decide_attempt(
+    stepping: Stepping,
     system: LoopSystem,
     carry: Carry,
     attempt: Attempt,
@@ -337,6 +338,7 @@ def decide_attempt(
     """Return the decision on an attempt: accept it, search within it, or end the run.
 
     Args:
+        stepping: Stepping method.
         system: Dynamics of the loop and its objectives.
         carry: Carry before the attempt.
         attempt: The attempt.
@@ -346,6 +348,10 @@ def decide_attempt(
         last: True if the run ends at the end of the attempt.
         frozen: True if a step keeps to a mode.
     """
+    if stepping.smooth:
+        no, taken = jnp.asarray(False), active & fine & exact
+        none = jax.tree.map(lambda margin: no, attempt.point.margins)
+        return Decision(fine, taken, no, no, none, UNCONSTRAINED, taken & last)
     running, landing, refreshing = (
         carry.status == one for one in (RunStatus.RUNNING, RunStatus.LANDING, RunStatus.REFRESHING)
     )

@@ -33,7 +33,7 @@ from diffabs.simulate.step.event_location import MAX_LOCATION_ATTEMPTS, SurfaceC
 from diffabs.simulate.step.outlook import look_ahead, watch_margins
 from diffabs.simulate.step.runge_kutta import RK4
 from diffabs.simulate.step.status import RunStatus
-from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
+from diffabs.simulate.step.system import UNCONSTRAINED, Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import Trajectory
 
 EVENT_ATTEMPTS_PER_STEP, SPARE_ATTEMPTS = 4, 64  # attempts to locate events: for each step of the grid, and in addition
@@ -68,7 +68,11 @@ class FixedStepReport(NamedTuple):
     grazes: Bool
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["kinks", "second_order", "watches"])
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["h", "steps"],
+    meta_fields=["kinks", "second_order", "watches", "smooth"],
+)
 @dataclasses.dataclass(frozen=True)
 class FixedStepping:
     """Steps of a `FixedStep` solver.
@@ -79,6 +83,7 @@ class FixedStepping:
         kinks: True if switching surfaces are located. None locates them for derivatives, and if a rate jumps there.
         second_order: True if the times of events have second derivatives.
         watches: True if the run ends where it slides or grazes. It must locate switching surfaces.
+        smooth: True if nothing switches and no event can happen. Then each attempt is a step to the next instant.
     """
 
     h: Scalar
@@ -86,7 +91,13 @@ class FixedStepping:
     kinks: bool | None = None
     second_order: bool = False
     watches: bool = False
-    tableau, searches, smooth = RK4, True, False
+    smooth: bool = False
+    tableau = RK4
+
+    @property
+    def searches(self) -> bool:
+        """True if the method locates events."""
+        return not self.smooth
 
     @property
     def has_margin_rates(self) -> bool:
@@ -136,6 +147,8 @@ class FixedStepping:
 
         An event takes at least four attempts. One of them is REFINING, which `FixedStepControl.extra` does not count.
         """
+        if self.smooth:
+            return steps
         crossings = CROSSING_ATTEMPTS_PER_STEP if self.kinks is not False else 0
         about = (crossings + (EVENT_ATTEMPTS_PER_STEP if loop.eventful else 0)) * steps + SPARE_ATTEMPTS
         return steps + SPARE_ATTEMPTS + about + about // 3
@@ -146,7 +159,11 @@ class FixedStepping:
 
     def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
-        return propose_step(self, system, carry, carry.k + 1, frozen=system.program is not None)
+        strike = carry.k + 1
+        if self.smooth:
+            no, yes = jnp.asarray(False), jnp.asarray(True)
+            return StepRequest(self.h, strike * self.h, self.h, UNCONSTRAINED, no, yes, strike)
+        return propose_step(self, system, carry, strike, frozen=system.program is not None)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
         """Return the `Outlook` from `seen` for the run of `carry` if the method `watches`, and else nothing."""
@@ -176,13 +193,16 @@ class FixedStepping:
         fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(attempt.point.state.flow())]))
         fine &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True
         last = request.strikes & (request.strike >= self.steps)
-        return decide_attempt(system, carry, attempt, active, fine, fine, last=last, frozen=system.program is not None)
+        frozen = system.program is not None
+        return decide_attempt(self, system, carry, attempt, active, fine, fine, last=last, frozen=frozen)
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
         """Return the carry `after` an `attempt` with length and status of the next one: to the grid, or for the search.
 
         `carry` is the run in `system` before the attempt, and `decision` the decision on it.
         """
+        if self.smooth:
+            return after._replace(status=jnp.where(decision.fine, after.status, RunStatus.DIVERGED))
         control, on_grid = carry.control, decision.taken & carry.strikes
         extra = control.extra + jnp.where(on_grid | (carry.status == RunStatus.REFINING), 0, 1)
         here = jnp.where(on_grid, 0, control.here + extra - control.extra)
