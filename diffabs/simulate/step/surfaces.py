@@ -4,12 +4,12 @@ Near a point of the run the margin x - y of a comparison moves along a line. It 
 ahead or in the past. A step that ends there has its kink at its end, where the kink costs no accuracy.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.core.types import Array, PyTree, Scalar
+from diffabs.core.types import Array, Bool, PyTree, Scalar
 from diffabs.simulate.step.modes import WORD_BITS, ModeBits
 
 NEVER_S = 1e9  # s; time to the next crossing if no crossing is predicted
@@ -62,11 +62,9 @@ def time_since_crossing(surfaces: Sequence[SwitchingFunction], changed: ModeBits
         length: Length of the step [s].
     """
     # Crossings outside of these fractions of the step lie at its ends.
-    low, high = (1 - STEP_END_FRACTION) * length, (1 - STEP_START_FRACTION) * length
-    first = low
-    for one in surfaces:
-        for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
-            first = jnp.where(on & (since < high) & (since > first), since, first)
+    first = low = (1 - STEP_END_FRACTION) * length
+    for _, later, since in _list_changes(surfaces, changed, length):
+        first = jnp.where(later & (since > first), since, first)
     return jnp.where(first > low, first, 0.0)
 
 
@@ -88,12 +86,20 @@ def valid_end_rates(surfaces: Sequence[SwitchingFunction], changed: ModeBits, le
         changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
         length: Length of the step [s].
     """
-    start = end = jnp.asarray(True)
+    at_start = later = jnp.asarray(False)
+    for one_at_start, one_later, _ in _list_changes(surfaces, changed, length):
+        at_start, later = at_start | one_at_start, later | one_later
+    return ~at_start, ~later
+
+
+def _list_changes(
+    surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar
+) -> Iterator[tuple[Bool, Bool, Scalar]]:
+    """Yield for each comparison whether it changes at the start of a step, whether later, and the time since [s]."""
     for one in surfaces:
         for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
             early = since >= (1 - STEP_START_FRACTION) * length
-            start, end = start & ~(on & early), end & ~(on & ~early)
-    return start, end
+            yield on & early, on & ~early, since
 
 
 def read_bits(words: ModeBits, numbers: PyTree) -> Scalar:
