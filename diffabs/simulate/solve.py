@@ -536,7 +536,7 @@ def solve(
             ' jax.config.update("jax_enable_x64", True), and give float64 numbers'
         )
     if not switched:
-        lean = {"is_logged": False} if isinstance(method, AdaptiveStepping) else {"kinks": False}
+        lean = {"keeps_mode": False} if isinstance(method, AdaptiveStepping) else {"kinks": False}
         method = dataclasses.replace(method, watches=False, smooth=True, **lean)
     saves = {} if kept is None else {"saves": kept}
     if engine == "kernel":
@@ -810,7 +810,7 @@ def _read_solver(solver: Any, t0: Scalar, t1: Scalar, dtype: DTypeLike) -> tuple
         count = solver.steps
         solver = FixedStep(1.0 / count, 1.0, kinks=True)
     method = dataclasses.replace(build_stepping(solver, dtype), watches=True)
-    return dataclasses.replace(method, is_logged=True) if isinstance(method, AdaptiveStepping) else method, count
+    return dataclasses.replace(method, keeps_mode=True) if isinstance(method, AdaptiveStepping) else method, count
 
 
 def _read_functions(

@@ -219,7 +219,7 @@ def on_limits(solver):
 
 @killed_by(
     "simulate/step/adaptive.py",
-    "surface = find_surface_crossing(seen, carry.search.which, h) if self.is_logged else None",
+    "surface = find_surface_crossing(seen, carry.search.which, h) if self.keeps_mode else None",
     "surface = None",
 )
 @pytest.mark.slow

@@ -25,6 +25,7 @@ Carry = Any  # pytree of the stepping method, with an attribute `running`
 Step = Callable[..., Carry]
 SCAN_GROUP_STEPS = 32  # steps that are skipped together, in scans of at most MAX_SAVED_CARRIES steps
 MAX_SAVED_CARRIES = 1800  # carries that reverse mode keeps in one scan: some 0.2 MB for each run of a batch
+BLOCKS_PER_GROUP = 32  # blocks of a logged run that are skipped together
 STEPS_PER_BLOCK = 16  # steps between two checks of `running`, which is a reduction over the whole batch
 
 
@@ -197,8 +198,8 @@ def log_run(
 ) -> tuple[Carry, PyTree]:
     """Return the carry at the end of a run after at most `room` attempts, and the log of the attempts.
 
-    The room is rounded up to whole blocks. The log is in blocks of shape (blocks, `STEPS_PER_BLOCK`, ...). Blocks after
-    the end of the run are zero.
+    The room is rounded up to whole groups of blocks. The log is in blocks of shape (blocks, `STEPS_PER_BLOCK`, ...).
+    Blocks after the end of the run are zero.
 
     Args:
         step: Function from carry to carry: one attempt of a step.
@@ -215,7 +216,13 @@ def log_run(
     def block(carry: Carry, _: None) -> tuple[Carry, PyTree]:
         return jax.lax.scan(one, renew(carry), length=STEPS_PER_BLOCK)
 
-    return _scan_active(block, lambda carry, _: carry.running, carry, None, -(-room // STEPS_PER_BLOCK))
+    return _scan_active(
+        block,
+        lambda carry, _: carry.running,
+        carry,
+        None,
+        BLOCKS_PER_GROUP * math.ceil(room / (BLOCKS_PER_GROUP * STEPS_PER_BLOCK)),
+    )
 
 
 def replay_log(
@@ -247,7 +254,8 @@ def replay_log(
     def block(carry: Carry, some: PyTree) -> tuple[Carry, PyTree]:
         return jax.lax.scan(rematerialise(one), carry, some)
 
-    return _scan_active(block, lambda _, some: jnp.any(taken(some)), carry, log)
+    blocks = len(taken(log))
+    return _scan_active(block, lambda _, some: jnp.any(taken(some)), carry, log, blocks)
 
 
 def _scan_active(
@@ -255,14 +263,27 @@ def _scan_active(
     on: Callable[[Carry, PyTree], Bool],
     carry: Carry,
     xs: PyTree,
-    length: int | None = None,
+    length: int,
 ) -> tuple[Carry, PyTree]:
-    """Return the result of a scan of `work` in which steps are skipped, with zeros, if no run is `on`."""
+    """Return the result of a scan of `work` over blocks, in which blocks are skipped, with zeros, if no run is `on`.
 
-    def body(carry: Carry, x: PyTree) -> tuple[Carry, PyTree]:
-        def skip() -> tuple[Carry, PyTree]:
-            return carry, jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(work, carry, x)[1])
+    Most of the capacity is not needed. To skip a block costs almost as much as a short step, so whole groups of
+    `BLOCKS_PER_GROUP` blocks are skipped as well.
+    """
 
-        return jax.lax.cond(any_lane(on(carry, x)), lambda: work(carry, x), skip)
+    def skip_unless_on(work: Callable) -> Callable:
+        def body(carry: Carry, x: PyTree) -> tuple[Carry, PyTree]:
+            def skip() -> tuple[Carry, PyTree]:
+                return carry, jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(work, carry, x)[1])
 
-    return jax.lax.scan(body, carry, xs, length=length)
+            return jax.lax.cond(any_lane(on(carry, x)), lambda: work(carry, x), skip)
+
+        return body
+
+    def group(carry: Carry, xs: PyTree) -> tuple[Carry, PyTree]:
+        return jax.lax.scan(skip_unless_on(work), carry, xs, length=BLOCKS_PER_GROUP)
+
+    groups = length // BLOCKS_PER_GROUP
+    split = jax.tree.map(lambda x: jnp.reshape(x, (groups, BLOCKS_PER_GROUP, *x.shape[1:])), xs)
+    carry, ys = jax.lax.scan(skip_unless_on(group), carry, split, length=groups)
+    return carry, jax.tree.map(lambda y: jnp.reshape(y, (length, *y.shape[2:])), ys)

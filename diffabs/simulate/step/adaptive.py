@@ -153,7 +153,7 @@ class AdaptiveReport(NamedTuple):
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["h", "steps", "rtol"],
-    meta_fields=["keeps_last_step", "is_logged", "watches", "smooth"],
+    meta_fields=["keeps_last_step", "keeps_mode", "watches", "smooth"],
 )
 @dataclasses.dataclass(frozen=True)
 class AdaptiveStepping:
@@ -164,9 +164,9 @@ class AdaptiveStepping:
         steps: Number of the last instant of the grid.
         rtol: Allowed relative error of a step.
         keeps_last_step: True if the carry keeps the last step, for samples between its ends.
-        is_logged: True if the run is logged for a replay with derivatives. Its steps then keep to a mode.
-        watches: True if the run ends where it slides or grazes, and a step where the margin of a comparison turns. It
-            must be logged.
+        keeps_mode: True if steps keep to a mode, as in a run that is logged for a replay with derivatives.
+        watches: True if the run ends where it slides or grazes, and a step where the margin of a comparison turns. Its
+            steps keep to a mode.
         smooth: True if nothing switches and no event can happen. The error alone then limits a step, not stability.
     """
 
@@ -174,7 +174,7 @@ class AdaptiveStepping:
     steps: Int
     rtol: Scalar
     keeps_last_step: bool = False
-    is_logged: bool = False
+    keeps_mode: bool = False
     watches: bool = False
     smooth: bool = False
     tableau, has_margin_rates, second_order = TSIT5, True, False
@@ -253,11 +253,10 @@ class AdaptiveStepping:
         """Return the method for a run that is logged and then replayed with derivatives.
 
         The derivative changes faster than the run. The allowed error of a step is therefore only
-        `DERIVATIVE_RTOL_FRACTION` of that for values.
+        `DERIVATIVE_RTOL_FRACTION` of that for values. The steps of a run that is `smooth` need no mode.
         """
-        return dataclasses.replace(
-            self, is_logged=True, smooth=False, rtol=clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol)
-        )
+        rtol = clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol)
+        return dataclasses.replace(self, keeps_mode=not self.smooth, rtol=rtol)
 
     def is_switched(self, loop: Loop) -> bool:
         """Return True: the comparisons of the `loop`'s flow are always visible."""
@@ -266,7 +265,7 @@ class AdaptiveStepping:
 
     def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
-        return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.is_logged)
+        return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.keeps_mode)
 
     def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
         """Return the predicted time [s] to the first change of an answer, from `seen`, for the run of `carry`.
@@ -292,7 +291,7 @@ class AdaptiveStepping:
         relative = error_norm(system.loop, state, off, scale, sample) / self.rtol
         if self.smooth:
             return AdaptiveReport(relative, scale, jnp.zeros_like(h), jnp.asarray(False), None)
-        surface = find_surface_crossing(seen, carry.search.which, h) if self.is_logged else None
+        surface = find_surface_crossing(seen, carry.search.which, h) if self.keeps_mode else None
         turns = watch_margins(carry, h, self._select_watched(seen), system.bit_count)
         past_crossing = jnp.maximum(time_since_crossing(seen.surfaces, changed, h), turns.time_since)
         if self.watches:
@@ -311,7 +310,7 @@ class AdaptiveStepping:
         fine = jnp.isfinite(error)  # the maximum over all states: one NaN makes it NaN
         exact = fine & (((error <= 1) & (past_crossing <= 0)) | (carry.length <= self.least))
         last = request.strikes & (request.strike >= self.steps)
-        return decide_attempt(self, system, carry, attempt, active, fine, exact, last=last, frozen=self.is_logged)
+        return decide_attempt(self, system, carry, attempt, active, fine, exact, last=last, frozen=self.keeps_mode)
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
         """Return the carry `after` an `attempt` with length and status of the next attempt.
@@ -322,7 +321,7 @@ class AdaptiveStepping:
         new = carry.status == RunStatus.RUNNING
         error_limited = self._error_limited_length(carry, attempt, decision)
         fraction = control.stability_fraction
-        if self.is_logged:
+        if self.keeps_mode:
             grown = jnp.minimum(STABILITY_FRACTION_GROWTH * fraction, 1.0)
             fraction = jnp.where(taken, jnp.where(new, grown, INITIAL_STABILITY_FRACTION), fraction)
         longest = jnp.maximum(jnp.minimum(error_limited, fraction * control.limit), self.least)
@@ -335,7 +334,7 @@ class AdaptiveStepping:
         length = jnp.where(falls_short, SHORT_OF_SURFACE_FRACTION * carry.length, length)
         searches, status, unrestricted = decision.searches, after.status, carry.unrestricted
         crossings = control.consecutive_crossings
-        if self.is_logged:
+        if self.keeps_mode:
             calm = taken & new & (carry.length > RESET_STEP_FRACTION * control.error_limited)
             if self.watches:
                 # Steps without an error are as long as the run, so that no step counts as long beside them.
@@ -414,16 +413,16 @@ class AdaptiveStepping:
 
     def _forecast_crossing(self, error_limited: Scalar, unrestricted: Bool, seen: Evaluation) -> Scalar:
         ahead = forecast_crossing(seen.surfaces, error_limited, self.least)
-        return jnp.where(unrestricted, 1.0, CROSSING_OVERREACH) * ahead if self.is_logged else ahead
+        return jnp.where(unrestricted, 1.0, CROSSING_OVERREACH) * ahead if self.keeps_mode else ahead
 
     def _jumps_at_end(self, carry: Carry, report: AdaptiveReport, decision: Decision) -> Bool:
         """Return True if an attempt by the run of `carry` aimed at a surface and has more than the allowed error.
 
         Then a rate jumps at the surface. A stage beyond it has the rate of the other side, and the weights of the
-        stages are not all positive: the step may even go away from the surface. Always False if the run is logged, or
-        `smooth`.
+        stages are not all positive: the step may even go away from the surface. Always False if steps keep to a mode,
+        or the run is `smooth`.
         """
-        if self.is_logged or self.smooth:  # all stages keep to one mode, or there is none
+        if self.keeps_mode or self.smooth:  # all stages keep to one mode, or there is none
             return jnp.asarray(False)
         aimed = (carry.status == RunStatus.RUNNING) & (carry.length == self._ahead(carry.point))
         return aimed & decision.fine & ~decision.taken & (report.error > 1) & (report.past_crossing <= 0)
