@@ -526,6 +526,40 @@ def test_fixed_steps_of_a_smooth_field_are_rk4():
     assert found.status.tolist() == [SolutionStatus.FINISHED, SolutionStatus.DIVERGED]
 
 
+@killed_by("simulate/step/fixed.py", "end.rates[0] if self.smooth else ()", "()")
+@killed_by("simulate/solve.py", 'loop.given["t1"], loop.time(point.t)', "loop.time(point.t), loop.time(point.t)")
+def test_the_last_fixed_step_ends_at_t1_within_the_domain():
+    def field(t, y, args):
+        return t**3, jnp.sqrt(args - y[0])  # y[0] = 1/4 at t = 1
+
+    def solve(args):
+        return d.solve(field, (0.0, 0.0), 0.0, 1.0, args, solver=d.FixedStep(1 / 49), save=jnp.ones(1))
+
+    found = jax.vmap(solve)(jnp.array([0.3, 0.249999]))
+    assert found.status.tolist() == [SolutionStatus.FINISHED, SolutionStatus.DIVERGED]
+    end = d.solve(lambda t, y, args: y, 1.0, 0.0, 1.0, solver=d.FixedStep(1 / 49))
+    assert end.t == 1.0  # 49 times 1/49 is less
+
+
+@pytest.mark.slow
+@killed_by("simulate/step/advance.py", "stepping.second_order or not stepping.smooth", "not stepping.smooth")
+@killed_by("simulate/step/adaptive.py", "not self.smooth, stable=True", "not self.smooth")
+@killed_by("simulate/step/replay.py", "one.refresh | ~one.taken, 0.0", "one.refresh, 0.0")
+def test_reverse_mode_where_rates_end_or_vanish():
+    """Beyond t1, at rest, and in attempts that were rejected, numbers are not finite, or grow."""
+
+    def final(field, y0, solver):
+        return lambda args: d.solve(field, y0, 0.0, 1.0, args, solver=solver).y
+
+    ends = final(lambda t, y, args: args * jnp.sqrt(1.001 - t), 0.0, d.FixedStep(0.01))
+    np.testing.assert_allclose(jax.grad(ends)(1.0), 2 / 3 * (1.001**1.5 - 0.001**1.5), rtol=1e-5)
+    rests = final(lambda t, y, args: 1000.0 * (args - y), 1.0, d.Adaptive(1e-8))
+    np.testing.assert_allclose(jax.grad(rests)(1.0), 1.0, rtol=1e-6)
+    drains = final(lambda t, y, args: -args * jnp.sqrt(y), 1.0, d.Adaptive(1e-4))
+    rates = jnp.linspace(1.9, 1.9995, 24)
+    np.testing.assert_allclose(jax.vmap(jax.grad(drains))(rates), rates / 2 - 1, atol=1e-3)
+
+
 @killed_by("simulate/solve.py", "watches=False, smooth=True", "watches=False, smooth=False")
 def test_a_smooth_field_pays_for_no_event():
     def lorenz(t, y, rho):

@@ -155,9 +155,9 @@ def _any_running(running: Bool) -> Bool:
 
 
 def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X], PyTree]) -> X:
-    """Return the carry after at least `capacity` applications of `step`, in nested scans.
+    """Return the carry after groups of steps, with room for at least `capacity` steps.
 
-    Groups of steps are skipped where `on(carry)` is False. Within a group `on` is not asked: `step` must leave a run
+    A group is skipped where `on(carry)` is False. Within a group `on` is not asked: `step` must leave a run
     that is over as it is. In a batch under `jax.vmap` groups are skipped only if `on` returns one value for all runs
     (`any_lane`). Reverse mode keeps the carry of each step. Beyond `MAX_SAVED_CARRIES` steps it keeps the carry of each
     group and computes the steps of a group again.
@@ -196,10 +196,10 @@ def nested_scan_lengths(count: int) -> tuple[int, int]:
 def log_run(
     step: Step, renew: Step, log: Callable[[Carry, Carry], PyTree], carry: Carry, room: int
 ) -> tuple[Carry, PyTree]:
-    """Return the carry at the end of a run after at most `room` attempts, and the log of the attempts.
+    """Return the carry at the end of a run, and the log of its attempts.
 
-    The room is rounded up to whole groups of blocks. The log is in blocks of shape (blocks, `STEPS_PER_BLOCK`, ...).
-    Blocks after the end of the run are zero.
+    There is room for at least `room` attempts, in whole groups of blocks. The log is in blocks of shape (blocks,
+    `STEPS_PER_BLOCK`, ...). Blocks after the end of the run are zero.
 
     Args:
         step: Function from carry to carry: one attempt of a step.
@@ -265,10 +265,10 @@ def _scan_active(
     xs: PyTree,
     length: int,
 ) -> tuple[Carry, PyTree]:
-    """Return the result of a scan of `work` over blocks, in which blocks are skipped, with zeros, if no run is `on`.
+    """Return the result of a scan of `work` over blocks. Where no run of the batch is `on`, a block is skipped: zeros.
 
     Most of the capacity is not needed. To skip a block costs almost as much as a short step, so whole groups of
-    `BLOCKS_PER_GROUP` blocks are skipped as well.
+    `BLOCKS_PER_GROUP` blocks are skipped as well; `length` is a multiple of it.
     """
 
     def skip_unless_on(work: Callable) -> Callable:

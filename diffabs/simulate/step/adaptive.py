@@ -153,7 +153,7 @@ class AdaptiveReport(NamedTuple):
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["h", "steps", "rtol"],
-    meta_fields=["keeps_last_step", "keeps_mode", "watches", "smooth"],
+    meta_fields=["keeps_last_step", "keeps_mode", "watches", "smooth", "stable"],
 )
 @dataclasses.dataclass(frozen=True)
 class AdaptiveStepping:
@@ -167,7 +167,8 @@ class AdaptiveStepping:
         keeps_mode: True if steps keep to a mode, as in a run that is logged for a replay with derivatives.
         watches: True if the run ends where it slides or grazes, and a step where the margin of a comparison turns. Its
             steps keep to a mode.
-        smooth: True if nothing switches and no event can happen. The error alone then limits a step, not stability.
+        smooth: True if nothing switches and no event can happen.
+        stable: True if stability limits a step, too. The error of a run at rest shows no derivative that grows.
     """
 
     h: Scalar
@@ -177,6 +178,7 @@ class AdaptiveStepping:
     keeps_mode: bool = False
     watches: bool = False
     smooth: bool = False
+    stable: bool = True
     tableau, has_margin_rates, second_order = TSIT5, True, False
 
     @property
@@ -197,7 +199,7 @@ class AdaptiveStepping:
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)
         scale = error_scales(state, point.sample)
-        limit = self.h * self.steps if self.smooth else self._find_stability_limit(loop, point.t, state, scale)
+        limit = self._find_stability_limit(loop, point.t, state, scale) if self.stable else self.h * self.steps
         left = self._next_strike(loop, zero) * self.h
         length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), left, self.least)
         last = span_step(point, point) if self.keeps_last_step else ()
@@ -213,7 +215,7 @@ class AdaptiveStepping:
 
     def renew(self, loop: Loop, carry: Carry) -> Carry:
         """Return the `carry` with a new stability limit of the `loop`, once in `ATTEMPTS_PER_RENEWAL` attempts."""
-        if self.smooth:
+        if not self.stable:
             return carry
         control, at = carry.control, carry.point
         due = carry.running & (control.tries - control.tries_at_renewal >= ATTEMPTS_PER_RENEWAL)
@@ -256,7 +258,7 @@ class AdaptiveStepping:
         `DERIVATIVE_RTOL_FRACTION` of that for values. The steps of a run that is `smooth` need no mode.
         """
         rtol = clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol)
-        return dataclasses.replace(self, keeps_mode=not self.smooth, rtol=rtol)
+        return dataclasses.replace(self, keeps_mode=not self.smooth, stable=True, rtol=rtol)
 
     def is_switched(self, loop: Loop) -> bool:
         """Return True: the comparisons of the `loop`'s flow are always visible."""

@@ -126,7 +126,7 @@ class Stepping(Protocol):
 
     @property
     def searches(self) -> bool:
-        """True if the method locates events; False if a log says where they are."""
+        """True if the method locates events; False if a log says where they are, or there are none."""
         ...
 
     @property
@@ -181,7 +181,7 @@ class Stepping(Protocol):
         """Return the carry `after` an `attempt` with length and status of the next attempt.
 
         `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has the new point
-        and, from a method that `searches`, the search with its length and status.
+        and, from a method that `searches` or is `smooth`, the status; if it `searches`, also the search and its length.
         """
         ...
 
@@ -219,8 +219,9 @@ def advance(
         return attempt_step(system, start, request, stepping.tableau, forecast, report)
 
     # Without the barriers, XLA would compile the attempt again into each expression that uses it. A step in which
-    # nothing is searched has few such expressions.
-    barrier = (lambda active, work: work()) if stepping.smooth else jit_barrier
+    # nothing is searched has few such expressions. For derivatives the barrier also skips attempts beyond the end,
+    # where reverse mode would multiply 0 by a rate that may be infinite.
+    barrier = jit_barrier if stepping.second_order or not stepping.smooth else lambda active, work: work()
     attempt = barrier(active, attempt_request)
     decision = barrier(active, lambda: stepping.decide(system, carry, request, attempt, active))
 

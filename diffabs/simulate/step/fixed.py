@@ -190,14 +190,17 @@ class FixedStepping:
 
         Its numbers must be finite and, within a mode, plausible. `active` is False if the run needs no attempt.
         """
-        fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(attempt.point.state.flow())]))
+        end = attempt.point
+        # The rates at the end of a smooth run are used nowhere else but in samples of its last step.
+        numbers = jax.tree.leaves((end.state.flow(), end.rates[0] if self.smooth else ()))
+        fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in numbers]))
         fine &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True
         last = request.strikes & (request.strike >= self.steps)
         frozen = system.program is not None
         return decide_attempt(self, system, carry, attempt, active, fine, fine, last=last, frozen=frozen)
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an `attempt` with length and status of the next one: to the grid, or for the search.
+        """Return `after` with length and status of the next attempt, which goes to the grid or continues the search.
 
         `carry` is the run in `system` before the attempt, and `decision` the decision on it.
         """

@@ -150,9 +150,11 @@ class ReplayStepping:
         """Return the logged attempt, for the replay `carry` in `system`.
 
         If the last step ended late, this one is shorter: it aims at the logged time, and `shift_end` may move its end.
+        An attempt that was not accepted becomes a step of length 0. It may have invalid numbers, which reverse mode in
+        a batch would multiply by 0.
         """
         one, k = self.logged, carry.k
-        h = jnp.where(one.refresh, 0.0, one.length - carry.control.delay)
+        h = jnp.where(one.refresh | ~one.taken, 0.0, one.length - carry.control.delay)
         end = jnp.where(one.refresh, carry.point.t, one.t)
         words = select(one.refresh, one.next_words, one.words)
         mode = mode_in_step(system, words, one.unrestricted)

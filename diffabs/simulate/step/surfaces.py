@@ -13,7 +13,7 @@ from diffabs.core.types import Array, Bool, PyTree, Scalar
 from diffabs.simulate.step.modes import WORD_BITS, ModeBits
 
 NEVER_S = 1e9  # s; time to the next crossing if no crossing is predicted
-# A crossing nearer than this fraction of the length that the error allows has happened.
+# A crossing nearer than this fraction of the length that the error allows counts as past.
 IMMEDIATE_FRACTION = 2e-4
 # A crossing outside of these fractions of a step lies at one end of the step.
 STEP_START_FRACTION, STEP_END_FRACTION = 0.02, 0.95
@@ -43,7 +43,7 @@ def forecast_crossing(surfaces: Sequence[SwitchingFunction], natural: Scalar, sh
         natural: Length that the error allows [s].
         shortest: Shortest length of any step [s].
     """
-    # A crossing nearer than this has happened.
+    # A crossing nearer than this counts as past.
     least, next = jnp.maximum(IMMEDIATE_FRACTION * natural, shortest), jnp.full_like(natural, -NEVER_S)
     for one in surfaces:
         for since in _times_since_crossing(one):
@@ -71,7 +71,7 @@ def time_since_crossing(surfaces: Sequence[SwitchingFunction], changed: ModeBits
 def _times_since_crossing(surface: SwitchingFunction) -> Array:
     """Return the times since the crossings of these surfaces, shape (n,) [s]; negative for a crossing ahead.
 
-    A rate of 0 gives an infinite time or NaN: no comparison with such a time is true.
+    A rate of 0 gives an infinite time or NaN, which cuts no step.
     """
     return jnp.ravel(jnp.asarray(surface.value / surface.rate))
 
@@ -95,7 +95,10 @@ def valid_end_rates(surfaces: Sequence[SwitchingFunction], changed: ModeBits, le
 def _list_changes(
     surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar
 ) -> Iterator[tuple[Bool, Bool, Scalar]]:
-    """Yield for each comparison whether it changes at the start of a step, whether later, and the time since [s]."""
+    """Yield for each comparison: whether it changed at the start of a step, whether later, and the time since then [s].
+
+    A change without a time, at a rate of 0, counts as later.
+    """
     for one in surfaces:
         for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
             early = since >= (1 - STEP_START_FRACTION) * length
