@@ -41,7 +41,7 @@ def rare(
     engine: engines.Engine = "auto",
     as_json: console.Json = False,
 ) -> None:
-    """Compute the probability that a metric reaches a bound.
+    """Compute the probability that a metric exceeds a bound.
 
     Parameters vary as [sweep.over] says. Probabilities below 1e-7 are feasible."""
     with console.end_on_errors():
@@ -87,6 +87,10 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
 
     levels: list[SubsetProgress] = []
 
+    def note(level: "SubsetProgress") -> None:
+        # The last level of a strict bound has the next number as its threshold, 5e-324 for a bound of zero.
+        levels.append(level._replace(threshold=min(level.threshold, bound)))
+
     def far() -> str:
         if not levels:
             return f"level 1, {progress.COMPILING}"
@@ -95,7 +99,7 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
     try:
         return console.run_with_progress(
             lambda: failure_probability(
-                study, metric, bound, gradients=gradients, samples=samples, seed=study.seed, progress=levels.append
+                study, metric, bound, gradients=gradients, samples=samples, seed=study.seed, progress=note
             ),
             "looking for failures",
             far,

@@ -108,7 +108,7 @@ def show_rare_event(result: JsonObject, chosen: Scenario) -> None:
         names = ("threshold", "share", "cov", "acceptance")
         levels.add_row(str(i), *(f"{row[name]:.4g}" for name in names), str(row["diverged"]))
     show_titled_table(
-        f"{chosen.title or chosen.name}: {result['metric']} >= {result['bound']:g} {result['unit']}", levels
+        f"{chosen.title or chosen.name}: {result['metric']} > {result['bound']:g} {result['unit']}", levels
     )
     estimates = Table("estimate", "probability", "low", "high", "coefficient of variation")
     for name in ("first level alone", "subset simulation", "importance sampling"):
@@ -140,6 +140,10 @@ def show_comparison(result: JsonObject) -> None:
     """
     table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")
     for name, row in result["metrics"].items():
+        if row["difference"] is None:
+            table.add_row(name)
+            say(f"warning: {name} is finite in {row['samples']} common samples: too few for statistics")
+            continue
         less = f"{100 * row['share in which the second is less']['value']:.1f} %"
         means = (format_brief(row[key]) for key in ("first", "second"))
         table.add_row(name, *means, *_estimate(row["difference"]), less, format_brief(row["variance reduction"]))

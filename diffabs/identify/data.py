@@ -1,10 +1,11 @@
 """Protocol of measured data that `identify` can compare with a loop."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from diffabs.core.kinds import format_value
 from diffabs.core.loop import Loop
 from diffabs.core.types import PyTree, Scalar
 from diffabs.identify.residuals import Residuals
@@ -42,6 +43,20 @@ class Data(Protocol):
             ValueError: The data do not fit the loop, the solver or each other.
         """
         ...
+
+
+def check_sigma_table(sigma: PyTree, of: str) -> None:
+    """Check that standard deviations are given by name.
+
+    Args:
+        sigma: Standard deviations.
+        of: What the names are, for the message.
+
+    Raises:
+        ValueError: They are no mapping.
+    """
+    if not isinstance(sigma, Mapping):
+        raise ValueError(f"sigma = {format_value(sigma)} is no mapping from {of} to standard deviations")
 
 
 def check_positive(name: str, value: Scalar, unit: str) -> None:

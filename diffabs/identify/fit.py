@@ -12,7 +12,7 @@ Source: M. A. Branch, T. F. Coleman and Y. Li, SIAM J. Sci. Comput. 21 (1999).
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
 from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
 from diffabs.core.validity import check_part
-from diffabs.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial
+from diffabs.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial, check_prior
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
 from diffabs.runtime.summary import Summary, round_for_table
 
@@ -148,7 +148,7 @@ def fit(
     sigma: AnyArray | None = None,
     absolute: bool = True,
     prior: Prior | None = None,
-    starts: Sequence[Table] = (),
+    starts: Iterable[Table] = (),
     norm: float = 2.0,
     tolerances: Tolerances | None = None,
     usable: Callable[[PyTree], bool] | None = None,
@@ -167,7 +167,8 @@ def fit(
         absolute: False if only the ratios of sigma are known. The residuals then estimate a factor s^2 of all
             variances.
         prior: JAX function of the part that returns deviations from prior knowledge, in standard deviations. `gaussian`
-            makes one; a roughness penalty is another. Arguments in a `jax.tree_util.Partial` are traced.
+            makes one; a roughness penalty is another. Arguments in a `jax.tree_util.Partial` are traced. A prior needs
+            a sigma that is known absolutely.
         starts: For each start, initial values by path; empty for one start from the part's own. The fit with the lowest
             cost is returned.
         norm: Exponent of the weighted residuals, >= 2: 2 is least squares, larger ones approach the largest residual.
@@ -180,9 +181,9 @@ def fit(
     Raises:
         ValueError: A path, a range or the shape of sigma does not fit, sigma is not positive and finite, or norm is
             outside [2, inf).
-        ValueError: There are fewer residuals than parameters and no prior. An estimate of s^2 needs one residual more,
-            also with a prior.
-        ValueError: There is a prior without sigma.
+        ValueError: There are fewer residuals than parameters and no prior. An estimate of s^2 needs one residual more.
+        ValueError: There is a prior, but no sigma that is known absolutely. Or the prior is that of `gaussian`, and one
+            of its parameters is not free.
         ValueError: No start can be used: at each one a residual or derivative is not finite, or `usable` returns False.
     """
     part = canonical_dtypes(check_part(part))
@@ -196,11 +197,12 @@ def fit(
             raise ValueError(f"sigma has shape {given.shape}; {n} residuals need a number or ({n},)")
         if not (np.isfinite(given) & (given > 0)).all():
             raise ValueError(f"sigma = {np.min(given):g} is not positive and finite")
-    if k and sigma is None:
-        raise ValueError("a prior needs sigma: nothing else says how much the data weigh against it")
     estimated = sigma is None or not absolute
-    # A prior makes up for missing data, but not for the estimate of s^2, which needs n > p.
-    if n < where.size + estimated and not (k and n > 0 and not estimated):
+    if k and estimated:
+        needed = "sigma" if sigma is None else "sigma with absolute = True"
+        raise ValueError(f"a prior needs {needed}: nothing else says how much the data weigh against it")
+    check_prior(prior, [entry.path for entry in where.entries])
+    if n < where.size + estimated and not (k and n > 0):  # a prior makes up for missing data
         more = " and one more for the estimate of s^2" if estimated else ""
         raise ValueError(f"{n} data do not determine {where.size} parameters{more}: free fewer, or state a prior")
     if not 2 <= norm < np.inf:

@@ -7,7 +7,7 @@ The data are compared with the loop's measured outputs, behind its sensor. No ra
 the cost and the method, `uncertainty` the covariance and the directions that the data leave open.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
 
@@ -32,7 +32,7 @@ def identify(
     solver: Solver,
     absolute: bool = True,
     prior: Prior | None = None,
-    starts: Sequence[Table] = (),
+    starts: Iterable[Table] = (),
     norm: float = 2.0,
     tolerances: Tolerances | None = None,
     progress: Callable[[int, float], None] | None = None,
@@ -54,11 +54,13 @@ def identify(
     """
     check_part(loop)
     comparison = data.against(loop, list(free), solver)
+    starts = tuple(starts)
     for start in starts or ({},):
         if why := _describe_refusal(first := replace(loop, dict(start)), comparison, solver):
-            # If the step is too long, the message gives the longest stable one.
-            most = min(float(stable_steps(canonical_dtypes(batch)).min()) for batch in comparison.loops(first))
-            raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
+            if why.endswith("is not stable"):  # the step is too long: the message gives the longest stable one
+                most = min(float(stable_steps(canonical_dtypes(batch)).min()) for batch in comparison.loops(first))
+                why += f" at the start; at most {most:.2g} s is"
+            raise ValueError(why)
     return fit(
         loop,
         free,

@@ -1,7 +1,7 @@
 """Residuals, prior and Jacobians of a least-squares fit, compiled once and evaluated at one z after the other."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -40,8 +40,10 @@ def gaussian(known: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
         known: Parameters as {path: (mean, standard deviation)}.
 
     Raises:
-        ValueError: A mean is not finite, or a standard deviation is not positive.
+        ValueError: No parameter is given, a mean is not finite, or a standard deviation is not positive.
     """
+    if not known:
+        raise ValueError("the prior has no parameter; leave the prior out")
     for path, (mean, deviation) in known.items():
         for name, value in (("mean", mean), ("standard deviation", deviation)):
             if line := find_value_objection(value):
@@ -55,6 +57,23 @@ def gaussian(known: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
     return Partial(
         _GaussianPrior(tuple(known)), *(list(map(jnp.asarray, map(np.float64, x))) for x in (means, deviations))
     )
+
+
+def check_prior(prior: Prior | None, free: Collection[str]) -> None:
+    """Check that the parameters of a prior of `gaussian` are free: it has no effect on others.
+
+    Args:
+        prior: Prior of a fit; one that is not of `gaussian` passes.
+        free: Paths of the free parameters.
+
+    Raises:
+        ValueError: A parameter of the prior is not free.
+    """
+    made = prior.func if isinstance(prior, Partial) else None
+    paths = made.paths if isinstance(made, _GaussianPrior) else ()
+    # An element of a free list, `gain.0`, is free.
+    if held := [path for path in paths if not any(f"{path}.".startswith(f"{one}.") for one in free)]:
+        raise ValueError(f"{', '.join(held)}: a prior, but not free; free are {', '.join(free)}")
 
 
 def as_partial(prior: Prior | None) -> Prior:

@@ -13,7 +13,7 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.validity import check_part
-from diffabs.identify.data import Comparison, check_positive
+from diffabs.identify.data import Comparison, check_positive, check_sigma_table
 from diffabs.objectives import BRAKING
 from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
 from diffabs.simulate.run import measure
@@ -89,6 +89,7 @@ class Table:
             if len(metrics) > 1:
                 raise ValueError(f"sigma: needed to weigh {', '.join(sorted(metrics))} against each other")
             return
+        check_sigma_table(self.sigma, "metrics")
         for metric in sorted(metrics):
             if metric not in self.sigma:
                 raise ValueError(f"sigma: none for {metric}")

@@ -13,7 +13,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.numerics import clamp, ratio
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import Params, Part, Scalar, Table
-from diffabs.identify.data import Comparison, check_positive
+from diffabs.identify.data import Comparison, check_positive, check_sigma_table
 from diffabs.identify.fit import Identified
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.run import rollout
@@ -129,6 +129,7 @@ class Traces:
             if len(self.columns) > 1:
                 raise ValueError(f"sigma: needed to weigh {', '.join(self.columns)} against each other")
             return
+        check_sigma_table(self.sigma, "columns")
         if set(self.sigma) != set(self.columns):
             named = ", ".join(self.sigma) or "no column"
             raise ValueError(f"sigma is that of {named}; the columns are {', '.join(self.columns)}")

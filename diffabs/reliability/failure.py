@@ -1,7 +1,7 @@
 """The probability that a metric of a study exceeds a bound, if it is too small for a count of runs.
 
 `Space.normal` maps standard normal coordinates z to the parameters v. The metric m of the run is the score of
-`subset_simulation`.
+`subset_simulation`. A failure is m > bound, as in a sweep.
 
 The probability is taken over the parameters, given one sequence of sensor noise that all runs share. It covers the
 whole space: a point that `simulate` refuses raises an error, since its side of the bound is unknown. On request, the
@@ -10,7 +10,8 @@ search for design points uses
     dm/dz_j = sum_i dm/dv_i dv_i/dz_j
 
 The derivative dm/dv passes through the run, in reverse mode or, with a kernel, in forward mode. The derivative dv/dz
-costs no run and comes from central differences.
+costs no run and comes from central differences. A trial point that `simulate` refuses only shortens a step of the
+search.
 """
 
 import dataclasses
@@ -38,7 +39,7 @@ DIFFERENCE_STEP = 1e-4  # step in z: relative errors of 1e-9 (truncation) and 1e
 def failure_probability(
     study: Study, metric: str, bound: float, *, gradients: bool = False, **options: Any
 ) -> RareEvent:
-    """Return an estimate of P[metric >= bound] over the space of a study, with runs on the study's engine.
+    """Return an estimate of P[metric > bound] over the space of a study, with runs on the study's engine.
 
     The engine "auto" becomes a kernel where one can make the runs; the log says once why XLA makes them, if it does.
     The study's design and its number of samples have no influence; its seed determines the sensor noise only. Runs that
@@ -81,8 +82,11 @@ def failure_probability(
         return _run_scores(study, metric, z)
 
     gradient = _make_gradient(study, metric) if gradients else None
-    found = subset_simulation(score, study.space.dimension, bound, gradient=gradient, **options)
-    return dataclasses.replace(found, engine=describe_engine(study.engine))
+    # `subset_simulation` counts a score at its threshold as a failure, so the threshold is the next number.
+    beyond = float(np.nextafter(np.asarray(bound, study.dtype), np.inf))
+    found = subset_simulation(score, study.space.dimension, beyond, gradient=gradient, **options)
+    levels = [level._replace(threshold=min(level.threshold, float(bound))) for level in found.levels]
+    return dataclasses.replace(found, levels=levels, engine=describe_engine(study.engine))
 
 
 def _choose_engine(study: Study, metric: str) -> Study:
@@ -150,17 +154,21 @@ def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) 
 
 
 def _make_gradient(study: Study, metric: str) -> Gradient:
-    """Return a function z (n, dimension) -> (metric (n,), derivative (n, dimension)), n <= `DESIGN_POINT_STARTS`."""
+    """Return a function z (n, dimension) -> (metric (n,), derivative (n, dimension)), n <= `DESIGN_POINT_STARTS`.
+
+    The metric is -inf at a point that cannot be run.
+    """
     slopes = _compile_derivatives(study, metric)
 
     def gradient(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         values = study.space.normal(_pad_with_last(z, DESIGN_POINT_STARTS))
-        _check_runnable(study, values, len(z))
+        accepted = batch_admissibility(study.loop, values, study.solver).accepted[: len(z)]
         values = {path: column.astype(study.dtype) for path, column in values.items()}
         with precision(study.dtype):
             score, by_value = jax.device_get(slopes(values))
         chain = [by_value[path][: len(z), None] * column for path, column in _parameter_slopes(study, z).items()]
-        return np.array(score[: len(z)], float), np.sum(chain, axis=0)
+        # Only a trial of the search for design points can be refused: the infinite score shortens its step.
+        return np.where(accepted, score[: len(z)], -np.inf).astype(float), np.sum(chain, axis=0)
 
     return gradient
 

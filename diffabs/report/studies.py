@@ -181,7 +181,7 @@ def rare_section(document: Document) -> Section:
     """
     content = document.content
     low, high = (format_known(end, 3) for end in content["interval"])
-    failure = f"{content['metric']} >= {content['bound']:g} {content['unit']}"
+    failure = f"{content['metric']} > {content['bound']:g} {content['unit']}"
     levels = [
         [i, row["threshold"], row["share"], row["cov"], row["acceptance"], row["diverged"]]
         for i, row in enumerate(content["levels"], 1)

@@ -28,6 +28,7 @@ import optax
 from diffabs.core.reason import Reason
 from diffabs.core.types import PyTree
 from diffabs.simulate.drive.engine import describe_engine
+from diffabs.tune.constraints import AtMost
 from diffabs.tune.descent import Descent, DescentState, Optimiser, lbfgs, slice_start
 from diffabs.tune.method import Method
 from diffabs.tune.problem import Multipliers, ObjectiveEvaluation, Problem
@@ -82,7 +83,7 @@ class AugmentedLagrangianSearch:
         """Run the search and return the best result over all starts.
 
         Raises:
-            StartError: No start has a finite objective and gradient, a stable step and only runs that do not diverge.
+            StartError: No start has finite metrics and gradients, a stable step and only runs that do not diverge.
         """
         problem, method = self.problem, self.method
         chosen = (
@@ -104,7 +105,7 @@ class AugmentedLagrangianSearch:
         descent_states = self._run_rounds(descent)
         usable = [descent_state for descent_state in descent_states if descent_state.reason is not Reason.START]
         if not usable:
-            raise StartError(f"{Reason.START.value}: {self._describe_failure()}")
+            raise StartError(self._describe_failure())
         for descent_state in usable:
             descent_state.go_back()
         best = min(usable, key=lambda descent_state: self._rank(descent_state.history[-1]))
@@ -187,14 +188,16 @@ class AugmentedLagrangianSearch:
             )
 
     def _describe_failure(self) -> str:
-        worst = int(self.before.diverged)
-        if not worst and np.isinf(self.before.objective):
-            return "the objective is infinite there: a run never settles; start from one that does, or take iae"
-        return (
-            f"{worst} of {self.problem.batch.size} lanes diverge there"
-            if worst
-            else self.refused or f"solver.step = {self.problem.solver.step:g} s"
-        )
+        """Return why the subject's own values are no start."""
+        lost, lanes = int(self.before.diverged), self.problem.batch.size
+        if lost or self.refused:
+            return f"{Reason.START.value}: {self.refused or f'{lost} of {lanes} lanes diverge there'}"
+        bounds = [one.metric for one in self.problem.constraints if isinstance(one, AtMost)]
+        for name in (*self.problem.weights, *bounds):
+            if never := np.count_nonzero(~np.isfinite(self.before.metrics[name])):
+                found = f"{name} is infinite at the start in {never} of {lanes} lanes"
+                return f"{found}: such a run never settles; start from one that does, or take iae"
+        return "the objective, a constraint or a derivative is not finite at the start"
 
     def _values(self, z: np.ndarray) -> dict[str, PyTree]:
         return {path: np.asarray(value) for path, value in self.problem.space.values(z).items()}

@@ -72,12 +72,12 @@ class Poles:
     def excess(self, loop: Loop, metrics: Params) -> PyTree:
         """Return the excesses of each vertex and pole of `loop`, shape (k,); `metrics` is not used.
 
-        First come (decay + Re s)/decay, or Re s without a decay rate. If a damping ratio is given, damping + Re s/|s|
+        First come (decay + Re s)/|decay|, or Re s without a decay rate. If a damping ratio is given, damping + Re s/|s|
         follow.
         """
         del metrics
         real, ratios = self._modes(loop)
-        rates = (self.decay + real) / (self.decay or 1.0)
+        rates = (self.decay + real) / (abs(self.decay) or 1.0)
         return jnp.concatenate([rates.ravel(), (self.damping - ratios).ravel() if self.damping else jnp.zeros(0)])
 
     def least_damping(self, loop: Loop) -> PyTree:

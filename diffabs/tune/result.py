@@ -13,7 +13,7 @@ from diffabs.tune.method import DerivativeMode
 
 
 class StartError(ValueError):
-    """No start is usable: the runs diverge there, or the integration step is not stable."""
+    """No start is usable: runs diverge or never settle there, or the integration step is not stable."""
 
 
 class DescentPoint(NamedTuple):

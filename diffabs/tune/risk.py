@@ -41,8 +41,8 @@ class SmoothWorst:
 
     def __call__(self, values: Vector) -> Scalar:
         """Return the smooth maximum of `values`."""
-        # The bound keeps values / w finite if every value is zero.
-        w = self.softness * jnp.maximum(jnp.mean(jnp.abs(values)), 1e-300)
+        size = jnp.mean(jnp.abs(values))
+        w = self.softness * jnp.where(size > 0, size, 1.0)  # any width serves if every value is zero
         return w * (jax.nn.logsumexp(values / w) - math.log(len(values)))
 
 

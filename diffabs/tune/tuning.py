@@ -1,16 +1,17 @@
 """Gradient-based tuning of any parameters of any part, under constraints, over a batch of runs."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
+import jax
 import numpy as np
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from diffabs.compiler.runtime.toolchain import NoCompiler
-from diffabs.core.bijectors import Range, parameter_space
+from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.kinds import find_value_objection, format_value, value_shape
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import get
-from diffabs.core.types import Part
+from diffabs.core.pytree import canonical_dtypes, get, replace
+from diffabs.core.types import Params, Part, PyTree
 from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
 from diffabs.simulate.arguments import refuse
@@ -19,7 +20,7 @@ from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.types import Solver
 from diffabs.tune import one_sided
 from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch
-from diffabs.tune.constraints import Constraint
+from diffabs.tune.constraints import AtMost, Constraint
 from diffabs.tune.method import DerivativeMode, Method
 from diffabs.tune.problem import Problem, choose_gradient_mode
 from diffabs.tune.result import Tuned, TuningProgress, build_subject_loop
@@ -68,7 +69,7 @@ def build_problem(
     solver: Solver,
     measured: Mapping[str, Objective] | None = None,
     aggregate: Aggregate | None = None,
-    constraints: Sequence[Constraint] = (),
+    constraints: Iterable[Constraint] = (),
     mode: DerivativeMode | None = None,
     engine: str = "auto",
 ) -> Problem:
@@ -93,6 +94,7 @@ def build_problem(
 
     Raises:
         ValueError: A path, range, metric, constraint or batch does not fit, or a parameter is out of range.
+        ValueError: No run depends on a free parameter.
         EngineError: The engine is "kernel" and the mode is reverse.
 
     >>> import diffabs as d
@@ -114,8 +116,9 @@ def build_problem(
         raise ValueError(f"over = {format_value(over)} is no Batch; d.Batch(values by path) is needed")
     batch = (over or Batch()).check(loop)
     _check_metrics(objective, measured)
-    _check_constraints(constraints, measured, batch.size)
+    constraints = _check_constraints(constraints, measured, batch.size)
     free_space = parameter_space(subject, free)
+    _check_influence(subject, free_space, batch)
     problem = Problem(
         subject=subject,
         space=free_space,
@@ -123,7 +126,7 @@ def build_problem(
         measured=measured,
         weights=objective,
         batch=batch,
-        aggregate=aggregate or Mean(),
+        aggregate=check_part(aggregate or Mean()),
         constraints=constraints,
         mode=mode or choose_gradient_mode(free_space),
     )
@@ -142,13 +145,16 @@ def _check_metrics(objective: Mapping[str, float], measured: Mapping[str, Object
             raise ValueError(f"objective: the weight of {name} is {weight!r}, not a finite number")
 
 
-def _check_constraints(constraints: Any, measured: Mapping[str, Objective], runs: int) -> None:
-    """Raise a ValueError if the constraints are no sequence of constraints, or a bound does not fit the runs."""
-    if isinstance(constraints, str | Mapping) or not all(hasattr(one, "excess") for one in constraints):
+def _check_constraints(
+    constraints: Iterable[Constraint], measured: Mapping[str, Objective], runs: int
+) -> tuple[Constraint, ...]:
+    """Return the constraints; raise a ValueError if one is no constraint, or a bound does not fit the runs."""
+    found = tuple(constraints) if isinstance(constraints, Iterable) else ()  # a generator can be read once only
+    if not isinstance(constraints, Iterable) or not all(hasattr(one, "excess") for one in found):
         given = format_value(constraints)
         raise ValueError(f'constraints = {given} is no list of constraints, such as [AtMost("overshoot", 0.01)]')
-    for one in constraints:
-        if not hasattr(one, "metric"):
+    for one in found:
+        if not isinstance(one, AtMost):
             continue
         _check_measured(one.metric, measured)
         bound = one.bound
@@ -157,6 +163,21 @@ def _check_constraints(constraints: Any, measured: Mapping[str, Objective], runs
         if value_shape(bound) not in ((), (runs,)):
             needed = f"one number, or one for each of {runs} runs, is needed"
             raise ValueError(f"constraints: the bound of {one.metric} has the shape {value_shape(bound)}; {needed}")
+    return found
+
+
+def _check_influence(subject: Part, space: FreeSpace, batch: Batch) -> None:
+    """Raise a ValueError if no run depends on a free parameter: the search would end at once."""
+
+    def loops(values: Params) -> PyTree:
+        loop = canonical_dtypes(build_subject_loop(replace(subject, values)))
+        return batch.each(loop, lambda loop, key: loop)
+
+    own = {entry.path: np.asarray(get(subject, entry.path), float) for entry in space.entries}
+    program = jax.make_jaxpr(loops)(own).jaxpr
+    _, used = dce_jaxpr(program, [True] * len(program.outvars))
+    if idle := [path for path, one in zip(sorted(own), used, strict=True) if not one]:
+        raise ValueError(f"{', '.join(idle)}: free, but no run depends on it, since over or closed_loop() replaces it")
 
 
 def _check_measured(name: str, measured: Mapping[str, Objective]) -> None:

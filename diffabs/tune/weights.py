@@ -21,6 +21,7 @@ from diffabs.core.types import AnyArray, Part, PyTree, Scalar, Vector
 from diffabs.design.interior.differentiable import robust_gain
 from diffabs.design.polytopes import Polytope
 from diffabs.linear.regulator import dlqr, lqr
+from diffabs.linear.weights import as_weight_matrix
 
 GainDesign = Callable[[Any, Any], Any]
 
@@ -72,18 +73,16 @@ def lq_weights(loop: Loop, Q: AnyArray, R: float, design: GainDesign, path: str 
         path: Dotted path of the gain in the loop.
 
     Raises:
-        ValueError: Q is not positive definite, or R is not positive.
+        ValueError: Q is not symmetric, finite and positive definite, or R is not positive and finite.
     """
-    q = np.asarray(Q, float)
-    q = np.diag(q) if q.ndim == 1 else q
-    if not (np.linalg.eigvalsh(q) > 0).all() or not R > 0:
-        raise ValueError(f"Q = {q.tolist()} or R = {R} is not positive definite: it has no logarithm")
+    q = as_weight_matrix("Q", Q, len(np.atleast_1d(Q)), definite=True)
+    r = as_weight_matrix("R", R, 1, definite=True)
     root = np.linalg.cholesky(q)
     return LQWeights(
         loop=loop,
         log_diagonal=np.log(np.diag(root)),
         lower=root[np.tril_indices(len(q), -1)],
-        log_effort=float(np.log(R)),
+        log_effort=float(np.log(r[0, 0])),
         design=design,
         path=path,
     )

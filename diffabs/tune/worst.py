@@ -6,6 +6,9 @@ One batch screens up to 64 corners of the box and random points. Gradient ascent
 with derivatives may end its steps on kinks, so its metrics may differ. Another batch therefore runs the ends of the
 ascents again, without derivatives, and the result has only metrics of such plain runs.
 
+In a box of more than six numbers, the corners have every combination of the ends of the first six. Each end of another
+number occurs in half of them, drawn at random.
+
 The method is local: a run that exceeds a bound is a counterexample, but the worst case found depends on the starts. The
 worst case is often a corner; a run of all corners then finds it without a gradient. `WorstCase.report` states how the
 search found the worst case, and whether a certificate covers the box.
@@ -42,7 +45,7 @@ from diffabs.tune.method import DerivativeMode, Stopping
 from diffabs.tune.problem import Multipliers, Problem, choose_gradient_mode
 from diffabs.tune.risk import Mean
 
-MAX_CORNERS = 64
+FULL_CORNERS = 6  # numbers of the box of which every combination of ends is run: up to 64 corners
 CORNER_TOLERANCE = 1e-6  # relative; an ascent that approaches a corner never quite reaches it
 EDGE_SHARE = 0.01  # of a range: least distance of a start from the ends; an ascent may end nearer
 
@@ -115,12 +118,15 @@ class WorstCase:
 
     def _finder(self) -> str:
         """Return a sentence on how the search found the worst case: corner, screened point or gradients."""
+        number = 2 ** sum(np.size(value) for value in self.values.values())
+        some = "" if self.corners == number else f"{self.corners} of "
+        worst = f"worst corner {self.corner:.6g}" + (f", {some}{number} run" if some else "")
         if math.isclose(self.value, self.corner, rel_tol=CORNER_TOLERANCE):
-            return f"That is a corner of the box: running its {self.corners} corners finds it."
+            return f"That is a corner of the box: running {some}its {number} corners finds it."
         if self.value <= self.screened:
-            return f"That is one of the points that were run first (worst corner {self.corner:.6g})."
+            return f"That is one of the points that were run first ({worst})."
         first = f"{self.screened:.6g}, the worst of the points that were run first"
-        return f"Gradients found it from {first} (worst corner {self.corner:.6g})."
+        return f"Gradients found it from {first} ({worst})."
 
 
 def worst_case(
@@ -151,7 +157,7 @@ def worst_case(
         screen: Number of points of a scrambled Sobol sequence that are run first, in addition to up to 64 corners.
         starts: Number of ascents, one from each of the worst screened points, in one batch; 0 only runs the screening.
         iterations: Greatest number of steps of each ascent.
-        seed: Seed of the Sobol sequence.
+        seed: Seed of the Sobol sequence, and of the corners of a box of more than six numbers.
         seed_of_noise: Seed of noisy sensors, the same in every run; or None.
         price: Cost of a gradient in rollouts. None is 6 in reverse mode and 1 + 1.5 p in forward mode, for p numbers in
             the box.
@@ -169,7 +175,7 @@ def worst_case(
     middle = replace(loop, _find_middle(loop, over))
     free, key = parameter_space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
     ranges = np.array(free.ranges)
-    corners = np.array(list(itertools.islice(itertools.product(*ranges), MAX_CORNERS)))
+    corners = _draw_corners(ranges, seed)
     points = np.concatenate([corners, _draw_points(ranges, screen, seed)])
     if line := first_refusal(loop, _values_by_path(free, points), solver):
         raise ValueError(f"the box has points that cannot be run; {line}")
@@ -186,7 +192,11 @@ def worst_case(
         middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), choose_gradient_mode(free)
     )
     problem = problem.with_engine(engine)
-    lanes = _ascend(problem, points[worst], iterations) if starts else []
+    known = runs.metrics[metric][worst]
+    known = known[np.isfinite(known)]
+    # The scale of the loss, which only decides when an ascent ends.
+    scale = max(abs(float(known[0])), 1e-12) if len(known) else 1.0
+    lanes = _ascend(problem, points[worst], scale, iterations) if starts else []
     if price is None:
         price = 1 + 1.5 * free.size if problem.mode is DerivativeMode.FORWARD else 6.0
     ends = _find_ends(free, lanes)
@@ -246,6 +256,13 @@ def _find_middle(loop: Loop, over: Mapping[str, Range]) -> dict[str, np.ndarray]
     return middle
 
 
+def _draw_corners(ranges: np.ndarray, seed: int) -> np.ndarray:
+    """Return up to 64 different corners of the box, shape (corners, p); all if there are no more."""
+    first = np.array(list(itertools.product(*ranges[:FULL_CORNERS])))
+    both = np.repeat(ranges[FULL_CORNERS:].T, len(first) // 2, axis=0)
+    return np.hstack([first, np.random.default_rng(seed).permuted(both, axis=0)])
+
+
 def _draw_points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
     """Return points of a scrambled Sobol sequence in the box, shape (screen, p)."""
     low, high = ranges.T
@@ -273,8 +290,8 @@ def _find_ends(free: FreeSpace, lanes: list[DescentState]) -> np.ndarray:
     return np.clip(np.reshape(rows, (-1, free.size)), low, high)
 
 
-def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[DescentState]:
-    """Return the final states of ascents from these points."""
+def _ascend(problem: Problem, points: np.ndarray, scale: float, iterations: int) -> list[DescentState]:
+    """Return the final states of ascents from these points, with the metric divided by `scale`."""
     low, high = np.array(problem.space.ranges).T
     # The map from z to a range is flat at its ends: an ascent from a corner would have no gradient.
     points = np.clip(points, low + EDGE_SHARE * (high - low), high - EDGE_SHARE * (high - low))
@@ -282,9 +299,6 @@ def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[Desce
         [problem.space.place(replace(problem.subject, _values_by_path(problem.space, point))) for point in points]
     )
     none = Multipliers(np.zeros((len(z), 0)), np.ones(len(z)))
-    first = jax.device_get(problem.evaluator(1.0)(jnp.asarray(z), none)).evaluation
-    known = first.objective[np.isfinite(first.objective)]
-    scale = max(abs(float(known[0])), 1e-12) if len(known) else 1.0
     loss = problem.loss(scale)
     descent = Descent(
         problem.evaluator(scale),

@@ -14,6 +14,7 @@ from diffabs import controllers, objectives, plants, references, roads, stops
 from diffabs.core.pytree import param, pytree, replace
 from diffabs.core.reason import Reason
 from diffabs.core.types import Scalar
+from diffabs.identify.data import Comparison
 from diffabs.identify.fit import Tolerances, fit
 from diffabs.identify.identification import identify
 from diffabs.identify.residuals import gaussian
@@ -282,13 +283,17 @@ class TestFit:
             )
         assert len(calls) <= 3  # traced once, and once per fit for its shape
 
+    @killed_by("identify/fit.py", "if k and estimated:", "if k and sigma is None:")
+    @killed_by("identify/fit.py", "    check_prior(prior, [entry.path for entry in where.entries])\n", "")
     @pytest.mark.parametrize(
         ("changed", "message"),
         [
             ({"sigma": 0.0}, "sigma = 0 is not positive and finite"),
             ({"sigma": np.ones(3)}, r"sigma has shape \(3,\); 13 residuals need a number or \(13,\)"),
             ({"norm": 1.0}, r"norm = 1 is outside \[2, inf\)"),
-            ({"sigma": None, "prior": gaussian({"a": (0.0, 1.0)})}, "a prior needs sigma"),
+            ({"sigma": None, "prior": gaussian({"a": (0.0, 1.0)})}, "a prior needs sigma: nothing"),
+            ({"absolute": False, "prior": gaussian({"a": (0.0, 1.0)})}, "a prior needs sigma with absolute = True"),
+            ({"free": ["a", "k"], "prior": gaussian({"c": (0.2, 0.1)})}, "c: a prior, but not free; free are a, k"),
             (
                 {"data": tuple(x[:2] for x in DATA)},
                 "2 data do not determine 3 parameters: free fewer, or state a prior",
@@ -326,6 +331,22 @@ class TestFit:
     def test_a_prior_without_width_or_place_is_an_error(self, known, message):
         with pytest.raises(ValueError, match=message):
             gaussian({"a": known})
+
+    @killed_by("identify/residuals.py", "if not known:", "if False:")
+    def test_a_prior_without_parameters_is_an_error(self):
+        with pytest.raises(ValueError, match="the prior has no parameter; leave the prior out"):
+            gaussian({})
+
+    def test_a_prior_of_one_element_of_a_list(self):
+        """Two data 2 and 9 with deviation 1, and 1 +- 1 for the first: their mean 1.5."""
+
+        @pytree
+        class Pair:
+            x: Scalar = param(default=(1.0, 2.0), unit="1")
+
+        prior = gaussian({"x.0": (1.0, 1.0)})
+        found = fit(Pair(), ["x"], lambda part: part.x - jnp.array([2.0, 9.0]), sigma=1.0, prior=prior)
+        np.testing.assert_allclose(found.values["x"], [1.5, 9.0], rtol=1e-7)
 
 
 ROAD = roads.Scaled(road=roads.MagicFormula(), scale=1.0)
@@ -400,6 +421,7 @@ class TestTraces:
         assert scale * peak < 0
         assert abs(inertia) < 1e-6
 
+    @killed_by("identify/traces.py", '        check_sigma_table(self.sigma, "columns")\n', "")
     @pytest.mark.parametrize(
         ("changed", "message"),
         [
@@ -412,6 +434,7 @@ class TestTraces:
             ({"sigma": {"speed": -0.1}}, r"sigma.speed = -0.1 is outside \(0, inf\) m/s"),
             ({"sigma": {"slip": 0.1}}, "sigma is that of slip; the columns are speed"),
             ({"sigma": {}}, "sigma is that of no column; the columns are speed"),
+            ({"sigma": 0.002}, "sigma = 0.002 is no mapping from columns to standard deviations"),
             ({"columns": {"speed": T, "slip": T}, "sigma": None}, "sigma: needed to weigh speed, slip"),
             ({"over": {"plant.mess": np.ones(2)}}, "plant.mess is not a parameter of the loop"),
             ({"over": {"plant.inertia": np.ones(1)}}, "plant.inertia: both free and given for each run"),
@@ -431,6 +454,34 @@ class TestTraces:
         )
         with pytest.raises(ValueError, match=r"solver.step = 0.001 s is not stable at the start; at most 0.00019 s is"):
             identify(loop, data, FREE, solver=SOLVER)
+
+    @killed_by("identify/identification.py", 'if why.endswith("is not stable"):', "if True:")
+    def test_another_refusal_does_not_blame_the_step(self):
+        """The step is not stable either, but a shorter one would not help."""
+        stiff = dataclasses.replace(LOOP, controller=controllers.PID(kp=3893.0, low=0.0, high=90.0))
+        data, starts = Traces(t=T, columns={"speed": T}), [{"plant.inertia": -1.0}]
+        with pytest.raises(ValueError, match=r"^plant.inertia is outside \(0, inf\) kg m\^2$"):
+            identify(stiff, data, FREE, solver=SOLVER, starts=starts)
+
+
+class Distances:
+    """Data that need no run: 1 and 2 kg m^2, each with a deviation of 1, are measured for the inertia."""
+
+    def against(self, loop, free, solver):
+        """The comparison with the loop's inertia."""
+
+        def residuals(loop, measured):
+            return loop.plant.inertia - measured
+
+        return Comparison(residuals, (np.array([1.0, 2.0]),), np.ones(2), lambda part: [])
+
+
+@killed_by("identify/identification.py", "    starts = tuple(starts)\n", "")
+def test_starts_may_come_from_a_generator():
+    starts = ({"plant.inertia": x} for x in (0.5, 3.0))
+    found = identify(LOOP, Distances(), ["plant.inertia"], solver=SOLVER, starts=starts)
+    np.testing.assert_allclose([one.start["plant.inertia"] for one in found.starts], [0.5, 3.0], rtol=1e-12)
+    np.testing.assert_allclose(found.values["plant.inertia"], 1.5, rtol=1e-6)  # the mean
 
 
 ROWS = {
@@ -463,6 +514,7 @@ class TestTable:
             np.testing.assert_allclose(ours, run.metrics[metric] - values[row][metric], rtol=0, atol=1e-10)
         np.testing.assert_array_equal(against.sigma, [0.01, 0.1, 0.01, 0.01])
 
+    @killed_by("identify/table.py", '        check_sigma_table(self.sigma, "metrics")\n', "")
     @pytest.mark.parametrize(
         ("changed", "message"),
         [
@@ -471,6 +523,7 @@ class TestTable:
             ({"values": {"locked": {"stop_time": np.nan}}}, "row locked: stop_time = nan is not finite"),
             ({"sigma": {"stop_time": 0.0}}, r"sigma.stop_time = 0 is outside \(0, inf\)"),
             ({"sigma": {"iae": 1.0}}, "sigma: none for stop_time"),
+            ({"sigma": 0.1}, "sigma = 0.1 is no mapping from metrics to standard deviations"),
             ({"loops": {"locked": braking()}}, "row locked: plant.road.scale is not a parameter of its loop"),
         ],
     )  # fmt: skip

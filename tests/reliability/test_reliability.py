@@ -2,10 +2,12 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from mutants import killed_by
-from scipy.stats import norm
+from scipy.stats import binomtest, norm
+from seams import replace_seam
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, stops
@@ -86,6 +88,41 @@ def test_the_probability_of_a_slippery_road():
     found = failure_probability(STUDY, "stop_distance", bound, samples=400, draws=400)
     assert found.interval[0] < norm.cdf(-4.0) < found.interval[1]
     assert found.probability == pytest.approx(norm.cdf(-4.0), rel=0.5)
+
+
+@killed_by("reliability/failure.py", "np.nextafter(np.asarray(bound, study.dtype), np.inf)", "bound")
+@killed_by("reliability/failure.py", "np.asarray(bound, study.dtype)", "bound", case="float32")
+@killed_by("reliability/failure.py", "min(level.threshold, float(bound))", "level.threshold")
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_metric_at_its_bound_has_not_failed(dtype, monkeypatch):
+    """A tenth of the masses is above 6.11 kg and exceeds the bound; all others are at the bound."""
+
+    def measure(study, metric, at):
+        return np.where(at["plant.mass"] > 6.11, 1.0, 0.1).astype(study.dtype)
+
+    replace_seam(monkeypatch, "measure_metric", measure)
+    found = failure_probability(dataclasses.replace(STUDY, dtype=dtype), "max_slip", 0.1, samples=400)
+    low, high = binomtest(40, 400).proportion_ci(0.999)
+    assert low < found.probability < high
+    assert [level.threshold for level in found.levels] == [0.1]
+
+
+@killed_by("reliability/failure.py", "np.where(accepted, score[: len(z)], -np.inf)", "score[: len(z)]")
+def test_a_refused_trial_shortens_the_search(monkeypatch):
+    """The tangent of tanh leads from a failure far below the speed at which a run stops: no metric means a thing."""
+    bound = float(np.tanh(4 * 0.5))  # at 3.5 standard deviations
+
+    def measure(study, metric, at):
+        speed = at["initial.speed"]
+        return jnp.where(speed > RIG.stop.speed, jnp.tanh(4 * ((speed - 10.0) / 0.5 - 3)), bound)
+
+    replace_seam(monkeypatch, "measure_metric", measure)
+    study = dataclasses.replace(STUDY, space=Space({"initial.speed": Normal(10.0, 0.5, low=1.0, high=19.0)}))
+    found = failure_probability(study, "max_slip", bound, samples=400, draws=400, gradients=True)
+    assert found.interval[0] < norm.sf(3.5) < found.interval[1]
+    assert found.diverged == 0
+    points = design_points(_make_gradient(study, "max_slip"), np.array([[4.5]]), bound)
+    np.testing.assert_allclose(points, [[3.5]], atol=0.1)
 
 
 def test_what_is_not_there_is_said():

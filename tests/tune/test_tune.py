@@ -119,6 +119,12 @@ class TestAggregates:
         np.testing.assert_allclose(soft, self.VALUES.mean(), rtol=1e-3)
         assert soft < SmoothWorst(softness=0.1)(x) < sharp
 
+    @killed_by("tune/risk.py", "jnp.where(size > 0, size, 1.0)", "jnp.maximum(size, 1e-300)")
+    def test_the_smooth_worst_of_zeros_in_single_precision(self):
+        value, slope = jax.value_and_grad(SmoothWorst())(jnp.zeros(3, jnp.float32))
+        assert value == 0
+        np.testing.assert_allclose(slope, 1 / 3, rtol=1e-6)  # all are alike
+
     @pytest.mark.parametrize("aggregate", [Mean(), CVaR(level=0.8), Quantile(level=0.8), SmoothWorst(softness=0.05)])
     def test_gradients(self, aggregate):
         x, h = jnp.asarray(self.VALUES), 1e-6

@@ -23,21 +23,25 @@ from diffabs.objectives import BRAKING
 from diffabs.objectives.balance import PeakTorque
 from diffabs.objectives.tracking import keep_memory, no_integral
 from diffabs.scenario.defaults import braking
+from diffabs.scenario.section_tune import Goal
 from diffabs.simulate.stability import stable_step, stable_steps
 from diffabs.stops import SpeedReached
 from diffabs.tune import (
     AtMost,
     CertifiedDecay,
+    CVaR,
     DerivativeMode,
     Method,
     Poles,
+    SmoothWorst,
+    StartError,
     Stopping,
     WorstCase,
     grid,
     tune,
     worst_case,
 )
-from diffabs.tune.problem import Multipliers
+from diffabs.tune.problem import Multipliers, Problem
 from diffabs.tune.tuning import build_problem
 from diffabs.tune.weights import lq_weights, lqr_gain_design
 
@@ -129,6 +133,9 @@ def test_a_start_that_is_not_stable_is_refused():
         tune(build_problem(RIG, free=GAINS, objective={"iae": 1.0}, solver=d.FixedStep(0.1, 0.3)))
 
 
+@killed_by("tune/tuning.py", "aggregate=check_part(aggregate or Mean()),", "aggregate=aggregate or Mean(),")
+@killed_by("tune/tuning.py", "    _check_influence(subject, free_space, batch)\n", "")
+@killed_by("tune/tuning.py", "if not isinstance(constraints, Iterable) or not all(", "if not all(")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -145,6 +152,14 @@ def test_a_start_that_is_not_stable_is_refused():
             r"iae has the shape \(2,\); one number, or one for",
         ),
         ({"constraints": {"iae": 0.7}}, r"constraints = \{'iae': 0.7\} is no list of constraints"),
+        ({"constraints": AtMost("iae", 0.7)}, r"constraints = AtMost\(.*\) is no list of constraints"),
+        ({"aggregate": CVaR(level=90.0)}, r"level = 90 is outside \[0, 1\)"),
+        ({"aggregate": CVaR(level=1.0)}, r"level = 1 is outside \[0, 1\)"),
+        ({"aggregate": SmoothWorst(softness=-0.02)}, r"softness = -0.02 is outside \(0, inf\)"),
+        (
+            {"free": {"plant.mass": (4.0, 8.0)}, "over": TWO},
+            r"plant.mass: free, but no run depends on it, since over or closed_loop\(\) replaces it",
+        ),
         ({"over": {"plant.mass": [5.0]}}, "over = .* is no Batch"),
         ({"free": "controller.kp"}, "free = 'controller.kp' is text; a list of paths, or ranges by path"),
         ({"free": {"plant.mass": 5.0}}, r"plant.mass: the range 5.0 is not a pair \(low, high\) of numbers"),
@@ -157,6 +172,53 @@ def test_says_what_does_not_fit(change, message):
     given = {"free": GAINS, "objective": {"iae": 1.0}, "solver": SOLVER}
     with pytest.raises(ValueError, match=message):
         tune(build_problem(RIG, **given | change))
+
+
+@killed_by("tune/tuning.py", "constraints = _check_constraints(", "_check_constraints(")
+def test_constraints_may_come_from_a_generator():
+    bounds = (AtMost(name, 0.5) for name in ("iae", "overshoot"))
+    problem = build_problem(RIG, free=GAINS, objective={"iae": 1.0}, over=TWO, solver=SOLVER, constraints=bounds)
+    assert problem.excesses == 2 * 2  # of each of two runs
+
+
+@killed_by("tune/tuning.py", "[True] * len(program.outvars)", "[False] * len(program.outvars)", case="log_diagonal")
+@pytest.mark.parametrize(
+    ("free", "over", "idle"),
+    [
+        ("log_diagonal", {"plant.mass": [5.3, 6.2]}, False),
+        ("loop.controller.gain", {"plant.mass": [5.3, 6.2]}, True),
+        ("log_diagonal", {"controller.gain": np.array([[-3e3, -60.0], [-2e3, -50.0]])}, True),
+    ],
+    ids=["log_diagonal", "a designed gain", "a gain of each run"],
+)
+def test_a_free_parameter_has_an_influence(free, over, idle):
+    loop = lq_weights(RIG, (1e6, 1e4), 1.0, lqr_gain_design(SlipModel(speed=20 / 3.6)))
+    given = {"free": [free], "over": d.Batch(over), "objective": {"iae": 1.0}, "solver": SOLVER}
+    if not idle:
+        assert build_problem(loop, **given).space.names == ["log_diagonal.0", "log_diagonal.1"]
+        return
+    with pytest.raises(ValueError, match=f"^{free}: free, but no run depends on it"):
+        build_problem(loop, **given)
+
+
+@killed_by("scenario/section_tune.py", "if both := set(self.free) & set(self.over):", "if both := set():")
+def test_a_section_frees_no_parameter_of_its_lanes():
+    goal = Goal(free={"plant.mass": (4.0, 8.0)}, objective={"iae": 1.0}, over={"plant.mass": (5.3, 6.2)})
+    with pytest.raises(ValueError, match=r"^plant.mass: both in tune.free and in tune.over; leave it out of one"):
+        goal.check(RIG)
+
+
+@killed_by("tune/augmented_lagrangian.py", "for name in (*self.problem.weights, *bounds):", "for name in ():")
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["constraint", "objective"])
+def test_a_metric_that_is_infinite_at_the_start_is_named(where):
+    """The slip starts at 0.02 and cannot settle at 0.2 within two steps."""
+    given = {"objective": {"iae": 1.0}, "constraints": [AtMost("settling_time", 1.0)]}
+    if where == "objective":  # its smooth worst is inf/inf
+        given = {"objective": {"settling_time": 1.0}, "aggregate": SmoothWorst()}
+    problem = build_problem(RIG, free=GAINS, over=TWO, solver=d.FixedStep(5e-4, 1e-3), **given)
+    with pytest.raises(StartError, match=r"^settling_time is infinite at the start in 2 of 2 lanes: such a run never"):
+        tune(problem)
 
 
 @pytest.mark.parametrize(
@@ -218,6 +280,17 @@ class TestPoles:
         rates, damping = np.split(np.asarray(excess), 2)
         np.testing.assert_allclose(np.sort(rates), np.sort(1 + np.array([-2, -2, -5, -1]) / 1.5), rtol=1e-12)
         np.testing.assert_allclose(np.sort(damping), np.sort([0.6 - 2 / 13**0.5] * 2 + [-0.4] * 2), rtol=1e-9)
+
+    @killed_by("tune/constraints.py", "(abs(self.decay) or 1.0)", "(self.decay or 1.0)")
+    def test_a_bound_on_growth(self):
+        """Growth of at most 2/s: the poles -2, -2, -5 and -1 hold it, and one of +3 does not."""
+        names = ("integral of slip error", "slip error")
+        grown = self.CLOSED.copy()
+        grown[1, 1, 1] = 3.0
+        for closed, real in ((self.CLOSED, [-2, -2, -5, -1]), (grown, [-2, -2, -5, 3])):
+            system = Polytope(closed, np.zeros((2, 2, 1)), states=names)
+            excess = Poles(system, decay=-2.0).excess(self.loop_for(np.array([-1.0, -2.0])), {})
+            np.testing.assert_allclose(np.sort(excess), np.sort((np.array(real) - 2.0) / 2), rtol=1e-12)
 
     @killed_by("tune/constraints.py", "if self.system.period is not None:", "if False:")
     def test_discrete_poles_are_those_of_continuous_time(self):
@@ -305,6 +378,20 @@ class TestWeights:
         with pytest.raises(ValueError, match="is not positive definite"):
             lq_weights(RIG, q, r, lqr_gain_design(SlipModel()))
 
+    @killed_by("tune/weights.py", 'q = as_weight_matrix("Q", Q, len(np.atleast_1d(Q)), definite=True)', "q = Q")
+    @killed_by("tune/weights.py", 'r = as_weight_matrix("R", R, 1, definite=True)', "r = np.array([[R]])")
+    @pytest.mark.parametrize(
+        ("q", "r", "message"),
+        [
+            ([[2.0, 1.0], [0.0, 2.0]], 1.0, "Q = .* is not symmetric"),
+            ((1.0, 1.0), np.inf, "R = .* has an entry that is not finite"),
+        ],
+        ids=["asymmetric", "infinite"],
+    )
+    def test_refuses_what_lqr_refuses(self, q, r, message):
+        with pytest.raises(ValueError, match=message):
+            lq_weights(RIG, q, r, lqr_gain_design(SlipModel()))
+
 
 class TestSpeedScaled:
     MODEL = SlipModel(actuator=actuators.Lag(time_constant=1e-3), sampling=Sampling(period=1e-3))
@@ -377,6 +464,8 @@ def test_a_worst_case_says_what_found_it(value, corner, screened, words):
     )  # fmt: skip
     assert found.report() == f"COUNTEREXAMPLE: m = {value} at a = 1.0, b = 2.0, beyond {value - 0.2:g} by 0.2. {words}"
     assert words in dataclasses.replace(found, bound=None).report()
+    some = dataclasses.replace(found, corners=3).report()
+    assert ("running 3 of its 4 corners" in some) or (f"(worst corner {corner}, 3 of 4 run)" in some)
 
 
 @pytest.mark.slow
@@ -395,6 +484,17 @@ class Shortness:
     def value(self, memory, ending):
         """-distance."""
         return -ending.sample.output.distance
+
+
+@pytree
+class Farness(Shortness):
+    """The distance."""
+
+    physical = (0.0, np.inf)
+
+    def value(self, memory, ending):
+        """The distance."""
+        return ending.sample.output.distance
 
 
 @jax.custom_jvp
@@ -526,6 +626,43 @@ class TestWorstCase:
         lanes = d.Batch(dict(zip(BOX, points.T, strict=True)))
         worst = float(np.max(d.run_batch(RIG, lanes, SOLVER, BRAKING).metrics["iae"]))
         np.testing.assert_allclose([found.value, found.rollouts], [worst, len(points)], rtol=1e-12)
+
+    @killed_by(
+        "tune/worst.py", "np.random.default_rng(seed).permuted(both, axis=0)", "both[:1].repeat(64, 0)", case="last"
+    )
+    @killed_by(
+        "tune/worst.py", "itertools.product(*ranges[:FULL_CORNERS])", "itertools.product(*ranges[-6:])", case="first"
+    )
+    @pytest.mark.slow
+    @pytest.mark.parametrize("place", ["first", "last"])
+    def test_corners_of_many_numbers_reach_every_end(self, place):
+        """A car that starts faster goes farther in the first hundredth of a second, whatever the other six numbers."""
+        others = {"controller.gain": ((-3100.0, -61.0), (-2900.0, -59.0)), "reference.slip": (0.15, 0.25)}
+        speed, others = {"initial.speed": (8.0, 9.0)}, others | BOX
+        box = speed | others if place == "first" else others | speed
+        measured = {"far": Farness()}
+        found = worst_case(
+            RIG, over=box, metric="far", solver=d.FixedStep(5e-4, 0.01), measured=measured, screen=0, starts=0
+        )
+        assert found.values["initial.speed"] == 9.0
+        assert found.corners == 64
+        assert "running 64 of its 128 corners finds it" in found.report()
+
+    @killed_by("tune/worst.py", "price * sum(lane.evaluations for lane in lanes)", "price * len(lanes)")
+    @pytest.mark.slow
+    def test_every_gradient_is_counted(self, monkeypatch):
+        """Of one ascent: each evaluation with a gradient is one point."""
+        made, evaluator = [], Problem.evaluator
+
+        def counted(problem, scale):
+            evaluate = evaluator(problem, scale)
+            return lambda z, m: made.append(len(z)) or evaluate(z, m)
+
+        monkeypatch.setattr(Problem, "evaluator", counted)
+        given = {"metric": "far", "measured": {"far": Farness()}, "screen": 0, "starts": 1, "iterations": 2}
+        found = worst_case(RIG, over={"initial.speed": (8.0, 9.0)}, solver=COARSE, **given, price=10.0)
+        assert found.rollouts == 2 + 1 + 10 * sum(made)  # corners, the end, gradients
+        assert sum(made) > 2
 
     @pytest.mark.slow
     def test_the_report_says_what_is_known(self):
