@@ -22,7 +22,7 @@ from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.regulator import dlqr
 from diffabs.linear.riccati import dare, symmetric_part
 from diffabs.linear.slip_model import Sampling
-from diffabs.linear.weights import check_symmetric
+from diffabs.linear.weights import as_weight_matrix, check_symmetric
 
 SELECTION = np.eye(len(STATE_NAMES))[[STATE_NAMES.index(name) for name in MEASURED_NAMES]]  # C: theta and psi
 
@@ -50,17 +50,18 @@ def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
     Args:
         A: State matrix, shape (n, n).
         C: Output matrix, shape (p, n).
-        W: Covariance of w, shape (n, n).
+        W: Covariance of w, shape (n, n), positive semidefinite.
         V: Covariance of v, shape (p, p), positive definite.
 
     Raises:
         ValueError: The shapes do not fit, there is no state or no output, or the matrices are complex or float32. For
-            covariances that are not traced also: W or V is not symmetric and finite.
+            covariances that are not traced also: W or V is not symmetric and finite, or not (semi)definite as above.
     """
     A, C, W, V = as_float_arrays(A, C, W, V)
     for name, covariance, size in (("W", W, len(A)), ("V", V, len(C))):
         if not isinstance(covariance, Tracer):
             check_symmetric(name, covariance, size)
+            as_weight_matrix(name, covariance, size, definite=name == "V")
     found = dare(A.T, C.T, W, V)
     spread = C @ found.P @ C.T + symmetric_part(V)
     return Filter(jnp.linalg.solve(spread, C @ found.P).T, found.P, found.stabilising)

@@ -4,9 +4,11 @@
     tracking_dynamics   dynamics of a tracked output while other outputs are frozen
 
 A frozen output, such as the speed of a brake, is a parameter of the model and not a state.
+
+At a kink the slopes of both sides differ, and rounding would choose one of them: there is no linear model.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,11 +19,13 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
+from diffabs.core.types import AnyArray, Bool, Matrix, PyTree, Scalar
 from diffabs.plants.wheel import FROZEN_OUTPUTS
 
 # Newton iterations that bring the remaining states to rest; one is enough where their equation is linear.
 REMAINING_STATE_ITERATIONS = 10
+NARROWER = 8.0  # the second difference of a smooth function falls as the square of this factor, at a kink as the factor
+MAX_SLOPE_JUMP = 1e-3  # that is no kink, relative to the largest slope of the same component
 
 
 class StateSpace(NamedTuple):
@@ -72,8 +76,9 @@ def tracking_dynamics(
         frozen: Names of the outputs w.
 
     Raises:
-        ValueError: F is not a change of coordinates: its components are more or fewer than the states, or dependent.
-            Inside jit dependence raises no error; A and B are then not finite.
+        ValueError: F is not a change of coordinates: its components are more or fewer than the states, or dependent. Or
+            a slope of G jumps here, at a kink. Inside jit only the number of components raises an error; otherwise A
+            and B are not finite.
     """
     plant, state, control = canonical_dtypes((plant, state, control))
     flow, x, u = as_vectors(plant, state, control)
@@ -87,10 +92,55 @@ def tracking_dynamics(
 
     by_x = jax.jacfwd(chart)(x)
     _check_chart(by_x, (*tracked, *frozen))
+
     # The tangent of the chart along f(x, u) is G(x, u); its Jacobian includes the second derivative of the chart.
-    a, b = jax.jacfwd(lambda x, u: jax.jvp(chart, (x,), (flow(x, u),))[1], (0, 1))(x, u)
+    def moves(x: AnyArray, u: AnyArray) -> AnyArray:
+        return jax.jvp(chart, (x,), (flow(x, u),))[1]
+
+    a, b = jax.jacfwd(moves, (0, 1))(x, u)
     n = len(x) - sum(np.size(getattr(jax.eval_shape(plant.output, state), name)) for name in frozen)
-    return StateSpace(jnp.linalg.solve(by_x.T, a.T).T[:n, :n], b[:n])
+    kinked = is_kinked(lambda x, u: moves(x, u)[:n], coordinate_moves(by_x, chart(x))[:n], x, u)
+    if not isinstance(kinked, Tracer) and kinked:
+        raise ValueError(f"the slopes of {', '.join(tracked)} jump here, at a kink: no linear model")
+    found = StateSpace(jnp.linalg.solve(by_x.T, a.T).T[:n, :n], b[:n])
+    return jax.tree.map(lambda x: jnp.where(kinked, jnp.nan, x), found)
+
+
+def is_kinked(function: Callable[..., AnyArray], moves: AnyArray, x: AnyArray, u: AnyArray) -> Bool:
+    """Return whether a slope of a function jumps at a point, along some moves of x or along a component of u.
+
+    In single precision the result is False: differences are too inexact.
+
+    Args:
+        function: Function of two vectors that returns a vector.
+        moves: Moves of x, shape (m, len(x)); each is as large as what it moves.
+        x: First vector of the point.
+        u: Second vector of the point.
+    """
+    point, unravel = ravel_pytree((x, u))
+    by_u = (1 + jnp.abs(u))[:, None] * jnp.eye(len(u), dtype=point.dtype)
+    moves = jnp.concatenate([jnp.pad(moves, ((0, 0), (0, len(u)))), jnp.pad(by_u, ((0, 0), (len(x), 0)))])
+    if point.dtype != jnp.float64:
+        return jnp.array(False)
+    offset = float(jnp.finfo(point.dtype).eps) ** (1 / 3)  # wider than the rounding of a point of rest
+    steps = jnp.array([0.0, offset, -offset, offset / NARROWER, -offset / NARROWER], point.dtype)
+    # Values instead of slopes: a further derivative of the function would compile twice as long.
+    ends = (point + steps[:, None, None] * moves).reshape(-1, len(point))
+    middle, up, down, near_up, near_down = jax.vmap(lambda z: function(*unravel(z)))(ends).reshape(5, len(moves), -1)
+    wide, narrow = jnp.abs(up - 2 * middle + down), jnp.abs(near_up - 2 * middle + near_down)
+    slopes = jnp.max(jnp.abs(up - down), 0) / (2 * offset)
+    jump = narrow * NARROWER / offset
+    return jnp.any((narrow * NARROWER**1.5 > wide) & (jump > MAX_SLOPE_JUMP * slopes))
+
+
+def coordinate_moves(by_x: AnyArray, at: AnyArray) -> AnyArray:
+    """Return the move of x for each coordinate alone, shape (n, n), by 1 plus the coordinate's size.
+
+    Args:
+        by_x: Derivatives of the coordinates by x, shape (n, n).
+        at: Coordinates of the point, shape (n,).
+    """
+    return (jnp.linalg.inv(by_x) * (1 + jnp.abs(at))).T
 
 
 def as_vectors(plant: Plant, state: PyTree, control: Scalar) -> Matrix:

@@ -26,9 +26,9 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.tracing import depends_on_signal
-from diffabs.core.types import Matrix, Part, PyTree, Scalar
+from diffabs.core.types import Bool, Matrix, Part, PyTree, Scalar
 from diffabs.core.validity import check_part
-from diffabs.linear.linearization import independent_components
+from diffabs.linear.linearization import coordinate_moves, independent_components, is_kinked
 from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer, check_transfer
 from diffabs.linear.zero_order_hold import hold_input
@@ -104,7 +104,8 @@ def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
     Raises:
         ValueError: A part has a parameter that `check` refuses, or the target is not finite. A block acts at instants
             (a relay, a controller that computes in every step but is not `Sampled`); or the plant does not come to rest
-            at the setpoint; or the command does not respond to a measured signal there, for example at a limit.
+            at the setpoint; or a slope jumps there, at a kink; or the command does not respond to a measured signal
+            there, for example at a limit.
     """
     check_part(loop)
     if target is not None and not np.isfinite(target):
@@ -116,6 +117,10 @@ def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
     )
     if not found.residue < MAX_REST_RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
+    for kinked, names in zip(found.kinked, (("sensor", "plant", "actuator"), ("controller",)), strict=True):
+        if kinked:
+            parts = ", ".join(f"{name} {type(getattr(loop, name)).__name__}" for name in names)
+            raise ValueError(f"{parts}: a slope jumps at the setpoint, at a kink: no linear model")
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     delay += float(sampled.delay) if sampled else 0.0
     controller = Transfer(*found.controller)._replace(period=float(sampled.period) if sampled else None)
@@ -168,11 +173,14 @@ class _SurroundingStates(NamedTuple):
 
 
 class _LinearHalves(NamedTuple):
-    """Matrices (A, B, C, D) of both halves, and their distance from rest, relative to the state."""
+    """Matrices (A, B, C, D) of both halves, their distance from rest, relative to the state, and whether each half is
+    at a kink.
+    """
 
     plant: Part
     controller: Part
     residue: Scalar
+    kinked: tuple[Bool, Bool]
 
 
 def _start_output_and_setpoint(loop: Loop) -> tuple[PyTree, PyTree]:
@@ -200,7 +208,13 @@ def _linearize_halves(loop: Loop, setpoint: Scalar) -> _LinearHalves:
     n = len(z) - around.held
     a, c = (jnp.linalg.solve(chart.T, m.T).T[:, :n] for m in (by_z, jax.jacfwd(around.signals)(z)))
     plant = (a[:n], b[:n, None], c, jnp.zeros((len(signal), 1), a.dtype))
-    return _LinearHalves(plant, _linearize_controller(loop, signal, as_signal, command), residue)
+    steps = coordinate_moves(chart, around.chart(z))[:n]
+    bent = is_kinked(
+        lambda z, v: jnp.concatenate([around.moves(z, v[0])[:n], around.signals(z)]), steps, z, command[None]
+    )
+    controller, compute, inside = _linearize_controller(loop, signal, as_signal, command)
+    moves = jax.vmap(lambda step: jax.jvp(around.signals, (z,), (step,))[1])(steps)
+    return _LinearHalves(plant, controller, residue, (bent, is_kinked(compute, moves, signal, inside)))
 
 
 class _Surroundings:
@@ -275,7 +289,7 @@ class _Surroundings:
 
 def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: Scalar) -> Matrix:
     """Return (A, B, C, D) of the controller from its signal to its command, at rest with the command that holds the
-    plant.
+    plant; the function of signal and memory that it linearises; and the memory.
     """
     controller, memory = loop.controller, loop.start().controller
     sampled = isinstance(controller, Sampled)
@@ -312,7 +326,7 @@ def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: S
         # The offset with the smallest finite residual.
         inside = each[jnp.argmin(jnp.where(jnp.isfinite(left), left, jnp.inf))]
     (f, g), (h, j) = jax.jacfwd(compute, (0, 1))(inside, signal)
-    return f, g, h[None], j[None]
+    return (f, g, h[None], j[None]), lambda s, c: jnp.append(*compute(c, s)), inside
 
 
 def _series(first: Transfer, second: Transfer) -> Transfer:

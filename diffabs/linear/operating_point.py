@@ -21,8 +21,8 @@ from diffabs.core.blocks import Direct, NoFeedforward
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Feedforward, Memory, Plant, Reference, Tracking
 from diffabs.core.pytree import canonical_dtypes, part, pytree, static
-from diffabs.core.types import AnyArray, Matrix, Part, PyTree, Scalar
-from diffabs.linear.linearization import StateSpace
+from diffabs.core.types import AnyArray, Bool, Matrix, Part, PyTree, Scalar
+from diffabs.linear.linearization import StateSpace, is_kinked
 from diffabs.stops import NoStop
 
 ROOT_ITERATIONS = 10  # Gauss-Newton iterations to the point of rest; one is enough where the loop is linear
@@ -37,12 +37,14 @@ class LinearLoop(NamedTuple):
         B: Input matrix, shape (n, 1).
         K: Gain of the loop's controller, shape (n,).
         residue: Largest rate or error at the operating point, over 1 plus the largest state or command.
+        kinked: Whether a slope jumps at the operating point; A, B and K are then NaN.
     """
 
     A: AnyArray
     B: AnyArray
     K: AnyArray
     residue: Scalar
+    kinked: Bool
 
 
 @pytree
@@ -96,7 +98,7 @@ def operating_point(loop: Loop) -> OperatingPoint:
 
     Raises:
         ValueError: A block acts at instants (sampled, delayed, a relay); or the plant does not come to rest at the
-            setpoint; or there the control is at a limit or has no effect.
+            setpoint; or there a slope jumps, or the control is at a limit or has no effect.
     """
     start = loop.start()
     for name in ("sensor", "controller", "actuator"):
@@ -107,6 +109,8 @@ def operating_point(loop: Loop) -> OperatingPoint:
     found = jax.device_get(_linearize_at_rest(model))
     if not found.residue < MAX_REST_RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
+    if found.kinked:
+        raise ValueError("a slope of the loop jumps at the setpoint, at a kink: no linear model")
     if not np.any(found.B) or not np.any(found.K):
         raise ValueError("the control is at a limit at the setpoint, or does not act there: no linear model")
     # The plant's states come first in the vector of states.
@@ -219,7 +223,10 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     z = z.at[inside].set(find_root(rest_residual, z[inside]))
     a, b = jax.jacfwd(one.flow, (0, 1))(z, free[-1])
     residue = jnp.max(jnp.abs(still(free))) / (1 + jnp.max(jnp.abs(free)))
-    return LinearLoop(a, b[:, None], jax.jacfwd(one.command)(z), residue)
+    moves, v = jnp.diag(1 + jnp.abs(z)), free[-1][None]
+    kinked = is_kinked(lambda z, v: jnp.append(one.flow(z, v[0]), one.command(z)), moves, z, v)
+    a, b, k = (jnp.where(kinked, jnp.nan, x) for x in (a, b[:, None], jax.jacfwd(one.command)(z)))
+    return LinearLoop(a, b, k, residue, kinked)
 
 
 def find_root(function: Any, x: Scalar) -> AnyArray:

@@ -21,6 +21,8 @@ import numpy as np
 from diffabs.core.types import AnyArray, PyTree, Scalar
 from diffabs.linear.riccati import care
 
+ROUNDING = 1e-12  # products below this, relative to the norms of their factors, are rounding
+
 
 def recoverable_bound(A: AnyArray, B: AnyArray, start: PyTree, limit: Scalar) -> AnyArray:
     """Return the largest multiple of `start` from which some |u| <= limit returns, for a system with one unstable pole.
@@ -46,7 +48,7 @@ def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[f
     Some |u| <= limit returns the mode from every smaller multiple, and none from a larger one. Each mode is taken
     alone, so no control returns the whole system from more than the least of the multiples. If only one pole is
     unstable, some control returns from every smaller multiple. A multiple is infinite where `start` does not excite the
-    mode. Complex pairs are left out.
+    mode. Modes with equal poles have one entry, the least of their multiples. Complex pairs are left out.
 
     Args:
         A: State matrix, shape (n, n).
@@ -60,15 +62,17 @@ def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[f
     for pole, w in zip(poles, left.T, strict=True):
         if pole.real > 0 and abs(pole.imag) <= 1e-12 * abs(pole):
             reach, there = abs(np.real(w) @ b) * limit / pole.real, abs(np.real(w) @ d)
-            found[float(pole.real)] = float(reach / there) if there > 0 else np.inf
+            multiple = float(reach / there) if there > 0 else np.inf
+            found[float(pole.real)] = min(multiple, found.get(float(pole.real), np.inf))
     return found
 
 
 def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
     """Return the finite transmission zeros of x' = A x + B u, y = c'x, shape (n - r,) for relative degree r.
 
-    At a zero the Rosenbrock matrix loses rank. The zeros are the poles of the inverse system, whose states keep y at 0.
-    They are eigenvalues of the matrix below, without its r eigenvalues nearest to zero, which come from the projection.
+    At a zero the Rosenbrock matrix loses rank. The zeros are the poles of the inverse system, whose states keep y and
+    its first r - 1 derivatives at 0. They are eigenvalues of the matrix below on the states x with c'x = c'A x = ... =
+    c'A^(r-1)x = 0.
 
         (I - B (c'A^(r-1)B)^-1 c'A^(r-1)) A
 
@@ -79,12 +83,15 @@ def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
         B: Input matrix, shape (n, 1).
         output: Output row c', shape (n,).
     """
-    a, b, c = np.asarray(A, float), np.asarray(B, float).reshape(-1, 1), np.asarray(output, float).reshape(1, -1)
-    degree, row = 1, c
-    while abs((row @ b).item()) <= 1e-12 * np.linalg.norm(row) * np.linalg.norm(b):
-        degree, row = degree + 1, row @ a
-        if degree > len(a):
-            return np.array([])
-    # The r eigenvalues of the projection are the ones nearest to zero.
-    found = np.linalg.eigvals(a - b @ (row @ a) / (row @ b).item())
-    return np.delete(found, np.argsort(np.abs(found))[:degree])
+    a, b, rows = np.asarray(A, float), np.asarray(B, float).reshape(-1), np.asarray(output, float).reshape(1, -1)
+    size = np.linalg.norm(rows)
+    for degree in range(1, len(a) + 1):
+        # The last row of the orthonormal basis replaces c'A^(degree - 1): powers of A would lose digits.
+        basis, triangle = np.linalg.qr(rows.T, mode="complete")
+        row, rest, left = basis[:, degree - 1], basis[:, degree:], abs(triangle[degree - 1, degree - 1])
+        if left <= ROUNDING * size:
+            break
+        if left * abs(row @ b) > ROUNDING * size * np.linalg.norm(b):
+            return np.linalg.eigvals(rest.T @ (a @ rest - np.outer(b, row @ a @ rest) / (row @ b)))
+        rows, size = np.vstack([rows, row @ a]), np.linalg.norm(a, 2)
+    return np.array([])

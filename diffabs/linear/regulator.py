@@ -61,7 +61,7 @@ def lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None =
             be proven. For matrices that are not traced also: an entry is not finite, Q or R is not symmetric, R is not
             positive definite, or the pair (A, B) is not stabilisable.
     """
-    _check_matrices(A, B, Q, R, discrete=False)
+    _check_matrices(A, B, Q, R, S, discrete=False)
     return _solve_lqr(A, B, Q, R, S)
 
 
@@ -85,7 +85,7 @@ def dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
     Raises:
         ValueError: The same cases as in `lqr`.
     """
-    _check_matrices(A, B, Q, R, discrete=True)
+    _check_matrices(A, B, Q, R, S, discrete=True)
     return _solve_dlqr(A, B, Q, R, S)
 
 
@@ -104,7 +104,7 @@ def _solve_dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -
     return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R)) + b.T @ found.P @ b, turned), *found)
 
 
-def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, *, discrete: bool) -> None:
+def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix, *, discrete: bool) -> None:
     """Raise ValueError for matrices of numbers that have no regulator; accept traced ones."""
     if any(isinstance(x, Tracer) for x in (A, B, Q, R)):
         return
@@ -118,6 +118,8 @@ def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, *, discr
     check_symmetric("Q", Q, len(a))
     check_symmetric("R", R, b.shape[1])
     as_weight_matrix("R", R, b.shape[1], definite=True)
+    if not isinstance(S, Tracer) and S is not None and not np.isfinite(np.asarray(S, float)).all():
+        raise ValueError("S has an entry that is not finite")
     unmoved = unstabilisable_mode(a, b, discrete=discrete)
     if unmoved is not None:
         raise ValueError(f"the pair (A, B) is not stabilisable: the input does not move the mode at {unmoved:.6g}")

@@ -55,7 +55,7 @@ def _batch_over_matrices(solver: Callable) -> Callable:
     @custom_vmap
     def many(*data: jax.Array) -> Matrix:
         lanes = len(data[0])
-        width = min(CHUNK_MATRICES, lanes)
+        width = min(CHUNK_MATRICES, max(lanes, 1))
         # The padding repeats the last equation. Zeros have no solution, and would start the fallback for the chunk.
         padding = -lanes % width
         chunks = [jnp.pad(x, ((0, padding), (0, 0), (0, 0)), mode="edge") for x in data]
@@ -68,7 +68,8 @@ def _batch_over_matrices(solver: Callable) -> Callable:
     def rule(axis_size: int, batched: Any, *data: jax.Array) -> Matrix:
         full = [x if b else jnp.broadcast_to(x, (axis_size, *x.shape)) for x, b in zip(data, batched, strict=True)]
         P, residual = many(*(x.reshape(-1, *x.shape[2:]) for x in full))
-        return (P.reshape(axis_size, -1, *P.shape[1:]), residual.reshape(axis_size, -1)), (True, True)
+        lanes = full[0].shape[:2]
+        return (P.reshape(*lanes, *P.shape[1:]), residual.reshape(lanes)), (True, True)
 
     return many
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 
 from diffabs.actuators import Lag
@@ -107,10 +108,14 @@ class SlipModel:
         """Return A (n, n) and B (n, 1), differentiable in every parameter; they compile once for each kind of model.
 
         Raises:
-            ValueError: The model has a part that a linear slip model does not support.
+            ValueError: The model has a part that a linear slip model does not support, or the slope of the plant jumps
+                at the slip, at a kink of the friction. Inside jit A and B are NaN at a kink.
         """
         self._check_supported()
-        return _matrices(self)
+        found = _matrices(self)
+        if not isinstance(found.B, Tracer) and jnp.isnan(found.B).any():
+            raise ValueError(f"the slope of {type(self.plant).__name__} jumps at slip {self.slip:g}: no linear model")
+        return found
 
     def point(self) -> tuple[PyTree, PyTree]:
         """Return (state, control) of the linearisation.

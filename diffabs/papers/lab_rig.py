@@ -213,14 +213,15 @@ def judge(record: Record, rig: LabRig, values: Params) -> JsonObject:
         "slip_rms_given": given.slip_rms,
         "wheel_rms_percent_own": own.wheel_rms_percent,
         "slip_rms_own": own.slip_rms,
-        **{name: getattr(own, name) for name in ("cycles", "stop_time", "stop_distance")},
+        **_ends(own),
         "given": _ends(given),
         "measured": {**_ends(measured), "printed_distance": record.printed_distance},
     }
 
 
 def _ends(seen: RecordMatch) -> JsonObject:
-    return {"cycles": seen.cycles, "stop_time": seen.stop_time, "stop_distance": seen.stop_distance}
+    time, distance = (record.format_time(x) for x in (seen.stop_time, seen.stop_distance))
+    return {"cycles": seen.cycles, "stop_time": time, "stop_distance": distance}
 
 
 def compare_tables(rig: LabRig) -> list[JsonObject]:
@@ -575,5 +576,6 @@ def compact(summary: Table) -> Digest:
     return Digest(summary["title"].split(" (")[0], headings, lines, sentences, (), len(summary["figures"]))
 
 
-def _cells(of: Table) -> tuple[str, str, str]:
-    return f"{of['cycles']}", f"{of['stop_time']:.2f}", f"{of['stop_distance']:.1f}"
+def _cells(of: Table) -> tuple[str, ...]:
+    ends = ((of["stop_time"], ".2f"), (of["stop_distance"], ".1f"))
+    return f"{of['cycles']}", *(end if end == "never" else format(end, digits) for end, digits in ends)

@@ -198,22 +198,27 @@ def bound_of_stop(kind: str, a: float, c: float, first: float, last: float) -> f
 def bound_of_loop(loop: Loop, row: Table) -> float:
     """Return the bound of a row for the road and the plant of its loop, in SI units.
 
+    The peak of the friction is the greater one of those at the first and at the last speed: between them it must be
+    monotone in the speed, as the packaged roads are.
+
     Args:
         loop: Closed loop of a quarter car or a road vehicle.
         row: Row with a `bound`.
     """
     plant, stop = cast(Any, loop.plant), cast(Any, loop.stop)
-    speed, slip = float(loop.initial.speed), np.linspace(0, 1, SLIP_GRID)
-    mu = float(np.max(jax.vmap(lambda s: plant.road.friction(s, speed, 0.0))(slip)))
+    if row["bound"] == "time_between":
+        kind, first, last = "time", *row["speeds"]
+    else:
+        # A fitted distance is that to standstill, wherever the run ends.
+        to_rest = isinstance(stop, Standstill) or row.get("measure") == "fitted_distance"
+        kind, first, last = row["bound"], float(loop.initial.speed), 0.0 if to_rest else float(stop.speed)
+    slip, speeds = np.linspace(0, 1, SLIP_GRID), np.array([[first], [last]])
+    mu = float(np.max(jax.vmap(lambda s: plant.road.friction(s, speeds, 0.0))(slip)))
     a, c = mu * GRAVITY, 0.0
     if isinstance(plant, RoadVehicle):
         a = mu * float(plant.wheel_load / plant.mass) + float(plant.rolling) * GRAVITY
         c = float(plant.drag / plant.mass)
-    if row["bound"] == "time_between":
-        return bound_of_stop("time", a, c, *row["speeds"])
-    # A fitted distance is that to standstill, wherever the run ends.
-    last = 0.0 if isinstance(stop, Standstill) or row.get("measure") == "fitted_distance" else float(stop.speed)
-    return bound_of_stop(row["bound"], a, c, speed, last)
+    return bound_of_stop(kind, a, c, first, last)
 
 
 def _bound(row: Table, overrides: list[str]) -> float | None:

@@ -75,16 +75,22 @@ class Record(NamedTuple):
 
     @property
     def stop_time(self) -> float:
-        """Time of the last sample with a wheel speed above 0 or a slip beyond 0.01, and one period more [s]."""
+        """Time of the last sample with a wheel speed above 0 or a slip beyond 0.01, and one period more [s].
+
+        It is infinite if the record ends before standstill.
+        """
         moves = (self.wheel > 0) | (np.abs(self.slip) > 0.01)
-        return float(self.t[np.flatnonzero(moves)[-1]] + PERIOD)
+        return float(np.inf if moves[-1] else self.t[np.flatnonzero(moves)[-1]] + PERIOD)
 
     @property
     def stop_distance(self) -> float:
         """Braking distance [m]: the integral of a cubic through the vehicle speeds that wheel speed and slip give.
 
-        Near slip 1 they say little about the vehicle: each reading has the weight 1 - slip.
+        Near slip 1 they say little about the vehicle: each reading has the weight 1 - slip. The distance is infinite if
+        the record ends before standstill.
         """
+        if np.isinf(self.stop_time):
+            return float(np.inf)
         known = (self.slip < 0.9) & (self.t < self.stop_time)
         left = 1 - self.slip[known]
         cubic = np.polyfit(self.t[known], self.wheel[known] * WHEEL_RADIUS / left, 3, w=left)
@@ -135,7 +141,7 @@ class RecordMatch:
         slip_rms: Rms difference of the slips, while the wheel turns faster than 20 rad/s.
         cycles: Number of brake applications.
         stop_time: Time until the encoders show no speed [s]; infinite if the run does not stop.
-        stop_distance: Distance to standstill [m].
+        stop_distance: Distance to standstill [m]; infinite if the run does not stop.
     """
 
     wheel_rms_percent: float
@@ -168,7 +174,7 @@ def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Rec
             wheel_speed_rad_per_s and slip_1, every 10 ms on the axis of the figure. None takes the packaged readings.
 
     Raises:
-        ScenarioError: A file lacks a column or a number.
+        ScenarioError: A file lacks a column, a number or a sample, or begins after the start of the brake.
     """
     if data is None:
         curves = read_curves()
@@ -181,7 +187,8 @@ def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Rec
     else:
         table = _read_table(data / f"{experiment.name}.csv", ("time_s", "wheel_speed_rad_per_s", "slip_1"))
         t, wheel, slip = table[table[:, 0] > experiment.start - 0.5 * PERIOD].T
-        if len(t) < 2 or not np.allclose(np.diff(t), PERIOD, atol=1e-4):
+        begins = len(t) > 1 and t[0] <= experiment.start + 0.5 * PERIOD
+        if not begins or not np.allclose(np.diff(t), PERIOD, atol=1e-4):
             raise ScenarioError(
                 f"{data}: {experiment.name}.csv needs a row every {PERIOD:g} s from {experiment.start} s on"
             )
@@ -340,7 +347,7 @@ def compare_with_record(recorded: RecordedRun, record: Record, first: float = 0.
         slip_rms=float(np.sqrt(np.mean((slip - record.slip)[turns] ** 2))),
         cycles=int(np.sum(rises & moves)),
         stop_time=float(sample.t[np.flatnonzero(moves)[-1]] + solver.step) if run.stopped else float(np.inf),
-        stop_distance=float(sample.output.distance[-1]),
+        stop_distance=float(sample.output.distance[-1] if run.stopped else np.inf),
     )
 
 

@@ -30,22 +30,23 @@ def lane(run: Run, i: int) -> Run:
 
 
 def computed_row(
-    name: str, quantity: str, unit: str, ours: Any, *, published: float | None = None, reference: float | None = None
+    name: str, quantity: str, unit: str, ours: Any, *, published: float | None = None, reference: Any = None
 ) -> JsonObject:
     """Return a row of a table with our number and, if known, the paper's or an independent number.
 
-    "difference" is ours less the published number, else ours less the reference; None without either.
+    "difference" is ours less the published number, else ours less the reference; None without either, or beside a word.
 
     Args:
         name: Name of the row.
         quantity: Quantity of the row.
         unit: Unit of the quantity.
-        ours: Our number.
+        ours: Our number, or a word for it from `format_time`.
         published: Number of the paper.
-        reference: Number of an independent computation.
+        reference: Number of an independent computation, or a word for it.
     """
-    ours, expected = float(ours), reference if published is None else published
-    difference = None if expected is None else ours - expected
+    ours = ours if isinstance(ours, str) else float(ours)
+    expected = reference if published is None else published
+    difference = None if expected is None or isinstance(expected, str) or isinstance(ours, str) else ours - expected
     line = {"name": name, "quantity": quantity, "unit": unit, "ours": ours}
     return {**line, "published": published, "reference": reference, "difference": difference}
 
@@ -66,10 +67,10 @@ def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float
 
 
 def format_time(time: Scalar) -> float | str:
-    """Return a time [s] for a summary: "never" if it is infinite.
+    """Return a time [s] for a summary, or the distance until then [m]: "never" if it is infinite.
 
     Args:
-        time: Time [s].
+        time: Time [s], or distance [m].
     """
     return "never" if math.isinf(float(time)) else float(time)
 

@@ -13,7 +13,7 @@ from diffabs.objectives import BRAKING
 from diffabs.references import FixedSlip
 from diffabs.stops import Standstill
 
-PROBED_SPEEDS = 6  # from start to stop, in geometric progression; the stiffest speed is at one of the ends
+PROBED_SPEEDS = 6  # from start to end, in geometric progression; the stiffest speed is at one of the ends
 PROBED_OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # distances in slip below and above the setpoint
 PROBED_SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # slips that a run may pass
 
@@ -99,15 +99,18 @@ def probes(self: Any, initial: BrakeStart, setpoint: Scalar, stop: Part) -> Brak
     They combine 6 speeds from the start's to the stop's with 23 slips. Some slips are close to the setpoint, where the
     controller is not at a limit. Other slips cover the friction curve, which is steepest near 0.
 
+    Under a stop without a speed, such as `NoStop`, a run may last to standstill. The least speed is then the plant's
+    crawl speed: the slip's denominator, and with it the stiffness, is the same at all lower speeds.
+
     Args:
-        self: The plant; it has no effect.
+        self: The plant, with a `crawl_speed` [m/s].
         initial: Start of the run; its speed is the greatest.
         setpoint: Target slip [1].
-        stop: Stop of the run; its speed is the least.
+        stop: Stop of the run; its speed, if it has one, is the least.
     """
-    del self
     near = jnp.concatenate([setpoint - jnp.array(PROBED_OFFSETS), setpoint + jnp.array(PROBED_OFFSETS)])
     slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(PROBED_SLIPS)])
-    speeds = jnp.geomspace(initial.speed, stop.speed, PROBED_SPEEDS)
+    least = stop.speed if hasattr(stop, "speed") else self.crawl_speed
+    speeds = jnp.geomspace(initial.speed, least, PROBED_SPEEDS)
     speed, slip = jnp.meshgrid(speeds, slips, indexing="ij")
     return jax.tree.map(jnp.ravel, BrakeStart(speed=speed, slip=slip))

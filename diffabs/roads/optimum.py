@@ -28,8 +28,9 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     it.
 
     Two Newton steps s - mu'/mu'' polish it and carry its derivative by the implicit function theorem. Slip and mu are
-    thus differentiable in every parameter of the road. At a kink between straight lines the derivative is that of their
-    crossing. A maximum at more than one slip has the derivative NaN.
+    thus differentiable in every parameter of the road. At a kink bisection alone locates the maximum. The derivative is
+    that of the crossing of both sides, where the curve may be continued beyond the kink. A maximum at more than one
+    slip has the derivative NaN.
 
     >>> from diffabs.roads import DRY_ASPHALT, peak
     >>> slip, mu = peak(DRY_ASPHALT)
@@ -64,14 +65,15 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     low, high = jax.lax.stop_gradient(jax.lax.fori_loop(0, BISECTIONS, halve, bracket))
     s0 = 0.5 * (low + high)
     curvature = jax.jvp(slope, (s0,), (jnp.ones_like(s0),))[1]
-    curved = jnp.not_equal(curvature, 0)
+    # Where mu is smooth, only rounding is left of the slope. At a kink a Newton step would leave the bracket.
+    smooth = jnp.abs(slope(s0)) < jnp.sqrt(jnp.finfo(s0.dtype).eps) * jnp.abs(curvature)
 
     def residual(s: Scalar) -> Any:
-        left, right = (mu(end) + slope(end) * (s - end) for end in (low, high))
+        left, right = (mu(end + (s - s0)) for end in (low, high))  # s is s0: only derivatives differ from mu(end)
         gap = left - right
-        return jnp.where(curved, slope(s), gap - jax.lax.stop_gradient(gap))  # bisection alone places a kink
+        return jnp.where(smooth, slope(s), gap - jax.lax.stop_gradient(gap))  # bisection alone places a kink
 
-    rate = jax.lax.stop_gradient(jnp.where(curved, curvature, slope(low) - slope(high)))
+    rate = jax.lax.stop_gradient(jnp.where(smooth, curvature, slope(low) - slope(high)))
     rate = jnp.where(inside, rate, 1.0)
     # The bracket carries no derivative. The first Newton step gives the first derivative of the maximum, and the second
     # step doubles the order of derivatives that are exact.

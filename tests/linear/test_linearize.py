@@ -1,6 +1,8 @@
 """Linear slip models against the paper's formulas, SciPy, finite differences, and the real loops."""
 
 from functools import partial
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from mutants import killed_by
 from scipy.signal import cont2discrete
 
-from diffabs.actuators import Delay, Lag, Limits, RateLimit
+from diffabs.actuators import AsymmetricLag, Delay, Lag, Limits, RateLimit
 from diffabs.controllers import (
     PID,
     BackCalculation,
@@ -23,18 +25,22 @@ from diffabs.controllers import (
     StateFeedback,
 )
 from diffabs.core.blocks import Direct, Series
-from diffabs.core.protocols import BrakeOutput, Clock
-from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import BrakeOutput, Clock, no_flow, no_memory
+from diffabs.core.pytree import canonical_dtypes, pytree, replace
 from diffabs.core.validity import check_part
 from diffabs.design.state_feedback import reduce_loop
 from diffabs.linear.linearization import linearize, tracking_dynamics
+from diffabs.linear.opened_loop import open_loop
+from diffabs.linear.operating_point import operating_point
 from diffabs.linear.slip_model import LowPass, Sampling, SlipModel
 from diffabs.plants import BrakeStart, LabRig, MirroredRig, QuarterCar
-from diffabs.references import FilteredSlip, FixedSlip
-from diffabs.roads import WET_ASPHALT, Burckhardt
+from diffabs.references import FilteredSlip, FixedSlip, Setpoint
+from diffabs.roads import WET_ASPHALT, Burckhardt, PiecewiseLinear
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import Bias, WheelSpeed
 from diffabs.simulate.step.runge_kutta import rk4_step
+from diffabs.stops import NoStop
 
 K = 1 / 3.6
 R1, R2, J1, G = 0.0995, 0.099, 7.53e-3, 9.81
@@ -122,6 +128,109 @@ def test_tracking_away_from_equilibrium(brake):
     a, b = quick(tracking_dynamics)(rig, state, control)
     np.testing.assert_allclose(a, differences(lambda z: rates(z, u), z, 1e-6), rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(b, differences(lambda u: rates(z, u), u, 1e-6), rtol=1e-6, atol=1e-8)
+
+
+@killed_by("linear/linearization.py", "(narrow * NARROWER**1.5 > wide) & ", "(wide < 0.0) & ")
+@killed_by("linear/linearization.py", "jnp.where(kinked, jnp.nan, x)", "jnp.where(kinked, x, x)")
+def test_no_slip_model_at_a_knot_of_the_friction():
+    """Where the slope is 0.6 below and -0.4 above, at slip 0.2; close to the knot each side has its own model."""
+    rig = MirroredRig(road=PiecewiseLinear())
+    speeds = np.array([3.0, 5.0, 7.0, 13.9])
+
+    @quick
+    def rates(slip):
+        return jax.vmap(lambda v: SlipModel(plant=rig, slip=slip, speed=v, integral=False).matrices().A[0, 0] * v)(
+            speeds
+        )
+
+    load, j2 = rig.mass * G, 0.5 * rig.mass * R2**2
+    for slip, steep in ((0.2 - 1e-4, 0.6), (0.2 + 1e-4, -0.4)):
+        mu = 1.0 + steep * (slip - 0.2)
+        alpha = -(R1**2 / (J1 * R2) * load * steep + ((1 - slip) * steep - mu) * load * R2 / j2)
+        np.testing.assert_allclose(rates(slip), alpha * R2, rtol=1e-9)
+    assert np.isnan(rates(0.2)).all()
+    with pytest.raises(ValueError, match=r"^the slope of MirroredRig jumps at slip 0\.2: no linear model$"):
+        SlipModel(plant=rig, integral=False).matrices()
+
+
+@killed_by("linear/linearization.py", "jump > MAX_SLOPE_JUMP * slopes", "jump > 0.0")
+@killed_by("linear/linearization.py", "narrow * NARROWER**1.5 > wide", "narrow * NARROWER**3 > wide")
+def test_a_steep_curve_has_no_kink():
+    """Friction that bends within a slip of 0.0001, or hardly at all."""
+    slips = np.geomspace(1e-4, 0.5, 40)
+    rig = MirroredRig(road=Burckhardt(c1=0.05, c2=1e4, c3=0.0))
+    found = quick(jax.vmap(lambda slip: SlipModel(plant=rig, slip=slip, integral=False).matrices().A))(slips)
+    assert np.isfinite(found).all()
+
+
+class Temperature(NamedTuple):
+    above: Any
+    units = MappingProxyType({"above": "K"})
+
+
+@pytree
+class Oven:
+    """x' = u - x, but u - 3 x above x = 1."""
+
+    shows, control_unit = Temperature, "W"
+
+    def start(self, initial):
+        del initial
+        return Temperature(jnp.asarray(0.5))
+
+    def project(self, state):
+        return state
+
+    output = project
+
+    def derivative(self, t, state, control):
+        del t
+        loss = jnp.where(state.above > 1.0, 3 * state.above - 2, state.above)
+        return Temperature(control - loss)
+
+    def holding(self, output, target):
+        del output
+        return jnp.where(target > 1.0, 3 * target - 2, target)
+
+
+@pytree
+class Hasty:
+    """A command of 2 per unit of error, or 4 where the target is exceeded."""
+
+    start, flow = no_memory, no_flow
+
+    def output(self, t, memory, signal):
+        del t, memory
+        error = signal.target - signal.measured.above
+        return signal.feedforward + jnp.where(error > 0, 2.0, 4.0) * error
+
+
+@pytest.mark.slow
+@killed_by("linear/operating_point.py", "if found.kinked:", "if False:")
+@killed_by("linear/opened_loop.py", "found.kinked, ((", "(False, False), ((")
+@killed_by("linear/opened_loop.py", "is_kinked(compute, moves, signal, inside)", "jnp.array(False)")
+def test_no_linear_loop_at_a_kink():
+    """Of the plant, the actuator, or the controller; nor where a lag rises and falls differently."""
+
+    def loop(target, controller, **more):
+        reference = Setpoint(value=target)
+        return Loop(plant=Oven(), initial=(), reference=reference, controller=controller, stop=NoStop(), **more)
+
+    pid = PID(kp=2.0, ki=1.0, low=-9.0, high=9.0)
+    for target, pole in ((0.8, -1.0), (1.2, -3.0)):
+        assert operating_point(loop(target, pid)).matrices().A[0, 0] == pytest.approx(pole)
+        assert open_loop(loop(target, pid)).plant.A[0, 0] == pytest.approx(pole)
+    with pytest.raises(ValueError, match=r"^a slope of the loop jumps at the setpoint, at a kink: no linear model$"):
+        operating_point(loop(1.0, pid))
+    lags = AsymmetricLag(rise=0.049, fall=0.001), AsymmetricLag(rise=0.01, fall=0.01)
+    for one, names in (
+        (loop(1.0, pid), "sensor Direct, plant Oven, actuator Direct"),
+        (loop(0.8, pid, actuator=lags[0]), "sensor Direct, plant Oven, actuator AsymmetricLag"),
+        (loop(0.8, Hasty(), feedforward=HoldingInput()), "controller Hasty"),
+    ):
+        with pytest.raises(ValueError, match=f"^{names}: a slope jumps at the setpoint, at a kink: no linear model$"):
+            open_loop(one)
+    assert np.sort(np.linalg.eigvals(open_loop(loop(0.8, pid, actuator=lags[1])).plant.A)) == pytest.approx([-100, -1])
 
 
 def test_tracking_needs_coordinates():

@@ -309,6 +309,17 @@ def test_a_covariance_that_is_not_symmetric_is_refused(name):
         kalman(**{"A": 0.5 * np.eye(2), "C": np.eye(2), "W": np.eye(2), "V": np.eye(2), name: wrong})
 
 
+@killed_by("linear/gaussian.py", 'as_weight_matrix(name, covariance, size, definite=name == "V")', "pass")
+@killed_by("linear/gaussian.py", 'definite=name == "V"', "definite=False")
+@killed_by("linear/gaussian.py", 'definite=name == "V"', "definite=True")
+def test_the_filter_needs_covariances():
+    """Unlike a regulator's Q: a variance is not negative, and V has an inverse. Without w a stable state is known."""
+    for w, v, message in ((-0.1, 1.0, "W is not positive semidefinite"), (1.0, 0.0, "V is not positive definite")):
+        with pytest.raises(ValueError, match=f"^{message}: an eigenvalue is {min(w, v):g}, outside"):
+            kalman([[0.5]], [[1.0]], [[w]], [[v]])
+    np.testing.assert_allclose(kalman([[0.5]], [[1.0]], [[0.0]], [[1.0]]).P, 0.0, atol=1e-12)
+
+
 @killed_by("linear/weights.py", "np.outer(scale, scale)", "0.0")
 def test_rounding_does_not_make_a_matrix_unsymmetric():
     """A product F P F' has small entries that are all rounding; differences far above rounding are refused."""
@@ -461,8 +472,11 @@ def test_no_silent_failure_among_a_thousand():
         ({"R": np.zeros((1, 1))}, r"R is not positive definite: an eigenvalue is 0, outside \(0, inf\)"),
         ({"A": np.full((2, 2), np.inf)}, "not finite"),
         ({"B": np.zeros((2, 1))}, "not stabilisable: the input does not move the mode at"),
+        ({"S": np.array([[0.0], [np.nan]])}, "^S has an entry that is not finite$"),
+        ({"S": np.array([[np.inf], [0.0]])}, "^S has an entry that is not finite$"),
     ],
 )
+@killed_by("linear/regulator.py", "not isinstance(S, Tracer) and", "False and")
 def test_bad_matrices(change, message):
     a, b = rig()
     given = {"A": a, "B": b, "Q": np.eye(2), "R": np.eye(1)} | change
@@ -480,6 +494,19 @@ def test_bad_matrices(change, message):
 def test_a_system_without_states_or_inputs_is_refused(solve, n, m):
     with pytest.raises(ValueError, match=rf"^B has shape \({n}, {m}\); at least one state and one input are needed$"):
         solve(-np.eye(n), np.zeros((n, m)), np.eye(n), np.eye(m))
+
+
+@killed_by("linear/riccati_batched.py", "max(lanes, 1)", "lanes")
+@killed_by("linear/riccati_batched.py", "P.reshape(*lanes, *P.shape[1:])", "P.reshape(axis_size, -1, *P.shape[1:])")
+@pytest.mark.parametrize("batch", [(0,), (0, 3), (3, 0)], ids=str)
+def test_a_batch_may_be_empty(batch):
+    def solve(a):
+        return care(a, jnp.ones((2, 1)), jnp.eye(2), jnp.eye(1))
+
+    for _ in batch:
+        solve = jax.vmap(solve)
+    found = jax.eval_shape(solve, jnp.zeros((*batch, 2, 2)))
+    assert (found.P.shape, found.residual.shape) == ((*batch, 2, 2), batch)
 
 
 def test_the_mode_that_is_not_moved():

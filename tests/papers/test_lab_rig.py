@@ -11,9 +11,11 @@ from mutants import killed_by
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get, replace
 from diffabs.papers import REPRODUCTIONS, compact, lab_rig
 from diffabs.papers import measured_rig as rig
+from diffabs.papers.record import computed_row, format_time
 from diffabs.scenario.scenario import load
 
 TABLE_4 = {  # d [N m s] and M0 [N m] that the manual fits to its coasting curves, p. 33
@@ -149,6 +151,54 @@ def test_the_records():
     assert 25.8 < first.stop_distance < 27.4
     assert set(first.commands) == {0.0, 1.0}
     assert rig.describe_record(first).cycles == 15
+
+
+def write_record(folder, experiment, first, last):
+    """The packaged readings of an experiment between two of its samples, as a folder of finer readings holds them."""
+    record = rig.read_record(experiment)
+    rows = zip(record.t + experiment.start, record.wheel, record.slip, strict=True)
+    lines = ["time_s,wheel_speed_rad_per_s,slip_1", *(f"{t:.4f},{w},{s}" for t, w, s in list(rows)[first:last])]
+    (folder / f"{experiment.name}.csv").write_text("\n".join(lines))
+
+
+@killed_by("papers/measured_rig.py", "np.inf if moves[-1] else ", "")
+@killed_by("papers/record.py", "ours if isinstance(ours, str) else float(ours)", "float(ours)")
+def test_a_record_that_ends_before_standstill(tmp_path):
+    """It shows no stop; tables say so in a word."""
+    experiment = rig.EXPERIMENTS[0]
+    write_record(tmp_path, experiment, 0, 150)
+    record = rig.read_record(experiment, tmp_path)
+    assert (record.stop_time, record.stop_distance) == (np.inf, np.inf)
+    row = computed_row("experiment 1", "stop_time", "s", format_time(record.stop_time), reference=3.0)
+    assert (row["ours"], row["reference"], row["difference"]) == ("never", 3.0, None)
+    ends = {"cycles": 7, "stop_time": "never", "stop_distance": "never"}
+    seen = ends | {"measured": ends, "wheel_rms_percent_given": 1.0, "wheel_rms_percent_own": 2.0}
+    both = {"fitted": seen, "judged": seen}
+    digest = lab_rig.compact({"title": "", "parameters": [], "steps": [], "figures": [], "before": both, **both})
+    assert digest.lines[0][-3:] == ("7", "never", "never")
+
+
+@pytest.mark.slow
+@killed_by("papers/measured_rig.py", " if run.stopped else np.inf", "")
+def test_a_run_that_ends_before_standstill(tmp_path):
+    """That of 0.3 s and one more: it has no stop, and its summary is JSON."""
+    write_record(tmp_path, rig.EXPERIMENTS[0], 0, 30)
+    with jax.enable_x64(True):
+        judged = lab_rig.judge(rig.read_record(rig.EXPERIMENTS[0], tmp_path), rig.MASK, lab_rig.MASK_VALUES)
+    for seen in (judged, judged["given"], judged["measured"]):
+        assert (seen["stop_time"], seen["stop_distance"]) == ("never", "never")
+    json.dumps(judged, allow_nan=False)
+
+
+@killed_by("papers/measured_rig.py", "t[0] <= experiment.start + 0.5 * PERIOD", "True")
+def test_a_record_that_begins_late_is_refused(tmp_path):
+    """Its first row would count as the start of the brake."""
+    experiment = rig.EXPERIMENTS[1]
+    write_record(tmp_path, experiment, 0, 60)
+    assert len(rig.read_record(experiment, tmp_path).t) == 60
+    write_record(tmp_path, experiment, 1, 60)
+    with pytest.raises(ScenarioError, match=r"needs a row every 0.01 s from 6.12 s on$"):
+        rig.read_record(experiment, tmp_path)
 
 
 def recorded_by(name):

@@ -10,13 +10,18 @@ import numpy as np
 import pytest
 from mutants import killed_by
 from project import ROOT
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 from scipy.linalg import expm
+from scipy.optimize import minimize_scalar
 
+from diffabs import BrakeStart, braking
 from diffabs.papers import literature
 from diffabs.papers.literature import bound_of_loop, bound_of_stop, judge_row, read_rows, read_sources
+from diffabs.plants import QuarterCar
+from diffabs.roads import Burckhardt
 from diffabs.scenario.registry import family_types
 from diffabs.scenario.scenario import load, names
+from diffabs.stops import SpeedReached, Standstill
 
 FOLDER = ROOT / "benchmarks" / "literature"
 VERDICTS = {"reproduced", "refuted", "undecidable"}
@@ -72,6 +77,25 @@ def test_bounds_of_an_independent_program(scenario, kind, bound):
     with jax.enable_x64(True):
         row = {"bound": kind}
         np.testing.assert_allclose(bound_of_loop(load(scenario, integrated=False).loop, row), bound, rtol=2e-4)
+
+
+@killed_by("papers/literature.py", "np.array([[first], [last]])", "np.array([[first]])")
+def test_a_bound_has_the_friction_of_the_slowest_speed():
+    """Which is the greatest one of Burckhardt's: mu = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v). The least time that
+    any slip takes at each speed is longer than the bound."""
+    c1, c2, c3, c4 = 1.2801, 23.99, 0.52, 0.1
+
+    def peak_at(v):
+        return -minimize_scalar(
+            lambda s: -(c1 * (1 - np.exp(-c2 * s)) - c3 * s) * np.exp(-c4 * s * v), bounds=(0, 1), method="bounded"
+        ).fun
+
+    car = QuarterCar(road=Burckhardt(c1=c1, c2=c2, c3=c3, c4=c4))
+    for stop, last in ((Standstill(), 0.0), (SpeedReached(speed=5.0), 5.0)):
+        loop = braking(plant=car, initial=BrakeStart(speed=30.0), stop=stop)
+        bound = bound_of_loop(loop, {"bound": "time"})
+        np.testing.assert_allclose(bound, (30.0 - last) / (9.81 * peak_at(last)), rtol=1e-6)
+        assert bound < quad(lambda v: 1 / (9.81 * peak_at(v)), last, 30.0)[0]
 
 
 def test_arithmetic_of_a_source():

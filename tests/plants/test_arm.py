@@ -291,6 +291,21 @@ def test_the_zero_that_nearly_cancels_the_unstable_pole():
     assert np.max(found.real) == pytest.approx(np.sqrt(98.1 / 13.7), rel=1e-10)
 
 
+@killed_by("linear/recoverable.py", "a @ rest - np.outer", "a @ rest + np.outer")
+@killed_by("linear/recoverable.py", "> ROUNDING * size * np.linalg.norm(b)", "> 0.0 * size")
+def test_a_slow_zero_is_found_in_any_basis():
+    """(s + 1e-6)/((s + 1)(s + 2)(s + 3)(s + 4)) in random coordinates of the state: the relative degree is 3."""
+    a, b, c = np.eye(4, k=1), np.eye(4)[:, 3:], np.array([1e-6, 1.0, 0.0, 0.0])
+    a[3] = -np.poly([-1.0, -2.0, -3.0, -4.0])[:0:-1]
+    random = np.random.default_rng(0)
+    for basis in random.normal(size=(100, 4, 4)):
+        inverse = np.linalg.inv(basis)
+        found = transmission_zeros(basis @ a @ inverse, basis @ b, c @ inverse)
+        assert found == pytest.approx([-1e-6], abs=1e-12 * np.linalg.cond(basis) ** 2)
+    for factor, output in ((1, 0 * c), (0, c)):  # without influence
+        assert transmission_zeros(a, factor * b, output).shape == (0,)
+
+
 @pytest.mark.parametrize("period", [1e-3, 0.02])
 def test_a_sampled_model_is_the_exact_one(period):
     """e^(A T) and the input held over T, by SciPy's exponential of both together."""

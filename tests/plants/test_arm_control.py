@@ -77,6 +77,13 @@ def test_two_unstable_poles_are_two_bounds():
     assert mode_bounds(a, b, np.zeros(6), 48.0) == dict.fromkeys(found, np.inf)
 
 
+@killed_by("linear/recoverable.py", "min(multiple, found.get(float(pole.real), np.inf))", "multiple")
+def test_equal_poles_have_the_least_bound():
+    """No control reaches the first state; in the second order it is the last one."""
+    for b in ([[0.0], [1.0]], [[1.0], [0.0]]):
+        assert mode_bounds(np.eye(2), b, np.ones(2), 1.0) == {1.0: 0.0}
+
+
 @pytest.mark.parametrize(("share", "returns"), [(0.999, True), (1.001, False)])
 def test_full_effort_returns_from_within_the_bound_only(share, returns):
     """x' = s x + b u with u = -U sign(b x), the most that can be done, until x changes its sign or has doubled."""

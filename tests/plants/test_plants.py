@@ -15,8 +15,18 @@ from diffabs.core.protocols import BrakeOutput
 from diffabs.objectives import BRAKING
 from diffabs.plants import GRAVITY, BrakeStart, LabRig, MirroredRig, QuarterCar, RoadVehicle
 from diffabs.plants.lab_rig import LabRigState
-from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt, Patches, RationalCurve, Tabulated
-from diffabs.stops import SpeedReached
+from diffabs.roads import (
+    DRY_ASPHALT,
+    RIG,
+    SNOW,
+    SPLINE_B,
+    Burckhardt,
+    Patches,
+    PiecewiseLinear,
+    RationalCurve,
+    Tabulated,
+)
+from diffabs.stops import NoStop, SpeedReached
 
 NO_FRICTION = Burckhardt(c1=0.0, c3=0.0)
 MU = 0.39575220833898  # of the rig's curve at slip 0.2
@@ -114,6 +124,25 @@ def test_slip_in_driving_and_at_standstill():
     ):
         state = car.start(BrakeStart(speed=0.0))._replace(speed=float(v), spin=w / 0.2)
         np.testing.assert_allclose(car.output(state).slip, slip, rtol=1e-13, atol=1e-15)
+
+
+@killed_by("plants/wheel.py", "else self.crawl_speed", "else 10.0")
+def test_without_a_stop_the_crawl_speed_limits_the_step():
+    """A run may last to standstill, and below the crawl speed c the slip fades as exp(-(g k/c) (1 + m r^2/J) t). RK4 is
+    stable to 2.785 of this rate, k is the friction's first slope."""
+    road = PiecewiseLinear(slip=(0.0, 0.1, 1.0), mu=(0.0, 0.8, 0.7))
+    car = QuarterCar(mass=15.0, radius=0.2, inertia=1.0, crawl_speed=0.05, road=road)
+    loop = braking(plant=car, initial=BrakeStart(speed=0.2), controller=ConstantTorque(torque=20.0), stop=NoStop())
+    limit = 2.785293563405282 / (GRAVITY * 8.0 / 0.05 * (1 + 15.0 * 0.2**2))
+    check(loop, FixedStep(0.97 * limit, 0.2))
+    with pytest.raises(ValueError, match="is not stable"):
+        check(loop, FixedStep(1.03 * limit, 0.2))
+    run = jax.jit(rollout, static_argnums=1)(loop, FixedStep(1e-4, 0.2))
+    last = jax.tree.map(lambda x: float(x[-1]), run.trajectory.sample)
+    np.testing.assert_allclose(last.t, 0.2, rtol=1e-12)  # the whole duration, though the car stands from 0.05 s on
+    assert last.output.speed == 0.0
+    assert not run.stopped
+    assert not run.diverged
 
 
 # The laboratory rig

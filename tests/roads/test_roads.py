@@ -9,7 +9,7 @@ from parts import ROADS, differences, jacobian
 from scipy.interpolate import BSpline, PchipInterpolator
 from scipy.optimize import brentq
 
-from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.pytree import canonical_dtypes, param, pytree, replace
 from diffabs.core.validity import check_part, find_problems
 from diffabs.roads import (
     DRY_ASPHALT,
@@ -325,6 +325,53 @@ def test_peak_of_straight_lines_moves_with_its_knot():
     expected = np.zeros((10, 2))
     expected[3, 0] = expected[5 + 3, 1] = 1.0
     np.testing.assert_allclose(jacobian(found, road), expected, rtol=1e-9, atol=1e-12)
+
+
+@killed_by("roads/optimum.py", "jnp.abs(slope(s0)) < ", "jnp.abs(curvature) > 0.0 * ")
+def test_peak_at_a_kink_beside_a_curve():
+    """Half a table, which peaks at its knot, and half a smooth curve past its peak: slip and mu move with the knot."""
+    table = PiecewiseLinear(slip=np.array([0.0, 0.1, 0.2, 1.0]), mu=np.array([0.0, 0.8, 1.0, 0.7]))
+    road = Patches(roads=(table, DRY_ASPHALT), edges=(10.0,))
+    c1, c2, c3 = TABLE["DRY_ASPHALT"]
+    mu, slope = c1 * (1 - np.exp(-c2 * 0.2)) - c3 * 0.2, c1 * c2 * np.exp(-c2 * 0.2) - c3
+    np.testing.assert_allclose(best(canonical_dtypes(road), 0.0, 10.0), (0.2, 0.5 * (1.0 + mu)), rtol=1e-12)
+    expected = np.zeros((8, 2))
+    expected[2] = 1.0, 0.5 * slope
+    expected[4 + 2, 1] = 0.5
+    moved = jacobian(lambda t: peak(replace(road, {"roads.0": t}), 0.0, 10.0), table)
+    np.testing.assert_allclose(moved, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytree
+class Crossing:
+    """The lower one of a s + s^2 and exp(-2 s)."""
+
+    a: float = param(default=3.0, unit="1")
+
+    def friction(self, slip, speed, distance):
+        del speed, distance
+        rising, falling = self.a * slip + slip**2, jnp.exp(-2 * slip)
+        return jnp.where(rising < falling, rising, falling)
+
+
+@killed_by("roads/optimum.py", "mu(end + (s - s0))", "mu(end) + slope(end) * (s - s0)")
+def test_two_derivatives_of_a_peak_where_curves_cross():
+    """Against differences of the crossing that SciPy finds."""
+
+    def cross(a):
+        return brentq(lambda s: a * s + s * s - np.exp(-2 * s), 0.0, 1.0, xtol=1e-16)
+
+    def slip(a):
+        return peak(Crossing(a=a)).slip
+
+    h = 1e-3
+    known = (
+        cross(3.0),
+        (cross(3.0 + h) - cross(3.0 - h)) / (2 * h),
+        (cross(3 + h) - 2 * cross(3.0) + cross(3 - h)) / h**2,
+    )
+    both = jax.jit(lambda a: (slip(a), jax.grad(slip)(a), jax.grad(jax.grad(slip))(a)))(3.0)
+    np.testing.assert_allclose(both, known, rtol=1e-6)
 
 
 @killed_by("roads/optimum.py", "jnp.where(at[1] == 0, jnp.nan, at[1])", "jnp.where(at[1] == 0, 1.0, at[1])")
