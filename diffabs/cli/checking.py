@@ -2,18 +2,19 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import numpy as np
 
 from diffabs.config.values import ScenarioError
 from diffabs.core.types import JsonObject, Key, Params
+from diffabs.runtime.summary import round_for_table
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, needs_key
+from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, measure_finer, needs_key
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.run import measure
-from diffabs.simulate.types import Adaptive, Run, Solver, describe_solver, refine_solver
+from diffabs.simulate.types import Adaptive, Run, Solver, describe_solver, differs_in_kind, refine_solver
 
 MIN_CHANGE = 1e-6  # of a value; the order of a smaller error does not matter
 ROUNDING = 1e-12  # in the metric's unit; a smaller error of a value near 0 is rounding
@@ -29,8 +30,8 @@ def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
     half steps, and "finer difference" the further change by quarter steps. "float32 difference" gives the change by
     single precision, None for a loop with noise. "order", "converges" and "error" are estimates from these runs.
 
-    The keys beside it are "solvers", "comparable", "reasons" and "ended alike". If the runs are not comparable,
-    "reasons" says why.
+    The keys beside it are "solvers", "comparable", "reasons", "ended alike" and "turned". If the runs are not
+    comparable, "reasons" says why. "turned" names the metrics that are finite with one step, and not with another.
 
     Args:
         chosen: Scenario of the run.
@@ -68,8 +69,17 @@ def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
         "comparable": not why,
         "reasons": why,
         "ended alike": bool(found.alike),
+        "turned": [] if why or not found.alike else _find_turned(chosen, key, metrics),
         "metrics": metrics,
     }
+
+
+def _find_turned(chosen: Scenario, key: Key, rows: Mapping[str, JsonObject]) -> list[str]:
+    """Return the metrics that a shorter step turns from a number into "never" or NaN, or back."""
+    suspects = {name: row["value"] for name, row in rows.items() if math.isnan(row["difference"])}
+    times = (2, FINEST) if suspects else ()
+    runs = [measure_finer(chosen.loop, chosen.solver, chosen.objectives, n, key=key) for n in times]
+    return [name for name, one in suspects.items() if any(differs_in_kind(one, run.metrics[name]) for run in runs)]
 
 
 def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
@@ -84,14 +94,21 @@ def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[S
         again: Function that makes the run again with another solver.
     """
     closer = dataclasses.replace(solver, rtol=solver.rtol / CLOSER)
-    others = again(closer).metrics.items()
-    changed = [(name, value) for name, value in others if metrics[name] != value]  # both may be infinite
-    shares = {name: abs(metrics[name] - value) / max(abs(value), LEAST) for name, value in changed}
-    found = [f"{name} by {100 * share:.2g} %" for name, share in shares.items() if share > LOOSE * solver.rtol]
+    found = []
+    for name, other in again(closer).metrics.items():
+        one, other = float(metrics[name]), float(other)
+        if differs_in_kind(one, other):
+            found.append(f"{name} from {_format_value(one)} to {_format_value(other)}")
+        elif abs(one - other) > LOOSE * solver.rtol * max(abs(other), LEAST):
+            found.append(f"{name} by {100 * abs(one - other) / max(abs(other), LEAST):.2g} %")
     if not found:
         return []
     why = "the run chatters or amplifies its errors; choose a smaller solver.rtol, or see --check"
     return [f"solver.rtol = {closer.rtol:.2g} changes {', '.join(found)}: {why}"]
+
+
+def _format_value(value: float) -> str:
+    return "never" if value == math.inf else round_for_table(value)
 
 
 def describe_check(found: JsonObject) -> list[str]:
@@ -108,6 +125,8 @@ def describe_check(found: JsonObject) -> list[str]:
     loose = [name for name, row in rows if not row["converges"] and row["error"] > least[name]]
     if found["comparable"] and loose:
         lines.append(f"shorter steps do not converge for {', '.join(loose)}: the error is a guess")
+    if found["turned"]:
+        lines.append(f"a shorter step turns {', '.join(found['turned'])} from a number into never, or back")
     return lines
 
 

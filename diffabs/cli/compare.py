@@ -14,7 +14,11 @@ from diffabs.core.types import JsonObject
 if TYPE_CHECKING:
     from diffabs.sweep import Results
 
-FEWEST = 4  # common samples below which a metric is left out
+FEWEST = 4  # common samples below which a metric has no statistics
+STATISTICS = (
+    *("first", "second", "difference", "median difference", "share in which the second is less", "equal"),
+    "variance reduction",
+)
 SHARED_FIELDS = ("space", "seed", "samples")  # fields that two studies of the same samples share
 
 
@@ -53,7 +57,7 @@ def _compare_metrics(a: "Results", b: "Results", metrics: list[str]) -> JsonObje
     """Return paired statistics of second minus first.
 
     Samples that diverged or were refused in either sweep are left out. A sample with an infinite metric in either sweep
-    is left out of that metric, and counted.
+    is left out of that metric, and counted. With fewer than `FEWEST` samples the statistics are None.
     """
     from diffabs.sweep.statistics.estimates import Moments
     from diffabs.sweep.statistics.paired import compare_pairs
@@ -63,17 +67,15 @@ def _compare_metrics(a: "Results", b: "Results", metrics: list[str]) -> JsonObje
     for name in metrics:
         both = ~lost & np.isfinite(a.column(name)) & np.isfinite(b.column(name))
         before, after = a.column(name)[both], b.column(name)[both]
-        if both.sum() < FEWEST:
-            continue
-        found = compare_pairs(after, before)
+        numbers = [None] * len(STATISTICS)
+        if len(before) >= FEWEST:
+            found = compare_pairs(after, before)
+            numbers = [Moments.of(before).mean().value, Moments.of(after).mean().value]
+            numbers += [one.table() for one in (found.mean, found.median, found.less)]
+            numbers += [found.ties, found.reduction]
         rows[name] = {
-            "first": Moments.of(before).mean().value,
-            "second": Moments.of(after).mean().value,
-            "difference": found.mean.table(),
-            "median difference": found.median.table(),
-            "share in which the second is less": found.less.table(),
-            "equal": found.ties,
-            "variance reduction": found.reduction,
+            "samples": len(before),
+            **dict(zip(STATISTICS, numbers, strict=True)),
             "never": int((~lost & ~both).sum()),
         }
     return {"samples": len(lost), "left out": int(lost.sum()), "metrics": rows}

@@ -35,6 +35,7 @@ REDUNDANT = (
     "slip, speed and wheel_speed depend on each other; together they make the standard deviations too small; choose"
     " columns with --column"
 )
+FILE_ROUNDING = 1e-11  # relative, of an instant in a file of `simulate --csv`
 SPARE = 2  # extra steps, so that the run covers the last instant of the data
 
 
@@ -211,9 +212,13 @@ def _fit(
 def _solver(solver: Solver, readings: Readings) -> Solver:
     """Return the solver with the duration of the data, and at most `MAX_DATA_ROWS` instants."""
     steps = math.ceil(float(readings.t[-1]) / solver.step) + SPARE
-    if steps * solver.step >= solver.duration:
+    duration = steps * solver.step
+    if duration >= solver.duration:
         steps = solver.steps
-    return dataclasses.replace(solver, duration=steps * solver.step, every=max(1, math.ceil(steps / MAX_DATA_ROWS)))
+        # The product may be less than the duration by a rounding, and a file has the last instant in 12 digits.
+        end = steps * solver.step
+        duration = max(end, min(float(readings.t[-1]), end * (1 + FILE_ROUNDING)))
+    return dataclasses.replace(solver, duration=duration, every=max(1, math.ceil(steps / MAX_DATA_ROWS)))
 
 
 def _root_mean_square(values: np.ndarray) -> float:

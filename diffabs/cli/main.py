@@ -65,7 +65,7 @@ app = typer.Typer(
     help="Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers.",
 )
 
-AT_LIMIT = "at a limit"  # key among a run's objectives; the space keeps it apart from a scenario's metrics
+AT_LIMIT = "at a limit\n"  # key among a run's objectives; the names in a scenario have no line break
 WARNED_LIMIT_SHARE = 0.5  # share of time at a limit, above which a run gets a warning
 MAX_CSV_ROWS = 20_000  # of a trajectory
 
@@ -160,9 +160,12 @@ def simulate(
                 else None
             )
             lines = describe_check(found) if found else _find_loose_metrics(chosen, run, key, kept)
-        result = _result(chosen, run, limited, {"csv": csv, "mat": mat, "plot": plot}) | (
-            {"accuracy": found} if found else {}
-        )
+        result = _result(chosen, run, limited, {"csv": csv, "mat": mat, "plot": plot})
+        if from_sweep:  # the sweep's seed and the number of the sample decide the noise
+            result["solver"]["seed"] = None
+            result["sample"] = {"sweep": str(from_sweep), "seed": chosen.sweep.seed, "number": sample}
+        if found:
+            result["accuracy"] = found
         show.as_json(result) if as_json else show.show_run(result, chosen)
         if found and not as_json:
             show.show_accuracy(found)

@@ -357,7 +357,7 @@ def _document(
         if name in known:
             bounds[name]["least_run"], worst = known[name]
             bounds[name]["worst_run"] = worst
-            bounds[name]["looseness"] = (high - worst) / worst if math.isfinite(high) else None
+            bounds[name]["looseness"] = (high - worst) / worst if worst and math.isfinite(high) else None
     widths = np.array([high - low for low, high in box.values()])
     shares = (
         ((proof.left[:, :, 1] - proof.left[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1)

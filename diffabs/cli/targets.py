@@ -139,7 +139,8 @@ def new_target_file(target: pathlib.Path | None, option: str) -> Iterator[pathli
 def new_target_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yield a temporary folder beside `target` that replaces it at the end; an error discards it.
 
-    An empty folder or an older result (a folder with summary.json) is replaced. Any other content is left alone.
+    An empty folder or an older result (a folder with summary.json, but no sweep) is replaced. Any other content is left
+    alone.
 
     Args:
         target: Folder to write.
@@ -148,7 +149,9 @@ def new_target_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
         typer.Exit: The folder cannot be made, or has other content.
     """
     target = resolve_path(target, "--out")
-    if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "summary.json").exists())):
+    there = set(os.listdir(target)) if target.is_dir() else set()
+    is_result = "summary.json" in there and not there & {"manifest.json", "chunks"}  # a sweep has a summary, too
+    if target.exists() and not (target.is_dir() and (is_result or not there)):
         fail(f"--out {target}: exists and is not an earlier result; move it away")
     with _open_target(files.new_folder(target), "--out", target) as new:
         yield new

@@ -114,7 +114,7 @@ def _without_proof(work: Work, result: JsonObject) -> JsonObject:
     goal = work.chosen.tune
     bounds = {"certified decay": goal.decay, "damping": goal.damping}
     unseen = [
-        {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False}
+        {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False, "missed": None}
         for name in work.constraints
         if name not in seen
     ]

@@ -1,7 +1,6 @@
 """Measured runs as CSV files, with the columns that `diffabs simulate --csv` writes."""
 
 import csv
-import math
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -33,7 +32,8 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
 
     Args:
         path: File of UTF-8 text, at most `MAX_MEASUREMENT_BYTES` long, with the column `t [s]`. Columns of target,
-            command and control are ignored.
+            command and control are ignored. So is a column beside others that has the same infinite number in every
+            row: a limit that the simulation lacks.
         units: Units of the plant's signals by name: a column's header is `name [unit]`.
 
     Raises:
@@ -57,13 +57,19 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
     if not len(numbers):
         raise ScenarioError(f"--data {path}: has a header and no numbers")
     lines = [i for i, row in enumerate(rows[1:], 2) if row]
+    unlimited = {i for i in names if np.isinf(numbers[0, i]) and (numbers[:, i] == numbers[0, i]).all()}
+    unlimited = unlimited if len(unlimited) < len(names) else set()
+    for i, j in np.argwhere(~np.isfinite(numbers)):
+        if j not in unlimited:
+            cell = rows[lines[i] - 1][j].strip()
+            raise ScenarioError(f"--data {path}, line {lines[i]}: {header[j]} = {cell} is outside (-inf, inf)")
     t = numbers[:, header.index(TIME_COLUMN)]
     late = np.flatnonzero(np.diff(t) <= 0)
     if t[0] < 0 or len(late):
         line, before = (lines[late[0] + 1], t[late[0]]) if len(late) else (lines[0], 0.0)
         at = t[late[0] + 1] if len(late) else t[0]
         raise ScenarioError(f"--data {path}, line {line}: t = {at:g} s does not come after {before:g} s")
-    return Readings(t, {name: numbers[:, i] for i, name in names.items()})
+    return Readings(t, {name: numbers[:, i] for i, name in names.items() if i not in unlimited})
 
 
 def _names(header: Sequence[str], path: pathlib.Path, units: Mapping[str, str]) -> dict[int, str]:
@@ -97,6 +103,4 @@ def _numbers(row: Sequence[str], line: int, header: Sequence[str], path: pathlib
             raise ScenarioError(
                 f"--data {path}, line {line}: {name} = {format_given(cell)} is text; a number is needed"
             ) from None
-        if not math.isfinite(found[-1]):
-            raise ScenarioError(f"--data {path}, line {line}: {name} = {cell.strip()} is outside (-inf, inf)")
     return found

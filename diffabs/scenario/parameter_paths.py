@@ -224,7 +224,7 @@ def canonical_path(path: str) -> str:
         path: Path as given.
     """
     path = path.replace('"', "").replace("'", "")
-    return path.removeprefix("plant.") if path.startswith("plant.road.") else path
+    return path.removeprefix("plant.") if f"{path}.".startswith("plant.road.") else path
 
 
 def read_entries(

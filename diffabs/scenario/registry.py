@@ -198,6 +198,24 @@ def inner_fields(family: str, name: str) -> list[str]:
     return [field for field in own if family_of(field, "") == family and not isinstance(getattr(part, field), tuple)]
 
 
+def missing_inner_parts(family: str, given: PyTree, path: str) -> list[str]:
+    """Return a line for each part of the same family inside a given part that the table does not name.
+
+    Such a part would get the default type, whatever the scenario has there.
+
+    Args:
+        family: Family of the part.
+        given: Table of the part, or the bare name of its type.
+        path: Place of the part, for messages.
+    """
+    name, lines = type_name(given), []
+    for field in inner_fields(family, name) if isinstance(name, str) and name in family_types(family) else ():
+        inner = given.get(field) if isinstance(given, dict) else None
+        if inner is None or (isinstance(inner, dict) and "type" not in inner):
+            lines.append(f"{path}.{field} is missing: {name} encloses another {family}; give its type")
+    return lines
+
+
 def part_summary(part: Part) -> str:
     """Return the first paragraph of a part's docstring, on one line.
 

@@ -48,9 +48,8 @@ from diffabs.scenario.registry import (
     OTHER_SECTIONS,
     build_loop,
     build_part,
-    family_types,
-    inner_fields,
     join_path,
+    missing_inner_parts,
     type_name,
 )
 from diffabs.simulate.admissible import find_mismatches, find_unstable_step
@@ -188,18 +187,10 @@ def loads(
 
 
 def _without_inner(before: Table, table: Table) -> Iterator[str]:
-    """Yield a line for each section whose new part encloses another part that the override does not name.
-
-    Without this check the default inner part would silently replace the scenario's own part.
-    """
+    """Yield a line for each section whose new part encloses another part that the override does not name."""
     for family, old in before.items():
-        name, given = type_name(table.get(family)), table.get(family)
-        if name in (None, old) or name not in family_types(family):
-            continue
-        for field in inner_fields(family, name):
-            inner = given.get(field) if isinstance(given, dict) else None
-            if inner is None or (isinstance(inner, dict) and "type" not in inner):
-                yield f"{family}.{field} is missing: {name} encloses another {family}; give its type"
+        if type_name(table.get(family)) != old:
+            yield from missing_inner_parts(family, table.get(family), family)
 
 
 def _refuse(*objections: Iterable[str]) -> None:
@@ -269,6 +260,8 @@ def _override(table: JsonObject, override: str) -> str:
         node[place] = child
         node = child
     place = _place(node, keys[-1], ".".join(keys[:-1]))
+    replaced = keys[:-1] if place == "type" else keys
+    old_type = node.get("type") if place == "type" else None
     if isinstance(place, str):
         # An override in m/s replaces a value in km/h and the reverse; both together would be given twice.
         other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
@@ -282,7 +275,8 @@ def _override(table: JsonObject, override: str) -> str:
     parameter_paths.to_canonical_form(table)
     new = node[place]
     part = new.get("type") if isinstance(new, dict) else new
-    removed = parameter_paths.forget_replaced_part(table, ".".join(keys)) if isinstance(part, str) else []
+    is_replaced = isinstance(part, str) and part != old_type
+    removed = parameter_paths.forget_replaced_part(table, ".".join(replaced)) if is_replaced else []
     if not removed:
         return ""
     return f"{'.'.join(keys)}={part} removes {', '.join(removed)} of the replaced part"

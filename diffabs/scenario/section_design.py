@@ -26,6 +26,7 @@ from diffabs.config.values import (
     read_number,
     table_field,
     table_reader,
+    unknown_name_error,
     wrong_kind_error,
 )
 from diffabs.config.values import read_table as read_table
@@ -35,7 +36,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Scalar
 from diffabs.linear.slip_model import SlipModel
-from diffabs.scenario.parameter_paths import read_entries
+from diffabs.scenario.parameter_paths import canonical_path, read_entries
 
 ENTRY = ParameterSpec("1")
 
@@ -101,8 +102,19 @@ class DesignTask:
 
         The dictionary is empty if [design.over] is empty. Otherwise the speed of a brake without a range gets the range
         from the loop's stop to its start.
+
+        Raises:
+            ScenarioError: A range is that of a parameter which only the linear model of `loop` has.
         """
         over = self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else self.over
+        known = [path for path, _, _ in parameters(loop)]
+        for path in over:
+            if path not in known:
+                raise unknown_name_error(
+                    f"design.over.{canonical_path(path)} is a parameter of the linear model, but not of this loop",
+                    path,
+                    map(canonical_path, known),
+                )
         return {path: ends for path, ends in over.items() if ends[0] < ends[1]}
 
     def _with_speed(self, loop: Loop) -> dict[str, Range]:

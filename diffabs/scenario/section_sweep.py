@@ -4,7 +4,8 @@
     chunk                    runs that are computed and stored together
     check                    runs, drawn from all, that are repeated with a half step to see how accurate they are
     dtype                    "float64" or "float32"
-    design                   "random", "sobol", "latin-hypercube", "grid", "corners", "saltelli", or a table of one
+    design                   "random", "sobol", "latin-hypercube", "corners", "saltelli", or a table such as
+                             { type = "grid", levels = 3 }, or levels = { "road.w4" = 5, "plant.mass" = 3 }
     [sweep.over]
     "plant.mass" = [5.3, 6.2]                                 # uniform between them
     "road.scale" = { type = "normal", mean = 1.0, deviation = 0.1, low = 0.5, high = 1.5 }
@@ -24,7 +25,7 @@ Running the sweep needs the extra `sweep`.
 
 import dataclasses
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from diffabs.config.values import (
@@ -47,7 +48,7 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get
 from diffabs.core.types import JsonObject, Params, PyTree, Table
 from diffabs.scenario.parameter_paths import ParameterEntry, canonical_path, flatten_table, metric_reader, read_entries
-from diffabs.scenario.registry import FAMILIES, build_part, family_of, unit_of
+from diffabs.scenario.registry import build_part, family_of, missing_inner_parts, unit_of
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.variables import Correlation, Space, read_correlation
 
@@ -135,20 +136,38 @@ def read_sweep_section(
         SweepSection,
         table,
         "sweep",
+        design=_read_design,
         over=lambda given, path: _over(flatten_table(table_reader(read_as_given)(given, path), path), loop, folder),
         correlation=lambda given, path: read_correlation(given, path) if given != {} else None,
         failures=metric_reader(objectives, "bounds by metric", lambda one: unit_of(one, loop.plant)),
     )
-    if not plan.correlation:
-        return plan
-    # The correlation may name a path in any allowed form; from here on it has the paths of the loop.
-    known = {canonical_path(path): path for path in plan.over}
-    paths = [canonical_path(path).removesuffix("_kmh") for path in plan.correlation.paths]
-    for path, given in zip(paths, plan.correlation.paths, strict=True):
-        if path not in known:
-            raise unknown_name_error(f"sweep.correlation.paths: {format_given(given)} does not vary", given, known)
-    correlation = dataclasses.replace(plan.correlation, paths=tuple(known[path] for path in paths))
-    return dataclasses.replace(plan, correlation=correlation)
+    if plan.correlation:
+        paths = _loop_paths(plan.correlation.paths, plan.over, "sweep.correlation.paths")
+        plan = dataclasses.replace(plan, correlation=dataclasses.replace(plan.correlation, paths=tuple(paths)))
+    if isinstance(plan.design, sampling.Grid) and isinstance(levels := plan.design.levels, Mapping):
+        paths = _loop_paths(levels, plan.over, "sweep.design.levels")
+        if len(set(paths)) < len(paths):
+            raise ScenarioError("sweep.design.levels: a speed is given twice, in m/s and in km/h")
+        levels = dict(zip(paths, levels.values(), strict=True))
+        plan = dataclasses.replace(plan, design=dataclasses.replace(plan.design, levels=levels))
+    return plan
+
+
+def _read_design(given: PyTree, path: str) -> sampling.SamplingDesign:
+    """Return the sampling design of a table, whose levels may be nested tables like those of [sweep.over]."""
+    if isinstance(given, Mapping) and isinstance(given.get("levels"), Mapping):
+        given = {**given, "levels": flatten_table(given["levels"], f"{path}.levels")}
+    return sampling.read_sampling_design(given, path)
+
+
+def _loop_paths(given: Iterable[str], over: Params, where: str) -> list[str]:
+    """Return the paths of the loop of varied parameters, which are given in any allowed form."""
+    known = {canonical_path(path): path for path in over}
+    found = {path: canonical_path(path).removesuffix("_kmh") for path in given}
+    for path, there in found.items():
+        if there not in known:
+            raise unknown_name_error(f"{where}: {format_given(path)} does not vary", path, known)
+    return [known[found[path]] for path in given]
 
 
 def _over(given: Table, loop: Loop, folder: pathlib.Path) -> JsonObject:
@@ -212,9 +231,12 @@ def _choice(key: str, given: PyTree, default: Any) -> Choice:
         raise wrong_kind_error(where, given, "a list of parts, or a table of choices and weights,")
     names = [item if isinstance(item, str) else f"{i}" for i, item in enumerate(table["choices"])]
     drawn = distributions.read_distribution({**table, "type": "categorical", "choices": names}, where)
-    family = key if key in FAMILIES else family_of(key, key)
-    items = enumerate(zip(names, table["choices"], strict=True))
-    return Choice(given, drawn, {name: build_part(family, item, default, f"{where}.{i}") for i, (name, item) in items})
+    family, parts = family_of(key, key), {}
+    for i, (name, item) in enumerate(zip(names, table["choices"], strict=True)):
+        if lines := missing_inner_parts(family, item, f"{where}.{i}"):
+            raise ScenarioError("; ".join(lines))
+        parts[name] = build_part(family, item, default, f"{where}.{i}")
+    return Choice(given, drawn, parts)
 
 
 def build_study(chosen: Any) -> "Study":

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.protocols import Ending, Sample
 from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar
@@ -96,13 +97,30 @@ def refine_solver(solver: Solver, times: int) -> Solver:
 
 
 def describe_solver(solver: Solver) -> dict[str, PyTree]:
-    """Return step and duration of a solver [s] by name and, for `Adaptive`, its type and `rtol`; for a file.
+    """Return everything of a solver that decides the metrics, by name; for a file.
+
+    It has step and duration [s]. `Adaptive` adds its type and `rtol`, `FixedStep` its `kinks` unless they are None.
 
     Args:
         solver: Solver of the run.
     """
     said = {"step": solver.step, "duration": solver.duration}
-    return said | ({"type": "adaptive", "rtol": solver.rtol} if isinstance(solver, Adaptive) else {})
+    if isinstance(solver, Adaptive):
+        return said | {"type": "adaptive", "rtol": solver.rtol}
+    return said if solver.kinks is None else said | {"kinks": solver.kinks}
+
+
+def differs_in_kind(one: Scalar, other: Scalar) -> Bool:
+    """Return True where two values of a metric differ and are not both finite, such as 0.3 s and "never".
+
+    No subtraction shows such a change: its result is infinite, or no number.
+
+    Args:
+        one: Values of the metric, any shape.
+        other: Other values, same shape.
+    """
+    finite = np.isfinite(one) & np.isfinite(other)
+    return ~finite & (np.asarray(one) != other) & ~(np.isnan(one) & np.isnan(other))
 
 
 class Trajectory(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 from diffabs.core.types import JsonObject, Key, Part, PyTree
 from diffabs.simulate.accuracy import is_comparable, measure_finer, relative_difference
 from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
-from diffabs.simulate.types import Run, describe_solver
+from diffabs.simulate.types import Run, describe_solver, differs_in_kind
 from diffabs.sweep.results import Results
 from diffabs.sweep.study import Study, precision
 
@@ -25,6 +25,8 @@ def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
     - `samples`: Numbers of the compared samples.
     - `step`, `solver`: The half step [s], and the description of the sweep's solver.
     - `ended otherwise`, `not comparable`: Numbers of runs left out, because they end differently or draw other noise.
+    - `turned`: For each metric that is finite with one step and not with the other, the `count` and numbers of such
+      `samples`. They are not in `metrics`.
     - `metrics`: For each metric the `median` and `largest` relative change, and the `sample` with the largest. Its
       `difference` is the absolute change of this sample, in the metric's unit.
 
@@ -48,6 +50,7 @@ def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
 
     for places in group_by_structure(loops):  # loops of one structure share a program
         loop, batch = stack_loops([loops[i] for i in places])
+        loop = jax.tree.map(np.asarray, loop)  # an array of JAX would ask for its double precision in single
         lanes = batch.values, jnp.stack([keys[i] for i in places])
         with precision(study.dtype):
             both = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, rerun))(*lanes)
@@ -58,13 +61,16 @@ def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
         alike[places] = ~np.asarray(run.diverged) & (np.asarray(run.stopped) == stopped[places])
     same = fine & alike
     compared, rows = samples[same], rows[same]
-    changes = {n: _summarise_changes(found.column(n)[rows], column[same], compared) for n, column in half.items()}
+    pairs = {name: (found.column(name)[rows], column[same]) for name, column in half.items()}
+    turned = {name: compared[differs_in_kind(*pair)].tolist() for name, pair in pairs.items()}
+    changes = {name: _summarise_changes(*pair, compared) for name, pair in pairs.items()}
     return {
         "samples": compared.tolist(),
         "step": study.solver.step / 2,
         "solver": describe_solver(study.solver),
         "ended otherwise": int((fine & ~alike).sum()),
         "not comparable": int((~fine).sum()),
+        "turned": {name: {"count": len(one), "samples": one} for name, one in turned.items() if one},
         "metrics": {name: row for name, row in changes.items() if row},
     }
 
@@ -83,6 +89,9 @@ def accuracy_warnings(result: JsonObject) -> list[str]:
         each = (f"{name} by up to {100 * row['largest']:.3g} % (sample {row['sample']})" for name, row in loose.items())
         cure = "lower solver.rtol" if "rtol" in result.get("solver", {}) else "shorten solver.step"
         lines.append(f"a half step changes {', '.join(each)}: {cure}")
+    for name, row in result["turned"].items():
+        where = f"{row['count']} of {len(result['samples'])} runs, the first sample {row['samples'][0]}"
+        lines.append(f"a half step turns {name} from a number into never, or back, in {where}")
     if result["ended otherwise"]:
         lines.append(f"with a half step {result['ended otherwise']} of the lanes looked at ended in another way")
     if result["not comparable"]:

@@ -163,13 +163,18 @@ class _Solver:
 
 
 @dataclasses.dataclass(frozen=True)
+class _Fixed(_Solver):
+    kinks: bool | None = table_field(read_switch, None)
+
+
+@dataclasses.dataclass(frozen=True)
 class _Adaptive(_Solver):
     rtol: float = table_field(range_reader(FINITE_SPEC))
 
 
 def _read_solver(given: PyTree, path: str) -> _Solver:
     table = {"type": "fixed", **given} if isinstance(given, Mapping) else given
-    return read_one({"fixed": _Solver, "adaptive": _Adaptive}, table, path)
+    return read_one({"fixed": _Fixed, "adaptive": _Adaptive}, table, path)
 
 
 @dataclasses.dataclass(frozen=True)

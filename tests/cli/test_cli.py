@@ -447,3 +447,14 @@ def test_control_c_ends_a_long_run_with_one_line(tmp_path):
     assert (out, last) == ("", "interrupted")
     assert all(line.startswith("simulating") for line in before)  # how far it was, where the machine is slow
     assert left_in(tmp_path) == set()
+
+
+@pytest.mark.slow
+@killed_by("cli/main.py", 'AT_LIMIT = "at a limit\\n"', 'AT_LIMIT = "at a limit"')
+def test_an_objective_may_have_the_name_of_the_share_at_a_limit():
+    limits = ("--set", "controller.torque_min=0", "--set", "controller.torque_max=0.1")  # far below the demand
+    found = json.loads(
+        run("simulate", "slip-lmi", *SHORT, *limits, "--set", "objective.at a limit=iae", "--json").stdout
+    )
+    assert found["at_limit"] == pytest.approx(1.0)
+    assert found["metrics"]["at a limit"] == found["metrics"]["iae"] != 1.0

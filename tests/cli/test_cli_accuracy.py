@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import assert_one_error_line, run
@@ -13,9 +14,11 @@ from mutants import killed_by
 from sweeping import SCENARIO
 
 import diffabs as d
-from diffabs.cli.checking import describe_check
+from diffabs.cli.checking import check_run_accuracy, describe_check, describe_loose_metrics
+from diffabs.core.protocols import Memory
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import load, loads
+from diffabs.simulate.types import Adaptive
 from diffabs.sweep import Results, sweep
 from diffabs.sweep.checking import _choose_samples, accuracy_warnings, check_accuracy
 
@@ -28,6 +31,17 @@ actuator = {type = "rate-limit", rate = 500.0}
 solver = {step = 2e-3, duration = 1.0}
 sweep = {samples = 40, chunk = 40, seed = 5, check = 6, over = {"plant.mass" = [5.3, 6.2]}}
 """
+
+TURNS = ["never at all", "half", "quarter", "always"]
+PAIRS = {
+    "to never": (0.3, np.inf, ["settling_time from 0.3 to never"]),
+    "from never": (np.inf, 0.3, ["settling_time from never to 0.3"]),
+    "to NaN": (0.3, np.nan, ["settling_time from 0.3 to nan"]),
+    "never": (np.inf, np.inf, []),
+    "both NaN": (np.nan, np.nan, []),
+    "near": (0.3, 0.3002, []),
+    "far": (0.3, 0.33, ["settling_time by 9.1 %"]),
+}
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -127,14 +141,14 @@ def test_lanes_that_are_no_result_are_not_drawn():
 @killed_by("cli/checking.py", 'max(MIN_CHANGE * abs(row["value"]), ROUNDING)', 'MIN_CHANGE * abs(row["value"])')
 def test_no_order_of_rounding_is_not_said():
     row = {"value": 8.9e-16, "converges": False, "error": 1.7e-14}
-    found = {"reasons": [], "comparable": True, "ended alike": True, "metrics": {"final_slip_error": row}}
+    found = {"reasons": [], "comparable": True, "ended alike": True, "turned": [], "metrics": {"final_slip_error": row}}
     assert describe_check(found) == []
     row["error"] = 1e-9
     assert describe_check(found) == ["shorter steps do not converge for final_slip_error: the error is a guess"]
 
 
 def test_what_is_said():
-    nothing = {"metrics": {}, "ended otherwise": 0, "not comparable": 0}
+    nothing = {"metrics": {}, "turned": {}, "ended otherwise": 0, "not comparable": 0}
     assert accuracy_warnings(nothing) == []
     loose = {
         **nothing,
@@ -150,3 +164,60 @@ def test_what_is_said():
     assert accuracy_warnings({**loose, "solver": {"rtol": 1e-3}}) == []
     assert "2 of the lanes" in accuracy_warnings({**nothing, "ended otherwise": 2})[0]
     assert "accuracy unknown" in accuracy_warnings({**nothing, "not comparable": 1})[0]
+    never = {**nothing, "samples": [3, 5, 8], "turned": {"settling_time": {"count": 2, "samples": [5, 8]}}}
+    (line,) = accuracy_warnings(never)
+    assert line.endswith("settling_time from a number into never, or back, in 2 of 3 runs, the first sample 5")
+
+
+@dataclasses.dataclass(frozen=True)
+class EndlessSteps:
+    """The number of steps of a run, and "never" above a limit."""
+
+    most: int
+    unit = "1"
+    unreached = np.inf
+
+    def start(self, sample):
+        del sample
+        return Memory((), jnp.zeros(()))
+
+    def flow(self, memory, sample):
+        del memory, sample
+        return ()
+
+    def update(self, memory, segment):
+        del segment
+        return memory.held + 1
+
+    def value(self, memory, ending):
+        del ending
+        return jnp.where(memory.held > self.most, jnp.inf, memory.held)
+
+
+jax.tree_util.register_dataclass(EndlessSteps, [], ["most"])
+
+
+@pytest.mark.slow
+@killed_by("cli/checking.py", 'if math.isnan(row["difference"])', "if False")
+@killed_by("cli/checking.py", "times = (2, FINEST) if", "times = (2,) if", case="quarter")
+@pytest.mark.parametrize(("most", "turned"), [(9, []), (10, ["steps"]), (20, ["steps"]), (40, [])], ids=TURNS)
+def test_a_shorter_step_that_turns_a_number_into_never(file, most, turned):
+    """Ten steps become twenty, and forty."""
+    chosen = load(file(RELAY.replace("step = 2e-3, duration = 1.0", "step = 2e-3, duration = 0.02")))
+    chosen = dataclasses.replace(chosen, objectives={"steps": EndlessSteps(most)})
+    found = check_run_accuracy(chosen, chosen.key())
+    assert found["metrics"]["steps"]["value"] == (10 if most >= 10 else np.inf)
+    assert found["turned"] == turned
+    lines = describe_check(found)
+    assert ["a shorter step turns steps from a number into never, or back" in lines] == [bool(turned)]
+
+
+@killed_by("cli/checking.py", "if differs_in_kind(one, other):", "if False:")
+@killed_by("simulate/types.py", "~(np.isnan(one) & np.isnan(other))", "True", case="both NaN")
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("one", "other", "words"), PAIRS.values(), ids=PAIRS)
+def test_a_change_to_never_is_the_largest_of_rtol(one, other, words):
+    solver = Adaptive(rtol=1e-5)
+    run: Any = SimpleNamespace(metrics={"settling_time": np.float64(other)})
+    lines = describe_loose_metrics({"settling_time": np.float64(one)}, solver, lambda finer: run)
+    assert [line.partition("changes ")[2].partition(":")[0] for line in lines] == words

@@ -1,12 +1,17 @@
 """`diffabs sweep` and `diffabs compare`, in this process: what the tables say, on sweeps of a few lanes."""
 
 import json
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from commands import run
+from mutants import killed_by
 from scipy.stats import t
 
+from diffabs.cli.compare import _compare_metrics
+from diffabs.cli.show_samples import show_comparison
 from diffabs.sweep import Results
 
 # one worker makes what these share
@@ -55,6 +60,24 @@ def test_a_comparison_is_sample_by_sample(swept):
     spread = np.std(b - a, ddof=1) / np.sqrt(24)
     width = row["difference"]["high"] - row["difference"]["low"]
     assert width == pytest.approx(2 * t.ppf(0.975, 23) * spread, rel=1e-9)
+
+
+@killed_by("cli/compare.py", "if len(before) >= FEWEST:", "if len(before) < FEWEST:")
+def test_a_metric_of_few_runs_has_a_row(capsys):
+    """Three of five samples reach the event in both sweeps, and every sample has the other metric."""
+    stop = np.array([1.0, np.inf, 2.0, 3.0, 1.5])
+    table = {"stop_time": stop, "iae": np.arange(5.0), "diverged": np.zeros(5, bool)}
+    a: Any = SimpleNamespace(column=table.__getitem__, accepted=np.ones(5, bool))
+    other = table | {"stop_time": np.where(np.arange(5) == 4, np.inf, stop), "iae": np.arange(5.0) + 2}
+    b: Any = SimpleNamespace(column=other.__getitem__, accepted=np.ones(5, bool))
+    found = _compare_metrics(a, b, ["stop_time", "iae"])
+    row = found["metrics"]["stop_time"]
+    assert (row["samples"], row["never"], row["difference"], row["first"]) == (3, 2, None, None)
+    assert (found["metrics"]["iae"]["samples"], found["metrics"]["iae"]["difference"]["value"]) == (5, 2.0)
+    show_comparison({"first": "a", "second": "b", **found})
+    shown = capsys.readouterr()
+    assert "stop_time" in shown.out
+    assert shown.err.startswith("warning: stop_time is finite in 3 common samples: too few for statistics\n")
 
 
 def test_only_common_samples_are_compared(swept):

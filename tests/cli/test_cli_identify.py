@@ -16,7 +16,7 @@ from diffabs.cli import identify as commands_identify
 from diffabs.core.protocols import BrakeOutput
 from diffabs.identify.fit import Identified
 from diffabs.identify.uncertainty import uncertainty
-from diffabs.scenario.measurements import read_measurements
+from diffabs.scenario.measurements import Readings, read_measurements
 from diffabs.scenario.scenario import ScenarioError, load
 from diffabs.simulate.types import FixedStep
 from diffabs.tune import Reason
@@ -310,3 +310,28 @@ def test_a_trajectory_is_as_long_as_the_data(small, csv):
     assert long.steps == 300_002
     assert long.every == 16
     assert commands_identify._solver(FixedStep(0.1, 0.3), readings).duration == pytest.approx(0.3)
+
+
+@killed_by("cli/identify.py", "end * (1 + FILE_ROUNDING)", "end", case="product")
+@killed_by("cli/identify.py", "end * (1 + FILE_ROUNDING)", "end", case="thirds")
+@pytest.mark.parametrize(("step", "duration"), [(3e-4, 3.0), (2 / 3, 2 / 3)], ids=["product", "thirds"])
+def test_the_last_instant_of_a_file_is_in_the_run(step, duration):
+    """10,000 times 3e-4 is less than 3, and a file has 0.666666666667 for two thirds."""
+    last = float(f"{duration:.12g}")
+    found = commands_identify._solver(FixedStep(step, duration), Readings(np.array([0.0, last]), {}))
+    assert last <= found.duration <= duration * (1 + 1e-11)
+    longer = Readings(np.array([0.0, 1.01 * duration]), {})
+    assert commands_identify._solver(FixedStep(step, duration), longer).duration <= duration * (1 + 1e-11)
+
+
+@killed_by("scenario/measurements.py", "if i not in unlimited})", "})")
+@killed_by("scenario/measurements.py", "        if j not in unlimited:", "        if True:")
+def test_a_limit_that_a_simulation_lacks_is_not_measured(csv):
+    rows = ("t [s],psi [rad],current_max [A]", "0,0.1,inf", "0.1,0.2,inf")
+    units = {"psi": "rad", "current_max": "A"}
+    assert list(read_measurements(csv(*rows), units).columns) == ["psi"]
+    for wrong in ((*rows[:2], "0.1,0.2,3"), (rows[0], "0,0.1,3", rows[2]), (*rows[:2], "0.1,inf,inf")):
+        with pytest.raises(ScenarioError, match="= inf is outside"):
+            read_measurements(csv(*wrong), units)
+    with pytest.raises(ScenarioError, match="line 2: psi"):
+        read_measurements(csv("t [s],psi [rad]", "0,inf"), units)

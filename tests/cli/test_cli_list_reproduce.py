@@ -172,6 +172,15 @@ def test_reproduce_leaves_other_peoples_folders_alone(papers, tmp_path):
     assert_one_error_line(run("reproduce", "slip-lmi", "--out", tmp_path / "slip-lmi" / "thesis.tex", status=2))
 
 
+@killed_by("cli/targets.py", 'not there & {"manifest.json", "chunks"}', "True")
+@pytest.mark.parametrize("sweeps", ["manifest.json", "chunks"])
+def test_reproduce_leaves_a_sweep_alone(papers, tmp_path, sweeps):
+    (tmp_path / "slip-lmi" / sweeps).mkdir(parents=True)
+    (tmp_path / "slip-lmi" / "summary.json").write_text("of a sweep")
+    assert_one_error_line(run("reproduce", "slip-lmi", "--out", tmp_path, status=2))
+    assert left_in(tmp_path / "slip-lmi") == {sweeps, "summary.json"}
+
+
 def test_reproduce_an_unknown_paper(papers, tmp_path):
     result = run("reproduce", "slip-lim", "--out", tmp_path / "out", status=2)
     assert_one_error_line(result)

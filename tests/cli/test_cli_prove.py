@@ -5,12 +5,16 @@ import pathlib
 import re
 from collections.abc import Iterator
 from fractions import Fraction
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from commands import run
 from marks import cases
 from mutants import killed_by
 
+from diffabs.cli.prove import _document
 from diffabs.cli.show import show_verification
 from diffabs.cli.show_proofs import show_box_proof
 from diffabs.scenario.outside import lend_modules
@@ -109,6 +113,18 @@ def test_the_table_of_a_proof_has_units_and_no_negative_zero(capsys: pytest.Capt
     shown = capsys.readouterr().out
     assert "proved for every initial.speed 5 to 10 m/s, reference.slip 0.1 to 0.2\n" in shown
     assert "-0" not in shown
+
+
+@killed_by("cli/prove.py", "if worst and math.isfinite(high)", "if math.isfinite(high)")
+def test_a_bound_around_zero_has_no_relative_looseness() -> None:
+    empty = np.zeros((0, 1, 2))
+    proof: Any = SimpleNamespace(
+        **{"bounds": {"greatest slip": (0.0, 0.01)}, "left": empty, "cells": empty, "refuting": None},
+        **{"verdict": "proved", "tried": 1, "seconds": 0.0},
+    )
+    chosen, box = load("slip-lmi", integrated=False), {"plant.mass": (5.0, 6.0)}
+    found = [_document(proof, chosen, box, [], {"greatest slip": (0.0, worst)}) for worst in (0.0, 0.008)]
+    assert [one["bounds"]["greatest slip"]["looseness"] for one in found] == [None, pytest.approx(0.25)]
 
 
 @killed_by("cli/show.py", 'if result.get("complete", True) else', "if True else")

@@ -476,6 +476,19 @@ def test_interrupted_while_it_certifies_it_shows_what_was_found(small, invented,
     assert (tmp_path / "out.toml").exists()
 
 
+@killed_by("cli/tune.py", '"met": False, "missed": None}', '"met": False}')
+def test_interrupted_while_it_certifies_what_is_asked_for(small, invented, tmp_path, monkeypatch):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    replace_seam(monkeypatch, "build_proof_task", lambda chosen: types.SimpleNamespace(polytope=None))
+    replace_seam(monkeypatch, "certify_result", interrupted)
+    result = run("tune", small, "--set", "tune.decay=9", "--out", tmp_path / "out.toml", status=130)
+    assert re.search(r"certified decay │ 9 +│ +│ +│ NO, not known │", result.stdout)
+    assert result.stderr.endswith("not met: certified decay not known, so that no file is written\n")
+    assert left_in(tmp_path) == {"small.toml"}
+
+
 def test_interrupted_while_it_draws_there_is_no_picture(small, invented, tmp_path, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt

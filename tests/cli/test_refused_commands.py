@@ -79,6 +79,12 @@ REFUSALS = [
     ("prove slip-cured --over controller.period=1e-3:2e-3", 2, ["no rule for a range of periods or delays"]),
     ("prove slip-real --over plant.mass=5:6", 2, ["ticks with the integration grid"]),
     ("prove slip-estimator --over plant.mass=12:13", 2, ["has events"]),
+    # margins
+    (
+        "margins slip-lmi --set reference=setpoint --set reference.value=0.2 --set design.over.reference.slip=0.1,0.2",
+        2,
+        ["design.over.reference.slip is a parameter of the linear model, but not of this loop"],
+    ),
     # export
     ("export slip-cured --to cc", 2, ["error: --to: 'cc' is not one of 'c', 'st', 'table', 'fmu'"]),
     ("export slip-cured --given slip", 2, ["error: --given: 'slip' is not one of 'target'"]),
@@ -212,7 +218,7 @@ REFUSALS = [
         ["controller.gain.1 = -70 is outside (-60, -20) N m/s, N m, its range in"],
     ),
     (
-        "tune tune.toml --set tune.free.plant.mass=5.3,6",
+        "tune tune.toml --set tune.over={} --set tune.free.plant.mass=5.3,6",
         2,
         ["plant.mass = 5.3 is outside (5.3, 6) kg, its range in tune.free"],
     ),
@@ -298,6 +304,12 @@ REFUSALS = [
     "if os.path.isfile(source) and",
     "if False and",
     case="design tune.toml --out tune.toml",
+)
+@killed_by(
+    "scenario/section_design.py",
+    "            if path not in known:",
+    "            if False:",
+    case="margins slip-lmi --set reference=setpoin",
 )
 @killed_by("cli/usage.py", "(Value error, )?", "", case="export slip-cured --to cc")
 @killed_by("cli/rare.py", "if not math.isfinite(value):", "if False:", case="rare rare.toml overshoot=nan")

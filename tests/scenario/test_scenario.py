@@ -14,6 +14,7 @@ from diffabs.scenario import registry, scenario
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import dump, load, names
 from diffabs.scenario.section_design import DesignTask
+from diffabs.scenario.section_sweep import build_study
 from diffabs.scenario.section_tune import Goal
 from diffabs.simulate.types import Adaptive, FixedStep
 from diffabs.tune import risk
@@ -512,3 +513,59 @@ def test_the_key_of_a_run_is_that_of_jax(seed):
     found, wanted = scenario.Scenario("mine", seed=seed).key(), jax.random.key(seed)
     assert found.dtype == wanted.dtype
     np.testing.assert_array_equal(jax.random.key_data(found), jax.random.key_data(wanted))
+
+
+@killed_by("scenario/scenario.py", 'keys[:-1] if place == "type" else keys', "keys")
+@killed_by("scenario/scenario.py", "isinstance(part, str) and part != old_type", "isinstance(part, str)")
+def test_a_type_alone_replaces_a_part_too():
+    assert "reference.time_constant" in load("slip-cured").tune.free
+    found = load("slip-cured", ["reference.type=limited-slip"])
+    assert "reference.time_constant" not in found.tune.free
+    removes = "removes tune.free.reference.time_constant of the replaced part"
+    assert found.notes == (f"reference.type=limited-slip {removes}",)
+    assert load("slip-cured", ["reference=limited-slip"]).notes == (f"reference=limited-slip {removes}",)
+    same = load("slip-cured", ["reference.type=filtered-slip"])
+    assert "reference.time_constant" in same.tune.free
+    assert same.notes == ()
+
+
+# What varies in a sweep
+
+
+@killed_by("scenario/parameter_paths.py", 'f"{path}.".startswith("plant.road.")', 'path.startswith("plant.road.")')
+def test_a_choice_of_roads_is_written_and_read(file):
+    there = load("slip-lmi", ['sweep.over={road=["rig", "snow"], plant={mass=[5.3, 6.2]}}'])
+    again = load(file(dump(there)))
+    assert dump(dataclasses.replace(again, name=there.name)) == dump(there)
+    assert list(again.sweep.over) == ["plant.road", "plant.mass"]
+    assert again.sweep.over["plant.road"].parts["snow"] is roads.SNOW
+
+
+@killed_by("scenario/section_sweep.py", "design=_read_design", "design=sampling.read_sampling_design", case="nested")
+@killed_by("scenario/section_sweep.py", "paths = _loop_paths(levels,", "paths = list(levels) or _loop_paths(levels,")
+@pytest.mark.parametrize(
+    "levels",
+    [
+        '{"plant.road.w4"=3, "initial.speed"=2}',
+        '{"road.w4"=3, "initial.speed_kmh"=2}',
+        "{road={w4=3}, initial.speed=2}",
+    ],
+    ids=["loop", "short", "nested"],
+)
+def test_levels_of_a_grid_have_the_paths_of_what_varies(file, levels):
+    over = '"road.w4" = [0.3, 0.4]\n"initial.speed_kmh" = [20, 40]'
+    chosen = load(file(f'plant = "mirrored-rig"\n[sweep]\ndesign = {{type = "grid", levels = {levels}}}\n'
+                       f"[sweep.over]\n{over}"))  # fmt: skip
+    assert chosen.sweep.design.levels == {"plant.road.w4": 3, "initial.speed": 2}
+    assert build_study(chosen).samples == 6
+    assert load(file(dump(chosen))).sweep.design == chosen.sweep.design
+
+
+@killed_by("scenarios/literature-mathworks.toml", "0.249960856269", "0.249958735168", case="dry")
+@pytest.mark.parametrize(
+    ("name", "share"), [("literature-mathworks", 1.0), ("literature-vipulsree", 0.8)], ids=["dry", "case 1"]
+)
+def test_the_load_of_a_quarter_car_in_feet(name, share):
+    """32.18 ft/s2 of 0.3048 m, for a road whose weight is m times 9.81 m/s2."""
+    scale = load(name, integrated=False).loop.plant.road.scale
+    assert scale == pytest.approx(share * 32.18 * 0.3048 / 9.81 / 4, rel=1e-11)

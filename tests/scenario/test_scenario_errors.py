@@ -322,3 +322,26 @@ def test_too_many_combinations(file):
 def test_a_start_that_overflows_is_refused_in_a_line():
     with pytest.raises(ScenarioError, match="initial is at the stop or beyond"):
         load("arm-balance", ["initial.theta=1e300"])
+
+
+@killed_by("scenario/section_sweep.py", "if lines := missing_inner_parts(family, item,", "if lines := () and (item,")
+@killed_by("scenario/registry.py", "if inner is None or", "if")
+@pytest.mark.parametrize(
+    "choice", ['"sampled"', "{type='sampled', period=1e-3}", "{type='sampled', controller={kp=1}}"]
+)
+def test_a_choice_of_a_sweep_names_the_part_inside(choice):
+    """Without it half of the runs would have the default controller."""
+    line = message("slip-lmi", f"sweep.over.controller=['state-feedback', {choice}]")
+    assert line == ("sweep.over.controller.1.controller is missing: sampled encloses another controller; give its type")
+    inside = "{type='sampled', controller='state-feedback'}"
+    assert set(load("slip-lmi", [f"sweep.over.controller=['pid', {inside}]"]).sweep.over["controller"].parts) == {
+        "pid",
+        "1",
+    }
+
+
+def test_a_grid_of_what_does_not_vary():
+    line = message("slip-lmi", "sweep.design={type='grid', levels={initial.sped=3}}")
+    assert 'sweep.design.levels: "initial.sped" does not vary; did you mean initial.speed?' in line
+    twice = "sweep.design={type='grid', levels={'initial.speed'=3, 'initial.speed_kmh'=3}}"
+    assert message("slip-lmi", twice) == "sweep.design.levels: a speed is given twice, in m/s and in km/h"

@@ -8,6 +8,8 @@ import re
 import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -230,6 +232,52 @@ def test_a_half_step_of_a_sweep_with_a_gap(study, swept, tmp_path):
     assert found["metrics"]["iae"]["largest"] < 1e-3
 
 
+@killed_by("sweep/checking.py", "for name, one in turned.items() if one", "for name, one in turned.items() if not one")
+@pytest.mark.slow
+def test_a_half_step_that_turns_never_into_a_number(study, swept):
+    """The table says "never" of two of the repeated runs, which have a number with the half step."""
+    study = dataclasses.replace(study, objectives={"overshoot": study.objectives["overshoot"]})
+    columns = {name: swept.column(name) for name in ("sample", "stopped", "diverged", "refused", "overshoot")}
+    table: Any = SimpleNamespace(metrics=["overshoot"], column=columns.__getitem__)
+    repeated = check_accuracy(study, table, 3)["samples"]
+    columns["overshoot"] = np.where(np.isin(columns["sample"], repeated[:2]), np.inf, columns["overshoot"])
+    found = check_accuracy(study, table, 3)
+    assert found["turned"] == {"overshoot": {"count": 2, "samples": repeated[:2]}}
+    assert found["metrics"]["overshoot"]["sample"] == repeated[2]
+
+
+@killed_by("simulate/types.py", "said if solver.kinks is None else", "said if True else")
+def test_steps_on_kinks_are_another_sweep(study, tmp_path):
+    """Without a choice the table stays that of older versions, whose sweeps can be continued."""
+    entries = {}
+    for kinks in (None, True, False):
+        solver = d.FixedStep(2e-3, 0.25, kinks=kinks)
+        entries[kinks] = dataclasses.replace(study, solver=solver).table()["solver"]
+    assert entries[None] == {"step": 2e-3, "duration": 0.25}
+    Store(tmp_path).begin(manifest(2, 1, solver=entries[True]), resume=False)
+    Store(tmp_path).begin(manifest(2, 1, solver=entries[True]), resume=True)
+    for kinks, said in ((False, "false"), (None, "null")):
+        with pytest.raises(SweepError, match=f"study.solver.kinks is true there, {said} here"):
+            Store(tmp_path).begin(manifest(2, 1, solver=entries[kinks]), resume=True)
+
+
+@killed_by("cli/sweep.py", "report.check_target(out / report.DEFAULT_NAME)", "pass")
+def test_a_report_of_somebody_else_is_left_alone(file, swept, tmp_path):
+    folder = shutil.copytree(swept.folder, tmp_path / "out")
+    (folder / "report.html").write_text("mine")
+    result = run("sweep", file(SMALL), "--out", folder, "--resume", "--figures", status=2)
+    assert_one_error_line(result)
+    assert "report.html: exists and is not an earlier report" in result.stderr
+    assert (folder / "report.html").read_text() == "mine"
+
+
+@killed_by("cli/sweep.py", "        if chosen.seed:", "        if False:")
+def test_the_seed_of_a_single_run_has_no_effect_and_that_is_said(file, tmp_path):
+    (tmp_path / "notes.tmp").write_text("mine")
+    result = run("sweep", file(SMALL), "--out", tmp_path, "--set", "solver.seed=5", status=2)
+    assert "note: solver.seed = 5 has no effect: sweep.seed decides the noise of a sweep\n" in result.stderr
+
+
 def test_a_finished_sweep_is_not_computed_again(study, swept):
     class Nobody:
         def run(self, *_):
@@ -373,6 +421,7 @@ def test_the_command_computes_the_table(by_command, swept):
         assert tables_digest([found.table().slice(0, 64)]) == tables_digest([swept.table().slice(0, 64)])
 
 
+@killed_by("cli/main.py", '"seed": chosen.sweep.seed', '"seed": chosen.seed')
 @pytest.mark.slow
 def test_a_sample_that_is_simulated_again_is_its_row(by_command):
     folder, document, _ = by_command
@@ -381,6 +430,7 @@ def test_a_sample_that_is_simulated_again_is_its_row(by_command):
     tolerance = TOLERANCE if table["iae"].dtype == float else {"rtol": 1e-4, "atol": 2e-5}
     for number, status in ((good, 0), (bad, 1)):
         again = json.loads(run("simulate", "--from-sweep", folder, "--sample", number, "--json", status=status).stdout)
+        assert (again["solver"]["seed"], again["sample"]) == (None, {"sweep": str(folder), "seed": 3, "number": number})
         assert (again["stopped"], again["diverged"]) == tuple(table.loc[number, ["stopped", "diverged"]])
         for name, value in again["metrics"].items():
             np.testing.assert_allclose(math.nan if value is None else value, table.loc[number, name], **tolerance)

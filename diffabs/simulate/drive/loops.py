@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.lanes import any_lane, rematerialise
-from diffabs.core.types import Bool, Int, PyTree
+from diffabs.core.types import Array, Bool, Int, PyTree
 
 X = TypeVar("X")
 Carry = Any  # pytree of the stepping method, with an attribute `running`
@@ -228,7 +228,7 @@ def log_run(
 def replay_log(
     step: Callable[[Carry, PyTree], Carry],
     keep: Callable[[Carry], PyTree],
-    taken: Callable[[PyTree], Bool],
+    taken: Callable[[PyTree], Array],
     carry: Carry,
     log: PyTree,
 ) -> tuple[Carry, PyTree]:
