@@ -39,11 +39,10 @@ def larger(x: Scalar, y: Scalar) -> Scalar:
 
 
 def later_of_larger(x: Scalar, y: Scalar, falls: Scalar = False) -> PyTree:
-    """Return max(x, y) of two successive values of a signal; where both are equal to rounding, return y.
+    """Return max(x, y) of two successive values of a signal; where both are equal to rounding, it moves as y.
 
-    The choice decides the derivative. At the end of a step of zero length, y moves with the event there, and x does
-    not. If the signal falls at x, the function returns x instead. So a peak at an event just before a grid instant does
-    not move with the grid.
+    At the end of a step of zero length, y moves with the event there, and x does not. If the signal falls at x, the
+    result moves as x instead. So a peak at an event just before a grid instant does not move with the grid.
 
     Args:
         x: Earlier value.
@@ -52,7 +51,10 @@ def later_of_larger(x: Scalar, y: Scalar, falls: Scalar = False) -> PyTree:
     """
     rounding = EQUAL_EPS * jnp.finfo(jnp.result_type(x, y)).eps * jnp.abs(x)
     more = jnp.where(falls, rounding, -rounding)
-    return jnp.where(jnp.greater_equal(y, x + more), y, x)
+    chosen = jnp.where(jnp.greater_equal(y, x + more), y, x)
+    # The value is the larger one also within the rounding: a maximum of many values would follow a slow decline.
+    short = jnp.where(jnp.greater(y, x), y, x) - chosen
+    return chosen + jax.lax.stop_gradient(jnp.where(jnp.greater(short, 0), short, 0.0))
 
 
 def smaller(x: Scalar, y: Scalar) -> Scalar:

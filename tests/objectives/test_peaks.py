@@ -12,6 +12,7 @@ from diffabs import actuators, controllers, objectives, plants, references, sens
 from diffabs.core.blocks import Series
 from diffabs.core.cubic import Cubic
 from diffabs.core.messages import Segment
+from diffabs.core.numerics import later_of_larger
 from diffabs.core.protocols import Shown
 from diffabs.objectives import PeakVoltage
 
@@ -154,3 +155,28 @@ def test_a_cubic_without_a_root_returns_its_end():
 
     assert jax.jvp(place, (1.0,), (1.0,)) == (1.0, 0.0)
     assert jax.jvp(place, (-1.0,), (1.0,))[0] < 1.0
+
+
+@killed_by("core/cubic.py", "jnp.where(falls, c1, -c2 - bend), jnp.where(falls, bend - c2, 3.0 * c3)", "c1, bend - c2")
+@killed_by(
+    "core/cubic.py", "inside = (square > 0) & (x > 0) & (x < 1)", "inside = (square > 0) & (x > 0) & (x < 1) & (c1 > 0)"
+)
+def test_the_greatest_value_of_any_cubic():
+    """Against NumPy's roots; some values and slopes at the ends are zero, as in a step from rest."""
+    random = np.random.default_rng(5)
+    ends = random.normal(size=(200, 4)) * (random.random((200, 4)) > 0.2)
+    found = jax.vmap(lambda one: Cubic(*one).greatest())(jnp.asarray(ends))
+    for (a, b, da, db), greatest in zip(ends, found, strict=True):
+        curve = np.polynomial.Polynomial([a, da, 3 * (b - a) - 2 * da - db, 2 * (a - b) + da + db])
+        inside = [x.real for x in curve.deriv().roots() if abs(x.imag) < 1e-6 and 0 < x.real < 1]
+        np.testing.assert_allclose(greatest, max(a, b, *curve(np.array(inside))), rtol=1e-9, atol=1e-12)
+
+
+@killed_by("core/numerics.py", "jnp.where(jnp.greater(short, 0), short, 0.0)", "0.0")
+def test_a_maximum_does_not_follow_a_slow_decline():
+    """In single precision 0.9999 is equal to 1 within the rounding that decides about derivatives."""
+
+    def follow(held, k):
+        return later_of_larger(held, jnp.float32(0.9999) ** k), None
+
+    assert jax.lax.scan(follow, jnp.float32(1.0), jnp.arange(5000.0, dtype=jnp.float32))[0] == 1.0
