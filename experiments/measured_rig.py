@@ -283,7 +283,8 @@ def diagnosis(first: Record, second: Record, rig: LabRig, found: Identified) -> 
             **{path.rpartition(".")[2]: f"{float(value):.4g} +- {deviations[path]:.1g}"
                for path, value in one.values.items()},
             "wheel 1 [%]": errors[0].wheel_rms_percent, "wheel 2 [%]": errors[1].wheel_rms_percent,
-            "cycles 2": errors[1].cycles, "stop 1 [s]": errors[0].stop_time, "stop 2 [s]": errors[1].stop_time,
+            "cycles 2": errors[1].cycles, "stop 1 [s]": record.format_time(errors[0].stop_time),
+            "stop 2 [s]": record.format_time(errors[1].stop_time),
         })  # fmt: skip
     return rows
 

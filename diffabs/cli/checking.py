@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from diffabs.config.values import ScenarioError
 from diffabs.core.types import JsonObject, Key, Params
 from diffabs.runtime.summary import round_for_table
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, measure_finer, needs_key
+from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, needs_key
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.run import measure
 from diffabs.simulate.types import Adaptive, Run, Solver, describe_solver, differs_in_kind, refine_solver
@@ -69,24 +69,17 @@ def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
         "comparable": not why,
         "reasons": why,
         "ended alike": bool(found.alike),
-        "turned": [] if why or not found.alike else _find_turned(chosen, key, metrics),
+        "turned": [name for name, one in found.estimates.items() if one.turned],
         "metrics": metrics,
     }
-
-
-def _find_turned(chosen: Scenario, key: Key, rows: Mapping[str, JsonObject]) -> list[str]:
-    """Return the metrics that a shorter step turns from a number into "never" or NaN, or back."""
-    suspects = {name: row["value"] for name, row in rows.items() if math.isnan(row["difference"])}
-    times = (2, FINEST) if suspects else ()
-    runs = [measure_finer(chosen.loop, chosen.solver, chosen.objectives, n, key=key) for n in times]
-    return [name for name, one in suspects.items() if any(differs_in_kind(one, run.metrics[name]) for run in runs)]
 
 
 def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
     """Return a list of one line that names the metrics which depend on `rtol`; the list is empty without such metrics.
 
     The run is made again with `rtol` / 16. A change is reported if it exceeds 100 `rtol` of the metric's new value, or
-    of 0.01 if that value is smaller. Such a run chatters, or amplifies its errors.
+    of 0.01 if that value is smaller. Such a run chatters, or amplifies its errors. A closer run that diverges has no
+    metrics to compare, and the line says so.
 
     Args:
         metrics: Metrics of the run by name.
@@ -94,8 +87,10 @@ def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[S
         again: Function that makes the run again with another solver.
     """
     closer = dataclasses.replace(solver, rtol=solver.rtol / CLOSER)
-    found = []
-    for name, other in again(closer).metrics.items():
+    finer, found = again(closer), []
+    if finer.diverged:
+        return [f"the run diverges with solver.rtol = {closer.rtol:.2g}: its metrics cannot be trusted"]
+    for name, other in finer.metrics.items():
         one, other = float(metrics[name]), float(other)
         if differs_in_kind(one, other):
             found.append(f"{name} from {_format_value(one)} to {_format_value(other)}")
@@ -125,9 +120,8 @@ def describe_check(found: JsonObject) -> list[str]:
     loose = [name for name, row in rows if not row["converges"] and row["error"] > least[name]]
     if found["comparable"] and loose:
         lines.append(f"shorter steps do not converge for {', '.join(loose)}: the error is a guess")
-    if found["turned"]:
-        lines.append(f"a shorter step turns {', '.join(found['turned'])} from a number into never, or back")
-    return lines
+    never = "is finite with one step and never with another: its value cannot be trusted"
+    return [*lines, *(f"{name} {never}" for name in found["turned"])]
 
 
 def _run_in_single_precision(chosen: Scenario) -> dict[str, float]:

@@ -95,7 +95,11 @@ def identify(
 def _compared_columns(data: pathlib.Path, names: Sequence[str] | None, units: Mapping[str, str]) -> Readings:
     """Return the columns of a file that are compared."""
     readings = read_measurements(data, units)
+    if readings.infinite and not names:
+        console.say(f"note: {', '.join(readings.infinite)} is infinite in every row of the data, and is not compared")
     for name in names or ():
+        if name in readings.infinite:
+            raise ScenarioError(f"--column {name} is infinite in every row of the data")
         if name not in readings.columns:
             raise unknown_name_error(f"--column {format_given(name)} is not in the data", name, readings.columns)
     columns = {name: readings.columns[name] for name in names or readings.columns}
@@ -180,12 +184,12 @@ def _fit(
     from diffabs.identify.identification import identify
     from diffabs.identify.traces import Traces
 
-    solver, columns = _solver(chosen.solver, readings), readings.columns
+    (solver, t), columns = _match_times(chosen.solver, readings.t), readings.columns
 
     def fit_traces(
         noise: Mapping[str, float], starts: Sequence[PyTree] = (), absolute: bool = bool(given)
     ) -> tuple["Identified", dict[str, np.ndarray]]:
-        traces = Traces(t=readings.t, columns=columns, sigma=noise)
+        traces = Traces(t=t, columns=columns, sigma=noise)
         options = {"solver": solver, "absolute": absolute, "starts": starts}
         found = identify(chosen.loop, traces, dict(ranges), **options, progress=told, stopping=stopping)
         return found, traces.residuals(found)
@@ -209,16 +213,17 @@ def _fit(
     return dataclasses.replace(found, evaluations=evaluations), noise
 
 
-def _solver(solver: Solver, readings: Readings) -> Solver:
-    """Return the solver with the duration of the data, and at most `MAX_DATA_ROWS` instants."""
-    steps = math.ceil(float(readings.t[-1]) / solver.step) + SPARE
-    duration = steps * solver.step
-    if duration >= solver.duration:
-        steps = solver.steps
-        # The product may be less than the duration by a rounding, and a file has the last instant in 12 digits.
-        end = steps * solver.step
-        duration = max(end, min(float(readings.t[-1]), end * (1 + FILE_ROUNDING)))
-    return dataclasses.replace(solver, duration=duration, every=max(1, math.ceil(steps / MAX_DATA_ROWS)))
+def _match_times(solver: Solver, t: np.ndarray) -> tuple[Solver, np.ndarray]:
+    """Return a solver whose whole steps cover the instants `t`, but not more steps than the given solver's, and `t`.
+
+    The solver keeps at most `MAX_DATA_ROWS` instants. The last instant becomes its end if it exceeds that only by the
+    rounding of a file.
+    """
+    steps = min(math.ceil(float(t[-1]) / solver.step) + SPARE, solver.steps)
+    end = steps * solver.step
+    solver = dataclasses.replace(solver, duration=end, every=max(1, math.ceil(steps / MAX_DATA_ROWS)))
+    # A file has an instant in 12 digits, and the product of the steps may be less than the duration by a rounding.
+    return solver, np.where(t <= end * (1 + FILE_ROUNDING), np.minimum(t, end), t)
 
 
 def _root_mean_square(values: np.ndarray) -> float:

@@ -50,6 +50,7 @@ def rare(
 
         engines.check_engine_name(engine)
         chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
+        show_samples.say_unused_seed(chosen)
         metric, bound = _read_failure(failure, chosen)
         if samples < 20 or samples % 10:
             console.fail(f"--samples {samples} is not a multiple of 10 in [20, inf)")
@@ -87,10 +88,6 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
 
     levels: list[SubsetProgress] = []
 
-    def note(level: "SubsetProgress") -> None:
-        # The last level of a strict bound has the next number as its threshold, 5e-324 for a bound of zero.
-        levels.append(level._replace(threshold=min(level.threshold, bound)))
-
     def far() -> str:
         if not levels:
             return f"level 1, {progress.COMPILING}"
@@ -99,7 +96,7 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
     try:
         return console.run_with_progress(
             lambda: failure_probability(
-                study, metric, bound, gradients=gradients, samples=samples, seed=study.seed, progress=note
+                study, metric, bound, gradients=gradients, samples=samples, seed=study.seed, progress=levels.append
             ),
             "looking for failures",
             far,
@@ -108,8 +105,9 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
         if not levels:
             raise
         probability, last = math.prod(level.share for level in levels), levels[-1]
-        reached = f"{metric} >= {last.threshold:.4g} has a probability of about {probability:.2g}"
-        console.say(f"interrupted: {reached}, by {last.evaluations:,} runs")
+        reached = f"{metric} {'>' if last.strict else '>='} {last.threshold:.4g}"
+        found = f"{reached} has a probability of about {probability:.2g}"
+        console.say(f"interrupted: {found}, by {last.evaluations:,} runs")
         raise typer.Exit(console.INTERRUPTED) from None
     except DivergenceError as error:
         console.fail(str(error), console.FAILED)

@@ -60,7 +60,8 @@ def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, tit
         text = made([one for source in sources for one in find_documents(source)], title)
     except ReportError as error:
         raise ScenarioError(str(error)) from None
-    files.write_file(target, text.encode())
+    # Half of a surrogate pair (in JSON, in a file name) has no UTF-8; readers of HTML show its reference as U+FFFD.
+    files.write_file(target, text.encode(errors="xmlcharrefreplace"))
 
 
 def check_target(target: pathlib.Path) -> None:

@@ -103,10 +103,11 @@ def show_rare_event(result: JsonObject, chosen: Scenario) -> None:
         result: JSON document of the probability.
         chosen: Scenario.
     """
-    levels = Table("level", "at least", "share", "coefficient of variation", "accepted", "diverged")
+    levels = Table("level", "metric", "share", "coefficient of variation", "accepted", "diverged")
     for i, row in enumerate(result["levels"], 1):
-        names = ("threshold", "share", "cov", "acceptance")
-        levels.add_row(str(i), *(f"{row[name]:.4g}" for name in names), str(row["diverged"]))
+        reached = f"{'>' if row['strict'] else '>='} {row['threshold']:.4g}"
+        numbers = (f"{row[name]:.4g}" for name in ("share", "cov", "acceptance"))
+        levels.add_row(str(i), reached, *numbers, str(row["diverged"]))
     show_titled_table(
         f"{chosen.title or chosen.name}: {result['metric']} > {result['bound']:g} {result['unit']}", levels
     )
@@ -144,6 +145,8 @@ def show_comparison(result: JsonObject) -> None:
             table.add_row(name)
             say(f"warning: {name} is finite in {row['samples']} common samples: too few for statistics")
             continue
+        if row["never"]:
+            say(f"warning: {name} is infinite (never) in {row['never']} common samples: its statistics leave them out")
         less = f"{100 * row['share in which the second is less']['value']:.1f} %"
         means = (format_brief(row[key]) for key in ("first", "second"))
         table.add_row(name, *means, *_estimate(row["difference"]), less, format_brief(row["variance reduction"]))
@@ -154,6 +157,16 @@ def show_comparison(result: JsonObject) -> None:
 
 def _estimate(row: JsonObject) -> list[str]:
     return ["" if row[key] is None else format_brief(row[key]) for key in ("value", "low", "high")]
+
+
+def say_unused_seed(chosen: Scenario) -> None:
+    """Say that the seed of the solver has no effect on a study of samples, if a scenario gives one.
+
+    Args:
+        chosen: Scenario.
+    """
+    if chosen.seed:
+        say(f"note: solver.seed = {chosen.seed} has no effect: sweep.seed decides the noise of a sweep")
 
 
 def warn_of_strays(found: "Results") -> None:

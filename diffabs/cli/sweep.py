@@ -72,8 +72,7 @@ def sweep(
             scenario, console.add_option_overrides(changes, "sweep", samples=samples, seed=seed)
         )
         out = out or pathlib.Path("out") / f"sweep-{chosen.name}"
-        if chosen.seed:
-            console.say(f"note: solver.seed = {chosen.seed} has no effect: sweep.seed decides the noise of a sweep")
+        show_samples.say_unused_seed(chosen)
         if figures:
             report.check_target(out / report.DEFAULT_NAME)
         study = _with_engine(section_sweep.build_study(chosen), engine, out, resume, remote=scheduler is not None)

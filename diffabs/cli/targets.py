@@ -139,8 +139,8 @@ def new_target_file(target: pathlib.Path | None, option: str) -> Iterator[pathli
 def new_target_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yield a temporary folder beside `target` that replaces it at the end; an error discards it.
 
-    An empty folder or an older result (a folder with summary.json, but no sweep) is replaced. Any other content is left
-    alone.
+    An empty folder or an older result (a folder with summary.json that is not a sweep's) is replaced. Any other content
+    is left alone.
 
     Args:
         target: Folder to write.

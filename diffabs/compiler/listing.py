@@ -1,11 +1,12 @@
-"""A program as text, one line for each operation: what a pass receives and what it returns.
+"""A program as text, one line for each operation: the input and the result of a pass.
 
     v7 = mul c0.0, u1.0     f64, step
     c0.0 <- v7
 
 u1.0 is entry 0 of the uniform array 1, l0.2 entry 2 of the lane's array 0, and c0.0 entry 0 of the carry's array 0. The
-last word says how often the operation is computed: once a launch (uniform), once a lane, or in each step. An arrow says
-what a function writes into the carry. `select` and `gate` have the operands condition, value if false, value if true.
+last word says how often the operation is computed: once a launch (uniform), once a lane, or in each step. Numbers
+that a function writes into the carry have an arrow. `select` and `gate` have the operands condition, value if false,
+value if true.
 """
 
 from collections.abc import Iterator
@@ -105,7 +106,7 @@ def _operation(node: Node, names: dict[int, str]) -> str:
 
 
 def _arrows(program: ScalarProgram, function: str, names: dict[int, str]) -> Iterator[str]:
-    """Yield the lines for what a function returns: numbers of the carry that it changes, or if the lane goes on."""
+    """Yield the lines for the results of a function: numbers of the carry that it changes, or if the lane goes on."""
     results = program.results[function]
     if function == RUNNING_FUNCTION:
         yield f"-> {names[results[0].id]}"

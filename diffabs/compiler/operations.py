@@ -8,6 +8,7 @@ An operation without a template in a language has no translation to it. The node
 `select`, `gate`, `any` and `table` have no row: they need more than operands, so each back end translates them itself.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +55,11 @@ _C_MIN, _ST_MIN = "{0} != {0} || {0} < {1} ? {0} : {1}", "SEL(({0} <> {0}) OR ({
 _C_MAX, _ST_MAX = "{0} != {0} || {0} > {1} ? {0} : {1}", "SEL(({0} <> {0}) OR ({0} > {1}), {1}, {0})"
 # The conversion of IEC 61131-3 rounds to the nearest integer, half to even.
 _ST_RINT = "LINT_TO_{real}({real}_TO_LINT({0}))"
+# Near 0 the differences of exponentials cancel: Lambert's continued fraction and the power series do not.
+_ST_TANH = "{0} / " + functools.reduce(lambda rest, k: f"({k}.0 + {{0}} * {{0}} / {rest})", range(11, 0, -2), "13.0")
+_ST_SINH = "{0}" + functools.reduce(
+    lambda rest, k: f" * (1.0 + {{0}} * {{0}} / {k * (k + 1)}.0{rest})", range(12, 0, -2), ""
+)
 
 OPERATIONS: dict[str, Operation] = {
     "add": Operation(np.add, "{0} + {1}", "{0} + {1}", "{0} + {1}", symmetric=True),
@@ -98,9 +104,9 @@ OPERATIONS: dict[str, Operation] = {
     "atan": _function("atan", "ATAN(...)"),
     "atan2": _function("atan2", "ATAN2(...)", arity=2),
     "pow": _function("pow", "EXPT(...)", arity=2),
-    "sinh": _function("sinh", "(EXP({0}) - EXP(-{0})) / 2.0"),
+    "sinh": _function("sinh", f"SEL(ABS({{0}}) < 0.5, (EXP({{0}}) - EXP(-{{0}})) / 2.0, {_ST_SINH})"),
     "cosh": _function("cosh", "(EXP({0}) + EXP(-{0})) / 2.0"),
-    "tanh": _function("tanh", "1.0 - 2.0 / (EXP(2.0 * {0}) + 1.0)"),
+    "tanh": _function("tanh", f"SEL(ABS({{0}}) < 0.5, 1.0 - 2.0 / (EXP(2.0 * {{0}}) + 1.0), {_ST_TANH})"),
 }
 MIRRORED = {"gt": "lt", "ge": "le"}  # the same comparison with the operands exchanged
 NEGATED = {"eq": "ne", "ne": "eq"}  # not "lt" and "ge": both are false for NaN

@@ -107,7 +107,7 @@ def check_size(program: ScalarProgram, operations: int) -> ScalarProgram:
 def keep_read(program: ScalarProgram, arrays: Iterable[int]) -> ScalarProgram:
     """Return the program without updates of the carry that never influence `running` or the given arrays.
 
-    The result of such an update becomes its input, so the number stays as it is in the initial carry.
+    The result of such an update becomes its input, so the number keeps its initial value.
 
     Args:
         program: Program of functions that update the carry, and `running`.

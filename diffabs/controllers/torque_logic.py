@@ -74,7 +74,7 @@ class FourPhase:
         return 0.0 * self.torque_high, self.torque_high
 
     def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: PyTree) -> tuple[PyTree, PyTree]:
-        """Return what is left of a change of the torque [control], and the slip left of a hold [signal].
+        """Return the rest of a change of the torque [control], and the rest of the slip of a hold [signal].
 
         The margin that does not belong to the present phase is 1.
         """

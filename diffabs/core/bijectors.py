@@ -24,7 +24,7 @@ from diffabs.core.pytree import ParameterSpec, parameters, replace
 from diffabs.core.types import AnyArray, Part, PyTree, Scalar
 
 LOGARITHMIC_RATIO = 10.0  # ratio of the ends from which a range is mapped in the logarithm
-END_SHARE = 1e-9  # relative; the map is flat near an end, so a closer start could not leave it
+END_SHARE = 1e-9  # of a finite range as it is mapped: near an end the map is flat; of a lone end: rounding
 
 Range = tuple[Any, Any]
 RANGE_END_SHARE = 0.3  # spread in z on half lines, over that on finite ranges: exp(0.3 * 3.9) is about 3
@@ -200,8 +200,8 @@ class FreeSpace:
         values = [np.asarray(there[entry.path], float).ravel() for entry in self.entries]
         found = []
         for entry, numbers in zip(self.entries, values, strict=True):
-            for x, (low, high) in zip(numbers, entry.ranges, strict=True):
-                _check_inside(entry.path, float(x), low, high)
+            for x, m, ends in zip(numbers, entry.maps, entry.ranges, strict=True):
+                _check_inside(entry.path, float(x), m, ends)
             found.append(np.array([m.place(float(x)) for m, x in zip(entry.maps, numbers, strict=True)]))
         return np.concatenate(found)
 
@@ -262,16 +262,21 @@ def _entry(path: str, spec: ParameterSpec, value: np.ndarray, ends: Range | None
             raise ValueError(f"{path}: the range [{a:g}, {b:g}] is empty")
         if a < spec.low or b > spec.high:
             raise ValueError(f"{path}: the range [{a:g}, {b:g}] leaves the declared one, {spec.interval()}")
-        _check_inside(path, x, a, b)
         maps.append(bijection(a, b, x))
+        _check_inside(path, x, maps[-1], (a, b))
     return FreeParameter(
         path, value.shape, tuple(maps), tuple(zip(low.ravel().tolist(), high.ravel().tolist(), strict=True))
     )
 
 
-def _check_inside(path: str, value: float, low: float, high: float) -> None:
+def _check_inside(path: str, value: float, one: Bijection, ends: tuple[float, float]) -> None:
     """Raise a ValueError if a value is too close to an end of its range, or outside."""
-    ends = [end for end in (low, high) if math.isfinite(end)]
-    room = END_SHARE * (high - low if len(ends) == 2 else max(1.0, *map(abs, ends), 0.0) if ends else 1.0)
-    if not low + room <= value <= high - room:
+    (low, high), x = ends, value
+    inside = low < value < high
+    if inside and isinstance(one, Decades):
+        low, high, x = one.logarithm.low, one.logarithm.high, math.log(one.sign * value)
+    finite = [abs(end) for end in (low, high) if math.isfinite(end)]
+    room = END_SHARE * (high - low if len(finite) == 2 else sum(finite))
+    if not (inside and low + room <= x <= high - room):
+        low, high = ends
         raise ValueError(f"{path} = {value:g} is not inside ({low:g}, {high:g}): it cannot be moved from there")

@@ -1,7 +1,7 @@
 """Names of types for annotations. An array may be a tracer, and under `vmap` a number stands for a batch of numbers.
 
-An alias of Any says what a reader may expect. A part satisfies a contract by its methods and attributes. The structure
-of a pytree is the caller's.
+An alias of Any tells a reader the kind of value. A part satisfies a contract by its methods and attributes. The
+structure of a pytree is the caller's.
 """
 
 from collections.abc import Mapping

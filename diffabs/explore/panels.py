@@ -1,4 +1,4 @@
-"""What a chart shows: curves in panels, and the quantiles of many runs."""
+"""Contents of a chart: curves in panels, and the quantiles of many runs."""
 
 import dataclasses
 import math

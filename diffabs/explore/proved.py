@@ -1,4 +1,4 @@
-"""What a proof's file says about the values on the page: whether they lie in its box, and what is proved there."""
+"""A proof's file and the values on the page: whether they lie in its box, and the bounds proved there."""
 
 import pathlib
 from typing import NamedTuple
@@ -50,7 +50,7 @@ def judge_values(proved: ProvedBox, session: Session) -> ProofVerdict:
     """Return whether the current values of a session lie in the box of a proof: "certified", else "unknown".
 
     They do if each of the box's parameters lies in its range, and the duration and the rest of the loop are those of
-    the file's scenario. The sentence says what the file states, or which value differs.
+    the file's scenario. The sentence gives the file's bounds, or the value that differs.
 
     Args:
         proved: Proof's file.

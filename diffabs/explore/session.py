@@ -71,7 +71,7 @@ class Basis(NamedTuple):
 
 
 def load_basis(source: str, parts: Mapping[str, str] = MappingProxyType({})) -> Basis:
-    """Return the basis of a session, which may be run as it is.
+    """Return the basis of a session, which may be run unchanged.
 
     Args:
         source: Path or name of the scenario.

@@ -5,7 +5,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.types import AnyArray, JsonObject, Scalar
 from diffabs.export.device import NotExported, with_sampled_controller
-from diffabs.linear.opened_loop import open_loop
+from diffabs.linear.opened_loop import linear_controller
 
 ENTRY_ROUNDING = 1e-12  # relative to a matrix's largest coefficient; smaller coefficients are rounding errors
 
@@ -30,7 +30,7 @@ def difference_equations(loop: Loop, target: Scalar = None) -> JsonObject:
     """
     loop = with_sampled_controller(loop)
     try:
-        found = open_loop(loop, target).controller
+        found = linear_controller(loop, target)
     except ValueError as error:
         raise NotExported(str(error)) from None
     found = found._replace(**{name: _round_entries(getattr(found, name)) for name in "ABCD"})

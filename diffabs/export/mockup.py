@@ -7,6 +7,7 @@ the plant as C, so the FMU consists of its library, its source and a description
 import hashlib
 import importlib.resources
 import io
+import math
 import pathlib
 import platform
 import subprocess
@@ -49,11 +50,16 @@ def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, abou
         about: Description, one line.
 
     Raises:
+        ValueError: Step or duration is not positive and finite.
         NotExported: The name is no identifier, an operation has no translation, a state is not a real number, or no C
             compiler works.
     """
     if not is_name(name):
         raise NotExported(f"{name!r} is no name that C has for a function: letters, digits and _")
+    # As Python's numbers: the text of NumPy's has the name of the type.
+    step, duration = float(step), float(duration)
+    if not all(0 < x < math.inf for x in (step, duration)):
+        raise ValueError(f"step = {step!r} s, duration = {duration!r} s: positive and finite numbers are needed")
     about = make_printable(about)
     plant = plant_source(loop)
     # A digest instead of a random identifier: the same plant has the same GUID, and any change gives another one.
@@ -115,7 +121,6 @@ def _description(plant: PlantSource, name: str, guid: str, step: float, duration
     """Return modelDescription.xml."""
     root = xml.Element("fmiModelDescription", {
         **{"fmiVersion": "2.0", "modelName": name, "guid": guid, "generationTool": "diffabs", "description": about},
-        "variableNamingConvention": "structured",
     })  # fmt: skip
     simulation = xml.SubElement(root, "CoSimulation", {
         **{"modelIdentifier": name, "canHandleVariableCommunicationStepSize": "true"},

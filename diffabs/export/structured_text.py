@@ -252,7 +252,7 @@ def _fresh(path: str, taken: set[str]) -> str:
     name = re.sub(r"[\W_]+", "_", path, flags=re.ASCII).strip("_")
     name = f"x_{name}".strip("_") if name.lower() in ST_KEYWORDS or not name[:1].isalpha() else name
     number, fresh = 2, name
-    while fresh.lower() in taken:
+    while taken & (both := {fresh.lower(), f"{fresh}_table".lower()}):
         number, fresh = number + 1, f"{name}_{number}"
-    taken |= {fresh.lower(), f"{fresh}_table".lower()}
+    taken |= both
     return fresh

@@ -1,6 +1,6 @@
 """Protocol of measured data that `identify` can compare with a loop."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -53,9 +53,9 @@ def check_sigma_table(sigma: PyTree, of: str) -> None:
         of: What the names are, for the message.
 
     Raises:
-        ValueError: They are no mapping.
+        ValueError: They are no mapping and, unlike a pandas Series, do not behave as one.
     """
-    if not isinstance(sigma, Mapping):
+    if not hasattr(sigma, "keys"):
         raise ValueError(f"sigma = {format_value(sigma)} is no mapping from {of} to standard deviations")
 
 

@@ -181,7 +181,8 @@ def fit(
     Raises:
         ValueError: A path, a range or the shape of sigma does not fit, sigma is not positive and finite, or norm is
             outside [2, inf).
-        ValueError: There are fewer residuals than parameters and no prior. An estimate of s^2 needs one residual more.
+        ValueError: There are fewer residuals than parameters (without an absolute sigma: than parameters + 1) and no
+            prior.
         ValueError: There is a prior, but no sigma that is known absolutely. Or the prior is that of `gaussian`, and one
             of its parameters is not free.
         ValueError: No start can be used: at each one a residual or derivative is not finite, or `usable` returns False.

@@ -7,6 +7,7 @@ The data are compared with the loop's measured outputs, behind its sensor. No ra
 the cost and the method, `uncertainty` the covariance and the directions that the data leave open.
 """
 
+import decimal
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
@@ -59,7 +60,9 @@ def identify(
         if why := _describe_refusal(first := replace(loop, dict(start)), comparison, solver):
             if why.endswith("is not stable"):  # the step is too long: the message gives the longest stable one
                 most = min(float(stable_steps(canonical_dtypes(batch)).min()) for batch in comparison.loops(first))
-                why += f" at the start; at most {most:.2g} s is"
+                # Rounded down: the printed step must be stable, too.
+                longest = decimal.Context(prec=3, rounding=decimal.ROUND_FLOOR).create_decimal(most)
+                why += f" at the start; the longest stable step there is {longest} s"
             raise ValueError(why)
     return fit(
         loop,

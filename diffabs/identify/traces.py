@@ -130,8 +130,8 @@ class Traces:
                 raise ValueError(f"sigma: needed to weigh {', '.join(self.columns)} against each other")
             return
         check_sigma_table(self.sigma, "columns")
-        if set(self.sigma) != set(self.columns):
-            named = ", ".join(self.sigma) or "no column"
+        if set(self.sigma.keys()) != set(self.columns):
+            named = ", ".join(self.sigma.keys()) or "no column"
             raise ValueError(f"sigma is that of {named}; the columns are {', '.join(self.columns)}")
         for name, value in self.sigma.items():
             if np.shape(value) not in ((), self.shape[1:], self.shape):

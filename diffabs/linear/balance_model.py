@@ -43,7 +43,10 @@ class BalanceModel:
         return ArmState._fields
 
     def matrices(self) -> StateSpace:
-        """Return A (6, 6) and B (6, 1), differentiable in every parameter; they compile once for each kind of model."""
+        """Return A (6, 6) and B (6, 1), differentiable in every parameter; they compile once for each kind of model.
+
+        At a kink of the plant, such as dry friction at rest, both are NaN. In single precision it is not noticed.
+        """
         return _matrices(self)
 
     def problems(self) -> Iterator[str]:

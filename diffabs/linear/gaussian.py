@@ -55,7 +55,8 @@ def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
 
     Raises:
         ValueError: The shapes do not fit, there is no state or no output, or the matrices are complex or float32. For
-            covariances that are not traced also: W or V is not symmetric and finite, or not (semi)definite as above.
+            covariances that are not traced also: W or V is not symmetric and finite, or W is not positive semidefinite,
+            or V not positive definite.
     """
     A, C, W, V = as_float_arrays(A, C, W, V)
     for name, covariance, size in (("W", W, len(A)), ("V", V, len(C))):
@@ -94,15 +95,18 @@ def lqg(
         voltage_max: Limit of the voltage in the filter's prediction [V]. The command itself has no limit.
 
     Raises:
-        ValueError: The same cases as in `dlqr`.
+        ValueError: A standard deviation in `noise` is not positive and finite, or the same cases as in `dlqr`.
     """
+    noise = jnp.asarray(noise)
+    if not isinstance(noise, Tracer) and not (jnp.isfinite(noise) & (noise > 0)).all():
+        raise ValueError(f"noise = {noise.tolist()} is outside (0, inf) rad")
     model = BalanceModel(plant=plant, sampling=Sampling(period=period))
     a, b = model.matrices()
     regulator = dlqr(a, b, period * jnp.asarray(Q), period * jnp.asarray(R).reshape(1, 1))
     # An acceleration d, constant over the period T, moves an angle by d T^2/2 and its rate by d T.
     spread = jnp.concatenate([0.5 * period**2 * jnp.asarray(disturbance), period * jnp.asarray(disturbance)])
     kicks = jnp.concatenate([jnp.eye(3), jnp.eye(3)]) * spread[:, None]
-    filtered = kalman(a, SELECTION, kicks @ kicks.T, jnp.diag(jnp.asarray(noise) ** 2))
+    filtered = kalman(a, SELECTION, kicks @ kicks.T, jnp.diag(noise**2))
     observer = ObserverFeedback(
         gain=regulator.gain[0], transition=a, entry=b[:, 0], correction=filtered.gain, voltage_max=voltage_max
     )

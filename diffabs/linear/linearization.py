@@ -24,8 +24,13 @@ from diffabs.plants.wheel import FROZEN_OUTPUTS
 
 # Newton iterations that bring the remaining states to rest; one is enough where their equation is linear.
 REMAINING_STATE_ITERATIONS = 10
-NARROWER = 8.0  # the second difference of a smooth function falls as the square of this factor, at a kink as the factor
-MAX_SLOPE_JUMP = 1e-3  # that is no kink, relative to the largest slope of the same component
+# An offset smaller by this factor makes the second difference smaller by its square where the function is smooth, by
+# the factor itself at a kink. It leaves the slope of a smooth function as it is, and makes that of a jump larger.
+NARROWER = 8.0
+KINK_POWER = 1.1  # a second difference that falls by a smaller power of the factor is a kink's; that of |x|^1.5 is 1.5
+MAX_SLOPE_GROWTH = 1.5  # of a smooth function's slope with the smaller offset
+MAX_ROUNDINGS = 8.0  # of a component's value that make no jump
+MAX_SLOPE_JUMP = 1e-3  # largest jump of a slope that counts as none, relative to the largest slope of the component
 
 
 class StateSpace(NamedTuple):
@@ -48,9 +53,15 @@ def linearize(plant: Plant, state: PyTree, control: Scalar) -> StateSpace:
         plant: Plant whose `derivative` is f.
         state: State of the plant; it need not be an equilibrium. The components of x are the leaves of the state.
         control: Control at this point.
+
+    Raises:
+        ValueError: A slope of f jumps here, at a kink. Inside jit A and B are then NaN. In single precision a kink is
+            not noticed.
     """
     flow, x, u = as_vectors(plant, state, control)
-    return StateSpace(*jax.jacfwd(flow, (0, 1))(x, u))
+    kinked = is_kinked(flow, jnp.diag(1 + jnp.abs(x)), x, u)
+    check_kink(type(plant).__name__, kinked)
+    return nan_at_kink(StateSpace(*jax.jacfwd(flow, (0, 1))(x, u)), kinked)
 
 
 def tracking_dynamics(
@@ -77,8 +88,32 @@ def tracking_dynamics(
 
     Raises:
         ValueError: F is not a change of coordinates: its components are more or fewer than the states, or dependent. Or
-            a slope of G jumps here, at a kink. Inside jit only the number of components raises an error; otherwise A
-            and B are not finite.
+            a slope of G jumps here, at a kink. Inside jit only a wrong number of components raises an error; in the
+            other cases A and B are not finite. In single precision a kink is not noticed.
+    """
+    found, kinked = track_outputs(plant, state, control, tracked, frozen)
+    check_kink(", ".join(tracked), kinked)
+    return nan_at_kink(found, kinked)
+
+
+def track_outputs(
+    plant: Plant,
+    state: PyTree,
+    control: Scalar,
+    tracked: Sequence[str] = ("slip",),
+    frozen: Sequence[str] = FROZEN_OUTPUTS,
+) -> tuple[StateSpace, Bool]:
+    """Return the model of `tracking_dynamics`, and whether it is at a kink; there it is the model of one side.
+
+    Args:
+        plant: Plant x' = f(x, u).
+        state: State of the plant; it need not be an equilibrium.
+        control: Control at this point.
+        tracked: Names of the outputs h.
+        frozen: Names of the outputs w.
+
+    Raises:
+        ValueError: F is not a change of coordinates.
     """
     plant, state, control = canonical_dtypes((plant, state, control))
     flow, x, u = as_vectors(plant, state, control)
@@ -100,14 +135,11 @@ def tracking_dynamics(
     a, b = jax.jacfwd(moves, (0, 1))(x, u)
     n = len(x) - sum(np.size(getattr(jax.eval_shape(plant.output, state), name)) for name in frozen)
     kinked = is_kinked(lambda x, u: moves(x, u)[:n], coordinate_moves(by_x, chart(x))[:n], x, u)
-    if not isinstance(kinked, Tracer) and kinked:
-        raise ValueError(f"the slopes of {', '.join(tracked)} jump here, at a kink: no linear model")
-    found = StateSpace(jnp.linalg.solve(by_x.T, a.T).T[:n, :n], b[:n])
-    return jax.tree.map(lambda x: jnp.where(kinked, jnp.nan, x), found)
+    return StateSpace(jnp.linalg.solve(by_x.T, a.T).T[:n, :n], b[:n]), kinked
 
 
 def is_kinked(function: Callable[..., AnyArray], moves: AnyArray, x: AnyArray, u: AnyArray) -> Bool:
-    """Return whether a slope of a function jumps at a point, along some moves of x or along a component of u.
+    """Return whether a function or its slope jumps at a point, along some moves of x or along a component of u.
 
     In single precision the result is False: differences are too inexact.
 
@@ -128,13 +160,37 @@ def is_kinked(function: Callable[..., AnyArray], moves: AnyArray, x: AnyArray, u
     ends = (point + steps[:, None, None] * moves).reshape(-1, len(point))
     middle, up, down, near_up, near_down = jax.vmap(lambda z: function(*unravel(z)))(ends).reshape(5, len(moves), -1)
     wide, narrow = jnp.abs(up - 2 * middle + down), jnp.abs(near_up - 2 * middle + near_down)
-    slopes = jnp.max(jnp.abs(up - down), 0) / (2 * offset)
-    jump = narrow * NARROWER / offset
-    return jnp.any((narrow * NARROWER**1.5 > wide) & (jump > MAX_SLOPE_JUMP * slopes))
+    slope, near_slope = jnp.abs(up - down) / (2 * offset), jnp.abs(near_up - near_down) * NARROWER / (2 * offset)
+    rounding = jnp.abs(middle) * jnp.finfo(point.dtype).eps * NARROWER / offset
+    counts = MAX_SLOPE_JUMP * jnp.max(slope, 0) + MAX_ROUNDINGS * rounding
+    bent = (narrow * NARROWER**KINK_POWER > wide) & (narrow * NARROWER / offset > counts)
+    # A jump such as that of sign(x) at 0 has no second difference.
+    return jnp.any(bent | ((near_slope > MAX_SLOPE_GROWTH * slope) & (near_slope > counts)))
+
+
+def check_kink(what: str, kinked: Bool) -> None:
+    """Raise ValueError if a flag of a kink is true; accept a traced flag.
+
+    Args:
+        what: What has no linear model, for the message.
+        kinked: Result of `is_kinked`.
+    """
+    if not isinstance(kinked, Tracer) and kinked:
+        raise ValueError(f"{what}: a slope jumps here, at a kink: no linear model")
+
+
+def nan_at_kink(found: PyTree, kinked: Bool) -> PyTree:
+    """Return a model, or NaN in its place at a kink.
+
+    Args:
+        found: Model.
+        kinked: Result of `is_kinked`.
+    """
+    return jax.tree.map(lambda x: jnp.where(kinked, jnp.nan, x), found)
 
 
 def coordinate_moves(by_x: AnyArray, at: AnyArray) -> AnyArray:
-    """Return the move of x for each coordinate alone, shape (n, n), by 1 plus the coordinate's size.
+    """Return the moves of x, one a row, that change one coordinate by 1 plus its size and no other.
 
     Args:
         by_x: Derivatives of the coordinates by x, shape (n, n).

@@ -28,7 +28,7 @@ from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.tracing import depends_on_signal
 from diffabs.core.types import Bool, Matrix, Part, PyTree, Scalar
 from diffabs.core.validity import check_part
-from diffabs.linear.linearization import coordinate_moves, independent_components, is_kinked
+from diffabs.linear.linearization import check_kink, coordinate_moves, independent_components, is_kinked
 from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer, check_transfer
 from diffabs.linear.zero_order_hold import hold_input
@@ -105,8 +105,26 @@ def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
         ValueError: A part has a parameter that `check` refuses, or the target is not finite. A block acts at instants
             (a relay, a controller that computes in every step but is not `Sampled`); or the plant does not come to rest
             at the setpoint; or a slope jumps there, at a kink; or the command does not respond to a measured signal
-            there, for example at a limit.
+            there, for example at a limit. In single precision a kink is not noticed.
     """
+    return _open(loop, target, plant=True)
+
+
+def linear_controller(loop: Loop, target: Scalar = None) -> Transfer:
+    """Return the controller of `open_loop`; the parts around it may be at a kink.
+
+    Args:
+        loop: Loop with the controller.
+        target: Setpoint, as in `open_loop`.
+
+    Raises:
+        ValueError: The other cases of `open_loop`.
+    """
+    return _open(loop, target, plant=False).controller
+
+
+def _open(loop: Loop, target: Scalar, *, plant: bool) -> OpenLoop:
+    """Return the open loop. `plant`: whether the parts around the controller must be smooth, too."""
     check_part(loop)
     if target is not None and not np.isfinite(target):
         raise ValueError(f"target = {float(target):g} is outside (-inf, inf), in the unit of the first signal")
@@ -117,10 +135,10 @@ def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
     )
     if not found.residue < MAX_REST_RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
-    for kinked, names in zip(found.kinked, (("sensor", "plant", "actuator"), ("controller",)), strict=True):
-        if kinked:
-            parts = ", ".join(f"{name} {type(getattr(loop, name)).__name__}" for name in names)
-            raise ValueError(f"{parts}: a slope jumps at the setpoint, at a kink: no linear model")
+    halves = (("sensor", "plant", "actuator"), plant and found.kinked[0]), (("controller",), found.kinked[1])
+    for names, kinked in halves:
+        parts = ", ".join(f"{name} {type(getattr(loop, name)).__name__}" for name in names)
+        check_kink(f"{parts} at the setpoint", kinked)
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     delay += float(sampled.delay) if sampled else 0.0
     controller = Transfer(*found.controller)._replace(period=float(sampled.period) if sampled else None)
@@ -288,8 +306,10 @@ class _Surroundings:
 
 
 def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: Scalar) -> Matrix:
-    """Return (A, B, C, D) of the controller from its signal to its command, at rest with the command that holds the
-    plant; the function of signal and memory that it linearises; and the memory.
+    """Return three things of the controller, at rest with the command that holds the plant.
+
+    They are: (A, B, C, D) from its signal to its command; the function (signal, memory) -> (rate or next memory,
+    command); and the memory at rest.
     """
     controller, memory = loop.controller, loop.start().controller
     sampled = isinstance(controller, Sampled)

@@ -22,7 +22,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Feedforward, Memory, Plant, Reference, Tracking
 from diffabs.core.pytree import canonical_dtypes, part, pytree, static
 from diffabs.core.types import AnyArray, Bool, Matrix, Part, PyTree, Scalar
-from diffabs.linear.linearization import StateSpace, is_kinked
+from diffabs.linear.linearization import StateSpace, check_kink, is_kinked, nan_at_kink
 from diffabs.stops import NoStop
 
 ROOT_ITERATIONS = 10  # Gauss-Newton iterations to the point of rest; one is enough where the loop is linear
@@ -81,13 +81,21 @@ class OperatingPoint:
         return tuple(names[i] for i in self.kept)
 
     def matrices(self) -> StateSpace:
-        """Return A (n, n) and B (n, 1), differentiable in every parameter; they compile once for each kind of loop."""
-        found, kept = _linearize_at_rest(self), np.array(self.kept, int)
+        """Return A (n, n) and B (n, 1), differentiable in every parameter; they compile once for each kind of loop.
+
+        Raises:
+            ValueError: A slope jumps at the setpoint, at a kink. Inside jit A and B are NaN there.
+        """
+        found, kept = _smooth_model(self), np.array(self.kept, int)
         return StateSpace(found.A[kept][:, kept], found.B[kept])
 
     def gain(self) -> AnyArray:
-        """Return K (n,) of the loop's own controller."""
-        return _linearize_at_rest(self).K[np.array(self.kept, int)]
+        """Return K (n,) of the loop's own controller.
+
+        Raises:
+            ValueError: A slope jumps at the setpoint, at a kink. Inside jit K is NaN there.
+        """
+        return _smooth_model(self).K[np.array(self.kept, int)]
 
 
 def operating_point(loop: Loop) -> OperatingPoint:
@@ -98,7 +106,8 @@ def operating_point(loop: Loop) -> OperatingPoint:
 
     Raises:
         ValueError: A block acts at instants (sampled, delayed, a relay); or the plant does not come to rest at the
-            setpoint; or there a slope jumps, or the control is at a limit or has no effect.
+            setpoint; or there a slope jumps, or the control is at a limit or has no effect. In single precision a
+            jump is not noticed.
     """
     start = loop.start()
     for name in ("sensor", "controller", "actuator"):
@@ -109,8 +118,7 @@ def operating_point(loop: Loop) -> OperatingPoint:
     found = jax.device_get(_linearize_at_rest(model))
     if not found.residue < MAX_REST_RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
-    if found.kinked:
-        raise ValueError("a slope of the loop jumps at the setpoint, at a kink: no linear model")
+    check_kink("the loop at its setpoint", found.kinked)
     if not np.any(found.B) or not np.any(found.K):
         raise ValueError("the control is at a limit at the setpoint, or does not act there: no linear model")
     # The plant's states come first in the vector of states.
@@ -128,9 +136,12 @@ def loop_gain(loop: Loop, states: tuple[str, ...]) -> AnyArray:
     Args:
         loop: Loop with the controller.
         states: Names of the states, as in `OperatingPoint.states`.
+
+    Raises:
+        ValueError: A slope jumps at the setpoint, at a kink. Inside jit K is NaN there.
     """
     names = _names(loop)
-    return _linearize_at_rest(_drop_stop(loop)).K[np.array([names.index(name) for name in states])]
+    return _smooth_model(_drop_stop(loop)).K[np.array([names.index(name) for name in states])]
 
 
 def _drop_stop(loop: Loop) -> OperatingPoint:
@@ -225,8 +236,15 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     residue = jnp.max(jnp.abs(still(free))) / (1 + jnp.max(jnp.abs(free)))
     moves, v = jnp.diag(1 + jnp.abs(z)), free[-1][None]
     kinked = is_kinked(lambda z, v: jnp.append(one.flow(z, v[0]), one.command(z)), moves, z, v)
-    a, b, k = (jnp.where(kinked, jnp.nan, x) for x in (a, b[:, None], jax.jacfwd(one.command)(z)))
+    a, b, k = nan_at_kink((a, b[:, None], jax.jacfwd(one.command)(z)), kinked)
     return LinearLoop(a, b, k, residue, kinked)
+
+
+def _smooth_model(model: OperatingPoint) -> LinearLoop:
+    """Return the linear model, unless it is known to be at a kink."""
+    found = _linearize_at_rest(model)
+    check_kink("the loop at its setpoint", found.kinked)
+    return found
 
 
 def find_root(function: Any, x: Scalar) -> AnyArray:

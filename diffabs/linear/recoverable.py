@@ -21,6 +21,7 @@ import numpy as np
 from diffabs.core.types import AnyArray, PyTree, Scalar
 from diffabs.linear.riccati import care
 
+UNIT_SWEEPS = 30  # over the states, for their units; enough where these differ by 1e12
 ROUNDING = 1e-12  # products below this, relative to the norms of their factors, are rounding
 
 
@@ -48,7 +49,8 @@ def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[f
     Some |u| <= limit returns the mode from every smaller multiple, and none from a larger one. Each mode is taken
     alone, so no control returns the whole system from more than the least of the multiples. If only one pole is
     unstable, some control returns from every smaller multiple. A multiple is infinite where `start` does not excite the
-    mode. Modes with equal poles have one entry, the least of their multiples. Complex pairs are left out.
+    mode. Modes with equal poles have one entry, the least multiple of all their left eigenvectors. Complex pairs are
+    left out.
 
     Args:
         A: State matrix, shape (n, n).
@@ -58,21 +60,33 @@ def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[f
     """
     a, b, d = np.asarray(A, float), np.asarray(B, float).reshape(-1), np.asarray(start, float)
     poles, left = np.linalg.eig(a.T)
-    found = {}
-    for pole, w in zip(poles, left.T, strict=True):
-        if pole.real > 0 and abs(pole.imag) <= 1e-12 * abs(pole):
-            reach, there = abs(np.real(w) @ b) * limit / pole.real, abs(np.real(w) @ d)
-            multiple = float(reach / there) if there > 0 else np.inf
-            found[float(pole.real)] = min(multiple, found.get(float(pole.real), np.inf))
+    found, waiting = {}, (np.real(poles) > 0) & (abs(np.imag(poles)) <= ROUNDING * abs(poles))
+    while waiting.any():
+        pole = float(np.real(poles[waiting][0]))
+        equal = waiting & (abs(poles - pole) <= 2 * ROUNDING * pole)
+        waiting &= ~equal
+        # The one input moves the left eigenvectors of a pole along one direction only, B in the basis W.
+        _, sizes, basis = np.linalg.svd(
+            np.vstack([np.real(left.T[equal]), np.imag(left.T[equal])]), full_matrices=False
+        )
+        basis = basis[sizes > ROUNDING * sizes[0]]
+        reach, there = basis @ b, basis @ d
+        size = np.linalg.norm(reach)
+        moved = reach / size if size > 0 else reach
+        along = moved @ there
+        if np.linalg.norm(there - along * moved) > ROUNDING * np.linalg.norm(d):
+            found[pole] = 0.0
+        else:
+            found[pole] = float(size * limit / (pole * abs(along))) if along else np.inf
     return found
 
 
 def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
-    """Return the finite transmission zeros of x' = A x + B u, y = c'x, shape (n - r,) for relative degree r.
+    """Return the finite invariant zeros of x' = A x + B u, y = c'x, shape (n - r,) for relative degree r.
 
-    At a zero the Rosenbrock matrix loses rank. The zeros are the poles of the inverse system, whose states keep y and
-    its first r - 1 derivatives at 0. They are eigenvalues of the matrix below on the states x with c'x = c'A x = ... =
-    c'A^(r-1)x = 0.
+    They are the transmission zeros, and the modes that u does not move or y does not show. At a zero the Rosenbrock
+    matrix loses rank. The zeros are the poles of the inverse system, whose states keep y and its first r - 1
+    derivatives at 0. They are eigenvalues of the matrix below on the states x with c'x = c'A x = ... = c'A^(r-1)x = 0.
 
         (I - B (c'A^(r-1)B)^-1 c'A^(r-1)) A
 
@@ -82,8 +96,14 @@ def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
         A: State matrix, shape (n, n).
         B: Input matrix, shape (n, 1).
         output: Output row c', shape (n,).
+
+    Raises:
+        ValueError: An entry is not finite.
     """
     a, b, rows = np.asarray(A, float), np.asarray(B, float).reshape(-1), np.asarray(output, float).reshape(1, -1)
+    if not all(np.isfinite(x).all() for x in (a, b, rows)):
+        raise ValueError("A, B or the output has an entry that is not finite")
+    a, b, rows = _balance(a, b, rows)
     size = np.linalg.norm(rows)
     for degree in range(1, len(a) + 1):
         # The last row of the orthonormal basis replaces c'A^(degree - 1): powers of A would lose digits.
@@ -93,5 +113,18 @@ def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
             break
         if left * abs(row @ b) > ROUNDING * size * np.linalg.norm(b):
             return np.linalg.eigvals(rest.T @ (a @ rest - np.outer(b, row @ a @ rest) / (row @ b)))
-        rows, size = np.vstack([rows, row @ a]), np.linalg.norm(a, 2)
+        rows, size = np.vstack([rows, row @ a]), np.linalg.norm(abs(row) @ abs(a))
     return np.array([])
+
+
+def _balance(a: np.ndarray, b: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a system in units of its states, input and output, powers of two, in which no entry hides another one."""
+    whole = np.block([[a, b[:, None]], [row, np.zeros((1, 1))]])
+    for _ in range(UNIT_SWEEPS):
+        for i in range(len(whole)):
+            by_others, on_others = (np.sum(np.abs(np.delete(x, i))) for x in (whole[i], whole[:, i]))
+            if by_others > 0 and on_others > 0:
+                unit = 2.0 ** np.round(0.5 * (np.log2(by_others) - np.log2(on_others)))
+                whole[i] /= unit
+                whole[:, i] *= unit
+    return whole[:-1, :-1], whole[:-1, -1], whole[-1:, :-1]

@@ -101,14 +101,14 @@ def is_reproduced(row: Row) -> bool:
     return row["matches"] if "matches" in row else rounds_to(row["ours"], row["published"])
 
 
-def rounds_to(number: float, given: float) -> bool:
-    """Return whether a number rounds to another number at the other's decimals.
+def rounds_to(number: float | str, given: float) -> bool:
+    """Return whether a number rounds to another number at the other's decimals; a word does not.
 
     Args:
-        number: Number to round.
+        number: Number to round, or a word such as "never".
         given: Number as printed.
     """
-    return round(number, decimals(given)) == given
+    return not isinstance(number, str) and round(number, decimals(given)) == given
 
 
 def decimals(given: float) -> int:
@@ -129,8 +129,10 @@ def is_close(row: Row) -> bool:
     Args:
         row: Row with an independent number.
     """
-    known, gap = row["reference"], abs(row["difference"])
-    return gap <= RELATIVE_TOLERANCE * abs(known) or (decimals(known) > 0 and rounds_to(row["ours"], known))
+    known, gap = row["reference"], row["difference"]
+    if gap is None:  # beside a word, such as "never"
+        return row["ours"] == known
+    return abs(gap) <= RELATIVE_TOLERANCE * abs(known) or (decimals(known) > 0 and rounds_to(row["ours"], known))
 
 
 def count_published(where: str, rows: Sequence[Row]) -> str:
@@ -156,7 +158,8 @@ def count_computed(rows: Sequence[Row]) -> str:
 
 def _share(rows: Sequence[Row], agrees: Callable[[Row], bool], words: str) -> str:
     missed = [row for row in rows if not agrees(row)]
-    which = "; ".join(f"{row['name']}, {row['quantity']}: {row['ours']:.5g}" for row in missed)
+    ours = [row["ours"] if isinstance(row["ours"], str) else f"{row['ours']:.5g}" for row in missed]
+    which = "; ".join(f"{row['name']}, {row['quantity']}: {x}" for row, x in zip(missed, ours, strict=True))
     return f"{len(rows) - len(missed)} of {len(rows)} {words}{f', not {which}' if missed else ''}." if rows else ""
 
 

@@ -198,8 +198,8 @@ def bound_of_stop(kind: str, a: float, c: float, first: float, last: float) -> f
 def bound_of_loop(loop: Loop, row: Table) -> float:
     """Return the bound of a row for the road and the plant of its loop, in SI units.
 
-    The peak of the friction is the greater one of those at the first and at the last speed: between them it must be
-    monotone in the speed, as the packaged roads are.
+    The friction is the greater of its peaks at the first and at the last speed. This is a bound only if the peak is
+    monotone in the speed, as it is for the packaged roads.
 
     Args:
         loop: Closed loop of a quarter car or a road vehicle.

@@ -67,7 +67,7 @@ def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float
 
 
 def format_time(time: Scalar) -> float | str:
-    """Return a time [s] for a summary, or the distance until then [m]: "never" if it is infinite.
+    """Return a number for a summary, or "never" if it is infinite.
 
     Args:
         time: Time [s], or distance [m].

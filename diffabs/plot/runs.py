@@ -11,7 +11,6 @@ from diffabs.core.types import Table
 from diffabs.objectives.balance import motor_torque
 from diffabs.plot.style import (
     COLOURS,
-    DASHES,
     GREY,
     KMH,
     Axes,
@@ -19,6 +18,7 @@ from diffabs.plot.style import (
     ListedColormap,
     Patch,
     control_label,
+    curve_style,
     label_axes,
     make_logarithmic,
     sheet,
@@ -38,7 +38,7 @@ def draw_braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
     Raises:
         ValueError: The run has no trajectory, as from `measure`.
     """
-    seen = _trajectory(run)
+    seen, title = _trajectory(run, title)
     figure, (top, speed, torque, brake) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
     t, sample = np.asarray(seen.sample.t), seen.sample
     top.plot(t, sample.output.slip, color=COLOURS[0], label="slip")
@@ -64,7 +64,7 @@ def draw_balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
     Raises:
         ValueError: The run has no trajectory, as from `measure`.
     """
-    seen = _trajectory(run)
+    seen, title = _trajectory(run, title)
     figure, (angles, rates, voltage, torque) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
     t, sample = np.asarray(seen.sample.t), seen.sample
     draw_angle_lines(angles, seen)
@@ -93,7 +93,7 @@ def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     Raises:
         ValueError: The run has no trajectory, as from `measure`.
     """
-    seen = _trajectory(run)
+    seen, title = _trajectory(run, title)
     t, sample = np.asarray(seen.sample.t), seen.sample
     groups: dict[str, list[str]] = {}
     for name, of_signal in sample.output.units.items():
@@ -101,7 +101,7 @@ def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     figure, axes = sheet(-(-(len(groups) + 1) // 2), 2, title=title, size=(5.6, 3.0), sharex=True)
     for ax, (of_signal, names) in zip(axes, groups.items(), strict=False):
         for i, name in enumerate(names):
-            ax.plot(t, getattr(sample.output, name), DASHES[i % 7], color=COLOURS[i % 7], label=spaced_name(name))
+            ax.plot(t, getattr(sample.output, name), label=spaced_name(name), **curve_style(i))
         if ax is axes[0]:
             ax.plot(t, sample.target, "--", color=GREY, label="target")
             ax.plot(t, sample.setpoint, ":", color="black", label="setpoint")
@@ -154,7 +154,7 @@ def draw_angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
     """
     for i, (name, words) in enumerate({"theta": "frame", "psi": "arm", "phi": "rider"}.items()):
         values = getattr(seen.sample.output, name + suffix)
-        ax.plot(np.asarray(seen.sample.t), values, DASHES[i], color=COLOURS[i], label=f"{words} {name}")
+        ax.plot(np.asarray(seen.sample.t), values, label=f"{words} {name}", **curve_style(i))
 
 
 def shade_region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> list[Patch]:
@@ -199,7 +199,7 @@ def draw_slip_lines(ax: Axes, runs: Mapping[str, Trajectory]) -> None:
         runs: Trajectories by name.
     """
     for i, (name, seen) in enumerate(runs.items()):
-        ax.plot(np.asarray(seen.sample.t), seen.sample.output.slip, DASHES[i], color=COLOURS[i], label=name)
+        ax.plot(np.asarray(seen.sample.t), seen.sample.output.slip, label=name, **curve_style(i))
     first = next(iter(runs.values())).sample
     ax.plot(np.asarray(first.t), first.setpoint, color="black", linewidth=0.9, linestyle=":", label="setpoint")
 
@@ -214,7 +214,7 @@ def draw_speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
     figure, axes = sheet(1, len(runs), title=title, size=(5.2 if len(runs) > 1 else 6.4, 3.6), sharex=True, sharey=True)
     for i, (ax, (name, seen)) in enumerate(zip(axes, runs.items(), strict=True)):
         _speeds(ax, seen)
-        words = f"{name}: {float(seen.sample.t[-1]):.2f} s" if name else ""
+        words = f"{name}: ends at {float(seen.sample.t[-1]):.2f} s" if name else ""
         label_axes(ax, "time [s]", "" if i else "speed [km/h]", words)
         ax.set_xlim(0, None)
     # The automatic end below 0 keeps the line of a locked wheel off the axis.
@@ -244,8 +244,8 @@ def draw_positions(
         single = len(runs) == 1
         for j, (name, seen) in enumerate(runs.items()):
             t, x = np.asarray(seen.sample.t), np.asarray(seen.sample.output.distance)
-            ax.plot(t, x, DASHES[j], color=COLOURS[j], label=None if single else f"{name}: {x[-1]:.2f} m")
-            ax.plot(t[-1:], x[-1:], "o", color=COLOURS[j], markersize=4.5)
+            ax.plot(t, x, label=None if single else f"{name}: {x[-1]:.2f} m", **curve_style(j))
+            ax.plot(t[-1:], x[-1:], marker="o", markersize=4.5, **curve_style(j))
         label_axes(ax, "time [s]", "" if i else "position [m]", next(iter(runs)) if single else "")
         ax.set_xlim(0, None)
     if zoom:
@@ -280,7 +280,7 @@ def draw_friction(
         for i, (name, road) in enumerate(roads.items()):
             # road=road binds the road of this iteration.
             mu = jax.vmap(lambda x, road=road: road.friction(x, speed, 0.0))(s)
-            ax.plot(s, np.asarray(mu), DASHES[i], color=COLOURS[i], label=name)
+            ax.plot(s, np.asarray(mu), label=name, **curve_style(i))
         for i, (name, (x, y)) in enumerate((marks or {}).items()):
             if limits[0] <= x <= limits[1]:
                 ax.plot([x], [y], "osD^v"[i % 5], color=COLOURS[(i + len(roads)) % 7], markersize=7, label=name)
@@ -307,7 +307,7 @@ def draw_convergence(
     for i, (ax, order, (name, curves)) in enumerate(zip(axes, orders, panels.items(), strict=True)):
         for j, (quantity, errors) in enumerate(curves.items()):
             words = "IAE" if quantity == "iae" else spaced_name(quantity)
-            ax.loglog(h, errors, "o" + DASHES[j], color=COLOURS[j], markersize=4.5, label=words)
+            ax.loglog(h, errors, marker="o", markersize=4.5, label=words, **curve_style(j))
         # The guide line has the slope of the order and starts a factor of 3 above the largest error.
         top = 3.0 * np.max([np.max(e) for e in curves.values()])
         ax.loglog(h, top * (h / h.max()) ** order, color=GREY, linewidth=0.9, label=f"slope {order}")
@@ -318,7 +318,8 @@ def draw_convergence(
     return figure
 
 
-def _trajectory(run: Run) -> Trajectory:
+def _trajectory(run: Run, title: str) -> tuple[Trajectory, str]:
+    """Return the trajectory and the title, which says so if the run diverged: the curves look like those of others."""
     if run.trajectory is None:
         raise ValueError("the run has no trajectory: use rollout, not measure")
-    return run.trajectory
+    return run.trajectory, f"{title} (diverged)".lstrip() if run.diverged else title

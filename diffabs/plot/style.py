@@ -132,7 +132,7 @@ class _Powers(Formatter):
         # 1e-9 keeps the exponent if the logarithm of a power of ten is rounded down.
         power = int(np.floor(np.log10(x) + 1e-9)) if x > 0 else 0
         mantissa = x / 10.0**power
-        head = "" if abs(mantissa - 1) < 1e-9 else f"{mantissa:.0f}\N{MULTIPLICATION SIGN}"
+        head = "" if abs(mantissa - 1) < 1e-9 else f"{mantissa:g}\N{MULTIPLICATION SIGN}"
         return f"{head}10{str(power).translate(RAISED)}"
 
 
@@ -149,6 +149,11 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
     with files.new_file(path) as temporary:
         figure.savefig(temporary, format=path.suffix.lstrip(".") or "png", dpi=DPI)
     return path
+
+
+def curve_style(i: int) -> dict[str, Any]:
+    """Return the colour and the dashes of the `i`-th curve of an axes, counted from 0; the first 49 all differ."""
+    return {"color": COLOURS[i % 7], "linestyle": DASHES[(i + i // 7) % 7]}
 
 
 def control_label(unit: str) -> str:

@@ -69,9 +69,12 @@ class SweepView:
         """
         return rows & np.isfinite(self.found.column(name)) if name else rows
 
-    def never(self, name: str) -> str:
-        """Return a note such as " (3 never: left out)" on the runs with an infinite metric `name`; "" for none."""
-        count = np.sum(self.rows & ~self.known_rows(name, self.rows))
+    def never(self, name: str, rows: np.ndarray) -> str:
+        """Return a note such as " (3 never: left out)" on the runs of the mask `rows` with an infinite metric `name`.
+
+        The note is empty if there are none.
+        """
+        count = np.sum(rows & ~self.known_rows(name, rows))
         return f" ({count} never: left out)" if count else ""
 
     def label(self, name: str) -> str:

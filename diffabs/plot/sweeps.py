@@ -78,7 +78,7 @@ def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure 
         ax.set_xlim(_limits(ax, *ends, view.bounds.get(name)))
         beyond = len(values) - counts.sum()
         outside = f" ({beyond} more outside)" if beyond else ""
-        label_axes(ax, view.label(name), f"runs{outside}{view.never(name)}", legend=False)
+        label_axes(ax, view.label(name), f"runs{outside}{view.never(name, view.rows)}", legend=False)
         ax.legend(**ABOVE)
     return figure
 
@@ -100,7 +100,7 @@ def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: f
         values = np.sort(found.column(name)[view.known_rows(name, view.rows)])
         n, limits = len(values), _limits(ax, values[0], values[-1], view.bounds.get(name))
         x, counts = _exceedance_corners(values, *limits)
-        ax.plot(x, counts / n, color=COLOURS[0], label=f"runs{view.never(name)}")
+        ax.plot(x, counts / n, color=COLOURS[0], label=f"runs{view.never(name, view.rows)}")
         if view.design not in ("grid", "corners"):
             known = [Count(int(k), n).probability(confidence=confidence) for k in counts]
             ends = [one.low for one in known], [one.high for one in known]
@@ -138,7 +138,8 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
     # Later points cover earlier ones: ascending values keep the worst run of a place visible.
     shown = shown[np.argsort(values[shown], kind="stable")]
     x, y = ones[0].values, ones[1].values if ones[1:] else values
-    figure, (ax,) = sheet(title=view.title(f"greatest {metric} of", np.sum(good)), size=(8.4, 4.8))
+    title = view.title(f"greatest {metric} of", np.sum(good)) + view.never(metric, view.good)
+    figure, (ax,) = sheet(title=title, size=(8.4, 4.8))
     dots = ax.scatter(x[shown], y[shown], 10, values[shown], cmap="viridis", linewidths=0)
     bar = figure.colorbar(dots, ax=ax, label=view.label(metric))
     if bound is not None and values.min() < bound < values.max():

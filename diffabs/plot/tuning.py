@@ -7,11 +7,11 @@ import numpy as np
 from diffabs.core.types import PyTree, Scalar
 from diffabs.plot.style import (
     COLOURS,
-    DASHES,
     GREY,
     Axes,
     Figure,
     control_label,
+    curve_style,
     label_axes,
     make_logarithmic,
     sheet,
@@ -66,8 +66,8 @@ def draw_pareto(
     for i, (name, (across, up)) in enumerate(fronts.items()):
         across, up = np.asarray(across, float), np.asarray(up, float)
         best = pareto_front(across, up)
-        ax.plot(across, up, "o", color=COLOURS[i], alpha=0.25, markersize=4)
-        ax.plot(across[best], up[best], "o-", color=COLOURS[i], markersize=5, label=name)
+        ax.plot(across, up, "o", color=COLOURS[i % 7], alpha=0.25, markersize=4)
+        ax.plot(across[best], up[best], "o-", color=COLOURS[i % 7], markersize=5, label=name)
     for i, (name, point) in enumerate((marks or {}).items()):
         ax.plot([point[0]], [point[1]], MARKS[i % 5], color=COLOURS[(i + len(fronts)) % 7], markersize=8, label=name)
     label_axes(ax, x, y)
@@ -122,8 +122,8 @@ def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str =
     """Draw the first signal (the slip of a brake) with its setpoint, and the control."""
     for i, (name, seen) in enumerate(runs.items()):
         t = np.asarray(seen.sample.t)
-        slip.plot(t, seen.sample.output[0], DASHES[i], color=COLOURS[i], label=name)
-        torque.plot(t, seen.sample.control, DASHES[i], color=COLOURS[i], label=name, linewidth=1.2)
+        slip.plot(t, seen.sample.output[0], label=name, **curve_style(i))
+        torque.plot(t, seen.sample.control, label=name, linewidth=1.2, **curve_style(i))
     first = next(iter(runs.values())).sample
     slip.plot(np.asarray(first.t), first.setpoint, color=GREY, linewidth=0.9, linestyle=":", label="setpoint")
     label_axes(slip, "time [s]", signal_label(first.output), title)

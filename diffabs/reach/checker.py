@@ -238,7 +238,7 @@ class _Program:
         return found
 
     def keeps(self, state: int) -> bool:
-        """Return whether a tick leaves a state as it is."""
+        """Return whether a tick leaves a state unchanged."""
         e = self.equations
         return not e.tick or self.operations[e.tick[state]] == RealOperation("state", (), state)
 

@@ -1,4 +1,4 @@
-"""Proofs over a box: cells of parameters that cover it, each proved, those that fail or say too little halved.
+"""Proofs over a box: cells of parameters cover it. A cell that fails, or bounds too little, is halved.
 
     proved     every cell of the cover satisfies the claim
     refuted    in one cell every run violates it; a cell may be a single run
@@ -43,7 +43,7 @@ class RunClaim(NamedTuple):
 
 
 class BoxProof(NamedTuple):
-    """What was proved about a box.
+    """Bounds and verdicts proved about a box.
 
     Attributes:
         verdict: proved, refuted or undecided.
@@ -249,7 +249,7 @@ def _find_violation(
 
 
 def _find_contradiction(bounds: Mapping[str, tuple[float, float]], known: Mapping[str, tuple[float, float]]) -> str:
-    """Return what a run violates by more than the errors of runs, empty if nothing."""
+    """Return the bounds that a run violates by more than the errors of runs, empty without any."""
     for name, (least, greatest) in known.items():
         low, high = bounds.get(name, (-math.inf, math.inf))
         for run, bound, beyond in ((least, low, low - least), (greatest, high, greatest - high)):

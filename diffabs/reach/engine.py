@@ -387,7 +387,7 @@ def balance_weights(matrix: np.ndarray) -> np.ndarray:
 
 
 def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], list[int], list[int]]:
-    """Return the states that a proof needs: kept over a tick, set anew by a tick, and quadratures.
+    """Return the states that a proof needs: kept over a tick, set by a tick, and quadratures.
 
     A quadrature is a state that nothing reads, such as the distance.
 

@@ -112,7 +112,7 @@ class Equations:
 
 
 class RealGraph(Graph):
-    """A graph that means real numbers: it folds and simplifies only what is exact."""
+    """A graph that means real numbers: it folds and simplifies only if the result is exact."""
 
     def __init__(self) -> None:
         """Create an empty graph."""
@@ -435,14 +435,14 @@ class _Derivation:
         return self.graph.const(float(getattr(self.loop.initial, name)))
 
     def substitute(self, node: Node, known: dict[int, Node]) -> Node:
-        """Return a node with other nodes in place of those in `known`, by number; it adds what it finds."""
+        """Return a node with other nodes in place of those in `known`, by number; `known` gets each one."""
         if node.id not in known:
             args = [self.substitute(arg, known) for arg in node.args]
             known[node.id] = self.graph.again(node, args) if args else node
         return known[node.id]
 
     def make(self, name: str, args: tuple[int, ...], value: Any = None) -> int:
-        """Return the index of an operation, a new one only if there is none."""
+        """Return the index of an operation, which is added if it is new."""
         key = (name, args, value)
         if key not in self.known:
             self.operations.append(RealOperation(*key))

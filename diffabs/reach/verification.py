@@ -1,6 +1,6 @@
 """The verification of a proof's file: coverage by halving, and a sample of the cells by the checker.
 
-A file is text that anybody can edit, so nothing in it counts except what is proved again here. What is verified is the
+A file is text that anybody can edit, so only statements that are proved again here count. They are the
 list `statements` of `FileVerdict`: about the loop and the duration of the scenario in the file, and over its box.
 """
 
@@ -30,13 +30,13 @@ Bounds = dict[str, tuple[float | None, float | None]]
 
 
 class FileVerdict(NamedTuple):
-    """What the checker found about a file.
+    """Findings of the checker about a file.
 
     Attributes:
         checked: Number of cells that were proved again.
         cells: Number of cells in the file.
         reason: Why the file is not verified, empty if it is.
-        statements: What the file states of every run of the box, such as `greatest slip <= 0.33`.
+        statements: Statements of the file about every run of the box, such as `greatest slip <= 0.33`.
     """
 
     checked: int
@@ -308,7 +308,7 @@ def _check_cell(equations: Equations, file: ProofFile, cell: Cell) -> str:
 def _choose_sides(over: Mapping[str, tuple[float, float]], cell: Cell) -> list[int]:
     """Return the parameters along which the checker halves a cell, one after the other.
 
-    Those that the prover has halved most often come first: they move the runs most.
+    Parameters that the prover has halved most often come first: they move the runs most.
     """
     shares = [
         (high - low) / (b - a) if low < high else 0.0 for (low, high), (a, b) in zip(cell, over.values(), strict=True)

@@ -16,7 +16,7 @@ search.
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,13 @@ import numpy as np
 from diffabs.core.types import Params, PyTree, Scalar, Table
 from diffabs.core.units import resolve_unit, units_of
 from diffabs.reliability.importance_sampling import DESIGN_POINT_STARTS, Gradient
-from diffabs.reliability.subset_simulation import RareEvent, check_number, subset_simulation
+from diffabs.reliability.subset_simulation import (
+    RareEvent,
+    SubsetLevel,
+    SubsetProgress,
+    check_number,
+    subset_simulation,
+)
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import describe_engine, log_kernel, log_xla_reason, resolve_request
@@ -35,9 +41,17 @@ from diffabs.sweep.study import Study, noise_key, precision
 
 DIFFERENCE_STEP = 1e-4  # step in z: relative errors of 1e-9 (truncation) and 1e-12 (rounding)
 
+_Level = TypeVar("_Level", SubsetLevel, SubsetProgress)
+
 
 def failure_probability(
-    study: Study, metric: str, bound: float, *, gradients: bool = False, **options: Any
+    study: Study,
+    metric: str,
+    bound: float,
+    *,
+    gradients: bool = False,
+    progress: Callable[[SubsetProgress], None] | None = None,
+    **options: Any,
 ) -> RareEvent:
     """Return an estimate of P[metric > bound] over the space of a study, with runs on the study's engine.
 
@@ -50,11 +64,12 @@ def failure_probability(
         metric: Name of a metric that the study measures.
         bound: Bound on the metric, in its unit.
         gradients: Whether to offer importance sampling design points as centres, found by gradients through the run.
+        progress: Called after every level.
         options: Keyword arguments of `subset_simulation`, such as `samples` and the `seed` of the draws.
 
     Raises:
-        ValueError: The metric is not measured, the study draws parts, the bound is no finite number, or a drawn point
-            cannot be run.
+        ValueError: The metric is not measured, the study draws parts, the bound is no finite number of the study's
+            type, or a drawn point cannot be run.
         importance_sampling.DivergenceError: Too many runs diverge.
 
     >>> import diffabs as d
@@ -73,6 +88,11 @@ def failure_probability(
     check_number(
         "bound", bound, resolve_unit(getattr(study.objectives[metric], "unit", ""), units_of(study.loop.plant))
     )
+    # `subset_simulation` counts a score at its threshold as a failure, so the threshold is the next number.
+    with np.errstate(over="ignore"):
+        beyond = float(np.nextafter(np.asarray(bound, study.dtype), np.inf))
+    if not np.isfinite(beyond):
+        raise ValueError(f"bound = {bound:g} is too great for {study.dtype}")
     if study.parts:
         raise ValueError(f"{', '.join(study.parts)}: alternatives of parts have no normal coordinates")
 
@@ -82,11 +102,18 @@ def failure_probability(
         return _run_scores(study, metric, z)
 
     gradient = _make_gradient(study, metric) if gradients else None
-    # `subset_simulation` counts a score at its threshold as a failure, so the threshold is the next number.
-    beyond = float(np.nextafter(np.asarray(bound, study.dtype), np.inf))
-    found = subset_simulation(score, study.space.dimension, beyond, gradient=gradient, **options)
-    levels = [level._replace(threshold=min(level.threshold, float(bound))) for level in found.levels]
-    return dataclasses.replace(found, levels=levels, engine=describe_engine(study.engine))
+
+    def state_bound(level: _Level) -> _Level:
+        return level._replace(threshold=float(bound), strict=True) if level.threshold == beyond else level
+
+    def report(level: SubsetProgress) -> None:
+        if progress:
+            progress(state_bound(level))
+
+    found = subset_simulation(score, study.space.dimension, beyond, gradient=gradient, progress=report, **options)
+    return dataclasses.replace(
+        found, levels=[state_bound(level) for level in found.levels], engine=describe_engine(study.engine)
+    )
 
 
 def _choose_engine(study: Study, metric: str) -> Study:
@@ -156,7 +183,7 @@ def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) 
 def _make_gradient(study: Study, metric: str) -> Gradient:
     """Return a function z (n, dimension) -> (metric (n,), derivative (n, dimension)), n <= `DESIGN_POINT_STARTS`.
 
-    The metric is -inf at a point that cannot be run.
+    The metric is -inf at a point that `simulate` refuses.
     """
     slopes = _compile_derivatives(study, metric)
 
@@ -167,7 +194,8 @@ def _make_gradient(study: Study, metric: str) -> Gradient:
         with precision(study.dtype):
             score, by_value = jax.device_get(slopes(values))
         chain = [by_value[path][: len(z), None] * column for path, column in _parameter_slopes(study, z).items()]
-        # Only a trial of the search for design points can be refused: the infinite score shortens its step.
+        # Only a trial can be refused, because the starts are failures that were run. A score of -inf makes the search
+        # halve its step.
         return np.where(accepted, score[: len(z)], -np.inf).astype(float), np.sum(chain, axis=0)
 
     return gradient

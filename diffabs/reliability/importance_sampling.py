@@ -257,8 +257,8 @@ def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> n
     A search moves to z + t (z' - z) if the merit |z|^2/2 + 2 (|z| + 1)/|a| |threshold - g| falls. Otherwise t is
     halved. All searches advance together. Of ends closer than 0.5 to each other, the nearest to the origin is returned.
 
-    A search that meets a kink, a plateau (a = 0), or a run that diverges or is refused, stops there. The point is then
-    a poor centre, but the estimate stays unbiased for any centre.
+    A trial whose run diverges or is refused halves t. A search stops at a kink, on a plateau (a = 0), or when t falls
+    below 1e-3. Its point is then a poor centre, but the estimate stays unbiased for any centre.
 
     Args:
         gradient: Function z (n, d) -> (score g (n,), derivative (n, d)).

@@ -71,12 +71,14 @@ class SubsetProgress(NamedTuple):
         threshold: Threshold of the level.
         share: Fraction of the level's samples that reached the threshold [1].
         evaluations: Number of runs over all levels so far.
+        strict: Whether only a score above the threshold reaches it, as in `SubsetLevel`.
     """
 
     level: int
     threshold: float
     share: float
     evaluations: int
+    strict: bool = False
 
 
 class SubsetLevel(NamedTuple):
@@ -84,11 +86,12 @@ class SubsetLevel(NamedTuple):
 
     Attributes:
         threshold: Threshold b_j of the score.
-        share: Fraction of the samples with a score of at least b_j [1].
+        share: Fraction of the samples with a score of at least b_j, or above b_j if `strict` [1].
         cov: Coefficient of variation of the share, with the correlation along chains.
         acceptance: Accepted fraction of the proposals [1]; 1 for the first level, whose samples are independent.
         spread: Standard deviation s of a proposal, after the last step.
         diverged: Number of the level's runs that diverged.
+        strict: Whether only a score above b_j reaches it, as where b_j is the bound of `failure_probability`.
     """
 
     threshold: float
@@ -97,11 +100,12 @@ class SubsetLevel(NamedTuple):
     acceptance: float
     spread: float
     diverged: int
+    strict: bool = False
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RareEvent:
-    """An estimate of P[g(z) >= threshold].
+    """An estimate of P[g(z) >= threshold] or, from `failure_probability`, of P[metric > bound].
 
     Attributes:
         probability: Probability of the better estimate; NaN, undecided, if no sample failed.

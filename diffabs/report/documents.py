@@ -109,12 +109,21 @@ def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
         return
     if isinstance(content.get("papers"), dict) and isinstance(content.get("out"), str):
         for name, paper in content["papers"].items():
-            yield from _inside(paper, pathlib.Path(content["out"]) / name / SUMMARY)
+            yield from _inside(paper, _find_folder(content["out"], path) / name / SUMMARY)
         return
     for kind, keys in KEYS_BY_KIND.items():
         if all(key in content for key in keys):
             # The output of `sweep --json` counts as the summary in the sweep's folder: figures and manifest are there.
             if kind == "sweep" and not (path.parent / MANIFEST).exists() and isinstance(content.get("out"), str):
-                path = pathlib.Path(content["out"]) / SUMMARY
+                path = _find_folder(content["out"], path) / SUMMARY
             yield Document(kind, content, path)
             return
+
+
+def _find_folder(out: str, path: pathlib.Path) -> pathlib.Path:
+    """Return the folder `out` that the document of the file `path` names.
+
+    A relative name counts from the folder of the file if there is such a folder, else from the working directory.
+    """
+    beside = path.parent / out
+    return beside if beside.is_dir() else pathlib.Path(out)

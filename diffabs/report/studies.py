@@ -25,6 +25,7 @@ from diffabs.report.page import (
 from diffabs.runtime import files
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import ScenarioError, loads
+from diffabs.sweep.checking import describe_turned_metrics
 
 FIGURES, UNDRAWN = "figures", "No figures: diffabs sweep ... --figures draws them."
 CAPTIONS = {
@@ -162,6 +163,7 @@ def _notes(content: Table) -> Iterator[str]:
         yield f"{count} samples were refused, and are left out of all numbers: {reason}"
     if content["diverged"]["count"]:
         yield f"Diverged samples: {join_words(content['diverged']['samples'][:20])}."
+    yield from describe_turned_metrics(content.get("accuracy") or {})
 
 
 def _sample(content: Table, folder: pathlib.Path) -> list[str]:
@@ -182,8 +184,10 @@ def rare_section(document: Document) -> Section:
     content = document.content
     low, high = (format_known(end, 3) for end in content["interval"])
     failure = f"{content['metric']} > {content['bound']:g} {content['unit']}"
+    columns = ("threshold", "share", "cov", "acceptance", "diverged")
+    # Documents of earlier versions have no key `strict`.
     levels = [
-        [i, row["threshold"], row["share"], row["cov"], row["acceptance"], row["diverged"]]
+        [i, "above" if row.get("strict") else "at least", *(row[key] for key in columns)]
         for i, row in enumerate(content["levels"], 1)
     ]
     estimates = [
@@ -205,8 +209,8 @@ def rare_section(document: Document) -> Section:
         tables=[
             ReportTable("Estimates", ("by", "probability", "low (95 %)", "high (95 %)", "coefficient of variation"),
                   estimates),
-            ReportTable("Levels", ("level", f"at least [{content['unit']}]", "share", "coefficient of variation",
-                             "accepted", "diverged"), levels),
+            ReportTable("Levels", ("level", "metric", f"threshold [{content['unit']}]", "share",
+                             "coefficient of variation", "accepted", "diverged"), levels),
             ReportTable("The likeliest failures", ("parameter", *map(str, range(1, most + 1))), failing, "in SI"),
         ],
         notes=[content["note"]] if content["note"] else [],

@@ -28,9 +28,9 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     it.
 
     Two Newton steps s - mu'/mu'' polish it and carry its derivative by the implicit function theorem. Slip and mu are
-    thus differentiable in every parameter of the road. At a kink bisection alone locates the maximum. The derivative is
-    that of the crossing of both sides, where the curve may be continued beyond the kink. A maximum at more than one
-    slip has the derivative NaN.
+    thus differentiable in every parameter of the road. At a kink bisection alone locates the maximum. Its derivative is
+    that of the point where both sides cross, each continued beyond the kink. A maximum at more than one slip has the
+    derivative NaN.
 
     >>> from diffabs.roads import DRY_ASPHALT, peak
     >>> slip, mu = peak(DRY_ASPHALT)

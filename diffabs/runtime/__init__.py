@@ -1,1 +1,1 @@
-"""What a process needs: files, interrupts, provenance, and summaries of results. It knows no physics."""
+"""Services of a process: files, interrupts, provenance, and summaries of results. It knows no physics."""

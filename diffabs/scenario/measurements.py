@@ -21,10 +21,12 @@ class Readings(NamedTuple):
     Attributes:
         t: Instants [s], increasing.
         columns: Readings at the instants, in SI, by the names of a plant's output.
+        infinite: Names of the columns that are left out, because they are infinite in every row.
     """
 
     t: np.ndarray
     columns: dict[str, np.ndarray]
+    infinite: tuple[str, ...] = ()
 
 
 def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
@@ -32,14 +34,14 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
 
     Args:
         path: File of UTF-8 text, at most `MAX_MEASUREMENT_BYTES` long, with the column `t [s]`. Columns of target,
-            command and control are ignored. So is a column beside others that has the same infinite number in every
-            row: a limit that the simulation lacks.
+            command and control are ignored. A column that is infinite in every row, such as a limit that the simulation
+            lacks, is ignored if another column is left.
         units: Units of the plant's signals by name: a column's header is `name [unit]`.
 
     Raises:
         ScenarioError: The file cannot be read, a column is unknown, or there is no signal or no row. Also raised for a
-            cell that is no finite number, and for an instant that is negative or not after the one before. The message
-            names the line of such a cell or instant.
+            cell that is no finite number in another column, and for an instant that is negative or not after the one
+            before. The message names the line of such a cell or instant.
     """
     try:
         raw = files.read_content(path, MAX_MEASUREMENT_BYTES + 1)
@@ -69,7 +71,8 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
         line, before = (lines[late[0] + 1], t[late[0]]) if len(late) else (lines[0], 0.0)
         at = t[late[0] + 1] if len(late) else t[0]
         raise ScenarioError(f"--data {path}, line {line}: t = {at:g} s does not come after {before:g} s")
-    return Readings(t, {name: numbers[:, i] for i, name in names.items() if i not in unlimited})
+    columns = {name: numbers[:, i] for i, name in names.items() if i not in unlimited}
+    return Readings(t, columns, tuple(name for name in names.values() if name not in columns))
 
 
 def _names(header: Sequence[str], path: pathlib.Path, units: Mapping[str, str]) -> dict[int, str]:

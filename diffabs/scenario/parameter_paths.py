@@ -1,5 +1,5 @@
 """Tables of a scenario whose keys are parameters of the loop: `[design.over]`, `[tune.free]`, `[tune.over]`,
-`[sweep.over]`.
+`[sweep.over]`, and the levels of a grid.
 
     "plant.mass" = ...                   a path of the loop, as one key with dots or as nested tables
     "road.scale" = ...                   the road has a section of its own, here as elsewhere
@@ -35,7 +35,7 @@ from diffabs.scenario.registry import KMH, MAX_DEPTH, in_kmh
 
 Ends = tuple[Any, Any]  # low and high, tuples where the parameter is a list
 
-TABLES = (("design", "over"), ("tune", "free"), ("tune", "over"), ("sweep", "over"))
+TABLES = (("design", "over"), ("tune", "free"), ("tune", "over"), ("sweep", "over"), ("sweep", "design", "levels"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,11 +149,19 @@ def to_canonical_form(table: JsonObject) -> JsonObject:
         if "road" in table:
             raise ScenarioError("road is given twice, as a section and in plant")
         table["road"] = plant.pop("road")
-    for section, name in TABLES:
-        inside = table.get(section)
-        if isinstance(inside, dict) and isinstance(inside.get(name), dict):
-            inside[name] = flatten_table(inside[name], f"{section}.{name}")
+    for where, inside, name in _find_tables(table):
+        inside[name] = flatten_table(inside[name], where)
     return table
+
+
+def _find_tables(table: JsonObject) -> Iterator[tuple[str, JsonObject, str]]:
+    """Yield path, enclosing table and name of each table with parameter keys."""
+    for *sections, name in TABLES:
+        inside: Any = table
+        for section in sections:
+            inside = inside.get(section) if isinstance(inside, dict) else None
+        if isinstance(inside, dict) and isinstance(inside.get(name), dict):
+            yield ".".join([*sections, name]), inside, name
 
 
 def forget_replaced_part(table: JsonObject, replaced: str) -> list[str]:
@@ -166,12 +174,10 @@ def forget_replaced_part(table: JsonObject, replaced: str) -> list[str]:
         replaced: Path of the part.
     """
     removed = []
-    for section, name in TABLES:
-        inside = table.get(section)
-        if isinstance(inside, dict) and isinstance(inside.get(name), dict):
-            old = [key for key in inside[name] if key.startswith(f"{canonical_path(replaced)}.")]
-            inside[name] = {key: value for key, value in inside[name].items() if key not in old}
-            removed += [_where(f"{section}.{name}", key) for key in old]
+    for where, inside, name in _find_tables(table):
+        old = [key for key in inside[name] if key.startswith(f"{canonical_path(replaced)}.")]
+        inside[name] = {key: value for key, value in inside[name].items() if key not in old}
+        removed += [_where(where, key) for key in old]
     return removed
 
 
@@ -184,8 +190,9 @@ def join_path_keys(keys: list[str]) -> list[str]:
     Args:
         keys: Words of the override's path between its dots.
     """
-    if tuple(keys[:2]) in TABLES and len(keys) > 2:
-        return [*keys[:2], canonical_path(".".join(keys[2:]))]
+    for table in TABLES:
+        if tuple(keys[: (n := len(table))]) == table and keys[n:]:
+            return [*table, canonical_path(".".join(keys[n:]))]
     return keys
 
 

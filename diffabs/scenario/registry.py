@@ -186,22 +186,11 @@ def type_name(given: PyTree) -> Scalar:
     return given.get("type") if isinstance(given, dict) else given
 
 
-def inner_fields(family: str, name: str) -> list[str]:
-    """Return the fields of a part that hold one part of the same family, such as the controller inside `sampled`.
+def describe_missing_inner_parts(family: str, given: PyTree, path: str) -> list[str]:
+    """Return a line for each enclosed part of the same family whose type the table does not give.
 
-    Args:
-        family: Family of the part.
-        name: Name of the part.
-    """
-    part = family_types(family)[name]
-    own = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
-    return [field for field in own if family_of(field, "") == family and not isinstance(getattr(part, field), tuple)]
-
-
-def missing_inner_parts(family: str, given: PyTree, path: str) -> list[str]:
-    """Return a line for each part of the same family inside a given part that the table does not name.
-
-    Such a part would get the default type, whatever the scenario has there.
+    Such a part would get the default type of the enclosing class, whatever the scenario has there. A named constant
+    brings its own parts.
 
     Args:
         family: Family of the part.
@@ -209,10 +198,21 @@ def missing_inner_parts(family: str, given: PyTree, path: str) -> list[str]:
         path: Place of the part, for messages.
     """
     name, lines = type_name(given), []
-    for field in inner_fields(family, name) if isinstance(name, str) and name in family_types(family) else ():
-        inner = given.get(field) if isinstance(given, dict) else None
-        if inner is None or (isinstance(inner, dict) and "type" not in inner):
-            lines.append(f"{path}.{field} is missing: {name} encloses another {family}; give its type")
+    part = family_types(family).get(name) if isinstance(name, str) else None
+    is_class = part is not None and name == kebab_case(type(part).__name__)
+    for field in () if part is None else dataclasses.fields(part):
+        if "part" not in field.metadata:
+            continue
+        inner = given.get(field.name) if isinstance(given, dict) else None
+        where, what = f"{path}.{field.name}", family_of(field.name, family)
+        if isinstance(getattr(part, field.name), tuple):
+            items = inner.items() if isinstance(inner, dict) else enumerate(inner if isinstance(inner, list) else ())
+            for key, item in items:
+                lines += describe_missing_inner_parts(what, item, f"{where}.{key}")
+        elif is_class and what == family and type_name(inner) is None:
+            lines.append(f"{where} is missing: {name} encloses another {family}; give its type")
+        else:
+            lines += describe_missing_inner_parts(what, inner, where)
     return lines
 
 

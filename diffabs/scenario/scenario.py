@@ -36,6 +36,7 @@ from diffabs.config.values import (
 from diffabs.config.values import ScenarioError as ScenarioError
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
+from diffabs.core.pytree import get
 from diffabs.core.types import JsonObject, Table
 from diffabs.core.units import units_of
 from diffabs.core.validity import find_cautions, find_problems
@@ -48,8 +49,10 @@ from diffabs.scenario.registry import (
     OTHER_SECTIONS,
     build_loop,
     build_part,
+    describe_missing_inner_parts,
+    family_of,
     join_path,
-    missing_inner_parts,
+    name_of,
     type_name,
 )
 from diffabs.simulate.admissible import find_mismatches, find_unstable_step
@@ -190,7 +193,7 @@ def _without_inner(before: Table, table: Table) -> Iterator[str]:
     """Yield a line for each section whose new part encloses another part that the override does not name."""
     for family, old in before.items():
         if type_name(table.get(family)) != old:
-            yield from missing_inner_parts(family, table.get(family), family)
+            yield from describe_missing_inner_parts(family, table.get(family), family)
 
 
 def _refuse(*objections: Iterable[str]) -> None:
@@ -261,7 +264,7 @@ def _override(table: JsonObject, override: str) -> str:
         node = child
     place = _place(node, keys[-1], ".".join(keys[:-1]))
     replaced = keys[:-1] if place == "type" else keys
-    old_type = node.get("type") if place == "type" else None
+    old_type = node.get("type", _usual_type(table, replaced)) if place == "type" else None
     if isinstance(place, str):
         # An override in m/s replaces a value in km/h and the reverse; both together would be given twice.
         other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
@@ -282,6 +285,15 @@ def _override(table: JsonObject, override: str) -> str:
     return f"{'.'.join(keys)}={part} removes {', '.join(removed)} of the replaced part"
 
 
+def _usual_type(table: JsonObject, keys: Sequence[str]) -> str | None:
+    """Return the name of the part at a path of the loop before an override; None if there is none yet."""
+    path = ".".join(["plant", *keys] if keys[:1] == ["road"] else keys)
+    try:
+        return name_of(family_of(keys[-1], keys[0]), get(_build_loop(table), path))
+    except (ScenarioError, LookupError):
+        return None
+
+
 def _place(node: Any, key: str, path: str) -> Any:
     if isinstance(node, dict):
         return key
@@ -293,16 +305,11 @@ def _place(node: Any, key: str, path: str) -> Any:
 
 def _assemble(name: str, table: JsonObject, folder: pathlib.Path, notes: Iterable[str]) -> Scenario:
     texts = {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
-    sections = {key: value for key, value in table.items() if key not in OTHER_SECTIONS}
-    if "road" in table:
-        plant = sections.get("plant", {})
-        plant = {"type": plant} if isinstance(plant, str) else plant
-        sections["plant"] = {**plant, "road": table["road"]} if isinstance(plant, dict) else plant
     solver, seed = section_solver.read_solver_section(table.get("solver", {}))
     given = table.get("objective", {})
     if not isinstance(given, dict):
         raise wrong_kind_error("objective", given, "a table of objectives")
-    loop = build_loop(sections)
+    loop = _build_loop(table)
     report = default_objectives(loop.plant)
     measured = {}
     for key, value in given.items():
@@ -324,6 +331,16 @@ def _assemble(name: str, table: JsonObject, folder: pathlib.Path, notes: Iterabl
         sweep=section_sweep.read_sweep_section(table.get("sweep", {}), loop, objectives, folder),
         notes=tuple(notes),
     )
+
+
+def _build_loop(table: JsonObject) -> Loop:
+    """Return the loop of a scenario, whose road has a section of its own."""
+    sections = {key: value for key, value in table.items() if key not in OTHER_SECTIONS}
+    if "road" in table:
+        plant = sections.get("plant", {})
+        plant = {"type": plant} if isinstance(plant, str) else plant
+        sections["plant"] = {**plant, "road": table["road"]} if isinstance(plant, dict) else plant
+    return build_loop(sections)
 
 
 def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:

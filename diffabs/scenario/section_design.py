@@ -26,7 +26,6 @@ from diffabs.config.values import (
     read_number,
     table_field,
     table_reader,
-    unknown_name_error,
     wrong_kind_error,
 )
 from diffabs.config.values import read_table as read_table
@@ -104,18 +103,16 @@ class DesignTask:
         from the loop's stop to its start.
 
         Raises:
-            ScenarioError: A range is that of a parameter which only the linear model of `loop` has.
+            ScenarioError: [design.over] has a range for a parameter of the linear model that `loop` itself lacks.
         """
         over = self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else self.over
-        known = [path for path, _, _ in parameters(loop)]
-        for path in over:
+        ranges = {path: ends for path, ends in over.items() if ends[0] < ends[1]}
+        known = {path for path, _, _ in parameters(loop)}
+        for path in ranges:
             if path not in known:
-                raise unknown_name_error(
-                    f"design.over.{canonical_path(path)} is a parameter of the linear model, but not of this loop",
-                    path,
-                    map(canonical_path, known),
-                )
-        return {path: ends for path, ends in over.items() if ends[0] < ends[1]}
+                where = f"design.over.{canonical_path(path)} is a parameter of the linear model, but not of this loop"
+                raise ScenarioError(f"{where}: remove it from [design.over]")
+        return ranges
 
     def _with_speed(self, loop: Loop) -> dict[str, Range]:
         over = dict(self.over)

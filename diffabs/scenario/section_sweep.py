@@ -25,7 +25,7 @@ Running the sweep needs the extra `sweep`.
 
 import dataclasses
 import pathlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from diffabs.config.values import (
@@ -38,17 +38,16 @@ from diffabs.config.values import (
     read_text,
     table_field,
     table_reader,
-    unknown_name_error,
     whole_reader,
     wrong_kind_error,
 )
 from diffabs.config.values import read_table as read_table
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import elements, get
+from diffabs.core.pytree import ParameterSpec, elements, get
 from diffabs.core.types import JsonObject, Params, PyTree, Table
-from diffabs.scenario.parameter_paths import ParameterEntry, canonical_path, flatten_table, metric_reader, read_entries
-from diffabs.scenario.registry import build_part, family_of, missing_inner_parts, unit_of
+from diffabs.scenario.parameter_paths import ParameterEntry, flatten_table, metric_reader, read_entries
+from diffabs.scenario.registry import build_part, describe_missing_inner_parts, family_of, unit_of
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.variables import Correlation, Space, read_correlation
 
@@ -136,38 +135,25 @@ def read_sweep_section(
         SweepSection,
         table,
         "sweep",
-        design=_read_design,
         over=lambda given, path: _over(flatten_table(table_reader(read_as_given)(given, path), path), loop, folder),
         correlation=lambda given, path: read_correlation(given, path) if given != {} else None,
         failures=metric_reader(objectives, "bounds by metric", lambda one: unit_of(one, loop.plant)),
     )
     if plan.correlation:
-        paths = _loop_paths(plan.correlation.paths, plan.over, "sweep.correlation.paths")
-        plan = dataclasses.replace(plan, correlation=dataclasses.replace(plan.correlation, paths=tuple(paths)))
+        paths = dict.fromkeys(plan.correlation.paths)
+        paths = tuple(_by_varied_path(paths, "sweep.correlation.paths", plan.over, loop))
+        plan = dataclasses.replace(plan, correlation=dataclasses.replace(plan.correlation, paths=paths))
     if isinstance(plan.design, sampling.Grid) and isinstance(levels := plan.design.levels, Mapping):
-        paths = _loop_paths(levels, plan.over, "sweep.design.levels")
-        if len(set(paths)) < len(paths):
-            raise ScenarioError("sweep.design.levels: a speed is given twice, in m/s and in km/h")
-        levels = dict(zip(paths, levels.values(), strict=True))
+        levels = _by_varied_path(levels, "sweep.design.levels", plan.over, loop)
         plan = dataclasses.replace(plan, design=dataclasses.replace(plan.design, levels=levels))
     return plan
 
 
-def _read_design(given: PyTree, path: str) -> sampling.SamplingDesign:
-    """Return the sampling design of a table, whose levels may be nested tables like those of [sweep.over]."""
-    if isinstance(given, Mapping) and isinstance(given.get("levels"), Mapping):
-        given = {**given, "levels": flatten_table(given["levels"], f"{path}.levels")}
-    return sampling.read_sampling_design(given, path)
-
-
-def _loop_paths(given: Iterable[str], over: Params, where: str) -> list[str]:
-    """Return the paths of the loop of varied parameters, which are given in any allowed form."""
-    known = {canonical_path(path): path for path in over}
-    found = {path: canonical_path(path).removesuffix("_kmh") for path in given}
-    for path, there in found.items():
-        if there not in known:
-            raise unknown_name_error(f"{where}: {format_given(path)} does not vary", path, known)
-    return [known[found[path]] for path in given]
+def _by_varied_path(given: Table, where: str, over: Params, loop: Loop) -> JsonObject:
+    """Return the values given for varied parameters by path of the loop; the keys may have any allowed form."""
+    specs = elements(loop)
+    there = {path: (specs.get(path, ParameterSpec("1")), ()) for path in over}
+    return {item.path: item.given for item in read_entries(given, where, there, "not varied in sweep.over")}
 
 
 def _over(given: Table, loop: Loop, folder: pathlib.Path) -> JsonObject:
@@ -233,7 +219,7 @@ def _choice(key: str, given: PyTree, default: Any) -> Choice:
     drawn = distributions.read_distribution({**table, "type": "categorical", "choices": names}, where)
     family, parts = family_of(key, key), {}
     for i, (name, item) in enumerate(zip(names, table["choices"], strict=True)):
-        if lines := missing_inner_parts(family, item, f"{where}.{i}"):
+        if lines := describe_missing_inner_parts(family, item, f"{where}.{i}"):
             raise ScenarioError("; ".join(lines))
         parts[name] = build_part(family, item, default, f"{where}.{i}")
     return Choice(given, drawn, parts)

@@ -104,7 +104,7 @@ class SpeedEstimator:
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
         """Return the memory after one filter step if a period begins, else the old memory.
 
-        At the first sample, and where slip >= gate with f < rest, the filter starts anew from the wheel speed.
+        At the first sample, and where slip >= gate with f < rest, the filter starts again from the wheel speed.
         """
         now, _ = clock.ticks(self.period)
         m: EstimatorMemory = memory.held

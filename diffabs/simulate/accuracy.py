@@ -36,17 +36,17 @@ MAX_COMPARED_INSTANTS = 256  # greatest number of instants at which noise is com
 class ErrorEstimate(NamedTuple):
     """Error estimate of one metric, in the metric's unit (`order` and `converges` have none).
 
-    If the runs are not comparable, every field but `value` and `converges` is NaN.
+    If the runs are not comparable, every number but `value` is NaN, and the flags are False.
 
     Attributes:
         value: Value m(h) with the step h of the solver.
         difference: Change d1 = m(h/2) - m(h) by the half step.
         finer: Change d2 = m(h/4) - m(h/2) by the quarter step.
         order: Observed order p = -log2(|d2/d1|). NaN if both differences are rounding errors, or if d2 = 0.
-        converges: True if |d2/d1| is at most `MAX_DIFFERENCE_RATIO`, or if both differences are rounding errors. False
-            if the runs are not comparable.
+        converges: True if |d2/d1| is at most `MAX_DIFFERENCE_RATIO`, or if both differences are rounding errors.
         error: Estimate |d1| + |d2|/(1 - q) of the error of `value`, with q = |d2/d1|. A larger q than
             `MAX_DIFFERENCE_RATIO` is replaced by this limit: the error is then not reliable.
+        turned: True if the metric is finite with one of the three steps and not with another.
     """
 
     value: Scalar
@@ -55,6 +55,7 @@ class ErrorEstimate(NamedTuple):
     order: Any
     converges: Bool
     error: Scalar
+    turned: Bool
 
     @property
     def relative(self) -> Scalar:
@@ -258,4 +259,6 @@ def _estimate(coarse: Scalar, half: Scalar, quarter: Scalar, comparable: Bool) -
     error = jnp.abs(d1) + jnp.abs(d2) / (1 - jnp.minimum(q, MAX_DIFFERENCE_RATIO))
     known = comparable & jnp.isfinite(d1) & jnp.isfinite(d2)
     d1, d2, order, error = (jnp.where(known, x, jnp.nan) for x in (d1, d2, order, error))
-    return ErrorEstimate(coarse, d1, d2, order, known & (rounded | (q <= MAX_DIFFERENCE_RATIO)), error)
+    finite = jnp.isfinite(jnp.stack([coarse, half, quarter]))
+    turned = comparable & jnp.any(finite) & ~jnp.all(finite)
+    return ErrorEstimate(coarse, d1, d2, order, known & (rounded | (q <= MAX_DIFFERENCE_RATIO)), error, turned)

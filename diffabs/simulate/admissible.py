@@ -147,7 +147,7 @@ def find_solver_faults(solver: Solver) -> list[str]:
 
 
 def _find_field_fault(name: str, value: Any) -> str:
-    """Return what is wrong with the value of one field of a solver, or an empty string."""
+    """Return the fault in the value of one field of a solver, or an empty string."""
     if isinstance(value, Tracer):
         return "is traced; a number that is known before the trace is needed"
     if line := kinds.find_value_objection(value) or (

@@ -1,4 +1,4 @@
-"""Arguments of a run: what is refused, and their preparation for a compiled program."""
+"""Arguments of a run: refusals, and the preparation for a compiled program."""
 
 from collections.abc import Mapping
 

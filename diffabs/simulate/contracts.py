@@ -60,7 +60,7 @@ def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[st
     """Yield one line for each misfit: a method that fails, or that returns something else than its contract asks for.
 
     The first misfit of a part of the loop ends the check. If the loop fits, each objective gives at most one line. A
-    structure that fits is not traced again, whatever the values of its parameters.
+    structure that fits is not traced again for other values of its parameters.
 
     Args:
         loop: Loop to trace, with its ticks and events.

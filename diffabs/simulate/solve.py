@@ -484,8 +484,8 @@ def solve(
 
     Every comparison in the field that depends on t or y is a switch: steps end where it changes, so that values keep
     the order of the method, and derivatives are right. `switches` lists them. The function works under `jax.jit`,
-    `jax.vmap` and both modes of differentiation, by y0, t0, t1, args, `save` and whatever the functions close over. It
-    is compiled again where a constant of a function has changed, so pass parameters by `args`.
+    `jax.vmap` and both modes of differentiation, by y0, t0, t1, args, `save` and all values that the functions close
+    over. It is compiled again where a constant of a function has changed, so pass parameters by `args`.
 
     Args:
         field: Pure function of (t, y, args) that returns dy/dt, with the structure and shapes of y.
@@ -875,7 +875,7 @@ def _check_result(name: str, found: PyTree, like: PyTree) -> None:
 
 
 def _describe_program(program: jex.ClosedJaxpr | jex.Jaxpr, constants: Sequence[Any], hidden: list[Any]) -> Any:
-    """Return what is equal for programs of equal operations and constants; see `_describe`."""
+    """Return a description that is equal for programs of equal operations and constants; see `_describe`."""
     x, numbers = getattr(program, "jaxpr", program), dict[Any, int]()
 
     def read(atoms: Sequence[Any]) -> tuple:
@@ -892,7 +892,7 @@ def _describe_program(program: jex.ClosedJaxpr | jex.Jaxpr, constants: Sequence[
 
 
 def _describe(x: Any, hidden: list[Any]) -> Any:
-    """Return what is equal for equal programs or parameters of them; `hidden` gets the parameters that are not read."""
+    """Return a description that is equal for equal programs or parameters; `hidden` gets the parameters not read."""
     if isinstance(x, jex.ClosedJaxpr | jex.Jaxpr):
         return _describe_program(x, getattr(x, "consts", ()), hidden)
     if isinstance(x, dict):

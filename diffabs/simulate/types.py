@@ -97,7 +97,7 @@ def refine_solver(solver: Solver, times: int) -> Solver:
 
 
 def describe_solver(solver: Solver) -> dict[str, PyTree]:
-    """Return everything of a solver that decides the metrics, by name; for a file.
+    """Return the fields of a solver that decide the metrics, by name, as JSON values.
 
     It has step and duration [s]. `Adaptive` adds its type and `rtol`, `FixedStep` its `kinks` unless they are None.
 
@@ -113,7 +113,7 @@ def describe_solver(solver: Solver) -> dict[str, PyTree]:
 def differs_in_kind(one: Scalar, other: Scalar) -> Bool:
     """Return True where two values of a metric differ and are not both finite, such as 0.3 s and "never".
 
-    No subtraction shows such a change: its result is infinite, or no number.
+    Such a change has no size: the difference would be infinite or NaN.
 
     Args:
         one: Values of the metric, any shape.

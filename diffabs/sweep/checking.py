@@ -1,5 +1,8 @@
 """Accuracy of a sweep's metrics: a random sample of its runs, repeated with steps of half the length."""
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,8 +11,10 @@ from diffabs.core.types import JsonObject, Key, Part, PyTree
 from diffabs.simulate.accuracy import is_comparable, measure_finer, relative_difference
 from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
 from diffabs.simulate.types import Run, describe_solver, differs_in_kind
-from diffabs.sweep.results import Results
 from diffabs.sweep.study import Study, precision
+
+if TYPE_CHECKING:
+    from diffabs.sweep.results import Results
 
 ACCURACY_STREAM = 0x0ACC  # stream of random numbers, independent of the designs
 EXCLUDED_FLAGS = ("diverged", "refused")  # flags of samples without metrics
@@ -17,7 +22,7 @@ NEGLIGIBLE_CHANGE = 1e-9  # smaller changes, or changes below solver.rtol, give 
 MAX_RELATIVE_CHANGE = 0.01  # largest relative change by a half step without a warning
 
 
-def check_accuracy(study: Study, found: Results, count: int) -> JsonObject:
+def check_accuracy(study: Study, found: "Results", count: int) -> JsonObject:
     """Return how much a half step changes each metric, for at most `count` runs that did not diverge.
 
     The seed chooses the runs. The result has these entries:
@@ -89,9 +94,7 @@ def accuracy_warnings(result: JsonObject) -> list[str]:
         each = (f"{name} by up to {100 * row['largest']:.3g} % (sample {row['sample']})" for name, row in loose.items())
         cure = "lower solver.rtol" if "rtol" in result.get("solver", {}) else "shorten solver.step"
         lines.append(f"a half step changes {', '.join(each)}: {cure}")
-    for name, row in result["turned"].items():
-        where = f"{row['count']} of {len(result['samples'])} runs, the first sample {row['samples'][0]}"
-        lines.append(f"a half step turns {name} from a number into never, or back, in {where}")
+    lines += describe_turned_metrics(result)
     if result["ended otherwise"]:
         lines.append(f"with a half step {result['ended otherwise']} of the lanes looked at ended in another way")
     if result["not comparable"]:
@@ -99,14 +102,25 @@ def accuracy_warnings(result: JsonObject) -> list[str]:
     return lines
 
 
-def _choose_samples(study: Study, found: Results, count: int) -> np.ndarray:
+def describe_turned_metrics(result: JsonObject) -> Iterator[str]:
+    """Yield a line for each metric that the half step turns from a number into never, or back.
+
+    Args:
+        result: Result of `check_accuracy`; older versions wrote none of these metrics.
+    """
+    for name, row in result.get("turned", {}).items():
+        where = f"{row['count']} of {len(result['samples'])} runs, the first sample {row['samples'][0]}"
+        yield f"{name} is finite with one step and never with the other in {where}: its statistics cannot be trusted"
+
+
+def _choose_samples(study: Study, found: "Results", count: int) -> np.ndarray:
     """Return the numbers of at most `count` samples with metrics, in ascending order."""
     good = found.column("sample")[~np.any([_has_flag(found, flag) for flag in EXCLUDED_FLAGS], axis=0)]
     random = np.random.default_rng([study.seed, ACCURACY_STREAM])
     return np.sort(random.choice(good, min(count, len(good)), replace=False))
 
 
-def _has_flag(found: Results, flag: str) -> np.ndarray:
+def _has_flag(found: "Results", flag: str) -> np.ndarray:
     """Return which runs have a flag or a reason; none if the table lacks this column."""
     try:
         column = found.column(flag)

@@ -28,7 +28,6 @@ import optax
 from diffabs.core.reason import Reason
 from diffabs.core.types import PyTree
 from diffabs.simulate.drive.engine import describe_engine
-from diffabs.tune.constraints import AtMost
 from diffabs.tune.descent import Descent, DescentState, Optimiser, lbfgs, slice_start
 from diffabs.tune.method import Method
 from diffabs.tune.problem import Multipliers, ObjectiveEvaluation, Problem
@@ -83,7 +82,8 @@ class AugmentedLagrangianSearch:
         """Run the search and return the best result over all starts.
 
         Raises:
-            StartError: No start has finite metrics and gradients, a stable step and only runs that do not diverge.
+            StartError: No start has a finite objective, constraints and gradient, a stable step and only runs that do
+                not diverge.
         """
         problem, method = self.problem, self.method
         chosen = (
@@ -192,11 +192,14 @@ class AugmentedLagrangianSearch:
         lost, lanes = int(self.before.diverged), self.problem.batch.size
         if lost or self.refused:
             return f"{Reason.START.value}: {self.refused or f'{lost} of {lanes} lanes diverge there'}"
-        bounds = [one.metric for one in self.problem.constraints if isinstance(one, AtMost)]
+        bounds = filter(None, (getattr(one, "metric", None) for one in self.problem.constraints))
         for name in (*self.problem.weights, *bounds):
-            if never := np.count_nonzero(~np.isfinite(self.before.metrics[name])):
+            value, unreached = self.before.metrics[name], getattr(self.problem.measured[name], "unreached", np.nan)
+            if never := np.count_nonzero(value == unreached):
                 found = f"{name} is infinite at the start in {never} of {lanes} lanes"
                 return f"{found}: such a run never settles; start from one that does, or take iae"
+            if lost := np.count_nonzero(~np.isfinite(value)):
+                return f"{name} is not finite at the start in {lost} of {lanes} lanes"
         return "the objective, a constraint or a derivative is not finite at the start"
 
     def _values(self, z: np.ndarray) -> dict[str, PyTree]:

@@ -9,6 +9,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.kinds import find_value_objection, format_value, value_shape
+from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, replace
 from diffabs.core.types import Params, Part, PyTree
@@ -20,7 +21,7 @@ from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.types import Solver
 from diffabs.tune import one_sided
 from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch
-from diffabs.tune.constraints import AtMost, Constraint
+from diffabs.tune.constraints import Constraint
 from diffabs.tune.method import DerivativeMode, Method
 from diffabs.tune.problem import Problem, choose_gradient_mode
 from diffabs.tune.result import Tuned, TuningProgress, build_subject_loop
@@ -94,7 +95,7 @@ def build_problem(
 
     Raises:
         ValueError: A path, range, metric, constraint or batch does not fit, or a parameter is out of range.
-        ValueError: No run depends on a free parameter.
+        ValueError: `over` or `closed_loop()` overwrites a free parameter.
         EngineError: The engine is "kernel" and the mode is reverse.
 
     >>> import diffabs as d
@@ -118,7 +119,7 @@ def build_problem(
     _check_metrics(objective, measured)
     constraints = _check_constraints(constraints, measured, batch.size)
     free_space = parameter_space(subject, free)
-    _check_influence(subject, free_space, batch)
+    _check_not_overwritten(subject, free_space, batch)
     problem = Problem(
         subject=subject,
         space=free_space,
@@ -126,7 +127,7 @@ def build_problem(
         measured=measured,
         weights=objective,
         batch=batch,
-        aggregate=check_part(aggregate or Mean()),
+        aggregate=check_part(aggregate or Mean(), "aggregate."),
         constraints=constraints,
         mode=mode or choose_gradient_mode(free_space),
     )
@@ -149,25 +150,26 @@ def _check_constraints(
     constraints: Iterable[Constraint], measured: Mapping[str, Objective], runs: int
 ) -> tuple[Constraint, ...]:
     """Return the constraints; raise a ValueError if one is no constraint, or a bound does not fit the runs."""
-    found = tuple(constraints) if isinstance(constraints, Iterable) else ()  # a generator can be read once only
-    if not isinstance(constraints, Iterable) or not all(hasattr(one, "excess") for one in found):
+    listed = isinstance(constraints, Iterable) and not isinstance(constraints, Mapping | str)
+    found = tuple(constraints) if listed else ()  # a generator can be read once only
+    if not listed or not all(hasattr(one, "excess") for one in found):
         given = format_value(constraints)
         raise ValueError(f'constraints = {given} is no list of constraints, such as [AtMost("overshoot", 0.01)]')
-    for one in found:
-        if not isinstance(one, AtMost):
+    for one in found:  # AtMost, or a class of the user's own with such attributes
+        if (metric := getattr(one, "metric", None)) is None:
             continue
-        _check_measured(one.metric, measured)
-        bound = one.bound
+        _check_measured(metric, measured)
+        bound = getattr(one, "bound", 0.0)
         if find_value_objection(bound) or not np.isfinite(np.asarray(bound, float)).all():
-            raise ValueError(f"constraints: the bound of {one.metric} is {bound!r}, not a finite number")
+            raise ValueError(f"constraints: the bound of {metric} is {bound!r}, not a finite number")
         if value_shape(bound) not in ((), (runs,)):
             needed = f"one number, or one for each of {runs} runs, is needed"
-            raise ValueError(f"constraints: the bound of {one.metric} has the shape {value_shape(bound)}; {needed}")
+            raise ValueError(f"constraints: the bound of {metric} has the shape {value_shape(bound)}; {needed}")
     return found
 
 
-def _check_influence(subject: Part, space: FreeSpace, batch: Batch) -> None:
-    """Raise a ValueError if no run depends on a free parameter: the search would end at once."""
+def _check_not_overwritten(subject: Part, space: FreeSpace, batch: Batch) -> None:
+    """Raise a ValueError if `over` or `closed_loop()` overwrites a free parameter: the search could not move it."""
 
     def loops(values: Params) -> PyTree:
         loop = canonical_dtypes(build_subject_loop(replace(subject, values)))
@@ -177,7 +179,8 @@ def _check_influence(subject: Part, space: FreeSpace, batch: Batch) -> None:
     program = jax.make_jaxpr(loops)(own).jaxpr
     _, used = dce_jaxpr(program, [True] * len(program.outvars))
     if idle := [path for path, one in zip(sorted(own), used, strict=True) if not one]:
-        raise ValueError(f"{', '.join(idle)}: free, but no run depends on it, since over or closed_loop() replaces it")
+        by = "`over`" if isinstance(subject, Loop) else "`over` or `closed_loop()`"
+        raise ValueError(f"{', '.join(idle)}: free, but {by} gives its value in every run")
 
 
 def _check_measured(name: str, measured: Mapping[str, Objective]) -> None:

@@ -6,8 +6,8 @@ One batch screens up to 64 corners of the box and random points. Gradient ascent
 with derivatives may end its steps on kinks, so its metrics may differ. Another batch therefore runs the ends of the
 ascents again, without derivatives, and the result has only metrics of such plain runs.
 
-In a box of more than six numbers, the corners have every combination of the ends of the first six. Each end of another
-number occurs in half of them, drawn at random.
+In a box of more than six numbers, the corners have every combination of the ends of the first six. Every further number
+is at its low end in half of these corners and at its high end in the other half, in random order.
 
 The method is local: a run that exceeds a bound is a counterexample, but the worst case found depends on the starts. The
 worst case is often a corner; a run of all corners then finds it without a gradient. `WorstCase.report` states how the
@@ -119,10 +119,12 @@ class WorstCase:
     def _finder(self) -> str:
         """Return a sentence on how the search found the worst case: corner, screened point or gradients."""
         number = 2 ** sum(np.size(value) for value in self.values.values())
-        some = "" if self.corners == number else f"{self.corners} of "
-        worst = f"worst corner {self.corner:.6g}" + (f", {some}{number} run" if some else "")
+        all_run = self.corners == number
+        worst = f"worst corner {self.corner:.6g}" + ("" if all_run else f", {self.corners} of {number} run")
         if math.isclose(self.value, self.corner, rel_tol=CORNER_TOLERANCE):
-            return f"That is a corner of the box: running {some}its {number} corners finds it."
+            if all_run:
+                return f"That is a corner of the box: running its {number} corners finds it."
+            return f"That is a corner of the box: it is one of the {self.corners} corners (of {number}) that were run."
         if self.value <= self.screened:
             return f"That is one of the points that were run first ({worst})."
         first = f"{self.screened:.6g}, the worst of the points that were run first"
@@ -194,7 +196,7 @@ def worst_case(
     problem = problem.with_engine(engine)
     known = runs.metrics[metric][worst]
     known = known[np.isfinite(known)]
-    # The scale of the loss, which only decides when an ascent ends.
+    # The scale of the loss. It sets when an ascent ends, and the length of its first step.
     scale = max(abs(float(known[0])), 1e-12) if len(known) else 1.0
     lanes = _ascend(problem, points[worst], scale, iterations) if starts else []
     if price is None:

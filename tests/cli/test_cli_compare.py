@@ -62,6 +62,22 @@ def test_a_comparison_is_sample_by_sample(swept):
     assert width == pytest.approx(2 * t.ppf(0.975, 23) * spread, rel=1e-9)
 
 
+@killed_by("cli/show_samples.py", 'if row["never"]:', "if False:")
+def test_runs_that_never_reach_an_event_are_said(capsys):
+    """Two of seven samples: the other five have statistics."""
+    stop = np.array([1.0, np.inf, 2.0, 3.0, 1.5, 2.5, np.inf])
+    a, b = (
+        SimpleNamespace(
+            column={"stop_time": stop + more, "diverged": np.zeros(7, bool)}.__getitem__, accepted=np.ones(7, bool)
+        )
+        for more in (0.0, 0.1)
+    )
+    both: Any = (a, b)
+    show_comparison({"first": "a", "second": "b", **_compare_metrics(*both, ["stop_time"])})
+    line = "warning: stop_time is infinite (never) in 2 common samples: its statistics leave them out\n"
+    assert line in capsys.readouterr().err
+
+
 @killed_by("cli/compare.py", "if len(before) >= FEWEST:", "if len(before) < FEWEST:")
 def test_a_metric_of_few_runs_has_a_row(capsys):
     """Three of five samples reach the event in both sweeps, and every sample has the other metric."""

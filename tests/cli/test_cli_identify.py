@@ -16,7 +16,7 @@ from diffabs.cli import identify as commands_identify
 from diffabs.core.protocols import BrakeOutput
 from diffabs.identify.fit import Identified
 from diffabs.identify.uncertainty import uncertainty
-from diffabs.scenario.measurements import Readings, read_measurements
+from diffabs.scenario.measurements import read_measurements
 from diffabs.scenario.scenario import ScenarioError, load
 from diffabs.simulate.types import FixedStep
 from diffabs.tune import Reason
@@ -67,7 +67,7 @@ def small(file):
 
 
 def test_readings_are_what_is_in_the_file(csv):
-    t, columns = read_measurements(csv("\ufeff" + HEADER, *ROWS, ""), UNITS)
+    t, columns, _ = read_measurements(csv("\ufeff" + HEADER, *ROWS, ""), UNITS)
     assert t.tolist() == [0, 0.1, 0.3]
     assert list(columns) == ["wheel_speed", "slip"]
     assert columns["wheel_speed"].tolist() == [13.8, 12.9, 11.0]
@@ -77,7 +77,7 @@ def test_readings_are_what_is_in_the_file(csv):
 @pytest.mark.slow
 def test_readings_are_what_simulate_writes(small, tmp_path):
     run("simulate", small, "--csv", tmp_path / "run.csv", "--set", "solver.duration=0.02")
-    t, columns = read_measurements(tmp_path / "run.csv", UNITS)
+    t, columns, _ = read_measurements(tmp_path / "run.csv", UNITS)
     np.testing.assert_allclose(t, 1e-3 * np.arange(21), rtol=1e-11, atol=1e-15)
     assert list(columns) == ["slip", "speed", "wheel_speed", "deceleration", "distance"]
     np.testing.assert_allclose(columns["slip"], 1 - columns["wheel_speed"] / columns["speed"], rtol=0, atol=1e-10)
@@ -221,7 +221,7 @@ def test_table_for_people(small, csv, invented):
 def test_what_simulate_wrote_is_found_again(small, tmp_path):
     truth = ("--set", "plant.mass=6.0", "--set", "road.w4=0.38")
     run("simulate", small, "--csv", tmp_path / "run.csv", *truth)
-    t, columns = read_measurements(tmp_path / "run.csv", UNITS)
+    t, columns, _ = read_measurements(tmp_path / "run.csv", UNITS)
     noisy = columns["wheel_speed"] + np.random.default_rng(5).normal(0.0, 0.02, len(t))
     lines = (f"{x},{w}" for x, w in zip(t, noisy, strict=True))
     (tmp_path / "noisy.csv").write_text("\n".join(["t [s],wheel_speed [m/s]", *lines]))
@@ -305,33 +305,53 @@ def test_without_the_extra(small, csv, monkeypatch):
 
 def test_a_trajectory_is_as_long_as_the_data(small, csv):
     solver, readings = load(small).solver, read_measurements(csv(HEADER, *ROWS), UNITS)
-    assert commands_identify._solver(solver, readings).steps == 302
-    long = commands_identify._solver(FixedStep(1e-6, 1.0), readings)
+    assert commands_identify._match_times(solver, readings.t)[0].steps == 302
+    long, _ = commands_identify._match_times(FixedStep(1e-6, 1.0), readings.t)
     assert long.steps == 300_002
     assert long.every == 16
-    assert commands_identify._solver(FixedStep(0.1, 0.3), readings).duration == pytest.approx(0.3)
+    assert commands_identify._match_times(FixedStep(0.1, 0.3), readings.t)[0].duration == pytest.approx(0.3)
 
 
 @killed_by("cli/identify.py", "end * (1 + FILE_ROUNDING)", "end", case="product")
-@killed_by("cli/identify.py", "end * (1 + FILE_ROUNDING)", "end", case="thirds")
-@pytest.mark.parametrize(("step", "duration"), [(3e-4, 3.0), (2 / 3, 2 / 3)], ids=["product", "thirds"])
+@killed_by("cli/identify.py", "np.minimum(t, end)", "t")
+@pytest.mark.parametrize(
+    ("step", "duration"), [(3e-4, 3.0), (2 / 3, 2 / 3), (5 / 3, 5 / 3)], ids=["product", "thirds", "five thirds"]
+)
 def test_the_last_instant_of_a_file_is_in_the_run(step, duration):
-    """10,000 times 3e-4 is less than 3, and a file has 0.666666666667 for two thirds."""
+    """10,000 times 3e-4 is less than 3, and a file has 1.66666666667 for five thirds."""
     last = float(f"{duration:.12g}")
-    found = commands_identify._solver(FixedStep(step, duration), Readings(np.array([0.0, last]), {}))
-    assert last <= found.duration <= duration * (1 + 1e-11)
-    longer = Readings(np.array([0.0, 1.01 * duration]), {})
-    assert commands_identify._solver(FixedStep(step, duration), longer).duration <= duration * (1 + 1e-11)
+    solver = FixedStep(step, duration)
+    found, t = commands_identify._match_times(solver, np.array([0.0, last]))
+    assert t[1] == pytest.approx(last, rel=1e-11)
+    assert t[1] <= found.duration == pytest.approx(duration, rel=1e-15)
+    assert found.steps == solver.steps == round(duration / step)
+    found, t = commands_identify._match_times(solver, np.array([0.0, 1.01 * duration]))
+    assert t[1] > found.duration  # is refused
 
 
-@killed_by("scenario/measurements.py", "if i not in unlimited})", "})")
+@killed_by("scenario/measurements.py", "if i not in unlimited}", "}")
 @killed_by("scenario/measurements.py", "        if j not in unlimited:", "        if True:")
 def test_a_limit_that_a_simulation_lacks_is_not_measured(csv):
     rows = ("t [s],psi [rad],current_max [A]", "0,0.1,inf", "0.1,0.2,inf")
     units = {"psi": "rad", "current_max": "A"}
-    assert list(read_measurements(csv(*rows), units).columns) == ["psi"]
+    found = read_measurements(csv(*rows), units)
+    assert (list(found.columns), found.infinite) == (["psi"], ("current_max",))
     for wrong in ((*rows[:2], "0.1,0.2,3"), (rows[0], "0,0.1,3", rows[2]), (*rows[:2], "0.1,inf,inf")):
         with pytest.raises(ScenarioError, match="= inf is outside"):
             read_measurements(csv(*wrong), units)
     with pytest.raises(ScenarioError, match="line 2: psi"):
         read_measurements(csv("t [s],psi [rad]", "0,inf"), units)
+
+
+@killed_by("cli/identify.py", "        if name in readings.infinite:", "        if False:")
+@killed_by("cli/identify.py", "if readings.infinite and not names:", "if False:")
+def test_a_column_that_is_left_out_is_named(csv, capsys):
+    path, units = csv("t [s],psi [rad],current_max [A]", "0,0.1,inf", "0.1,0.2,inf"), {"psi": "rad", "current_max": "A"}
+    found = commands_identify._compared_columns(path, None, units)
+    assert list(found.columns) == ["psi"]
+    line = "note: current_max is infinite in every row of the data, and is not compared\n"
+    assert capsys.readouterr().err == line
+    commands_identify._compared_columns(path, ["psi"], units)
+    assert capsys.readouterr().err == ""
+    with pytest.raises(ScenarioError, match="--column current_max is infinite in every row of the data"):
+        commands_identify._compared_columns(path, ["current_max"], units)

@@ -16,7 +16,10 @@ from seams import replace_seam
 from small_scenarios import RARE
 from sweeping import described
 
+from diffabs.cli.show_samples import show_rare_event
 from diffabs.reliability.failure import failure_probability
+from diffabs.report.documents import find_documents
+from diffabs.report.studies import rare_section
 from diffabs.scenario.scenario import load
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.ensemble import run_batch
@@ -55,6 +58,28 @@ def test_tables_for_a_person(scenario, runs, monkeypatch):
     assert "stop_distance > 2.8 m" in text
     assert re.search(rf"probability {NUMBER}, 95 % interval {NUMBER} to {NUMBER}", text)
     assert re.search(r"initial\.speed +\S +\d", text)
+
+
+@killed_by("cli/show_samples.py", "'>' if row['strict'] else '>='", "'>='")
+@killed_by("cli/rare.py", "'>' if last.strict else '>='", "'>='")
+@killed_by("report/studies.py", '"above" if row.get("strict") else "at least"', '"at least"')
+def test_a_level_at_the_bound_is_above_it(scenario, tmp_path, capsys, monkeypatch):
+    interrupts = [KeyboardInterrupt()]
+
+    def measure(study, metric, at):
+        if len(at["initial.speed"]) > 1000 and interrupts:  # importance sampling: after the last level
+            raise interrupts.pop()
+        return (at["initial.speed"] ** 2 - 48.2) / 17
+
+    replace_seam(monkeypatch, "measure_metric", measure)
+    words = ("rare", scenario, "stop_distance=1.75", "--samples", 200, "--engine", "xla")
+    assert "interrupted: stop_distance > 1.75 has a probability" in run(*words, status=130).stderr
+    path = tmp_path / "rare.json"
+    path.write_text(run(*words, "--json").stdout)
+    (table,) = [one for one in rare_section(*find_documents(path)).tables if one.title == "Levels"]
+    assert [row[1] for row in table.rows] == ["at least", "above"]
+    show_rare_event(json.loads(path.read_text()), load(scenario))
+    assert re.findall(r"│ \d +│ (>=? 1)", capsys.readouterr().out) == [">= 1", "> 1"]
 
 
 @killed_by("cli/show_samples.py", '"undecided" if math.isnan(probability) else ', "")

@@ -83,7 +83,7 @@ REFUSALS = [
     (
         "margins slip-lmi --set reference=setpoint --set reference.value=0.2 --set design.over.reference.slip=0.1,0.2",
         2,
-        ["design.over.reference.slip is a parameter of the linear model, but not of this loop"],
+        ["parameter of the linear model, but not of this loop: remove it from [design.over]"],
     ),
     # export
     ("export slip-cured --to cc", 2, ["error: --to: 'cc' is not one of 'c', 'st', 'table', 'fmu'"]),

@@ -111,7 +111,7 @@ DRAWN = f"sweep.over={{'initial.speed_kmh'=[36,72], 'road.w4'={W4}, 'plant.mass'
 @killed_by(
     "scenario/section_sweep.py", "return distributions.convert_distribution_to_si(found, item.scale)", "return found"
 )
-@killed_by("scenario/section_sweep.py", "[known[found[path]] for path in given]", "[found[path] for path in given]")
+@killed_by("scenario/section_sweep.py", "return {item.path: item.given for", "return {item.where: item.given for")
 def test_a_sweep_is_read_once_into_si_by_path_of_the_loop():
     chosen = load("slip-lmi", [DRAWN, "sweep.design=sobol", "sweep.correlation={paths=['road.w4'], matrix=[[1]]}"])
     assert list(chosen.sweep.over.items()) == [

@@ -35,9 +35,9 @@ from diffabs.controllers import (
 from diffabs.core.protocols import BalanceOutput, BrakeOutput
 from diffabs.export import NotExported, c_source, computer_program, difference_equations, structured_text
 from diffabs.export.device import Input
-from diffabs.plants import ArmBalance, LabRig, MirroredRig
+from diffabs.plants import ArmBalance, LabRig, MirroredRig, QuarterCar
 from diffabs.references import FilteredSlip, FixedSlip, PeakLatch
-from diffabs.roads import Tabulated
+from diffabs.roads import PiecewiseLinear, Tabulated
 from diffabs.scenario.defaults import balancing, braking
 from diffabs.scenario.scenario import load
 
@@ -366,6 +366,17 @@ def test_difference_equations_are_the_controllers():
     np.testing.assert_allclose(found["J"], [60 + kd * wc, -60 - kd * wc, 1.0], rtol=1e-12)
     with pytest.raises(NotExported, match="continuous time"):
         difference_equations(braking(plant=MirroredRig(), controller=StateFeedback(), feedforward=HoldingInput()))
+
+
+@pytest.mark.slow
+@killed_by("linear/opened_loop.py", "_open(loop, target, plant=False)", "_open(loop, target, plant=True)")
+def test_a_kink_of_the_plant_does_not_matter_to_a_controller():
+    """The friction has a knot at the target; the equations of the PI are its own."""
+    rig_at_knot = {"plant": QuarterCar(road=PiecewiseLinear()), "reference": FixedSlip(slip=0.2)}
+    pi = PID(kp=60.0, ki=400.0, high=np.inf, low=0.0)
+    found = difference_equations(braking(**rig_at_knot, controller=Sampled(controller=pi, period=2e-3)))
+    assert dict(zip(found["inputs"], found["J"], strict=True)) == {"target": 60.0, "slip": -60.0, "feedforward": 1.0}
+    assert (found["G"][0], found["H"]) == ([2e-3, -2e-3, 0.0], [400.0, 0.0])
 
 
 @pytest.mark.parametrize("name", ["2fast", "a b", "float", "while"])
@@ -700,6 +711,63 @@ def test_structured_text_knows_every_kind_of_operation():
     result = commands_of_text(structured_text(computer_program(loop), "Unit"), seen)
     wanted = commands_of_parts(loop, seen, np.float64)
     np.testing.assert_allclose(result, wanted, rtol=1e-12, atol=1e-13)
+
+
+@killed_by("compiler/operations.py", 'range(11, 0, -2), "13.0"', 'range(9, 0, -2), "11.0"', case="tanh-float64")
+@killed_by("compiler/operations.py", "range(12, 0, -2)", "range(10, 0, -2)", case="sinh-float64")
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("name", ["tanh", "sinh"])
+def test_hyperbolic_functions_are_right_near_zero(name, dtype):
+    """To four roundings, where the exponentials nearly cancel and where they do not; against NumPy."""
+
+    @d.core.pytree.pytree
+    class Shape:
+        start, flow = d.core.protocols.no_memory, d.core.protocols.no_flow
+
+        def output(self, t, memory, signal):
+            return getattr(jnp, name)(signal.measured.slip)
+
+    block = Block(structured_text(computer_program(rig(Shape()), dtype=dtype), "Unit"))
+    size = np.concatenate([np.geomspace(1e-12, 20.0, 200), [0.49999, 0.5]])
+    slips = np.concatenate([-size, [0.0], size]).astype(dtype)
+    wanted = getattr(np, name)(slips.astype(np.float64))
+    np.testing.assert_allclose([float(block(slip=x)) for x in slips], wanted, rtol=4 * np.finfo(dtype).eps)
+
+
+@killed_by("compiler/emit/c99_words.py", 'taken |= {new, f"{new}_table"}', "taken.add(new)", case="table first")
+@killed_by("compiler/emit/c99_words.py", 'taken & {new, f"{new}_table"}', "new in taken", case="table last")
+@killed_by(
+    "export/structured_text.py", "taken & (both := {", "fresh.lower() in taken or not (both := {", case="table last"
+)
+@pytest.mark.parametrize("order", ["table first", "table last"])
+@needs_cc
+def test_no_variable_has_the_name_of_a_table(order, tmp_path):
+    """The constants of a choice, the sixth number of its line, are an array entry_6_table."""
+
+    @d.core.pytree.pytree
+    class Choose:
+        start, flow = d.core.protocols.no_memory, d.core.protocols.no_flow
+
+        def output(self, t, memory, signal):
+            place = jnp.clip(signal.measured.speed.astype(int), 0, 3)
+            if order == "table first":
+                entry = jnp.array([0.1, 0.4, 0.2, 0.9])[place]
+                entry_6_table = entry * signal.measured.slip
+                return entry_6_table + entry
+            entry_6_table = jnp.exp(signal.measured.slip)
+            entry = jnp.array([0.1, 0.4, 0.2, 0.9])[place]
+            return entry_6_table * entry
+
+    found = computer_program(rig(Choose()))
+    wanted = 0.2 * 1.5 if order == "table first" else 0.2 * math.exp(0.5)
+    assert Block(structured_text(found, "Unit"))(slip=0.5, speed=2.3) == pytest.approx(wanted, rel=1e-14)
+    text = c_source(found, "unit")
+    assert "entry_6_table" in text
+    program = compiled(text, "unit", tmp_path)
+    first = text.index(" slip;") < text.index(" speed;")
+    line = "0.5 2.3\n" if first else "2.3 0.5\n"
+    said = subprocess.run([program], input=line, capture_output=True, text=True, check=True).stdout
+    assert float(said) == pytest.approx(wanted, rel=1e-14)
 
 
 @killed_by("export/structured_text.py", "or name.lower() in ST_KEYWORDS | OWN:", "or False:", case="step")

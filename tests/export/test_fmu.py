@@ -177,6 +177,7 @@ def test_a_number_of_a_list_has_its_own_unit():
 def test_the_description_says_what_is_what(tmp_path):
     one = imported(PLANTS["mirrored rig"], tmp_path)
     assert one.description.get("fmiVersion") == "2.0"
+    assert one.description.get("variableNamingConvention", "flat") == "flat"  # a.0 is no structured name
     variables = {scalar.get("name"): scalar for scalar in one.description.iter("ScalarVariable")}
     roles = {name: scalar.get("causality") for name, scalar in variables.items()}
     assert {name for name, role in roles.items() if role == "input"} == {"control"}
@@ -327,6 +328,24 @@ def test_a_description_is_xml_whatever_the_title(about, tmp_path):
     one = Fmu(path, tmp_path / "in")  # reads it
     assert len(one.description.get("description")) == len(about)
     assert one.description.get("description").isprintable()
+
+
+@killed_by("export/mockup.py", "step, duration = float(step), float(duration)", "pass")
+def test_numbers_of_numpy_are_numbers():
+    """A step as from a list of steps gives the same FMU as one of Python, to the byte."""
+    rig = PLANTS["mirrored rig"]
+    found = build_fmu(rig, "plant", step=np.float64(STEP), duration=np.float64(2.0))
+    assert found == build_fmu(rig, "plant", step=STEP, duration=2.0)
+
+
+@killed_by("export/mockup.py", "0 < x < math.inf for x in", "0 <= x < math.inf for x in", case="0.0-1.0")
+@killed_by("export/mockup.py", "0 < x < math.inf for x in", "0 < x for x in", case="0.0001-inf")
+@pytest.mark.parametrize(
+    ("step", "duration"), [(0.0, 1.0), (-STEP, 1.0), (math.inf, 1.0), (math.nan, 1.0), (STEP, 0.0), (STEP, math.inf)]
+)
+def test_times_that_no_importer_can_use_are_refused(step, duration):
+    with pytest.raises(ValueError, match=r"^step = .* s, duration = .* s: positive and finite numbers are needed$"):
+        build_fmu(PLANTS["mirrored rig"], "plant", step=step, duration=duration)
 
 
 @pytest.mark.parametrize("name", ["../../x", "a b", "int", "é", ""])

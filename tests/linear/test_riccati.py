@@ -13,11 +13,12 @@ import scipy.linalg as sl
 from marks import cases
 from mutants import killed_by
 
-from diffabs.linear.gaussian import kalman
+from diffabs.linear.gaussian import kalman, lqg
 from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
 from diffabs.linear.regulator import dlqr, lqr, unstabilisable_mode
 from diffabs.linear.riccati import care, dare
 from diffabs.linear.weights import is_symmetric
+from diffabs.plants import ArmBalance
 
 ALPHA, BETA, FAST, SLOW = 83.8796606703, 133.472842636189, 140.291806958, 14.0291806958
 CARE, DARE = jax.jit(care), jax.jit(dare)
@@ -320,6 +321,13 @@ def test_the_filter_needs_covariances():
     np.testing.assert_allclose(kalman([[0.5]], [[1.0]], [[0.0]], [[1.0]]).P, 0.0, atol=1e-12)
 
 
+@killed_by("linear/gaussian.py", "(jnp.isfinite(noise) & (noise > 0)).all()", "True")
+@pytest.mark.parametrize("noise", [(0.0, 1e-3), (1e-3, -1e-3), (np.nan, 1e-3), (1e-3, np.inf)], ids=str)
+def test_a_sensor_without_noise_has_no_filter(noise):
+    with pytest.raises(ValueError, match=r"^noise = \[.*\] is outside \(0, inf\) rad$"):
+        lqg(ArmBalance(), np.eye(6), 1.0, noise=noise)
+
+
 @killed_by("linear/weights.py", "np.outer(scale, scale)", "0.0")
 def test_rounding_does_not_make_a_matrix_unsymmetric():
     """A product F P F' has small entries that are all rounding; differences far above rounding are refused."""
@@ -505,7 +513,7 @@ def test_a_batch_may_be_empty(batch):
 
     for _ in batch:
         solve = jax.vmap(solve)
-    found = jax.eval_shape(solve, jnp.zeros((*batch, 2, 2)))
+    found = solve(jnp.zeros((*batch, 2, 2)))
     assert (found.P.shape, found.residual.shape) == ((*batch, 2, 2), batch)
 
 

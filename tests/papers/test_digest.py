@@ -143,6 +143,18 @@ def test_what_counts_as_an_independent_number_reproduced(ours, reference, agrees
     assert count_computed([row]).startswith("1 of 1" if agrees else "0 of 1")
 
 
+@killed_by("papers/digest.py", 'return row["ours"] == known', "return False")
+@killed_by("papers/digest.py", "not isinstance(number, str) and ", "")
+def test_a_word_is_reproduced_by_the_same_word():
+    """A stop that is never reached has no difference from a number."""
+    rows = [
+        record.computed_row(name, "stop", "s", "never", reference=known) for name, known in (("a", 3.0), ("b", "never"))
+    ]
+    assert count_computed(rows).endswith("not a, stop: never.")
+    assert count_computed(rows[1:]).startswith("1 of 1")
+    assert count_published("x", [{**rows[0], "published": 3.0}]).startswith("0 of 1")
+
+
 def test_decimals_are_those_that_are_written():
     assert [decimals(x) for x in (46.5, 479.0, 1000.0, 1e-5, -0.00257, 0.0)] == [1, 0, 0, 5, 5, 0]
 

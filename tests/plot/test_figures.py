@@ -48,6 +48,7 @@ def test_labels_of_a_logarithmic_axis_do_not_touch(ends):
 
 
 @killed_by("plot/style.py", "few = low > 0 and", "few = low > 0 or")
+@killed_by("plot/style.py", "{mantissa:g}", "{mantissa:.0f}")
 def test_a_long_axis_has_powers_and_a_short_one_numbers():
     _, (ax,) = plot.sheet()
     plot.make_logarithmic(ax, "x")
@@ -59,6 +60,7 @@ def test_a_long_axis_has_powers_and_a_short_one_numbers():
     assert said(0.2) == "0.2"
     ax.set_xlim(1e-7, 5e-6)
     assert said(2e-7) == "2\N{MULTIPLICATION SIGN}10⁻⁷"
+    assert said(2.5e-6) == "2.5\N{MULTIPLICATION SIGN}10⁻⁶"
 
 
 @pytest.mark.slow

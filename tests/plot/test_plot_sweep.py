@@ -190,6 +190,17 @@ def test_of_many_runs_some_are_drawn_and_the_worst_of_all(made):
     assert {text.get_text().split(":")[0] for text in ax.texts} == {"17", "39000"}
 
 
+@killed_by("plot/sweeps.py", " + view.never(metric, view.good)", "")
+@killed_by("plot/sweep_view.py", "np.sum(rows & ~self.known_rows(name, rows))", "np.sum(self.rows & ~rows)")
+@pytest.mark.parametrize("design", ["random", "saltelli"])
+def test_the_worst_runs_that_never_settle_are_counted(made, design):
+    """They are the worst of all, and have no place on the scale of colours."""
+    never = A > 0.9
+    sweep = made({"a": A, "b": B}, {"settling_time": np.where(never, np.inf, A + B)}, design=design)
+    title = " ".join(plots.draw_worst(sweep).get_suptitle().split())
+    assert title == f"greatest settling_time of {N - never.sum():,} runs ({never.sum()} never: left out)"
+
+
 def test_a_metric_that_varies_is_taken_where_none_has_a_bound(made):
     sweep = made({"a": A}, {"locked_time": 0 * A, "effort": A**2})
     (ax, _) = plots.draw_worst(sweep, {"effort": "J"}).axes

@@ -91,20 +91,58 @@ def test_the_probability_of_a_slippery_road():
 
 
 @killed_by("reliability/failure.py", "np.nextafter(np.asarray(bound, study.dtype), np.inf)", "bound")
-@killed_by("reliability/failure.py", "np.asarray(bound, study.dtype)", "bound", case="float32")
-@killed_by("reliability/failure.py", "min(level.threshold, float(bound))", "level.threshold")
+@killed_by("reliability/failure.py", "np.asarray(bound, study.dtype)", "bound", case="0.1-float32")
+@killed_by(
+    "reliability/failure.py",
+    "np.nextafter(np.asarray(bound, study.dtype), np.inf)",
+    "np.asarray(bound * (1 + 2e-7), study.dtype)",
+    case="0.0-float64",
+)
+@killed_by(
+    "reliability/failure.py",
+    "np.nextafter(np.asarray(bound, study.dtype), np.inf)",
+    "np.asarray(bound * (1 + 2e-7), study.dtype)",
+    case="-0.1-float64",
+)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_a_metric_at_its_bound_has_not_failed(dtype, monkeypatch):
+@pytest.mark.parametrize("bound", [0.1, 0.0, -0.1])
+def test_a_metric_at_its_bound_has_not_failed(bound, dtype, monkeypatch):
     """A tenth of the masses is above 6.11 kg and exceeds the bound; all others are at the bound."""
 
     def measure(study, metric, at):
-        return np.where(at["plant.mass"] > 6.11, 1.0, 0.1).astype(study.dtype)
+        return np.where(at["plant.mass"] > 6.11, 1.0, bound).astype(study.dtype)
 
     replace_seam(monkeypatch, "measure_metric", measure)
-    found = failure_probability(dataclasses.replace(STUDY, dtype=dtype), "max_slip", 0.1, samples=400)
+    found = failure_probability(dataclasses.replace(STUDY, dtype=dtype), "max_slip", bound, samples=400)
     low, high = binomtest(40, 400).proportion_ci(0.999)
     assert low < found.probability < high
-    assert [level.threshold for level in found.levels] == [0.1]
+    assert [level.threshold for level in found.levels] == [bound]
+
+
+@killed_by("reliability/failure.py", "strict=True) if level.threshold == beyond", ") if level.threshold == beyond")
+@killed_by("reliability/failure.py", "if level.threshold == beyond", "if level.threshold >= bound")
+@killed_by("reliability/failure.py", "progress(state_bound(level))", "progress(level)")
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_level_states_whether_its_bound_is_exceeded(dtype, monkeypatch):
+    """Three tenths of the masses are at the bound or above it, and a hundredth above it: a level each."""
+
+    def measure(study, metric, at):
+        score = np.where(at["plant.mass"] > 6.191, 1.0, np.where(at["plant.mass"] > 5.93, 0.1, 0.0))
+        return score.astype(study.dtype)
+
+    replace_seam(monkeypatch, "measure_metric", measure)
+    told = []
+    found = failure_probability(
+        dataclasses.replace(STUDY, dtype=dtype), "max_slip", 0.1, samples=400, draws=0, progress=told.append
+    )
+    first, last = found.levels
+    assert (first.strict, last.strict, last.threshold) == (False, True, 0.1)
+    assert first.threshold == np.asarray(0.1, dtype)
+    assert first.share == pytest.approx(0.3, abs=4 * (0.3 * 0.7 / 400) ** 0.5)
+    assert found.probability == pytest.approx(0.01, rel=0.8)
+    assert [(one.threshold, one.share, one.strict) for one in told] == [
+        (one.threshold, one.share, one.strict) for one in found.levels
+    ]
 
 
 @killed_by("reliability/failure.py", "np.where(accepted, score[: len(z)], -np.inf)", "score[: len(z)]")
@@ -125,6 +163,7 @@ def test_a_refused_trial_shortens_the_search(monkeypatch):
     np.testing.assert_allclose(points, [[3.5]], atol=0.1)
 
 
+@killed_by("reliability/failure.py", "if not np.isfinite(beyond):", "if False:")
 def test_what_is_not_there_is_said():
     with pytest.raises(ValueError, match="overshoot is not measured; there is max_slip, stop_distance"):
         failure_probability(STUDY, "overshoot", 0.5)
@@ -132,3 +171,5 @@ def test_what_is_not_there_is_said():
         failure_probability(STUDY, "stop_distance", "0.9")
     with pytest.raises(ValueError, match=r"bound = nan is outside \(-inf, inf\) m"):
         failure_probability(STUDY, "stop_distance", np.nan)
+    with pytest.raises(ValueError, match=r"^bound = 1e\+39 is too great for float32$"):
+        failure_probability(dataclasses.replace(STUDY, dtype="float32"), "stop_distance", 1e39)

@@ -256,7 +256,7 @@ def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
     assert base64.b64decode(data.partition(",")[2]) == b"\x89PNG drawn"
 
 
-@killed_by("report/documents.py", 'path = pathlib.Path(content["out"]) / SUMMARY', "pass")
+@killed_by("report/documents.py", 'path = _find_folder(content["out"], path) / SUMMARY', "pass")
 @pytest.mark.slow
 def test_a_folder_of_results_is_one_file(results):
     """What `sweep --json` has printed beside the sweep's folder is the same result, and comes once."""
@@ -267,6 +267,34 @@ def test_a_folder_of_results_is_one_file(results):
     assert found.headings[0] == f"{len(SOURCES)} results"
     (printed,) = find_documents(results / "sweep.json")
     assert printed.folder == results / "sweep"
+
+
+@killed_by("report/documents.py", "beside if beside.is_dir() else pathlib.Path(out)", "pathlib.Path(out)")
+@killed_by("report/documents.py", "beside if beside.is_dir() else pathlib.Path(out)", "beside")
+def test_a_folder_is_looked_for_beside_its_document(tmp_path, monkeypatch):
+    """What a command printed in one folder is read in another, which has a folder of the same name."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    for folder in (there / "out", here / "out", here / "more"):
+        folder.mkdir(parents=True)
+    monkeypatch.chdir(here)
+    content = {"digest": "", "sensitivity": {}, "failures": {}}
+    paper = {"paper": "", "rows": [], "figures": []}
+    for name, wanted in (("out", there / "out"), ("more", here / "more"), (str(here / "out"), here / "out")):
+        (there / "sweep.json").write_text(json.dumps(content | {"out": name}))
+        assert find_documents(there / "sweep.json")[0].folder.resolve() == wanted
+        (there / "papers.json").write_text(json.dumps({"out": name, "papers": {"one": paper}}))
+        assert find_documents(there / "papers.json")[0].folder.resolve() == wanted / "one"
+
+
+@killed_by("cli/report.py", 'errors="xmlcharrefreplace"', "")
+def test_half_of_a_surrogate_pair_is_a_replacement_character(results, tmp_path):
+    """It is allowed in JSON and stands for the bytes of a file name that are no UTF-8; UTF-8 itself has none."""
+    content = json.loads((results / "tune.json").read_text()) | {"scenario": "small \ud800"}
+    path = tmp_path / "a\udcff.json"
+    path.write_text(json.dumps(content))
+    command("report", path, "-o", tmp_path / "x.html")
+    found = Page((tmp_path / "x.html").read_bytes().decode())
+    assert found.headings[0] == "Tuning of small \N{REPLACEMENT CHARACTER}"
 
 
 def test_the_command_says_where_it_is(results, tmp_path):
@@ -318,6 +346,17 @@ def test_of_a_saltelli_design_the_failures_are_among_the_rows_a(tmp_path):
     content, text = invented_sweep(tmp_path / "s", {"type": "saltelli"})
     assert content["failures"]["any"]["count"] == 4
     assert "64 runs; 0 diverged, 0 were refused. 4 of 16 failed: a probability of 0.25 (95 % interval" in text
+
+
+@killed_by("report/studies.py", 'yield from describe_turned_metrics(content.get("accuracy") or {})', "pass")
+def test_a_metric_that_a_half_step_turns_is_in_the_report(tmp_path):
+    content, text = invented_sweep(tmp_path / "s", {"type": "random"})
+    assert "never with the other" not in text
+    turned = {"margin": {"count": 2, "samples": [5, 8]}}
+    content["accuracy"] = {"samples": [3, 5, 8], "metrics": {}, "turned": turned}
+    (tmp_path / "s" / "summary.json").write_text(json.dumps(content))
+    text = Page(build_report(find_documents(tmp_path / "s"))).text
+    assert "margin is finite with one step and never with the other in 2 of 3 runs, the first sample 5" in text
 
 
 @killed_by("cli/sweep.py", "    _write_summary(out, result)\n    if kept:", "    if kept:")

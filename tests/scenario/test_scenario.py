@@ -1,6 +1,7 @@
 """Scenarios: packaged ones, the round trip, overrides, defaults, the catalogue."""
 
 import dataclasses
+import sys
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from seams import replace_seam
 
 from diffabs import controllers, roads
 from diffabs.objectives import BRAKING
-from diffabs.scenario import registry, scenario
+from diffabs.scenario import outside, registry, scenario
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import dump, load, names
 from diffabs.scenario.section_design import DesignTask
@@ -529,6 +530,17 @@ def test_a_type_alone_replaces_a_part_too():
     assert same.notes == ()
 
 
+@killed_by("scenario/scenario.py", 'node.get("type", _usual_type(table, replaced))', 'node.get("type")')
+def test_the_type_of_the_usual_part_replaces_nothing():
+    """`slip-lmi` gives its start no type, and a rig has a brake's start."""
+    found = load("slip-lmi", ["initial.type=brake-start"])
+    assert (found.notes, found.loop.initial.speed) == ((), pytest.approx(50 / 3.6, rel=1e-15))
+    assert "initial.speed" in found.design.over
+    assert "initial.speed" in found.sweep.over
+    other = load("slip-lmi", ["road.type=scaled", "road.road=rig"])
+    assert other.notes == ("road.type=scaled removes sweep.over.road.w4, sweep.over.road.a of the replaced part",)
+
+
 # What varies in a sweep
 
 
@@ -541,8 +553,10 @@ def test_a_choice_of_roads_is_written_and_read(file):
     assert again.sweep.over["plant.road"].parts["snow"] is roads.SNOW
 
 
-@killed_by("scenario/section_sweep.py", "design=_read_design", "design=sampling.read_sampling_design", case="nested")
-@killed_by("scenario/section_sweep.py", "paths = _loop_paths(levels,", "paths = list(levels) or _loop_paths(levels,")
+@killed_by("scenario/parameter_paths.py", ', ("sweep", "design", "levels"))', ")", case="nested")
+@killed_by(
+    "scenario/section_sweep.py", "levels = _by_varied_path(levels,", "levels = levels or _by_varied_path(levels,"
+)
 @pytest.mark.parametrize(
     "levels",
     [
@@ -561,6 +575,35 @@ def test_levels_of_a_grid_have_the_paths_of_what_varies(file, levels):
     assert load(file(dump(chosen))).sweep.design == chosen.sweep.design
 
 
+@killed_by(
+    "scenario/parameter_paths.py", "return [*table, canonical_path", "return [*table] or [*table, canonical_path"
+)
+def test_a_level_of_a_grid_is_changed(file):
+    """The file has the paths with dots, and a limit by its former name."""
+    path = file("""plant = "mirrored-rig"
+    controller = {type = "pid", torque_max = 9.0}
+    [sweep.over]
+    "controller.torque_max" = [5, 9]
+    "initial.speed_kmh" = [20, 40]
+    [sweep.design]
+    type = "grid"
+    levels = {"controller.torque_max" = 3, "initial.speed_kmh" = 2}""")
+    assert build_study(load(path)).samples == 6
+    changes = ["sweep.design.levels.controller.torque_max=4", "sweep.design.levels.initial.speed=5"]
+    assert build_study(load(path, changes)).samples == 20
+
+
+@killed_by("scenario/registry.py", "is_class and what == family", "what == family")
+def test_a_constant_has_its_own_inner_part(tmp_path):
+    text = "from diffabs import roads\nWORN = roads.Scaled(road=roads.ICE, scale=0.8)\n"
+    (tmp_path / "worn_roads.py").write_text(text)
+    with outside.lend_modules(tmp_path, ["worn_roads"]):
+        assert load("slip-lmi", ["sweep.over={}", "road=worn"]).loop.plant.road.road is roads.ICE
+        varied = load("slip-lmi", ["sweep.over={road=['rig', 'worn']}"]).sweep.over["plant.road"]
+        assert varied.parts["worn"].road is roads.ICE
+    sys.modules.pop("worn_roads")
+
+
 @killed_by("scenarios/literature-mathworks.toml", "0.249960856269", "0.249958735168", case="dry")
 @pytest.mark.parametrize(
     ("name", "share"), [("literature-mathworks", 1.0), ("literature-vipulsree", 0.8)], ids=["dry", "case 1"]
@@ -569,3 +612,11 @@ def test_the_load_of_a_quarter_car_in_feet(name, share):
     """32.18 ft/s2 of 0.3048 m, for a road whose weight is m times 9.81 m/s2."""
     scale = load(name, integrated=False).loop.plant.road.scale
     assert scale == pytest.approx(share * 32.18 * 0.3048 / 9.81 / 4, rel=1e-11)
+
+
+@killed_by("scenario/section_design.py", "if ends[0] < ends[1]}\n        known", "}\n        known")
+def test_a_single_value_of_the_model_is_no_range():
+    changes = ["reference=setpoint", "reference.value=0.2", "design.over.reference.slip=0.2,0.2"]
+    chosen = load("slip-lmi", changes, integrated=False)
+    assert chosen.design.over["reference.slip"] == (0.2, 0.2)
+    assert list(chosen.design.ranges(chosen.loop)) == ["plant.mass", "initial.speed"]

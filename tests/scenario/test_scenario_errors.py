@@ -57,7 +57,7 @@ BAD = [
     ("road={type='patches',roads='snow'}", 'road.roads = "snow" is text', "a list of parts"),
     ("road={type='patches',roads=[{c1=2}]}", "road.roads.0.type is missing", "snow"),
     ("road={type='patches',roads={5={c1=2}}}", "road.roads.5 is not there", "0, 1"),
-    ("road={type='scaled',road={type='scaled',scale=11}}", "road.road.scale = 11 is outside (0, 10]"),
+    ("road={type='scaled',road={type='scaled',road='ice',scale=11}}", "road.road.scale = 11 is outside (0, 10]"),
     ("controller={type='state-feedback',torque_max=-inf}", "controller.torque_max = -inf is outside (-inf, inf) N m"),
     ("controller={type='proportional-feedback',torque_min=inf}", "controller.torque_min = inf is outside (-inf, inf)"),
     ("controller={type='scheduled-feedback',torque_max=-inf}", "controller.torque_max = -inf is outside (-inf, inf)"),
@@ -324,8 +324,8 @@ def test_a_start_that_overflows_is_refused_in_a_line():
         load("arm-balance", ["initial.theta=1e300"])
 
 
-@killed_by("scenario/section_sweep.py", "if lines := missing_inner_parts(family, item,", "if lines := () and (item,")
-@killed_by("scenario/registry.py", "if inner is None or", "if")
+@killed_by("scenario/section_sweep.py", "lines := describe_missing_inner_parts(family, item,", "lines := () and (item,")
+@killed_by("scenario/registry.py", "and type_name(inner) is None:", "and inner is None:")
 @pytest.mark.parametrize(
     "choice", ['"sampled"', "{type='sampled', period=1e-3}", "{type='sampled', controller={kp=1}}"]
 )
@@ -340,8 +340,26 @@ def test_a_choice_of_a_sweep_names_the_part_inside(choice):
     }
 
 
+@killed_by("scenario/registry.py", "lines += describe_missing_inner_parts(what, inner, where)", "pass", case="scaled")
+@killed_by("scenario/registry.py", "describe_missing_inner_parts(what, item,", "() and (what, item,", case="patches")
+@pytest.mark.parametrize(
+    ("choice", "place"),
+    [
+        ("{{type='scaled', scale=0.5, road='{}'}}", "1.road.road"),
+        ("{{type='patches', roads=['snow', '{}']}}", "1.roads.1.road"),
+    ],
+    ids=["scaled", "patches"],
+)
+def test_a_choice_names_the_parts_at_every_depth(choice, place):
+    line = message("slip-lmi", f"sweep.over.road=['rig', {choice.format('scaled')}]")
+    assert line == f"sweep.over.road.{place} is missing: scaled encloses another road; give its type"
+    load("slip-lmi", ["sweep.over={}", f"sweep.over.road=['rig', {choice.format('ice')}]"])
+
+
 def test_a_grid_of_what_does_not_vary():
     line = message("slip-lmi", "sweep.design={type='grid', levels={initial.sped=3}}")
-    assert 'sweep.design.levels: "initial.sped" does not vary; did you mean initial.speed?' in line
+    assert "sweep.design.levels.initial.sped is not varied in sweep.over; did you mean initial.speed?" in line
     twice = "sweep.design={type='grid', levels={'initial.speed'=3, 'initial.speed_kmh'=3}}"
-    assert message("slip-lmi", twice) == "sweep.design.levels: a speed is given twice, in m/s and in km/h"
+    assert message("slip-lmi", twice) == "sweep.design.levels.initial.speed is given twice, in m/s and in km/h"
+    line = message("slip-lmi", "sweep.design={type='grid', levels={road.w4_kmh=3}}")
+    assert "sweep.design.levels.road.w4_kmh is not varied" in line  # w4 is no speed

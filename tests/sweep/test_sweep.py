@@ -271,7 +271,7 @@ def test_a_report_of_somebody_else_is_left_alone(file, swept, tmp_path):
     assert (folder / "report.html").read_text() == "mine"
 
 
-@killed_by("cli/sweep.py", "        if chosen.seed:", "        if False:")
+@killed_by("cli/show_samples.py", "    if chosen.seed:", "    if False:")
 def test_the_seed_of_a_single_run_has_no_effect_and_that_is_said(file, tmp_path):
     (tmp_path / "notes.tmp").write_text("mine")
     result = run("sweep", file(SMALL), "--out", tmp_path, "--set", "solver.seed=5", status=2)

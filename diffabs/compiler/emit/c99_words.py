@@ -156,14 +156,16 @@ def identifiers(paths: Iterable[str]) -> dict[str, str]:
 def fresh_name(name: str, taken: set[str]) -> str:
     """Return `name`, or `name` with a number such as name_2 if it is in `taken`, and add the result to `taken`.
 
+    The name of its table, `name_table`, is reserved as well.
+
     Args:
         name: Preferred name.
-        taken: Names in use; the function adds the new name.
+        taken: Names in use; the function adds the new names.
     """
     number, new = 2, name
-    while new in taken:
+    while taken & {new, f"{new}_table"}:
         number, new = number + 1, f"{name}_{number}"
-    taken.add(new)
+    taken |= {new, f"{new}_table"}
     return new
 
 

@@ -232,10 +232,10 @@ def replay_log(
     carry: Carry,
     log: PyTree,
 ) -> tuple[Carry, PyTree]:
-    """Return the carry after all logged attempts, and what is kept of each, in the blocks of the log.
+    """Return the carry after all logged attempts, and the kept values of each, in the blocks of the log.
 
-    A block without an accepted attempt is skipped: what is kept of it is zero. Reverse mode keeps the carry before each
-    block, and computes the attempts of a block again.
+    A block without an accepted attempt is skipped, and its kept values are zero. Reverse mode keeps the carry before
+    each block, and computes the attempts of a block again.
 
     Args:
         step: Function of the carry and a log entry: one attempt.

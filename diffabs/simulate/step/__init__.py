@@ -1,1 +1,1 @@
-"""One step of a run: what it computes, and which step is taken."""
+"""One step of a run: its computation, and the choice of the step."""

@@ -13,8 +13,8 @@ Clocks strike on the grid of `Adaptive.step`, and a trajectory keeps instants of
 
 A run that is logged for derivatives keeps to one mode in a step, and locates switching surfaces as events.
 
-A method that `watches` reports what it cannot resolve: a run that slides along a surface is over (`SLID`), and so is
-one with a margin that only touches zero (`GRAZED`). It looks for turns of the comparisons' margins, too.
+A method that `watches` reports runs that it cannot resolve. A run that slides along a surface is over (`SLID`), and so
+is one with a margin that only touches zero (`GRAZED`). It looks for turns of the comparisons' margins, too.
 """
 
 import dataclasses
@@ -400,7 +400,7 @@ class AdaptiveStepping:
         return jnp.full_like(self.h, jnp.inf) if self.smooth else point.forecast[0]
 
     def _look_ahead(self, error_limited: Scalar, unrestricted: Bool, fresh: Bool, seen: Evaluation) -> PyTree:
-        """Return the forecast, nothing if `smooth`; `fresh` is True if the answers were taken anew."""
+        """Return the forecast, nothing if `smooth`; `fresh` is True if the answers are new."""
         if self.smooth:
             return ()
         return self._forecast_crossing(error_limited, unrestricted, seen), look_ahead(fresh, self._select_watched(seen))

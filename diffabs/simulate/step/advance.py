@@ -161,7 +161,7 @@ class Stepping(Protocol):
     def report(
         self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
     ) -> Any:
-        """Return what the method needs to know of an attempt by the run of `carry` in `system`.
+        """Return the findings about an attempt, by the run of `carry` in `system`, that the method needs.
 
         The attempt has the length `h`. The dynamics `seen` and the `state` are those at its end, and `error` holds the
         shares of the rates in the error.

@@ -7,7 +7,7 @@ parts need not declare them.
 The answers to all comparisons together are a mode. With frozen answers the program is smooth also beyond its kinks, as
 event location requires, and a derivative at a kink is one-sided.
 
-`inner_functions` says which functions are opened. What the others compare stays unchanged, and is recorded as hidden.
+`inner_functions` says which functions are opened. Comparisons in the others stay unchanged, and are recorded as hidden.
 """
 
 from collections.abc import Callable, Sequence

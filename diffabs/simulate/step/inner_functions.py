@@ -1,4 +1,4 @@
-"""Comparisons inside functions of a program: which functions `comparisons` opens, and what the others hide.
+"""Comparisons inside functions of a program: the functions that `comparisons` opens, and those that hide comparisons.
 
 A call is opened by its own program. A conditional that compares becomes a selection among all its branches, and the
 greatest number of an array a tournament. The function atan2, which jumps behind its origin, becomes two halves. The

@@ -1,4 +1,4 @@
-"""Margins that cross zero twice within a step, or only touch it: what the signs at both ends of a step do not show.
+"""Margins that cross zero twice within a step, or only touch it. The signs at both ends of a step do not show them.
 
 The cubic from values and rates at both ends stands for a margin within the step. A margin that turns beyond zero has
 two crossings in the step. One that turns near zero has two or none, which rounding and errors decide: it grazes.

@@ -176,7 +176,7 @@ class ReplayStepping:
     def report(
         self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
     ) -> PyTree:
-        """Return nothing of `system`, `carry`, `h`, `seen`, `state` and `error`: the log says what is decided."""
+        """Return nothing of `system`, `carry`, `h`, `seen`, `state` and `error`: the log has the decisions."""
         del system, carry, h, seen, state, error
         return ()
 
