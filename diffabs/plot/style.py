@@ -152,7 +152,11 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
 
 
 def curve_style(i: int) -> dict[str, Any]:
-    """Return the colour and the dashes of the `i`-th curve of an axes, counted from 0; the first 49 all differ."""
+    """Return the colour and the dashes of a curve, as arguments of `plot`; those of the first 49 curves all differ.
+
+    Args:
+        i: Number of the curve in its axes, from 0.
+    """
     return {"color": COLOURS[i % 7], "linestyle": DASHES[(i + i // 7) % 7]}
 
 
