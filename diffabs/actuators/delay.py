@@ -15,7 +15,7 @@ after each step.
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from diffabs.core.log import Log
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree, static
 from diffabs.core.rules import Rule
-from diffabs.core.types import Int, PyTree, Scalar
+from diffabs.core.types import Int, Matrix, PyTree, Scalar, Vector
 
 TIME_ROUNDING = 1e-6  # relative rounding of single precision
 WINDOW_PIECES = 6  # pieces; a step that spans more is cut
@@ -81,12 +81,12 @@ class DelayMemory(NamedTuple):
     """
 
     ring: Log
-    window: Any
-    known: Any
+    window: Matrix
+    known: Int
     place: Scalar
     last: PyTree
     until: Scalar
-    first: Any
+    first: Int
     count: Scalar
     newest: Int
 
@@ -255,11 +255,11 @@ def find_wrong_capacity(capacity: Int, least: int, unit: str) -> Iterator[str]:
         yield f"capacity = {capacity} is outside [{least}, inf) {unit}"
 
 
-def _row(piece: Piece) -> Any:
+def _row(piece: Piece) -> Vector:
     return jnp.stack([jnp.asarray(x) for x in jax.tree.leaves(piece)])
 
 
-def _piece(window: Any, place: Scalar) -> Piece:
+def _piece(window: Matrix, place: Scalar) -> Piece:
     """Return the piece at a place of the window, by selects.
 
     A gather at a computed index would prevent XLA from fusing the stages of a step.
@@ -303,17 +303,17 @@ def _count(ends: list[PyTree], t: Scalar, low: Scalar, high: Scalar) -> Scalar:
 
 
 @_count.defjvp
-def _constant(at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _constant(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
     del moves
     count = _count(*at)
     return count, jnp.zeros_like(count)
 
 
 @jax.custom_jvp
-def _at_most_one(x: Scalar) -> Any:
+def _at_most_one(x: Scalar) -> Scalar:
     return jnp.minimum(x, 1.0)
 
 
 @_at_most_one.defjvp
-def _slope(at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _slope(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
     return _at_most_one(*at), jnp.where(at[0] <= 1.0, moves[0], 0.0)

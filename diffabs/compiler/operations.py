@@ -5,7 +5,7 @@ A template has the operands {0} and {1}. In C++ and CUDA the functions are those
 numbers only. In Structured Text, {real} is the type of the real numbers and {most} the largest of them.
 
 An operation without a template in a language has no translation to it. The nodes `const`, `input`, `convert`, `bits`,
-`select`, `gate`, `any` and `table` have no row: they need more than operands, so each back end translates them itself.
+`select`, `gate`, `any` and `table` have no row. They need more than operands, so each back end translates them itself.
 """
 
 import functools

@@ -11,7 +11,7 @@ and output then keep the values of the previous sample.
 
 from collections.abc import Iterator
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -206,7 +206,7 @@ class _AlwaysWaits(Sampled):
     makes a run several times slower.
     """
 
-    def _waits(self) -> Any:
+    def _waits(self) -> Scalar:
         return jnp.asarray(True)
 
 

@@ -20,7 +20,7 @@ analysis of limit cycles in hybrid anti-lock braking systems, Int. J. Control 82
     u' = growth u  for slip < slip_low,   u' = -decay u  for slip > slip_high,   else u' = 0
 
 At torque_max the growth stops. Inside a `sampled` controller of period T, one sample multiplies u by 1 + growth T or by
-1 - decay T, as the usual programs with this rule do.
+1 - decay T. The usual programs with this rule do so.
 """
 
 from collections.abc import Iterator

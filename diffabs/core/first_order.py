@@ -6,7 +6,6 @@ the wrapper of the output, a second pass in reverse mode that of the input.
 """
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.extend.core as jex
@@ -25,7 +24,7 @@ def first_order(tangents: PyTree, why: str) -> PyTree:
         why: Message of the error.
     """
 
-    def each(x: Scalar) -> Any:
+    def each(x: Scalar) -> PyTree:
         return x if getattr(x, "dtype", None) == jax.dtypes.float0 else _operation.bind(x, why=why)
 
     return jax.tree.map(each, tangents)
@@ -44,7 +43,7 @@ def without_derivative(path: str, x: Scalar) -> Scalar:
 
 
 @without_derivative.defjvp
-def _raise_for_parameter(path: str, at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _raise_for_parameter(path: str, at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
     # JAX calls this rule only if x has a tangent that is not a symbolic zero.
     del at, moves
     raise ValueError(
@@ -53,12 +52,12 @@ def _raise_for_parameter(path: str, at: Any, moves: PyTree) -> tuple[PyTree, PyT
     )
 
 
-def _raise_for_second_derivative(at: Any, moves: PyTree, *, why: str) -> Any:
+def _raise_for_second_derivative(at: PyTree, moves: PyTree, *, why: str) -> PyTree:
     del at, moves
     raise ValueError(why)
 
 
-def _batch_refusal(at: Any, axes: Any, *, why: str) -> Any:
+def _batch_refusal(at: PyTree, axes: PyTree, *, why: str) -> PyTree:
     return _operation.bind(*at, why=why), axes[0]
 
 

@@ -1,7 +1,6 @@
 """Elementary functions whose gradients stay finite where the textbook formulas fail."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +96,7 @@ def quotient(x: Scalar, y: Scalar) -> Scalar:
 
 
 @quotient.defjvp
-def _quotient_slope(at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _quotient_slope(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
     inverse = 1.0 / at[1]
     value = at[0] / at[1]
     return value, (moves[0] - value * moves[1]) * inverse

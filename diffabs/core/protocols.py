@@ -55,7 +55,7 @@ there, too.
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 from diffabs.core.messages import BalanceOutput as BalanceOutput
 from diffabs.core.messages import BrakeOutput as BrakeOutput
@@ -219,7 +219,7 @@ class Objective(Protocol):
         ...
 
 
-def no_memory(self: Any, signal: PyTree) -> Memory:
+def no_memory(self: Part, signal: PyTree) -> Memory:
     """Return an empty memory: `start` of a block without memory.
 
     Args:
@@ -230,7 +230,7 @@ def no_memory(self: Any, signal: PyTree) -> Memory:
     return Memory()
 
 
-def no_flow(self: Any, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
+def no_flow(self: Part, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
     """Return no rates: `flow` of a block without continuous memory.
 
     Args:

@@ -23,7 +23,8 @@ MAX_VERTICES = 2**12  # each vertex adds an LMI
 class Coverage:
     """The check of a hull against systems of the box.
 
-    The gauge of a system is 0 at the mean of the vertices and 1 on the boundary of the hull; above 1 it lies outside.
+    The gauge of a system is 0 at the mean of the vertices and 1 on the boundary of the hull. Above 1 the system lies
+    outside.
 
     Attributes:
         checked: Number of systems that were checked: corners, grid points and random points. Large hulls check only the

@@ -49,7 +49,7 @@ def load_proved_box(path: pathlib.Path, document: JsonObject) -> ProvedBox:
 def judge_values(proved: ProvedBox, session: Session) -> ProofVerdict:
     """Return whether the current values of a session lie in the box of a proof: "certified", else "unknown".
 
-    They do if each of the box's parameters lies in its range, and the duration and the rest of the loop are those of
+    They do if each of the box's parameters lies in its range. The duration and the rest of the loop must be those of
     the file's scenario. The sentence gives the file's bounds, or the value that differs.
 
     Args:

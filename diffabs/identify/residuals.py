@@ -13,7 +13,7 @@ from jax.tree_util import Partial
 from diffabs.core.bijectors import FreeSpace
 from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.pytree import get
-from diffabs.core.types import AnyArray, Part, PyTree, Scalar
+from diffabs.core.types import AnyArray, Part, PyTree, Scalar, Vector
 
 Residuals = Callable[..., Any]  # (part, *data) -> (n,)
 Prior = Callable[[Any], Any]  # part -> (k,), in standard deviations
@@ -25,7 +25,7 @@ class _GaussianPrior:
 
     paths: tuple[str, ...]
 
-    def __call__(self, means: Any, deviations: Any, part: Part) -> Scalar:
+    def __call__(self, means: Vector, deviations: Vector, part: Part) -> Scalar:
         """Return (p - mean)/deviation, concatenated over the parameters."""
         known = zip(self.paths, means, deviations, strict=True)
         return jnp.concatenate([jnp.ravel((get(part, path) - m) / s) for path, m, s in known])
@@ -85,7 +85,7 @@ def as_partial(prior: Prior | None) -> Prior:
     return prior if isinstance(prior, Partial) else Partial(prior or _empty_prior)
 
 
-def _empty_prior(part: Part) -> Any:
+def _empty_prior(part: Part) -> Vector:
     del part
     return jnp.zeros(0)
 
@@ -99,8 +99,8 @@ class ResidualEvaluation(NamedTuple):
         slopes: Derivatives of both in z, shapes (n, p) and (k, p).
     """
 
-    residuals: Any
-    prior: Any
+    residuals: Vector
+    prior: Vector
     slopes: tuple[PyTree, PyTree]
 
     def finite(self) -> bool:
@@ -110,7 +110,7 @@ class ResidualEvaluation(NamedTuple):
 
 @partial(jax.jit, static_argnames=("free", "residuals"))
 def _evaluate_residuals(
-    free: FreeSpace, residuals: Residuals, prior: Prior, part: Part, data: Any, z: AnyArray
+    free: FreeSpace, residuals: Residuals, prior: Prior, part: Part, data: PyTree, z: AnyArray
 ) -> ResidualEvaluation:
     """Return residuals, prior and derivatives at z; compiled once for equal functions, spaces and structures."""
 

@@ -110,7 +110,7 @@ class _MetricResiduals:
         return [Batch(rows).each(loop, lambda row, key: function(replace(row, values))) for loop, rows in batches]
 
     def __call__(self, part: Part, batches: Any, place: Scalar, target: Scalar) -> Any:
-        def row(loop: Part) -> Any:
+        def row(loop: Part) -> PyTree:
             metrics = measure(loop, self.solver, dict(self.objectives)).metrics
             return jnp.stack([metrics[name] for name, _ in self.objectives])
 

@@ -96,7 +96,7 @@ class Uncertainty:
 
 
 def uncertainty(
-    names: Sequence[str], size: np.ndarray, data: Any, prior: Any, scale: float, held: Collection[str] = ()
+    names: Sequence[str], size: np.ndarray, data: PyTree, prior: Any, scale: float, held: Collection[str] = ()
 ) -> Uncertainty:
     """Return covariance, correlation and directions from scaled Jacobians.
 

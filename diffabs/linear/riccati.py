@@ -16,7 +16,7 @@ derivative: one Lyapunov equation with the closed loop.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -149,7 +149,7 @@ def _solve_discrete(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @_solve_continuous.defjvp
-def _solve_continuous_jvp(data: Any, tangents: PyTree) -> Matrix:
+def _solve_continuous_jvp(data: PyTree, tangents: PyTree) -> Matrix:
     """Solve Ac' dP + dP Ac + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_continuous(*data)
 
@@ -163,7 +163,7 @@ def _solve_continuous_jvp(data: Any, tangents: PyTree) -> Matrix:
 
 
 @_solve_discrete.defjvp
-def _solve_discrete_jvp(data: Any, tangents: PyTree) -> Matrix:
+def _solve_discrete_jvp(data: PyTree, tangents: PyTree) -> Matrix:
     """Solve Ac' dP Ac - dP + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_discrete(*data)
 

@@ -170,15 +170,14 @@ def _shift_weights(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix, defini
 
 
 def _balance(A: jax.Array, G: jax.Array, Q: jax.Array) -> jax.Array:
-    """Return scales d (n, batch), powers of two, x = d z, with which row i and column i of the Hamiltonian have similar
-    sums.
+    """Return scales d (n, batch), powers of two. With x = d z, row i and column i of the Hamiltonian have similar sums.
 
     The sums leave out the diagonal.
     """
     A, G, Q = jnp.abs(A) * (1 - eye(len(A), A)), jnp.abs(G), jnp.abs(Q)
 
     # An exponent of 1/2 would equalise one row and column. All change at once, so 1/4 damps the sweep.
-    def sweep(_: Any, d: jax.Array) -> jax.Array:
+    def sweep(_: object, d: jax.Array) -> jax.Array:
         row = (jnp.sum(A * d, 1) + jnp.sum(G / d, 1)) / d
         column = (jnp.sum(A / d[:, None], 0) + jnp.sum(Q * d, 1)) * d
         fine = (row > 0) & (column > 0)

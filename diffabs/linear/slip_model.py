@@ -5,7 +5,6 @@ x = (integral of (slip - target), slip - target), u = tau - tau*.
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -133,7 +132,7 @@ class SlipModel:
         def rate(z: AnyArray) -> AnyArray:
             return flow(x.at[kept].set(z), u)[kept]
 
-        def newton(_: Any, z: AnyArray) -> AnyArray:
+        def newton(_: object, z: AnyArray) -> AnyArray:
             return z - jnp.linalg.solve(jax.jacfwd(rate)(z), rate(z))
 
         # A fixed number of iterations: a loop until convergence has no reverse-mode derivative.

@@ -5,7 +5,7 @@
 The poles decide whether the closed loop is stable. With a pure delay, the poles that cross the stability boundary are
 counted while the delay grows from zero. They cross only where |L| = 1 (Cooke and van den Driessche, On zeroes of some
 transcendental equations, 1986). Crossings are bracketed on a grid, which is refined until neighbours are close, and
-bisected to rounding. The grid separates all frequencies with |L| = 1, which are eigenvalues of a Hamiltonian matrix
+bisected to rounding. The grid separates all frequencies with |L| = 1. They are eigenvalues of a Hamiltonian matrix
 (Boyd, Balakrishnan and Kabamba, A bisection method for computing the H-infinity norm, 1989).
 
 In continuous time and without a delay, the direct path D is the limit of L at infinite frequency. It counts as a value
@@ -107,7 +107,7 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
 
     For a sampled loop the search ends at 1000 periods, or at 4 times (phase lag to -1)/frequency if that is more. For
     an `OpenLoop` it also ends after 3000 steps of the delay. The delay margin is NaN if it ends without a delay that
-    makes the loop unstable. It is infinite only if no delay at all does, because |L| < 1 at all frequencies with all
+    makes the loop unstable. It is infinite only if no delay at all does. Then |L| < 1 at all frequencies with all
     delays (|L| < 0.99 for an `OpenLoop`, as a peak may be between points).
 
     Args:

@@ -1,7 +1,6 @@
 """Objectives of a balance: fall, time to rest, and peaks of angles, voltage and torque."""
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, larger, later_of_larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import param, pytree
-from diffabs.core.types import PyTree, Scalar, Vector
+from diffabs.core.types import Part, PyTree, Scalar, Vector
 from diffabs.objectives.tracking import FinalError, held_value, integral_value, keep_memory, no_integral
 
 RATE_NAMES = ("theta_rate", "psi_rate", "phi_rate")
@@ -60,12 +59,12 @@ class FinalNorm:
 def _greatest_angle(name: str) -> tuple[PyTree, PyTree, PyTree, PyTree]:
     """Return start, flow, update and value of the greatest |angle|, from the cubic of every step."""
 
-    def start(self: Any, sample: Sample) -> Memory:
+    def start(self: Part, sample: Sample) -> Memory:
         """Return the memory with the first |angle|."""
         del self
         return Memory(held=jnp.abs(getattr(sample.output, name)))
 
-    def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
+    def update(self: Part, memory: Memory, segment: Segment) -> Scalar:
         """Return the greatest |angle| up to the end of the step."""
         del self
         angle = segment.output(lambda output: getattr(output, name))
@@ -103,12 +102,12 @@ def _greatest_size(size: Scalar) -> tuple[PyTree, PyTree, PyTree, PyTree]:
     otherwise the cubic may leave the limits.
     """
 
-    def start(self: Any, sample: Sample) -> Memory:
+    def start(self: Part, sample: Sample) -> Memory:
         """Return the memory with the first size."""
         del self
         return Memory(held=size(sample))
 
-    def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
+    def update(self: Part, memory: Memory, segment: Segment) -> Scalar:
         """Return the greatest size up to the end of the step."""
         del self
         ends, falls = later_of_larger(size(segment.start), size(segment.end)), False

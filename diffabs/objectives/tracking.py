@@ -6,7 +6,7 @@ setpoint is the final value of the reference and not a filtered target on its wa
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from diffabs.core.types import Part, PyTree, Scalar, Vector
 MIN_SETPOINT = 0.01  # least denominator of an overshoot, in the unit of the first signal
 
 
-def no_integral(self: Any, memory: Memory, sample: Sample) -> Scalar:
+def no_integral(self: Part, memory: Memory, sample: Sample) -> Scalar:
     """Return (): the `flow` of an objective without an integral.
 
     Args:
@@ -34,7 +34,7 @@ def no_integral(self: Any, memory: Memory, sample: Sample) -> Scalar:
     return ()
 
 
-def keep_memory(self: Any, memory: Memory, segment: Segment) -> PyTree:
+def keep_memory(self: Part, memory: Memory, segment: Segment) -> PyTree:
     """Return the held memory unchanged: the `update` of an objective that is only an integral.
 
     Args:
@@ -46,7 +46,7 @@ def keep_memory(self: Any, memory: Memory, segment: Segment) -> PyTree:
     return memory.held
 
 
-def integral_value(self: Any, memory: Memory, ending: Ending) -> Scalar:
+def integral_value(self: Part, memory: Memory, ending: Ending) -> Scalar:
     """Return the integral: the `value` of an objective that is only an integral.
 
     Args:
@@ -58,7 +58,7 @@ def integral_value(self: Any, memory: Memory, ending: Ending) -> Scalar:
     return memory.flow
 
 
-def start_integral(self: Any, sample: Sample) -> Memory:
+def start_integral(self: Part, sample: Sample) -> Memory:
     """Return the integral 0: the `start` of an objective that is only an integral.
 
     Args:
@@ -99,7 +99,7 @@ def absolute_integral(cubic: Cubic, integral: Callable[[PyTree], PyTree]) -> Sca
     return jnp.where(cubic.start * cubic.end < 0, jnp.abs(left) + jnp.abs(whole - left), jnp.abs(whole))
 
 
-def held_value(self: Any, memory: Memory, ending: Ending) -> Scalar:
+def held_value(self: Part, memory: Memory, ending: Ending) -> Scalar:
     """Return the held memory: the `value` of an objective that is its memory.
 
     Args:
@@ -111,7 +111,7 @@ def held_value(self: Any, memory: Memory, ending: Ending) -> Scalar:
     return memory.held
 
 
-def start_held(self: Any, sample: Sample) -> Memory:
+def start_held(self: Part, sample: Sample) -> Memory:
     """Return the held sum 0: the `start` of an objective that sums over steps.
 
     Args:

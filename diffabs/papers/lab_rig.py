@@ -19,7 +19,7 @@ from diffabs.controllers import ConstantTorque
 from diffabs.core.blocks import Direct
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import get, param, part, pytree
-from diffabs.core.types import JsonObject, Params, Scalar, Table
+from diffabs.core.types import JsonObject, Params, Scalar, Table, Vector
 from diffabs.identify import Identified, Tolerances, fit
 from diffabs.papers import record
 from diffabs.papers.digest import Digest
@@ -128,13 +128,13 @@ class Coasting:
     stiction: Scalar = param(default=1e-2, unit="N m", above=0.0)
     inertia: Scalar = param(default=7.5281e-3, unit="kg m^2", above=0.0)
 
-    def at(self, t: Any) -> Any:
+    def at(self, t: Vector) -> Vector:
         """Return the speed [rad/s] at instants `t` [s]."""
         dry = self.stiction / self.friction
         return (self.speed + dry) * jnp.exp(-self.friction * t / self.inertia) - dry
 
 
-def _coasting_residuals(wheel: Coasting, t: Any, speed: Any) -> Any:
+def _coasting_residuals(wheel: Coasting, t: Vector, speed: Vector) -> Vector:
     return wheel.at(t) - speed
 
 
@@ -286,8 +286,8 @@ class StepCurves(NamedTuple):
 def read_step(command: float) -> StepCurves:
     """Return the step-braking curves of a command, from Fig. 5.6 a of the manual.
 
-    Before the step the drawn rim of the wheel is 1.8 % faster than that of the drum, because the radii of the manual
-    are not those of the rig. Each curve is therefore divided by its own first reading.
+    Before the step the drawn rim of the wheel is 1.8 % faster than that of the drum. The radii of the manual are not
+    those of the rig. Each curve is therefore divided by its own first reading.
 
     Args:
         command: One of `STEP_COMMANDS`.
@@ -311,14 +311,14 @@ def build_step(curves: StepCurves, rig: LabRig) -> Loop:
     )  # fmt: skip
 
 
-def _rims(run: Run, speed: Any) -> tuple[Any, Any, Any]:
+def _rims(run: Run, speed: Vector) -> tuple[Vector, Vector, Vector]:
     """Return time [s] and the rim speeds of wheel and drum as fractions of the first speed."""
     assert run.trajectory is not None
     sample = run.trajectory.sample
     return sample.t, sample.output.wheel_speed / speed, sample.output.speed / speed
 
 
-def _step_residuals(step: StepRun, t: Any, wheel: Any, drum_t: Any, drum: Any) -> Any:
+def _step_residuals(step: StepRun, t: Vector, wheel: Vector, drum_t: Vector, drum: Vector) -> Vector:
     run = rollout(step.loop, FixedStep(step=FIT_STEP, duration=STEP_DURATION))
     at, ours, ours_drum = _rims(run, step.loop.initial.speed)
     return jnp.concatenate(

@@ -26,7 +26,7 @@ from diffabs.config.values import ScenarioError
 from diffabs.controllers import ConstantTorque, PlayedCommand, Relay, Sampled
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import param, part, pytree, replace
-from diffabs.core.types import JsonObject, Params, Part, Scalar
+from diffabs.core.types import JsonObject, Params, Part, Scalar, Vector
 from diffabs.identify import Identified, Tolerances, fit
 from diffabs.plants import BrakeStart, LabRig
 from diffabs.references import FixedSlip
@@ -249,7 +249,7 @@ class RecordResiduals:
 
     solver: FixedStep
 
-    def __call__(self, recorded: RecordedRun, t: Any, wheel: Any, slip: Any, weight: Any) -> Any:
+    def __call__(self, recorded: RecordedRun, t: Vector, wheel: Vector, slip: Vector, weight: Vector) -> Vector:
         """Return the residuals, shape (2 n,).
 
         Args:
@@ -264,7 +264,7 @@ class RecordResiduals:
         return jnp.concatenate([(turns - wheel) / SIGMA_SPEED, weight * (slips - slip) / SIGMA_SLIP])
 
 
-def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Any) -> tuple[Any, Any]:
+def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Vector) -> tuple[Vector, Vector]:
     """Return the counter's wheel speed [rad/s] and the computer's slip [1] at instants of a run, shape (n,) each.
 
     The wheel speed is the true one, older by the counter's lag. The slip is that of the encoders.

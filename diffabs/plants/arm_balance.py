@@ -34,7 +34,7 @@ from diffabs.controllers import BalanceFeedback
 from diffabs.core.numerics import clamp, quotient
 from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import param, pytree
-from diffabs.core.types import AnyArray, PyTree, Scalar
+from diffabs.core.types import AnyArray, Part, PyTree, Scalar
 from diffabs.objectives import BALANCE
 from diffabs.plants.audit import BalanceAudit
 from diffabs.references import Upright
@@ -77,7 +77,7 @@ class BalanceStart:
     phi_rate: Scalar = param(default=0.0, unit="rad/s")
 
 
-def usual_parts(self: Any) -> dict[str, PyTree]:
+def usual_parts(self: Part) -> dict[str, PyTree]:
     """Return the default parts of a loop around a two-wheeler: feedback that holds it upright until it falls.
 
     The keys are `initial`, `reference`, `controller`, `actuator` and `stop`.
@@ -90,7 +90,7 @@ def usual_parts(self: Any) -> dict[str, PyTree]:
     return {"initial": BalanceStart(), **around}
 
 
-def usual_objectives(self: Any) -> dict[str, PyTree]:
+def usual_objectives(self: Part) -> dict[str, PyTree]:
     """Return the default objectives of a two-wheeler, by name.
 
     Args:

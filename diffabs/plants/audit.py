@@ -33,13 +33,13 @@ def _driving_power(before: Any, after: Any) -> Scalar:
     return jnp.maximum(jnp.maximum(before, after), 0.0)
 
 
-def _zero(self: Any, sample: Sample) -> Memory:
+def _zero(self: Part, sample: Sample) -> Memory:
     """Return the memory with no gain of energy."""
     del self
     return Memory(held=0.0 * sample.t)
 
 
-def _excess(self: Any, memory: Memory, ending: Ending) -> Scalar:
+def _excess(self: Part, memory: Memory, ending: Ending) -> Scalar:
     """Return the unexplained gain of energy relative to the tolerance [1]."""
     del ending
     return memory.held / (FORGIVEN * self.scale)

@@ -1,7 +1,5 @@
 """Common functions of braked wheels: slip, standstill, the start of a run, and the default loop."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -65,7 +63,7 @@ def forward_speed(speed: Scalar) -> Scalar:
     return jnp.where(jnp.greater(speed, STANDSTILL_SPEED), speed, 0.0)
 
 
-def usual_parts(self: Any) -> dict[str, PyTree]:
+def usual_parts(self: Part) -> dict[str, PyTree]:
     """Return the default parts of a loop around a brake: a PID that holds a fixed slip until standstill.
 
     The keys are `initial`, `reference`, `controller` and `stop`. The PID has limits of 0 and 90 in the plant's control
@@ -83,7 +81,7 @@ def usual_parts(self: Any) -> dict[str, PyTree]:
     }
 
 
-def usual_objectives(self: Any) -> dict[str, PyTree]:
+def usual_objectives(self: Part) -> dict[str, PyTree]:
     """Return the default objectives of a brake, by name.
 
     Args:
@@ -93,7 +91,7 @@ def usual_objectives(self: Any) -> dict[str, PyTree]:
     return dict(BRAKING)
 
 
-def probes(self: Any, initial: BrakeStart, setpoint: Scalar, stop: Part) -> BrakeStart:
+def probes(self: Part, initial: BrakeStart, setpoint: Scalar, stop: Part) -> BrakeStart:
     """Return k starts at which the loop may be stiffest, as a `BrakeStart` of arrays (k,).
 
     They combine 6 speeds from the start's to the stop's with 23 slips. Some slips are close to the setpoint, where the

@@ -147,8 +147,8 @@ def assign_cells(one: AxisVariable, along: int = 2) -> tuple[np.ndarray, np.ndar
 def cell_means(one: AxisVariable, result: np.ndarray) -> np.ndarray:
     """Return for each run the mean of the result over its cell, shape (runs,).
 
-    The variance of these means measures influence. Unlike a correlation, it also shows a result that is worst in the
-    middle of a range, and the influence of a variable with names.
+    The variance of these means measures influence. Unlike a correlation, it shows a result that is worst in the middle
+    of a range. It also shows the influence of a variable with names.
 
     Args:
         one: Variable to divide into cells.

@@ -894,8 +894,8 @@ class _Check:
     ) -> tuple[list[arb], dict[int, _Chord], _Series]:
         """Return a box that no run leaves for a time h, the chords of limits there, and the series of the runs in it.
 
-        A limit takes every value that it or its chord has for arguments in its range. If the integrals of the rates
-        leave neither box nor ranges, these hold for the runs with limits and for those with chords (w = 0).
+        A limit takes every value that it or its chord has for arguments in its range. Suppose that the integrals of the
+        rates leave neither box nor ranges. Then these hold for the runs with limits and for those with chords (w = 0).
         """
         p, s = self.program, self.slip
         _, whole, _ = self.relax_limits(p.limits, centre, X, tangents, self.np + self.n)
@@ -1108,7 +1108,7 @@ class _Check:
     def at_zero(self, q: _Quadrature | None, rate: arb) -> tuple[float, float]:
         """Return the bounds of a quadrature where the margin is 0.
 
-        The captured set has the margin m, and m/a after it the margin is 0, with a = -m' in all boxes near the end.
+        The captured set has the margin m. The margin is 0 the time m/a later, with a = -m' in all boxes near the end.
         """
         if q is None or self.capture is None or self.rates is None:
             return -inf, inf

@@ -398,7 +398,7 @@ class _Derivation:
     def chart_rates(self, own: list[Node], rates: list[Node], chart: "_Chart") -> list[Node]:
         """Return the rates of slip, speed and distance from those of the plant's own states.
 
-        The graph of the speeds v and w in the plant's output is differentiated here: a derivative that a part declares
+        The graph of the speeds v and w in the plant's output is differentiated here. A derivative that a part declares
         need not be that of its values.
 
         Args:
@@ -782,7 +782,7 @@ def _text(path: PyTree) -> str:
 def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
     """Check that the plant's slip is 1 - w/v and its start has the slip and the speed asked for, in exact arithmetic.
 
-    Both sides are evaluated in fractions, at speeds from 2 cm/s to 200 m/s, slips from 0 to almost 1, and distances up
+    Both sides are evaluated in fractions. Speeds go from 2 cm/s to 200 m/s, slips from 0 to almost 1, and distances up
     to 10 km. The points are random, spread evenly over the decades of speed, and the ends of the ranges of speed and
     slip are among them. Parameters of the plant in `over` are multiplied by factors from 1e-6 to 1e6, both ends
     included.

@@ -307,8 +307,8 @@ class _Population(NamedTuple):
 
 
 class _LevelSequence(NamedTuple):
-    """All levels, the samples of the last one, the mask (n,) of its failures, the reason for the end, and the number of
-    failures among the samples of the first level.
+    """All levels; the samples of the last one and the mask (n,) of its failures. Then the reason for the end, and the
+    number of failures among the samples of the first level.
     """
 
     levels: list[SubsetLevel]
@@ -344,7 +344,7 @@ def _run_levels(
 def _next_threshold(scores: np.ndarray, plan: _Plan) -> float | None:
     """Return the next threshold b_j, or None if all samples share one score.
 
-    It is the final threshold if at least half as many samples as there are chains fail: another level would cost more
+    It is the final threshold if at least half as many samples as there are chains fail. Another level would cost more
     than it contributes. Otherwise it is the score that `chains` samples reach. If ties let more than half of all
     samples reach it, the next greater score is taken. That score must leave at least a tenth of the chains, unless all
     samples reach the tied score.

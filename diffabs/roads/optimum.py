@@ -1,6 +1,6 @@
 """The best slip of a road: the first maximum of its friction over slip."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,10 +43,10 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
         distance: Place on the road [m].
     """
 
-    def mu(s: Scalar) -> Any:
+    def mu(s: Scalar) -> Scalar:
         return road.friction(s, speed, distance)
 
-    def slope(s: Scalar) -> Any:
+    def slope(s: Scalar) -> Scalar:
         return jax.jvp(mu, (s,), (jnp.ones_like(s),))[1]
 
     grid = jnp.linspace(0.0, 1.0, GRID + 1)
@@ -55,7 +55,7 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     inside = jnp.any(falls)
     top = jnp.argmax(falls)  # the first fall is after the top grid point
 
-    def halve(_: Any, bracket: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+    def halve(_: object, bracket: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
         low, high = bracket
         middle = 0.5 * (low + high)
         rising = slope(middle) > 0
@@ -68,7 +68,7 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     # Where mu is smooth, only rounding is left of the slope. At a kink a Newton step would leave the bracket.
     smooth = jnp.abs(slope(s0)) < jnp.sqrt(jnp.finfo(s0.dtype).eps) * jnp.abs(curvature)
 
-    def residual(s: Scalar) -> Any:
+    def residual(s: Scalar) -> Scalar:
         left, right = (mu(end + (s - s0)) for end in (low, high))  # s is s0: only derivatives differ from mu(end)
         gap = left - right
         return jnp.where(smooth, slope(s), gap - jax.lax.stop_gradient(gap))  # bisection alone places a kink
@@ -83,11 +83,11 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
 
 
 @jax.custom_jvp
-def _newton_step(residual: Scalar, rate: Scalar) -> Any:
+def _newton_step(residual: Scalar, rate: Scalar) -> Scalar:
     """Return residual/rate for a constant rate; where it is 0, the step is 0 and its derivative NaN."""
     return ratio(residual, rate)
 
 
 @_newton_step.defjvp
-def _step_slope(at: Any, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _step_slope(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
     return _newton_step(*at), moves[0] / jnp.where(at[1] == 0, jnp.nan, at[1])

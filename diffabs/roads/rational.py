@@ -10,7 +10,6 @@ Source: Maeda and Sugiura, eq. (13), after INTECO, The Laboratory Anti-lock Brak
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 from jax.tree_util import Partial
 
@@ -41,7 +40,7 @@ class RationalCurve:
         """Yield the rule that friction is not negative."""
         yield opposes(Partial(type(self).friction, self))
 
-    def _curve(self, s: Scalar) -> Any:
+    def _curve(self, s: Scalar) -> Scalar:
         p = power(s, self.q)
         return quotient(self.w4 * p, self.a + p) + s * (self.w1 + s * (self.w2 + s * self.w3))
 

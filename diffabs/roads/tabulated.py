@@ -11,7 +11,6 @@ Sci. Stat. Comput. 5 (1984). The three-point end slopes are those of C. Moler, N
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -102,7 +101,7 @@ class PiecewiseCubic:
         del speed, distance
         return odd(self._curve, slip)
 
-    def _curve(self, s: Scalar) -> Any:
+    def _curve(self, s: Scalar) -> Scalar:
         i = searchsorted(self.knots[1:-1], s)
         x, c0, c1, c2, c3 = self.rows[i]
         z = jnp.minimum(s, self.knots[-1]) - x
@@ -131,7 +130,7 @@ def slopes(x: Scalar, y: Scalar) -> Scalar:
     return jnp.concatenate([first[None], inner, last[None]])
 
 
-def _end_slope(h0: Scalar, h1: Scalar, m0: Scalar, m1: Scalar) -> Any:
+def _end_slope(h0: Scalar, h1: Scalar, m0: Scalar, m1: Scalar) -> Scalar:
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
     steep = (jnp.sign(m0) != jnp.sign(m1)) & (jnp.abs(d) > 3 * jnp.abs(m0))
     return jnp.where(jnp.sign(d) != jnp.sign(m0), 0.0, jnp.where(steep, 3 * m0, d))

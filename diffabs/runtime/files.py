@@ -202,7 +202,7 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yield an empty folder beside `target` that replaces `target` at the end, or vanishes after an error.
 
     Linux exchanges the old and the new folder in one step. Other systems, and some network file systems, take two
-    steps: a process killed between them leaves no `target`, and the old content in `.NAME.*/old` beside it. A killed
+    steps. A process killed between them leaves no `target`, and the old content in `.NAME.*/old` beside it. A killed
     process may leave a hidden folder `.NAME.*` in any case; remove it when no process writes.
 
     Args:

@@ -79,20 +79,20 @@ def _answer(handler: Any) -> None:
         signal.signal(signal.SIGINT, handler)
 
 
-def _press(*_: Any) -> None:
+def _press(*_: object) -> None:
     global _pending
     _pending += 1
     if _pending >= MAX_UNHEARD_PRESSES:
         _leave()
 
 
-def _terminate(*_: Any) -> None:
+def _terminate(*_: object) -> None:
     global _terminated
     _terminated = True
     _press()
 
 
-def _leave(*_: Any) -> None:
+def _leave(*_: object) -> None:
     """End the process at once, with a restored cursor and the line `interrupted`."""
     with contextlib.suppress(OSError):
         os.write(2, (SHOW_CURSOR + b"\n" if _pending and os.isatty(2) else b"") + b"interrupted\n")

@@ -1,12 +1,11 @@
 """The usual loops, from which a scenario or an example starts: a braking car, a balanced two-wheeler."""
 
-from typing import Any
-
 from diffabs.core.loop import Loop
+from diffabs.core.types import Part
 from diffabs.plants import ArmBalance, QuarterCar
 
 
-def braking(**parts: Any) -> Loop:
+def braking(**parts: Part) -> Loop:
     """Return a loop of a quarter car, with PID control of the slip at a fixed target until standstill.
 
     Args:
@@ -15,7 +14,7 @@ def braking(**parts: Any) -> Loop:
     return Loop(**{"plant": QuarterCar(), **QuarterCar().usual_parts(), **parts})
 
 
-def balancing(**parts: Any) -> Loop:
+def balancing(**parts: Part) -> Loop:
     """Return a loop of the two-wheeler, which state feedback keeps upright; the run ends early if it falls.
 
     Args:

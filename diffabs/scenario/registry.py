@@ -1,8 +1,8 @@
 """The parts by family and name, and the construction of a part from the values of a scenario.
 
-A part belongs to a family if its class has all methods of the family's contract in `core.protocols`, and if the
-family's package exports it. Its name in scenarios is the kebab-case of its Python name: `QuarterCar` is `quarter-car`,
-`SNOW` is `snow`. To add a part, write its class and export it.
+A part belongs to a family on two conditions. Its class has all methods of the family's contract in `core.protocols`,
+and the family's package exports it. Its name in scenarios is the kebab-case of its Python name: `QuarterCar` is
+`quarter-car`, `SNOW` is `snow`. To add a part, write its class and export it.
 
 A module from outside may hold parts of all families. Such a part belongs to the family whose contract has the most
 methods among the contracts that fit. The attribute `family` of its class overrides this.

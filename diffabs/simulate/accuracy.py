@@ -3,7 +3,7 @@
     d1 = m(h/2) - m(h),  d2 = m(h/4) - m(h/2),  q = |d2/d1| = 2^-p for a method of order p
     |m(h) - m(0)|, about                    |d1| + |d2| (1 + q + q^2 + ...)
 
-With p = 4 the error of the step h is 16/15 of d1, and the error of the half step is 1/15 of d1. If q exceeds
+With p = 4 the error of the step h is 16/15 of d1. The error of the half step is 1/15 of d1. If q exceeds
 `MAX_DIFFERENCE_RATIO`, the differences do not shrink: the metric has no order and no limit can be estimated.
 
 Runs with different steps are comparable only if everything with its own clock keeps that clock. Noise is drawn and a

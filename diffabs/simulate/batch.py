@@ -103,7 +103,7 @@ class Batch:
         """Return the loop of run `i`, given the common `loop`."""
         return replace(loop, {path: np.asarray(column)[i] for path, column in self.values.items()})
 
-    def each(self, loop: Part, function: Callable[[PyTree, PyTree], PyTree], lanes: Any = None) -> PyTree:
+    def each(self, loop: Part, function: Callable[[PyTree, PyTree], PyTree], lanes: PyTree = None) -> PyTree:
         """Return function(loop, key) for every run, stacked along a leading axis (runs,), by `jax.vmap`;
         differentiable.
 

@@ -1,7 +1,7 @@
 """Contracts of a loop's parts: whether each method returns what `core.protocols` asks for.
 
-`find_misfits` traces the methods that a run calls, once each, so no values are computed. A mistake in a part of the
-user's own, or a part that reads a signal which the plant lacks, gives one line with the part, the method and what is
+`find_misfits` traces the methods that a run calls, once each, so no values are computed. A part of the user's own may
+have a mistake, or may read a signal that the plant lacks. Either gives one line with the part, the method and what is
 needed. Without this check JAX would report the mistake later, in terms of compiled loops and derivatives. Of the
 optional methods, only those of ticks and events are traced.
 """

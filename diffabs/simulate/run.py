@@ -142,12 +142,12 @@ class RunCapacity(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=1)
-def _truncate_trajectory(trajectory: PyTree, count: int) -> Any:
+def _truncate_trajectory(trajectory: PyTree, count: int) -> PyTree:
     return jax.tree.map(lambda x: x[:count], trajectory)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def run_differentiable(capacity: RunCapacity, run: PyTree) -> Any:
+def run_differentiable(capacity: RunCapacity, run: PyTree) -> PyTree:
     """Return the run of (loop, objectives, method, key), as `capacity.finish` makes it of the last carry.
 
     Args:
@@ -185,7 +185,7 @@ run_differentiable.defjvp(_rule, symbolic_zeros=True)
 @compile_once(static=("instants", "finish"), options=SAME_RESULT_OPTIONS)
 def _run(
     loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key, every: Any, *, instants: int, finish: Finish
-) -> Any:
+) -> PyTree:
     """Return a run for values, with capacity for `instants` of a trajectory; 0 without one."""
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
     carry = method.start(loop, objectives, key)
@@ -267,7 +267,7 @@ def _attach_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: 
     """Return the run with its trajectory: first and later instants, and the last one repeated after the end."""
     run, last = judged
 
-    def join(a: Scalar, b: Scalar, c: Scalar) -> Any:
+    def join(a: Scalar, b: Scalar, c: Scalar) -> PyTree:
         # Rows after the end contain anything, so the last instant replaces them.
         b = jnp.where(jnp.expand_dims(seen.running, range(1, b.ndim)), b, c)
         return jnp.concatenate([jnp.asarray(a)[None], b])

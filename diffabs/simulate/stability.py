@@ -13,7 +13,6 @@ matrices themselves.
 import dataclasses
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any
 
 import jax
 import jax.extend.core
@@ -95,13 +94,13 @@ def _as_single_precision(*trees: PyTree) -> PyTree:
     return jax.tree.map(lambda x: np.asarray(x, np.float32), trees)
 
 
-def _at(values: PyTree, lanes: np.ndarray) -> Any:
+def _at(values: PyTree, lanes: np.ndarray) -> PyTree:
     return jax.tree.map(lambda x: np.asarray(x)[lanes], values)
 
 
 def _is_known_stable(loop: Part, values: PyTree, step: float, squarings: int | None) -> np.ndarray:
-    """Return True for each run whose step is known to be stable: by a bound with so many squarings, or with None by the
-    eigenvalues.
+    """Return True for each run whose step is known to be stable. The proof is a bound with so many squarings; with None
+    the eigenvalues.
     """
     if squarings is not None:
         return (
@@ -186,7 +185,7 @@ def _balance(matrices: jax.Array) -> jax.Array:
     """
     size = jnp.abs(matrices) * (1 - jnp.eye(matrices.shape[-1]))
 
-    def halve(_: Any, log: jax.Array) -> jax.Array:
+    def halve(_: object, log: jax.Array) -> jax.Array:
         scaled = size * jnp.exp(log[:, None, :] - log[:, :, None])
         rows, columns = jnp.sum(scaled, -1), jnp.sum(scaled, -2)
         fine = (rows > 0) & (columns > 0) & jnp.isfinite(rows / columns)
@@ -266,7 +265,7 @@ class _AtTarget:
     def start(self, signal: PyTree) -> Memory:
         return self.reference.start(signal)
 
-    def flow(self, t: Scalar, memory: Memory, signal: PyTree) -> Any:
+    def flow(self, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
         return self.reference.flow(t, memory, signal)
 
     def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:

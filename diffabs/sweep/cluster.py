@@ -131,7 +131,7 @@ def _start_workers(workers: int) -> Iterator[PyTree]:
         yield opened.enter_context(cluster)
 
 
-def dask_setup(_: Any) -> None:
+def dask_setup(_: object) -> None:
     """Ignore Ctrl-C in a worker, so that only the process in the terminal handles it.
 
     Dask calls this in each new worker.

@@ -25,8 +25,8 @@ from diffabs.core.types import PyTree, Table
 def choose_indices(u: ArrayLike, count: int, weights: Sequence[float] | None = None) -> np.ndarray:
     """Return the index of the item that each uniform u picks.
 
-    It is the smallest k with u < F(k), where F(k) is the weight of the items 0 to k over the weight of all. At u = 1 it
-    is the last item with a positive weight.
+    It is the smallest k with u < F(k). F(k) is the weight of the items 0 to k over the weight of all. At u = 1 it is
+    the last item with a positive weight.
 
     Args:
         u: Uniforms in [0, 1], any shape.

@@ -3,7 +3,7 @@
     value(u)         quantile at u in [0, 1], the inverse of the cumulative distribution function
     from_normal(z)   quantile at u = Phi(z), equally exact for large and small z
 
-Each is a formula in p = u and q = 1 - u, and uses the smaller of both, which has all its digits. Phi(7) = 1 - 1.28e-12
+Each is a formula in p = u and q = 1 - u. It uses the smaller of both, which has all its digits. Phi(7) = 1 - 1.28e-12
 has lost twelve digits, and Phi(-7) none. At u = 0 and 1 the value is the end of the support, which may be infinite.
 """
 

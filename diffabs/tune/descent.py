@@ -346,8 +346,8 @@ def _next_step_factor(descent_state: DescentState, loss: float, slope: float) ->
     """Return the next step factor t of a line search.
 
     Without an upper bound on t the step expands. With both bounds it is bisected. With only an upper bound, the next t
-    is the minimum of the parabola through both losses and the slope, kept between 0.1 t and 0.5 t. If the loss at t is
-    not finite, it is t/4.
+    is the minimum of the parabola through both losses and the slope. It is kept between 0.1 t and 0.5 t. If the loss at
+    t is not finite, it is t/4.
     """
     if not np.isfinite(descent_state.high):
         return min(STEP_EXPANSION * descent_state.t, MAX_UPDATE_COMPONENT / float(np.max(np.abs(descent_state.update))))

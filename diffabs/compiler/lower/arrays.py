@@ -9,6 +9,7 @@ from jax.extend.core import JaxprEqn
 from diffabs.compiler.ir import Array, Graph, Node
 from diffabs.compiler.lower.elementwise import max_or_min
 from diffabs.compiler.lower.rules import Unsupported, as_node_array, constant_array, lowering_rule, map_entries
+from diffabs.core.types import Equation
 
 
 @lowering_rule("broadcast_in_dim", "shape broadcast_dimensions sharding")
@@ -23,7 +24,7 @@ def _broadcast(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 @lowering_rule("reshape", "new_sizes dimensions sharding")
 @lowering_rule("squeeze", "dimensions")
 @lowering_rule("expand_dims", "dimensions")
-def _reshape(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _reshape(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     if eqn.primitive.name == "reshape" and eqn.params["dimensions"] is not None:
         raise Unsupported("reshape", "in another order of dimensions")
     return [ins[0].reshape(eqn.outvars[0].aval.shape)]
@@ -99,7 +100,7 @@ NEUTRAL_ELEMENTS = {"sum": 0, "prod": 1, "and": True, "or": False}
 @lowering_rule("reduce_max", "axes out_sharding")
 @lowering_rule("reduce_min", "axes out_sharding")
 @lowering_rule("reduce_and reduce_or", "axes")
-def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _reduce(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     """Reduce by pairs: the longest dependency chain of n entries has about log2(n) operations."""
     kind, x = eqn.primitive.name.removeprefix("reduce_"), ins[0]
     name: Any = REDUCTION_OPERATIONS.get(kind, kind)
@@ -157,7 +158,7 @@ def _first_extreme(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]
 
 
 @lowering_rule("dot_general", "dimension_numbers precision preferred_element_type out_sharding")
-def _dot(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _dot(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     (left, right), batch = eqn.params["dimension_numbers"]
     if any(batch):
         raise Unsupported("dot_general", "of stacked arrays")

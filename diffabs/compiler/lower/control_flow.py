@@ -1,7 +1,5 @@
 """Lowering rules for programs within a program: calls, conditionals and loops of known length."""
 
-from typing import Any
-
 import jax
 import jax.extend.core as jex
 import numpy as np
@@ -16,6 +14,7 @@ from diffabs.compiler.lower.rules import (
     scalar_array,
 )
 from diffabs.core.tracing import scan_input_counts
+from diffabs.core.types import Equation
 
 MAX_UNROLLED_STEPS = 64  # bound on the length of a scan, because its steps are unrolled
 
@@ -27,12 +26,12 @@ MAX_UNROLLED_STEPS = 64  # bound on the length of a scan, because its steps are 
 )
 @lowering_rule("custom_jvp_call", "call_jaxpr jvp_jaxpr_fun num_consts symbolic_zeros")
 @lowering_rule("custom_vjp_call", "call_jaxpr fwd_jaxpr_thunk bwd num_consts out_trees symbolic_zeros")
-def _call(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _call(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     return inline_program(graph, eqn.params["call_jaxpr" if "call_jaxpr" in eqn.params else "jaxpr"], ins)
 
 
 @lowering_rule("custom_vmap_call", "call rule in_tree out_tree")
-def _custom_vmap_any(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _custom_vmap_any(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     """Lower the identity of a boolean whose custom rule for vmap is `any` over the batch; refuse other rules.
 
     `core.lanes.any_lane` is such a call.
@@ -44,7 +43,7 @@ def _custom_vmap_any(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [scalar_array(graph.any(ins[0].item()))]
 
 
-def _is_any_rule(eqn: Any) -> bool:
+def _is_any_rule(eqn: Equation) -> bool:
     """Return whether a custom rule for vmap computes `any` over the batch, by a test on three batches of two values."""
     told = jex.DebugInfo("kernel", "any", None, None)
     body = jex.Jaxpr((), list(eqn.invars), list(eqn.outvars), [eqn], eqn.effects, told)
@@ -55,7 +54,7 @@ def _is_any_rule(eqn: Any) -> bool:
 
 
 @lowering_rule("cond", "branches")
-def _cond(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _cond(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     which, rest, branches = ins[0].item(), ins[1:], eqn.params["branches"]
     if which.op == "const":
         # XLA clamps an index that is out of range.
@@ -74,7 +73,7 @@ def _cond(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("scan", "length reverse jaxpr num_consts num_carry linear unroll _split_transpose ft_in ft_out")
-def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _scan(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     p = eqn.params
     if p["length"] > MAX_UNROLLED_STEPS:
         raise Unsupported("scan", f"of {p['length']} steps within a step; {MAX_UNROLLED_STEPS} are the most")

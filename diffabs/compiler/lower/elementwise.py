@@ -1,12 +1,11 @@
 """Lowering rules for elementwise primitives: arithmetic, functions, comparisons, conversions and bit operations."""
 
-from typing import Any
-
 import numpy as np
 from jax.extend.core import JaxprEqn
 
 from diffabs.compiler.ir import Array, Graph, Node, is_real
 from diffabs.compiler.lower.rules import Unsupported, lowering_rule, map_entries
+from diffabs.core.types import Equation
 
 
 @lowering_rule(
@@ -14,7 +13,7 @@ from diffabs.compiler.lower.rules import Unsupported, lowering_rule, map_entries
 )
 @lowering_rule("div sub is_finite floor ceil eq ne lt le gt ge pow", "accuracy")
 @lowering_rule("add mul", "out_dtype")
-def _elementwise(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _elementwise(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     name = eqn.primitive.name
     if eqn.params.get("accuracy") is not None:
         raise Unsupported(name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
@@ -168,7 +167,7 @@ def _round(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("select_n")
-def _select(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _select(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     which, *cases = ins
     if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
         raise Unsupported("select_n", f"between {len(cases)} cases")
@@ -187,7 +186,7 @@ def _convert(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("bitcast_convert_type", "new_dtype")
-def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+def _bits(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     if eqn.invars[0].aval.dtype.itemsize != np.dtype(eqn.params["new_dtype"]).itemsize:
         raise Unsupported("bitcast_convert_type", "between types of different sizes")
     return [map_entries(lambda x: graph.bits(x, eqn.params["new_dtype"]), *ins)]

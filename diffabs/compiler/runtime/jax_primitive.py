@@ -82,7 +82,7 @@ def _launch_in_parts(
     def part(first: int) -> list[PyTree]:
         """Return the results of the launch for `each` directions from `first` on."""
 
-        def cut(key: ArrayKey, x: Scalar) -> Any:
+        def cut(key: ArrayKey, x: Scalar) -> PyTree:
             # Tangents of arrays of lanes are (lanes, tangents, ...), of uniform arrays (tangents, ...).
             axis = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
             lacking = max(0, first + each - many)
@@ -107,7 +107,7 @@ def _launch_once(
 ) -> list[PyTree]:
     """Return the results of one launch; initial tangents of the carry that are not in `given` are zero."""
 
-    def array(key: ArrayKey) -> Any:
+    def array(key: ArrayKey) -> PyTree:
         if key in given:
             return given[key]
         x = given[key._replace(tangent=False)]
@@ -135,7 +135,7 @@ def _jvp_rule(
     # Build the derivative here: JAX 0.12 forbids tracing inside the abstract evaluation, where `result_keys` needs it.
     lanes.derivative(seeds)
 
-    def add_direction_axis(key: ArrayKey, x: Scalar) -> Any:
+    def add_direction_axis(key: ArrayKey, x: Scalar) -> PyTree:
         return jnp.expand_dims(x, 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1)
 
     given = [add_direction_axis(key, x) for key, x, on in zip(lanes.value_keys, slopes, moving, strict=True) if on]
@@ -150,7 +150,7 @@ def _jvp_rule(
 ad.primitive_jvps[run_lanes_primitive] = _jvp_rule
 
 
-def _zero_tangent(x: Scalar) -> Any:
+def _zero_tangent(x: Scalar) -> PyTree:
     """Return JAX's symbolic zero tangent of a value."""
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 

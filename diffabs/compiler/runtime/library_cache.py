@@ -1,8 +1,9 @@
 """A cache of compiled libraries and GPU code in the user's cache folder, with a check for damage.
 
 A file name holds two digests: one of every input of the compilation, and one of the file's content. A library is
-compiled again if no file has its first digest: it was never made, an input changed, or it was removed to make room. A
-file whose content does not match the second digest (empty, truncated or changed) is removed, and compiled again too.
+compiled again if no file has its first digest. Either it was never made, or an input changed, or it was removed to make
+room. A file whose content does not match the second digest (empty, truncated or changed) is removed, and compiled again
+too.
 """
 
 import contextlib

@@ -216,7 +216,7 @@ def _balancing_units(size: Scalar) -> Matrix:
     """Return units d (n,), x = d z, that give rows and columns of `size` about equal sums without the diagonal."""
     size = size * (1 - jnp.eye(len(size)))
 
-    def sweep(_: Any, d: Any) -> Matrix:
+    def sweep(_: object, d: Any) -> Matrix:
         row, column = size @ d / d, size.T @ (1 / d) * d
         # A state without coupling keeps its unit; the inner where avoids 0/0 for it.
         fine = (row > 0) & (column > 0)

@@ -26,7 +26,7 @@ class Dyadic:
     __slots__ = ("bits", "error", "ints")
     __array_ufunc__ = None  # makes NumPy leave array * Dyadic to __rmul__ instead of an element-wise product
 
-    def __init__(self, ints: Any, bits: int, error: Scalar = None) -> None:
+    def __init__(self, ints: Matrix, bits: int, error: Scalar = None) -> None:
         """Store `ints`, `bits` and `error` unchanged; `as_dyadic` and `as_uncertain_dyadic` convert floats."""
         self.ints, self.bits, self.error = ints, bits, error
 
@@ -49,7 +49,7 @@ class Dyadic:
         finer = bits - self.bits
         return self.each(lambda array: array * (1 << finer), finer) if finer else self
 
-    def product(self, other: Any, times: Callable[[PyTree, PyTree], PyTree]) -> "Dyadic":
+    def product(self, other: Matrix, times: Callable[[PyTree, PyTree], PyTree]) -> "Dyadic":
         """Return the product with `other` by the bilinear `times`, with its error |a| db + da |b| + da db."""
         other = as_dyadic(other)
         a, b, da, db = self.ints, other.ints, self.error, other.error
@@ -58,29 +58,29 @@ class Dyadic:
         errors += [] if da is None or db is None else [times(da, db)]
         return Dyadic(times(a, b), self.bits + other.bits, functools.reduce(operator.add, errors) if errors else None)
 
-    def __add__(self, other: Any) -> "Dyadic":
+    def __add__(self, other: Matrix) -> "Dyadic":
         other = as_dyadic(other)
         bits = max(self.bits, other.bits)
         a, b = self.at(bits), other.at(bits)
         errors = [each.error for each in (a, b) if each.error is not None]
         return Dyadic(a.ints + b.ints, bits, functools.reduce(operator.add, errors) if errors else None)
 
-    def __mul__(self, other: Any) -> "Dyadic":
+    def __mul__(self, other: Matrix) -> "Dyadic":
         return self.product(other, operator.mul)
 
-    def __matmul__(self, other: Any) -> "Dyadic":
+    def __matmul__(self, other: Matrix) -> "Dyadic":
         return self.product(other, operator.matmul)
 
     def __neg__(self) -> "Dyadic":
         return Dyadic(-self.ints, self.bits, self.error)
 
-    def __sub__(self, other: Any) -> "Dyadic":
+    def __sub__(self, other: Matrix) -> "Dyadic":
         return self + -as_dyadic(other)
 
-    def __rsub__(self, other: Any) -> "Dyadic":
+    def __rsub__(self, other: Matrix) -> "Dyadic":
         return -self + other
 
-    def __getitem__(self, index: Any) -> "Dyadic":
+    def __getitem__(self, index: object) -> "Dyadic":
         return self.each(lambda array: array[index])
 
     __radd__, __rmul__ = __add__, __mul__

@@ -86,7 +86,7 @@ def run_native(
     return jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
 
 
-def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish) -> Any:
+def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish) -> PyTree:
     """Return one run, as `finish` makes it of the last carry; `jax.vmap` makes a lane of each run of a batch.
 
     Args:
@@ -106,7 +106,7 @@ def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish) ->
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _run_differentiable(finish: Finish, given: PyTree) -> Any:
+def _run_differentiable(finish: Finish, given: PyTree) -> PyTree:
     """Return the runs of (loop, values, objectives, method, keys, accepted, data for early ends, early ends)."""
     return _run(*given, finish=finish)
 
@@ -122,7 +122,7 @@ def _rule(finish: Finish, primals: PyTree, tangents: PyTree) -> tuple[PyTree, Py
     refuse_derivative(given_loop, measured, method)
     paths = differentiated_paths(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
 
-    def run(given: PyTree) -> Any:
+    def run(given: PyTree) -> PyTree:
         # Only paths with a nonzero tangent are prepared for derivatives.
         loop, values, objectives, method, *rest = given
         loop = prepare_derivatives(loop, paths)
@@ -151,11 +151,11 @@ def _run(
     enough: EarlyEnd | None,
     *,
     finish: Finish,
-) -> Any:
+) -> PyTree:
     """Return the results of all runs; `method` is the stepping method, and `own` the runs' data for `enough`."""
     leaves, build_lane = split_by_lane(loop, values, objectives)
 
-    def start(mine: PyTree, key: PyTree, accepted: Scalar) -> Any:
+    def start(mine: PyTree, key: PyTree, accepted: Scalar) -> PyTree:
         return _stop_unaccepted(accepted, method.start(*build_lane(mine), key))
 
     def is_running(lane: PyTree, carry: PyTree) -> Scalar:
@@ -164,7 +164,7 @@ def _run(
         output = build_lane(lane[0])[0].plant.output(carry.point.state.plant)
         return carry.running & ~enough.has_reached(lane[2], output)
 
-    def judge(mine: PyTree, carry: PyTree) -> Any:
+    def judge(mine: PyTree, carry: PyTree) -> PyTree:
         return finish(*build_lane(mine), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)

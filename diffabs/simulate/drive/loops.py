@@ -136,7 +136,7 @@ def scan_with_trajectory(
     def segment(carry: Carry, i: Int) -> tuple[Carry, PyTree]:
         until = (i + 1) * every
 
-        def on(carry: Carry) -> Any:
+        def on(carry: Carry) -> PyTree:
             return _any_running(before(carry, until))
 
         def go_to_sample(carry: Carry) -> Carry:
@@ -173,7 +173,7 @@ def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X
     def group(carry: X) -> X:
         return jax.lax.scan(rematerialise(lambda carry, _: (step(carry), None)), carry, length=inner)[0]
 
-    def body(carry: X, _: Any) -> tuple[X, None]:
+    def body(carry: X, _: object) -> tuple[X, None]:
         return jax.lax.cond(on(carry), group, lambda carry: carry, carry), None
 
     # Checkpoints on both levels: memory for the carries of the groups plus those of one group at a time.
@@ -267,7 +267,7 @@ def _scan_active(
 ) -> tuple[Carry, PyTree]:
     """Return the result of a scan of `work` over blocks. Where no run of the batch is `on`, a block is skipped: zeros.
 
-    Most of the capacity is not needed. To skip a block costs almost as much as a short step, so whole groups of
+    Most of the capacity is not needed. To skip a block costs almost as much as a short step. So whole groups of
     `BLOCKS_PER_GROUP` blocks are skipped as well; `length` is a multiple of it.
     """
 

@@ -143,10 +143,10 @@ def _run(
         return mine, key, carry._replace(status=status.astype(carry.status.dtype))
 
     def step_and_exchange(slots: _LaneSlots) -> _LaneSlots:
-        def step_once(carry: Carry, _: Any) -> tuple[Carry, None]:
+        def step_once(carry: Carry, _: object) -> tuple[Carry, None]:
             return step_all(slots.leaves, slots.keys, carry), None
 
-        def renew_and_step(carry: PyTree, _: Any) -> tuple[PyTree, None]:
+        def renew_and_step(carry: PyTree, _: object) -> tuple[PyTree, None]:
             return jax.lax.scan(step_once, renew_all(slots.leaves, carry), length=STEPS_PER_BLOCK)[0], None
 
         slots = slots._replace(
@@ -194,7 +194,7 @@ def _exchange_lanes(
     return _LaneSlots(mine, key, carry, jnp.minimum(number, count), slots.next + jnp.sum(free), ended)
 
 
-def _select_lanes(which: Scalar, a: Scalar, b: Scalar) -> Any:
+def _select_lanes(which: Scalar, a: Scalar, b: Scalar) -> PyTree:
     if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_select_lanes(which, jax.random.key_data(a), jax.random.key_data(b)))
     return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)

@@ -420,9 +420,9 @@ class AdaptiveStepping:
     def _jumps_at_end(self, carry: Carry, report: AdaptiveReport, decision: Decision) -> Bool:
         """Return True if an attempt by the run of `carry` aimed at a surface and has more than the allowed error.
 
-        Then a rate jumps at the surface. A stage beyond it has the rate of the other side, and the weights of the
-        stages are not all positive: the step may even go away from the surface. Always False if steps keep to a mode,
-        or the run is `smooth`.
+        Then a rate jumps at the surface. A stage beyond it has the rate of the other side. The weights of the stages
+        are not all positive, so the step may even go away from the surface. Always False if steps keep to a mode, or
+        the run is `smooth`.
         """
         if self.keeps_mode or self.smooth:  # all stages keep to one mode, or there is none
             return jnp.asarray(False)

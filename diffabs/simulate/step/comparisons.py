@@ -20,7 +20,7 @@ import numpy as np
 from jax._src.source_info_util import user_frame  # JAX has no public function that names the line of an operation
 from jax.extend.core import JaxprEqn
 
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Equation, PyTree, Scalar, Source
 from diffabs.simulate.step import inner_functions
 from diffabs.simulate.step.inner_functions import (
     SEARCHSORTED,
@@ -46,7 +46,7 @@ class _Op(NamedTuple):
     outs: tuple[int, ...]
     shape: tuple[int, ...]
     name: str = ""
-    source: Any = None
+    source: Source = None
     queries: tuple[tuple[int, bool], ...] = ()
 
 
@@ -153,7 +153,7 @@ class SwitchedProgram:
         self._constants[new] = x.astype(literal.aval.dtype)[()]
         return new
 
-    def _add_jaxpr(self, jaxpr: Any, constants: list[int], inputs: list[int], source: Any = None) -> list[int]:
+    def _add_jaxpr(self, jaxpr: Any, constants: list[int], inputs: list[int], source: Source = None) -> list[int]:
         """Add the operations of a jaxpr, and return the numbers of its outputs; `source` wrote its call."""
         at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
@@ -173,7 +173,7 @@ class SwitchedProgram:
             at.update(zip(eqn.outvars, outs, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    def _operation(self, eqn: Any, ins: tuple[int, ...], source: Any) -> list[int]:
+    def _operation(self, eqn: Equation, ins: tuple[int, ...], source: Source) -> list[int]:
         """Add an operation, written by the line `source`, and return the numbers of its outputs."""
         # The same operation on the same values gets the same name, so that a repeated comparison has one number.
         said = tuple(sorted((key, str(value)) for key, value in eqn.params.items() if not callable(value)))
@@ -223,7 +223,7 @@ class SwitchedProgram:
         return numbers[key], turned
 
 
-def _nearest_line(source: Any, caller: Any) -> Any:
+def _nearest_line(source: Source, caller: Any) -> Any:
     """Return JAX's record `source` of an operation if it names a line of a user, and otherwise that of its caller."""
     frame = user_frame(source.traceback)
     return source if caller is None or (frame and frame.file_name != inner_functions.__file__) else caller

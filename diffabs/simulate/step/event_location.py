@@ -26,7 +26,7 @@ numbers after the last bit. The margin of a comparison is known only at the end 
 Source: A. Griewank, A. Walther, Evaluating Derivatives, section 15.3 (order of the refinement).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -72,16 +72,16 @@ class EventSearch(NamedTuple):
     """
 
     which: Int
-    full: Any
-    at_full: Any
+    full: Scalar
+    at_full: Scalar
     near: Scalar
-    at_near: Any
-    far: Any
-    at_far: Any
+    at_near: Scalar
+    far: Scalar
+    at_far: Scalar
     tries: Int
     place: Scalar
     margin: Scalar
-    found: Any
+    found: Bool
     at_once: Bool
     fall: Scalar
 
@@ -113,7 +113,7 @@ class AttemptCrossings(NamedTuple):
     sought: EventCrossing
     falls: Scalar
     other: EventCrossing
-    another: Any
+    another: Bool
 
 
 class SurfaceCrossing(NamedTuple):
@@ -409,7 +409,7 @@ def _falls_from_start(search: EventSearch, fall: Scalar, start: PyTree) -> Scala
     return smooth & (fall < 0) & (fall <= GRAZING_FRACTION * jax.lax.stop_gradient(mean))
 
 
-def _narrow_bracket(old: EventSearch, x: Scalar, first: Any, sought: EventCrossing) -> tuple[EventSearch, PyTree]:
+def _narrow_bracket(old: EventSearch, x: Scalar, first: PyTree, sought: EventCrossing) -> tuple[EventSearch, PyTree]:
     """Return the search whose bracket ends at the attempt x, and the margin's slope in the length there.
 
     The slope is that of the parabola through the ends of the bracket and this point; 0 for a new bracket.
@@ -435,7 +435,7 @@ def _slope(search: EventSearch, x: Scalar, g: AnyArray) -> Scalar:
     return jnp.where(jnp.isfinite(search.at_near) & jnp.isfinite(search.at_far), bent, right)
 
 
-def _pick(which: Int, values: list[PyTree]) -> Any:
+def _pick(which: Int, values: list[PyTree]) -> PyTree:
     found = values[0]
     for i, value in enumerate(values[1:], 1):
         found = jnp.where(which == i, value, found)

@@ -9,17 +9,15 @@ time or state is hidden: no step can end where its answer changes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 
 from diffabs.core.tracing import scan_input_counts
-from diffabs.core.types import Array, PyTree
+from diffabs.core.types import Array, Equation, PyTree, Source
 from diffabs.simulate.step.modes import WORD_BITS
-
-Equation: TypeAlias = Any  # jax.extend.core.JaxprEqn, whose type does not tell the shapes of its variables
 
 # What compares real numbers, as `comparisons` answers it.
 COMPARING_OPERATIONS = ("gt", "ge", "lt", "le", "max", "min", "abs", "sign", "clamp")
@@ -49,7 +47,7 @@ class Hidden(NamedTuple):
 
     name: str
     function: str
-    source: Any
+    source: Source
 
 
 def open_equation(eqn: Equation, moves: Sequence[bool], bends: bool) -> jex.ClosedJaxpr | None:

@@ -6,10 +6,10 @@
 |1 + z + z^2/2 + z^3/6 + z^4/24| <= 1, z = h lambda.
 
 `TSIT5` is Tsitouras' method of fifth order. It is stable up to |h lambda| = 2.7 at any angle of lambda from 95 to 180
-degrees, and up to 3.5 on the negative axis. A cubic represents every signal within a step: the cubic of the values and
-rates at both ends, with k7 the rate at the end. Between ends of fifth order its greatest error is h^4 x''''/384, in the
-middle. There the method has a solution of its own, of fourth order, that needs no further rate. The difference of the
-two is h sum_i di ki.
+degrees. On the negative axis it is stable up to 3.5. A cubic represents every signal within a step. It has the values
+and rates at both ends; k7 is the rate at the end. Between ends of fifth order its greatest error is h^4 x''''/384, in
+the middle. There the method has a solution of its own, of fourth order, that needs no further rate. The difference of
+the two is h sum_i di ki.
 
 Source: Ch. Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption, Comput.
 Math. Appl. 62 (2011) 770-775 (coefficients and weights of the solution in the middle).

@@ -222,7 +222,7 @@ def quantile(values: PyTree, level: float, *, confidence: float = 0.95) -> Inter
     """Return a quantile by linear interpolation (`numpy.quantile`), with an interval between two order statistics.
 
     The interval covers the quantile of any law at least with this confidence. For a continuous law the probability is
-    exactly P(r <= B < s), where r and s are the ranks of its ends and B is binomial. An end is infinite where no order
+    exactly P(r <= B < s). Here r and s are the ranks of its ends, and B is binomial. An end is infinite where no order
     statistic reaches the confidence. The value is clipped to the interval.
 
     Args:
