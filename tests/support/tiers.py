@@ -70,7 +70,7 @@ def jobs_of_tier(tier: str, today: datetime.date) -> list[Job]:
 def run_job(job: Job) -> tuple[str, list[str]]:
     """Run a job, print what it prints, and return its outcome in a few words and the names of what failed."""
     OUT.mkdir(parents=True, exist_ok=True)
-    report = OUT / f"{re.sub(r'[^a-z]+', '-', job.name)}.xml"
+    report = OUT / f"{re.sub(r'[^a-z0-9]+', '-', job.name)}.xml"
     report.unlink(missing_ok=True)
     more = (f"--junitxml={report}",) if "pytest" in job.arguments else ()
     command = [sys.executable, *job.arguments, *more]
@@ -110,11 +110,19 @@ def write_status(tier: str, jobs: list[Job], new: Job, commit: str, minutes: flo
     PAGE.write_text(old.sub(lambda _: "\n".join([*section, "", ""]), text).rstrip() + "\n", encoding="utf-8")
 
 
+def _describe_commit() -> str:
+    """Return the short name of the commit; "-dirty" follows if a file other than the page differs from it."""
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", f":!{PAGE.relative_to(ROOT)}")
+    return git("rev-parse", "--short", "HEAD") + ("-dirty" if changed else "")
+
+
 def main(tier: str, names: list[str]) -> int:
     """Run a tier, or the jobs of these names, and write the rows."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.strip()
+    commit = _describe_commit()
     jobs, status = jobs_of_tier(tier, datetime.date.today()), 0
     for job in jobs:
         if names and not any(name in job.name for name in names):
