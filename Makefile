@@ -41,7 +41,6 @@ bench: $(VENV)/.bench
 	$(BIN)/python benchmarks/bench_riccati.py
 	$(BIN)/python benchmarks/bench_design.py
 	$(BIN)/python benchmarks/bench_sweep.py
-	$(BIN)/python benchmarks/bench_basin.py
 	$(BIN)/python benchmarks/bench_studies.py
 	$(BIN)/python benchmarks/bench_yardsticks.py
 

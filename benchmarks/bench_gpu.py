@@ -100,7 +100,7 @@ def solvers(masses, speeds, dtype):
     from peers import ours
 
     def of(kind, engine):
-        return lambda setting: ours.prepared_with(kind, masses, speeds, setting, dtype, engine)
+        return lambda setting: ours.prepared_with(kind, engine, masses, speeds, setting, dtype)
 
     found = {
         "kernel, FixedStep": (STEPS, of("fixed", "kernel")),

@@ -8,7 +8,7 @@ Each study and engine is a process of its own. "First" has tracing and compiling
 engines see the same points, so that what they find is to agree: a rare event exactly as far as no sample changes sides
 by a rounding.
 
-    python benchmarks/bench_studies.py [--rounds 3] [--studies rare attraction worst]
+    python benchmarks/bench_studies.py [--rounds 3] [--studies rare attraction worst] [--dtype float32]
 """
 
 import argparse
@@ -41,7 +41,7 @@ BOX = {"plant.mass": (5.3, 6.2), "initial.speed": (5.6, 19.4), "plant.road.w4": 
 def rare(engine, size):
     """The probability, its interval, and how many runs it took."""
     study = section_sweep.build_study(load("slip-lmi", ["solver.step=1e-3", "solver.duration=4", W4]))
-    study = dataclasses.replace(study, engine=engine)
+    study = dataclasses.replace(study, engine=engine, dtype=str(jax.numpy.result_type(float)))
     found = failure_probability(study, "stop_time", SLOWEST, samples=size or 2800)
     return {"found": found.probability, "interval": [float(x) for x in found.interval], "runs": found.evaluations}
 
@@ -68,7 +68,7 @@ STUDIES = {"rare": rare, "attraction": map_, "worst": worst}
 
 def child(options):
     """One study by one engine, in this process: prints a line of JSON."""
-    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_enable_x64", options.dtype == "float64")
     study, seen, times = STUDIES[options.studies[0]], {}, []
     for _ in range(options.rounds + 1):
         times.append(record.timed(lambda: seen.update(study(options.engine, options.size))))
@@ -82,6 +82,7 @@ def main():
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--studies", nargs="+", choices=STUDIES, default=list(STUDIES))
     parser.add_argument("--size", type=int, help="runs, or samples of a level, where not the usual ones")
+    parser.add_argument("--dtype", choices=("float64", "float32"), default="float64")
     parser.add_argument("--out", type=pathlib.Path)
     parser.add_argument("--engine", choices=ENGINES, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -89,9 +90,9 @@ def main():
         return child(options)
     found = {}
     for study in options.studies:
-        sizes = [] if options.size is None else ["--size", str(options.size)]
+        settings = ["--dtype", options.dtype, *([] if options.size is None else ["--size", str(options.size)])]
         for engine in ENGINES:
-            command = [sys.executable, __file__, "--rounds", str(options.rounds), *sizes, "--studies", study]
+            command = [sys.executable, __file__, "--rounds", str(options.rounds), *settings, "--studies", study]
             done = subprocess.run([*command, "--engine", engine], stdout=subprocess.PIPE, text=True, check=True)
             found[f"{study}, {engine}"] = json.loads(done.stdout.splitlines()[-1])
     table = Table("", "found", "runs", "first [s]", "median [s]", "memory [MB]")
@@ -100,7 +101,7 @@ def main():
         cells = (f"{one['found']:.6g}", f"{one['runs']:,}", f"{one['first']:.2f}", f"{median:.2f}")
         table.add_row(name, *cells, f"{one['memory [MB]']:.0f}")
     Console().print(table)
-    path = record.written("studies", found, options.out)
+    path = record.written(f"studies-{options.dtype}", found, options.out)
     Console().print(f"written to {path}")
     return 0
 

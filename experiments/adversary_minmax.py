@@ -11,9 +11,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from adversary_attack import MEASURED, Attack
+from adversary_attack import MEASURED, NOTHING, Attack
 from adversary_search import Log, Searching, gradients
 from adversary_set import Bounds, drawn, nominal, parameters
+from pid_over_roads import kept
 from real_rig_box import KNOWN, Box, Fixed
 from real_rig_box import drawn as drawn_from_box
 from real_rig_judge import Judging, runs
@@ -100,27 +101,31 @@ def _said(loop: Loop) -> str:
 
 
 def judged(attack: Attack, config: Rounds, searching: Searching, price: float) -> dict[str, Any]:
-    """Return how a loop fares against fresh adversaries, and on random points."""
-    fresh = attacked(attack, searching, config.fresh, config.budget, price)
+    """Return how a loop fares against fresh adversaries, and on random points. A run that does not stop, or diverges,
+    is counted and not averaged in."""
+    found = attacked(attack, searching, config.fresh, config.budget, price)
     points = drawn(attack.bounds, config.samples, np.random.default_rng(config.seed + 1))
-    random = attack.overshoots(points)
-    errors = [float(np.max(attack.runs(z).metrics["iae"])) for z in (nominal(attack.bounds), fresh.points)]
+    both = found.overshoots, attack.overshoots(points)
+    fresh, random = (kept(each, each > NOTHING) for each in both)
+    error, errors = (attack.runs(z).metrics["iae"] for z in (nominal(attack.bounds), found.points))
     return {
         "nominal [%]": 100 * float(attack.overshoots(nominal(attack.bounds))[0]),
-        "fresh adversaries, median [%]": 100 * float(np.median(fresh.overshoots)),
-        "least [%]": 100 * float(fresh.overshoots.min()),
-        "greatest [%]": 100 * float(fresh.overshoots.max()),
+        "fresh adversaries, median [%]": 100 * float(np.median(fresh)),
+        "least [%]": 100 * float(fresh.min()),
+        "greatest [%]": 100 * float(fresh.max()),
         "random, median [%]": 100 * float(np.median(random)),
         "random, 95 % [%]": 100 * float(np.quantile(random, 0.95)),
         "random, greatest [%]": 100 * float(random.max()),
-        "IAE, nominal [s]": errors[0],
-        "IAE, greatest found [s]": errors[1],
+        "not stopped or diverged": sum(int(np.sum(each <= NOTHING)) for each in both),
+        "IAE, nominal [s]": float(error[0]),
+        "IAE, greatest found [s]": float(np.max(kept(errors, found.overshoots > NOTHING))),
         **in_the_box(attack.loop, config),
     }
 
 
 def in_the_box(loop: Loop, config: Rounds) -> dict[str, float]:
-    """Return overshoots of the same gains in the box of `real_rig.py`, everything wrong at once."""
+    """Return overshoots of the same gains in the box of `real_rig.py`, everything wrong at once. A run that
+    diverges counts there, with LOST."""
     one: Any = loop
     judged = loop_of_box(Fixed(), one.controller.controller, KNOWN, one.reference)
     points = drawn_from_box(Box(), KNOWN, config.samples, config.seed + 2)

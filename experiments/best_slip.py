@@ -12,16 +12,16 @@ and how was fixed before the first run (`best_slip_fixed.py`).
 """
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import numpy as np
-from best_slip_fixed import ERRORS, EXACT, Fixed, Lanes, best, good, interval, lanes, line
+from best_slip_fixed import ERRORS, EXACT, Fixed, Lanes, best, good, lanes, line
 from best_slip_rules import FIXED, KNOWN, PAPER, ROBUST, RULES, Ranges, start, told_the_peak, untuned
 from best_slip_search import MEASURED, Search, against_differences, by_cma_es, described, tuned
+from pid_over_roads import interval
 
 from diffabs import Batch, FixedStep, Loop, plot, run_batch
 from diffabs.papers import record
@@ -131,7 +131,7 @@ def of_sensors(
 def of_bounds(fixed: Fixed) -> dict[str, Any]:
     """What the bound adds to the distance at the peak's friction alone, and of how many roads what is true."""
     bound = lanes(fixed, fixed.roads.held_out, fixed.roads.seed + 1).bound
-    mean, half = interval(fixed, bound.distance / bound.friction - 1)
+    mean, half = interval(bound.distance / bound.friction - 1, fixed.confidence)
     return {
         "above friction alone [%]": 100 * mean,
         "+- [%]": 100 * half,
@@ -174,16 +174,7 @@ def main(config: Config | None = None, progress: Callable[[str], None] = lambda 
     shortest = lanes(config.fixed, config.fixed.roads.held_out, config.fixed.roads.seed + 1).bound.distance
     whole = {**said, "bound": of_bounds(config.fixed), "CMA-ES, exact sensors": again}
     whole["seconds of processor time"] = time.process_time() - begun
-    return record.experiment(config, finite(whole), {"roads": figure(config, results, shortest)})
-
-
-def finite(tree: Any) -> Any:
-    """The same with None for a number that is not finite: the mean of no lane, the objective of a start that failed."""
-    if isinstance(tree, dict):
-        return {key: finite(value) for key, value in tree.items()}
-    if isinstance(tree, list):
-        return [finite(value) for value in tree]
-    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
+    return record.experiment(config, whole, {"roads": figure(config, results, shortest)})
 
 
 if __name__ == "__main__":

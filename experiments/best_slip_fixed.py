@@ -13,14 +13,12 @@ them stop. It is asked for exact sensors, and for sensors with errors, separatel
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import numpy as np
 from best_slip_bound import Bound, bound
 from pid_over_roads import Config as Roads
-from pid_over_roads import Family, family
-from scipy.stats import t
+from pid_over_roads import Family, family, interval, kept
 
 from diffabs import Batch
 
@@ -73,26 +71,19 @@ def good(found: dict[str, Any]) -> np.ndarray:
     return found["stopped"] & ~found["diverged"] & ~(found["locked_time"] > 0)
 
 
-def interval(fixed: Fixed, x: np.ndarray) -> tuple[float, float]:
-    """Mean, and half of its t interval; NaN for fewer than two."""
-    if len(x) < 2:
-        return math.nan, math.nan
-    half = t.ppf((1 + fixed.confidence) / 2, len(x) - 1) * np.std(x, ddof=1) / math.sqrt(len(x))
-    return float(np.mean(x)), float(half)
-
-
 def line(fixed: Fixed, found: dict[str, Any], paper: dict[str, Any], shortest: np.ndarray) -> dict[str, Any]:
     """What is said of a rule beside the paper's, in per cent of the bound (lanes,)."""
     mine, both = good(found), good(found) & good(paper)
     ratio = found["stop_distance"] / shortest
     gain = (paper["stop_distance"] - found["stop_distance"])[both] / shortest[both]
-    above, above_half = interval(fixed, ratio[mine] - 1)
-    shorter, half = interval(fixed, gain)
+    above, above_half = interval(ratio[mine] - 1, fixed.confidence)
+    each = 100 * (kept(ratio, mine) - 1)
+    shorter, half = interval(gain, fixed.confidence)
     return {
         "above the bound [%]": 100 * above,
         "+- [%]": 100 * above_half,
-        "median [%]": 100 * float(np.median(ratio[mine] - 1)) if mine.any() else math.nan,
-        "95 % of them [%]": 100 * float(np.quantile(ratio[mine] - 1, 0.95)) if mine.any() else math.nan,
+        "median [%]": float(np.median(each)),
+        "95 % of them [%]": float(np.quantile(each, 0.95)),
         "shorter than the paper's [%]": 100 * shorter,
         "+- of that [%]": 100 * half,
         "both stop": int(both.sum()),

@@ -34,10 +34,10 @@ def check(document):
     loops, gain, discrete, sizes = system(given["system"], given["gain"])
     found = [] if given["claims"] else ["no claim: NOTHING PROVED"]
     for claim in given["claims"]:
-        kind, data = members(claim, "a claim", {"kind", "data"}).values()
+        kind = members(claim, "a claim", {"kind", "data"})["kind"]
         if not isinstance(kind, str) or kind not in SHAPES:
             found.append(f"{kind!r:.40} is NOT PROVED here, where {', '.join(SHAPES)} are known")
-        elif not proved(kind, numbers(kind, data, discrete, sizes), loops, gain, discrete):
+        elif not proved(kind, numbers(kind, claim["data"], discrete, sizes), loops, gain, discrete):
             found.append(f"{said(claim)}: NOT PROVED")
     return found
 

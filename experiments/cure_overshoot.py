@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 from cure_figures import figures
+from pid_over_roads import kept
 from weak_spots import Box, torques, weak_spots
 
 from diffabs import Batch, BrakeStart, FixedStep, Loop, Run, replace, run_batch
@@ -194,11 +195,11 @@ def contenders(config: Config, found: Loop, lmi: tuple[float, float]) -> dict[st
 
 
 def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[dict[str, Any], Certificate]:
-    """Worst over the lanes, and what is proved of the gain."""
+    """Worst over the lanes that do not diverge, and what is proved of the gain."""
     solver = FixedStep(step=config.step, duration=config.duration)
     runs = jax.device_get(jax.jit(lambda one: run_batch(one, batch, solver, BRAKING))(one))
     proof = certify(feedback_gain(one, system.states), system, fastest=True)
-    worst = {name: float(np.max(values)) for name, values in runs.metrics.items()}
+    worst = {name: float(np.max(kept(values, ~runs.diverged))) for name, values in runs.metrics.items()}
     row = {
         "overshoot [%]": 100 * worst["overshoot"],
         "settling [s]": record.format_time(worst["settling_time"]),

@@ -212,20 +212,34 @@ def judged(config: Config, one: Loop, unseen: Family, noise: float = 0.0) -> dic
     return {**done.metrics, "stopped": done.stopped, "diverged": done.diverged}
 
 
+def interval(x: np.ndarray, confidence: float) -> tuple[float, float]:
+    """Mean, and half of its t interval; NaN for fewer than two."""
+    if len(x) < 2:
+        return math.nan, math.nan
+    half = t.ppf((1 + confidence) / 2, len(x) - 1) * np.std(x, ddof=1) / math.sqrt(len(x))
+    return float(np.mean(x)), float(half)
+
+
+def kept(x: np.ndarray, lanes: np.ndarray) -> np.ndarray:
+    """The values of these lanes; one NaN where there is none."""
+    return x[lanes] if lanes.any() else np.full(1, np.nan)
+
+
 def compared(config: Config, name: str, before: Any, after: Any, unseen: Family) -> dict[str, Any]:
-    """Paired over the lanes: by how much shorter, with a t interval, and the locked wheels."""
-    gain = 1 - after["stop_distance"] / before["stop_distance"]
-    n = len(gain)
-    half = t.ppf((1 + config.confidence) / 2, n - 1) * np.std(gain, ddof=1) / math.sqrt(n)
-    relative = {key: m["stop_distance"] / unseen.distance for key, m in (("before", before), ("after", after))}
+    """Paired over the lanes that both stop: by how much shorter, with a t interval, and the locked wheels."""
+    both = before["stopped"] & ~before["diverged"] & after["stopped"] & ~after["diverged"]
+    gain, half = interval((1 - after["stop_distance"] / before["stop_distance"])[both], config.confidence)
+    pair = (("before", before), ("after", after))
+    relative = {key: kept(one["stop_distance"] / unseen.distance, both) for key, one in pair}
     return {
         "control": name,
         "paper's gains: distance/shortest": float(relative["before"].mean()),
         "tuned": float(relative["after"].mean()),
-        "shorter [%]": 100 * float(gain.mean()),
-        "+- [%]": 100 * float(half),
+        "shorter [%]": 100 * gain,
+        "+- [%]": 100 * half,
         "worst lane, paper's": float(relative["before"].max()),
         "worst lane, tuned": float(relative["after"].max()),
+        "both stop": int(np.sum(both)),
         "lanes locked longer": int(np.sum(after["locked_time"] > before["locked_time"] + 1e-9)),
         "not stopped": int(np.sum(~after["stopped"])),
         "diverged": int(np.sum(after["diverged"])),

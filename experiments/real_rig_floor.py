@@ -20,9 +20,9 @@ import numpy as np
 from real_rig_box import KMH, KNOWN, Fixed
 
 from diffabs.core.numerics import larger
-from diffabs.core.protocols import Memory, Sample, Segment
+from diffabs.core.protocols import Memory, Segment
 from diffabs.core.pytree import pytree
-from diffabs.objectives.tracking import held_value, no_integral
+from diffabs.objectives.tracking import HeldValue
 from diffabs.roads import RIG
 
 HELD = 0.25  # s, from which on every controller worth the name holds its target
@@ -54,17 +54,11 @@ def floor(points: dict[str, np.ndarray], speed: str, fixed: Fixed, *, two_sided:
 
 
 @pytree
-class Deviation:
+class Deviation(HeldValue):
     """Greatest deviation from the setpoint, as a fraction of it: above it at any time, below it from HELD on."""
 
     unit = "1"
     physical = (0.0, math.inf)
-
-    flow, value = no_integral, held_value
-
-    def start(self, sample: Sample) -> Memory:
-        """None yet."""
-        return Memory(held=0.0 * sample.t)
 
     def update(self, memory: Memory, segment: Segment) -> Any:
         """The greater of that so far and that at the end of the step."""

@@ -12,12 +12,11 @@ from project import ROOT
 PACKAGE = ROOT / "diffabs"
 TREES = {path.relative_to(PACKAGE): ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
 
-# The same verb, the same meaning: a command and the function that it calls; the methods of a paper's module; of a
-# plant; a formula of a checker that imports nothing of the package.
+# The same verb, the same meaning: a command and the function that it calls; the methods of a paper's module; a
+# formula of a checker that imports nothing of the package.
 SHARED_FUNCTIONS = {
     *("certify", "design", "identify", "margins", "sweep", "tune"),
     *("compact", "figures", "loop", "reproduce", "run", "table"),
-    *("usual_objectives", "usual_parts"),
     *("he", "is_positive_definite"),
 }
 # The parts of a paper's module, and tables of a checker that imports nothing of the package.

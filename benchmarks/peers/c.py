@@ -6,10 +6,12 @@ import pathlib
 import shutil
 import subprocess
 import tempfile
+import types
 
 import numpy as np
 
 from peers import problem
+from peers.ladder import LADDERS
 
 FLAGS = ("-O3", "-march=native", "-mprefer-vector-width=512", "-ffast-math", "-fopenmp", "-fPIC", "-c")
 LINK = (
@@ -62,3 +64,22 @@ def solved(method, masses, speeds, setting, dtype="float64", least=LEAST, longes
     first = FIRST if method == "adaptive" else setting
     tried = run(METHODS[method], len(masses), *columns, first, setting, longest, least, LIMIT, out)
     return out, tried
+
+
+def prepared_with(method, masses, speeds, setting, dtype, threads):
+    """What `prepared` of a peer returns. Threads are set by OMP_NUM_THREADS."""
+    del threads
+    built("float" if dtype == "float32" else "double")
+    return lambda: solved(method, masses, speeds, setting, dtype)[0]
+
+
+PEERS = {
+    f"c_{method}": types.SimpleNamespace(
+        TITLE=f"C, {method} RK4 (gcc -O3, OpenMP)",
+        PACKAGES=(),
+        MANY=None,
+        LADDER=LADDERS[method],
+        prepared=functools.partial(prepared_with, method),
+    )
+    for method in METHODS
+}

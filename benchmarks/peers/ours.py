@@ -1,13 +1,16 @@
 """diffabs itself: its parts, `run_batch` as a user calls it, and the one place where a solver is chosen."""
 
+import functools
+import types
+
 import jax.numpy as jnp
 
 import diffabs
 from diffabs import controllers, objectives, plants, stops
 from diffabs.scenario.defaults import braking
 from peers import on_devices, problem
+from peers.ladder import LADDERS
 
-PACKAGES, MANY = ("diffabs-control", "jax", "jaxlib"), None
 MEASURED = {name: objectives.BRAKING[name] for name in problem.METRICS}
 LOOP = braking(
     plant=plants.MirroredRig(),
@@ -26,8 +29,9 @@ def solver(kind, setting, duration):
     return diffabs.FixedStep(setting, duration)
 
 
-def prepared_with(kind, masses, speeds, setting, dtype, engine="xla"):
-    """What `prepared` of a peer returns, for a solver and an engine of diffabs."""
+def prepared_with(kind, engine, masses, speeds, setting, dtype, threads=None):
+    """What `prepared` of a peer returns, for a solver and an engine of diffabs. Lanes are dealt to host devices."""
+    del threads
     chosen = solver(kind, setting, problem.DURATION)
 
     def solve(m, v):
@@ -36,3 +40,20 @@ def prepared_with(kind, masses, speeds, setting, dtype, engine="xla"):
         return tuple(jnp.asarray(metrics[name]) for name in problem.METRICS)
 
     return on_devices.spread(solve, masses, speeds, dtype, compiled=False)
+
+
+PEERS = {
+    name: types.SimpleNamespace(
+        TITLE=title,
+        PACKAGES=("diffabs-control", "jax", "jaxlib"),
+        MANY=None,
+        LADDER=LADDERS[kind],
+        prepared=functools.partial(prepared_with, kind, engine),
+    )
+    for name, title, kind, engine in (
+        ("diffabs_adaptive", "diffabs, Adaptive", "adaptive", "xla"),
+        ("diffabs_fixed", "diffabs, FixedStep", "fixed", "xla"),
+        ("kernel_adaptive", "diffabs, Adaptive, kernel", "adaptive", "kernel"),
+        ("kernel_fixed", "diffabs, FixedStep, kernel", "fixed", "kernel"),
+    )
+}

@@ -5,8 +5,9 @@
     {"do": "prepare", "lanes": 4096, "some": 4096, "setting": 1e-6, "out": "answers.npy"}   solves, keeps the solver
     {"do": "time", "setting": 1e-6}                                                         solves again, takes time
 
-A peer is a module of this package with TITLE, PACKAGES (whose versions are stated), LADDER (settings, coarse to fine),
-MANY (lanes that it is run on at most, None: all; it is extrapolated then) and
+A peer is an entry of PEERS in ours.py or c.py, or else a module of this package. It has TITLE, PACKAGES (whose versions
+are stated), LADDER (settings, coarse to fine), MANY (the most lanes that it is run on, from which its time for all is
+extrapolated; None: all) and
 
     prepared(masses, speeds, setting, dtype, threads) -> a function without arguments that returns (4, lanes)
 """
@@ -24,6 +25,7 @@ import numpy as np
 
 from peers import problem
 
+FAMILIES = {"diffabs": "ours", "kernel": "ours", "c": "c"}  # modules by the first word of a peer's name
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
@@ -41,9 +43,11 @@ def main() -> None:
     os.environ |= {"JAX_NUM_CPU_DEVICES": str(options.threads), "JAX_ENABLE_X64": str(int(options.dtype == "float64"))}
     os.environ |= {name: str(options.threads) for name in THREADS}
     try:
-        peer = importlib.import_module(f"peers.{options.peer}")
+        family = FAMILIES.get(options.peer.split("_")[0])
+        there = importlib.import_module(f"peers.{family or options.peer}")
+        peer = there.PEERS[options.peer] if family else there
         print(json.dumps(described(peer)), file=replies)
-    except ImportError as missing:
+    except (ImportError, KeyError) as missing:
         print(
             json.dumps(
                 {"refused": f"{missing}: not installed in this environment, see the groups bench of pyproject.toml"}

@@ -58,13 +58,7 @@ class DeadTime:
     flow = no_flow
 
     def start(self, signal: Scalar) -> Memory:
-        """Return the memory for the control 0, with no switch on its way.
-
-        Raises:
-            ValueError: The capacity is no integer, or smaller than 1 switch.
-        """
-        for line in self.problems():
-            raise ValueError(f"DeadTime.{line}")
+        """Return the memory for the control 0, with no switch on its way."""
         zero = 0.0 * jnp.asarray(signal)
         none = jnp.broadcast_to(zero, (self.capacity,))
         return Memory(held=DeadTimeMemory(zero, zero, none + jnp.inf, none))

@@ -96,7 +96,7 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
     typed = None if gain is None else _read_gain(gain, states)  # refused before anything is computed
     spec = Spec(Q=wanted.Q, R=wanted.R, decay=wanted.decay, damping=wanted.damping)
     try:
-        spec = spec.check(len(states), 1)
+        spec = spec.check(len(states), 1, reduced.model.period)
     except ValueError as error:
         raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
     solver.solvers()  # fails early if no SDP solver is installed

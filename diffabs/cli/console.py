@@ -26,6 +26,7 @@ from diffabs.runtime import files, interrupt, provenance, stopwatch
 from diffabs.scenario import outside
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import Scenario, dump, load, names
+from diffabs.simulate.drive.engine import EngineError
 
 T = TypeVar("T")
 
@@ -33,7 +34,6 @@ FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, interrupt.INTERRUPTED, interr
 SILENCE_S, SECOND_INTERRUPT_S = progress.SILENCE_S, progress.REPEAT_S
 AWAKE = 0.1  # s between two checks for Ctrl-C
 LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
-CONTINUED = " \\"  # end of a shell's line that continues on the next
 WORKER = "diffabs worker"
 EXTRAS = {
     "sweep": ("filelock", "pyarrow", "scipy", "zarr"),
@@ -160,24 +160,13 @@ def say(line: str) -> None:
 
 
 def say_command(line: str, words: Sequence[str]) -> None:
-    """Write a line that ends in a command; a narrow terminal gets the command on lines of its own, to copy.
+    """Write a line that ends in a command, even if quiet. A terminal wraps it itself: it is copied as one line.
 
     Args:
         line: Text before the command.
         words: Words of the command, which are quoted for a shell.
     """
-    width, command = _terminal_width(), [shlex.quote(word) for word in words]
-    if width is None or len(" ".join([line, *command])) <= width:
-        say(" ".join([line, *command]))
-        return
-    say(line)
-    rows = [command[0]]
-    for word in command[1:]:
-        if len(rows[-1]) + len(word) + len(" ") + len(CONTINUED) <= width:
-            rows[-1] += f" {word}"
-        else:
-            rows.append(f"    {word}")
-    _write(f"{CONTINUED}\n".join(rows))
+    _write(f"{line} {shlex.join(words)}")
 
 
 def _write(text: str) -> None:
@@ -218,15 +207,15 @@ def is_animated() -> bool:
 def end_on_errors() -> Iterator[None]:
     """End a command with one line and an exit status for expected errors in the `with` block.
 
-    Expected are bad input, errors of the system such as a full disk, lack of memory, and Ctrl-C. Parts from outside
-    that raise or exit are expected, too.
+    Expected are bad input, an engine that cannot make the runs, errors of the system such as a full disk, lack of
+    memory, and Ctrl-C. Parts from outside that raise or exit are expected, too.
 
     Raises:
         typer.Exit: One of these errors occurred.
     """
     try:
         yield
-    except ScenarioError as error:
+    except (ScenarioError, EngineError) as error:
         fail(str(error))
     except BrokenPipeError:
         raise

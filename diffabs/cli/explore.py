@@ -1,6 +1,7 @@
 """The command `explore`: a scenario in the browser."""
 
 import errno
+import os
 import pathlib
 import socket
 from collections.abc import Callable
@@ -29,12 +30,12 @@ def explore(
         typer.Option(
             min=0,
             max=65535,
-            help=f"Port of the page; 0 for any free port. Default: {PORT}, or any free port if it is in use.",
+            help=f"Port of the page; 0 for any free port. Default: {PORT}, or any free port if it cannot be used.",
         ),
     ] = None,
     proof: Annotated[
         pathlib.Path | None,
-        typer.Option(metavar="FILE", help="Certificate of prove: the page says whether it covers the values shown."),
+        typer.Option(metavar="FILE", help="Certificate of prove; the page says whether its box has the values shown."),
     ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
 ) -> None:
@@ -59,16 +60,19 @@ def explore(
 
 
 def _open_socket(port: int | None) -> socket.socket:
-    """Return a socket at the given port, else at the usual port or any free one. Raises typer.Exit."""
-    from diffabs.explore.server import listen_on_loopback
+    """Return a socket at the given port, else at the usual port or any free one. Raises typer.Exit.
+
+    The socket listens before the server starts, so that a port in use is reported at once.
+    """
+    from diffabs.explore.guard import LOOPBACK_ADDRESS
 
     try:
-        return listen_on_loopback(PORT if port is None else port)
+        return socket.create_server((LOOPBACK_ADDRESS, PORT if port is None else port))
     except OSError as error:
-        if port is None and error.errno == errno.EADDRINUSE:
-            return listen_on_loopback(0)
-        why = "another program uses this port" if error.errno == errno.EADDRINUSE else error.strerror
-        console.fail(f"--port {port}: {why}")
+        if port is None:
+            return socket.create_server((LOOPBACK_ADDRESS, 0))
+        in_use = error.errno == errno.EADDRINUSE
+        console.fail(f"--port {port}: {'another program uses this port' if in_use else os.strerror(error.errno or 0)}")
 
 
 def load_judge(path: pathlib.Path) -> "Callable[[Session], ProofVerdict]":

@@ -81,6 +81,8 @@ def export(
                     return
                 if to is Form.TABLE:
                     _show_table(chosen, file, as_json)
+                    if out:
+                        console.say(f"table: {out}")
                     return
                 text = console.run_with_progress(
                     lambda: _write_source(chosen, out, to, single, given), f"tracing {chosen.name}"
@@ -114,7 +116,7 @@ def _sample_controller(chosen: Scenario, period: float) -> Scenario:
 def _function_prefix(chosen: Scenario, out: pathlib.Path | None) -> str:
     """Return the prefix of the functions' names, from the name of the file or of the scenario."""
     name = re.sub(r"[\W_]+", "_", out.stem if out else chosen.name, flags=re.ASCII).strip("_")
-    return name if name[:1].isalpha() else f"controller_{name}"
+    return name if name[:1].isalpha() else f"controller_{name}".rstrip("_")
 
 
 def _write_source(chosen: Scenario, out: pathlib.Path | None, to: Form, single: bool, given: PyTree) -> str:
@@ -155,9 +157,9 @@ def _show_table(chosen: Scenario, file: pathlib.Path | None, as_json: bool) -> N
     if file:
         lines = [",".join(["", *columns]), *(",".join([name, *map(repr, row)]) for name, row in rows.items())]
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    elif as_json:
+    if as_json:
         show.as_json({"scenario": chosen.name, **found, "versions": versions()})
-    else:
+    elif not file:
         table = Table("next", *columns)
         for name, row in rows.items():
             table.add_row(name, *(f"{value:.8g}" for value in row))

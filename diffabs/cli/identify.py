@@ -13,8 +13,8 @@ import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, progress, show, targets
-from diffabs.config.values import ScenarioError, format_given, unknown_name_error
-from diffabs.core.pytree import get, parameters
+from diffabs.config.values import ScenarioError, format_given, read_number_in_range, unknown_name_error
+from diffabs.core.pytree import ParameterSpec, get, parameters
 from diffabs.core.types import JsonObject, PyTree
 from diffabs.runtime import provenance
 from diffabs.scenario import section_tune, toml
@@ -120,13 +120,10 @@ def _read_noise(given: Sequence[str], readings: Readings, units: Mapping[str, st
             raise unknown_name_error(
                 f"--sigma {format_given(name)} is not a column of the data", name, readings.columns
             )
-        value = toml.parse_value(number.strip())
-        unit = "" if units[name] == "1" else f" {units[name]}"
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ScenarioError(f"--sigma {name} = {format_given(value)} is no number in (0, inf){unit}")
-        if not 0 < value < math.inf:
-            raise ScenarioError(f"--sigma {name} = {format_given(value)} is outside (0, inf){unit}")
-        found[name] = float(value)
+        if name in found:
+            raise ScenarioError(f"--sigma {name} is given twice")
+        spec = ParameterSpec(units[name], low=0.0, open_low=True)
+        found[name] = read_number_in_range(toml.parse_value(number.strip()), spec, f"--sigma {name}")
     return found
 
 

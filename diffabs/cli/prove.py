@@ -1,5 +1,6 @@
 """The command `prove`: bounds of all runs of a box of parameters, of the nonlinear loop with its limits."""
 
+import itertools
 import json
 import math
 import pathlib
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     from diffabs.reach import BoxProof, RunClaim
     from diffabs.reach.equations import Equations
 
-SEARCHED = (9, 17)  # runs along the first and the other parameters, among which the worst is looked for
+SEARCHED = (9, 17)  # runs along the first and the second of two parameters, among which the worst is looked for
+MANY_SEARCHED, MOST_RUNS = 5, 1_000  # runs along each of more parameters; fewer where the grid would have more runs
 MOST_BYTES = 2**28  # of a file that is read; some million cells
 NO_LOCK, OVERSHOOT, TIMES = "no_lock", "overshoot", ("stop_time", "stop_distance")
 
@@ -178,7 +180,7 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
 
 def _describe_claim(claim: "RunClaim") -> str:
     """Return a claim in words."""
-    return f"{claim.quantity} {'>=' if claim.quantity.startswith('least') else '<='} {claim.bound:.6g}"
+    return f"{claim.quantity} {'>=' if claim.quantity.startswith('least') else '<='} {claim.bound!r}"
 
 
 class _Side(NamedTuple):
@@ -213,14 +215,22 @@ def _read_sides(given: Sequence[str], chosen: Scenario) -> list[_Side]:
         if entry.shape:
             raise ScenarioError(f"{entry.where} is a list; a proof varies single numbers")
         low, high = entry.range()
-        ends = (float(np.nextafter(low, -np.inf)), float(np.nextafter(high, np.inf)))
+        if not (math.isfinite(low) and math.isfinite(high)):
+            raise ScenarioError(f"{entry.where} = {format_given(entry.given)}: both ends must be finite")
+        # Zero is exact, and a slip must not be less.
+        ends = (low and math.nextafter(low, -math.inf), high and math.nextafter(high, math.inf))
         sides.append(_Side(entry.path, ends, f"{entry.path} [{entry.spec.unit or 1}]", entry.scale))
     return sides
 
 
+def _is_wide(ends: tuple[float, float]) -> bool:
+    """Return whether a range has more than one value, apart from the rounding by which `_read_sides` widens it."""
+    return ends[1] - ends[0] > 1e-12 * max(map(abs, ends))
+
+
 def _choose_axes(sides: Sequence[_Side]) -> list[int]:
     """Return the indices of the parameters with more than one value. Raises ScenarioError unless there are 1 or 2."""
-    wide = [i for i, side in enumerate(sides) if side.ends[1] - side.ends[0] > 1e-12 * max(map(abs, side.ends))]
+    wide = [i for i, side in enumerate(sides) if _is_wide(side.ends)]
     if len(wide) not in (1, 2):
         raise ScenarioError(f"--plot draws one or two parameters; {len(wide)} of --over have more than one value")
     return wide
@@ -322,10 +332,12 @@ def _extreme_runs(
 
     if chosen.loop.plant.shows is not BrakeOutput:
         return {}, {}
-    counts = [SEARCHED[min(i, 1)] if len(box) < 3 else 5 for i in range(len(box))]
-    axes = [np.linspace(low, high, n)[:: max(1, (n - 1))] if low == high else np.linspace(low, high, n)
-            for (low, high), n in zip(box.values(), counts, strict=True)]  # fmt: skip
-    points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], 1)
+    wide = sum(map(_is_wide, box.values()))
+    most = next(n for n in range(MANY_SEARCHED, 0, -1) if n**wide <= MOST_RUNS)
+    counts = SEARCHED if len(box) < 3 else (most,) * len(box)
+    axes = [np.linspace(*ends, n) if n > 1 and _is_wide(ends) else [0.5 * sum(ends)]
+            for ends, n in zip(box.values(), counts, strict=False)]  # fmt: skip
+    points = np.array(list(itertools.product(*axes)))
     metrics = {"greatest slip": MaxSlip(), "stop_time": StopTime(), "stop_distance": StopDistance()}
     batch = d.Batch(dict(zip(box, points.T, strict=True)))
     runs = d.run_batch(chosen.loop, batch, chosen.solver, metrics)
@@ -359,16 +371,8 @@ def _document(
             bounds[name]["worst_run"] = worst
             bounds[name]["looseness"] = (high - worst) / worst if worst and math.isfinite(high) else None
     widths = np.array([high - low for low, high in box.values()])
-    shares = (
-        ((proof.left[:, :, 1] - proof.left[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1)
-        if len(proof.left)
-        else np.zeros(0)
-    )
-    refuting = (
-        None
-        if proof.refuting is None
-        else {path: ends.tolist() for path, ends in zip(box, proof.refuting, strict=True)}
-    )
+    shares = ((proof.left[:, :, 1] - proof.left[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1)
+    refuting = None if proof.refuting is None else dict(zip(box, proof.refuting.tolist(), strict=True))
     if proof.verdict == "refuted":
         reason = "every run violates the claim where " + ", ".join(
             f"{path} = {ends[0]:.6g}" if ends[0] == ends[1] else f"{path} in [{ends[0]:.6g}, {ends[1]:.6g}]"

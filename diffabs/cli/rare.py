@@ -48,7 +48,6 @@ def rare(
         console.need_extra("sweep")
         from diffabs.reliability.failure import find_metric_objection
 
-        engines.check_engine_name(engine)
         chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
         show_samples.say_unused_seed(chosen)
         metric, bound = _read_failure(failure, chosen)

@@ -47,6 +47,9 @@ def reproduce(
             console.fail(f"--data {data}: only lab-rig reads measurements")
         if data is not None and not data.is_dir():
             console.fail(f"--data {data}: there is no such folder")
+        whole = out / report.DEFAULT_NAME if name == "all" else None
+        if whole:
+            report.check_target(whole)
         results: JsonObject = {}
         try:
             for paper in PAPERS if name == "all" else (name,):
@@ -56,9 +59,7 @@ def reproduce(
                     report.write_report_file([folder], folder / report.DEFAULT_NAME)
                 if not as_json:
                     show.show_paper(compact(results[paper]), out / paper)
-            whole = out / report.DEFAULT_NAME if name == "all" else None
             if whole:
-                report.check_target(whole)
                 folders = [out / paper for paper in results]
                 report.write_report_file(folders, whole, f"{len(results)} papers, reproduced")
         except KeyboardInterrupt:

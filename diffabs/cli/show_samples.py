@@ -150,7 +150,7 @@ def show_comparison(result: JsonObject) -> None:
         less = f"{100 * row['share in which the second is less']['value']:.1f} %"
         means = (format_brief(row[key]) for key in ("first", "second"))
         table.add_row(name, *means, *_estimate(row["difference"]), less, format_brief(row["variance reduction"]))
-    out = f", {result['left out']} left out that diverged" if result["left out"] else ""
+    out = f", {result['left out']} left out that diverged or were refused" if result["left out"] else ""
     show_titled_table(f"{result['second']} against {result['first']}: {result['samples']} common samples{out}", table)
     say("variance reduction: factor by which sweeps without common samples would need more samples")
 

@@ -63,7 +63,7 @@ def sweep(
 
     Parameters vary as [sweep.over] says. Statistics have confidence intervals."""
     with console.end_on_errors():
-        _check_options(engine, on, scheduler, workers, devices, figures)
+        _check_options(on, scheduler, workers, devices, figures)
         if samples is not None and not 1 <= samples <= MAX_UINT32:
             console.fail(f"--samples {samples} is outside [1, {MAX_UINT32}]")
         if devices:
@@ -154,11 +154,8 @@ def _explain_resume(out: pathlib.Path, resume: bool) -> Iterator[None]:
         raise typer.Exit(console.INTERRUPTED) from None
 
 
-def _check_options(
-    engine: str, on: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool
-) -> None:
+def _check_options(on: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool) -> None:
     console.need_extra("sweep")
-    engines.check_engine_name(engine)
     if on not in PLACES:
         raise unknown_name_error(f"--on {on} is unknown", on, PLACES)
     if on == "dask":

@@ -18,7 +18,6 @@ from diffabs.cli import engine as engines
 from diffabs.cli.tuning_task import Work, build_work, certify_result, tuning_document, without_certificate
 from diffabs.core.types import JsonObject, Part
 from diffabs.scenario.scenario import Scenario, dump
-from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Trajectory
 
@@ -44,7 +43,6 @@ def tune(
     The objective is taken over all runs of [tune] at once."""
     with console.end_on_errors(), certificates.report_design_errors():
         console.need_extra("tune")
-        engines.check_engine_name(engine)
         targets.check_picture(plot)
         targets.check_scenario_file(out)
         with contextlib.ExitStack() as files:
@@ -159,8 +157,6 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
         ), ending.asked
     except StartError as error:
         console.fail(f"{work.chosen.name}: no start can be used: {error}", console.FAILED)
-    except EngineError as error:
-        console.fail(str(error))
 
 
 def _format_progress(told: "list[TuningProgress]", most: int | None = None) -> progress.WorkProgress:

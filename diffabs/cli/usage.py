@@ -13,6 +13,7 @@ import typer
 import typer.core
 
 from diffabs.cli import console, targets
+from diffabs.cli import engine as engines
 from diffabs.core.types import PyTree, Scalar
 from diffabs.scenario.registry import register_parts
 
@@ -59,7 +60,7 @@ def add_command(app: typer.Typer, function: Callable[..., PyTree], example: str,
 
     Args:
         app: Program.
-        function: Function of the command.
+        function: Function of the command. An unknown engine is refused before it is called.
         example: Words after `diffabs`.
         name: Name of the command; by default the name of the function.
     """
@@ -70,6 +71,7 @@ def add_command(app: typer.Typer, function: Callable[..., PyTree], example: str,
         with console.end_on_errors():
             register_parts(parts or ())
             targets.check_distinct(given)
+            engines.check_engine_name(given.get("engine", "auto"))
         return function(*args, **given)
 
     signature = inspect.signature(function)

@@ -263,7 +263,7 @@ def _add(graph: Graph, x: Node, y: Node) -> Node | None:
     return y if x.is_number(0) else x if y.is_number(0) else None
 
 
-def _sub(graph: Graph, x: Node, y: Node) -> Node | None:
+def _without_zero(graph: Graph, x: Node, y: Node) -> Node | None:
     return x if y.is_number(0) else None
 
 
@@ -277,8 +277,8 @@ def _mul(graph: Graph, x: Node, y: Node) -> Node | None:
         # Two factors that are constant over the steps become one: fewer operations, with another rounding.
         if is_real(x.dtype) and a.level < UpdateLevel.STEP and b.op == "mul" and b.level == UpdateLevel.STEP:
             for c, rest in (b.args, b.args[::-1]):
-                if c.level < UpdateLevel.STEP:
-                    return graph.op("mul", graph.op("mul", a, c), rest)
+                if c.level < UpdateLevel.STEP and _is_factor(product := graph.op("mul", a, c)):
+                    return graph.op("mul", product, rest)
     return None
 
 
@@ -289,10 +289,12 @@ def _div(graph: Graph, x: Node, y: Node) -> Node | None:
     if not is_real(x.dtype) or x.level < UpdateLevel.STEP or y.level == UpdateLevel.STEP:
         return None
     inverse = graph.op("div", graph.const(1, y.dtype), y)
-    # A subnormal or infinite inverse would lose digits.
-    if inverse.op == "const" and not np.finfo(y.dtype).tiny <= abs(inverse.attr) < np.inf:
-        return None
-    return graph.op("mul", x, inverse)
+    return graph.op("mul", x, inverse) if _is_factor(inverse) else None
+
+
+def _is_factor(x: Node) -> bool:
+    """Return whether a factor may replace others: it is no constant, or a normal one, which has all its digits."""
+    return x.op != "const" or bool(np.finfo(x.dtype).tiny <= abs(x.attr) < np.inf)
 
 
 def _and(graph: Graph, x: Node, y: Node) -> Node | None:
@@ -346,10 +348,6 @@ def _eq(graph: Graph, x: Node, y: Node) -> Node | None:
     return None if found is None else graph.op("not", found)
 
 
-def _shift_by_zero(graph: Graph, x: Node, y: Node) -> Node | None:
-    return x if y.is_number(0) else None
-
-
 def _bounded_integer(value: float, dtype: np.dtype) -> int:
     """Return a real number as an integer, as XLA does: NaN is 0, and the ends of the type's range bound the others."""
     ends = np.iinfo(dtype)
@@ -360,7 +358,7 @@ def _bounded_integer(value: float, dtype: np.dtype) -> int:
 
 _SIMPLIFICATIONS: dict[str, Callable[..., Node | None]] = {
     "add": _add,
-    "sub": _sub,
+    "sub": _without_zero,
     "mul": _mul,
     "div": _div,
     "and": _and,
@@ -371,6 +369,6 @@ _SIMPLIFICATIONS: dict[str, Callable[..., Node | None]] = {
     "neg": lambda graph, x: x.args[0] if x.op == "neg" else None,
     "ne": _ne,
     "eq": _eq,
-    "shift_left": _shift_by_zero,
-    "shift_right_logical": _shift_by_zero,
+    "shift_left": _without_zero,
+    "shift_right_logical": _without_zero,
 }

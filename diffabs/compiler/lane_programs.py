@@ -9,11 +9,10 @@ from diffabs.compiler.autodiff.jvp import (
     DerivativeProgram,
     arrange_arrays,
     differentiate_functions,
-    lower_without_tangents,
     replicate_tangents,
 )
 from diffabs.compiler.ir import UpdateLevel
-from diffabs.compiler.program import ScalarProgram, keep_read
+from diffabs.compiler.program import ScalarProgram, keep_read, lower_functions
 from diffabs.compiler.trace import TracedFunctions
 from diffabs.core.types import PyTree
 
@@ -63,10 +62,9 @@ class LanePrograms:
         """
         if seeds not in self._derivatives:
             moving = {level: tuple(i for one, i in seeds or () if one == level) for level in INPUT_LEVELS}
-            plain = seeds is None
             self._derivatives[seeds] = (
-                lower_without_tangents(self.functions)
-                if plain
+                DerivativeProgram(lower_functions(self.functions), moving, moving)
+                if seeds is None
                 else differentiate_functions(self.functions, moving, self.wanted)
             )
         return self._derivatives[seeds]

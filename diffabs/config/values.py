@@ -8,10 +8,11 @@ import dataclasses
 import datetime
 import difflib
 import json
+import numbers
 import re
 import reprlib
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -86,10 +87,6 @@ def unknown_name_error(what: str, name: Any, there: Iterable[str]) -> ScenarioEr
     return ScenarioError(f"{what}; {hint} {', '.join(there) or 'nothing'}")
 
 
-# Former names of a controller's limits `low` and `high`, which scenarios may still use.
-FORMER_FIELDS = {"torque_min": "low", "torque_max": "high"}
-
-
 def wrong_kind_error(path: str, value: Scalar, needed: str) -> ScenarioError:
     """Return the error for a value of the wrong kind.
 
@@ -99,7 +96,8 @@ def wrong_kind_error(path: str, value: Scalar, needed: str) -> ScenarioError:
         needed: The required kind, in words.
     """
     kinds = ((bool, "a boolean"), (str, "text"), ((int, float), "a number"), (list, "a list"), (dict, "a table"))
-    kind = next((name for of, name in kinds if isinstance(value, of)), "nothing" if value is None else "a date or time")
+    kinds = (*kinds, (datetime.date | datetime.time, "a date or time"), (type(None), "nothing"))
+    kind = next((name for of, name in kinds if isinstance(value, of)), f"of type {type(value).__name__}")
     return ScenarioError(f"{path} = {format_given(value)} is {kind}; {needed} is needed")
 
 
@@ -115,7 +113,7 @@ def read_number(value: Scalar, spec: ParameterSpec, path: str) -> float:
         ScenarioError: The value is not a number, or too large for a float.
     """
     # bool is a subclass of int, so it is excluded first.
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise wrong_kind_error(path, value, f"a number in {spec.interval()}")
     try:
         return float(value)
@@ -152,11 +150,12 @@ def read_whole(value: Scalar, low: int, high: int, path: str) -> int:
     Raises:
         ScenarioError: The value is not a whole number, or out of range.
     """
-    if isinstance(value, bool) or not isinstance(value, int):
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise wrong_kind_error(path, value, f"a whole number in [{low}, {high}]")
-    if not low <= value <= high:
+    number = int(value)
+    if not low <= number <= high:
         raise ScenarioError(f"{path} = {format_given(value)} is outside [{low}, {high}]")
-    return value
+    return number
 
 
 def whole_reader(low: int, high: int) -> Reader:
@@ -380,6 +379,20 @@ def _reader(field: dataclasses.Field[Any]) -> Reader:
     """Return the reader of a field: of its range, its own, or of its type."""
     spec = field.metadata.get("spec")
     return range_reader(spec) if spec else field.metadata.get("read") or READER_BY_TYPE[field.type]
+
+
+def find_field_faults(part: Part, name: str) -> Iterator[str]:
+    """Yield an error for each field of a dataclass that its reader refuses.
+
+    Args:
+        part: Instance of a dataclass.
+        name: Name of the part in messages.
+    """
+    for field in dataclasses.fields(part):
+        try:
+            _reader(field)(getattr(part, field.name), f"{name}: {field.name}")
+        except ScenarioError as error:
+            yield str(error)
 
 
 def read_one(kinds: Mapping[str, type], given: PyTree, path: str, **readers: Reader) -> Scalar:

@@ -7,7 +7,6 @@ The sign convention is u = +K x, as in all of diffabs. `Sampled` runs the observ
 discrete-time matrices of one period. `diffabs.linear.lqg` computes K and L.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -17,7 +16,7 @@ import numpy as np
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking, no_flow, no_memory
 from diffabs.core.pytree import param, pytree
-from diffabs.core.types import Matrix, Part, PyTree, Scalar, Vector
+from diffabs.core.types import Matrix, PyTree, Scalar, Vector
 
 STATE_NAMES = ("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate")
 MEASURED_NAMES = ("theta", "psi")
@@ -52,10 +51,6 @@ class BalanceFeedback:
         del t, memory
         terms = [k * getattr(signal.measured, name) for k, name in zip(self.gain, STATE_NAMES, strict=True)]
         return sum(terms[1:], terms[0])
-
-    def problems(self) -> Iterator[str]:
-        """Yield a message if the gain does not have shape (6,)."""
-        yield from _shape_problems(self, gain=(6,))
 
 
 class ObserverMemory(NamedTuple):
@@ -122,14 +117,3 @@ class ObserverFeedback:
         state = jnp.where(number > 0, predicted + self.correction @ error, self.start(signal).held.state)
         new = ObserverMemory(state, self.gain @ state)
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, estimate))
-
-    def problems(self) -> Iterator[str]:
-        """Yield a message for every array of the wrong shape."""
-        yield from _shape_problems(self, gain=(6,), transition=(6, 6), entry=(6,), correction=(6, 2))
-
-
-def _shape_problems(part: Part, **shapes: tuple[int, ...]) -> Iterator[str]:
-    for name, shape in shapes.items():
-        found = np.shape(getattr(part, name))
-        if found != shape:
-            yield f"{name} has shape {found}; it needs {shape}, for {', '.join(STATE_NAMES)}"

@@ -41,27 +41,25 @@ class StateFeedback:
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return x1' = slip - target, in the signal's unit, as modified by the anti-windup strategy."""
-        raw, limited = self._torque(memory, signal)
-        error = signal.measured[0] - signal.target
-        return self.antiwindup.rate(error, self.gain[0], raw, limited)
+        gain, error = self._gain(signal), signal.measured[0] - signal.target
+        return self.antiwindup.rate(error, gain[0], *self._torque(gain, memory, signal))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return the limited control, for a brake its torque [N m]."""
-        return self._torque(memory, signal)[1]
+        return self._torque(self._gain(signal), memory, signal)[1]
 
-    def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
+    def _gain(self, signal: Tracking) -> Vector:
+        del signal
+        return self.gain
+
+    def _torque(self, gain: Vector, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
         error = signal.measured[0] - signal.target
-        raw = signal.feedforward + self.gain[0] * memory.flow + self.gain[1] * error
+        raw = signal.feedforward + gain[0] * memory.flow + gain[1] * error
         return raw, clamp(raw, self.torque_min, self.torque_max)
 
     def limits(self) -> tuple[Scalar, Scalar]:
         """Return the lower and the upper limit of the control."""
         return self.torque_min, self.torque_max
-
-    def problems(self) -> Iterator[str]:
-        """Yield a message if the gain does not have shape (2,)."""
-        if np.shape(self.gain) != (2,):
-            yield f"gain has shape {np.shape(self.gain)}; it needs (2,): integral and proportional"
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rule torque_min <= torque_max."""

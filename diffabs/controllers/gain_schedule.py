@@ -17,7 +17,7 @@ import numpy as np
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.controllers.feedback import StateFeedback
 from diffabs.core.numerics import interpolate_shares, interval_shares
-from diffabs.core.protocols import Memory, Tracking
+from diffabs.core.protocols import Tracking
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.rules import Rule, increase_rule
 from diffabs.core.types import Part, Scalar, Vector
@@ -43,38 +43,13 @@ class ScheduledFeedback:
     torque_max: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
     antiwindup: Part = part(default=NoAntiWindup)
 
-    start, limits = StateFeedback.start, StateFeedback.limits
+    start, limits, flow, output = StateFeedback.start, StateFeedback.limits, StateFeedback.flow, StateFeedback.output
+    _torque = StateFeedback._torque
 
-    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return x1' = slip - target, in the signal's unit, as modified by the anti-windup strategy.
-
-        Raises:
-            ValueError: `speeds`, `integral_gains` and `gains` differ in shape.
-        """
-        return self._here(signal).flow(t, memory, signal)
-
-    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the limited control with the gains at the measured speed, for a brake its torque [N m].
-
-        Raises:
-            ValueError: `speeds`, `integral_gains` and `gains` differ in shape.
-        """
-        return self._here(signal).output(t, memory, signal)
-
-    def _here(self, signal: Tracking) -> StateFeedback:
-        """Return the state feedback at the measured speed.
-
-        Raises:
-            ValueError: `speeds`, `integral_gains` and `gains` differ in shape.
-        """
-        speeds, *rows = map(jnp.asarray, (self.speeds, self.integral_gains, self.gains))
-        if any(row.shape != speeds.shape for row in rows):
-            shapes = ", ".join(str(x.shape) for x in (speeds, *rows))
-            raise ValueError(f"speeds, integral_gains and gains have shapes {shapes}")
+    def _gain(self, signal: Tracking) -> tuple[Scalar, Scalar]:
+        speeds, integral_gains, gains = map(jnp.asarray, (self.speeds, self.integral_gains, self.gains))
         rise = interval_shares(signal.measured.speed, speeds)
-        gain = jnp.stack([interpolate_shares(rise, row) for row in rows])
-        limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
-        return StateFeedback(gain=gain, **limits, antiwindup=self.antiwindup)
+        return interpolate_shares(rise, integral_gains), interpolate_shares(rise, gains)
 
     def problems(self) -> Iterator[str]:
         """Yield a message if `speeds`, `integral_gains` and `gains` differ in shape, or are empty."""
@@ -109,12 +84,8 @@ class ProportionalFeedback:
     torque_max: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
     antiwindup: Part = part(default=NoAntiWindup)
 
-    start, limits = StateFeedback.start, StateFeedback.limits
-    problems, rules = StateFeedback.problems, StateFeedback.rules
-    flow, output = ScheduledFeedback.flow, ScheduledFeedback.output
+    start, limits, flow, output = StateFeedback.start, StateFeedback.limits, StateFeedback.flow, StateFeedback.output
+    rules, _torque = StateFeedback.rules, StateFeedback._torque
 
-    def _here(self, signal: Tracking) -> StateFeedback:
-        """Return the state feedback at the measured speed."""
-        gain = jnp.asarray(self.gain) * (signal.measured.speed / self.reference_speed)
-        limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
-        return StateFeedback(gain=gain, **limits, antiwindup=self.antiwindup)
+    def _gain(self, signal: Tracking) -> Vector:
+        return jnp.asarray(self.gain) * (signal.measured.speed / self.reference_speed)

@@ -8,7 +8,7 @@ import numpy as np
 
 from diffabs.core.protocols import Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import param, pytree
-from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.rules import period_on_grid
 from diffabs.core.types import Scalar, Vector
 
 
@@ -25,6 +25,7 @@ class PlayedCommand:
     period: Scalar = param(default=0.01, unit="s", above=0.0, tunable=False)
 
     flow = no_flow
+    grid_rules = period_on_grid
 
     def start(self, signal: Tracking) -> Memory:
         """Return the memory with the first entry."""
@@ -47,7 +48,3 @@ class PlayedCommand:
         """Yield a message if `commands` is not a vector of at least one entry."""
         if np.ndim(self.commands) != 1 or np.size(self.commands) < 1:
             yield f"commands has shape {np.shape(self.commands)}; it needs (n,), n at least 1"
-
-    def grid_rules(self, step: float) -> Iterator[Rule]:
-        """Yield the rule that the period is a multiple of the integration step."""
-        yield whole_steps("period", self.period, step)

@@ -16,13 +16,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.controllers.antiwindup import BackCalculation
 from diffabs.controllers.pid import PID
+from diffabs.controllers.torque_logic import BandLogic
 from diffabs.core.arrays import as_rule_array
 from diffabs.core.blocks import offers
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import param, part, pytree
-from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.rules import Rule, period_on_grid, whole_steps
 from diffabs.core.tracing import leaf_dependence
 from diffabs.core.types import Bool, Part, PyTree, Scalar
 
@@ -64,6 +66,7 @@ class Sampled:
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
     flow = no_flow
+    grid_rules = period_on_grid
 
     def start(self, signal: Tracking) -> Memory:
         """Return the memory with output 0, which applies until the first sample's output replaces it."""
@@ -175,17 +178,17 @@ class Sampled:
         """
         inner: Part = self.controller
         if offers(inner, "margins"):
-            late = tuple(margin < 0 for margin in inner.margins(clock.t, memory, signal, None))
+            late = tuple(margin < 0 for margin in inner.margins(clock.t, memory, signal, _refuse_rate))
             memory = inner.event(clock.t, memory, signal, late)
         return inner.tick(clock, memory, signal) if offers(inner, "tick") else memory
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rules that the delay is at most the period, and that filter and anti-windup are stable."""
-        yield from within_period(self.controller, self.delay, self.period)
+        """Yield the rules that delay and controller fit the period."""
+        yield from sampling_rules(self.controller, self.delay, self.period)
 
-    def grid_rules(self, step: float) -> Iterator[Rule]:
-        """Yield the rule that the period is a multiple of the integration step."""
-        yield whole_steps("period", self.period, step)
+
+def _refuse_rate() -> PyTree:
+    raise ValueError("the signal of a sampled controller has no rate: its `margins` cannot call rate()")
 
 
 def replace_nan(signal: PyTree) -> PyTree:
@@ -219,66 +222,51 @@ def inner_controller(controller: Part) -> PyTree:
     return controller.controller if isinstance(controller, Sampled) else controller
 
 
-def within_period(controller: Part, delay: Scalar, period: Scalar) -> Iterator[Rule]:
-    """Yield the rules delay <= period, cutoff < 2 / period and tracking time > period / 2, for a controller with these.
+def sampling_rules(controller: Part, delay: Scalar, period: Scalar) -> Iterator[Rule]:
+    """Yield the rule delay <= period, and the rules that the controller's own clock and its Euler steps fit the period.
 
     Args:
-        controller: Inner controller.
+        controller: Inner controller, or None.
         delay: Computing time [s].
         period: Sampling period [s].
     """
-    yield delay_within(delay, period)
-    if hasattr(controller, "cutoff"):
-        yield filter_within(controller.cutoff, period)
-    if hasattr(getattr(controller, "antiwindup", None), "tracking_time"):
-        yield tracking_within(controller.antiwindup.tracking_time, period)
-
-
-def delay_within(delay: Scalar, period: Scalar) -> Rule:
-    """Return the rule that the delay is at most the period.
-
-    Args:
-        delay: Computing time [s].
-        period: Sampling period [s].
-    """
-    return Rule(
+    yield Rule(
         as_rule_array(delay) <= as_rule_array(period),
         "delay exceeds the period",
         lambda: f"delay = {delay:g} s exceeds the period of {period:g} s",
     )
-
-
-def filter_within(cutoff: Scalar, period: Scalar) -> Rule:
-    """Return the rule that the filter d_(k+1) = d_k + period cutoff (e - d_k) is stable: cutoff < 2 / period.
-
-    Args:
-        cutoff: Cutoff of the derivative filter [rad/s].
-        period: Sampling period [s].
-    """
-    return Rule(
-        as_rule_array(cutoff) * as_rule_array(period) < 2,
-        "controller.cutoff is too fast for the period",
-        lambda: (
-            f"controller.cutoff = {cutoff:g} rad/s is outside (0, {2 / period:g}) rad/s: sampled every {period:g} s, a"
-            " faster filter is not stable"
-        ),
-    )
-
-
-def tracking_within(tracking_time: Scalar, period: Scalar) -> Rule:
-    """Return the rule that back-calculation is stable: tracking_time > period / 2.
-
-    At a limit, one sample multiplies the excess over the limit by 1 - period / tracking_time.
-
-    Args:
-        tracking_time: Tracking time of the anti-windup [s].
-        period: Sampling period [s].
-    """
-    return Rule(
-        as_rule_array(period) < 2 * as_rule_array(tracking_time),
-        "controller.antiwindup.tracking_time is too short for the period",
-        lambda: (
-            f"controller.antiwindup.tracking_time = {tracking_time:g} s is outside ({period / 2:g}, inf) s: sampled"
-            f" every {period:g} s, a faster back-calculation is not stable"
-        ),
-    )
+    if offers(controller, "tick") and hasattr(controller, "period"):
+        yield whole_steps("controller.period", controller.period, as_rule_array(period), "the sampling period")
+    if isinstance(controller, PID):
+        # d_(k+1) = d_k + period cutoff (e - d_k)
+        cutoff = controller.cutoff
+        yield Rule(
+            as_rule_array(cutoff) * as_rule_array(period) < 2,
+            "controller.cutoff is too fast for the period",
+            lambda: (
+                f"controller.cutoff = {cutoff:g} rad/s is outside (0, {2 / period:g}) rad/s: sampled every"
+                f" {period:g} s, a faster filter is not stable"
+            ),
+        )
+    if isinstance(antiwindup := getattr(controller, "antiwindup", None), BackCalculation):
+        # At a limit, one sample multiplies the excess over the limit by 1 - period / tracking_time.
+        tracking_time = antiwindup.tracking_time
+        yield Rule(
+            as_rule_array(period) < 2 * as_rule_array(tracking_time),
+            "controller.antiwindup.tracking_time is too short for the period",
+            lambda: (
+                f"controller.antiwindup.tracking_time = {tracking_time:g} s is outside ({period / 2:g}, inf) s: sampled"
+                f" every {period:g} s, a faster back-calculation is not stable"
+            ),
+        )
+    if isinstance(controller, BandLogic):
+        # One sample multiplies the torque by 1 - period decay. A negative torque would stay negative.
+        decay = controller.decay
+        yield Rule(
+            as_rule_array(decay) * as_rule_array(period) < 1,
+            "controller.decay is too fast for the period",
+            lambda: (
+                f"controller.decay = {decay:g} 1/s is outside (0, {1 / period:g}) 1/s: sampled every {period:g} s,"
+                " a faster decay ends below zero"
+            ),
+        )

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.controllers.pid import PID
-from diffabs.controllers.sampled import PERIOD_EPS, Sampled, replace_nan, within_period
+from diffabs.controllers.sampled import PERIOD_EPS, Sampled, replace_nan, sampling_rules
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import param, part, pytree
@@ -99,8 +99,8 @@ class SampledOnGrid:
         return Memory(held=m._replace(applied=jnp.where(clock.ticks()[0], applied, m.applied)))
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rules that the delay is at most the period, and that filter and anti-windup are stable."""
-        yield from within_period(self.controller, self.delay, self.sampling_period)
+        """Yield the rules that delay and controller fit the period."""
+        yield from sampling_rules(self.controller, self.delay, self.sampling_period)
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """Yield the rule that the sampling period is a multiple of the integration step."""

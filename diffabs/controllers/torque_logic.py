@@ -7,7 +7,8 @@
     lower      u' = -rate    until u falls to torque_low
     hold       u' = 0        until the slip falls to slip_low; then again from the top
 
-It has a limit cycle on a road with the wheel's torque balance Psi(slip) = (r + (1 - slip) J/(m r)) m g mu(slip) if
+It skips a hold that is already over. It has a limit cycle on a road with the wheel's torque balance
+Psi(slip) = (r + (1 - slip) J/(m r)) m g mu(slip) if
 
     torque_high > max Psi,   torque_low < Psi on [slip_low, slip_high],
     and the slip at the end of `lower` is below the unstable equilibrium of torque_low.
@@ -20,7 +21,7 @@ analysis of limit cycles in hybrid anti-lock braking systems, Int. J. Control 82
     u' = growth u  for slip < slip_low,   u' = -decay u  for slip > slip_high,   else u' = 0
 
 At torque_max the growth stops. Inside a `sampled` controller of period T, one sample multiplies u by 1 + growth T or by
-1 - decay T. The usual programs with this rule do so.
+1 - decay T, which must be positive: decay T < 1. The usual programs with this rule do so.
 """
 
 from collections.abc import Iterator
@@ -36,8 +37,9 @@ from diffabs.core.types import PyTree, Scalar
 
 @pytree
 class FourPhase:
-    """Raise the torque, hold it until the slip is high, lower it, hold it until the slip is low. The target has no
-    effect.
+    """Raise the torque, hold it until the slip is high, lower it, hold it until the slip is low.
+
+    It skips a hold that is already over. The target has no effect.
 
     Attributes:
         torque_low: Torque at which the brake stops lowering.
@@ -86,12 +88,15 @@ class FourPhase:
         return jnp.where(changes, torque, 1.0), jnp.where(changes, 1.0, hold)
 
     def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[PyTree, PyTree]) -> Memory:
-        """Return the memory in the next phase if an event of the present phase has fired."""
-        del t, signal
-        phase = memory.held
+        """Return the memory in the next phase, after a hold that is over, if an event of this phase has fired."""
+        del t
+        phase, slip = memory.held, signal.measured[0]
         mine = jnp.where((phase == 0) | (phase == 2), fired[0], fired[1])
         reached = jnp.where(phase == 0, self.torque_high, jnp.where(phase == 2, self.torque_low, memory.flow))
-        following = jnp.where(phase == 3, 0.0, phase + 1)
+        # A hold whose edge the slip has already passed would never end: no margin falls through zero.
+        passed = jnp.where(phase == 0, slip >= self.slip_high, (phase == 2) & (slip <= self.slip_low))
+        following = phase + jnp.where(passed, 2.0, 1.0)
+        following = jnp.where(following > 3, 0.0, following)
         return Memory(jnp.where(mine, reached, memory.flow), jnp.where(mine, following, phase))
 
     def rules(self) -> Iterator[Rule]:

@@ -81,19 +81,19 @@ class Cubic(NamedTuple):
 
     @jax.jit
     def greatest(self) -> Scalar:
-        """Return the greatest value of p in [0, 1].
+        """Return the greatest value of p in [0, 1], if p rises at the start and falls at the end; else the greater end.
 
+        Another maximum is an artefact of a step that ends beyond a bend of the quantity, such as the end of a limit.
         Its derivative is the derivative of p at the place of the extremum. A Newton step moves that place; its effect
         on the value is of second order.
         """
         c1, c2, c3 = jax.lax.stop_gradient(self.coefficients())
+        inside = (self.start_slope > 0) & (self.end_slope < 0)
         square = c2 * c2 - 3.0 * c1 * c3
-        # Of both roots of p' = c1 + 2 c2 x + 3 c3 x^2 that at which p'' < 0, as a quotient without cancellation.
-        bend = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-        falls = c2 <= 0
-        x = _quotient(jnp.where(falls, c1, -c2 - bend), jnp.where(falls, bend - c2, 3.0 * c3))
-        inside = (square > 0) & (x > 0) & (x < 1)
-        x = jnp.where(inside, x, 0.0)
+        # Root of p' = c1 + 2 c2 x + 3 c3 x^2 as c1/(sqrt(c2^2 - 3 c1 c3) - c2), which has no cancellation for c2 < 0.
+        # The inner `where` keeps the root's argument positive, since 0 times an infinite gradient is NaN.
+        bend = jnp.sqrt(jnp.where(inside & (square > 0), square, 1.0)) - c2
+        x = clamp(_quotient(c1, bend), 0.0, 1.0)
         x = _refine_zero(x, self.slope, jnp.where(inside, 2.0 * c2 + 6.0 * c3 * x, 0.0))
         ends = later_of_larger(self.start, self.end, self.falls)
         top = self(x)

@@ -30,7 +30,7 @@ def find_value_objection(value: Scalar) -> str:
     """
     if type(value) is float:
         return ""
-    if isinstance(value, list | tuple):
+    if isinstance(value, list | tuple | range):
         return next(filter(None, map(find_value_objection, value)), "")
     if hasattr(value, "dtype"):
         return _of_type(value.dtype)
@@ -67,7 +67,7 @@ def value_shape(value: Scalar) -> tuple[int, ...]:
     Args:
         value: Array, number, or list.
     """
-    if isinstance(value, list | tuple):
+    if isinstance(value, list | tuple | range):
         return (len(value), *(value_shape(value[0]) if value else ()))
     return np.shape(value)
 
@@ -79,7 +79,7 @@ def format_value(value: Scalar) -> str:
         value: Any value.
     """
     try:
-        text = " ".join(str(value).split()) if hasattr(value, "dtype") else repr(value)
+        text = " ".join(str(value).split()) if hasattr(value, "dtype") else repr(value).replace("\n", " ")
     except ValueError:  # a whole number of thousands of digits
         text = "..."
     return text if len(text) <= MAX_SHOWN_LENGTH else f"{text[: MAX_SHOWN_LENGTH - 3]}..."

@@ -253,9 +253,15 @@ def run_signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, PyTree]]:
     Args:
         sample: Samples of the run.
         plant: Plant of the loop.
+
+    Raises:
+        ValueError: An output of the plant has the name of another signal.
     """
     units = plant.shows.units
     shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
     asked = {"target": (units[sample.output._fields[0]], sample.target)}
     given = {name: (plant.control_unit, getattr(sample, name)) for name in ("command", "control")}
-    return {"t": ("s", sample.t), **shown, **asked, **given}
+    time = {"t": ("s", sample.t)}
+    if taken := shown.keys() & {*time, *asked, *given}:
+        raise ValueError(f"plant.shows: no output can be called {', '.join(sorted(taken))}, like a signal of the loop")
+    return {**time, **shown, **asked, **given}

@@ -23,10 +23,11 @@ something else than its contract says, or that reads an output which the plant l
 Optional methods or attributes of a part's class, beyond its contract:
 
     of             offer                                purpose
-    any part       problems(), rules()                  errors in its fields; rules between its numbers
+    any part       problems(), rules()                  wrong shapes or static fields; rules between its numbers
                    grid_rules(step)                     rules about the integration step
                    cautions()                           settings that are allowed but hardly intended
                    prepared(), refined(times)           the part for a run; for a step shorter by a factor `times`
+                   enable_derivatives(names)            the part for derivatives by its parameters in `names`
                    family = "sensor"                    the family of a block from outside the package
                    jumps = True                         its rates jump where a comparison changes: a step ends there
     block          tick()                               change at an instant of a clock: see Ticking
@@ -35,7 +36,8 @@ Optional methods or attributes of a part's class, beyond its contract:
                    every_step = True                    it ticks in every step of the integration
                    record(memory, step)                 called after every step: `core.cubic.HermiteStep`
                    limits()                             limits of the control, for a controller or actuator
-                   offers(hook)                         for a composite block: whether one of its blocks has the hook
+                   offers(hook), recorded_signals()     for a composite block: whether one of its blocks has the hook;
+                                                        the signals that its blocks record
     plant          usual_parts(), usual_objectives()    defaults of a scenario: the other parts of the loop, the metrics
                    audit(initial)                       an objective that exceeds 1 in a physically impossible run
                    probes(initial, setpoint, stop)      starts (k,) at which its loop may be stiffest
@@ -148,7 +150,8 @@ class Switching(Block, Protocol):
     def margins(self, t: Scalar, memory: Memory, signal: PyTree, rate: Callable[[], PyTree]) -> tuple[Scalar, ...]:
         """Return numbers that are positive until an event; at the event, one of them falls through zero.
 
-        `rate()` is d(signal)/dt. It costs an evaluation of the loop and of its derivative.
+        `rate()` is d(signal)/dt. It costs an evaluation of the loop and of its derivative. In a sampled controller it
+        raises a ValueError.
         """
         ...
 

@@ -13,7 +13,7 @@ The construction of a part does not check ranges, because JAX rebuilds parts wit
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -125,7 +125,7 @@ def param(
 
 
 def part(*, default: Any = dataclasses.MISSING) -> PyTree:
-    """Return a field that holds another part, or a tuple of parts.
+    """Return a field that holds another part, or a tuple or list of parts.
 
     Args:
         default: A part, or a class to call.
@@ -212,13 +212,13 @@ def parameters(part: Part, prefix: str = "", units: Units | None = None) -> Iter
 def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[PyTree] | None, PyTree]]:
     """Yield (dotted path, field, value) of each field that is not static, without descending into the values.
 
-    For a tuple of parts it yields the items, with None as their field. For any other value it yields nothing.
+    For a tuple or a list of parts it yields the items, with None as their field. For any other value it yields nothing.
 
     Args:
-        part: Part, or tuple of parts.
+        part: Part, or tuple or list of parts.
         prefix: Text before every path.
     """
-    if isinstance(part, tuple):
+    if isinstance(part, tuple | list):
         for i, item in enumerate(part):
             yield f"{prefix}{i}", None, item
     elif dataclasses.is_dataclass(part):
@@ -228,7 +228,7 @@ def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[P
 
 
 def parts(part: Part) -> Iterator[PyTree]:
-    """Yield the parts directly in a part, but not the parts in those; items of a tuple count singly.
+    """Yield the parts directly in a part, but not the parts in those; items of a tuple or list count singly.
 
     Args:
         part: Part.
@@ -237,7 +237,7 @@ def parts(part: Part) -> Iterator[PyTree]:
         if field is None:
             yield value
         elif "part" in field.metadata:
-            yield from value if isinstance(value, tuple) else (value,)
+            yield from value if isinstance(value, tuple | list) else (value,)
 
 
 def elements(part: Part) -> dict[str, ParameterSpec]:
@@ -275,7 +275,7 @@ def get(part: Part, path: str) -> PyTree:
 
 
 def _names(part: Part) -> list[str]:
-    if isinstance(part, tuple) or dataclasses.is_dataclass(part):
+    if isinstance(part, tuple | list) or dataclasses.is_dataclass(part):
         return [child.rpartition(".")[2] for child, _, _ in children(part, "")]
     return [str(i) for i in range(np.shape(part)[0])] if np.ndim(part) else []
 
@@ -306,13 +306,16 @@ def replace(part: T, values: Params) -> T:
 
 def _replace(part: Part, names: list[str], value: Scalar) -> Any:
     head, *rest = names
-    if not dataclasses.is_dataclass(part) and not isinstance(part, tuple):
-        return jnp.asarray(part).at[int(head)].set(_replace(part[int(head)], rest, value) if rest else value)
-    if isinstance(part, tuple):
-        i = int(head)
-        return (*part[:i], _replace(part[i], rest, value) if rest else value, *part[i + 1 :])
-    new = _replace(getattr(part, head), rest, value) if rest else value
-    return dataclasses.replace(part, **{head: new})  # pyright: ignore[reportArgumentType]  # an instance
+    if dataclasses.is_dataclass(part):
+        new = _replace(getattr(part, head), rest, value) if rest else value
+        return dataclasses.replace(part, **{head: new})  # pyright: ignore[reportArgumentType]  # an instance
+    i = int(head)
+    new = _replace(part[i], rest, value) if rest else value
+    if isinstance(part, tuple) or dataclasses.is_dataclass(part[i]):
+        return (*part[:i], new, *part[i + 1 :])
+    part = jnp.asarray(part)
+    # An array of integers would round the new value.
+    return part.astype(jnp.result_type(part, 0.0)).at[i].set(new)
 
 
 def arrays(part: T) -> T:
@@ -383,7 +386,7 @@ def prepare_parts(part: Part) -> PyTree:
     Args:
         part: Part.
     """
-    return _rebuild_parts(part, "prepared")
+    return _rebuild_parts(part, "prepared", lambda prefix: ())
 
 
 def refine_parts(part: Part, times: int) -> PyTree:
@@ -396,10 +399,10 @@ def refine_parts(part: Part, times: int) -> PyTree:
         part: Part.
         times: Factor by which the steps are shorter.
     """
-    return _rebuild_parts(part, "refined", times)
+    return _rebuild_parts(part, "refined", lambda prefix: (times,))
 
 
-def prepare_derivatives(part: Part, paths: Iterable[str], prefix: str = "") -> PyTree:
+def prepare_derivatives(part: Part, paths: Iterable[str]) -> PyTree:
     """Return the part for derivatives by the parameters at these paths.
 
     Each part in it with a method `enable_derivatives(names)` is replaced by the method's result. `names` are the paths
@@ -408,26 +411,24 @@ def prepare_derivatives(part: Part, paths: Iterable[str], prefix: str = "") -> P
     Args:
         part: Part.
         paths: Dotted paths.
-        prefix: Path of the part, with a final dot.
     """
-    if isinstance(part, tuple):
-        return tuple(prepare_derivatives(item, paths, f"{prefix}{i}.") for i, item in enumerate(part))
+    return _rebuild_parts(
+        part,
+        "enable_derivatives",
+        lambda prefix: ({path.removeprefix(prefix) for path in paths if path.startswith(prefix)},),
+    )
+
+
+def _rebuild_parts(part: Part, method: str, args: Callable[[str], tuple[PyTree, ...]], prefix: str = "") -> PyTree:
+    """Return the part, with the method's result in place of each part that has the method, the innermost first.
+
+    `args` returns the method's arguments for the path of a part, with a final dot.
+    """
+    if isinstance(part, tuple | list):
+        return tuple(_rebuild_parts(item, method, args, f"{prefix}{i}.") for i, item in enumerate(part))
     if not dataclasses.is_dataclass(part):
         return part
     fields = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
-    inner = {name: prepare_derivatives(getattr(part, name), paths, f"{prefix}{name}.") for name in fields}
+    inner = {name: _rebuild_parts(getattr(part, name), method, args, f"{prefix}{name}.") for name in fields}
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
-    own = {path.removeprefix(prefix) for path in paths if path.startswith(prefix)}
-    return part.enable_derivatives(own) if hasattr(part, "enable_derivatives") else part
-
-
-def _rebuild_parts(part: Part, method: str, *args: PyTree) -> PyTree:
-    """Return the parts, each with this method replaced by the method's result, from the innermost outwards."""
-    if isinstance(part, tuple):
-        return tuple(_rebuild_parts(item, method, *args) for item in part)
-    if not dataclasses.is_dataclass(part):
-        return part
-    fields = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
-    inner = {name: _rebuild_parts(getattr(part, name), method, *args) for name in fields}
-    part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
-    return getattr(part, method)(*args) if hasattr(part, method) else part
+    return getattr(part, method)(*args(prefix)) if hasattr(part, method) else part

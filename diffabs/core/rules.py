@@ -4,13 +4,13 @@ A part yields its rules from a method `rules()`, and from `grid_rules(step)` the
 are evaluated with concrete numbers, or traced, for all runs of a batch in one compiled call.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from diffabs.core.arrays import as_rule_array
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import Units, insert_unit
 
 MAX_SHOWN_NUMBERS = 8  # numbers of a list in a message
@@ -23,7 +23,7 @@ class Rule(NamedTuple):
         holds: Boolean or boolean array, True where the condition holds.
         broken: Message for the runs of a batch that break the rule, without numbers.
         says: Function that returns the message for a single part, with its numbers, which must be concrete. The text
-            `{control}` in it stands for the unit of the loop's control.
+            `{control}` or `{signal}` in it stands for the unit of the loop's control or signal.
     """
 
     holds: Any
@@ -46,10 +46,11 @@ def order_rule(low: tuple[str, PyTree], high: tuple[str, PyTree], unit: str, *, 
     """
     (below, a), (above, b) = low, high
     relation = "exceeds" if equal else "is not below"
+    unit = "" if unit == "1" else f" {unit}"
     return Rule(
         as_rule_array(a) <= as_rule_array(b) if equal else as_rule_array(a) < as_rule_array(b),
         f"{below} {relation} {above}",
-        lambda: f"{below} = {a:g} {unit} {relation} {above} = {b:g} {unit}",
+        lambda: f"{below} = {a:g}{unit} {relation} {above} = {b:g}{unit}",
     )
 
 
@@ -72,17 +73,30 @@ def increase_rule(name: str, values: PyTree, broken: str, unit: str) -> Rule:
     )
 
 
-def whole_steps(name: str, period: Scalar, step: float) -> Rule:
+def whole_steps(name: str, period: Scalar, step: Scalar, called: str = "") -> Rule:
     """Return the rule that a period is a whole multiple of the step, to a relative tolerance of 1e-6.
 
     Args:
         name: Name of the period.
         period: Period [s].
         step: Step [s].
+        called: Name of the step in the message; empty for the step of the solver, with its number.
     """
-    count = as_rule_array(period) / step
+    count, called = as_rule_array(period) / step, called or f"solver.step = {step:g} s"
     return Rule(
         (count >= 0.5) & (abs(count - count.round()) <= 1e-6 * count),
-        f"{name} is not a multiple of solver.step = {step:g} s",
-        lambda: f"{name} = {float(period):g} s is not a multiple of solver.step = {step:g} s",
+        f"{name} is not a multiple of {called}",
+        lambda: f"{name} = {float(period):g} s is not a multiple of {called}",
     )
+
+
+def period_on_grid(self: Part, step: float) -> Iterator[Rule]:
+    """Yield the rule that a block's period is a multiple of the integration step.
+
+    A block with a `period` takes this function as its method `grid_rules`.
+
+    Args:
+        self: Block.
+        step: Integration step [s].
+    """
+    yield whole_steps("period", self.period, step)

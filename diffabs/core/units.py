@@ -59,13 +59,16 @@ def unit_at(unit: str, place: int, count: int) -> str:
 
 
 def insert_unit(text: str, units: Units | None) -> str:
-    """Return a sentence with ` {control}` replaced by the unit of the control, or removed if this is unknown or 1.
+    """Return a sentence with the units for ` {control}` and ` {signal}`; a unit that is unknown or 1 is left out.
 
     Args:
         text: Sentence.
         units: Units of the loop, or None.
     """
-    return text.replace(" {control}", f" {units.control}" if units and units.control != "1" else "")
+    for name in Units._fields:
+        unit = getattr(units, name, "1")
+        text = text.replace(f" {{{name}}}", "" if unit == "1" else f" {unit}")
+    return text
 
 
 def _multiply_units(unit: str, meaning: dict[str, str]) -> str:

@@ -1,17 +1,19 @@
 """Validity of a part: ranges of its parameters, and the conditions that the parts declare themselves.
 
-Parts declare conditions by the methods `problems` (shapes of fields), `rules` (between numbers), `grid_rules` (on the
-integration step) and `cautions` (allowed, but hardly intended). The functions here evaluate them for a part and for all
-parts in it.
+Parts declare conditions by the methods `problems` (shapes and static fields), `rules` (between numbers), `grid_rules`
+(on the integration step) and `cautions` (allowed, but hardly intended). The functions here evaluate them for a part and
+for all parts in it.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import TypeVar
+from contextlib import suppress
+from typing import Any, TypeVar
 
+import jax
 import numpy as np
 
 from diffabs.core import kinds
-from diffabs.core.pytree import ParameterSpec, children, parameters
+from diffabs.core.pytree import ParameterSpec, children, parameters, stack_lists
 from diffabs.core.rules import Rule
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import Units, insert_unit, units_of
@@ -22,15 +24,15 @@ T = TypeVar("T")
 def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> Iterator[str]:
     """Yield one line for each field that is out of range, and for each condition of the parts that fails.
 
-    The conditions of a part are evaluated only if its fields, and the parts in it, have no errors. The shapes of fields
-    (`problems`) come first. If they are correct, the rules between numbers (`rules`) follow.
+    For each part, four groups are checked in order: its numbers and the parts in it, the shapes of its numbers, its
+    `problems`, its `rules`. The lines are those of the first group with a fault.
 
     Args:
         part: Part.
         prefix: Text before every name.
         units: Units of the loop, or None.
     """
-    found = False
+    found, shapes = False, []
     units = units or units_of(getattr(part, "plant", None))
     for name, field, value in children(part, prefix):
         if field is not None and "spec" in field.metadata:
@@ -41,13 +43,14 @@ def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> I
             elif not spec.holds(value):
                 found = True
                 yield f"{name} = {_show(value)} is outside {spec.interval()}"
+            elif line := _find_wrong_shape(spec, value):
+                shapes.append(f"{field.name} {line}")
         else:
             within = list(find_problems(value, f"{name}.", units))
             found |= bool(within)
             yield from within
-    # Rules between numbers assume correct fields and shapes: they are evaluated only without earlier errors.
     if not found:
-        shapes = list(part.problems()) if hasattr(part, "problems") else []
+        shapes = shapes or list(_own(part, "problems"))
         yield from (prefix + insert_unit(line, units) for line in shapes or find_broken(_own(part, "rules")))
 
 
@@ -89,40 +92,50 @@ def find_broken(rules: Iterable[Rule]) -> Iterator[str]:
     yield from (rule.says() for rule in rules if not bool(rule.holds))
 
 
-def _own(part: Part, hook: str, *args: PyTree) -> Iterator[Rule]:
-    """Yield the rules from a method of this part alone."""
+def _own(part: Part, hook: str, *args: PyTree) -> Iterator[Any]:
+    """Yield the rules or lines from a method of this part alone."""
     if hasattr(part, hook):
         yield from getattr(part, hook)(*args)
 
 
-def _below(part: Part, prefix: str, units: Units | None, hook: str, *args: PyTree) -> Iterator[Rule]:
-    """Yield the rules from a method of the part and of the parts in it, the innermost first."""
+def _below(part: Part, prefix: str, units: Units | None, hook: str, *args: PyTree) -> Iterator[Any]:
+    """Yield the rules or lines from a method of the part and of the parts in it, the innermost first."""
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:
             yield from _below(value, f"{name}.", units, hook, *args)
-    yield from (rule.under(prefix, units) for rule in _own(part, hook, *args))
+    for found in _own(part, hook, *args):
+        yield found.under(prefix, units) if isinstance(found, Rule) else prefix + insert_unit(found, units)
 
 
 def find_misshapen(part: Part, prefix: str = "") -> Iterator[str]:
-    """Yield one line for each parameter of an unbatched part that is not a number or has another shape than its field.
+    """Yield one line for each parameter of the wrong type or shape in an unbatched part, or else its `problems`.
 
-    The function does not look at values, so they may be traced.
+    The values may be traced.
 
     Args:
         part: Part.
         prefix: Text before every name.
     """
+    lines = []
     for name, spec, value in parameters(part, prefix):
         if line := _find_unfit(name, spec, value):
-            yield line
-        elif spec.shape is not None and kinds.value_shape(value) != spec.shape:
-            yield f"{name} = {kinds.format_value(value)} has shape {kinds.value_shape(value)}; it needs {spec.shape}"
+            lines.append(line)
+        elif line := _find_wrong_shape(spec, value):
+            lines.append(f"{name} = {kinds.format_value(value)} {line}")
+    with suppress(jax.errors.JAXTypeError):  # `problems` that need the value of a traced number
+        yield from lines or _below(stack_lists(part), prefix, units_of(getattr(part, "plant", None)), "problems")
 
 
 def _find_unfit(name: str, spec: ParameterSpec, value: Scalar) -> str:
     """Return a line for a value that is not a number of a run, or an empty text."""
     line = kinds.find_value_objection(value)
     return line and f"{name} = {kinds.format_value(value)} {line}; a number in {spec.interval()} is needed"
+
+
+def _find_wrong_shape(spec: ParameterSpec, value: Scalar) -> str:
+    """Return the end of a line for a value of another shape than its field, or an empty text."""
+    shape = kinds.value_shape(value)
+    return "" if spec.shape in (None, shape) else f"has shape {shape}; it needs {spec.shape}"
 
 
 def find_cautions(part: Part, prefix: str = "") -> Iterator[str]:
@@ -132,11 +145,7 @@ def find_cautions(part: Part, prefix: str = "") -> Iterator[str]:
         part: Part.
         prefix: Text before every name.
     """
-    for name, field, value in children(part, prefix):
-        if field is None or "spec" not in field.metadata:
-            yield from find_cautions(value, f"{name}.")
-    if hasattr(part, "cautions"):
-        yield from (prefix + line for line in part.cautions())
+    yield from _below(part, prefix, None, "cautions")
 
 
 def check_part(part: T, prefix: str = "") -> T:

@@ -57,9 +57,8 @@ def certify(
         Certificate with the proved claims; it has none if nothing is proved.
 
     Raises:
-        ValueError: Shapes that do not fit, a field of `spec` out of its range, or damping of a discrete loop that is
-            proved stable. Also a schedule in discrete time, without `spec.rates`, or with specifications besides decay
-            and cost.
+        ValueError: Shapes that do not fit, a field of `spec` out of its range, or damping in discrete time. Also a
+            schedule in discrete time, without `spec.rates`, or with specifications besides decay and cost.
         ModuleNotFoundError: cvxpy is not installed.
 
     Examples:
@@ -73,7 +72,7 @@ def certify(
         from diffabs.design.scheduled import certify_schedule
 
         return certify_schedule(gain, system, spec, fastest=fastest)
-    spec = spec.check(system.order, system.inputs)
+    spec = spec.check(system.order, system.inputs, system.period)
     k = as_gain_matrix(gain, (system.inputs, system.order))
     return Certificate(system, k, tuple(_Analysis(system, k, spec).claims(fastest)))
 

@@ -152,28 +152,44 @@ def classify_starts(
         Outcomes, each of shape (runs,). `unstable` is False everywhere with a band.
 
     Raises:
-        ValueError: A loop with a part for which no ellipsoid is known, and no band; or a band outside (0, inf).
+        ValueError: Columns without a run, or of unlike lengths; a loop that is no balance, or one with a part for
+            which no ellipsoid is known, and no band; or a band outside (0, inf).
     """
-    starts = {path: np.asarray(column) for path, column in starts.items()}
-    count = len(next(iter(starts.values())))
-    inside = _system_ellipsoids(loop, starts, count) if band is None else _ball_as_ellipsoid(band, count)
-    return _classify_starts(loop, starts, solver, inside, band is None, key, engine)
+    starts, count = _read_columns("starts", starts)
+    return _classify_starts(loop, starts, solver, *_find_ellipsoids(loop, starts, count, band), key, engine)
+
+
+def _read_columns(name: str, columns: Params) -> tuple[dict[str, np.ndarray], int]:
+    """Return columns as arrays, and their common length; raise ValueError without one of at least 1."""
+    arrays = {path: np.asarray(column) for path, column in columns.items()}
+    lengths = {column.shape[:1] for column in arrays.values()}
+    if len(lengths) != 1 or lengths & {(), (0,)}:
+        shapes = ", ".join(f"{path} {column.shape}" for path, column in arrays.items())
+        raise ValueError(f"{name} = {{{shapes}}}: it needs columns of one length, at least 1")
+    return arrays, lengths.pop()[0]
+
+
+def _check_direction(direction: Mapping[str, float]) -> None:
+    """Raise ValueError unless a direction has finite values of the initial state, not all zero."""
+    if others := [path for path in direction if not path.startswith(INITIAL_PREFIX)]:
+        raise ValueError(f"{', '.join(others)}: a direction is one of the initial state")
+    values = np.array(list(direction.values()), float)
+    if not (np.isfinite(values).all() and values.any()):
+        raise ValueError(f"direction = {dict(direction)}: it needs finite values of the initial state, not all zero")
 
 
 def _classify_starts(
     loop: Loop,
     starts: dict[str, np.ndarray],
     solver: Solver,
-    inside: "_Ellipsoids",
-    early: bool,
+    inside: _Ellipsoids,
+    enough: _Ellipsoids | None,
     key: PyTree,
     engine: str,
 ) -> Outcomes:
-    """Return the outcomes; with `early`, a run ends when it enters its ellipsoid."""
     count = len(inside.system)
     # fold_in by the run's number, so that the draws do not depend on the split over cores.
     keys = None if key is None else jax.vmap(lambda i: jax.random.fold_in(key, i))(np.arange(count))
-    enough = inside if early else None
     run = jax.device_get(run_batch(loop, Batch(starts, keys), solver, enough=enough, engine=engine))
     x = np.stack(list(state_of(run.ending.sample.output)), axis=-1)
     return Outcomes(
@@ -212,7 +228,7 @@ def region_of_attraction(
         Basin with outcomes of shape (n, m) for n and m cells.
 
     Raises:
-        ValueError: A loop with a part for which no ellipsoid is known, and no band; or a band outside (0, inf).
+        ValueError: No cells, or a loop or band that `classify_starts` refuses.
     """
     grid = np.meshgrid(first.centres, second.centres, indexing="ij")
     starts = {path: axis.ravel() for path, axis in zip(paths, grid, strict=True)}
@@ -246,11 +262,16 @@ def largest_recovered_multiples(
         One `Reach` for each row.
 
     Raises:
-        ValueError: A loop with a part for which no ellipsoid is known.
+        ValueError: A path outside the initial state, a direction of zero, multiples that do not increase from above 0,
+            no rows, or a loop with a part for which no ellipsoid is known.
     """
-    count = len(next(iter(rows.values())))
-    runs = {path: np.repeat(np.asarray(column), len(multiples), axis=0) for path, column in rows.items()}
-    runs |= {path: np.tile(value * np.asarray(multiples), count) for path, value in direction.items()}
+    _check_direction(direction)
+    multiples = np.array(multiples, float)
+    if not (multiples.ndim == 1 and multiples.size and (np.diff(multiples, prepend=0.0) > 0).all()):
+        raise ValueError(f"multiples = {multiples.tolist()}: they need to increase, the first above 0")
+    rows, count = _read_columns("rows", rows)
+    runs = {path: np.repeat(column, len(multiples), axis=0) for path, column in rows.items()}
+    runs |= {path: np.tile(value * multiples, count) for path, value in direction.items()}
     found = classify_starts(loop, runs, solver, engine=engine)
     fine, open_ = (x.reshape(count, -1) for x in (found.recovered, found.undecided))
     # argmin of booleans is the index of the first failure.
@@ -285,23 +306,20 @@ def recoverable_multiple(
         engine: Engine of the runs, as in `run_batch`.
 
     Raises:
-        ValueError: A path outside the initial state, no path, or a loop with a part for which no ellipsoid is known
-            and no band. Also `most` or a band that is not positive and finite.
+        ValueError: A path outside the initial state, a direction of zero, or a loop or band that `classify_starts`
+            refuses. Also `most` that is not positive and finite.
     """
-    if others := [path for path in direction if not path.startswith(INITIAL_PREFIX)]:
-        raise ValueError(f"{', '.join(others)}: a direction is one of the initial state")
-    if not direction:
-        raise ValueError("direction = {}: it needs a value of the initial state")
+    _check_direction(direction)
     if not 0 < most < np.inf:
         raise ValueError(f"most = {most:g} is outside (0, inf)")
     alike = {path: np.full(SEARCH_POINTS, value) for path, value in direction.items()}
     # All starts of the search share one system, so its ellipsoid is computed once.
-    inside = _system_ellipsoids(loop, alike, SEARCH_POINTS) if band is None else _ball_as_ellipsoid(band, SEARCH_POINTS)
+    inside, enough = _find_ellipsoids(loop, alike, SEARCH_POINTS, band)
     low, high, undecided = 0.0, float(most), False
     while high - low > MULTIPLE_TOLERANCE * high:
         tried = np.linspace(low, high, SEARCH_POINTS + 1)[1:]
         starts = {path: value * tried for path, value in direction.items()}
-        found = _classify_starts(loop, starts, solver, inside, band is None, key, engine)
+        found = _classify_starts(loop, starts, solver, inside, enough, key, engine)
         good = SEARCH_POINTS if found.recovered.all() else int(np.argmin(found.recovered))
         if good == SEARCH_POINTS:
             return Reach(high, undecided)
@@ -311,8 +329,20 @@ def recoverable_multiple(
     return Reach(float(low), undecided)
 
 
-def _system_ellipsoids(loop: Loop, starts: Mapping[str, np.ndarray], count: int) -> _Ellipsoids:
-    """Return one ellipsoid for each distinct system among the runs; the start of a run does not change it."""
+def _find_ellipsoids(
+    loop: Loop, starts: Mapping[str, np.ndarray], count: int, band: float | None
+) -> tuple[_Ellipsoids, _Ellipsoids | None]:
+    """Return the ellipsoids for the verdict, and those that end a run early (None: no run ends early).
+
+    Each distinct system among the runs has one ellipsoid; the start of a run does not change its system. With a band
+    the ball |x| <= band is the ellipsoid of all runs, and no run ends early.
+    """
+    if not hasattr(loop.initial, "theta"):
+        raise ValueError(f"plant {type(loop.plant).__name__} is no balance; recovery is defined for a balance only")
+    if band is not None:
+        if not 0 < band < np.inf:
+            raise ValueError(f"band = {band:g} is outside (0, inf)")
+        return _Ellipsoids(np.eye(6)[None] / band, np.zeros(1, bool), np.zeros(count, int)), None
     own = [column.reshape(count, -1) for path, column in starts.items() if not path.startswith(INITIAL_PREFIX)]
     first, system = np.zeros(1, int), np.zeros(count, int)
     if own:
@@ -323,11 +353,5 @@ def _system_ellipsoids(loop: Loop, starts: Mapping[str, np.ndarray], count: int)
     roots = np.full_like(shapes, np.inf)
     # S = R'R. An unknown ellipsoid keeps R = inf, so that |R x| <= 1 is false everywhere.
     roots[known] = np.swapaxes(np.linalg.cholesky(shapes[known]), 1, 2)
-    return _Ellipsoids(roots, unstable, system.reshape(-1))
-
-
-def _ball_as_ellipsoid(radius: float, count: int) -> _Ellipsoids:
-    """Return the ball |x| <= radius as the ellipsoid of all runs; raise ValueError for a radius that is no band."""
-    if not 0 < radius < np.inf:
-        raise ValueError(f"band = {radius:g} is outside (0, inf)")
-    return _Ellipsoids(np.eye(6)[None] / radius, np.zeros(1, bool), np.zeros(count, int))
+    found = _Ellipsoids(roots, unstable, system.reshape(-1))
+    return found, found

@@ -11,7 +11,8 @@ from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Claim
 from diffabs.design.proof.exact import he
 from diffabs.design.sdp import solver
-from diffabs.design.sdp.scaling import Frame, analysis_frame, whitening_matrix
+from diffabs.design.sdp.program import damping_matrix
+from diffabs.design.sdp.scaling import Frame, analysis_frame, definite_weight, whitening_matrix
 from diffabs.design.sdp.solver import Unknowns, group_blocks, symmetric_from_blocks
 from diffabs.design.spec import Spec
 
@@ -50,7 +51,9 @@ class Bounds:
     def cost(self) -> Claim | None:
         """Return the claim with the smallest trace P."""
         q, r = self.spec.Q, self.spec.R
-        weight = q + self.k.T @ r @ self.k
+        # W = Q + K'RK may be singular, and P loosened by (more - 1) P then proves no strict inequality. The P of
+        # W + 1e-9 diag W leaves 1e-9 diag W, a margin in each state that scales with the unit of the state.
+        weight = definite_weight(q + self.k.T @ r @ self.k, 1e-9)
         at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
         scaled = at.weight(weight)
         # Congruence by `even` makes the solver's absolute tolerance relative to the weight in every direction.
@@ -75,9 +78,7 @@ class Bounds:
         cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)
 
         def cone(v: Scalar, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
-            flow = v["P"] @ c / np.linalg.norm(c)
-            skew = cot * (flow - np.swapaxes(flow, -1, -2))
-            return [-symmetric_from_blocks([[he(flow)], [-skew, he(flow)]]) - v["t"] * np.eye(2 * len(c))]
+            return [damping_matrix(v["P"] @ c / np.linalg.norm(c), cot) - v["t"] * np.eye(2 * len(c))]
 
         return self._solve_in_frame(
             self.frame,
@@ -118,7 +119,8 @@ class Bounds:
             lambda p, v, more: {
                 "kind": "l2",
                 "P": more * p,
-                "gamma": math.sqrt(more * float(v["g"][0, 0])),
+                # gamma^2 grows a little more than P, so that gamma^2 - Bw'P Bw has a margin in discrete time.
+                "gamma": (1 + 1e-9) * math.sqrt(more * float(v["g"][0, 0])),
                 "Bw": disturbance,
                 "C": l2.output,
                 "D": l2.feedthrough,

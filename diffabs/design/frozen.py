@@ -4,15 +4,13 @@ Stable frozen loops are no proof for parameters that vary, and their poles are f
 Lyapunov matrix is not necessarily unstable: the frozen loops show how stable it is for fixed parameters.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.core.pytree import replace
 from diffabs.core.types import AnyArray, Part
-from diffabs.design.parameter_box import check_box_bounds, evaluate_systems
+from diffabs.design.parameter_box import check_box_bounds, evaluate_grid
 from diffabs.design.polytopes import as_gain_matrix
 
 MAX_POINTS_PER_AXIS, MAX_BOX_SYSTEMS = 17, 5000  # points per parameter; systems in all
@@ -49,13 +47,11 @@ def analyse_frozen_loops(gain: AnyArray, model: Part, over: Mapping[str, Sequenc
         ValueError: A gain that does not fit, a box that `check_box_bounds` refuses, or matrices that are not finite.
     """
     low, high = check_box_bounds(model, over)
-    free = tuple(path for path in over if low[path] < high[path])
+    free = sum(low[path] < high[path] for path in over)
     # The largest equal number of points per axis whose grid stays within MAX_BOX_SYSTEMS; 1e-9 undoes rounding of the
     # root.
-    count = max(2, min(MAX_POINTS_PER_AXIS, int(MAX_BOX_SYSTEMS ** (1 / max(len(free), 1)) + 1e-9)))
-    points = itertools.product(*(np.linspace(low[path], high[path], count) for path in free))
-    grid = np.array(list(points)).reshape(count ** len(free), len(free))
-    data = evaluate_systems(replace(model, low), free, grid)
+    count = max(2, min(MAX_POINTS_PER_AXIS, int(MAX_BOX_SYSTEMS ** (1 / max(free, 1)) + 1e-9)))
+    data, labels, model = evaluate_grid(model, over, count)
     a, b = data.matrices
     modes = np.linalg.eigvals(a + b @ as_gain_matrix(gain, (data.inputs, data.order)))
     if model.period is None:
@@ -64,5 +60,4 @@ def analyse_frozen_loops(gain: AnyArray, model: Part, over: Mapping[str, Sequenc
         # A deadbeat loop has only poles at 0: the smallest float keeps its rate finite.
         rates = -np.log(np.maximum(np.abs(modes).max(axis=1), np.finfo(float).tiny)) / float(model.period)
     i = int(np.argmin(rates))
-    at = {**low, **dict(zip(free, grid[i].tolist(), strict=True))}
-    return FrozenLoops(len(grid), int((rates > 0).sum()), float(rates[i]), at)
+    return FrozenLoops(len(labels), int((rates > 0).sum()), float(rates[i]), labels[i])

@@ -74,7 +74,7 @@ def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9,
 
     Raises:
         ValueError: A path that is no parameter of the model; an interval that is inverted, not finite or out of range;
-            a period that varies; more than 2^12 vertices; matrices that are not finite.
+            a period that varies; `most` below 1; more than 2^12 vertices; matrices that are not finite.
         ModuleNotFoundError: SciPy is not installed.
 
     Examples:
@@ -85,18 +85,18 @@ def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9,
         ((4, 2, 2), (4, 2, 1), 1.0)
     """
     _require_scipy()
+    if most < 1:
+        raise ValueError(f"most = {most} is outside [1, inf): a check needs a point of the grid")
     low, high = check_box_bounds(model, over)
     free = tuple(path for path in over if low[path] < high[path])
     if 2 ** len(free) > MAX_VERTICES:
         raise ValueError(
             f"a box of {len(free)} parameters has {2 ** len(free)} corners, more than {MAX_VERTICES}; fix some"
         )
-    model = replace(model, low)
     box = np.array([[low[path], high[path]] for path in free]).reshape(-1, 2)
-    corners = np.array(list(itertools.product(*box))).reshape(2 ** len(free), len(free))
-    data = evaluate_systems(model, free, corners)
+    data, corners, model = evaluate_grid(model, over, 2)
     rows, kept, coverage = _cover_box(model, free, box, data, grid, most)
-    labels = tuple({**low, **dict(zip(free, corners[i].tolist(), strict=True))} for i in kept)
+    labels = tuple(corners[i] for i in kept)
     return Polytope(*data._replace(rows=rows).matrices, model.period, tuple(model.states), labels, coverage)
 
 
@@ -203,6 +203,30 @@ def evaluate_systems(model: Part, free: tuple[str, ...], points: np.ndarray) -> 
         where = ", ".join(f"{path} = {value:g}" for path, value in zip(free, points[bad][0], strict=True))
         raise ValueError(f"the model's matrices are not finite at {where or 'its parameters'}")
     return _SystemRows(rows, n, m)
+
+
+def evaluate_grid(
+    model: Part, over: Mapping[str, Sequence[float]], points: int
+) -> tuple[_SystemRows, tuple[dict[str, float], ...], Part]:
+    """Return the systems on a grid over a box, the parameters by path of each, and the model at the box's low ends.
+
+    The grid includes the ends. The returned model has the fixed parameters of all systems, and their period.
+
+    Args:
+        model: Model with `matrices()`.
+        over: Box {path: (low, high)}; a parameter with low = high is fixed. The last one runs first.
+        points: Number of values of each parameter, >= 2.
+
+    Raises:
+        ValueError: A box that `check_box_bounds` refuses, or matrices that are not finite.
+    """
+    low, high = check_box_bounds(model, over)
+    free = tuple(path for path in over if low[path] < high[path])
+    axes = itertools.product(*(np.linspace(low[path], high[path], points) for path in free))
+    grid = np.array(list(axes)).reshape(points ** len(free), len(free))
+    labels = tuple({**low, **dict(zip(free, row, strict=True))} for row in grid.tolist())
+    model = replace(model, low)
+    return evaluate_systems(model, free, grid), labels, model
 
 
 def _points(box: np.ndarray, grid: int, most: int, seed: int) -> np.ndarray:

@@ -7,14 +7,11 @@ The vertices are therefore the systems on the grid, corners included, and a proo
 systems between the points is likely, not proved. A finer grid makes it more likely.
 """
 
-import itertools
+import numbers
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
-from diffabs.core.pytree import replace
 from diffabs.core.types import Part
-from diffabs.design.parameter_box import check_box_bounds, evaluate_systems
+from diffabs.design.parameter_box import check_box_bounds, evaluate_grid
 from diffabs.design.polytopes import MAX_VERTICES, Polytope
 
 
@@ -32,14 +29,11 @@ def grid_polytope(model: Part, over: Mapping[str, Sequence[float]], points: int 
         ValueError: A box that `check_box_bounds` refuses, fewer than two points, more than 2^12 systems, or matrices
             that are not finite.
     """
-    if points < 2:
-        raise ValueError(f"points = {points} is outside [2, inf): a grid has the ends of the box")
+    if not isinstance(points, numbers.Integral) or points < 2:
+        raise ValueError(f"points = {points} is no whole number in [2, inf): a grid has the ends of the box")
     low, high = check_box_bounds(model, over)
-    free = tuple(path for path in over if low[path] < high[path])
-    if points ** len(free) > MAX_VERTICES:
-        raise ValueError(f"a grid of {points ** len(free)} systems is more than {MAX_VERTICES}; take fewer points")
-    axes = [np.linspace(low[path], high[path], points) for path in free]
-    grid = np.array(list(itertools.product(*axes))).reshape(points ** len(free), len(free))
-    data = evaluate_systems(replace(model, low), free, grid)
-    labels = tuple({**low, **dict(zip(free, row.tolist(), strict=True))} for row in grid)
+    count = points ** sum(low[path] < high[path] for path in over)
+    if count > MAX_VERTICES:
+        raise ValueError(f"a grid of {count} systems is more than {MAX_VERTICES}; take fewer points")
+    data, labels, model = evaluate_grid(model, over, points)
     return Polytope(*data.matrices, model.period, tuple(model.states), labels)

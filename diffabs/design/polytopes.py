@@ -52,8 +52,8 @@ class Polytope:
         coverage: Check of the hull, if there is one.
 
     Raises:
-        ValueError: Shapes that do not fit, entries that are not finite, a period that is not positive and finite, no
-            vertex or more than 2^12.
+        ValueError: Shapes or labels that do not fit, entries that are not finite, a period that is not positive and
+            finite, no vertex or more than 2^12.
     """
 
     A: np.ndarray
@@ -74,6 +74,10 @@ class Polytope:
             raise ValueError(f"a polytope of {a[0]} vertices is outside [1, {MAX_VERTICES}]: an LMI for each")
         if not (np.isfinite(self.A).all() and np.isfinite(self.B).all()):
             raise ValueError("a vertex of the polytope has an entry that is not finite")
+        labels = len(self.corners), len(self.states)
+        if labels[0] not in (0, a[0]) or labels[1] not in (0, a[1]):
+            needed = f"0 or {a[0]}, one for each vertex, and 0 or {a[1]}, one for each state"
+            raise ValueError(f"numbers of corners and of states' names = {labels}; needed: {needed}")
         if self.period is not None and (objection := find_value_objection(self.period)):
             raise ValueError(f"period = {format_value(self.period)} {objection}")
         if self.period is not None and not 0 < self.period < math.inf:
@@ -141,6 +145,8 @@ def as_gain_matrix(gain: AnyArray, shape: tuple[int, int]) -> np.ndarray:
     Raises:
         ValueError: Another shape, or numbers that are not finite.
     """
+    if objection := find_value_objection(gain):
+        raise ValueError(f"gain = {format_value(gain)} {objection}")
     k = np.atleast_2d(np.array(gain, float))
     if k.shape != shape:
         raise ValueError(f"the gain has shape {k.shape}; inputs and states of the system need {shape}")

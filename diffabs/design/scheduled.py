@@ -17,25 +17,25 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
+from diffabs.design.bounds import BOUND_LOOSENINGS
 from diffabs.design.polytopes import Schedule, as_gain_matrix
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
 from diffabs.design.proof.exact import he
 from diffabs.design.sdp import solver
-from diffabs.design.sdp.scaling import Frame, analysis_frame
+from diffabs.design.sdp.scaling import Frame, analysis_frame, definite_weight
 from diffabs.design.sdp.solver import Unknowns, group_blocks
 from diffabs.design.spec import Spec
 
 SCHEDULE_DECAY_TOLERANCE = 0.01  # relative width at which the search for the fastest decay stops
-# Relative amounts by which the answer is loosened, in this order, until its proof succeeds.
-FORM_LOOSENINGS = (1e-9, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
 def certify_schedule(gain: AnyArray, system: Schedule, spec: Spec, *, fastest: bool = False) -> Certificate:
     """Return the proved properties of a gain on a schedule, with a parameter-dependent P(p).
 
-    The first claim proves `spec.decay` (0 for stability alone), and the cost if `spec` has Q and R. Without a proof it
-    is left out, and the search for the fastest decay too.
+    One claim proves `spec.decay` (0 for stability alone). With Q and R another one, with its own P(p), proves the cost.
+    A proof of the cost is also one of stability, and then the only claim for a decay of 0. A claim without a proof is
+    left out. The search for the fastest decay needs a proof of `spec.decay`.
 
     Args:
         gain: Gain K, constant of shape (m, n) or (n,), or linear between the nodes, shape (N + 1, m, n) for N cells.
@@ -47,17 +47,15 @@ def certify_schedule(gain: AnyArray, system: Schedule, spec: Spec, *, fastest: b
         ValueError: Shapes that do not fit, missing rates, discrete time, or a specification other than decay and cost.
         ModuleNotFoundError: cvxpy is not installed.
     """
-    first = system.cells[0]
-    spec = spec.check(first.order, first.inputs, scheduled=True)
-    if spec.rates is None or first.period is not None:
-        raise ValueError("a schedule needs rates, the bounds of its parameter's derivative, and continuous time")
-    if spec.damping or spec.l2 or spec.input:
-        raise ValueError("over a schedule, decay and cost can be proved; damping, L2 gain, input limit need a polytope")
+    cell = system.cells[0]
+    spec = spec.check(cell.order, cell.inputs, cell.period, scheduled=True)
     gains = gains_at_nodes(gain, system)
-    claims = [_find_claim(gains, system, spec)]
-    if fastest and claims[0] is not None:
-        claims.append(_fastest_decay_claim(gains, system, spec))
-    return Certificate(system, gains, tuple(claim for claim in claims if claim is not None))
+    # In one inequality V' <= -2 rate V - x'(Q + K'RK)x the bound of the cost would grow with the asked decay.
+    cost = None if spec.Q is None else _find_claim(gains, system, Spec(Q=spec.Q, R=spec.R, rates=spec.rates))
+    decay = Spec(decay=spec.decay, rates=spec.rates)
+    first = cost if cost and spec.decay == 0 else _find_claim(gains, system, decay)
+    fast = _fastest_decay_claim(gains, system, spec) if fastest and first else None
+    return Certificate(system, gains, tuple(dict.fromkeys(claim for claim in (first, cost, fast) if claim)))
 
 
 def _fastest_decay_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
@@ -83,13 +81,12 @@ def gains_at_nodes(gain: AnyArray, system: Schedule) -> np.ndarray:
     Raises:
         ValueError: Other shapes.
     """
-    first, k = system.cells[0], np.array(gain, float)
-    shape = (first.inputs, first.order)
-    if k.ndim < 3:
-        return np.repeat(as_gain_matrix(k, shape)[None], len(system.nodes), axis=0)
-    if len(k) != len(system.nodes):
-        raise ValueError(f"the gain has {len(k)} rows of a table; the schedule has {len(system.nodes)} nodes")
-    return np.array([as_gain_matrix(one, shape) for one in k])
+    shape = (system.cells[0].inputs, system.cells[0].order)
+    if np.ndim(gain) < 3:
+        return np.repeat(as_gain_matrix(gain, shape)[None], len(system.nodes), axis=0)
+    if len(gain) != len(system.nodes):
+        raise ValueError(f"the gain has {len(gain)} rows of a table; the schedule has {len(system.nodes)} nodes")
+    return np.array([as_gain_matrix(one, shape) for one in gain])
 
 
 def _find_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
@@ -117,7 +114,7 @@ def _find_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None
     values = unknowns.values(answer.y)
     forms = np.array([frame.form(values[f"P{i}"]) for i in nodes])
     cost = {} if spec.Q is None else {"Q": spec.Q, "R": spec.R}
-    for loosening in FORM_LOOSENINGS if cost else (0.0,):
+    for loosening in BOUND_LOOSENINGS if cost else (0.0,):
         data = {"P": forms * (1 + loosening), "rates": np.array(spec.rates), "rate": spec.decay, **cost}
         claim = Claim("scheduled", data)
         if exact.is_proved(claim.kind, system, gains, claim.data):
@@ -134,11 +131,9 @@ def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: 
     for i, cell in enumerate(system.cells):
         width = float(system.nodes[i + 1] - system.nodes[i])
         low, high = gains[i], gains[i + 1]
-        price = [
-            # 1e-12 keeps the answer strictly inside the inequality that the exact proof requires.
-            frame.weight(weight + part) + 1e-12 * np.eye(n)
-            for part in (low.T @ effort @ low, he(low.T @ effort @ high) / 2, high.T @ effort @ high)
-        ]
+        spent = low.T @ effort @ low, he(low.T @ effort @ high) / 2, high.T @ effort @ high
+        # A margin for the exact proof, as in `Bounds.cost`.
+        price = [frame.weight(definite_weight(weight + each, 1e-9)) for each in spent]
         for a, b in zip(cell.A, cell.B, strict=True):
             closed = frame.states(a + b @ low), frame.states(a + b @ high)
             size = float(max(np.linalg.norm(c) for c in closed))
@@ -155,9 +150,6 @@ def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: 
                     flows = (he(start @ c[0]), (he(start @ c[1]) + he(end @ c[0])) / 2, he(end @ c[1]))
                     forms = (start, (start + end) / 2, end)
                     speed = 2 * spec.decay / frame.tau
-                    return [
-                        -(f + common + speed * p + (0.0 if spec.Q is None else w)) / s - spare
-                        for f, p, w in zip(flows, forms, q, strict=True)
-                    ]
+                    return [-(f + common + speed * p + w) / s - spare for f, p, w in zip(flows, forms, q, strict=True)]
 
                 yield coefficients

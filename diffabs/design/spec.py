@@ -1,6 +1,7 @@
 """Specifications of a design or a certificate; they combine freely, and all are optional."""
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from diffabs.linear.weights import as_weight_matrix
 
 DECAY_RANGE = ParameterSpec("1/s", low=0.0)
 DAMPING_RANGE = ParameterSpec("1", low=0.0, high=1.0, open_high=True)
+MAX_STEP_DECAY = 700.0  # largest decay times the period, so that exp(-decay period) does not round to 0
 L2_RANGE = ParameterSpec("1", low=0.0, open_low=True)
 
 
@@ -73,10 +75,10 @@ class Spec:
     l2: L2Gain | None = None
     rates: tuple[float, float] | None = None
 
-    def check(self, order: int, inputs: int, *, scheduled: bool = False) -> "Spec":
+    def check(self, order: int, inputs: int, period: float | None = None, *, scheduled: bool = False) -> "Spec":
         """Return the specification with full matrices, for a system of `order` states and `inputs` inputs.
 
-        Only a schedule (`scheduled`) has rates.
+        `period` [s] is that of a system in discrete time. Only a schedule (`scheduled`) has rates.
 
         Raises:
             ValueError: A field that does not fit; the message names it, its value and the allowed range.
@@ -89,13 +91,20 @@ class Spec:
                 "Q": as_weight_matrix("Q", self.Q, order, definite=False),
                 "R": as_weight_matrix("R", self.R, inputs, definite=True),
             }
-        _check_number("decay", self.decay, DECAY_RANGE)
+        most = math.inf if period is None else MAX_STEP_DECAY / period
+        _check_number("decay", self.decay, dataclasses.replace(DECAY_RANGE, high=most))
         _check_number("damping", self.damping, DAMPING_RANGE)
+        if self.damping and period is not None:
+            raise ValueError(f"damping = {self.damping:g} needs continuous time; the system's period is {period:g} s")
         if self.rates is not None:
             _check_rates(self.rates)
             if not scheduled:
                 raise ValueError("rates belong to a schedule: a polytope admits every rate, so a spec of it has none")
+        if scheduled and (self.rates is None or period is not None):
+            raise ValueError("a schedule needs rates, the bounds of its parameter's derivative, and continuous time")
         limit, gain = self.input, self.l2
+        if scheduled and (self.damping or gain or limit):
+            raise ValueError("a schedule allows decay and cost; damping, L2 gain, input limit need a polytope")
         if limit:
             values, points = np.atleast_1d(np.array(limit.limit, float)), np.atleast_2d(np.array(limit.points, float))
             if values.shape != (inputs,) or not (np.isfinite(values) & (values > 0)).all():

@@ -1,7 +1,7 @@
 """A loop's controller as static state feedback u = K x on a linear model, the form that a certificate needs.
 
     StateFeedback   K = (k1, k2)
-    BalanceFeedback K unchanged, on the model of a balance (`design.state_feedback_balance`)
+    BalanceFeedback K unchanged, on the model of a balance
     any other       around a plant that is no brake: on the states of the loop at rest (`operating_point`)
     PID             K = (-ki, -(kp + kd wc), ..., kd wc), with the slip error behind the filter wc as the last state
 
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.actuators import Delay, Lag, Limits, RateLimit
+from diffabs.actuators import Delay, Lag, Limits, RateLimit, VoltageLimit
 from diffabs.controllers import (
     PID,
     BalanceFeedback,
@@ -33,7 +33,6 @@ from diffabs.core.loop import Loop
 from diffabs.core.types import AnyArray, Part, PyTree
 from diffabs.core.units import insert_unit, units_of
 from diffabs.core.validity import check_part
-from diffabs.design.state_feedback_balance import reduce_balance_loop
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.operating_point import OperatingPoint, loop_gain, operating_point
 from diffabs.linear.slip_model import Continuous, LowPass, Sampling, SlipModel
@@ -72,10 +71,9 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
     """
     check_part(loop)
     if isinstance(inner_controller(loop.controller), BalanceFeedback):
-        return ReducedLoop(*reduce_balance_loop(loop))
+        return reduce_balance_loop(loop)
     if not hasattr(loop.plant, "frozen"):
         return _reduce_at_rest(loop)
-    sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     controller = inner_controller(loop.controller)
     integral, _, derivative, cutoff = map(float, _gains(controller))
     actuator, by_actuator, exact = _actuator(loop.actuator)
@@ -86,7 +84,7 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
         slip=float(setpoint),
         speed=float(loop.initial.speed),
         actuator=actuator,
-        sampling=Sampling(period=float(sampled.period), delay=float(sampled.delay)) if sampled else Continuous(),
+        sampling=_read_sampling(loop.controller),
         filter=LowPass(cutoff=cutoff) if derivative else Direct(),
         # Without integral action its state would be a pole at 0, and no proof of stability would succeed.
         integral=integral != 0,
@@ -98,6 +96,42 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
     left_out = (*_controller_omissions(controller), *by_actuator, *_loop_omissions(loop))
     neglected = tuple(insert_unit(line, units) for line in left_out)
     return ReducedLoop(model, gain, exact and isinstance(loop.sensor, Direct | Noise | Bias), neglected)
+
+
+def reduce_balance_loop(loop: Loop) -> ReducedLoop:
+    """Return a balance's loop as state feedback on its linear model about upright.
+
+    It is exact if the sensor passes the output unchanged. A voltage limit is neglected but does not count against it.
+
+    Args:
+        loop: Closed loop of a balance.
+
+    Raises:
+        ValueError: A controller other than feedback of the whole state, an actuator other than none or a voltage limit,
+            or a parameter out of its range.
+    """
+    controller = inner_controller(loop.controller)
+    if not isinstance(controller, BalanceFeedback):
+        raise ValueError(f"controller {type(controller).__name__} is not feedback of the whole state")
+    if not isinstance(loop.actuator, Direct | VoltageLimit):
+        raise ValueError(f"actuator {type(loop.actuator).__name__} is not known to a linear model of a balance")
+    model = check_part(BalanceModel(plant=loop.plant, sampling=_read_sampling(loop.controller)))
+    exact = isinstance(loop.sensor, Direct)
+    neglected = [
+        "Everything that is not linear: the proof is about small angles.",
+        "What lies between the points of the grid: a balance is rational in its masses, its hull covers no box.",
+    ]
+    if isinstance(loop.actuator, VoltageLimit):
+        neglected.append(f"The voltage limit of {float(loop.actuator.voltage_max):g} V.")
+    if not exact:
+        neglected.append(f"The sensor ({type(loop.sensor).__name__}).")
+    return ReducedLoop(model, np.asarray(controller.gain, float), exact, tuple(neglected))
+
+
+def _read_sampling(controller: Part) -> Sampling | Continuous:
+    if isinstance(controller, Sampled):
+        return Sampling(period=float(controller.period), delay=float(controller.delay))
+    return Continuous()
 
 
 def feedback_gain(loop: Loop, states: Sequence[str]) -> AnyArray:

@@ -467,7 +467,9 @@ def _schedule_conditions(d: Mapping[str, Any], stored: StoredCertificate) -> Ite
                 flow = he(weighted_sum((1, multiply_matrices(px, cy)), (1, multiply_matrices(py, cx))))
                 falls = weighted_sum((-width / 2, flow), (-rate * width, px), (-rate * width, py))
                 spent = [(-width, d["Q"])] if "Q" in d else []
-                spent += [(-width / 2, he(multiply_matrices(transpose_matrix(kx), d["R"], ky)))] if "R" in d else []
+                # Both orders: he() of one of them would hide that R is not symmetric.
+                for x, y in ((kx, ky), (ky, kx)) if "R" in d else ():
+                    spent.append((-width / 2, multiply_matrices(transpose_matrix(x), d["R"], y)))
                 for speed in d["rates"]:
                     left = weighted_sum((1, falls), (-speed, moved))
                     holds = is_positive_definite(left) and (
@@ -477,33 +479,34 @@ def _schedule_conditions(d: Mapping[str, Any], stored: StoredCertificate) -> Ite
 
 
 def _describe_claim(kind: str, d: Mapping[str, Any], discrete: bool) -> str:
-    """Return the statement of a claim in words, with its numbers."""
-    number = {name: float(value) for name, value in d.items() if isinstance(value, Fraction)}
-    pace = f"{number.get('rate', 0.0):.9g} 1/s"
-    if discrete:
-        pace = f"{number.get('factor', 1.0):.9g} a period"
+    """Return the statement of a claim in words; its numbers keep all digits, as a rounded bound may be no bound."""
+    rate, factor = _format_numbers(d.get("rate", 0)), _format_numbers(d.get("factor", 1))
+    pace = f"{factor} a period" if discrete else f"{rate} 1/s"
+    weights = ", ".join(_describe_numbers(name, d[name]) for name in ("Q", "R") if name in d)
     if kind == "infeasible":
-        some = number.get("factor", 1.0) < 1 if discrete else number.get("rate", 0.0) > 0
+        some = d.get("factor", 1) < 1 if discrete else d.get("rate", 0) > 0
         return f"no common Lyapunov matrix {f'proves a decay of {pace}' if some else 'exists'}"
     if kind == "cost":
-        return f"the cost from x is at most x'Px, trace P = {float(sum(row[i] for i, row in enumerate(d['P']))):.9g}"
+        trace = f"{float(sum(row[i] for i, row in enumerate(d['P']))):.9g}"
+        return f"the cost from x is at most x'Px, trace P about {trace}, for {weights}"
     if kind == "scheduled":
-        low, high = (f"{float(rate):.9g}" for rate in d["rates"])
-        return f"stable, with a decay of at least {pace}, while the parameter moves at {low} to {high} a second"
+        low, high = map(_format_numbers, d["rates"])
+        cost = f", and the cost from x is at most x'P(p)x for {weights}" if weights else ""
+        moves = f"while the parameter p stays within the nodes and moves at {low} to {high} a second"
+        return f"stable, with a decay of at least {pace}, {moves}{cost}"
     if kind == "l2":
         matrices = ", ".join(_describe_numbers(name, d[name]) for name in ("Bw", "C", "D"))
-        gain = f"the L2 gain from w to C x + D u is below {number['gamma']:.9g}"
+        gain = f"the L2 gain from w to C x + D u is below {_format_numbers(d['gamma'])}"
         return f"{gain}, where Bw w acts on the states: {matrices}"
     if kind == "input":
-        limits, starts = _describe_numbers("limit", d["limit"], 9), _describe_numbers("points", d["points"])
+        limits, starts = _describe_numbers("limit", d["limit"]), _describe_numbers("points", d["points"])
         return f"each |u| stays below its limit from every start in the hull of the points: {limits}, {starts}"
-    return {
-        "decay": f"stable, with a decay of at least {pace}, however the system varies",
-        "damping": f"every fixed system is damped by {number.get('zeta', 0.0):.9g} or more",
-    }[kind]
+    if kind == "damping":
+        return f"every fixed system is damped by {_format_numbers(d['zeta'])} or more"
+    return f"stable, with a decay of at least {pace}, however the system varies"
 
 
-def _describe_numbers(name: str, value: Any, digits: int = 6) -> str:
+def _describe_numbers(name: str, value: Any) -> str:
     """Return the name and the entries of nested lists, or their sizes if the entries are many."""
     sizes, part = [], value
     while isinstance(part, list):
@@ -511,10 +514,10 @@ def _describe_numbers(name: str, value: Any, digits: int = 6) -> str:
         part = part[0]
     if math.prod(sizes) > MAX_STATED_NUMBERS:
         return f"{name} of the file ({' by '.join(map(str, sizes))})"
-    return f"{name} = {_format_numbers(value, digits)}"
+    return f"{name} = {_format_numbers(value)}"
 
 
-def _format_numbers(value: Any, digits: int) -> str:
+def _format_numbers(value: Any) -> str:
     if isinstance(value, list):
-        return f"[{', '.join(_format_numbers(each, digits) for each in value)}]"
-    return f"{float(value):.{digits}g}"
+        return f"[{', '.join(map(_format_numbers, value))}]"
+    return repr(float(value)).removesuffix(".0")

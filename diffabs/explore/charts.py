@@ -161,7 +161,7 @@ def change_poles(found: Stability | None) -> JsonObject:
         found: Stability of the loop; None empties the map.
     """
     here = _points(found.poles, found.period) if found else []
-    around = _points(found.corners, found.period) if found else []
+    around = _points(found.corners.poles, found.period) if found else []
     x, y = (np.array([point[i] for point in here + around] or [-1.0]) for i in (0, 1))
     far = _round_up_nicely(1.05 * max(float(np.max(np.abs(x))), 1e-3))
     right = max(0.1 * far, _round_up_nicely(1.05 * float(x.max())) if x.max() > 0 else 0.0)
@@ -187,13 +187,8 @@ def round_for_screen(values: PyTree) -> list[float | None]:
     Args:
         values: Numbers, shape (n,).
     """
-    values = np.asarray(values, float)
-    finite = np.isfinite(values)
-    # log10 needs numbers that are finite and not 0.
-    safe = np.where(finite & (values != 0), values, 1.0)
-    unit = 10.0 ** (np.floor(np.log10(np.abs(safe))) - CHART_DIGITS + 1)
-    near = np.where(finite, np.round(np.where(finite, values, 0.0) / unit) * unit, np.nan)
-    return [None if math.isnan(x) else float(f"{x:.{CHART_DIGITS}g}") for x in near.tolist()]
+    numbers = np.asarray(values, float).tolist()
+    return [float(f"{x:.{CHART_DIGITS}g}") if math.isfinite(x) else None for x in numbers]
 
 
 def _legend(panel: Panel, i: int, top: float) -> JsonObject:

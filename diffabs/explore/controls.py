@@ -82,12 +82,12 @@ class Controls:
             self.refused[key] = partial(self.show, key)
 
     def fan(self, found: Fan | None) -> None:
-        """Show the number of runs in the fan `found`, and the parameters that differ between them."""
+        """Show the number of members of the fan `found`, and the parameters that differ between them."""
         if found is None:
             self.made.set_text("no fan: nothing differs between its runs")
             return
-        lost = f"; {found.diverged} diverged" if found.diverged else ""
-        self.made.set_text(f"{found.members} runs, {found.words}{lost}")
+        lost = [f"; {n} {words}" for n, words in ((found.refused, "refused"), (found.diverged, "diverged")) if n]
+        self.made.set_text(f"{found.members} members, {found.words}{''.join(lost)}")
 
     def _fill(self) -> None:
         self.fields, self.sliders, self.refused = {}, {}, {}
@@ -98,6 +98,8 @@ class Controls:
             for family in EXCHANGEABLE_FAMILIES:
                 if there := self.session.choices(family):
                     self._chooser(family, there, self.session.parts[family], partial(self.session.load_part, family))
+            for note in self.session.given.notes:
+                ui.label(note).classes("note")
             # How far the members of the fan spread around the current values.
             ui.label("fan of 200 runs").classes("group")
             words = {MASS: "masses differ by ±", ROAD: "friction differs by ±"}
@@ -113,10 +115,7 @@ class Controls:
             # Few numbers at first, to keep the page light: rows of the others are built when they are first opened.
             self._rows(self.session.first)
             rest = [key for key in self.session.knobs if key not in self.session.first]
-            with (
-                ui.expansion(f"all other numbers ({len(rest)})").classes("w-full").props("dense data-id=others") as more
-            ):
-                pass
+            more = ui.expansion(f"all other numbers ({len(rest)})").classes("w-full").props("dense data-id=others")
 
             def open_rest(event: Any) -> None:
                 if event.value and not any(key in self.fields for key in rest):

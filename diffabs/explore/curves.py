@@ -14,6 +14,7 @@ from diffabs.explore.panels import Curve, Curves, Fan, Panel, Spread
 from diffabs.linear.robustness import low_discrepancy_points
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.convert import trajectory_columns
 from diffabs.simulate.ensemble import run_batch
@@ -70,7 +71,7 @@ def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
     count = len(trajectory_columns(run, chosen.loop.plant)["t"][1])
     t = np.asarray(run.trajectory.sample.t)[:count]
     panels = tuple(
-        Panel(panel.unit, tuple(Curve(line.name, _finite(line.values[:count])) for line in panel.lines))
+        Panel(panel.unit, tuple(Curve(line.name, line.values[:count]) for line in panel.lines))
         for panel in _layout(run, chosen.loop.plant)
     )
     metrics = {name: float(run.metrics[name]) for name in chosen.objectives}
@@ -103,7 +104,7 @@ def transient_end(found: Curves) -> float:
 def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
     """Return the quantiles of `MEMBERS` runs with different masses and roads, or None if nothing differs.
 
-    Diverged runs do not count. The fan ends where too few runs still go on.
+    Refused and diverged runs do not count. The fan ends where too few runs still go on.
 
     Args:
         chosen: Scenario.
@@ -113,8 +114,9 @@ def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
     if not values:
         return None
     by = draft_solver(chosen) or drawing_solver(chosen, DRAFT_INSTANTS)
+    accepted = batch_admissibility(chosen.loop, values, by).accepted
     batch = Batch(values, keys=np.arange(MEMBERS) + chosen.seed)
-    run: Run = jax.device_get(run_batch(chosen.loop, batch, by, {}, trajectories=True))
+    run: Run = jax.device_get(run_batch(chosen.loop, batch, by, {}, trajectories=True, accepted=accepted))
     # Samples after the end of a run, and diverged runs, are no part of the quantiles.
     lost = np.asarray(run.diverged)
     assert run.trajectory is not None
@@ -125,7 +127,8 @@ def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
     count = int(np.sum(going.mean(axis=0) >= MIN_TRANSIENT_SHARE * max(1e-9, going[:, 0].mean())))
     shown = [panel.lines[0].values for panel in _layout(run, chosen.loop.plant)]
     bands = tuple(_quantiles(np.where(going, values, np.nan)[:, :count]) for values in shown)
-    return Fan(t[longest, :count], bands, MEMBERS, int(lost.sum()), words)
+    refused = int(np.sum(~accepted))
+    return Fan(t[longest, :count], bands, MEMBERS, refused, int(lost.sum()) - refused, words)
 
 
 def fan_members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], str]:
@@ -185,10 +188,6 @@ def _in_kmh(panel: Panel) -> Panel:
     if panel.unit != "m/s":
         return panel
     return Panel("km/h", tuple(Curve(line.name, KMH * line.values) for line in panel.lines))
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(values), values, np.nan)
 
 
 def _describe_end(chosen: Scenario, run: Run, t: np.ndarray) -> str:

@@ -8,14 +8,13 @@ Other users of this machine could forge all of this. So the printed address ends
 a cookie at once, and requests without the cookie are refused.
 """
 
-import http.cookies
 import ipaddress
 import secrets
-import urllib.parse
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
 
-from diffabs.core.types import Table
+from starlette.requests import HTTPConnection  # pyright: ignore[reportMissingImports]  # the extra `explore`
+from starlette.responses import PlainTextResponse  # pyright: ignore[reportMissingImports]
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Any]]
@@ -23,6 +22,7 @@ Send = Callable[[Any], Awaitable[None]]
 
 LOOPBACK_ADDRESS = "127.0.0.1"
 LOOPBACK_NAMES = (LOOPBACK_ADDRESS, "localhost")
+HTTP_PORT = 80  # a browser leaves it out of `Host` and `Origin`
 FOREIGN = "diffabs explore answers only its own page"
 STRANGER = "diffabs explore: the token is missing or wrong; open the whole address that the command has printed"
 # The browser loads nothing from other hosts. Inline scripts are allowed because the framework needs them.
@@ -39,67 +39,46 @@ class Guard:
     def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], port: int, token: str):
         """Protect `app`, served at `port`, with the secret `token` of its user."""
         self.app, self.hosts = app, {f"{name}:{port}" for name in LOOPBACK_NAMES}
+        self.hosts |= {*LOOPBACK_NAMES} if port == HTTP_PORT else set()
         # A browser sends a cookie to every port of a host, so the port is in its name.
         self.token, self.cookie = token, f"diffabs-explore-{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward a request, exchange its token for the cookie, or refuse it."""
-        if scope["type"] == "lifespan" or (self.is_allowed(scope) and self.is_known(scope)):
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        request = HTTPConnection(scope)
+        allowed = self.is_allowed(request)
+        if allowed and self._same([request.cookies.get(self.cookie, "")]):
             await self.app(scope, receive, _with_policy(send) if scope["type"] == "http" else send)
         elif scope["type"] == "websocket":
             # A close before the accept refuses the handshake with 403.
             await receive()
             await send({"type": "websocket.close", "code": 1008})
-        elif not self.is_allowed(scope):
-            await _answer(send, 403, FOREIGN)
-        elif self._same(urllib.parse.parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [])):
-            cookie = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
-            # "/" is the only page. The request's own path is unsafe: "//name" is a host, a line break ends the header.
-            await _answer(send, 303, "", (b"location", b"/"), (b"set-cookie", cookie.encode()))
         else:
-            await _answer(send, 403, STRANGER)
+            answer = PlainTextResponse(f"{STRANGER if allowed else FOREIGN}\n", 403)
+            if allowed and self._same(request.query_params.getlist("token")):
+                cookie = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
+                # "/" is the only page. The request's own path may be unsafe: "//name" is a host.
+                answer = PlainTextResponse("", 303, {"location": "/", "set-cookie": cookie})
+            answer.headers["cache-control"] = "no-store"
+            await answer(scope, receive, send)
 
-    def is_allowed(self, scope: Table) -> bool:
-        """Return whether the request with this `scope` comes from this machine and names the explorer as its host.
+    def is_allowed(self, request: HTTPConnection) -> bool:
+        """Return whether the `request` comes from this machine and names the explorer as its host.
 
         If the request states the page that sent it, this page must be the explorer's.
         """
-        given = _headers(scope)
-        host, origin = given.get(b"host", []), given.get(b"origin", [])
+        host, origin = (request.headers.getlist(name) for name in ("host", "origin"))
         here = len(host) == 1 and host[0] in self.hosts
         # Requests without Origin pass: a browser omits it for the navigation to the page.
         own = origin in ([], [f"http://{host[0]}"]) if here else False
-        return here and own and _loopback(scope.get("client"))
-
-    def is_known(self, scope: Table) -> bool:
-        """Return whether the request with this `scope` has the cookie that replaces the token."""
-        given = []
-        for line in _headers(scope).get(b"cookie", []):
-            try:
-                found = http.cookies.SimpleCookie(line).get(self.cookie)
-            except http.cookies.CookieError:
-                continue
-            given += [found.value] if found else []
-        return self._same(given)
+        return here and own and _loopback(request.client)
 
     # compare_digest takes the same time for every guess, so timing does not reveal the token.
     def _same(self, given: list[str]) -> bool:
         return len(given) == 1 and secrets.compare_digest(given[0].encode(), self.token.encode())
-
-
-def _headers(scope: Table) -> dict[bytes, list[str]]:
-    given: dict[bytes, list[str]] = {}
-    for name, value in scope["headers"]:
-        given.setdefault(name.lower(), []).append(value.decode("latin-1"))
-    return given
-
-
-async def _answer(send: Send, status: int, line: str, *more: tuple[bytes, bytes]) -> None:
-    body = f"{line}\n".encode()
-    headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(body)).encode())]
-    headers += [(b"cache-control", b"no-store"), *more]
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
 
 
 def _loopback(client: Any) -> bool:

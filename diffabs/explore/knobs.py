@@ -8,7 +8,7 @@ import numpy as np
 
 from diffabs.config.values import read_number_in_range, wrong_kind_error
 from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import Part, PyTree
+from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import unit_at
 from diffabs.explore.friction import FACTOR_PATH
 from diffabs.scenario.parameter_paths import canonical_path
@@ -68,6 +68,10 @@ class Knob:
             except ValueError:
                 raise wrong_kind_error(self.name, given.strip(), f"a number in {self.spec.interval()}") from None
         return read_number_in_range(given, self.spec, self.name) / self.scale
+
+    def pick(self, value: Scalar) -> float:
+        """Return this number [SI] from the `value` of its parameter."""
+        return float(np.asarray(value, float)[() if self.place is None else self.place])
 
     def text(self, value: float) -> str:
         """Return a `value` [SI] as text in the displayed unit."""

@@ -46,7 +46,6 @@ body { background: #F3F5F7; color: #1F2933; font-family: 'Inter', 'Roboto', syst
 .busy { color: #B7791F; font-weight: 400; font-size: 11px; }
 .verdict { border-radius: 5px; padding: 7px 9px; border-left: 4px solid #9AA5B1; background: #F3F5F7;
   line-height: 1.35; }
-.verdict b { font-size: 13.5px; }
 .verdict .why { color: #52606D; font-size: 12px; max-height: 84px; overflow: auto; }
 .verdict.certified { border-color: #009E73; background: #E8F6F1; }
 .verdict.refuted { border-color: #D55E00; background: #FCEFE6; }

@@ -219,6 +219,10 @@ class Page:
         if version != self.version:
             return
         self.show_refusal(error)
+        if what == "fan":
+            self.controls.made.set_text("no fan")
+            if self.chart is not None:
+                self.chart.change(charts.clear_curves("fan"))
         if what == "run":
             self.results.measuring.set_visibility(False)
             if self.shown is None:

@@ -48,7 +48,8 @@ class Fan(NamedTuple):
     Attributes:
         t: Instants [s].
         bands: Quantiles of the first curve of each panel, shape (QUANTILES, instants).
-        members: Number of runs.
+        members: Number of members.
+        refused: Number of members that must not be run.
         diverged: Number of diverged runs.
         words: Parameters that differ between the runs, with their spread.
     """
@@ -56,6 +57,7 @@ class Fan(NamedTuple):
     t: np.ndarray
     bands: tuple[np.ndarray, ...]
     members: int
+    refused: int
     diverged: int
     words: str
 

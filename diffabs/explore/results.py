@@ -12,11 +12,7 @@ from diffabs.explore.stability import Stability, format_margin
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 
-HEADS = {
-    CERTIFIED: "certified",
-    REFUTED: "no common Lyapunov matrix",
-    UNDECIDED: "undecided",
-}
+HEADS = {CERTIFIED: "certified", REFUTED: "no common Lyapunov matrix", UNDECIDED: "undecided"}
 MARGINS = {
     "gain_up": "gain may rise to",
     "gain_down": "gain may fall to",
@@ -106,8 +102,9 @@ class ResultsPanel:
         self.map.element.set_visibility(one is not None)
         self.none.set_text(found if isinstance(found, str) else self._of_poles(found))
         for name, (here, worst) in self.margin_cells.items():
-            here.set_text(format_margin(name, one.margins[name]) if one else NO_VALUE)
-            worst.set_text(format_margin(name, one.worst[name]) if one and name in one.worst else NO_VALUE)
+            lowest = one.corners.worst if one else {}
+            here.set_text(format_margin(name, one.margins[name], one.stable) if one else NO_VALUE)
+            worst.set_text(format_margin(name, lowest[name], stable=True) if name in lowest else NO_VALUE)
         self.loop.set_text("" if one is None else "stable" if one.stable else "NOT STABLE")
 
     def verdict(self, found: ProofVerdict) -> None:
@@ -129,6 +126,7 @@ class ResultsPanel:
         """Return a line about the map: sampling, delay, and the corners behind the worst margins."""
         kind = f"sampled every {1e3 * found.period:g} ms, shown as ln(z)/T" if found.period else "continuous time"
         late = f", {1e3 * found.delay:g} ms of delay" if found.delay else ""
-        lost = f", {found.unstable} NOT stable" if found.unstable else ""
-        corners = f"; grey and worst: {found.systems} corners of [design.over]{lost}" if found.systems else ""
+        around = found.corners
+        lost = f", {around.unstable} NOT stable" if around.unstable else ""
+        corners = f"; grey and worst: {around.systems} corners of [design.over]{lost}" if around.systems else ""
         return f"{kind}{late}{corners}"

@@ -21,30 +21,8 @@ from diffabs.explore.guard import LOOPBACK_ADDRESS, Guard
 from diffabs.explore.session import Tools
 
 SHUTDOWN_S = 1  # s that open pages have to close their connections
-WORKER_NAME = "diffabs worker"
 # Python's interval between thread switches. At the default of 5e-3 s a busy thread delays every curve several times.
 THREAD_SWITCH_S = 5e-4
-
-
-def listen_on_loopback(port: int) -> socket.socket:
-    """Return a socket that listens on the loopback address.
-
-    Args:
-        port: Port; 0 is any free one.
-
-    Raises:
-        OSError: The port cannot be used, for example because it is in use.
-    """
-    # The socket listens before the server starts, so that a port in use is reported at once.
-    there = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        there.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        there.bind((LOOPBACK_ADDRESS, port))
-        there.listen(64)
-    except OSError:
-        there.close()
-        raise
-    return there
 
 
 def serve(
@@ -53,7 +31,7 @@ def serve(
     folder: pathlib.Path,
     there: socket.socket,
     *,
-    thread: str = WORKER_NAME,
+    thread: str,
     ready: Callable[[str], None] = lambda url: None,
     browser: bool = False,
 ) -> None:

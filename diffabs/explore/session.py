@@ -13,8 +13,8 @@ import numpy as np
 
 from diffabs.config.values import ScenarioError, read_number_in_range, unknown_name_error, wrong_kind_error
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import ParameterSpec, get, replace
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.pytree import ParameterSpec, get, parameters, replace
+from diffabs.core.types import PyTree
 from diffabs.core.validity import find_problems
 from diffabs.explore import friction, knobs, tuning
 from diffabs.explore.knobs import Knob
@@ -112,14 +112,15 @@ class Session:
     def switch(self, basis: Basis) -> None:
         """Start again from another `basis`.
 
-        If it is the same scenario with another part, edits of all other numbers are kept. `check_edit` must follow.
+        If it is the same scenario with another part, changes of other parameters are kept. `check_edit` must follow.
         """
         changed = self._changed_values() if basis.source == self.source else {}
-        replaced = [family for family, part in basis.parts.items() if part != self.parts[family]]
+        replaced = tuple(f"{family}." for family, part in basis.parts.items() if part != self.parts[family])
         self._begin(basis)
-        for key, value in changed.items():
-            if key in self.knobs and not key.removeprefix("plant.").startswith(tuple(f"{one}." for one in replaced)):
-                self._put(key, value)
+        for path, _, _ in parameters(self._base.loop):
+            if path in changed and not path.removeprefix("plant.").startswith(replaced):
+                self._values[path] = changed[path]
+        self.edited = next((knob for knob in self.knobs.values() if knob.path in self._values), None)
 
     def choices(self, family: str) -> list[str]:
         """Return the parts of a `family` that can be chosen, the scenario's own first.
@@ -166,8 +167,8 @@ class Session:
         )
 
     def adopt(self, loop: Loop) -> None:
-        """Set all numbers to those of another `loop` with the same parts, and accept them."""
-        self._start(loop, {knob.path: np.asarray(get(loop, knob.path), float) for knob in self.knobs.values()})
+        """Set all parameters to those of another `loop` with the same parts, and accept them."""
+        self._start(loop, {path: np.asarray(value, float) for path, _, value in parameters(loop)})
 
     def reset(self) -> None:
         """Return to the numbers of the scenario."""
@@ -179,14 +180,8 @@ class Session:
         return dataclasses.replace(self._base, loop=replace(self._base.loop, values)) if values else self._base
 
     def to_save(self) -> Scenario:
-        """Return the scenario for a file, without a friction factor of 1.
-
-        Raises:
-            ScenarioError: The scenario must not be run.
-        """
+        """Return the scenario for a file, without a friction factor of 1."""
         now = self.scenario()
-        if lines := objections(now):
-            raise ScenarioError(lines[0])
         changed = bool(self._changed_values()) or any(part != AS_GIVEN for part in self.parts.values())
         return friction.without_factor(now.with_loop(now.loop, "explored") if changed else now, self.given)
 
@@ -194,7 +189,7 @@ class Session:
         """Return the current value of the number `key` in SI."""
         knob = self.knobs[key]
         value = self._values.get(knob.path)
-        return _value(get(self._base.loop, knob.path) if value is None else value, knob)
+        return knob.pick(get(self._base.loop, knob.path) if value is None else value)
 
     def _begin(self, basis: Basis) -> None:
         self.source, self.parts, self.given, self._base, self.knobs, self.first = basis
@@ -213,15 +208,10 @@ class Session:
         # A new dict and a new array: threads may still use the old ones.
         self._values, self.edited = {**self._values, knob.path: new}, knob
 
-    def _changed_values(self) -> dict[str, float]:
-        """Return the values [SI] that differ from the scenario's, by key."""
+    def _changed_values(self) -> dict[str, np.ndarray]:
+        """Return the parameters [SI] that differ from the scenario's, by path."""
         loop = self._base.loop
-        changed = {path for path, value in self._values.items() if not np.array_equal(value, get(loop, path))}
-        return {key: self.value(key) for key, knob in self.knobs.items() if knob.path in changed}
-
-
-def _value(value: Scalar, knob: Knob) -> float:
-    return float(np.asarray(value, float)[() if knob.place is None else knob.place])
+        return {path: value for path, value in self._values.items() if not np.array_equal(value, get(loop, path))}
 
 
 def check_edit(knob: Knob, chosen: Scenario) -> None:
@@ -235,7 +225,7 @@ def check_edit(knob: Knob, chosen: Scenario) -> None:
         ScenarioError: The scenario must not be run.
     """
     if lines := objections(chosen):
-        raise ScenarioError(f"{knob.name} = {knob.words(_value(get(chosen.loop, knob.path), knob))}: {lines[0]}")
+        raise ScenarioError(f"{knob.name} = {knob.words(knob.pick(get(chosen.loop, knob.path)))}: {lines[0]}")
 
 
 def objections(chosen: Scenario) -> list[str]:

@@ -24,23 +24,17 @@ class Stability(NamedTuple):
         period: Sampling period of the controller [s], or None in continuous time.
         delay: Delay in the loop [s]. In continuous time the poles do not include it.
         poles: Poles of the closed loop, in z for a sampled loop, else in s.
-        corners: Poles at the corners of the ranges.
         margins: Margins by name, in SI.
-        worst: Worst margins over the corners; empty without corners or with an unstable corner.
         stable: Whether the loop with the current values is stable.
-        unstable: Number of unstable corners.
-        systems: Number of corners.
+        corners: Poles and worst margins at the corners of the ranges.
     """
 
     period: float | None
     delay: float
     poles: np.ndarray
-    corners: np.ndarray
     margins: dict[str, float]
-    worst: dict[str, float]
     stable: bool
-    unstable: int
-    systems: int
+    corners: "CornerLoops"
 
 
 class CornerLoops(NamedTuple):
@@ -51,7 +45,7 @@ class CornerLoops(NamedTuple):
     Attributes:
         of: Key of `corners_of`: equal keys mean equal corners.
         poles: Poles of all corners.
-        worst: Worst margins by name.
+        worst: Worst margins by name; empty without corners or with an unstable corner.
         unstable: Number of unstable corners.
         systems: Number of corners.
     """
@@ -113,17 +107,13 @@ def linear_stability(chosen: Scenario, corners: CornerLoops | None) -> Stability
         ValueError: The loop has no linear model.
     """
     here = band(chosen.loop, {}, 0).systems[0]
-    corners = corners or CornerLoops((), np.array([]), {}, 0, 0)
     return Stability(
         here.loop.period,
         here.loop.delay,
         closed_loop_poles(here.loop.transfer()),
-        corners.poles,
         margin_values(here.margins),
-        corners.worst,
         here.margins.stable,
-        corners.unstable,
-        corners.systems,
+        corners or CornerLoops((), np.array([]), {}, 0, 0),
     )
 
 
@@ -140,15 +130,16 @@ def margin_values(found: Margins) -> dict[str, float]:
     return dict(zip(MARGIN_KEYS, values, strict=True))
 
 
-def format_margin(name: str, value: float) -> str:
+def format_margin(name: str, value: float, stable: bool) -> str:
     """Return a margin as text with its unit.
 
     Args:
         name: Name of the margin.
         value: Value in SI.
+        stable: Whether the loop is stable.
     """
     if math.isnan(value):
-        return "none"
+        return "undecided" if name == "delay" and stable else "none"
     if value == math.inf:
         return "no limit"
     scale, unit = {"phase": (math.degrees(1), "°"), "delay": (1e3, " ms")}.get(name, (1.0, ""))

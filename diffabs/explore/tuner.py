@@ -1,8 +1,8 @@
 """The dialog and the card of a tuning: free parameters, progress, and values before and after."""
 
+import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.config.values import ScenarioError
@@ -17,8 +17,9 @@ from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.explore.page import Page
+    from diffabs.tune.result import TuningProgress
 
-Fields = tuple[Any, Any, tuple[str, str]]  # fields of the lower and the upper bound, and their initial texts
+Fields = tuple[Any, Any]  # fields of the lower and the upper bound
 LOGARITHMIC_LOSS_RATIO = 20  # ratio of the largest to the smallest loss above which the axis is logarithmic
 LOSS = {
     "animation": False,
@@ -67,10 +68,8 @@ class Tuner:
         self.dialog.clear()
         with self.dialog, ui.card().style("min-width: 460px").props("data-id=ask-tuning"):
             ui.label("Tune from here").style("font-weight:600; font-size:15px")
-            free = ui.select(tuning.tunable_parameters(now), value=paths, label="free parameters", multiple=True).props(
-                "dense outlined"
-            )
-            free.classes("w-full").props("use-chips data-id=free")
+            free = ui.select(tuning.tunable_parameters(now), value=paths, label="free parameters", multiple=True)
+            free.classes("w-full").props("dense outlined use-chips data-id=free")
             fields: dict[str, Fields] = {}
             ranges = ui.element("div").classes("grid-table bounds").props("data-id=bounds")
             ranges.style("grid-template-columns: 1fr 92px 92px auto")
@@ -86,9 +85,7 @@ class Tuner:
                     if not self.dialog.value:
                         return  # a second click, while the dialog closes
                     self.dialog.close()
-                    typed = {key: (low.value, high.value) for key, (low, high, _) in fields.items()}
-                    # Unchanged texts are rounded; the exact bounds are used instead.
-                    bounded = {key: pair for key, pair in typed.items() if pair != fields[key][2]}
+                    bounded = {key: (low.value, high.value) for key, (low, high) in fields.items()}
                     self._start(list(free.value or ()), str(small.value), bounded)
 
                 ui.button("start", on_click=start).props("unelevated no-caps data-id=start")
@@ -110,20 +107,21 @@ class Tuner:
                     continue
                 for key, pair in ends.items():
                     ui.label(known[key].name)
-                    shown = (f"{pair[0]:.6g}", f"{pair[1]:.6g}")
-                    low, high = (ui.input(value=text).props("dense outlined") for text in shown)
+                    low, high = (ui.input(value=known[key].text(end)).props("dense outlined") for end in pair)
                     low.props["data-bound"], high.props["data-bound"] = f"{key}-low", f"{key}-high"
-                    fields[key] = (low, high, shown)
+                    fields[key] = (low, high)
                     ui.label(unit_words(known[key].spec.unit)).classes("note")
 
     @staticmethod
     def _about(now: Scenario) -> str:
         task = now.tune
-        lanes = " by ".join(f"{len(values)} of {path}" for path, values in task.over.items()) or "the run shown"
+        grid = " by ".join(f"{len(values)} of {path}" for path, values in task.over.items()) or "the run shown"
+        lanes = f"{task.samples} samples of {' and '.join(task.over)}" if task.samples and task.over else grid
         asked = [f"{name} ≤ {bound:g}" for name, bound in task.limits.items()]
         asked += [f"certified decay ≥ {task.decay:g} 1/s"] if task.decay else []
         asked += [f"damping ≥ {task.damping:g}"] if task.damping else []
-        return f"over {lanes}{'; such that ' + ', '.join(asked) if asked else ''}; at most {task.iterations} iterations"
+        most = f"at most {task.iterations} iterations"
+        return f"over {lanes}; such that {', '.join(asked)}; {most} in each round" if asked else f"over {lanes}; {most}"
 
     def _start(self, paths: list[str], metric: str, bounded: dict[str, tuple[PyTree, PyTree]]) -> None:
         session = self.page.session
@@ -134,7 +132,7 @@ class Tuner:
             return
         self.page.show_refusal(None)
         self.stopping, self.running, self.origin = False, True, session.scenario()
-        self.points: list[tuple[int, float]] = []
+        self.losses: list[float] = []
         self.card.clear()
         with self.card:
             with ui.element("div").classes("card-title"):
@@ -156,7 +154,7 @@ class Tuner:
             posed = self.page.tools.pose(chosen)
             before = curves.run_curves(chosen)
             found = tuning.tune_scenario(
-                chosen, posed, lambda i, loss: later(self._show_progress, i, loss), lambda: self.stopping
+                chosen, posed, lambda progress: later(self._show_progress, progress), lambda: self.stopping
             )
             after = curves.run_curves(found.after)
         except Exception as error:  # the message shows every error
@@ -165,18 +163,20 @@ class Tuner:
             later(self._show_result, chosen, found, before, after)
 
     # Methods that run in the server's thread.
-    def _show_progress(self, iteration: int, loss: float) -> None:
+    def _show_progress(self, progress: "TuningProgress") -> None:
+        iteration, loss = progress.point.iteration, progress.point.loss
         if self.origin is None:
             return
-        self.points.append((iteration, float(f"{loss:.6g}")))
         most = self.origin.tune.iterations
-        self.far.set_text(f"iteration {iteration} of at most {most}, loss {loss:.5g}")
-        self.bar.set_value(min(1.0, len(self.points) / most))
-        data = [(i, point) for i, (_, point) in enumerate(self.points)]
-        losses = [loss for _, loss in data]
-        wide = min(losses) > 0 and max(losses) > LOGARITHMIC_LOSS_RATIO * min(losses)
+        words = f"round {progress.round + 1}, " if progress.round else ""
+        self.far.set_text(f"{words}iteration {iteration} of at most {most}, loss {loss:.5g}")
+        self.bar.set_value(min(1.0, iteration / most))
+        if not math.isfinite(loss):  # an infinite loss has no place in the chart
+            return
+        self.losses.append(float(f"{loss:.6g}"))
+        wide = min(self.losses) > 0 and max(self.losses) > LOGARITHMIC_LOSS_RATIO * min(self.losses)
         axis = {"type": "log" if wide else "value"}
-        self.loss.change({"yAxis": [axis], "series": [{"id": "loss", "data": data}]})
+        self.loss.change({"yAxis": [axis], "series": [{"id": "loss", "data": [*enumerate(self.losses)]}]})
 
     def _gave_up(self, error: Exception) -> None:
         self.running = False
@@ -208,10 +208,10 @@ class Tuner:
             with place.props("data-id=before-after"):
                 for words in ("", "before", "after"):
                     ui.label(words).classes("head number")
-                old, new = (dict(self._values(one, knobs)) for one in (chosen, found.after))
-                moved = {key: (old[key], new[key]) for key in old if knobs[key].path in chosen.tune.free}
-                for key, pair in moved.items():
-                    self._line(knobs[key].label, *(knobs[key].text(value) for value in pair))
+                for knob in knobs.values():
+                    if knob.path in chosen.tune.free:
+                        pair = (knob.pick(get(one.loop, knob.path)) for one in (chosen, found.after))
+                        self._line(knob.label, *map(knob.text, pair))
                 for name in chosen.objectives:
                     pair = (one.metrics[name] for one in (before, after))
                     self._line(name.replace("_", " "), *map(format_metric, pair))
@@ -224,12 +224,6 @@ class Tuner:
         ui.label(words)
         ui.label(before).classes("number")
         ui.label(after).classes("number")
-
-    @staticmethod
-    def _values(one: Scenario, knobs: Any) -> Any:
-        for key, knob in knobs.items():
-            value = np.asarray(get(one.loop, knob.path), float)
-            yield key, float(value if knob.place is None else value[knob.place])
 
     def _keep(self) -> None:
         self.card.set_visibility(False)

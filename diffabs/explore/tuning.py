@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from diffabs.core.pytree import get, parameters
 from diffabs.core.types import PyTree
 from diffabs.explore.knobs import Knob
 from diffabs.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from diffabs.tune.result import TuningProgress
 
 
 class TuningTask(NamedTuple):
@@ -67,9 +70,9 @@ def default_tuning(chosen: Scenario) -> tuple[list[str], str]:
 
 
 def bounds_on_page(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> dict[str, tuple[float, float]]:
-    """Return the bounds of a free parameter in displayed units, by the key of each of its numbers.
+    """Return the bounds of a free parameter in SI, by the key of each of its numbers.
 
-    They are the bounds of [tune], else the ends of the sliders.
+    They are the bounds or the declared range that [tune] gives. Without any they are the ends of the sliders.
 
     Args:
         chosen: Scenario.
@@ -81,14 +84,15 @@ def bounds_on_page(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> di
     """
     mine = {key: knob for key, knob in known.items() if knob.path == path}
     given = chosen.tune.free.get(path)
-    if given is None and not (mine and all(knob.low is not None for knob in mine.values())):
+    if path not in chosen.tune.free and not (mine and all(knob.low is not None for knob in mine.values())):
         raise ScenarioError(f"tune.free.{path} has no range: it is a matrix, or not finite here")
 
     def end(knob: Knob, side: int) -> float:
         if given is None:
-            return float((knob.low, knob.high)[side] or 0.0)
+            ends = (knob.spec.low, knob.spec.high) if path in chosen.tune.free else (knob.low, knob.high)
+            return float(ends[side] or 0.0) / knob.scale
         values = np.asarray(given[side], float)
-        return float(values if knob.place is None or not values.ndim else values[knob.place]) * knob.scale
+        return float(values if knob.place is None or not values.ndim else values[knob.place])
 
     return {key: (end(knob, 0), end(knob, 1)) for key, knob in mine.items()}
 
@@ -110,8 +114,8 @@ def scenario_with_goal(
         paths: Paths of the free parameters.
         metric: Name of the metric.
         known: Numbers of the loop by key.
-        bounded: Typed bounds (low, high) in the displayed unit, by key of a number. Other numbers have the bounds of
-            `bounds_on_page`.
+        bounded: Texts of the bounds (low, high) in the displayed unit, by key of a number. A bound without a text, or
+            with an unchanged one, is that of `bounds_on_page`.
 
     Raises:
         ScenarioError: There is no free parameter, or no such metric. Also raised for a bound that is not in the
@@ -128,14 +132,14 @@ def scenario_with_goal(
 
 
 def tune_scenario(
-    chosen: Scenario, posed: TuningTask, told: Callable[[int, float], None], stopping: Callable[[], bool]
+    chosen: Scenario, posed: TuningTask, told: "Callable[[TuningProgress], None]", stopping: Callable[[], bool]
 ) -> TuningFound:
     """Return the result of a tuning by a scenario's [tune], from one start: the current values.
 
     Args:
         chosen: Scenario.
         posed: Runs and constraints.
-        told: Callback with iteration and loss.
+        told: Callback with the progress.
         stopping: Callback that returns True to end the tuning.
 
     Raises:
@@ -158,7 +162,7 @@ def tune_scenario(
     found = tune(
         problem,
         method=Method(starts=1, seed=task.seed, stopping=Stopping(iterations=task.iterations)),
-        progress=lambda progress: told(progress.point.iteration, progress.point.loss),
+        progress=told,
         stopping=stopping,
     )
     return TuningFound(dataclasses.replace(chosen, loop=found.loop), found.met, found.reason.value)
@@ -167,17 +171,17 @@ def tune_scenario(
 def _range(
     chosen: Scenario, path: str, known: Mapping[str, Knob], bounded: Mapping[str, tuple[PyTree, PyTree]]
 ) -> tuple[PyTree, PyTree] | None:
-    """Return the lower and the upper bound of a parameter in SI, in its shape."""
-    ends = {
-        **bounds_on_page(chosen, path, known),
-        **{key: ends for key, ends in bounded.items() if known[key].path == path},
-    }
-    read = {key: tuple(known[key].read(end) for end in pair) for key, pair in ends.items()}
-    for key, (low, high) in read.items():
+    """Return the lower and the upper bound of a parameter in SI, in its shape; None for the declared range."""
+    given, read = bounds_on_page(chosen, path, known), {}
+    for key, ends in given.items():
+        knob = known[key]
+        typed = bounded.get(key, map(knob.text, ends))
+        # The text of an unchanged bound is rounded; the exact bound is used instead.
+        low, high = (end if text == knob.text(end) else knob.read(text) for text, end in zip(typed, ends, strict=True))
         if not low < high:
-            knob = known[key]
             raise ScenarioError(f"tune.free.{knob.name}: {knob.text(low)} is not below {knob.words(high)}")
-    if not read:
-        return chosen.tune.free[path]  # of a matrix
+        read[key] = (low, high)
+    if path in chosen.tune.free and read == given:
+        return chosen.tune.free[path]
     low, high = zip(*read.values(), strict=True)
     return (low, high) if np.shape(get(chosen.loop, path)) else (low[0], high[0])

@@ -26,6 +26,7 @@ from diffabs.core.pytree import ParameterSpec, arrays, parameters, prepare_parts
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import unit_at
+from diffabs.core.validity import find_problems
 from diffabs.simulate.step.runge_kutta import rk4_step
 
 MAX_STEPS_PER_SAMPLE = 64  # simulation steps in a period, for a target that moves by itself
@@ -147,15 +148,22 @@ def computer_program(
 
     Args:
         loop: Closed loop.
-        step: Step of the simulation [s], by which a target that moves by itself is advanced; by default the period.
+        step: Step of the simulation [s], by which a target that moves by itself is advanced; None for the period.
             The number of steps in a period is rounded to a whole number.
         dtype: Type of the real numbers, np.float32 or np.float64.
         given_target: True makes the target an input and leaves the reference out.
 
     Raises:
-        NotExported: The controller runs in continuous time, or a period has more than MAX_STEPS_PER_SAMPLE steps.
-            Without `given_target`, also a reference that follows measurements, ticks or has events.
+        ValueError: The step is not positive and finite, or the type is neither float32 nor float64.
+        NotExported: A parameter is no number or has a wrong value or shape, the controller runs in continuous time,
+            or a period has more than MAX_STEPS_PER_SAMPLE steps. Without `given_target`, also a reference that follows
+            measurements, ticks or has events.
     """
+    if step is not None and not 0 < step < np.inf:
+        raise ValueError(f"step = {step:g} s: a positive and finite number is needed")
+    if np.dtype(dtype) not in (np.float32, np.float64):
+        raise ValueError(f"dtype = {np.dtype(dtype)}: float32 or float64 is needed")
+    check_numbers(loop)
     loop = with_sampled_controller(loop)
     controller: Part = loop.controller
     with jax.enable_x64(True):
@@ -201,6 +209,20 @@ def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Itera
     for path, spec, value in parameters(loop):
         if path.partition(".")[0] in families:
             yield DeviceParameter(path, np.asarray(value, float), spec)
+
+
+def check_numbers(part: Part, prefix: str = "") -> None:
+    """Check the parameters of a part before their names and values become code.
+
+    Args:
+        part: Part, or a whole loop.
+        prefix: Text before every name in a message, `"plant."`.
+
+    Raises:
+        NotExported: A parameter is no number, is out of range, breaks a rule between parameters, or has a wrong shape.
+    """
+    if lines := list(find_problems(part, prefix)):
+        raise NotExported("; ".join(lines))
 
 
 def with_sampled_controller(loop: Loop) -> Loop:

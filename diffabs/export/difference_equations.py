@@ -1,10 +1,12 @@
 """A sampled controller as linear difference equations, valid while no limit is active."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.types import AnyArray, JsonObject, Scalar
-from diffabs.export.device import NotExported, with_sampled_controller
+from diffabs.export.device import NotExported, check_numbers, with_sampled_controller
 from diffabs.linear.opened_loop import linear_controller
 
 ENTRY_ROUNDING = 1e-12  # relative to a matrix's largest coefficient; smaller coefficients are rounding errors
@@ -26,11 +28,14 @@ def difference_equations(loop: Loop, target: Scalar = None) -> JsonObject:
         "period" [s].
 
     Raises:
-        NotExported: The controller runs in continuous time, or the loop has no linear model at rest on the setpoint.
+        NotExported: A parameter is no number or has a wrong value or shape, the controller runs in continuous time, or
+            the loop has no linear model at rest on the setpoint.
     """
+    check_numbers(loop)
     loop = with_sampled_controller(loop)
     try:
-        found = linear_controller(loop, target)
+        with jax.enable_x64(True):
+            found = linear_controller(jax.tree.map(lambda x: jnp.asarray(x, float), loop), target)
     except ValueError as error:
         raise NotExported(str(error)) from None
     found = found._replace(**{name: _round_entries(getattr(found, name)) for name in "ABCD"})

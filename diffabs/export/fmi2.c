@@ -237,19 +237,14 @@ EXPORT fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueR
   return fmi2Error;
 }
 
-EXPORT fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference at[], size_t n,
-                                              const int order[], const double value[])
-{
-  (void)c, (void)at, (void)n, (void)order, (void)value;
-  return fmi2Error;
-}
-
-EXPORT fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference at[], size_t n,
-                                               const int order[], double value[])
-{
-  (void)c, (void)at, (void)n, (void)order, (void)value;
-  return fmi2Error;
-}
+#define NO_DERIVATIVES(name, type)                                                                                     \
+  EXPORT fmi2Status name(fmi2Component c, const fmi2ValueReference at[], size_t n, const int order[], type value[])    \
+  {                                                                                                                    \
+    (void)c, (void)at, (void)n, (void)order, (void)value;                                                              \
+    return fmi2Error;                                                                                                  \
+  }
+NO_DERIVATIVES(fmi2SetRealInputDerivatives, const double)
+NO_DERIVATIVES(fmi2GetRealOutputDerivatives, double)
 
 EXPORT fmi2Status fmi2CancelStep(fmi2Component c)
 {
@@ -257,11 +252,16 @@ EXPORT fmi2Status fmi2CancelStep(fmi2Component c)
   return fmi2Error;
 }
 
-EXPORT fmi2Status fmi2GetStatus(fmi2Component c, int kind, fmi2Status *value)
-{
-  (void)c, (void)kind, (void)value;
-  return fmi2Discard;
-}
+#define NO_STATUS(name, type)                                                                                          \
+  EXPORT fmi2Status fmi2Get##name(fmi2Component c, int kind, type *value)                                              \
+  {                                                                                                                    \
+    (void)c, (void)kind, (void)value;                                                                                  \
+    return fmi2Discard;                                                                                                \
+  }
+NO_STATUS(Status, fmi2Status)
+NO_STATUS(IntegerStatus, int)
+NO_STATUS(BooleanStatus, fmi2Boolean)
+NO_STATUS(StringStatus, fmi2String)
 
 EXPORT fmi2Status fmi2GetRealStatus(fmi2Component c, int kind, double *value)
 {
@@ -271,22 +271,4 @@ EXPORT fmi2Status fmi2GetRealStatus(fmi2Component c, int kind, double *value)
     return fmi2Discard;
   *value = ((model *)c)->time;
   return fmi2OK;
-}
-
-EXPORT fmi2Status fmi2GetIntegerStatus(fmi2Component c, int kind, int *value)
-{
-  (void)c, (void)kind, (void)value;
-  return fmi2Discard;
-}
-
-EXPORT fmi2Status fmi2GetBooleanStatus(fmi2Component c, int kind, fmi2Boolean *value)
-{
-  (void)c, (void)kind, (void)value;
-  return fmi2Discard;
-}
-
-EXPORT fmi2Status fmi2GetStringStatus(fmi2Component c, int kind, fmi2String *value)
-{
-  (void)c, (void)kind, (void)value;
-  return fmi2Discard;
 }

@@ -18,7 +18,7 @@ import zipfile
 from typing import Any
 from xml.etree import ElementTree as xml
 
-from diffabs.compiler.emit.c99_words import is_name
+from diffabs.compiler.emit.c99_words import Words, is_name
 from diffabs.compiler.runtime.toolchain import NoCompiler, find_compiler
 from diffabs.config.values import make_printable
 from diffabs.core.loop import Loop
@@ -51,8 +51,8 @@ def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, abou
 
     Raises:
         ValueError: Step or duration is not positive and finite.
-        NotExported: The name is no identifier, an operation has no translation, a state is not a real number, or no C
-            compiler works.
+        NotExported: The name is no identifier, a parameter of plant or start is no number or has a wrong value or
+            shape, an operation has no translation, a state is not a real number, or no C compiler works.
     """
     if not is_name(name):
         raise NotExported(f"{name!r} is no name that C has for a function: letters, digits and _")
@@ -82,24 +82,22 @@ def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, abou
 def _source(plant: PlantSource, guid: str, step: float) -> str:
     """Return all C of the FMU as one file."""
     outputs = sum(one.role == "output" for one in plant.variables)
-    begun = ", ".join(_number(one.value) for one in plant.variables)
+    number = Words("double", lambda op, place: place).literal  # a literal has no place
+    begun = ", ".join(number(one.value) for one in plant.variables)
     struct = "double v[VARIABLES], x[STATES], time;\n  int phase, ready;\n  char guid[sizeof GUID];"
-    limits = {name: ", ".join(_number(getattr(one, name)) for one in plant.variables) for name in ("low", "high")}
+    limits = {name: ", ".join(number(getattr(one, name)) for one in plant.variables) for name in ("low", "high")}
     head = (
         "#include <math.h>\n#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n\n"
-        f'#define GUID "{guid}"\n#define VARIABLES {len(plant.variables)}\n#define OUTPUTS {outputs}\n'
-        f"#define STATES {plant.states}\n#define STEP {step!r}\n\ntypedef struct {{\n  {struct}\n}} model;\n\n"
+        # Constants, not macros: a macro would replace variables of the same name in the plant's code.
+        f'static const char GUID[] = "{guid}";\nstatic const double STEP = {step!r};\n'
+        f"enum {{ VARIABLES = {len(plant.variables)}, OUTPUTS = {outputs}, STATES = {plant.states} }};\n\n"
+        f"typedef struct {{\n  {struct}\n}} model;\n\n"
         f"static const double begun[VARIABLES] = {{{begun}}};\n"
         f"static const double low[VARIABLES] = {{{limits['low']}}};\n"
         f"static const double high[VARIABLES] = {{{limits['high']}}};\n"
     )
     glue = (importlib.resources.files("diffabs.export") / "fmi2.c").read_text(encoding="utf-8")
     return f"{head}\n{plant.text}\n{glue}"
-
-
-def _number(value: float) -> str:
-    """Return the C literal of a number."""
-    return {"inf": "INFINITY", "-inf": "-INFINITY", "nan": "NAN"}.get(str(value), repr(value))
 
 
 def _compile_library(source: str) -> bytes:

@@ -20,7 +20,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, canonical_dtypes, parameters, prepare_parts
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import unit_at
-from diffabs.export.device import NotExported
+from diffabs.export.device import NotExported, check_numbers
 from diffabs.export.lowered import fill_shapes, number_leaves, trace_outputs
 from diffabs.simulate.step.runge_kutta import rk4_step
 
@@ -69,8 +69,11 @@ def plant_source(loop: Loop) -> PlantSource:
         loop: Closed loop.
 
     Raises:
-        NotExported: An operation has no translation, or a state is not a real number.
+        NotExported: A parameter of plant or start is no number or has a wrong value or shape, an operation has no
+            translation, or a state is not a real number.
     """
+    check_numbers(loop.plant, "plant.")
+    check_numbers(loop.initial, "initial.")
     with jax.enable_x64(True):
         typed = jax.tree.map(lambda x: jnp.asarray(x, float), canonical_dtypes((loop.plant, loop.initial)))
         variables = _variables(loop)
@@ -161,10 +164,10 @@ class _Written:
         yield f"static void {head}\n{{"
         yield from (f"  (void){name};" for name in unused)
         yield from self.words.operations(live_nodes(list(results.values())), "  ")
-        for k, node in results.items():
-            yield f"  const double n{k} = {self.words.name(node)};"
+        names = {k: f"n{k}_" for k in results}  # no variable is called n, a number and _
+        yield from (f"  const double {names[k]} = {self.words.name(node)};" for k, node in results.items())
         # Store last: a result may read the old value of another one.
-        yield from (f"  m->{array}[{k}] = n{k};" for k in results)
+        yield from (f"  m->{array}[{k}] = {name};" for k, name in names.items())
         yield "}\n"
 
 

@@ -13,8 +13,10 @@ from typing import Any
 
 import jax
 
+from diffabs.core.arrays import as_rule_array
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes, part, pytree
+from diffabs.core.rules import Rule
 from diffabs.linear.linearization import StateSpace, linearize
 from diffabs.linear.slip_model import Continuous, Sampling, SlipModel
 from diffabs.linear.zero_order_hold import discretise_held_input
@@ -49,10 +51,13 @@ class BalanceModel:
         """
         return _matrices(self)
 
-    def problems(self) -> Iterator[str]:
-        """Yield an error for a sampling delay, because this model has no state for the previous input."""
-        if isinstance(self.sampling, Sampling) and self.sampling.delay != 0:
-            yield f"sampling.delay = {self.sampling.delay:g} s is outside [0, 0] s: this model has none"
+    def rules(self) -> Iterator[Rule]:
+        """Yield the rule that a sampling delay is 0, because this model has no state for the previous input."""
+        if isinstance(self.sampling, Sampling):
+            delay, line = self.sampling.delay, "is outside [0, 0] s: this model has none"
+            yield Rule(
+                as_rule_array(delay) == 0, f"sampling.delay {line}", lambda: f"sampling.delay = {delay:g} s {line}"
+            )
 
 
 @jax.jit

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from diffabs.actuators import Lag
+from diffabs.controllers.sampled import sampling_rules
 from diffabs.core.blocks import Direct
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
+from diffabs.core.rules import Rule
 from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
 from diffabs.linear.linearization import (
     REMAINING_STATE_ITERATIONS,
@@ -54,10 +56,9 @@ class Sampling:
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
-    def problems(self) -> Iterator[str]:
-        """Yield an error if the delay exceeds the period."""
-        if not self.delay <= self.period:
-            yield f"delay = {self.delay:g} s exceeds the period of {self.period:g} s"
+    def rules(self) -> Iterator[Rule]:
+        """Yield the rule delay <= period."""
+        yield from sampling_rules(None, self.delay, self.period)
 
 
 @pytree

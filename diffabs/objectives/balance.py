@@ -9,7 +9,7 @@ from diffabs.core.numerics import clamp, larger, later_of_larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Part, PyTree, Scalar, Vector
-from diffabs.objectives.tracking import FinalError, held_value, integral_value, keep_memory, no_integral
+from diffabs.objectives.tracking import FinalValue, HeldValue, Integral
 
 RATE_NAMES = ("theta_rate", "psi_rate", "phi_rate")
 ANGLE_NAMES = ("theta", "psi", "phi")
@@ -23,7 +23,7 @@ def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Scalar:
 
 
 @pytree
-class Fell:
+class Fell(FinalValue):
     """1 if the run reached its stop, such as `Fallen`, else 0 [1].
 
     A value of 0 does not prove that the run comes to rest; `diffabs.design.attraction` gives a proof.
@@ -33,8 +33,6 @@ class Fell:
     failure = 0.0  # a fall
     physical = (0.0, 1.0)
 
-    start, flow, update = FinalError.start, no_integral, keep_memory
-
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return 1 if the run reached the stop, else 0."""
         del memory
@@ -42,13 +40,11 @@ class Fell:
 
 
 @pytree
-class FinalNorm:
+class FinalNorm(FinalValue):
     """sqrt(x'x) at the end of the run [1], x = (theta, psi, phi, theta', psi', phi') in rad and rad/s."""
 
     unit = "1"
     physical = (0.0, math.inf)
-
-    start, flow, update = Fell.start, no_integral, keep_memory
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return |x| of the last sample."""
@@ -56,8 +52,8 @@ class FinalNorm:
         return _norm(ending.sample.output)
 
 
-def _greatest_angle(name: str) -> tuple[PyTree, PyTree, PyTree, PyTree]:
-    """Return start, flow, update and value of the greatest |angle|, from the cubic of every step."""
+def _greatest_angle(name: str) -> tuple[PyTree, PyTree]:
+    """Return start and update of the greatest |angle|, from the cubic of every step."""
 
     def start(self: Part, sample: Sample) -> Memory:
         """Return the memory with the first |angle|."""
@@ -72,31 +68,31 @@ def _greatest_angle(name: str) -> tuple[PyTree, PyTree, PyTree, PyTree]:
         falls = jnp.where(angle.start >= 0, angle.falls, angle.times(-1.0).falls)
         return later_of_larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()), falls)
 
-    return start, no_integral, update, held_value
+    return start, update
 
 
 @pytree
-class PeakLean:
+class PeakLean(HeldValue):
     """Greatest |theta| of the frame [rad]."""
 
     unit = "rad"
     physical = (0.0, math.inf)
 
-    start, flow, update, value = _greatest_angle("theta")
+    start, update = _greatest_angle("theta")
 
 
 @pytree
-class PeakArmAngle:
+class PeakArmAngle(HeldValue):
     """Greatest |psi| of the arm [rad]."""
 
     unit = "rad"
     physical = (0.0, math.inf)
 
-    start, flow, update, value = _greatest_angle("psi")
+    start, update = _greatest_angle("psi")
 
 
-def _greatest_size(size: Scalar) -> tuple[PyTree, PyTree, PyTree, PyTree]:
-    """Return start, flow, update and value of the greatest size(sample).
+def _greatest_size(size: Scalar) -> tuple[PyTree, PyTree]:
+    """Return start and update of the greatest size(sample).
 
     The search covers both ends of every step. It covers the inside only of a smooth step, in which no limit is reached:
     otherwise the cubic may leave the limits.
@@ -116,17 +112,17 @@ def _greatest_size(size: Scalar) -> tuple[PyTree, PyTree, PyTree, PyTree]:
             ends, falls = jnp.where(segment.smooth, cubic.greatest(), ends), segment.smooth & cubic.falls
         return later_of_larger(memory.held, ends, falls)
 
-    return start, no_integral, update, held_value
+    return start, update
 
 
 @pytree
-class PeakVoltage:
+class PeakVoltage(HeldValue):
     """Greatest |u| at the motor [V]."""
 
     unit = "V"
     physical = (0.0, math.inf)
 
-    start, flow, update, value = _greatest_size(lambda sample: jnp.abs(sample.control))
+    start, update = _greatest_size(lambda sample: jnp.abs(sample.control))
 
 
 def motor_torque(sample: Sample) -> Scalar:
@@ -140,17 +136,17 @@ def motor_torque(sample: Sample) -> Scalar:
 
 
 @pytree
-class PeakTorque:
+class PeakTorque(HeldValue):
     """Greatest absolute torque of the motor, without its friction [N m]."""
 
     unit = "N m"
     physical = (0.0, math.inf)
 
-    start, flow, update, value = _greatest_size(lambda sample: jnp.abs(motor_torque(sample)))
+    start, update = _greatest_size(lambda sample: jnp.abs(motor_torque(sample)))
 
 
 @pytree
-class SoftLoss:
+class SoftLoss(FinalValue):
     """1/(1 + (radius/|x|)^(1/softness)) of the last state x [1]. Here |x|^2 is the sum of `weight` times x^2.
 
     x is (theta, psi, phi, theta', psi', phi') in rad and rad/s. The loss is near 0 for a run that comes to rest, near 1
@@ -165,8 +161,6 @@ class SoftLoss:
     radius: Scalar = param(default=0.1, unit="1", above=0.0)
     softness: Scalar = param(default=0.3, unit="1", above=0.0)
 
-    start, flow, update = Fell.start, no_integral, keep_memory
-
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the loss, a sigmoid of log |x|."""
         del memory
@@ -175,7 +169,7 @@ class SoftLoss:
 
 
 @pytree
-class RestTime:
+class RestTime(HeldValue):
     """Time [s] from t = 0 after which theta, psi and phi all stay within +-`band` of upright.
 
     The value is 0 for a run that never leaves the band, and infinite for one that ends outside.
@@ -186,8 +180,6 @@ class RestTime:
     unreached = math.inf
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
-
-    flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory of a run that rests from t = 0."""
@@ -211,7 +203,7 @@ class RestTime:
 
 
 @pytree
-class BalanceCost:
+class BalanceCost(Integral):
     """Integral of x'diag(q) x + r u^2 dt [rad^2 s], where u is the voltage at the motor [V].
 
     x is (theta, psi, phi, theta', psi', phi') in rad and rad/s.
@@ -222,8 +214,6 @@ class BalanceCost:
 
     q: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
     r: Scalar = param(default=0.0, unit="rad^2/V^2", low=0.0)
-
-    update, value = keep_memory, integral_value
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory with integral 0."""

@@ -10,19 +10,11 @@ from diffabs.core.numerics import larger
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Scalar
-from diffabs.objectives.tracking import (
-    FinalError,
-    held_value,
-    integral_value,
-    keep_memory,
-    no_integral,
-    start_held,
-    start_integral,
-)
+from diffabs.objectives.tracking import FinalValue, HeldValue, Integral
 
 
 @pytree
-class StopTime:
+class StopTime(FinalValue):
     """Time to the stop [s]: the time of the last sample, plus the time that the loop's stop extrapolates.
 
     `Standstill` extrapolates to rest, v/a. A run that does not stop is extrapolated, too, with its last deceleration a
@@ -32,8 +24,6 @@ class StopTime:
     unit = "s"
     physical = (0.0, math.inf)
 
-    start, flow, update = FinalError.start, no_integral, keep_memory
-
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the time of the last sample plus the remaining time [s]."""
         del memory
@@ -41,7 +31,7 @@ class StopTime:
 
 
 @pytree
-class StopDistance:
+class StopDistance(FinalValue):
     """Distance to the stop [m]: the distance of the last sample, plus the distance that the loop's stop extrapolates.
 
     `Standstill` extrapolates to rest, v^2/(2 a). A run that does not stop is extrapolated, too, with its last
@@ -51,8 +41,6 @@ class StopDistance:
     unit = "m"
     physical = (0.0, math.inf)
 
-    start, flow, update = FinalError.start, no_integral, keep_memory
-
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the distance of the last sample plus the remaining distance [m]."""
         del memory
@@ -60,7 +48,7 @@ class StopDistance:
 
 
 @pytree
-class LockedTime:
+class LockedTime(HeldValue):
     """Time [s] during which the slip exceeds `threshold`; 0 if the wheel never locks.
 
     A root of the step's cubic locates each crossing.
@@ -72,8 +60,6 @@ class LockedTime:
 
     threshold: Scalar = param(default=0.99, unit="1", above=0.0, below=1.0)
 
-    start, flow, value = start_held, no_integral, held_value
-
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the part of the step above the threshold [s]."""
         slip = segment.output(lambda output: output.slip).minus(self.threshold)
@@ -83,15 +69,13 @@ class LockedTime:
 
 
 @pytree
-class Effort:
+class Effort(Integral):
     """Integral of u^2 dt, where u is the actuator's output, in the square of its unit times s; for a torque [N^2 m^2
     s].
     """
 
     unit = "control^2 s"
     physical = (0.0, math.inf)
-
-    start, update, value = start_integral, keep_memory, integral_value
 
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
         """Return u^2."""
@@ -114,15 +98,13 @@ class Varied(NamedTuple):
 
 
 @pytree
-class Variation:
+class Variation(HeldValue):
     """Total variation of the control, a brake's torque [N m]: the integral of |du| along the run, with jumps. It
     measures chattering.
     """
 
     unit = "control"
     physical = (0.0, math.inf)
-
-    flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory with the first control and variation 0."""
@@ -152,7 +134,7 @@ class Variation:
 
 
 @pytree
-class TorqueRate:
+class TorqueRate(HeldValue):
     """Greatest |du/dt| of the actuator's output u at the instants of the integration, for a torque [N m/s].
 
     A jump counts as its height divided by the grid's step, so it depends on the step. An actuator with a lag has no
@@ -162,7 +144,7 @@ class TorqueRate:
     unit = "control/s"
     physical = (0.0, math.inf)
 
-    start, flow, value = Variation.start, no_integral, Variation.value
+    start, value = Variation.start, Variation.value
 
     def update(self, memory: Memory, segment: Segment) -> Varied:
         """Return the greatest rate up to the step's end, from the jump before the step and the rates at its ends."""

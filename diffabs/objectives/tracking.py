@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
+from diffabs.core.arrays import as_rule_array
 from diffabs.core.cubic import Cubic
 from diffabs.core.numerics import larger, later_of_larger, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
@@ -22,51 +22,49 @@ from diffabs.core.types import Part, PyTree, Scalar, Vector
 MIN_SETPOINT = 0.01  # least denominator of an overshoot, in the unit of the first signal
 
 
-def no_integral(self: Part, memory: Memory, sample: Sample) -> Scalar:
-    """Return (): the `flow` of an objective without an integral.
+class FinalValue:
+    """Base of objectives; without further methods the memory stays empty."""
 
-    Args:
-        self: The objective; it has no effect.
-        memory: The accumulator; it has no effect.
-        sample: The present sample; it has no effect.
-    """
-    del self, memory, sample
-    return ()
+    def start(self, sample: Sample) -> Memory:
+        """Return an empty memory."""
+        del sample
+        return Memory()
 
+    def flow(self, memory: Memory, sample: Sample) -> Scalar:
+        """Return (): there is no integral."""
+        del memory, sample
+        return ()
 
-def keep_memory(self: Part, memory: Memory, segment: Segment) -> PyTree:
-    """Return the held memory unchanged: the `update` of an objective that is only an integral.
-
-    Args:
-        self: The objective; it has no effect.
-        memory: The accumulator.
-        segment: The step; it has no effect.
-    """
-    del self, segment
-    return memory.held
+    def update(self, memory: Memory, segment: Segment) -> PyTree:
+        """Return the held memory unchanged."""
+        del segment
+        return memory.held
 
 
-def integral_value(self: Part, memory: Memory, ending: Ending) -> Scalar:
-    """Return the integral: the `value` of an objective that is only an integral.
+class Integral(FinalValue):
+    """Base of objectives that are only an integral, from 0."""
 
-    Args:
-        self: The objective; it has no effect.
-        memory: The accumulator.
-        ending: End of the run; it has no effect.
-    """
-    del self, ending
-    return memory.flow
+    def start(self, sample: Sample) -> Memory:
+        """Return the integral 0."""
+        return Memory(flow=0.0 * sample.output[0])
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Return the integral."""
+        del ending
+        return memory.flow
 
 
-def start_integral(self: Part, sample: Sample) -> Memory:
-    """Return the integral 0: the `start` of an objective that is only an integral.
+class HeldValue(FinalValue):
+    """Base of objectives that update what they hold at each step; by default a number, from 0."""
 
-    Args:
-        self: The objective; it has no effect.
-        sample: First sample; it sets shape and type.
-    """
-    del self
-    return Memory(flow=0.0 * sample.output[0])
+    def start(self, sample: Sample) -> Memory:
+        """Return the held number 0."""
+        return Memory(held=0.0 * sample.output[0])
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Return the held number."""
+        del ending
+        return memory.held
 
 
 def tracking_error(sample: Sample) -> Scalar:
@@ -76,15 +74,6 @@ def tracking_error(sample: Sample) -> Scalar:
         sample: A sample of the run, or another tuple with `output` and `setpoint`.
     """
     return sample.output[0] - sample.setpoint
-
-
-def highest_signal(output: PyTree) -> float:
-    """Return the greatest possible value of the first signal; infinity if the output has no `highest`.
-
-    Args:
-        output: Output of the plant.
-    """
-    return getattr(output, "highest", math.inf)
 
 
 def absolute_integral(cubic: Cubic, integral: Callable[[PyTree], PyTree]) -> Scalar:
@@ -99,31 +88,8 @@ def absolute_integral(cubic: Cubic, integral: Callable[[PyTree], PyTree]) -> Sca
     return jnp.where(cubic.start * cubic.end < 0, jnp.abs(left) + jnp.abs(whole - left), jnp.abs(whole))
 
 
-def held_value(self: Part, memory: Memory, ending: Ending) -> Scalar:
-    """Return the held memory: the `value` of an objective that is its memory.
-
-    Args:
-        self: The objective; it has no effect.
-        memory: The accumulator.
-        ending: End of the run; it has no effect.
-    """
-    del self, ending
-    return memory.held
-
-
-def start_held(self: Part, sample: Sample) -> Memory:
-    """Return the held sum 0: the `start` of an objective that sums over steps.
-
-    Args:
-        self: The objective; it has no effect.
-        sample: First sample; it sets shape and type.
-    """
-    del self
-    return Memory(held=0.0 * sample.output[0])
-
-
 @pytree
-class IAE:
+class IAE(HeldValue):
     """Integral of |e| dt, e = y - setpoint, in the unit of y times s; for a slip [s].
 
     The cubic of e is integrated on both sides of its zero.
@@ -132,8 +98,6 @@ class IAE:
     unit = "signal s"
     physical = (0.0, math.inf)
 
-    start, flow, value = start_held, no_integral, held_value
-
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the integral of |e| over the step."""
         e = segment.error()
@@ -141,13 +105,11 @@ class IAE:
 
 
 @pytree
-class ITAE:
+class ITAE(HeldValue):
     """Integral of t |e| dt, by the method of `IAE`, in the unit of y times s^2; for a slip [s^2]."""
 
     unit = "signal s^2"
     physical = (0.0, math.inf)
-
-    start, flow, value = start_held, no_integral, held_value
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the integral of t |e| over the step."""
@@ -168,13 +130,11 @@ class Sided(NamedTuple):
 
 
 @pytree
-class MaxSlip:
+class MaxSlip(HeldValue):
     """Greatest slip of the run [1], at most 1. Its derivative jumps where two maxima are equal."""
 
     unit = "1"
     physical = (-1.0, 1.0)
-
-    flow, value = no_integral, held_value
 
     def start(self, sample: Sample) -> Memory:
         """Return the first slip."""
@@ -187,7 +147,7 @@ class MaxSlip:
 
 
 @pytree
-class Overshoot:
+class Overshoot(HeldValue):
     """Overshoot as a fraction of the final setpoint r [1]: max(0, (max y - r)/max(r, 0.01)).
 
     The floor 0.01, in the unit of y, avoids a division by 0 where a reference ends at slip 0. If the first setpoint is
@@ -199,8 +159,6 @@ class Overshoot:
     unit = "1"
     physical = (0.0, math.inf)
 
-    flow = no_integral
-
     def start(self, sample: Sample) -> Memory:
         """Return the side of the setpoint and the first value on this side."""
         side = jnp.where(sample.setpoint < 0, -1.0, 1.0)
@@ -209,8 +167,8 @@ class Overshoot:
     def update(self, memory: Memory, segment: Segment) -> Sided:
         """Return the greatest value up to the end of the step, from the step's cubic."""
         side, greatest = memory.held
-        signal = segment.output().times(side)
-        value = smaller(signal.greatest(), highest_signal(segment.end.output))
+        signal, output = segment.output().times(side), segment.end.output
+        value = smaller(signal.greatest(), getattr(output, "highest", math.inf))
         return Sided(side, later_of_larger(greatest, value, signal.falls))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
@@ -237,7 +195,7 @@ class Settling(NamedTuple):
 
 
 @pytree
-class SettlingTime:
+class SettlingTime(HeldValue):
     """Time [s] from t = 0 after which |y - setpoint| stays within a band.
 
     The value is 0 for a run that never leaves the band, and infinite for one that ends outside. The band is `share` of
@@ -254,8 +212,6 @@ class SettlingTime:
 
     share: Scalar = param(default=0.02, unit="1", low=0.0, below=1.0)
     band: Scalar = param(default=0.0, unit="signal", low=0.0)
-
-    flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory of a run that is settled from t = 0."""
@@ -282,14 +238,14 @@ class SettlingTime:
         """Return half the width of the band, for a sample or another tuple with a `setpoint`."""
         return larger(self.share * jnp.abs(seen.setpoint - first), self.band)
 
-    def problems(self) -> Iterator[str]:
-        """Yield a message if `share` and `band` are both 0."""
-        if np.all(np.asarray(self.share) == 0) and np.all(np.asarray(self.band) == 0):
-            yield "share and band are both 0; a settling time needs a band of some width"
+    def rules(self) -> Iterator[Rule]:
+        """Yield the rule that `share` or `band` is positive."""
+        line = "share and band are both 0; a settling time needs a band of some width"
+        yield Rule((as_rule_array(self.share) > 0) | (as_rule_array(self.band) > 0), line, lambda: line)
 
 
 @pytree
-class ShareAtLimit:
+class ShareAtLimit(HeldValue):
     """Fraction of the run's time [1] during which the controller's command is at or beyond `low` or `high`.
 
     A step with one end at a limit counts by half. `at_limits` returns this objective with the limits of a loop.
@@ -301,8 +257,6 @@ class ShareAtLimit:
     low: Scalar = param(default=-math.inf, unit="control", below=math.inf, infinite=True)
     high: Scalar = param(default=math.inf, unit="control", above=-math.inf, infinite=True)
 
-    start, flow = start_held, no_integral
-
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the step, half the step, or 0 [s]."""
         ends = [(x.command <= self.low) | (x.command >= self.high) for x in (segment.start, segment.end)]
@@ -311,7 +265,8 @@ class ShareAtLimit:
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the share [1]; 0 for a run of zero length."""
         t = ending.sample.t
-        return jnp.where(t > 0, memory.held / jnp.where(t > 0, t, 1.0), 0.0)
+        # The sum of the steps may exceed t by rounding.
+        return jnp.where(t > 0, smaller(memory.held / jnp.where(t > 0, t, 1.0), 1.0), 0.0)
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rule low <= high."""
@@ -349,18 +304,11 @@ def at_limits(loop: Part) -> ShareAtLimit:
 
 
 @pytree
-class FinalError:
+class FinalError(FinalValue):
     """|y - setpoint| at the end of the run, in the unit of y."""
 
     unit = "signal"
     physical = (0.0, math.inf)
-
-    flow, update = no_integral, keep_memory
-
-    def start(self, sample: Sample) -> Memory:
-        """Return an empty memory."""
-        del sample
-        return Memory()
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the final error."""
@@ -381,7 +329,7 @@ class Quadratic(NamedTuple):
 
 
 @pytree
-class QuadraticCost:
+class QuadraticCost(Integral):
     """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt, without a unit of its own.
 
     Here x1 is the integral of e, and x2 = e. u is the actuator's output, and ff the feedforward.
@@ -394,8 +342,6 @@ class QuadraticCost:
 
     q: Vector = param(default=(1.0, 1.0), unit="1", low=0.0)
     r: Scalar = param(default=1.0, unit="1", above=0.0)
-
-    update = keep_memory
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory with both integrals 0."""
@@ -410,8 +356,3 @@ class QuadraticCost:
         """Return the cost."""
         del ending
         return memory.flow.cost
-
-    def problems(self) -> Iterator[str]:
-        """Yield a message if q does not have shape (2,)."""
-        if np.shape(self.q) != (2,):
-            yield f"q has shape {np.shape(self.q)}; it needs (2,): integral and error"

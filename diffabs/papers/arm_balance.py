@@ -176,15 +176,14 @@ def largest_possible_multiples(plant: ArmBalance, riders: Any) -> np.ndarray:
     )
 
 
-def heaviest(plant: ArmBalance, gain: np.ndarray, low: float = 50.0, high: float = 200.0) -> float:
-    """Return the mass of the heaviest rider [kg] that a gain stabilises in the linear model, by bisection to 1 g.
+def heaviest(plant: ArmBalance, gain: np.ndarray) -> float:
+    """Return the mass of the heaviest rider [kg], at most 200, that a gain stabilises in the linear model, to 1 g.
 
     Args:
         plant: A two-wheeler.
-        gain: K of u = K x, shape (6,).
-        low: Mass [kg] that the gain is known to stabilise.
-        high: Upper end of the search [kg].
+        gain: K of u = K x, shape (6,), that is known to stabilise 50 kg.
     """
+    low, high = 50.0, 200.0  # kg
     while high - low > 1e-3:
         mass = (low + high) / 2
         a, b = upright_model(replace(plant, {"rider_mass": mass}))

@@ -49,29 +49,26 @@ def variation(run: Run) -> float:
     return float(np.sum(np.abs(np.diff(run_columns(run)["torque"]))))
 
 
-def jerk(run: Run, after: float = LATE_TIME) -> float:
-    """Return the greatest |da/dt| of the vehicle between stored samples [m/s^3].
+def jerk(run: Run) -> float:
+    """Return the greatest |da/dt| of the vehicle between stored samples from `LATE_TIME` on [m/s^3].
 
     Args:
         run: Run with a trajectory.
-        after: Time from which samples count [s].
     """
     one = run_columns(run)
     t = one["t"]
     rates = np.abs(np.diff(one["deceleration"]) / np.diff(t))
-    return float(np.max(rates[t[:-1] >= after]))
+    return float(np.max(rates[t[:-1] >= LATE_TIME]))
 
 
-def rebounds(run: Run, begin: float = 0.3, end: float = 1.0) -> int:
-    """Return the number of sign changes of the wheel's acceleration within a time window.
+def rebounds(run: Run) -> int:
+    """Return the number of sign changes of the wheel's acceleration from 0.3 s to 1 s.
 
     Args:
         run: Run with a trajectory.
-        begin: Start of the time window [s].
-        end: End of the time window [s].
     """
     one = run_columns(run)
-    rate = np.diff(one["wheel_speed"])[(one["t"][:-1] >= begin) & (one["t"][:-1] < end)]
+    rate = np.diff(one["wheel_speed"])[(one["t"][:-1] >= 0.3) & (one["t"][:-1] < 1.0)]
     return int(np.sum(np.diff(np.sign(rate)) != 0))
 
 

@@ -372,35 +372,35 @@ def fit_step(curves: StepCurves, rig: LabRig) -> Identified:
     )  # fmt: skip
 
 
-def compare_steps(rig: LabRig, fitted: bool = True) -> list[JsonObject]:
+def compare_steps(rig: LabRig) -> list[JsonObject]:
     """Return how far the mask's and the identified rig are from the three step-braking curves.
 
     Args:
         rig: Identified rig; its brake torque is `brake_gain` at full command, with `brake_offset` 0.
-        fitted: Also fit friction, brake torque and lag of this rig to each curve alone. No other number depends on it.
 
     Returns:
         For each command: `measured`, with the `fall_time` [s]; `mask` and `identified`, from `match_step`. `fitted` is
-        the same for the fit, with `friction` [1], `brake_torque` [N m], `brake_rate` [1/s] and their deviations.
+        the same for a fit of this rig to each curve alone, with `friction` [1], `brake_torque` [N m], `brake_rate`
+        [1/s] and their deviations. No other number depends on this fit.
     """
     rows = []
     for command in STEP_COMMANDS:
         curves = read_step(command)
+        found = fit_step(curves, rig)
+        values, deviations = found.values, found.uncertainty.deviations
+        fitted = match_step(curves, found.part.loop.plant) | {
+            name + suffix: factor * float(of[f"loop.plant.{path}"])
+            for name, path, factor in (("friction", "road.w4", 1.0), ("brake_torque", "brake_gain", command),
+                                       ("brake_rate", "brake_rate", 1.0))
+            for suffix, of in (("", values), ("_deviation", deviations))
+        }  # fmt: skip
         row = {
             "command": command,
             "measured": {"fall_time": _fall_time(curves.t, curves.wheel)},
             "mask": match_step(curves, MASK),
             "identified": match_step(curves, with_scaled_brake(rig)),
+            "fitted": fitted,
         }
-        if fitted:
-            found = fit_step(curves, rig)
-            values, deviations = found.values, found.uncertainty.deviations
-            row["fitted"] = match_step(curves, found.part.loop.plant) | {
-                name + suffix: factor * float(of[f"loop.plant.{path}"])
-                for name, path, factor in (("friction", "road.w4", 1.0), ("brake_torque", "brake_gain", command),
-                                           ("brake_rate", "brake_rate", 1.0))
-                for suffix, of in (("", values), ("_deviation", deviations))
-            }  # fmt: skip
         rows.append(row)
     return rows
 

@@ -9,9 +9,7 @@ plant is a user's own, in `examples/NAME.py`.
     undecidable    a number, a parameter or a part is missing
 """
 
-import csv
 import functools
-import io
 import json
 import math
 import pathlib
@@ -310,7 +308,7 @@ def judge_row(row: Table) -> JsonObject:
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObject:
-    """Write the figure, `table.json`, `table.csv` and `summary.json` into the folder, and return the summary.
+    """Write the figure, `table.json` and `summary.json` into the folder, and return the summary.
 
     Args:
         folder: Existing folder.
@@ -320,9 +318,8 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
     for group in _by_source(read_rows()):
         progress(f"literature: {group[0]['title']}")
         rows += [judge_row(row) for row in group]
-    progress("literature: figure and tables")
+    progress("literature: figure and table")
     files.write_file(folder / "table.json", write_json(rows).encode())
-    files.write_file(folder / "table.csv", write_table_csv(rows).encode())
     solver = load(SHOWN, integrated=False).solver
     summary = {
         "paper": "literature",
@@ -360,20 +357,6 @@ def write_json(rows: list[JsonObject]) -> str:
         "rows": [_round_row(row) for row in rows],
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
-
-
-def write_table_csv(rows: list[JsonObject]) -> str:
-    """Return the rows of the benchmark table as CSV.
-
-    Args:
-        rows: Rows of `judge_row`.
-    """
-    text = io.StringIO()
-    rounded = [_round_row(row) for row in rows]
-    writer = csv.DictWriter(text, list(rounded[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rounded)
-    return text.getvalue()
 
 
 def _round_row(row: JsonObject) -> JsonObject:

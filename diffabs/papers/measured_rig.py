@@ -47,6 +47,7 @@ BRAKING_SPEED = 1700 * RPM  # rad/s of the drum, at which the motor stops and th
 SIGMA_SPEED, SIGMA_SLIP = 3.0, 0.01  # rad/s and 1: scales of the residuals; only their ratio counts
 WHEEL_RADIUS, DRUM_RADIUS = 0.6004 / (2 * np.pi), 0.619 / (2 * np.pi)  # m, the perimeters in the driver
 HARDLY_TURNS = 20.0  # rad/s; below it a slip counts less in the fit
+MAX_KNOWN_SLIP, MIN_KNOWN = 0.9, 4  # largest slip of a reading that tells the vehicle's speed; fewest for a cubic
 # the rig with the numbers in the mask of the maker's Simulink model
 MASK = LabRig(
     wheel_inertia=7.5281e-3, drum_inertia=25.603e-3, wheel_friction=1.2e-4, drum_friction=2.25e-4, drum_stiction=0.093,
@@ -91,7 +92,7 @@ class Record(NamedTuple):
         """
         if np.isinf(self.stop_time):
             return float(np.inf)
-        known = (self.slip < 0.9) & (self.t < self.stop_time)
+        known = (self.slip < MAX_KNOWN_SLIP) & (self.t < self.stop_time)
         left = 1 - self.slip[known]
         cubic = np.polyfit(self.t[known], self.wheel[known] * WHEEL_RADIUS / left, 3, w=left)
         t = np.linspace(0.0, self.stop_time, 400)
@@ -151,13 +152,9 @@ class RecordMatch:
     stop_distance: float
 
 
-def read_curves(folder: pathlib.Path | None = None) -> dict[str, np.ndarray]:
-    """Return the readings by name of the curve, each of shape (n, 2): abscissa and value.
-
-    Args:
-        folder: Folder with `measured_rig.csv`; by default that of the package.
-    """
-    path = (folder or pathlib.Path(__file__).parent) / "measured_rig.csv"
+def read_curves() -> dict[str, np.ndarray]:
+    """Return the readings of `measured_rig.csv` by name of the curve, each of shape (n, 2): abscissa and value."""
+    path = pathlib.Path(__file__).with_name("measured_rig.csv")
     curves: dict[str, list[tuple[float, float]]] = {}
     with path.open(encoding="utf-8") as lines:
         for name, x, y in list(csv.reader(line for line in lines if not line.startswith("#")))[1:]:
@@ -174,7 +171,8 @@ def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Rec
             wheel_speed_rad_per_s and slip_1, every 10 ms on the axis of the figure. None takes the packaged readings.
 
     Raises:
-        ScenarioError: A file lacks a column, a number or a sample, or begins after the start of the brake.
+        ScenarioError: A file lacks a column, a number or a sample, begins after the start of the brake, or has fewer
+            than 4 rows that tell the vehicle's speed.
     """
     if data is None:
         curves = read_curves()
@@ -192,30 +190,33 @@ def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Rec
             raise ScenarioError(
                 f"{data}: {experiment.name}.csv needs a row every {PERIOD:g} s from {experiment.start} s on"
             )
+        if np.sum((wheel > 0) & (slip < MAX_KNOWN_SLIP)) < MIN_KNOWN:
+            needed = f"{MIN_KNOWN} rows with a wheel speed above 0 rad/s and a slip below {MAX_KNOWN_SLIP}"
+            raise ScenarioError(f"{data}: {experiment.name}.csv needs {needed}")
         times, commands = np.arange(len(t)) * PERIOD, np.where(slip < experiment.threshold, 1.0, 0.0)
     return Record(experiment.threshold, times, wheel, slip, commands, experiment.printed_distance)
 
 
 def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> np.ndarray:
     """Return these columns of a CSV file with a header, shape (n, columns)."""
-    rows = list(csv.DictReader(files.read_content(path).decode().splitlines()))
+    raw = files.read_content(path)
     try:
+        rows = list(csv.DictReader(raw.decode().splitlines()))
         table = np.array([[float(row[name]) for name in columns] for row in rows]).reshape(-1, len(columns))
         if np.isfinite(table).all():
             return table
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, csv.Error):
         pass
-    raise ScenarioError(f"{path}: needs the columns {', '.join(columns)}, with a number in every row")
+    raise ScenarioError(f"{path}: needs UTF-8 text with the columns {', '.join(columns)}, and a number in every row")
 
 
-def build_record_loop(record: Record, given: bool, rig: LabRig = MASK, actuator: Part | None = None) -> Loop:
+def build_record_loop(record: Record, given: bool, rig: LabRig = MASK) -> Loop:
     """Return the loop of an experiment.
 
     Args:
         record: Record of the experiment.
         given: True plays the recorded commands; False lets the loop's relay switch.
         rig: Plant.
-        actuator: Actuator in front of the plant's brake; by default a dead time.
     """
     relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
     return braking(
@@ -224,7 +225,7 @@ def build_record_loop(record: Record, given: bool, rig: LabRig = MASK, actuator:
         sensor=EncoderSlip(period=PERIOD),
         reference=FixedSlip(slip=record.threshold),
         controller=PlayedCommand(commands=record.commands, period=PERIOD) if given else relay,
-        actuator=DeadTime() if actuator is None else actuator,
+        actuator=DeadTime(),
         stop=Standstill(speed=0.05),
     )
 
@@ -351,22 +352,17 @@ def compare_with_record(recorded: RecordedRun, record: Record, first: float = 0.
     )
 
 
-def compare_with_maker(until: float = 1.2) -> list[JsonObject]:
+def compare_with_maker() -> list[JsonObject]:
     """Return the largest differences of `MASK` from the maker's own simulations.
 
     Both wheels start at 180 rad/s. The relay reads the true slip every 10 ms. Below 1 m/s the maker's model smooths
-    friction, so the comparison ends before.
-
-    Args:
-        until: Last instant of the relay's runs that counts [s]; the open loop counts until 0.31 s.
+    friction, so the comparison ends before, at 1.2 s.
 
     Returns:
         A row for each simulation: its name, `wheel_rpm` (not for the open loop) and `slip`.
     """
-    curves, start = (
-        read_curves(),
-        DrivenStart(speed=180 * MASK.drum_radius, slip=1 - MASK.wheel_radius / MASK.drum_radius),
-    )
+    curves = read_curves()
+    start = DrivenStart(speed=180 * MASK.drum_radius, slip=1 - MASK.wheel_radius / MASK.drum_radius)
 
     def run_of(controller: Part, name: str, end: float) -> tuple[Callable[[str], np.ndarray], JsonObject]:
         loop = braking(plant=MASK, initial=start, controller=controller, stop=Standstill(speed=0.05),
@@ -386,7 +382,7 @@ def compare_with_maker(until: float = 1.2) -> list[JsonObject]:
     rows = []
     relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
     for threshold in ("0.1", "0.7"):
-        difference, row = run_of(relay, f"maker-simulation-slip-{threshold}", until)
+        difference, row = run_of(relay, f"maker-simulation-slip-{threshold}", 1.2)
         rows.append(
             {**row, "wheel_rpm": float(difference("wheel").max() / RPM), "slip": float(difference("slip").max())}
         )

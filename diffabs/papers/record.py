@@ -146,9 +146,10 @@ def experiment(config: Any, results: Params, figures: Params) -> JsonObject:
 
     Args:
         config: Dataclass of the experiment's settings; its field `out` is the folder.
-        results: Results, as for JSON.
+        results: Results, as for JSON; a number that is not finite, such as the mean of no run, becomes None.
         figures: Figures by file name without suffix.
     """
+    results = json.loads(json.dumps(results), parse_constant=lambda _: None)
     folder = pathlib.Path(config.out)
     folder.mkdir(parents=True, exist_ok=True)
     names = save_figures(figures, folder)

@@ -238,17 +238,6 @@ class ArmBalance:
         scale = fall + self.kinetic_energy(start) + 0.5 * self.stiffness * start.phi**2
         return BalanceAudit(plant=self, first=self.energy(start), scale=scale)
 
-    def power(self, state: ArmState, control: Scalar) -> tuple[Scalar, Scalar]:
-        """Return the mechanical power tau psi' of the motor and the dissipation d phi'^2 of the rider's damper [W].
-
-        Energy' is the first minus the second. The motor's power is negative where the motor brakes the arm.
-
-        Args:
-            state: Angles [rad] and rates [rad/s].
-            control: Motor voltage [V].
-        """
-        return self.torque(state.psi_rate, control) * state.psi_rate, self.damping * state.phi_rate**2
-
     def limits(self, gain: AnyArray) -> np.ndarray:
         """Return the row, shape (..., 1, 6), for which the motor's current is within its limit where |row x| <= 1.
 
@@ -307,7 +296,7 @@ class ArmBalance:
     def cautions(self) -> Iterator[str]:
         """Yield a message if the spring cannot hold the rider on an upright frame."""
         least = self.rider_mass * self.gravity * self.rider_height
-        if not self.stiffness > least:
+        if self.rider_mass > 0 and not self.stiffness > least:
             yield (
                 f"stiffness = {self.stiffness:g} N m/rad does not hold the rider: even on an upright frame that needs "
                 f"more than m3 g hg = {least:g} N m/rad"

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Part, Scalar
-from diffabs.objectives.tracking import no_integral
+from diffabs.objectives.tracking import HeldValue
 
 FORGIVEN = 0.01  # tolerance for a whole run, as a fraction of the energy scale
 SPEED_ROUNDING = 1e-6  # single precision: fraction of the energy scale in one step; ten times as much of the distance
@@ -33,20 +33,23 @@ def _driving_power(before: Any, after: Any) -> Scalar:
     return jnp.maximum(jnp.maximum(before, after), 0.0)
 
 
-def _zero(self: Part, sample: Sample) -> Memory:
-    """Return the memory with no gain of energy."""
-    del self
-    return Memory(held=0.0 * sample.t)
+class _Audit(HeldValue):
+    """Base of audits, which sum energies."""
 
+    scale: Scalar
 
-def _excess(self: Part, memory: Memory, ending: Ending) -> Scalar:
-    """Return the unexplained gain of energy relative to the tolerance [1]."""
-    del ending
-    return memory.held / (FORGIVEN * self.scale)
+    def start(self, sample: Sample) -> Memory:
+        """Return the memory with no gain of energy."""
+        return Memory(held=0.0 * sample.t)
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Return the unexplained gain of energy relative to the tolerance [1]; above 1 the run is not physical."""
+        del ending
+        return memory.held / (FORGIVEN * self.scale)
 
 
 @pytree
-class BrakeAudit:
+class BrakeAudit(_Audit):
     """Audit of a braked vehicle, whose kinetic energy is that of two masses: one at the car's speed and one at the
     wheel's rim.
 
@@ -64,8 +67,6 @@ class BrakeAudit:
     radius: Scalar = param(unit="m", above=0.0)
     scale: Scalar = param(unit="J", above=0.0)
     commanded: bool = static(default=False)
-
-    start, flow, value = _zero, no_integral, _excess
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum of the steps' unexplained gains of energy [J], this step included.
@@ -96,7 +97,7 @@ def _leaps(a: BrakeOutput, b: BrakeOutput, h: Scalar) -> Scalar:
 
 
 @pytree
-class BalanceAudit:
+class BalanceAudit(_Audit):
     """Audit of a two-wheeler with a motor at one joint: the energy at the end is at most `first` plus the motor's work.
 
     The audit evaluates the energy only at the end of the run, because every evaluation costs five cosines.
@@ -110,8 +111,6 @@ class BalanceAudit:
     plant: Part = part()
     first: Scalar = param(unit="J")
     scale: Scalar = param(unit="J", above=0.0)
-
-    start, flow = _zero, no_integral
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum of the work [J] that the motor may have done, this step included.

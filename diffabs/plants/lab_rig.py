@@ -46,16 +46,7 @@ from diffabs.core.pytree import param, part, pytree
 from diffabs.core.rules import Rule
 from diffabs.core.types import PyTree, Scalar
 from diffabs.plants.audit import BrakeAudit
-from diffabs.plants.wheel import (
-    FROZEN_OUTPUTS,
-    BrakeStart,
-    forward_speed,
-    halt_at_zero,
-    probes,
-    slip_ratio,
-    usual_objectives,
-    usual_parts,
-)
+from diffabs.plants.wheel import BrakedWheel, BrakeStart, forward_speed, halt_at_zero, slip_ratio
 from diffabs.roads import RIG
 from diffabs.roads.sign import stays_below
 
@@ -77,7 +68,7 @@ class LabRigState(NamedTuple):
 
 
 @pytree
-class LabRig:
+class LabRig(BrakedWheel):
     """Two wheels, a lever, bearing friction, and a brake with a 49 ms lag. The control u in [0, 1] is the brake
     command.
 
@@ -103,11 +94,7 @@ class LabRig:
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     road: Road = part(default=RIG)
 
-    shows = BrakeOutput
     control_unit = "1"  # a command; the other braked plants take a torque in N m
-    frozen = FROZEN_OUTPUTS
-
-    usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
     def start(self, initial: BrakeStart) -> LabRigState:
         """Return the state for a speed and a slip, with the brake released."""

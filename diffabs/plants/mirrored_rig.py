@@ -16,17 +16,7 @@ from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.types import Scalar
 from diffabs.plants.audit import BrakeAudit
-from diffabs.plants.wheel import (
-    FROZEN_OUTPUTS,
-    GRAVITY,
-    BrakeStart,
-    forward_speed,
-    halt_at_zero,
-    probes,
-    slip_ratio,
-    usual_objectives,
-    usual_parts,
-)
+from diffabs.plants.wheel import GRAVITY, BrakedWheel, BrakeStart, forward_speed, halt_at_zero, slip_ratio
 from diffabs.roads import RIG
 
 
@@ -39,7 +29,7 @@ class RigState(NamedTuple):
 
 
 @pytree
-class MirroredRig:
+class MirroredRig(BrakedWheel):
     """J1 omega1' = m g r1 mu - tau1, c m r2^2 omega2' = -m g r2 mu.
 
     The fields are m, r1, r2, J1 and c; `crawl_speed` is the least denominator of the slip.
@@ -52,12 +42,6 @@ class MirroredRig:
     inertia_factor: Scalar = param(default=0.5, unit="1", above=0.0, high=1.0)
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     road: Road = part(default=RIG)
-
-    shows = BrakeOutput
-    control_unit = "N m"
-    frozen = FROZEN_OUTPUTS
-
-    usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
     def start(self, initial: BrakeStart) -> RigState:
         """Return the state for a speed and a slip."""

@@ -15,17 +15,7 @@ from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.types import Scalar
 from diffabs.plants.audit import BrakeAudit
-from diffabs.plants.wheel import (
-    FROZEN_OUTPUTS,
-    GRAVITY,
-    BrakeStart,
-    forward_speed,
-    halt_at_zero,
-    probes,
-    slip_ratio,
-    usual_objectives,
-    usual_parts,
-)
+from diffabs.plants.wheel import GRAVITY, BrakedWheel, BrakeStart, forward_speed, halt_at_zero, slip_ratio
 from diffabs.roads import SPLINE_B
 
 
@@ -38,7 +28,7 @@ class QuarterCarState(NamedTuple):
 
 
 @pytree
-class QuarterCar:
+class QuarterCar(BrakedWheel):
     """m v' = -mu m g, J omega' = r mu m g - u. The inertia was identified together with the spline road.
 
     `crawl_speed` is the least denominator of the slip.
@@ -49,12 +39,6 @@ class QuarterCar:
     inertia: Scalar = param(default=1.04456, unit="kg m^2", above=0.0)
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     road: Road = part(default=SPLINE_B)
-
-    shows = BrakeOutput
-    control_unit = "N m"
-    frozen = FROZEN_OUTPUTS
-
-    usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
     def start(self, initial: BrakeStart) -> QuarterCarState:
         """Return the state for a speed and a slip."""

@@ -16,23 +16,13 @@ from diffabs.core.numerics import quotient
 from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.types import Scalar
-from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.quarter_car import QuarterCar, QuarterCarState
-from diffabs.plants.wheel import (
-    FROZEN_OUTPUTS,
-    GRAVITY,
-    BrakeStart,
-    halt_at_zero,
-    probes,
-    slip_ratio,
-    usual_objectives,
-    usual_parts,
-)
+from diffabs.plants.wheel import GRAVITY, BrakedWheel, halt_at_zero, slip_ratio
 from diffabs.roads import DRY_ASPHALT
 
 
 @pytree
-class RoadVehicle:
+class RoadVehicle(BrakedWheel):
     """m v' = -Fz mu - c v^2 - f m g, J omega' = r Fz mu - B omega - u.
 
     Attributes:
@@ -57,12 +47,7 @@ class RoadVehicle:
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     road: Road = part(default=DRY_ASPHALT)
 
-    shows = BrakeOutput
-    control_unit = "N m"
-    frozen = FROZEN_OUTPUTS
-
-    usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
-    start, project, energy = QuarterCar.start, QuarterCar.project, QuarterCar.energy
+    start, project, energy, audit = QuarterCar.start, QuarterCar.project, QuarterCar.energy, QuarterCar.audit
 
     def derivative(self, t: Scalar, state: QuarterCarState, control: Scalar) -> QuarterCarState:
         """Return dx/dt under the brake torque `control` [N m]."""
@@ -89,13 +74,6 @@ class RoadVehicle:
         grip = self._grip(target, v, output.distance)
         a = quotient(grip + self.drag * v * v, self.mass) + self.rolling * GRAVITY
         return self.radius * grip + (1 - target) * (self.inertia * a - self.bearing * v) / self.radius
-
-    def audit(self, initial: BrakeStart) -> BrakeAudit:
-        """Return the audit of runs from `initial`; only a negative torque, which drives the wheel, explains a gain of
-        energy.
-        """
-        wheel, scale = self.inertia / self.radius**2, self.energy(self.start(initial))
-        return BrakeAudit(car=self.mass, wheel=wheel, radius=self.radius, scale=scale)
 
     def _grip(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
         return self.wheel_load * self.road.friction(slip, speed, distance)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from diffabs.controllers import PID
 from diffabs.core.numerics import larger, quotient
+from diffabs.core.protocols import BrakeOutput
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.objectives import BRAKING
@@ -63,52 +64,44 @@ def forward_speed(speed: Scalar) -> Scalar:
     return jnp.where(jnp.greater(speed, STANDSTILL_SPEED), speed, 0.0)
 
 
-def usual_parts(self: Part) -> dict[str, PyTree]:
-    """Return the default parts of a loop around a brake: a PID that holds a fixed slip until standstill.
+class BrakedWheel:
+    """Base of plants with a braked wheel, whose field `crawl_speed` [m/s] is the least denominator of the slip."""
 
-    The keys are `initial`, `reference`, `controller` and `stop`. The PID has limits of 0 and 90 in the plant's control
-    unit.
+    crawl_speed: Scalar
 
-    Args:
-        self: The plant; it has no effect.
-    """
-    del self
-    return {
-        "initial": BrakeStart(),
-        "reference": FixedSlip(),
-        "controller": PID(low=0.0, high=90.0),
-        "stop": Standstill(),
-    }
+    shows = BrakeOutput
+    control_unit = "N m"
+    frozen = FROZEN_OUTPUTS
 
+    def usual_parts(self) -> dict[str, PyTree]:
+        """Return the default parts of a loop around a brake: a PID that holds a fixed slip until standstill.
 
-def usual_objectives(self: Part) -> dict[str, PyTree]:
-    """Return the default objectives of a brake, by name.
+        The keys are `initial`, `reference`, `controller` and `stop`. The PID has limits of 0 and 90 in the plant's
+        control unit.
+        """
+        return {
+            "initial": BrakeStart(),
+            "reference": FixedSlip(),
+            "controller": PID(low=0.0, high=90.0),
+            "stop": Standstill(),
+        }
 
-    Args:
-        self: The plant; it has no effect.
-    """
-    del self
-    return dict(BRAKING)
+    def usual_objectives(self) -> dict[str, PyTree]:
+        """Return the default objectives of a brake, by name."""
+        return dict(BRAKING)
 
+    def probes(self, initial: BrakeStart, setpoint: Scalar, stop: Part) -> BrakeStart:
+        """Return k starts at which the loop may be stiffest, as a `BrakeStart` of arrays (k,).
 
-def probes(self: Part, initial: BrakeStart, setpoint: Scalar, stop: Part) -> BrakeStart:
-    """Return k starts at which the loop may be stiffest, as a `BrakeStart` of arrays (k,).
+        They combine 6 speeds from the start's to the stop's with 23 slips. Some slips are close to the setpoint, where
+        the controller is not at a limit. Other slips cover the friction curve, which is steepest near 0.
 
-    They combine 6 speeds from the start's to the stop's with 23 slips. Some slips are close to the setpoint, where the
-    controller is not at a limit. Other slips cover the friction curve, which is steepest near 0.
-
-    Under a stop without a speed, such as `NoStop`, a run may last to standstill. The least speed is then the plant's
-    crawl speed: the slip's denominator, and with it the stiffness, is the same at all lower speeds.
-
-    Args:
-        self: The plant, with a `crawl_speed` [m/s].
-        initial: Start of the run; its speed is the greatest.
-        setpoint: Target slip [1].
-        stop: Stop of the run; its speed, if it has one, is the least.
-    """
-    near = jnp.concatenate([setpoint - jnp.array(PROBED_OFFSETS), setpoint + jnp.array(PROBED_OFFSETS)])
-    slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(PROBED_SLIPS)])
-    least = stop.speed if hasattr(stop, "speed") else self.crawl_speed
-    speeds = jnp.geomspace(initial.speed, least, PROBED_SPEEDS)
-    speed, slip = jnp.meshgrid(speeds, slips, indexing="ij")
-    return jax.tree.map(jnp.ravel, BrakeStart(speed=speed, slip=slip))
+        Under a stop without a speed, such as `NoStop`, a run may last to standstill. The least speed is then the
+        plant's crawl speed: the slip's denominator, and with it the stiffness, is the same at all lower speeds.
+        """
+        near = jnp.concatenate([setpoint - jnp.array(PROBED_OFFSETS), setpoint + jnp.array(PROBED_OFFSETS)])
+        slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(PROBED_SLIPS)])
+        least = stop.speed if hasattr(stop, "speed") else self.crawl_speed
+        speeds = jnp.geomspace(initial.speed, least, PROBED_SPEEDS)
+        speed, slip = jnp.meshgrid(speeds, slips, indexing="ij")
+        return jax.tree.map(jnp.ravel, BrakeStart(speed=speed, slip=slip))

@@ -4,14 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.collections import PatchCollection
+from matplotlib.patches import Rectangle
 
 from diffabs.plot.style import COLOURS, GREY, Axes, Figure, Patch, label_axes, sheet
-
-try:
-    from matplotlib.collections import PatchCollection
-    from matplotlib.patches import Rectangle
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError('figures need matplotlib: pip install ".[plot]" in a clone', name=error.name) from error
 
 LEFT_HATCH, UNBOUNDED = "////", "#DDDDDD"
 MANY_CELLS = 3000  # their lines would cover them

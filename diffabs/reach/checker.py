@@ -217,13 +217,14 @@ class _Program:
         return seen
 
     def _find_states(self) -> list[int]:
-        """Return the states that decide the margin, the signals, the distance and the time."""
+        """Return the states that decide the margin, the signals, the distance and the time, or may not be negative."""
         e = self.equations
         roots = {e.margin, *self.signals.values()} | {
             e.flow[i] for i in (e.travelled, e.clock if e.paced else -1) if i >= 0
         }
         while True:
-            found = {o.value for i in self.read_by(roots) for o in (self.operations[i],) if o.name == "state"}
+            found = {self.operations[i].value for i in self.read_by(roots) if self.operations[i].name == "state"}
+            found |= set(e.nonnegative)
             more = roots | {e.flow[i] for i in found} | ({e.tick[i] for i in found} if e.tick else set())
             if more == roots:
                 return sorted(found)
@@ -594,7 +595,9 @@ class _Check:
             max((arb(float(high)) - m).upper(), (m - arb(float(low))).upper())
             for m, (low, high) in zip(mids, cell, strict=True)
         ]
-        self.mids, self.all = mids, [m + arb(0, h) for m, h in zip(mids, self.halves, strict=True)]
+        # The radius of a ball is rounded up, so a cell from 0 would have negative numbers.
+        balls = [(m + arb(0, h), low) for m, h, (low, _) in zip(mids, self.halves, cell, strict=True)]
+        self.mids, self.all = mids, [x.nonnegative_part() if low >= 0 else x for x, low in balls]
         self.n, self.np = len(p.states), len(mids)
         self.slip = p.place.get(e.nonnegative[0], -1) if e.nonnegative else -1
         self.speed = p.place.get(e.speed, -1)
@@ -608,7 +611,7 @@ class _Check:
         self.constant_mid = _Series(p, self.mids, nothing)
         self.constant_all = _Series(p, self.all, nothing, halves=self.halves)
         self.weights = np.ones(self.n)
-        self.steps = self.across = 0
+        self.steps = 0
         self.elapsed = ZERO  # the independent variable
         self.rates: dict[str, arb] | None = None  # of the margin, the time and the distance, near the end
         self.capture: _Capture | None = None
@@ -887,7 +890,6 @@ class _Check:
             self.rates = near if self.rates is None else {x: _hull(near[x], self.rates[x]) for x in near}
         self.elapsed += h
         self.steps += 1
-        self.across += bool(crossed)
 
     def enclose(
         self, centre: Sequence[arb], X: Sequence[arb], tangents: Sequence[arb_poly], h: arb
@@ -1200,6 +1202,8 @@ def check_cell(
         return _prove(_Check(equations, signals, cell, order), steps, horizon)
     except (_Undefined, _StepFails) as reason:
         raise NotProved(str(reason)) from None
+    except RecursionError:
+        raise NotProved("a chain of too many operations, each of which reads the one before") from None
     finally:
         ctx.prec = before
 

@@ -4,24 +4,25 @@
     refuted    in one cell every run violates it; a cell may be a single run
     undecided  neither within the budget
 
-Cells come from halving, and the sum of their volumes equals the volume of the box in fractions.
+Cells come from halving, and `comes_from_halving` shows that they cover the box.
 """
 
 import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from diffabs.core.loop import Loop
+from diffabs.core.types import PyTree
 from diffabs.reach.engine import FAILURES, CellBounds, Prover
 from diffabs.reach.equations import Equations, derive_equations
 
 BATCH = 64  # cells between two looks at the clock
 LARGER, LARGER_TRIED = 1.5, 4  # size of a cell to try, in those proved just before; number that may be larger
 SMALLEST = 2.0**-40  # of the box's side: a smaller cell is not halved again
+FEWEST = 4  # a side that is not wider than so many floats is not halved: its middle must lie between its ends
 PROBE_SIZES = (1e-3, 1e-4, 1e-5)  # sizes of the cell that shows how much each parameter matters, in sides of the box
 SPEED_COST = 3.0
 CLOSE = 5e-4  # a bound is refined while it is farther than this from the worst run found, relative
@@ -101,11 +102,15 @@ def prove_box(
         threads: Number of threads; None for one for each core.
 
     Raises:
-        ValueError: A claim is about a quantity that the loop does not have, or a signal does not exist.
+        ValueError: A number is out of its range, a claim is about no quantity of the loop, or a signal does not exist.
         NoRule: A part, an operation or a parameter of the loop has no sound rule.
         NoCompiler: No C++ compiler of this machine works.
     """
     began = time.monotonic()
+    for name, value in (("horizon", horizon), ("budget", budget)):
+        if not 0 < value < math.inf:
+            raise ValueError(f"{name} = {value:g} is outside (0, inf) s")
+    check_box(over)
     paths = tuple(over)
     equations = derive_equations(loop, paths)
     if unknown := [name for name in signals if name not in equations.signals]:
@@ -117,7 +122,7 @@ def prove_box(
     fastest = [high if path == "initial.speed" else (low + high) / 2 for path, (low, high) in over.items()]
     prover.choose_weights(np.array(fastest))
     influence = _measure_influence(prover, box, np.array(fastest), threads)
-    sides = box[:, 1] - box[:, 0]
+    smallest = np.maximum(SMALLEST * (box[:, 1] - box[:, 0]), FEWEST * np.spacing(np.abs(box).max(1)))
     quantities = _Quantities(prover.signals)
     left, done, rows, refuting, tried, fitting, failure = box[None], [], [], None, 0, math.inf, ""
     suspects = [point for point in suspects if ((box[:, 0] <= point) & (point <= box[:, 1])).all()]
@@ -131,7 +136,7 @@ def prove_box(
     while len(left) and refuting is None and not hopeless and time.monotonic() - began < budget:
         left = left[np.lexsort(left[:, ::-1, 0].T)]
         now, left = left[:BATCH], left[BATCH:]
-        now, rest = _cut_to_size(now, fitting * LARGER, influence)
+        now, rest = _cut_to_size(now, fitting * LARGER, influence, smallest)
         left = np.concatenate([left, rest])
         found = prover.prove(now, threads)
         tried += len(now)
@@ -139,7 +144,7 @@ def prove_box(
         fine = (found.status > 0) & _satisfy(quantities, claims, found)
         fitting = float(_sizes(now[fine]).max()) if fine.any() else fitting
         done.append(now[fine])
-        rows.append(_select(found, fine))
+        rows.append([column[fine] for column in found])
         failed = found.failure[~fine]
         failure = FAILURES[int(np.bincount(failed[failed > 0]).argmax())] if (failed > 0).any() else ""
         matters = _widths(now) * influence
@@ -148,7 +153,7 @@ def prove_box(
             matters[vague] = quantities.weigh_sides(claim.quantity, found, _widths(now) * influence)[vague]
         again = now[~fine]
         # A side that is too short is not halved, however much it matters.
-        matters = np.where(_widths(now) > SMALLEST * sides, matters, -1.0)[~fine]
+        matters = np.where(_widths(now) > smallest, matters, -1.0)[~fine]
         small = (matters < 0).all(1)
         left = np.concatenate([left, again[small], _halve(again[~small], matters[~small])])
         if small.any():
@@ -158,12 +163,12 @@ def prove_box(
     merged = CellBounds(*(np.concatenate(columns) for columns in zip(*rows, strict=True))) if rows else None
     if not claims and not len(left) and merged is not None:
         cells, merged, more = _refine(
-            *(prover, quantities, cells, merged, influence, SMALLEST * sides, known or {}),
+            *(prover, quantities, cells, merged, influence, smallest, known or {}),
             *(began + budget, progress, threads),
         )
         tried += more
     covered = not len(left) and merged is not None
-    if covered and sum((_volume(cell) for cell in cells.tolist()), Fraction(0)) != _volume(box.tolist()):
+    if covered and not comes_from_halving(box.tolist(), cells.tolist()):
         raise AssertionError("the cells do not cover the box")
     bounds = quantities.over_all(merged) if covered and merged is not None else quantities.unbounded
     verdict = "refuted" if refuting is not None else "proved" if covered else "undecided"
@@ -182,11 +187,8 @@ class _Quantities:
         self.signals = tuple(signals)
 
     def names(self) -> list[str]:
-        return [
-            *(f"{word} {name}" for name in self.signals for word in ("greatest", "least")),
-            "stop_time",
-            "stop_distance",
-        ]
+        pairs = (f"{word} {name}" for name in self.signals for word in ("greatest", "least"))
+        return [*pairs, "stop_time", "stop_distance"]
 
     def of_cells(self, found: CellBounds, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return, for each cell, proved lower and upper bounds of a quantity of all its runs."""
@@ -217,12 +219,14 @@ class _Quantities:
 
 
 def _check_claims(claims: Sequence[RunClaim], signals: Collection[str]) -> None:
-    """Raise a ValueError if a claim is about a quantity that is not of these signals, the stop time or distance."""
+    """Raise a ValueError unless each claim is about one of these signals, the stop time or distance, with a bound."""
     known = _Quantities(tuple(signals)).names()
     for claim in claims:
         if claim.quantity not in known:
             names = f"stop_time, stop_distance, and greatest NAME or least NAME of a signal: {', '.join(signals)}"
             raise ValueError(f"claims: {claim.quantity!r} is no quantity of this loop; there is {names}")
+        if not math.isfinite(claim.bound):
+            raise ValueError(f"claims: {claim.quantity} has the bound {claim.bound:g}, outside (-inf, inf)")
 
 
 def _satisfy(quantities: _Quantities, claims: Sequence[RunClaim], found: CellBounds) -> np.ndarray:
@@ -258,16 +262,11 @@ def _find_contradiction(bounds: Mapping[str, tuple[float, float]], known: Mappin
     return ""
 
 
-def _select(found: CellBounds, which: np.ndarray) -> CellBounds:
-    return CellBounds(*(column[which] for column in found))
-
-
 def _measure_influence(prover: Prover, box: np.ndarray, point: np.ndarray, threads: int | None) -> np.ndarray:
     """Return how much a unit of each parameter moves the slip in the runs near a point of the box.
 
-    Without a slip it is state 0.
-
-    A cell that is not proved is halved along the side that moves it most. A wrong choice costs time, and no more.
+    Without a slip it is state 0. A cell that is not proved is halved along the side that moves it most. A wrong choice
+    costs time, and no more.
     """
     sides = box[:, 1] - box[:, 0]
     for share in PROBE_SIZES:
@@ -287,8 +286,6 @@ def _measure_influence(prover: Prover, box: np.ndarray, point: np.ndarray, threa
 
 def _halve(cells: np.ndarray, matters: np.ndarray) -> np.ndarray:
     """Return the halves of cells, each along the side that matters most; `matters` has the shape (cells, sides)."""
-    if not len(cells):
-        return cells
     side = matters.argmax(1)
     rows = np.arange(len(cells))
     middle = 0.5 * (cells[rows, side, 0] + cells[rows, side, 1])
@@ -306,23 +303,67 @@ def _sizes(cells: np.ndarray) -> np.ndarray:
     return np.where(_widths(cells) > 0, _widths(cells), 1.0).prod(1)
 
 
-def _cut_to_size(cells: np.ndarray, largest: float, influence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _cut_to_size(
+    cells: np.ndarray, largest: float, influence: np.ndarray, smallest: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return at most a batch of cells to try, and the others.
 
     A cell that is larger than `largest` is halved untried, as its neighbours of that size could not be proved. A few
     stay as they are: if they are proved, larger cells are tried again.
     """
     kept, cells = cells[:LARGER_TRIED], cells[LARGER_TRIED:]
-    while (wide := _sizes(cells) > largest).any() and len(cells) < 4 * BATCH:
-        cells = np.concatenate([cells[~wide], _halve(cells[wide], _widths(cells[wide]) * influence)])
+    while len(cells) < 4 * BATCH:
+        matters = np.where(_widths(cells) > smallest, _widths(cells) * influence, 0.0)
+        wide = (_sizes(cells) > largest) & (matters > 0).any(1)
+        if not wide.any():
+            break
+        cells = np.concatenate([cells[~wide], _halve(cells[wide], matters[wide])])
     cells = np.concatenate([kept, cells])
     return cells[:BATCH], cells[BATCH:]
 
 
-def _volume(cell: Any) -> Fraction:
-    """Return the product of the widths that are not 0, exactly."""
-    widths = (Fraction(high) - Fraction(low) for low, high in cell)
-    return math.prod((w for w in widths if w), start=Fraction(1))
+def check_box(over: Mapping[str, tuple[float, float]]) -> None:
+    """Check that a box has a parameter, and that the ends of each are finite and in order.
+
+    Args:
+        over: Range (low, high) of each parameter of the box, by path, in SI units.
+
+    Raises:
+        ValueError: The box is empty, or the ends of a parameter, which is named, are not finite and in order.
+    """
+    if not over:
+        raise ValueError("over: the box has no parameter")
+    for path, (low, high) in over.items():
+        if not -math.inf < low <= high < math.inf:
+            raise ValueError(f"over.{path} = [{low:.9g}, {high:.9g}]; two finite numbers are needed, the lower first")
+
+
+def comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[PyTree]) -> bool:
+    """Return whether the cells are the leaves of a tree of halvings of the box.
+
+    Then they cover it. A leaf is exactly its part of the box, and the parts of a halving have the whole as their union.
+
+    Args:
+        box: Ends of each parameter, shape (parameters, 2).
+        cells: Ends of each parameter, shape (cells, parameters, 2).
+    """
+    parts = [(list(map(list, box)), cells)]
+    while parts:
+        part, inside = parts.pop()
+        if len(inside) == 1 and list(map(list, inside[0])) == part:
+            continue
+        for i, (low, high) in enumerate(part):
+            middle = 0.5 * (low + high)
+            left = [cell for cell in inside if cell[i][1] <= middle]
+            right = [cell for cell in inside if cell[i][0] >= middle]
+            if left and right and len(left) + len(right) == len(inside):
+                # No other halving need be tried: the cells of a tree that lie in one half are a tree of that half.
+                halves = ([low, middle], left), ([middle, high], right)
+                parts += [([*part[:i], ends, *part[i + 1 :]], some) for ends, some in halves]
+                break
+        else:
+            return False
+    return True
 
 
 def _refine(

@@ -40,7 +40,6 @@ SPEED_WEIGHT = 256.0  # of the speed over the slip: an error of the speed stays,
 NEAR = 0.3  # logarithm of the ratio of speeds whose couplings count together
 CLOCKWORK_WEIGHT = 2.0**20  # of states that are the same in all runs: nothing else mixes with them
 SCOUTED = 20_000  # periods, or steps, of the run that the weights are chosen by
-SETTINGS = {"tolerance": 3e-7, "slowest": 0.02, "first": 1e-5, "shortest": 1e-8, "longest": 1e9}
 # Orders of the Taylor polynomials. With 8, one step lasts from one tick to the next; without ticks, limits need steps
 # that are shorter than order 6 allows.
 SAMPLED_ORDER, CONTINUOUS_ORDER = 8, 6
@@ -132,9 +131,6 @@ class CellBounds(NamedTuple):
         above: Values that the signals of every run of the cell rise above, or reach.
         reach: About the half widths that each parameter causes: of the slip at its greatest (of state 0
             without a slip), of the stop time, and of the stop distance, shape (cells, 3, parameters).
-        reached: Time up to which the cell was proved [s].
-        steps: Steps of the cell's group.
-        across: Attempted steps across a limit, and limits that ticks cross.
         failure: Why nothing is proved, as the index of `FAILURES`.
     """
 
@@ -146,9 +142,6 @@ class CellBounds(NamedTuple):
     below: np.ndarray
     above: np.ndarray
     reach: np.ndarray
-    reached: np.ndarray
-    steps: np.ndarray
-    across: np.ndarray
     failure: np.ndarray
 
 
@@ -176,23 +169,27 @@ class Prover:
         weights: Units of Lohner's step, shape (WEIGHT_TABLES, kept states); a choice, no part of the proof.
     """
 
-    def __init__(self, equations: Equations, signals: Sequence[str], horizon: float, **settings: float):
+    def __init__(
+        self, equations: Equations, signals: Sequence[str], horizon: float, *, tolerance: float = 3e-7,
+        slowest: float = 0.02, first: float = 1e-5, shortest: float = 1e-8, longest: float = 1e9, order: int = 0,
+    ):  # fmt: skip
         """Arrange the equations.
 
         Args:
             equations: Equations of the loop.
             signals: Names of the signals whose range is wanted.
             horizon: Duration after which a run is no longer followed [s].
-            settings: Other values of `SETTINGS`: greatest remainder of a step relative to the state, least speed [m/s],
-                length of the first, the shortest and the longest step [s] (of a paced loop [s^2/m]); and the `order` of
-                the Taylor polynomials.
+            tolerance: Greatest remainder of a step, relative to the state.
+            slowest: Least speed [m/s].
+            first, shortest, longest: Lengths of the first, the shortest and the longest step [s]; paced loop: [s^2/m].
+            order: Order of the Taylor polynomials; 0 for the usual one.
         """
         e = self.equations = equations
         self.signals, self.horizon = tuple(signals), horizon
-        chosen = SETTINGS | {"order": CONTINUOUS_ORDER if equations.period is None else SAMPLED_ORDER} | settings
+        order = order or (CONTINUOUS_ORDER if equations.period is None else SAMPLED_ORDER)
         kept, passing, quadratures = arrange_states(e, self.signals)
-        order = [*kept, *passing, *quadratures]
-        place = {state: i for i, state in enumerate(order)}
+        states = [*kept, *passing, *quadratures]
+        place = {state: i for i, state in enumerate(states)}
         if e.paced and place[e.clock] < len(kept) + len(passing):
             raise NoRule("a continuous loop of a braked wheel that reads the time")
         for operation in e.operations:
@@ -201,9 +198,9 @@ class Prover:
         self._kept, self._clockwork = len(kept), [place[i] for i in clockwork_states(e, kept)]
         moving = len(kept) + len(passing)
         roots = {
-            "start": [e.start[i] for i in order],
-            "flow": [e.flow[i] for i in order],
-            "tick": [e.tick[i] if e.tick else -1 for i in order[:moving]],
+            "start": [e.start[i] for i in states],
+            "flow": [e.flow[i] for i in states],
+            "tick": [e.tick[i] if e.tick else -1 for i in states[:moving]],
             "signal": [e.signals[name] for name in self.signals],
         }
         self._arrays = {name: np.array(column, np.int32) for name, column in roots.items()}
@@ -218,15 +215,14 @@ class Prover:
             *(at["start"], at["flow"], at["tick"], len(self.signals), at["signal"]),
             *(e.margin, place.get(e.travelled, -1), place.get(e.clock, -1) if e.paced else -1),
             *(place[e.nonnegative[0]] if e.nonnegative else -1, place.get(e.speed, -1)),
-            *(chosen["slowest"], low, high, horizon, chosen["tolerance"]),
-            *(chosen["longest"], chosen["shortest"], chosen["first"], int(chosen["order"]), WEIGHT_TABLES),
+            *(slowest, low, high, horizon, tolerance, longest, shortest, first, order, WEIGHT_TABLES),
             *(self.weights.ctypes.data, 0.0, horizon),
         )
 
     @property
     def _width(self) -> int:
         """Number of results of a cell."""
-        return 9 + 4 * len(self.signals) + 3 * len(self.equations.params)
+        return 6 + 4 * len(self.signals) + 3 * len(self.equations.params)
 
     def prove(self, cells: np.ndarray, threads: int | None = None) -> CellBounds:
         """Return the bounds of cells.
@@ -247,11 +243,11 @@ class Prover:
         with concurrent.futures.ThreadPoolExecutor(threads or core_count()) as pool:
             list(pool.map(prove_group, range(0, len(cells), lanes)))
         n = len(self.signals)
-        pairs = out[:, 8 : 8 + 4 * n].reshape(len(out), 2, n, 2)
+        pairs = out[:, 5 : 5 + 4 * n].reshape(len(out), 2, n, 2)
         return CellBounds(
             *(out[:, 0].astype(int), out[:, 1:3], out[:, 3:5]),
             *(pairs[:, 0, :, 0], pairs[:, 0, :, 1], pairs[:, 1, :, 0], pairs[:, 1, :, 1]),
-            *(out[:, 8 + 4 * n : -1].reshape(len(out), 3, -1), out[:, 5], out[:, 6], out[:, 7], out[:, -1].astype(int)),
+            *(out[:, 5 + 4 * n : -1].reshape(len(out), 3, -1), out[:, -1].astype(int)),
         )
 
     def follow(self, cell: np.ndarray, steps: int = 100_000) -> CellTube:
@@ -293,13 +289,13 @@ class Prover:
             point: Parameters of the run, shape (parameters,).
         """
         n = self._kept
-        found = np.zeros((SCOUTED, 2 + n * n))
+        found = np.zeros((SCOUTED, 1 + n * n))
         cell = np.repeat(np.asarray(point, float)[None, :, None], 2, 2)
         count = self._call(cell, np.zeros((1, self._width)), scout=found)
         found = found[:count][np.isfinite(found[:count]).all(1)]  # the first has no axes yet
         if not len(found):
             return
-        keys, jacobians = found[:, 0], np.abs(found[:, 2:]).reshape(len(found), n, n)
+        keys, jacobians = found[:, 0], np.abs(found[:, 1:]).reshape(len(found), n, n)
         if self.task.speed >= 0:
             keys = np.log(np.maximum(keys, 1e-3))
         self.task.keys_low, self.task.keys_high = low, high = float(keys.min()), float(keys.max())
@@ -401,6 +397,7 @@ def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], lis
     asked = _reads(e, [e.margin])[0]
     integrals = [i for i in (e.travelled, e.clock if e.paced else -1) if i >= 0]
     live = _reads(e, [e.margin, *(e.signals[name] for name in signals), *(e.flow[i] for i in integrals)])[0]
+    live |= set(e.nonnegative)  # the equations hold only where these are not negative
     while True:
         more = live | _reads(e, [root for i in live for root in (e.flow[i], *((e.tick[i],) if e.tick else ()))])[0]
         if more == live:

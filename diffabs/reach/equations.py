@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel
+from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, live_nodes
 from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr, scalar_array
 from diffabs.controllers.sampled import Sampled
 from diffabs.core.blocks import offers
@@ -39,9 +39,6 @@ from diffabs.plants import BrakeStart
 # Inputs: parameters of the box, states of the proof, states of the plant's own, and a tick's grid step and number.
 PARAM, STATE, OWN, GRID = "param", "state", "own", "grid"
 TIME = "t"
-FUNCTIONS = ("exp", "log", "sin", "cos", "atan", "power")
-COMPARISONS = ("lt", "le", "eq", "ne")
-LOGIC = ("and", "or", "not")
 # Operations of a program whose result is a number for all numbers.
 TOTAL = (
     *("input", "add", "sub", "mul", "neg", "abs", "min", "max", "lower", "higher", "select", "any", "gate", "convert"),
@@ -230,11 +227,15 @@ def derive_equations(loop: Loop, over: Iterable[str]) -> Equations:
         over: Paths of the parameters of the box.
 
     Raises:
-        NoRule: A part has events or noise, two blocks have different clocks, or an operation has no sound rule.
+        NoRule: A part has events or noise, two blocks have different clocks, an operation has no sound rule, or there
+            are too many in a chain.
     """
     paths = tuple(over)
-    with jax.enable_x64(True):
-        return _Derivation(loop, paths).equations()
+    try:
+        with jax.enable_x64(True):
+            return _Derivation(loop, paths).equations()
+    except RecursionError as error:
+        raise NoRule("the loop has too long a chain of operations, each of which reads the one before") from error
 
 
 class _Derivation:
@@ -436,9 +437,10 @@ class _Derivation:
 
     def substitute(self, node: Node, known: dict[int, Node]) -> Node:
         """Return a node with other nodes in place of those in `known`, by number; `known` gets each one."""
-        if node.id not in known:
-            args = [self.substitute(arg, known) for arg in node.args]
-            known[node.id] = self.graph.again(node, args) if args else node
+        for one in live_nodes([node]):
+            if one.id not in known:
+                args = [known[arg.id] for arg in one.args]
+                known[one.id] = self.graph.again(one, args) if args else one
         return known[node.id]
 
     def make(self, name: str, args: tuple[int, ...], value: Any = None) -> int:

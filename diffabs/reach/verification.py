@@ -17,13 +17,12 @@ from diffabs.config.values import format_given
 from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject
 from diffabs.reach.certificate import FORMAT, proved_ends
-from diffabs.reach.cover import RunClaim
+from diffabs.reach.cover import RunClaim, check_box, comes_from_halving
 from diffabs.reach.equations import Equations, derive_equations
 
 SAMPLED_STEPS = 2  # steps of the checker between two ticks
 PACED_STEP, STEPS = 4e-4, 500  # length in eta [s^2/m] of a paced loop; number of steps of other continuous loops
 CELL_HALVINGS = 3  # of a cell whose bounds by the checker are too wide
-DEEPEST = 200  # halvings of the box that lead to one cell
 
 Cell = list[list[float]]
 Bounds = dict[str, tuple[float | None, float | None]]
@@ -65,7 +64,7 @@ class ProofFile(NamedTuple):
     @property
     def signals(self) -> list[str]:
         """The signals that the file bounds."""
-        return list(dict.fromkeys(name.split()[1] for name in self.bounds if " " in name))
+        return list(dict.fromkeys(name.partition(" ")[2] for name in self.bounds if " " in name))
 
     @property
     def statements(self) -> tuple[str, ...]:
@@ -95,9 +94,7 @@ def read_proof(document: JsonObject) -> ProofFile:
         raise ValueError(f"nothing to verify: the file's verdict is {document.get('verdict')}, not proved")
     pair = "a pair [low, high] of finite numbers"
     over = _read_entries(document, "over", dict, lambda ends: tuple(_pair(ends)), pair)
-    for path, (low, high) in over.items():
-        if low > high:
-            raise ValueError(f"over.{path} = [{low:.9g}, {high:.9g}]; low must not exceed high")
+    check_box(over)
     cells = _read_entries(document, "cells", list, lambda cell: list(map(_pair, cell)), f"a list, each entry {pair},")
     claims = _read_entries(
         document, "claims", list, lambda x: RunClaim(str(x["quantity"]), _number(x["bound"])),
@@ -108,8 +105,6 @@ def read_proof(document: JsonObject) -> ProofFile:
         horizon = _number(document.get("horizon"))
     except (ValueError, OverflowError):
         raise ValueError(f"horizon = {format_given(document.get('horizon'))}; a finite number [s] is needed") from None
-    if not over:
-        raise ValueError("over: the box has no parameter")
     if any(len(cell) != len(over) for cell in cells.values()):
         raise ValueError("not a proof's file: a cell has not one pair of numbers for each parameter of the box")
     for name, ends in bounds.items():
@@ -197,8 +192,10 @@ def verify_box(
     Raises:
         ModuleNotFoundError: The extra `proof` is not installed.
         NoRule: A part of the loop has no sound rule.
-        ValueError: The document is not a proof's file.
+        ValueError: The document is not a proof's file, or the share is outside (0, 1].
     """
+    if not 0 < share <= 1:
+        raise ValueError(f"share = {share:g} is outside (0, 1]")
     file = read_proof(document)
     cells, over = file.cells, file.over
     reason, done = _find_contradiction(file, horizon), 0
@@ -228,7 +225,7 @@ def _find_contradiction(file: ProofFile, horizon: float) -> str:
             return f"the file's bound {worst} of {claim.quantity} violates its claim"
     if not file.statements:
         return "the file states nothing"
-    if not _comes_from_halving(list(file.over.values()), file.cells):
+    if not comes_from_halving(list(file.over.values()), file.cells):
         return "the cells do not cover the box: they do not come from halving it"
     return ""
 
@@ -243,24 +240,6 @@ def _choose_cells(cells: Sequence[Cell], share: float, suspects: Sequence[Sequen
     ]
     sample = random.SystemRandom().sample(range(len(cells)), max(1, math.ceil(share * len(cells))))
     return list(dict.fromkeys([*holding, *sample]))
-
-
-def _comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[Cell], depth: int = DEEPEST) -> bool:
-    """Return whether the cells are the leaves of a tree of halvings of the box.
-
-    Then they cover it. A leaf is exactly its part of the box, and the parts of a halving have the whole as their union.
-    """
-    if len(cells) == 1:
-        return [list(ends) for ends in cells[0]] == [list(ends) for ends in box]
-    for i, (low, high) in enumerate(box if depth else ()):
-        middle = 0.5 * (low + high)
-        left = [cell for cell in cells if cell[i][1] <= middle]
-        right = [cell for cell in cells if cell[i][0] >= middle]
-        if left and right and len(left) + len(right) == len(cells):
-            parts = ([*box[:i], end, *box[i + 1 :]] for end in ((low, middle), (middle, high)))
-            if all(_comes_from_halving(part, some, depth - 1) for part, some in zip(parts, (left, right), strict=True)):
-                return True
-    return False
 
 
 def _map_cells(check: Callable[[Cell], str], cells: Sequence[Cell], processes: int) -> Iterator[tuple[Cell, str]]:

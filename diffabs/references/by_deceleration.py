@@ -45,23 +45,13 @@ class SlipByDeceleration:
         return (signal.deceleration - memory.flow) / self.time_constant
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Return the present target slip [1].
-
-        Raises:
-            ValueError: `decelerations` and `slips` differ in shape.
-        """
+        """Return the present target slip [1]."""
         del t, signal
         return self.setpoint(memory)
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """Return the present target slip [1], the same as `output`.
-
-        Raises:
-            ValueError: `decelerations` and `slips` differ in shape.
-        """
+        """Return the present target slip [1], the same as `output`."""
         nodes, slips = jnp.asarray(self.decelerations), jnp.asarray(self.slips)
-        if nodes.shape != slips.shape:
-            raise ValueError(f"decelerations and slips have shapes {nodes.shape} and {slips.shape}")
         return interpolate_shares(interval_shares(memory.flow, nodes), slips)
 
     def problems(self) -> Iterator[str]:

@@ -8,14 +8,12 @@ the limits. It limits a rising target, not a falling one. Near its final value t
 constant T v/v0. The target starts at the measured slip. At t = 0 it has already made its first step.
 """
 
-from collections.abc import Iterator
-
 import jax.numpy as jnp
 
 from diffabs.core.numerics import smaller
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree
-from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.rules import period_on_grid
 from diffabs.core.types import Scalar
 
 
@@ -40,6 +38,7 @@ class LimitedSlip:
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
     flow = no_flow
+    grid_rules = period_on_grid
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with the measured slip."""
@@ -63,7 +62,3 @@ class LimitedSlip:
         left = self.slip - memory.held
         step = smaller(-jnp.expm1(-h / self.time_constant) * left, h * self.rate)
         return Memory(held=jnp.where(now, memory.held + step, memory.held))
-
-    def grid_rules(self, step: float) -> Iterator[Rule]:
-        """Yield the rule that the period is a multiple of the integration step."""
-        yield whole_steps("period", self.period, step)

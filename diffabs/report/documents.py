@@ -24,11 +24,12 @@ KEYS_BY_KIND = {  # the keys that only this kind has
     "design": ("gain", "states", "over", "poles"),
     "certificate": ("format", "system", "claims"),
 }
-READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, prove, design and certify write"
+CERTIFICATE_FORMAT = "diffabs certificate"  # a file with another `format` is no document of these
+READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, prove --json, design and certify write"
 
 
 class ReportError(ValueError):
-    """An error: a source has no readable document, or a document is not complete. The message is one line."""
+    """An error: a source has no document, or a document cannot be read. The message is one line."""
 
 
 class Document(NamedTuple):
@@ -112,7 +113,7 @@ def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
             yield from _inside(paper, _find_folder(content["out"], path) / name / SUMMARY)
         return
     for kind, keys in KEYS_BY_KIND.items():
-        if all(key in content for key in keys):
+        if all(key in content for key in keys) and content.get("format", CERTIFICATE_FORMAT) == CERTIFICATE_FORMAT:
             # The output of `sweep --json` counts as the summary in the sweep's folder: figures and manifest are there.
             if kind == "sweep" and not (path.parent / MANIFEST).exists() and isinstance(content.get("out"), str):
                 path = _find_folder(content["out"], path) / SUMMARY

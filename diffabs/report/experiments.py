@@ -1,21 +1,18 @@
 """Reproductions of papers as sections of a report."""
 
 import pathlib
-from typing import Any
 
 from diffabs.core.types import Table
 from diffabs.papers import MODULES, compact
 from diffabs.report.documents import Document
 from diffabs.report.page import (
     VERDICT_NAMES,
-    Figure,
     ReportTable,
     ReportVerdict,
     Section,
     describe_origin,
     embed_image,
     model_tables,
-    original_command,
 )
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import load
@@ -41,6 +38,8 @@ def paper_section(document: Document) -> Section:
     if name not in MODULES:
         raise KeyError(f"paper {name}")
     found, scenario = compact(content), content.get("scenario", name)
+    # A name with a path is skipped, so that a document cannot name files outside of its folder.
+    named = [document.folder / name for name in content["figures"] if pathlib.PurePath(name).name == name]
     return Section(
         title=content["title"],
         question="Are the numbers, figures and claims of this paper true? Its experiments are computed again, and"
@@ -49,26 +48,14 @@ def paper_section(document: Document) -> Section:
         verdicts=[ReportVerdict(*verdict) for verdict in found.verdicts],
         model=model_tables(describe_model(load(scenario, integrated=False))),
         model_note=f"The packaged scenario {scenario}; the first column of the tables names the change of each row.",
-        figures=existing_figures(content["figures"], document.folder),
+        figures=[figure for path in named if (figure := embed_image(path))],
         tables=[ReportTable("In short", found.headings, found.lines), *_tables(content)],
         certificate=_certificates(content.get("design")),
         certificate_tables=_designs(content.get("design")),
         notes=list(content["notes"]),
         provenance=describe_origin(content, **{f"solver, {name}": value for name, value in content["solver"].items()}),
-        again=original_command(content, f"diffabs reproduce {name}"),
+        again=[content["made"]["command"]],
     )
-
-
-def existing_figures(names: Any, folder: pathlib.Path) -> list[Figure]:
-    """Return the readable pictures of a folder.
-
-    Args:
-        names: Names of files. A name with a path is skipped, so that a document cannot name files outside of the
-            folder.
-        folder: Folder of the pictures.
-    """
-    found = [embed_image(folder / name) for name in names if pathlib.PurePath(name).name == name]
-    return [figure for figure in found if figure]
 
 
 def _tables(content: Table) -> list[ReportTable]:

@@ -7,7 +7,6 @@ from diffabs.report import proofs
 from diffabs.report.charts import draw_lines
 from diffabs.report.documents import Document
 from diffabs.report.page import (
-    UNKNOWN_ORIGIN,
     Figure,
     ReportTable,
     ReportVerdict,
@@ -18,7 +17,6 @@ from diffabs.report.page import (
     format_pairs,
     join_words,
     model_tables,
-    original_command,
     table_unit,
 )
 
@@ -44,17 +42,17 @@ def tuning_section(document: Document) -> Section:
         question=f"Which values of {join_words(content['free'])} make the objective least over {lanes}{under}?",
         answer=[f"The objective went from {before} to {after}; it ended because {content['reason']}."],
         verdicts=[_constraint_row(row) for row in content["constraints"]],
-        model=model_tables(content.get("model")),
-        model_note="Before the tuning." if content.get("model") else UNKNOWN_ORIGIN,
+        model=model_tables(content["model"]),
+        model_note="Before the tuning.",
         figures=list(_figures(document)),
         tables=list(_tuning_tables(content)),
         certificate=proofs.proof_verdicts(content["certificate"]),
         certificate_tables=proofs.proof_tables(content["certificate"], content),
         notes=["Interrupted: the best so far, not a minimum."] if content.get("interrupted") else [],
         provenance=describe_origin(content, gradients=content["evaluations"], mode=content["mode"],
-                          seed=((content.get("model") or {}).get("solver") or {}).get("seed"),
+                          seed=content["model"]["solver"]["seed"],
                           engine=format_pairs(content["engine"])),
-        again=original_command(content),
+        again=[content["made"]["command"]],
     )  # fmt: skip
 
 
@@ -77,7 +75,7 @@ def _figures(document: Document) -> Iterator[Figure]:
 
 
 def _tuning_tables(content: Table) -> Iterator[ReportTable]:
-    units = (content.get("model") or {}).get("metrics") or {}
+    units = content["model"]["metrics"]
     keys = ("before", "after", "low", "high")
     rows = [[path, *(row[key] for key in keys), table_unit(row["unit"])] for path, row in content["free"].items()]
     yield ReportTable("Free parameters", ("parameter", *keys, "unit"), rows)
@@ -115,12 +113,12 @@ def identification_section(document: Document) -> Section:
                 f" {content['reason']}."],
         verdicts=[ReportVerdict("not determined", row["direction"]) for row in content["undetermined"]]
         or [ReportVerdict("determined", "every parameter that was free")],
-        model=model_tables(content.get("model")),
-        model_note="Before the identification." if content.get("model") else UNKNOWN_ORIGIN,
+        model=model_tables(content["model"]),
+        model_note="Before the identification.",
         tables=list(_identification_tables(content)),
         notes=["Interrupted: the values so far, not the best ones."] if content.get("interrupted") else [],
         provenance=describe_origin(content, evaluations=content["evaluations"]),
-        again=original_command(content),
+        again=[content["made"]["command"]],
     )  # fmt: skip
 
 

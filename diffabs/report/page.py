@@ -14,7 +14,6 @@ from diffabs.runtime.summary import round_for_table
 IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 LARGEST_IMAGE = 2**25  # bytes
 MAX_SHOWN_ENTRIES = 8  # of a list in a cell
-UNKNOWN_ORIGIN = "not known: the document does not say"
 VERDICT_NAMES = {True: "proved", False: "disproved", None: "undecided"}
 
 
@@ -187,12 +186,12 @@ def describe_origin(content: Table, **more: Any) -> list[tuple[str, PyTree]]:
     """
     made = {name: value for name, value in (content.get("made") or {}).items() if name != "command"}
     versions = {f"version of {name}": value for name, value in (content.get("versions") or {}).items()}
-    # Older documents keep the origin among the versions.
+    # Papers and manifests keep part of the origin among the versions.
     for name in ("commit", "machine", "backend"):
         if value := versions.pop(f"version of {name}", None):
             made.setdefault(name, value)
     rows = {
-        "date": UNKNOWN_ORIGIN,
+        "date": "not known: the document does not say",
         **made,
         **{name: value for name, value in more.items() if value is not None},
         **versions,
@@ -210,17 +209,6 @@ def format_pairs(values: Params) -> str:
         values: Values by name.
     """
     return ", ".join(f"{name} {value}" for name, value in values.items() if value is not None)
-
-
-def original_command(content: Table, otherwise: str = "") -> list[str]:
-    """Return the command that made a document, as a list of one line; the list is empty if the command is unknown.
-
-    Args:
-        content: Values of the document.
-        otherwise: Equivalent command for a document without one.
-    """
-    line = (content.get("made") or {}).get("command") or otherwise
-    return [str(line)] if line else []
 
 
 def format_known(value: float | None, digits: int = 6) -> str:

@@ -7,7 +7,6 @@ from diffabs.core.types import Table
 from diffabs.design.verify import verify_file
 from diffabs.report.documents import Document
 from diffabs.report.page import (
-    UNKNOWN_ORIGIN,
     VERDICT_NAMES,
     ReportTable,
     ReportVerdict,
@@ -17,7 +16,6 @@ from diffabs.report.page import (
     format_known,
     join_words,
     model_tables,
-    original_command,
     table_unit,
 )
 
@@ -53,14 +51,13 @@ def design_section(document: Document) -> Section:
         title=f"{'Design for' if designed else 'Certificate of a gain of'} {content['scenario']}",
         question=f"{question}, over {ranges}?",
         answer=[content["reason"]] if content["reason"] else [],
-        model=model_tables(content.get("model")),
-        model_note="" if content.get("model") else UNKNOWN_ORIGIN,
+        model=model_tables(content["model"]),
         tables=[ReportTable("Gain", ("state", "gain"), [*zip(content["states"], content["gain"] or (), strict=False)])],
         certificate=proof_verdicts(content),
         certificate_tables=proof_tables(content, content),
         notes=_notes(content),
         provenance=describe_origin(content),
-        again=[*original_command(content), *map(_verify_command, content["files"].values())],
+        again=[content["made"]["command"], *map(_verify_command, content["files"].values())],
     )  # fmt: skip
 
 
@@ -177,7 +174,7 @@ def box_section(document: Document) -> Section:
     """
     content = document.content
     verdict, claims = content["verdict"], [_describe_claim(claim) for claim in content["claims"]]
-    units = {path: row["unit"] for path, row in (content.get("model") or {}).get("parameters", {}).items()}
+    units = {path: row["unit"] for path, row in content["model"]["parameters"].items()}
     ranges = join_words(
         f"{path} from {low:.6g} to {high:.6g}{_unit(units.get(path))}" for path, (low, high) in content["over"].items()
     )
@@ -194,10 +191,8 @@ def box_section(document: Document) -> Section:
         question=f"{asked}, for every {ranges}?",
         answer=[f"{verdict}: {content['reason']}." if content["reason"] else f"{verdict}."],
         verdicts=[ReportVerdict(verdict, claim) for claim in claims] or [ReportVerdict(verdict, "the bounds below")],
-        model=model_tables(content.get("model")),
-        model_note="The values of the box's parameters stand for nothing: the proof is about all of the box."
-        if content.get("model")
-        else UNKNOWN_ORIGIN,
+        model=model_tables(content["model"]),
+        model_note="The values of the box's parameters stand for nothing: the proof is about all of the box.",
         figures=[
             found for found in [embed_named(document.folder, files.get("plot"), "The cells of the proof")] if found
         ],
@@ -214,7 +209,7 @@ def box_section(document: Document) -> Section:
         notes=["The runs are those of the model in real numbers, without the rounding of the simulation."],
         provenance=describe_origin(content),
         again=[
-            *original_command(content),
+            content["made"]["command"],
             *([_verify_command(files["certificate"])] if verdict == "proved" and "certificate" in files else []),
         ],
     )

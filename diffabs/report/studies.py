@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from diffabs.core.types import JsonObject, Table
 from diffabs.report.documents import MANIFEST, MAX_DOCUMENT_BYTES, Document
 from diffabs.report.page import (
-    UNKNOWN_ORIGIN,
     Figure,
     ReportTable,
     ReportVerdict,
@@ -19,7 +18,6 @@ from diffabs.report.page import (
     format_pairs,
     join_words,
     model_tables,
-    original_command,
     table_unit,
 )
 from diffabs.runtime import files
@@ -52,6 +50,8 @@ def sweep_section(document: Document) -> Section:
     content = document.content
     manifest = json.loads(files.read_content(document.folder / MANIFEST, MAX_DOCUMENT_BYTES))
     study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
+    commit = {"commit": manifest["commit"]} if manifest.get("commit") else {}
+    made = content.get("made", {})  # a summary of `summarise_sweep` has none
     found, note = _scenario_model(source, document.folder)
     varied, percent = join_words(study["space"]["variables"]), f"{100 * content['confidence']:g} %"
     return Section(
@@ -66,17 +66,12 @@ def sweep_section(document: Document) -> Section:
         tables=list(_tables(content, units, percent)),
         notes=list(_notes(content)),
         provenance=describe_origin(
-            {"versions": manifest.get("versions"), "made": {**content.get("made", {}), **_commit(manifest)}},
+            {"versions": manifest["versions"], "made": {**made, **commit}},
             seed=study["seed"], samples=study["samples"], numbers=study["dtype"],
             engine=format_pairs(study.get("engine") or {}) or "xla", digest=content["digest"],
         ),
-        again=[*original_command(content), *_sample(content, document.folder)],
+        again=[*([made["command"]] if made else []), *_sample(content, document.folder)],
     )  # fmt: skip
-
-
-def _commit(manifest: Table) -> JsonObject:
-    commit = manifest.get("commit")
-    return dict(commit) if isinstance(commit, dict) else {"commit": commit} if commit else {}
 
 
 def _scenario_model(source: Table, folder: pathlib.Path) -> tuple[JsonObject | None, str]:
@@ -108,8 +103,7 @@ def _failure_tables(content: Table, percent: str) -> str:
     lost = content["diverged"]["count"]
     line = f"{content['samples']:,} runs; {lost:,} diverged, {content['refused']['count']:,} were refused."
     if one and one["value"] is not None:
-        among = f" of {one['samples']:,}" if "samples" in one else ""  # documents of earlier versions lack it
-        line += f" {one['count']:,}{among} failed: a probability of {one['value']:.4g}"
+        line += f" {one['count']:,} of {one['samples']:,} failed: a probability of {one['value']:.4g}"
         # A grid and corners are not random, so their documents have no interval.
         known = None not in (one["low"], one["high"])
         line += f" ({percent} interval {one['low']:.4g} to {one['high']:.4g})." if known else "."
@@ -160,9 +154,12 @@ def _tables(content: Table, units: Mapping[str, str], percent: str) -> Iterator[
 
 def _notes(content: Table) -> Iterator[str]:
     for reason, count in (content["refused"].get("reasons") or {}).items():
-        yield f"{count} samples were refused, and are left out of all numbers: {reason}"
+        yield f"Refused samples, left out of all numbers: {count}, {reason}"
     if content["diverged"]["count"]:
         yield f"Diverged samples: {join_words(content['diverged']['samples'][:20])}."
+    for name, row in content["never"].items():
+        runs = f"{row['count']}, the first is sample {row['samples'][0]}"
+        yield f"Runs with an infinite {name} (never), left out of its statistics: {runs}"
     yield from describe_turned_metrics(content.get("accuracy") or {})
 
 
@@ -185,7 +182,6 @@ def rare_section(document: Document) -> Section:
     low, high = (format_known(end, 3) for end in content["interval"])
     failure = f"{content['metric']} > {content['bound']:g} {content['unit']}"
     columns = ("threshold", "share", "cov", "acceptance", "diverged")
-    # Documents of earlier versions have no key `strict`.
     levels = [
         [i, "above" if row.get("strict") else "at least", *(row[key] for key in columns)]
         for i, row in enumerate(content["levels"], 1)
@@ -202,10 +198,9 @@ def rare_section(document: Document) -> Section:
     return Section(
         title=f"A rare failure of {content['scenario']}",
         question=f"How probable is {failure}, while what [sweep.over] names varies?",
-        answer=[f"{probability}, 95 % interval {low} to {high}."],
+        answer=[f"{probability}, 95 % interval {low} to {high}. Diverged runs: {content['diverged']:,}."],
         verdicts=[ReportVerdict("ended", content["reason"])],
-        model=model_tables(content.get("model")),
-        model_note="" if content.get("model") else UNKNOWN_ORIGIN,
+        model=model_tables(content["model"]),
         tables=[
             ReportTable("Estimates", ("by", "probability", "low (95 %)", "high (95 %)", "coefficient of variation"),
                   estimates),
@@ -217,5 +212,5 @@ def rare_section(document: Document) -> Section:
         provenance=describe_origin(
             content, seed=content["seed"], runs=content["runs"], engine=format_pairs(content["engine"])
         ),
-        again=original_command(content),
+        again=[content["made"]["command"]],
     )  # fmt: skip

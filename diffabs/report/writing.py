@@ -31,7 +31,7 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
         title: Title of the report; by default the title of the only section, or the number of results.
 
     Raises:
-        ReportError: A document is not complete, or a file that belongs to it cannot be read.
+        ReportError: A document, or a file that belongs to it, cannot be read.
     """
     import jinja2
 
@@ -50,7 +50,7 @@ def _section(document: Document) -> Section:
         return SECTION_BY_KIND[document.kind](document)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError) as error:
         said = " ".join(f"{type(error).__name__} {error}".split())
-        raise ReportError(f"{document.path}: is not a complete document of {document.kind}: {said}") from None
+        raise ReportError(f"{document.path}: cannot be read as a document of {document.kind}: {said}") from None
 
 
 def is_report(path: pathlib.Path) -> bool:

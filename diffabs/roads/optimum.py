@@ -25,7 +25,7 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
 
     A braking wheel meets the first maximum first. It is not always the greatest: the rig's curve rises again towards
     lock. A grid of 1024 intervals brackets the maximum, so it misses narrower maxima. Bisection of the slope locates
-    it.
+    it. If mu never falls and is NaN at a slip above 0, slip and mu are NaN.
 
     Two Newton steps s - mu'/mu'' polish it and carry its derivative by the implicit function theorem. Slip and mu are
     thus differentiable in every parameter of the road. At a kink bisection alone locates the maximum. Its derivative is
@@ -53,6 +53,8 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     values = jax.lax.stop_gradient(jax.vmap(mu)(grid))
     falls = (values[1:] < values[:-1]) & (values[:-1] > 0)  # a fitted curve may dip below 0 next to slip 0
     inside = jnp.any(falls)
+    # A comparison with NaN is false, so a curve of NaN seems never to fall. At slip 0 a formula may be 0/0.
+    lock = jnp.where(jnp.isnan(values[1:]).any(), jnp.nan, 1.0)
     top = jnp.argmax(falls)  # the first fall is after the top grid point
 
     def halve(_: object, bracket: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
@@ -78,7 +80,7 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     # The bracket carries no derivative. The first Newton step gives the first derivative of the maximum, and the second
     # step doubles the order of derivatives that are exact.
     near = s0 - _newton_step(residual(s0), rate)
-    best = jnp.where(inside, clamp(near - _newton_step(residual(near), rate), 0.0, 1.0), 1.0)
+    best = jnp.where(inside, clamp(near - _newton_step(residual(near), rate), 0.0, 1.0), lock)
     return Peak(best, mu(best))
 
 

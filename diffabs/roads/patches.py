@@ -69,9 +69,9 @@ class Patches:
 
     def problems(self) -> Iterator[str]:
         """Yield a message if the number of edges is not the number of roads minus one."""
-        edges = np.asarray(self.edges)
-        if edges.shape != (len(self.roads) - 1,):
-            yield f"edges has shape {edges.shape}; {len(self.roads)} roads need ({len(self.roads) - 1},)"
+        shape = np.shape(self.edges)
+        if shape != (len(self.roads) - 1,):
+            yield f"edges has shape {shape}; {len(self.roads)} roads need ({len(self.roads) - 1},)"
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rule that the edges increase."""

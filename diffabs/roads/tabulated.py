@@ -67,9 +67,9 @@ class Tabulated:
 
     def problems(self) -> Iterator[str]:
         """Yield a message if `slip` and `mu` differ in length, or have fewer than 3 knots."""
-        x, y = np.asarray(self.slip), np.asarray(self.mu)
-        if x.shape != y.shape or x.ndim != 1 or x.size < 3:
-            yield f"slip and mu have shapes {x.shape} and {y.shape}; both need the same length of at least 3"
+        x, y = np.shape(self.slip), np.shape(self.mu)
+        if x != y or len(x) != 1 or x[0] < 3:
+            yield f"slip and mu have shapes {x} and {y}; both need the same length of at least 3"
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rules that the slips increase and that the knots run from (0, 0) to slip 1."""

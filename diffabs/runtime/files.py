@@ -1,4 +1,4 @@
-"""Reading of regular files, and writing of files that appear whole or not at all and leave no temporary files."""
+"""Reading of regular files, and writing of files that appear whole or not at all."""
 
 import contextlib
 import ctypes
@@ -29,16 +29,11 @@ def open_regular(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     Raises:
         OSError: The file cannot be opened, or is a folder, a pipe or a device.
     """
-    handle = os.open(path, os.O_RDONLY | NONBLOCKING_FLAG | getattr(os, "O_BINARY", 0))
-    try:
-        if stat.S_ISDIR(os.fstat(handle).st_mode):
-            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+    with open(path, "rb", opener=lambda path, flags: os.open(path, flags | NONBLOCKING_FLAG)) as file:
+        handle = file.fileno()
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise OSError(errno.EINVAL, "not a regular file", os.fspath(path))
-        with open(handle, "rb", closefd=False) as file:
-            yield file
-    finally:
-        os.close(handle)
+        yield file
 
 
 def read_content(path: str | os.PathLike[str], most: int = sys.maxsize) -> bytes:
@@ -98,19 +93,23 @@ def temporary_path(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 @contextlib.contextmanager
-def new_file(target: pathlib.Path, temporary: pathlib.Path | None = None) -> Iterator[pathlib.Path]:
+def new_file(target: pathlib.Path, suffix: str | None = None) -> Iterator[pathlib.Path]:
     """Yield an empty file beside `target` that replaces `target` at the end, or vanishes after an error.
 
-    Readers see the old file or the whole new one. If the caller removes the file, `target` stays unchanged.
+    Readers see the old file or the whole new one. If the caller removes the file, `target` stays unchanged. A killed
+    process may leave a hidden file `.STEM.*`.
 
     Args:
-        target: Path of the file to write.
-        temporary: Path of the empty file, for a target that only one process writes; None takes an unused name.
+        target: Path of the file to write. The file behind a symbolic link is replaced, and the link stays.
+        suffix: Suffix of the file until then; None is that of `target`.
 
     Raises:
-        OSError: The file cannot be created.
+        OSError: The file cannot be created, or the target is a folder, a pipe or a device.
     """
-    temporary = temporary or target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    target = pathlib.Path(os.path.realpath(target))
+    if target.exists() and not target.is_file():
+        raise OSError(errno.EINVAL, "not a regular file", str(target))
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{suffix or target.suffix}")
     temporary.touch(exist_ok=False)
     with temporary_path(temporary):
         yield temporary
@@ -145,7 +144,7 @@ def write_synced(target: pathlib.Path, data: bytes) -> pathlib.Path:
     Raises:
         OSError: The file cannot be written.
     """
-    with new_file(target) as temporary, temporary.open("wb") as file:
+    with new_file(target, ".tmp") as temporary, temporary.open("wb") as file:  # data sets read hidden .parquet files
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
@@ -172,8 +171,7 @@ def others_may_write(folder: pathlib.Path) -> bool:
 def write_durably(target: pathlib.Path, data: bytes) -> pathlib.Path:
     """Write a file that is whole whenever it exists, also after a power cut, and return its path.
 
-    Only one process may write it. A killed process leaves at most a file that ends in `.tmp`. Unlike `write_synced`,
-    the function also syncs the folder, so that the new file survives a power cut.
+    Unlike `write_synced`, the function also syncs the folder, so that the new file survives a power cut.
 
     Args:
         target: Path of the file.
@@ -182,14 +180,9 @@ def write_durably(target: pathlib.Path, data: bytes) -> pathlib.Path:
     Raises:
         OSError: The file cannot be written.
     """
-    temporary = target.with_name(f"{target.name}.tmp")
-    temporary.unlink(missing_ok=True)
-    with new_file(target, temporary), temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    write_synced(target, data)
     if hasattr(os, "O_DIRECTORY"):
-        folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
+        folder = os.open(os.path.dirname(os.path.realpath(target)), os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(folder)
         finally:
@@ -206,11 +199,14 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     process may leave a hidden folder `.NAME.*` in any case; remove it when no process writes.
 
     Args:
-        target: Path of the folder to write.
+        target: Path of the folder to write. The folder behind a symbolic link is replaced, and the link stays.
 
     Raises:
-        OSError: The folder cannot be created or put in place; the old folder is then restored.
+        OSError: The folder cannot be created or put in place, and the old folder is restored. Or the target is a file.
     """
+    target = pathlib.Path(os.path.realpath(target))
+    if target.exists() and not target.is_dir():
+        raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(target))
     target.parent.mkdir(parents=True, exist_ok=True)
     with temporary_path(pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))) as room:
         new, old = room / "new", room / "old"

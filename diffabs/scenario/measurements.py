@@ -40,8 +40,8 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
 
     Raises:
         ScenarioError: The file cannot be read, a column is unknown, or there is no signal or no row. Also raised for a
-            cell that is no finite number in another column, and for an instant that is negative or not after the one
-            before. The message names the line of such a cell or instant.
+            cell that is no finite number in a column that is read, and for an instant that is negative or not after the
+            one before. The message names the line of such a cell or instant.
     """
     try:
         raw = files.read_content(path, MAX_MEASUREMENT_BYTES + 1)
@@ -55,23 +55,25 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
         raise ScenarioError(f"--data {path}: is not a CSV file of UTF-8 text") from None
     header = [cell.strip() for cell in rows[0]] if rows else []
     names = _names(header, path, units)
-    numbers = np.array([_numbers(row, i, header, path) for i, row in enumerate(rows[1:], 2) if row], float)
+    used = [header.index(TIME_COLUMN), *names]
+    numbers = np.array([_numbers(row, i, header, used, path) for i, row in enumerate(rows[1:], 2) if row], float)
     if not len(numbers):
         raise ScenarioError(f"--data {path}: has a header and no numbers")
     lines = [i for i, row in enumerate(rows[1:], 2) if row]
-    unlimited = {i for i in names if np.isinf(numbers[0, i]) and (numbers[:, i] == numbers[0, i]).all()}
+    t, *readings = numbers.T
+    compared = dict(zip(names, readings, strict=True))
+    unlimited = {i for i, column in compared.items() if np.isinf(column[0]) and (column == column[0]).all()}
     unlimited = unlimited if len(unlimited) < len(names) else set()
     for i, j in np.argwhere(~np.isfinite(numbers)):
-        if j not in unlimited:
-            cell = rows[lines[i] - 1][j].strip()
-            raise ScenarioError(f"--data {path}, line {lines[i]}: {header[j]} = {cell} is outside (-inf, inf)")
-    t = numbers[:, header.index(TIME_COLUMN)]
+        if used[j] not in unlimited:
+            cell = rows[lines[i] - 1][used[j]].strip()
+            raise ScenarioError(f"--data {path}, line {lines[i]}: {header[used[j]]} = {cell} is outside (-inf, inf)")
     late = np.flatnonzero(np.diff(t) <= 0)
     if t[0] < 0 or len(late):
         line, before = (lines[late[0] + 1], t[late[0]]) if len(late) else (lines[0], 0.0)
         at = t[late[0] + 1] if len(late) else t[0]
         raise ScenarioError(f"--data {path}, line {line}: t = {at:g} s does not come after {before:g} s")
-    columns = {name: numbers[:, i] for i, name in names.items() if i not in unlimited}
+    columns = {name: compared[i] for i, name in names.items() if i not in unlimited}
     return Readings(t, columns, tuple(name for name in names.values() if name not in columns))
 
 
@@ -95,15 +97,18 @@ def _names(header: Sequence[str], path: pathlib.Path, units: Mapping[str, str]) 
     return names
 
 
-def _numbers(row: Sequence[str], line: int, header: Sequence[str], path: pathlib.Path) -> list[float]:
+def _numbers(
+    row: Sequence[str], line: int, header: Sequence[str], used: Sequence[int], path: pathlib.Path
+) -> list[float]:
+    """Return the numbers of the `used` columns of a row."""
     if len(row) != len(header):
         raise ScenarioError(f"--data {path}, line {line}: has {len(row)} cells; the header has {len(header)}")
     found = []
-    for cell, name in zip(row, header, strict=True):
+    for i in used:
         try:
-            found.append(float(cell))
+            found.append(float(row[i]))
         except ValueError:
             raise ScenarioError(
-                f"--data {path}, line {line}: {name} = {format_given(cell)} is text; a number is needed"
+                f"--data {path}, line {line}: {header[i]} = {format_given(row[i])} is text; a number is needed"
             ) from None
     return found

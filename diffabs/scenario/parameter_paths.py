@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from diffabs.config.values import (
-    FORMER_FIELDS,
     Reader,
     ScenarioError,
     dotted_path,
@@ -239,7 +238,7 @@ def read_entries(
 ) -> Iterator[ParameterEntry]:
     """Yield one entry for each parameter in a table.
 
-    A speed may have the suffix `_kmh`. A controller's limit may have its former name.
+    A speed may have the suffix `_kmh`.
 
     Args:
         table: Nested or dotted values by path.
@@ -252,20 +251,13 @@ def read_entries(
     """
     known = {canonical_path(path): (path, spec, shape, 1.0) for path, (spec, shape) in there.items()}
     known |= {f"{k}_kmh": (path, in_kmh(spec), n, KMH) for k, (path, spec, n, _) in known.items() if spec.unit == "m/s"}
-    # A limit of a controller is also known by its former name, unless another parameter has this name.
-    older = {new: old for old, new in FORMER_FIELDS.items()}
-    for key, item in list(known.items()):
-        part, _, name = key.rpartition(".")
-        if part.startswith("controller") and name in older:
-            known.setdefault(f"{part}.{older[name]}", item)
     seen = set()
     for key, given in flatten_table(table, section).items():
         if key not in known:
             raise unknown_name_error(f"{_where(section, key)} is {otherwise}", key, known)
         path, spec, shape, scale = known[key]
         if path in seen:
-            how = "in m/s and in km/h" if spec.unit in ("m/s", "km/h") else "by its former name, too"
-            raise ScenarioError(f"{_where(section, canonical_path(path))} is given twice, {how}")
+            raise ScenarioError(f"{_where(section, canonical_path(path))} is given twice, in m/s and in km/h")
         seen.add(path)
         yield ParameterEntry(path, _where(section, key), given, spec, shape, scale)
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors, stops
 from diffabs.config.values import (
-    FORMER_FIELDS,
+    READER_BY_TYPE,
     ScenarioError,
     dotted_path,
     format_given,
@@ -41,7 +41,7 @@ from diffabs.scenario.defaults import braking
 
 KMH = 3.6  # km/h in a m/s
 MAX_DEPTH = 16  # parts inside parts; more is a mistake, and Python's stack is finite
-MAX_FILE_BYTES = 10_000_000  # largest static whole number: such numbers become shapes of arrays
+MAX_STATIC = 10_000_000  # largest static whole number: such numbers become shapes of arrays
 DEFAULT_UNITS = units_of(braking().plant)  # units in which `list` shows a part outside of a loop
 
 
@@ -287,8 +287,6 @@ def fill_part(template: Any, table: JsonObject, family: str, path: str, units: U
     values = {}
     for key, given in table.items():
         where = join_path(path, key)
-        if family == "controller" and key not in fields and FORMER_FIELDS.get(key) in fields:
-            key = FORMER_FIELDS[key]
         if key not in fields and key not in edge:
             whose = f"a field of {name_of(family, template)}" if path else "a section"
             if path and (inner := _find_inner_field(template, key)):
@@ -296,8 +294,7 @@ def fill_part(template: Any, table: JsonObject, family: str, path: str, units: U
             raise unknown_name_error(f"{where} is not {whose}", key, fields if path else (*fields, *OTHER_SECTIONS))
         field = fields[key] if key in fields else edge[key]
         if field.name in values:
-            how = "in m/s and in km/h" if field.metadata["spec"].unit == "m/s" else "by its former name, too"
-            raise ScenarioError(f"{join_path(path, field.name)} is given twice, {how}")
+            raise ScenarioError(f"{join_path(path, field.name)} is given twice, in m/s and in km/h")
         if key in edge:
             values[field.name] = read_number_in_range(given, in_kmh(field.metadata["spec"]), where) / KMH
         else:
@@ -366,17 +363,32 @@ def _value(
             return _parts(inner, given, default, path, units)
         return build_part(inner, given, default, path, units)
     if "static" in field.metadata:
-        if isinstance(default, int) and not isinstance(default, bool):
-            return read_whole(given, 1, MAX_FILE_BYTES, path)
-        if type(given) is not type(default):
+        if low_high := _whole_range(field, default):
+            return read_whole(given, *low_high, path)
+        if type(default) not in READER_BY_TYPE:
             raise wrong_kind_error(path, given, f"a value like {format_given(default)}")
-        return given
-    spec: ParameterSpec = field.metadata["spec"].around(units)
-    if np.ndim(default) == 0:
+        return READER_BY_TYPE[type(default)](given, path)
+    return _numbers(given, np.ndim(default), field.metadata["spec"].around(units), path)
+
+
+def _whole_range(field: dataclasses.Field[Any], value: Scalar) -> tuple[int, int] | None:
+    """Return the range of a static whole number, by its class's default; None for a value of another kind."""
+    if type(value) is not int:
+        return None
+    least = value if field.default is dataclasses.MISSING else field.default
+    return (1 if least >= 1 else -MAX_STATIC), MAX_STATIC
+
+
+def _numbers(given: PyTree, depth: int, spec: ParameterSpec, path: str) -> Any:
+    """Return a number (`depth` 0), or the array of lists that are nested `depth` deep."""
+    if not depth:
         return read_number(given, spec, path)
     if not isinstance(given, list):
-        raise wrong_kind_error(path, given, f"a list of numbers in {spec.interval()}")
-    return np.array([read_number(item, spec, f"{path}.{i}") for i, item in enumerate(given)], float)
+        raise wrong_kind_error(path, given, f"a list of {'lists of ' * (depth - 1)}numbers in {spec.interval()}")
+    rows = [_numbers(item, depth - 1, spec, f"{path}.{i}") for i, item in enumerate(given)]
+    if len({np.shape(row) for row in rows}) > 1:
+        raise ScenarioError(f"{path} = {format_given(given)} has rows of different lengths")
+    return np.array(rows, float)
 
 
 def _parts(
@@ -421,16 +433,14 @@ def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
         spec = spec and spec.around(DEFAULT_UNITS)
         if "part" in field.metadata:
             inner = family_of(field.name, family)
-            names = [name_of(inner, item) for item in value] if isinstance(value, tuple) else name_of(inner, value)
+            names = (
+                [name_of(inner, item) for item in value] if isinstance(value, tuple | list) else name_of(inner, value)
+            )
             rows[field.name] = {"default": names, "unit": "", "range": f"any {inner}", "low": None, "high": None}
         elif spec is None:
-            rows[field.name] = {
-                "default": value,
-                "unit": "",
-                "range": f"[1, {MAX_FILE_BYTES}]",
-                "low": 1,
-                "high": MAX_FILE_BYTES,
-            }
+            low, high = _whole_range(field, value) or (None, None)
+            text = "" if low is None else f"[{low}, {high}]"
+            rows[field.name] = {"default": value, "unit": "", "range": text, "low": low, "high": high}
         else:
             ends = {"low": spec.low, "high": spec.high}
             ends = {name: end if math.isfinite(end) else None for name, end in ends.items()}
@@ -445,10 +455,10 @@ def part_choices(part: Part, path: str = "") -> Iterator[tuple[str, JsonObject]]
     The given part comes first, then every part inside it.
 
     Args:
-        part: Part, or tuple of parts.
+        part: Part, or tuple or list of parts.
         path: Path of the part; empty for a whole loop, which itself is not yielded.
     """
-    if isinstance(part, tuple):
+    if isinstance(part, tuple | list):
         for i, item in enumerate(part):
             yield from part_choices(item, f"{path}.{i}")
         return

@@ -23,8 +23,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from diffabs.config.values import ScenarioError as ScenarioError
 from diffabs.config.values import (
-    FORMER_FIELDS,
     as_plain,
     format_given,
     make_printable,
@@ -33,7 +33,6 @@ from diffabs.config.values import (
     unknown_name_error,
     wrong_kind_error,
 )
-from diffabs.config.values import ScenarioError as ScenarioError
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import get
@@ -269,8 +268,6 @@ def _override(table: JsonObject, override: str) -> str:
         # An override in m/s replaces a value in km/h and the reverse; both together would be given twice.
         other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
         node.pop(other, None)
-        if keys[0] == "controller":  # an override replaces the same limit under its other name
-            node.pop({**FORMER_FIELDS, **{new: old for old, new in FORMER_FIELDS.items()}}.get(place), None)
     try:
         node[place] = toml.parse_value(text.strip())
     except ScenarioError as error:

@@ -109,13 +109,15 @@ class Goal:
         """Return this goal unchanged if `loop` can be tuned with it.
 
         Raises:
-            ScenarioError: No parameter is free, no metric has a weight, a start is not inside its range, or a free
-                parameter is in [tune.over]. Also raised if an initial speed in [tune.over] is not above the speed at
-                which runs stop.
+            ScenarioError: No parameter is free, no metric has a weight, a start is not inside its range, a free
+                parameter is in [tune.over], or there are samples without [tune.over]. Also raised if an initial speed
+                in [tune.over] is not above the speed at which runs stop.
         """
         for name, example in (("free", '"controller.gain" = [-20000.0, -80.0]'), ("objective", "iae = 1.0")):
             if not getattr(self, name):
                 raise ScenarioError(f"tune.{name} is empty; for example [tune.{name}] {example}")
+        if self.samples and not self.over:
+            raise ScenarioError(f"tune.samples = {self.samples} needs ranges to draw from: tune.over is empty")
         if both := set(self.free) & set(self.over):
             named = ", ".join(sorted(map(canonical_path, both)))
             raise ScenarioError(f"{named}: both in tune.free and in tune.over; leave it out of one of them")

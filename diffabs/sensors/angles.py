@@ -1,13 +1,11 @@
 """The balance sensor of a real vehicle: it measures theta (frame) and psi (arm), but not phi (rider)."""
 
-from collections.abc import Iterator
-
 import jax
 import jax.numpy as jnp
 
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree
-from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.rules import period_on_grid
 from diffabs.core.types import Scalar
 from diffabs.sensors.noise import draw_noise
 
@@ -29,6 +27,7 @@ class AngleSensor:
     period: Scalar = param(default=0.01, unit="s", above=0.0, tunable=False)
 
     flow = no_flow
+    grid_rules = period_on_grid
 
     def start(self, signal: BalanceOutput) -> Memory:
         """Return the memory with zero noise for both angles."""
@@ -48,15 +47,9 @@ class AngleSensor:
             ValueError: The run has no random key.
         """
         del signal
-        if clock.key is None:
-            raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
         now, number = clock.ticks(self.period)
         held = tuple(
             draw_noise(jnp.asarray(deviation), clock.key, 2 * number + i)
             for i, deviation in enumerate((self.theta, self.psi))
         )
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), held, memory.held))
-
-    def grid_rules(self, step: float) -> Iterator[Rule]:
-        """Yield the rule that the period is a multiple of the integration step."""
-        yield whole_steps("period", self.period, step)

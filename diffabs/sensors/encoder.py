@@ -15,8 +15,8 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import BrakeOutput, Clock, Memory
 from diffabs.core.pytree import param, pytree
+from diffabs.core.rules import period_on_grid
 from diffabs.core.types import Scalar
-from diffabs.sensors.noise import Noise
 
 
 class EncoderMemory(NamedTuple):
@@ -51,7 +51,7 @@ class EncoderSlip:
     dead_zone: Scalar = param(default=0.05, unit="m/s", low=0.0, tunable=False)
     floor: Scalar = param(default=0.01, unit="m/s", above=0.0)
 
-    grid_rules = Noise.grid_rules
+    grid_rules = period_on_grid
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with the rim's path 0, the true distance, and the true speeds for the period before."""

@@ -11,7 +11,7 @@ from jax.custom_derivatives import SymbolicZero
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import param, pytree
-from diffabs.core.rules import Rule, whole_steps
+from diffabs.core.rules import period_on_grid
 from diffabs.core.types import Key, PyTree, Scalar, Vector
 
 
@@ -39,6 +39,7 @@ class Noise:
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
 
     flow = no_flow
+    grid_rules = period_on_grid
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with zero noise in every channel."""
@@ -55,18 +56,12 @@ class Noise:
         Raises:
             ValueError: The run has no random key.
         """
-        if clock.key is None:
-            raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
         now, draw = clock.ticks(self.period)
         deviations = (self.slip, self.speed, self.wheel_speed, self.deceleration)
         # Every channel has its own draw number, so channels are independent.
         noise = [draw_noise(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
         held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), held, memory.held))
-
-    def grid_rules(self, step: float) -> Iterator[Rule]:
-        """Yield the rule that the period is a multiple of the integration step."""
-        yield whole_steps("period", self.period, step)
 
 
 @pytree
@@ -86,7 +81,7 @@ class WheelNoise:
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
 
     flow = no_flow
-    grid_rules = Noise.grid_rules
+    grid_rules = period_on_grid
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with zero noise."""
@@ -105,8 +100,6 @@ class WheelNoise:
             ValueError: The run has no random key.
         """
         del signal
-        if clock.key is None:
-            raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
         now, draw = clock.ticks(self.period)
         return Memory(held=jnp.where(now, draw_noise(jnp.asarray(self.slip), clock.key, draw), memory.held))
 
@@ -128,7 +121,7 @@ class PlayedWheelNoise:
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
 
     flow = no_flow
-    grid_rules, start, output = Noise.grid_rules, WheelNoise.start, WheelNoise.output
+    grid_rules, start, output = period_on_grid, WheelNoise.start, WheelNoise.output
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
         """Return the memory with the next entry if a period begins, else the old memory."""
@@ -155,7 +148,12 @@ def draw_noise(deviation: Scalar, key: Key, number: Scalar) -> PyTree:
         deviation: Standard deviation, shape ().
         key: Random key of the run.
         number: Number of the draw, folded into the key: equal key and number give equal z.
+
+    Raises:
+        ValueError: The run has no random key.
     """
+    if key is None:
+        raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
     return jax.lax.cond(deviation != 0, lambda: deviation * _normal(deviation, key, number), lambda: 0.0 * deviation)
 
 

@@ -43,8 +43,8 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, larger
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree
+from diffabs.core.rules import period_on_grid
 from diffabs.core.types import Scalar
-from diffabs.sensors.noise import Noise
 
 BRAKED = 9.81  # m/s^2, recent deceleration f that the filter assumes at its start
 
@@ -88,7 +88,7 @@ class SpeedEstimator:
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
     flow = no_flow
-    grid_rules = Noise.grid_rules
+    grid_rules = period_on_grid
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with v = w, at least `floor`, P = (noise v)^2 and f = 9.81 m/s^2."""

@@ -7,7 +7,7 @@ With p = 4 the error of the step h is 16/15 of d1. The error of the half step is
 `MAX_DIFFERENCE_RATIO`, the differences do not shrink: the metric has no order and no limit can be estimated.
 
 Runs with different steps are comparable only if everything with its own clock keeps that clock. Noise is drawn and a
-sampled controller computes once per period. The ring buffer of a delay becomes longer (`refined`). `has_same_noise`
+sampled controller computes once per period. The ring buffer of a delay becomes longer (`refined`). `_has_same_noise`
 compares the noise drawn at both steps. A block that works once in every step (`every_step`) is a different block under
 another step. If runs are not comparable, both differences, the order and the error are NaN.
 
@@ -56,11 +56,6 @@ class ErrorEstimate(NamedTuple):
     converges: Bool
     error: Scalar
     turned: Bool
-
-    @property
-    def relative(self) -> Scalar:
-        """|error/value|: 0 for a zero error, infinite for a nonzero error of a zero value."""
-        return relative_difference(self.error, self.value)
 
 
 class Accuracy(NamedTuple):
@@ -149,7 +144,7 @@ def is_comparable(loop: Loop, solver: Solver, key: Key | None = None) -> Bool:
         key: Random key of `jax.random`, for noisy sensors. Without a key (None) the noise is not compared.
     """
     steady = not any(True for _ in per_step_blocks(loop))
-    return steady & (has_same_noise(loop, solver, 2, key) & has_same_noise(loop, solver, 4, key))
+    return steady & (_has_same_noise(loop, solver, 2, key) & _has_same_noise(loop, solver, 4, key))
 
 
 def incomparability_reasons(loop: Loop, solver: Solver, key: Key | None = None) -> list[str]:
@@ -163,7 +158,7 @@ def incomparability_reasons(loop: Loop, solver: Solver, key: Key | None = None) 
     lines = [
         f"{name} computes once in every step: with another step it is another {name}" for name in per_step_blocks(loop)
     ]
-    if not (has_same_noise(loop, solver, 2, key) and has_same_noise(loop, solver, 4, key)):
+    if not (_has_same_noise(loop, solver, 2, key) and _has_same_noise(loop, solver, 4, key)):
         lines.append("a shorter step draws other noise: give the sensor a period that is a multiple of solver.step")
     return lines
 
@@ -196,17 +191,11 @@ def needs_key(loop: Loop) -> bool:
     return False
 
 
-def has_same_noise(loop: Loop, solver: Solver, times: int, key: PyTree) -> Bool:
+def _has_same_noise(loop: Loop, solver: Solver, times: int, key: PyTree) -> Bool:
     """Return True if the sensor shows the same values at the common instants with steps that are `times` shorter.
 
     The plant's signal is held constant, so only noise can differ. At most `MAX_COMPARED_INSTANTS` instants are
     compared.
-
-    Args:
-        loop: Closed loop.
-        solver: Solver with the original step.
-        times: Factor by which the step shrinks, a whole number.
-        key: Random key. Without a key (None) the answer is True.
     """
     if key is None:
         return jnp.asarray(True)

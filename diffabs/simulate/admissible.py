@@ -5,7 +5,7 @@
 
 Both make the same checks in the same order. First come the ranges of fields and the rules between them (`rules`), then
 the start against the stop, then the parts against the step. The stability of the step comes last, because it costs
-most.
+most. Before all these, `check` looks at the shapes of fields; of a batch, `run_batch` looks at those of the first run.
 """
 
 import math
@@ -26,7 +26,7 @@ from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.rules import Rule
 from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.core.validity import check_part as check_parts
-from diffabs.core.validity import find_broken, grid_rules, part_rules
+from diffabs.core.validity import find_broken, find_misshapen, grid_rules, part_rules
 from diffabs.simulate.contracts import refuse_misfits
 from diffabs.simulate.stability import is_step_stable, stable_step
 from diffabs.simulate.types import Adaptive, FixedStep, Solver
@@ -71,17 +71,18 @@ def check(part: T, solver: Solver | None = None) -> T:
             step. Otherwise it has no effect.
 
     Raises:
-        ValueError: A field is out of range or breaks a rule between fields. For a loop with a solver also: a part does
-            not fit its contract, or the start is beyond the stop. An invalid solver (`find_solver_faults`), a period
-            off the grid and an unstable step raise it, too. The message gives each value with its range and unit. A
-            later check runs only if the earlier ones have passed.
+        ValueError: A field has a wrong shape, is out of range, or breaks a rule between fields. For a loop with a
+            solver also: a part does not fit its contract, or the start is beyond the stop. An invalid solver
+            (`find_solver_faults`), a period off the grid and an unstable step raise it, too. The message gives each
+            value with its range and unit. A later check runs only if the earlier ones have passed.
     """
+    if lines := list(find_misshapen(part)):
+        raise ValueError("; ".join(lines))
     check_parts(part)
     if isinstance(part, Loop) and solver is not None:
         refuse_misfits(part, {})
-        for lines in (find_mismatches(part, solver), find_unstable_step(part, solver)):
-            if found := list(lines):
-                raise ValueError("; ".join(found))
+        if lines := list(find_mismatches(part, solver)) or list(find_unstable_step(part, solver)):
+            raise ValueError("; ".join(lines))
     return part
 
 
@@ -95,12 +96,8 @@ def find_impossible_values(loop: Loop, step: float) -> list[str]:
         loop: Closed loop with concrete parameters.
         step: Step of the grid [s].
     """
-    begun = _start_rule(loop)
-    return (
-        list(find_broken(part_rules(loop)))
-        or ([] if begun.holds else [begun.says()])
-        or list(find_broken(grid_rules(loop, step)))
-    )
+    groups = part_rules(loop), [_start_rule(loop)], grid_rules(loop, step)
+    return next(filter(None, map(list, map(find_broken, groups))), [])
 
 
 def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
@@ -113,18 +110,15 @@ def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
         loop: Closed loop with concrete parameters.
         solver: Solver of the run.
     """
-    begun = _start_rule(loop)
-    if not begun.holds:
-        yield begun.says()
-        return
-    yield from find_solver_faults(solver) or find_broken(grid_rules(loop, solver.step))
+    lines = list(find_broken([_start_rule(loop)]))
+    yield from lines or find_solver_faults(solver) or find_broken(grid_rules(loop, solver.step))
 
 
 def find_solver_faults(solver: Solver) -> list[str]:
     """Return one line for each fault of a solver, independent of the loop; an empty list if there is none.
 
-    Each field must be a positive, finite number, and `rtol` below 1. The step must not be longer than the duration. At
-    most `MAX_SOLVER_STEPS` steps are allowed.
+    `kinks` must be True, False or None. Each other field must be a positive, finite number, `rtol` below 1. The step
+    must not be longer than the duration. At most `MAX_SOLVER_STEPS` steps are allowed.
 
     Args:
         solver: Solver to check.
@@ -135,6 +129,9 @@ def find_solver_faults(solver: Solver) -> list[str]:
     names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
     if lines := [f"solver.{name} {line}" for name in names if (line := _find_field_fault(name, getattr(solver, name)))]:
         return lines
+    given = getattr(solver, "kinks", None)
+    if not (given is None or isinstance(given, bool)):
+        return [f"solver.kinks = {given!r} is not a Python bool; True, False or None is needed"]
     step, duration = solver.step, solver.duration
     if step > duration:
         return [
@@ -199,19 +196,20 @@ def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Ad
     """
     if lines := find_solver_faults(solver):
         raise ValueError(lines[0])
+    step = float(solver.step)  # an array could be no static argument
     values = {path: np.asarray(x, float) for path, x in values.items()} if isinstance(values, Mapping) else values
     loop, values = jax.tree.map(lambda x: np.asarray(x, float), (loop, values))
     with jax.enable_x64(True):
         known = jax.tree.map(lambda x: x if np.ndim(x) else as_array(float(x), x.dtype), (loop, values))
         # Double precision: single precision could round a value across the end of its range.
-        codes = np.array(_codes(*known, step=solver.step))
+        codes = np.array(_codes(*known, step=step))
     # Only accepted runs need the costly stability check. `np.resize` repeats them up to the batch's size, so that
     # the compiled program keeps its shapes.
     if not codes.all() and not isinstance(solver, Adaptive):
         fine = np.flatnonzero(codes == 0)
         asked = values if len(fine) == len(codes) else jax.tree.map(lambda x: x[np.resize(fine, len(codes))], values)
-        codes[fine[~is_step_stable(loop, asked, solver.step)[: len(fine)]]] = -1
-    return _name_reasons(loop, values, solver.step, codes)
+        codes[fine[~is_step_stable(loop, asked, step)[: len(fine)]]] = -1
+    return _name_reasons(loop, values, step, codes)
 
 
 def _name_reasons(loop: Loop | None, values: PyTree, step: float, codes: np.ndarray) -> Admissibility:
@@ -236,22 +234,19 @@ def first_refusal(loop: Loop, values: Params, solver: Solver) -> str | None:
         values: Values of the parameters that differ, shape (runs, ...), by dotted path.
         solver: Solver of all runs.
     """
-    if not values:
-        lines = [*find_broken(part_rules(loop)), *find_mismatches(loop, solver)] or list(
-            find_unstable_step(loop, solver)
-        )
-        return "; ".join(lines) or None
-    found = batch_admissibility(loop, values, solver)
-    if not found.number:
-        return None
-    i = int(np.flatnonzero(found.codes)[0])
-    lane = replace(loop, {path: np.asarray(column)[i] for path, column in values.items()})
+    where, lane, why = "", loop, ""
+    if values:
+        found = batch_admissibility(loop, values, solver)
+        if not found.number:
+            return None
+        i = int(np.flatnonzero(found.codes)[0])
+        lane = replace(loop, {path: np.asarray(column)[i] for path, column in values.items()})
+        where, why = f"lane {i}: ", found.texts[i]
     try:
         check(lane, solver)
-        why = found.texts[i]
     except ValueError as error:
         why = str(error)
-    return f"lane {i}: {why}"
+    return f"{where}{why}" if why else None
 
 
 def _lane(loop: Loop | None, values: PyTree) -> Loop:

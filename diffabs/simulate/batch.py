@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core import kinds
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace, stack_lists
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.simulate.admissible import first_refusal
@@ -39,6 +40,26 @@ class Batch:
     weights: PyTree = None
     durations: Any = None
 
+    def __post_init__(self) -> None:
+        """Raise a ValueError if `values` are no mapping, or a column has no numbers (or, for `keys`, no keys)."""
+        if not isinstance(self.values, Mapping):
+            given = kinds.format_value(self.values)
+            raise ValueError(f'values = {given} is no mapping by path, such as {{"plant.mass": [12.0, 18.0]}}')
+        for name, column in self._columns().items():
+            if name == "keys" and jnp.issubdtype(getattr(column, "dtype", float), jax.dtypes.prng_key):
+                continue
+            line = kinds.find_value_objection(column)
+            if not line and isinstance(column, list | tuple) and len({*map(kinds.value_shape, column)}) > 1:
+                line = "has rows of different shapes"
+            elif not line and name == "keys" and not _are_seeds(column):
+                line = "is neither keys of jax.random.key nor whole numbers"
+            if line:
+                raise ValueError(f"{name} = {kinds.format_value(column)} {line}; one value for each run is needed")
+
+    def _columns(self) -> Params:
+        others = {name: getattr(self, name) for name in ("keys", "weights", "durations")}
+        return {**self.values, **{name: column for name, column in others.items() if column is not None}}
+
     @property
     def size(self) -> int:
         """Number of runs.
@@ -46,8 +67,7 @@ class Batch:
         Raises:
             ValueError: The columns have different lengths, or a column has no length.
         """
-        others = {name: getattr(self, name) for name in ("keys", "weights", "durations")}
-        columns = {**self.values, **{name: column for name, column in others.items() if column is not None}}
+        columns = self._columns()
         lengths = {name: np.shape(column)[0] if np.ndim(column) else 0 for name, column in columns.items()}
         if len(set(lengths.values())) > 1 or 0 in lengths.values():
             said = {
@@ -93,8 +113,13 @@ class Batch:
 
         Args:
             duration: Upper limit of all durations [s].
+
+        Raises:
+            ValueError: A duration is not positive.
         """
         wanted = np.minimum(np.asarray(self.durations, float), duration)
+        if not (wanted > 0).all():
+            raise ValueError(f"durations = {np.min(wanted):g} s is not positive")
         classes = np.floor(np.log(wanted.max() / wanted) / np.log(MAX_LENGTH_RATIO)).astype(int)
         members = [np.flatnonzero(classes == i) for i in np.unique(classes)]
         return [(lanes, float(wanted[lanes].max())) for lanes in members]
@@ -130,6 +155,13 @@ class Batch:
         return jax.vmap(jax.random.key)(jnp.asarray(self.keys))
 
 
+def _are_seeds(column: Any) -> bool:
+    # Not by `jnp.asarray`: it would start JAX's backend.
+    shape = kinds.value_shape(column)
+    dtype = column.dtype if hasattr(column, "dtype") else np.result_type(*(column if shape else [column]))
+    return len(shape) < 2 and jnp.issubdtype(dtype, np.integer)
+
+
 def group_by_structure(loops: Sequence[PyTree]) -> list[list[int]]:
     """Return the indices of the loops in groups of equal structure and shapes; each group can be one batch.
 
@@ -152,8 +184,8 @@ def stack_loops(loops: Sequence[PyTree]) -> tuple[PyTree, Batch]:
     Raises:
         ValueError: The loops have different structures.
     """
-    if (kinds := len(group_by_structure(loops))) != 1:
-        raise ValueError(f"loops of {kinds} structures are no lanes of one batch")
+    if (count := len(group_by_structure(loops))) != 1:
+        raise ValueError(f"loops of {count} structures are no lanes of one batch")
     each = [{path: value for path, _, value in parameters(loop)} for loop in loops]
     return loops[0], Batch({path: np.stack([np.asarray(one[path], float) for one in each]) for path in each[0]})
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.config.values import kebab_case
 from diffabs.core import kinds
@@ -35,7 +36,7 @@ WITHOUT_VALUE = (
     jax.errors.TracerIntegerConversionError,
 )
 MAX_FITTING = 4096  # structures to remember
-_fitting: dict[Any, None] = {}  # structures that were checked without a misfit, the oldest first
+_fitting: dict[Any, None] = {}  # structures and shapes that were checked without a misfit, the oldest first
 
 
 class Misfit(Exception):
@@ -60,7 +61,7 @@ def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[st
     """Yield one line for each misfit: a method that fails, or that returns something else than its contract asks for.
 
     The first misfit of a part of the loop ends the check. If the loop fits, each objective gives at most one line. A
-    structure that fits is not traced again for other values of its parameters.
+    structure that fits is not traced again for other values of its parameters, of the same shapes.
 
     Args:
         loop: Loop to trace, with its ticks and events.
@@ -69,7 +70,8 @@ def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[st
     Raises:
         ValueError: A packaged part raises it itself.
     """
-    structure = jax.tree.structure((loop, list(objectives.values())))
+    leaves, structure = jax.tree.flatten((loop, list(objectives.values())))
+    structure = structure, *map(np.shape, leaves)
     if structure in _fitting:
         return
     lines: list[str] = []

@@ -15,12 +15,8 @@ NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
 DEFAULT_CONTROL_UNIT = "control"  # unit of the control if no plant is given
 
 
-def is_concrete(run: PyTree) -> bool:
-    """Return True if a run holds numbers, False inside a function that JAX traces.
-
-    Args:
-        run: Run to inspect.
-    """
+def _is_concrete(run: PyTree) -> bool:
+    """Return True if a run holds numbers, False inside a function that JAX traces."""
     leaves = jax.tree.leaves(run)
     return all(isinstance(x, NUMBER_TYPES) and not isinstance(x, Tracer) for x in leaves)
 
@@ -35,7 +31,7 @@ def summarise_run(run: PyTree) -> Summary:
         run: One run, or the runs of a batch.
     """
     shape, kept = np.shape(run.stopped), run.trajectory is not None
-    if not is_concrete(run):
+    if not _is_concrete(run):
         return Summary(f"Run being traced, of {len(run.metrics)} metrics")
     if shape:
         return _summarise_runs(run, int(np.prod(shape)))

@@ -12,7 +12,7 @@ from diffabs.core import kinds
 from diffabs.core.compiling import is_traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import replace
+from diffabs.core.pytree import get, replace
 from diffabs.core.types import Array, Bool, Key, PyTree
 from diffabs.simulate.admissible import batch_admissibility, find_impossible_values, find_unstable_step
 from diffabs.simulate.arguments import refuse, refuse_unnamed
@@ -53,10 +53,11 @@ def run_batch(
         objectives: Objectives by the names of the metrics, each with shape (runs,); None for no metrics.
         trajectories: True keeps trajectories, shape (runs, instants, ...), with every `solver.every`-th instant.
         together: True is `jax.vmap` of `measure`: all runs step until the last has ended, and derivatives exist in both
-            modes, with respect to the loop and the batch's values. False has no reverse mode, but a run that has ended
-            makes room for the next, so that a few long runs do not delay the rest. Both agree to rounding. None is True
-            if loop, values or objectives are traced (inside jit, grad, vmap). Trajectories always use True. An empty
-            batch uses True under XLA. Runs of a kernel never step together.
+            modes, with respect to the loop and the batch's values. With False, a run that has ended makes room for the
+            next, so that a few long runs do not delay the rest. XLA then has no derivatives, a kernel forward ones.
+            True and False agree to rounding. None is True if loop, values or objectives are traced (inside jit, grad,
+            vmap). Trajectories always use True. An empty batch uses True under XLA. Runs of a kernel never step
+            together.
         accepted: Runs to execute, shape (runs,), or True for all. The others have `diverged`, and their metrics are
             NaN, also where they step together with the rest. None means the runs that `batch_admissibility` accepts, or
             all if the call is traced. A batch without values has no accepted run if the step is not stable.
@@ -118,6 +119,9 @@ def _dispatch_batch(
     count = batch.size
     columns = {path: jnp.asarray(x) if isinstance(x, list | tuple) else x for path, x in batch.values.items()}
     batch = dataclasses.replace(batch, values=columns)
+    for path in columns:
+        if line := kinds.find_value_objection(get(loop, path)):
+            raise ValueError(f"{path} {line}; the path of a number or an array is needed")
     refuse(replace(loop, {path: _first_member(column) for path, column in batch.values.items()}), solver, objectives)
     # Traced values cannot be checked. A traced batch runs every member, also an impossible one.
     live = is_traced(loop, dict(batch.values), dict(objectives))

@@ -1,26 +1,35 @@
 """Export of a run as a MAT file for MATLAB and Octave. SciPy writes it and is imported only on request."""
 
 import pathlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from diffabs.core.loop import run_signals
 from diffabs.core.protocols import Plant
-from diffabs.core.types import Params, PyTree
+from diffabs.core.types import PyTree
 from diffabs.simulate.types import Run
+
+KEYWORDS_TEXT = (
+    "break case catch classdef continue else elseif end for function global if otherwise parfor persistent return spmd "
+    "switch try while"
+)
+KEYWORDS = set(KEYWORDS_TEXT.split())
+MAX_NAME = 60  # MATLAB reads 63 characters; a number against equal names takes the others
 
 
 def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
     """Write the trajectory of one run, up to its end, to a MAT file.
 
     The file has a column vector for each of `t`, the plant's outputs, `target`, `command` and `control`. The struct
-    `units` has their units, and the struct `metrics` the run's metrics.
+    `units` has their units, and the struct `metrics` the run's metrics. A name that is not
+    valid in MATLAB is changed: stop-time becomes `stop_time`.
 
     Args:
         path: File to write; an existing file is replaced.
         run: One run, no batch, with a trajectory. An AssertionError refuses a run without.
         plant: Plant that defines the signals and their units.
-        more: Further variables by name. A mapping becomes a struct, with underscores for dots in its names.
+        more: Further variables by name. A mapping becomes a struct.
     """
     from scipy.io import savemat
 
@@ -30,10 +39,18 @@ def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
     content: dict[str, PyTree] = {name: values[:rows] for name, (_, values) in kept.items()}
     content["units"] = {name: unit for name, (unit, _) in kept.items()}
     content["metrics"] = {name: float(value) for name, value in run.metrics.items()}
-    content |= {name: _struct(value) if isinstance(value, Mapping) else value for name, value in more.items()}
     with path.open("wb") as file:
-        savemat(file, content, do_compression=True, long_field_names=True, oned_as="column")
+        savemat(file, _with_valid_names(content | more), do_compression=True, long_field_names=True, oned_as="column")
 
 
-def _struct(values: Params) -> dict[str, PyTree]:
-    return {name.replace(".", "_"): value for name, value in values.items()}
+def _with_valid_names(values: Mapping[str, PyTree]) -> dict[str, PyTree]:
+    """Return a mapping, and the mappings in it, with names that are valid in MATLAB and differ."""
+    found: dict[str, PyTree] = {}
+    for name, value in values.items():
+        valid = re.sub(r"\W+", "_", name, flags=re.ASCII)
+        valid = (valid if valid[:1].isalpha() else f"x{valid}")[:MAX_NAME]
+        new, number = f"{valid}_" if valid in KEYWORDS else valid, 2
+        while new in found:
+            new, number = f"{valid}_{number}", number + 1
+        found[new] = _with_valid_names(value) if isinstance(value, Mapping) else value
+    return found

@@ -5,13 +5,16 @@ If a step crosses the stop or the event of a block, shorter steps are attempted 
 place of the crossing in the step.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from diffabs.core import kinds
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
@@ -21,16 +24,16 @@ from diffabs.core.types import Key, PyTree, Scalar
 from diffabs.simulate.arguments import prepare_arguments, refuse_derivative, refuse_values
 from diffabs.simulate.drive.loops import (
     log_run,
+    repeat_step,
     replay_log,
     round_up_capacity,
     run_to_end,
     run_with_trajectory,
-    scan_to_end,
     scan_with_trajectory,
 )
 from diffabs.simulate.result import Finish, finish_run, observe, prepare
 from diffabs.simulate.step.adaptive import AdaptiveStepping
-from diffabs.simulate.step.replay import ReplayedRun, ReplayStepping, log_attempt, log_capacity, states_between
+from diffabs.simulate.step.replay import ReplayStepping, log_attempt, log_capacity, states_between
 from diffabs.simulate.step.status import end_unfinished
 from diffabs.simulate.types import Adaptive, Run, Solver, Trajectory
 
@@ -111,6 +114,8 @@ def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     Raises:
         ValueError: An argument is invalid, apart from the values of parameters.
     """
+    if not (key is None or np.ndim(key) or jnp.issubdtype(getattr(key, "dtype", float), jax.dtypes.prng_key)):
+        raise ValueError(f"key = {kinds.format_value(key)} is no random key; one of jax.random.key is needed")
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
@@ -118,7 +123,8 @@ def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     tries = round_up_capacity(
         log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.capacity(loop, between)
     )
-    method = method.with_trajectory() if every else method
+    if every and isinstance(method, AdaptiveStepping):
+        method = dataclasses.replace(method, keeps_last_step=True)
     capacity = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
     run = run_differentiable(capacity, (loop, objectives, method, key))
@@ -210,7 +216,9 @@ def _run_reversible(
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
     carry, (tries, instants, every, finish) = method.start(loop, objectives, key), capacity
     if not every:
-        return finish(loop, objectives, end_unfinished(scan_to_end(stepped, carry, tries)))[0]
+        # A run that needs more attempts than there is room for is still running: `end_unfinished`.
+        carry = repeat_step(stepped, carry, tries, lambda carry: carry.running)
+        return finish(loop, objectives, end_unfinished(carry))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     carry, seen = scan_with_trajectory(
         stepped, method.is_active, partial(method.observe_at, loop), carry, every, count, instants, tries
@@ -226,7 +234,7 @@ def _run_by_replay(
     objectives, (tries, instants, every, finish) = objectives | audit, capacity
     # The log holds values only: derivatives come from the replay.
     still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
-    logged = live.without_trajectory()
+    logged = dataclasses.replace(live, keeps_last_step=False)
     carry, log = log_run(
         partial(logged.step, still, measures, key),
         partial(logged.renew, still),
@@ -245,7 +253,7 @@ def _run_by_replay(
         start,
         log,
     )
-    judged = finish(loop, objectives, ReplayedRun(again.point, status))
+    judged = finish(loop, objectives, again._replace(status=status))
     if not every:
         return judged[0]
 

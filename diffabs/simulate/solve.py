@@ -42,14 +42,14 @@ from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
 from diffabs.core.types import AnyArray, Array, Bool, Part, PyTree, Scalar
 from diffabs.simulate.admissible import find_solver_faults
 from diffabs.simulate.arguments import build_stepping
-from diffabs.simulate.drive.engine import EngineError, resolve_request
+from diffabs.simulate.drive.engine import resolve_request, run_with_engine
 from diffabs.simulate.drive.loops import log_run, round_up_capacity
 from diffabs.simulate.run import RunCapacity, run_differentiable
 from diffabs.simulate.step.adaptive import AdaptiveStepping
 from diffabs.simulate.step.attempt import Point
 from diffabs.simulate.step.comparisons import SwitchedProgram
 from diffabs.simulate.step.fixed import FixedStepping
-from diffabs.simulate.step.inner_functions import HOST_CALLS
+from diffabs.simulate.step.inner_functions import HOST_CALLS, SEARCHSORTED
 from diffabs.simulate.step.replay import log_attempt, log_capacity
 from diffabs.simulate.step.status import RunStatus, end_unfinished
 from diffabs.simulate.step.system import UNCONSTRAINED, build_system
@@ -540,28 +540,19 @@ def solve(
         lean = {"keeps_mode": False, "stable": False} if adaptive else {"kinks": False}
         method = dataclasses.replace(method, watches=False, smooth=True, **lean)
     saves = {} if kept is None else {"saves": kept}
-    if engine == "kernel":
-        return _solve_by_kernel(loop, saves, method)
-    capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, asked)
-    capacity = RunCapacity(round_up_capacity(capacity), 0, 0, finish_solution)
-    return run_differentiable(capacity, (loop, saves, method, None))
 
+    def by_kernel() -> Solution:
+        # A local import: `import diffabs` must not need the kernel package.
+        from diffabs.simulate.drive.kernel import run_single
 
-def _solve_by_kernel(loop: Part, saves: dict[str, PyTree], method: FixedStepping | AdaptiveStepping) -> Solution:
-    """Return the solution as a kernel makes it.
+        return run_single(loop, saves, method, _finish_solution)
 
-    Raises:
-        EngineError: A kernel is not possible.
-    """
-    # Local imports: `import diffabs` must not need the kernel package.
-    from diffabs.compiler.lower.rules import Unsupported
-    from diffabs.compiler.runtime.toolchain import NoCompiler
-    from diffabs.simulate.drive.kernel import run_single
+    def by_xla() -> Solution:
+        capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, asked)
+        capacity = RunCapacity(round_up_capacity(capacity), 0, 0, _finish_solution)
+        return run_differentiable(capacity, (loop, saves, method, None))
 
-    try:
-        return run_single(loop, saves, method, finish_solution)
-    except (Unsupported, NoCompiler) as error:
-        raise EngineError.of(error) from None
+    return run_with_engine("kernel" if engine == "kernel" else "xla", by_kernel, by_xla, ())
 
 
 def switches(
@@ -588,8 +579,7 @@ def switches(
     """
     if _is_traced(t, y, args, t1):
         raise ValueError("switches lists numbers of one run: call it outside of jit, vmap and grad")
-    end = t if t1 is None else t1
-    loop, _ = _build_loop(field, y, t, end if t1 is not None else float(t) + 1.0, args, (), None, 1)
+    loop, _ = _build_loop(field, y, t, float(t) + 1.0 if t1 is None else t1, args, (), None, 1)
     program, zero = _trace_program(loop), jnp.zeros_like(loop.given["t0"])
     system = build_system(loop, {}, zero, loop.start(), {}, switched=True)
     seen = system.evaluate(zero, loop.start(), {}, UNCONSTRAINED).surfaces
@@ -599,7 +589,7 @@ def switches(
         bits = range(first, first + int(np.prod(shape)))
         margins = [one.value for one in seen if int(np.min(one.numbers)) in bits]
         margin = margins[0] if len(margins) == 1 else min(margins, key=abs)
-        turned = op.queries[0][1]
+        turned = op.queries[0][1] and op.name != SEARCHSORTED  # the distance to a knot has no side
         times = tuple(time for time, bit in flips if bit in bits)
         found.append(Switch(summarize(op.source), op.name, -margin if turned else margin, times))
     return found
@@ -617,7 +607,7 @@ def _list_flips(loop: Part, solver: Adaptive) -> list[tuple[float, int]]:
         start = method.start(loop, {}, key)
         step, renew = partial(method.step, loop, {}, key), partial(method.renew, loop)
         carry, log = log_run(step, renew, log_attempt, start, round_up_capacity(log_capacity(loop, solver)))
-        return finish_solution(loop, {}, end_unfinished(carry))[0].status, log
+        return _finish_solution(loop, {}, end_unfinished(carry))[0].status, log
 
     status, log = run(loop)
     if status != SolutionStatus.FINISHED:
@@ -690,14 +680,8 @@ def _trace_program(loop: Part) -> SwitchedProgram:
     return program
 
 
-def finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree) -> tuple[Solution, None]:
-    """Return the solution of a run that is over.
-
-    Args:
-        loop: Field with its events.
-        objectives: The states to save, or nothing.
-        carry: Carry of any stepping method at the end of the run.
-    """
+def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree) -> tuple[Solution, None]:
+    """Return the solution of a run that is over."""
     point, held = carry.point, carry.point.state.controller.held
     known = {
         RunStatus.TIMED_OUT: SolutionStatus.FINISHED,

@@ -44,7 +44,7 @@ def stable_step(loop: Loop) -> float:
     Args:
         loop: Closed loop with concrete parameters.
     """
-    return float(_largest_stable_steps(np.asarray(_jacobians_of_one(canonical_dtypes(loop)))[None])[0])
+    return float(stable_steps(jax.tree.map(lambda x: np.asarray(x)[None], canonical_dtypes(loop)))[0])
 
 
 def stable_steps(loops: Loop) -> np.ndarray:
@@ -246,9 +246,6 @@ def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
 
     found = [jax.vmap(partial(begin, one=one))(jnp.array([0.0, 1.0])) for one in (loop, arrived)]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
-
-
-_jacobians_of_one = compile_once(options=SAME_RESULT_OPTIONS)(_jacobians_of)
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)

@@ -11,13 +11,12 @@ from diffabs.core.types import JsonObject, Key, Part, PyTree
 from diffabs.simulate.accuracy import is_comparable, measure_finer, relative_difference
 from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
 from diffabs.simulate.types import Run, describe_solver, differs_in_kind
-from diffabs.sweep.study import Study, precision
+from diffabs.sweep.study import Study, is_accepted, precision
 
 if TYPE_CHECKING:
     from diffabs.sweep.results import Results
 
 ACCURACY_STREAM = 0x0ACC  # stream of random numbers, independent of the designs
-EXCLUDED_FLAGS = ("diverged", "refused")  # flags of samples without metrics
 NEGLIGIBLE_CHANGE = 1e-9  # smaller changes, or changes below solver.rtol, give no warning; in the unit of the metric
 MAX_RELATIVE_CHANGE = 0.01  # largest relative change by a half step without a warning
 
@@ -115,18 +114,9 @@ def describe_turned_metrics(result: JsonObject) -> Iterator[str]:
 
 def _choose_samples(study: Study, found: "Results", count: int) -> np.ndarray:
     """Return the numbers of at most `count` samples with metrics, in ascending order."""
-    good = found.column("sample")[~np.any([_has_flag(found, flag) for flag in EXCLUDED_FLAGS], axis=0)]
+    good = found.column("sample")[is_accepted(found.column("refused")) & ~found.column("diverged")]
     random = np.random.default_rng([study.seed, ACCURACY_STREAM])
     return np.sort(random.choice(good, min(count, len(good)), replace=False))
-
-
-def _has_flag(found: "Results", flag: str) -> np.ndarray:
-    """Return which runs have a flag or a reason; none if the table lacks this column."""
-    try:
-        column = found.column(flag)
-    except KeyError:
-        return np.zeros(len(found.column("sample")), bool)
-    return column != "" if column.dtype.kind in "OU" else column.astype(bool)
 
 
 def _summarise_changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> JsonObject:

@@ -11,33 +11,35 @@ import asyncio
 import contextlib
 import dataclasses
 import logging
-import os
 import pathlib
 import signal
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from typing import Any
 
 import jax
 import numpy as np
-from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
+from distributed import Client, KilledWorker, LocalCluster, Security, as_completed, get_worker
 from distributed.comm.core import connect
 
 from diffabs.compiler import pipeline
-from diffabs.core.types import PyTree, Scalar
+from diffabs.config.values import read_whole
+from diffabs.core.types import JsonObject, PyTree, Scalar
 from diffabs.runtime import files, provenance
+from diffabs.runtime.process import core_count
 from diffabs.sweep.engines import DECISIVE_PACKAGES, ComputedChunk, encode_computed_chunk
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.runner import Runner
+from diffabs.sweep.seal import Seal
 from diffabs.sweep.store import SweepError, describe_differences
 from diffabs.sweep.study import Study
 
 CHUNKS_PER_THREAD = 2  # chunks in progress or waiting for each thread of the workers
 MAX_CHUNK_RETRIES = 5  # retries of a chunk that the scheduler gives up; it does so after four workers died with it
 TIMEOUT_SECONDS = 10.0  # time for a scheduler to answer [s]
+MAX_WORKERS = 2**16  # worker processes on this machine
 LOOPBACK_ADDRESS = "127.0.0.1"
 MAX_MESSAGE_CHARACTERS = 200  # characters of a message of Dask
 POLL_SECONDS = 0.05  # time between checks for finished chunks [s]; workers already have their next chunk
@@ -52,8 +54,13 @@ class Dask:
     """
 
     def __init__(self, scheduler: str | None = None, workers: int | None = None):
-        """Set the cluster: `scheduler`, or else `workers` processes here, by default one for each processor."""
-        self.scheduler, self.workers = scheduler, workers or os.cpu_count() or 1
+        """Set the cluster: `scheduler`, or else `workers` processes here, by default one for each core.
+
+        Raises:
+            ScenarioError: `workers` is not a positive number.
+        """
+        self.scheduler = scheduler
+        self.workers = core_count() if workers is None else read_whole(workers, 1, MAX_WORKERS, "workers")
 
     @property
     def remote(self) -> bool:
@@ -171,10 +178,14 @@ def _check_workers(client: Client, engine: str) -> None:
     try:
         answers: Any = client.run(_result_versions, engine)
     except Exception as error:  # Dask raises any type for a worker without diffabs
-        raise SweepError(f"a worker cannot say its versions: {str(error).splitlines()[0]}") from None
+        raise SweepError(f"a worker cannot say its versions: {(str(error) or repr(error)).splitlines()[0]}") from None
     for worker, there in answers.items():
-        for line in describe_differences(there, here):
-            raise SweepError(f"worker {worker}: {line}; results would not be those of one run")
+        _check_worker(worker, there, here)
+
+
+def _check_worker(worker: str, there: JsonObject, here: JsonObject) -> None:
+    for line in describe_differences(there, here):
+        raise SweepError(f"worker {worker}: {line}; results would not be those of one run")
 
 
 def _result_versions(engine: str) -> dict[str, str]:
@@ -189,11 +200,12 @@ def _compute_chunks(
 ) -> Iterator[ComputedChunk]:
     """Yield chunks as they finish, with at most CHUNKS_PER_THREAD chunks for each worker thread in progress."""
     rest, deaths, finished = iter(chunks), dict.fromkeys(chunks, 0), as_completed()
+    seals, versions = Seals(describe_owner(study)), _result_versions(study.engine)
     inside: dict[PyTree, int] = {}
 
     def give(chunk: int) -> None:
         # `pure=False` makes a new key, so that the result of another client is not reused.
-        future = client.submit(compute_chunk, study, chunk, pure=False)
+        future = client.submit(compute_chunk, study, seals.of(chunk), versions, pure=False)
         inside[future] = chunk
         finished.add(future)
 
@@ -245,30 +257,16 @@ def _convert_to_numpy(study: Study) -> Study:
     return dataclasses.replace(study, loop=jax.tree.map(plain, study.loop), parts=parts, objectives=objectives)
 
 
-def compute_chunk(study: Study, chunk: int) -> ComputedChunk:
+def compute_chunk(study: Study, seal: Seal, versions: JsonObject) -> ComputedChunk:
     """Return one chunk, computed on a worker.
 
     Args:
         study: Study of the sweep.
-        chunk: Number of the chunk.
+        seal: Seal of the chunk.
+        versions: Versions of the sweep's process that can change a bit of the results.
+
+    Raises:
+        SweepError: This worker, which may have joined later than the others, has other versions.
     """
-    runner, seals = _prepare_runner(_StudyKey(study))
-    return encode_computed_chunk(study, seals.of(chunk), runner.run([chunk])[0])
-
-
-class _StudyKey:
-    """A study as a key of a cache: equal for studies with equal tables, also after a second transfer."""
-
-    def __init__(self, study: Study):
-        self.study, self.name = study, repr(study.table())
-
-    def __hash__(self) -> int:
-        return hash(self.name)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _StudyKey) and self.name == other.name
-
-
-@lru_cache(maxsize=2)
-def _prepare_runner(same: _StudyKey) -> tuple[Runner, Seals]:
-    return Runner(same.study, jax.local_devices()[:1]), Seals(describe_owner(same.study))
+    _check_worker(get_worker().address, _result_versions(study.engine), versions)
+    return encode_computed_chunk(study, seal, Runner(study, jax.local_devices()[:1]).run([seal.chunk])[0])

@@ -22,39 +22,6 @@ from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import PyTree, Table
 
 
-def choose_indices(u: ArrayLike, count: int, weights: Sequence[float] | None = None) -> np.ndarray:
-    """Return the index of the item that each uniform u picks.
-
-    It is the smallest k with u < F(k). F(k) is the weight of the items 0 to k over the weight of all. At u = 1 it is
-    the last item with a positive weight.
-
-    Args:
-        u: Uniforms in [0, 1], any shape.
-        count: Number of items.
-        weights: Weight of each item; None for equal weights.
-    """
-    edges = _cumulative_probabilities(count, weights)
-    # The second term is the last item with a positive weight: u = 1 would otherwise give an index past the end.
-    return np.minimum(np.searchsorted(edges, u, side="right"), np.searchsorted(edges, 1.0))
-
-
-def probability_midpoints(count: int, weights: Sequence[float] | None = None) -> np.ndarray:
-    """Return for each item with a positive weight the middle of its interval of u.
-
-    Args:
-        count: Number of items.
-        weights: Weight of each item; None for equal weights.
-    """
-    edges = _cumulative_probabilities(count, weights)
-    widths = np.diff(edges, prepend=0.0)
-    return (edges - widths / 2)[widths > 0]
-
-
-def _cumulative_probabilities(count: int, weights: Sequence[float] | None) -> np.ndarray:
-    edges = np.cumsum(np.ones(count) if weights is None else np.asarray(weights, float))
-    return edges / edges[-1]
-
-
 def _weight_problems(weights: Sequence[float] | None, count: int, name: str, each: ParameterSpec) -> Iterator[str]:
     """Yield an error for weights of a wrong number, for weights outside `each`, and for weights that are all zero."""
     if weights is None:
@@ -65,6 +32,15 @@ def _weight_problems(weights: Sequence[float] | None, count: int, name: str, eac
         yield f"{name}: weights = {reprlib.repr(as_plain(weights))} are not all in {each.interval()}"
     elif not np.sum(weights) > 0:
         yield f"{name}: weights have sum {np.sum(weights):g}"
+
+
+def is_numeric(column: ArrayLike) -> bool:
+    """Return whether values have a type of numbers; objects and booleans have not.
+
+    Args:
+        column: Values, any shape.
+    """
+    return np.asarray(column).dtype.kind in "fiu"
 
 
 class _Discrete:
@@ -79,8 +55,38 @@ class _Discrete:
         return self.value(ndtr(z))
 
 
+class _Weighted(_Discrete):
+    """A discrete distribution of items with equal or weighted probabilities."""
+
+    weights: PyTree
+
+    @property
+    def size(self) -> int:
+        """Number of items."""
+        raise NotImplementedError
+
+    def index(self, u: ArrayLike) -> np.ndarray:
+        """Return the index of the item at u: the smallest k with u < F(k); at u = 1 the last with a positive weight.
+
+        F(k) is the weight of the items 0 to k over the weight of all.
+        """
+        edges = self._cumulative_probabilities()
+        # The second term is the last item with a positive weight: u = 1 would otherwise give an index past the end.
+        return np.minimum(np.searchsorted(edges, u, side="right"), np.searchsorted(edges, 1.0))
+
+    def middles(self) -> np.ndarray:
+        """Return for each item with a positive weight the middle of its interval of u."""
+        edges = self._cumulative_probabilities()
+        widths = np.diff(edges, prepend=0.0)
+        return (edges - widths / 2)[widths > 0]
+
+    def _cumulative_probabilities(self) -> np.ndarray:
+        edges = np.cumsum(np.ones(self.size) if self.weights is None else np.asarray(self.weights, float))
+        return edges / edges[-1]
+
+
 @dataclasses.dataclass(frozen=True)
-class Categorical(_Discrete):
+class Categorical(_Weighted):
     """One of several numbers, or one of several texts.
 
     Attributes:
@@ -92,9 +98,10 @@ class Categorical(_Discrete):
     weights: tuple[float, ...] | None = None
     scaled = ("choices",)
 
-    def index(self, u: ArrayLike) -> np.ndarray:
-        """Return the index of the choice at u, from 0."""
-        return choose_indices(u, len(self.choices), self.weights)
+    @property
+    def size(self) -> int:
+        """Number of choices."""
+        return len(self.choices)
 
     def value(self, u: ArrayLike) -> np.ndarray:
         """Return the choice at u; an array of objects for texts."""
@@ -103,10 +110,6 @@ class Categorical(_Discrete):
     def textual(self) -> bool:
         """Return whether the choices are texts."""
         return any(isinstance(choice, str) for choice in self.choices)
-
-    def middles(self) -> np.ndarray:
-        """Return values of u that give each choice once."""
-        return probability_midpoints(len(self.choices), self.weights)
 
     def support(self) -> tuple[float, float]:
         """Return the smallest and the largest choice; for texts those of their indices, from 0."""
@@ -161,13 +164,13 @@ def _read_columns(given: PyTree, where: str) -> dict[str, np.ndarray]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rows(_Discrete):
+class Rows(_Weighted):
     """Whole rows of a table, with equal or weighted probabilities: the joint distribution of its columns.
 
     Each column is a parameter by path. One uniform picks a row.
 
     Attributes:
-        columns: Values of each parameter, by path, shape (rows,).
+        columns: Finite numbers, or texts, of each parameter, by path, shape (rows,).
         weights: Numbers in proportion to the probabilities of the rows; None for equal probabilities.
     """
 
@@ -181,12 +184,8 @@ class Rows(_Discrete):
 
     def value(self, u: ArrayLike) -> dict[str, np.ndarray]:
         """Return the rows at u, by column."""
-        rows = choose_indices(u, self.size, self.weights)
+        rows = self.index(u)
         return {path: np.asarray(column)[rows] for path, column in self.columns.items()}
-
-    def middles(self) -> np.ndarray:
-        """Return values of u that give each row with a positive weight once."""
-        return probability_midpoints(self.size, self.weights)
 
     def problems(self, name: str) -> Iterator[str]:
         """Yield an error for each wrong field."""
@@ -197,6 +196,10 @@ class Rows(_Discrete):
             yield f"{name}: columns need one shape (n,); there is {found}"
             return
         for path, column in self.columns.items():
-            if np.asarray(column).dtype.kind in "fiu" and not np.isfinite(column).all():
-                yield f"{name}: column {path} is not finite in row {int(np.argmin(np.isfinite(column)))}"
+            if is_numeric(column):
+                if not np.isfinite(column).all():
+                    yield f"{name}: column {path} is not finite in row {int(np.argmin(np.isfinite(column)))}"
+            elif not all(isinstance(value, str) for value in column):
+                kind = np.asarray(column).dtype
+                yield f"{name}: column {path} is of type {kind}; numbers of type float, or texts, are needed"
         yield from _weight_problems(self.weights, self.size, name, ParameterSpec("1", low=0.0))

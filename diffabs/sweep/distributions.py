@@ -20,6 +20,7 @@ from diffabs.core.pytree import ParameterSpec, param
 from diffabs.core.types import PyTree, Scalar
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
+from diffabs.sweep.discrete import is_numeric
 
 # Smallest probability between the limits of a distribution. Below it, its tails have no correct digits.
 MIN_TRUNCATED_PROBABILITY = 1e-290
@@ -75,9 +76,11 @@ class _Continuous:
         lines = []
         for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
             value, spec = getattr(self, field.name), field.metadata["spec"]
-            if not spec.holds(value):
+            if not is_numeric(value):
+                lines.append(f"{name}: {field.name} = {value!r} is no number; one in {spec.interval()} is needed")
+            elif not spec.holds(value):
                 lines.append(f"{name}: {field.name} = {value:g} is outside {spec.interval()}")
-        if self.low >= self.high:
+        if not lines and self.low >= self.high:
             lines.append(f"{name}: low = {self.low:g} is not below high = {self.high:g}")
         yield from lines or self._consistency_problems(name)
 

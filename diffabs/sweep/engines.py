@@ -1,7 +1,6 @@
 """Engines that compute the chunks of a sweep: the devices of this process here, a Dask cluster in `cluster`."""
 
-import itertools
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, Protocol
 
@@ -14,7 +13,7 @@ from diffabs.sweep.manifest import DECISIVE_PACKAGES as DECISIVE_PACKAGES
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.runner import Columns, Runner
 from diffabs.sweep.seal import Seal, encode_chunk
-from diffabs.sweep.study import Study, has_failed, is_accepted
+from diffabs.sweep.study import Study, failure_masks, is_accepted
 
 
 class ComputedChunk(NamedTuple):
@@ -83,7 +82,7 @@ class Local:
         """
         places = self.places(study)
         runner, seals = Runner(study, places), Seals(describe_owner(study))
-        rest = group_items(chunks, len(places))
+        rest = iter([chunks[k : k + len(places)] for k in range(0, len(chunks), len(places))])
         with ThreadPoolExecutor(1) as beside:
             together = next(rest, None)
             coming = beside.submit(runner.run, together) if together else None
@@ -103,23 +102,7 @@ def encode_computed_chunk(study: Study, seal: Seal, columns: Columns) -> Compute
         seal: Seal of the chunk.
         columns: Columns of the chunk, each of shape (samples,).
     """
-    failed = has_failed(study, columns)
-    counts = (
-        len(failed),
-        int(failed.sum()),
-        int(np.sum(columns["diverged"] & is_accepted(columns["refused"]))),
-        int(np.sum(~is_accepted(columns["refused"]))),
-    )
+    kinds = failure_masks(columns.__getitem__, study.failure_bounds, study.success)
+    failed, accepted = np.any(list(kinds.values()), axis=0), is_accepted(columns["refused"])
+    counts = len(failed), int(failed.sum()), int(np.sum(columns["diverged"] & accepted)), int(np.sum(~accepted))
     return ComputedChunk(seal.chunk, encode_chunk(columns, seal, study.units()), *counts)
-
-
-def group_items(items: Sequence[int], size: int) -> Iterator[list[int]]:
-    """Yield lists of `size` items; the last one may be shorter.
-
-    Args:
-        items: Items to group.
-        size: Number of items in a list.
-    """
-    rest = iter(items)
-    while batch := list(itertools.islice(rest, size)):
-        yield batch

@@ -156,6 +156,9 @@ def _read_utf8(given: PyTree, path: str) -> str:
     return given
 
 
+read_notes = table_reader(_read_utf8)
+
+
 @dataclasses.dataclass(frozen=True)
 class _Solver:
     step: float = table_field(range_reader(POSITIVE_SECONDS))
@@ -203,6 +206,6 @@ class _Manifest:
     format: int = table_field(read_as_given)
     study: _Study = table_field(partial(read_table, _Study))
     versions: Mapping[str, str] = table_field(table_reader(read_text))
-    source: Mapping[str, str] = table_field(table_reader(_read_utf8))
+    source: Mapping[str, str] = table_field(read_notes)
     commit: str = table_field(read_text, "")
     units: Mapping[str, str] = table_field(table_reader(read_text), dict)

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.types import JsonObject, Matrix, PyTree, Scalar
 from diffabs.runtime import files
 from diffabs.runtime.summary import Summary
@@ -16,7 +17,7 @@ from diffabs.sweep import seal
 from diffabs.sweep.manifest import Seals, read_manifest
 from diffabs.sweep.seal import SweepError
 from diffabs.sweep.store import list_chunks, read_chunk
-from diffabs.sweep.study import FLAG_COLUMNS, describe_wrong_end, has_wrong_end, is_accepted
+from diffabs.sweep.study import FLAG_COLUMNS, failure_masks, is_accepted
 
 
 class Results:
@@ -136,28 +137,29 @@ class Results:
         The kinds are "diverged", a wrong end ("stopped" or "not stopped"), and "METRIC > BOUND". A sample may have
         several. A refused sample has not failed.
         """
-        study, run = self.study, self.accepted
-        kinds = {
-            "diverged": self.column("diverged"),
-            describe_wrong_end(study["success"]): has_wrong_end(self.column("stopped"), study["success"]),
-        }
-        kinds |= {f"{name} > {bound:g}": self.column(name) > bound for name, bound in study["failures"].items()}
-        return {name: failed & run for name, failed in kinds.items()}
+        return failure_masks(self.column, self.study["failures"], self.study["success"])
 
     def failed_samples(self) -> np.ndarray:
         """Return which samples failed, of any kind, shape (samples,)."""
         return np.any(list(self.failures().values()), axis=0)
 
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the rows in the order of the samples, with some `columns` or all."""
-        names = list(columns) if columns is not None else None
+        """Return the rows in the order of the samples, with some `columns` or all.
+
+        Raises:
+            ScenarioError: No column has one of the names.
+        """
+        names, there = list(columns) if columns is not None else None, self._schema().names
+        for name in names or ():
+            if name not in there:
+                raise unknown_name_error(f"{name} is no column of {self.folder}", name, there)
         return pa.concat_tables([self._read_table(chunk, names) for chunk in sorted(self.files)]).unify_dictionaries()
 
     def column(self, name: str) -> np.ndarray:
         """Return the column `name` in the order of the samples, shape (samples,).
 
         Raises:
-            KeyError: No column has this name.
+            ScenarioError: No column has this name.
         """
         return self.table([name]).column(name).to_numpy()
 
@@ -192,16 +194,21 @@ class Results:
         return self.table().filter(pa.array(self.column("diverged") & self.accepted))
 
     def worst(self, metric: str, count: int = 10) -> pa.Table:
-        """Return the `count` rows with the largest values of a `metric`, the largest first; NaN comes last."""
+        """Return the `count` rows with the largest values of a `metric`, the largest first; NaN comes last.
+
+        Raises:
+            ScenarioError: No column has this name, or its values are texts.
+        """
         values = self.column(metric)
+        if values.dtype.kind == "O":
+            raise ScenarioError(f"{metric} holds texts; a column of numbers is needed")
         order = np.argsort(np.where(np.isnan(values), -np.inf, values), kind="stable")[::-1][:count]
         return self.table().take(order)
 
 
 def _file_identity(path: pathlib.Path) -> tuple[int, ...] | None:
     """Return numbers that change with the file, or None if the file cannot be examined."""
-    try:
+    with contextlib.suppress(OSError):
         there = os.stat(path)
-    except OSError:
-        return None
-    return there.st_dev, there.st_ino, there.st_size, there.st_mtime_ns, there.st_ctime_ns
+        return there.st_dev, there.st_ino, there.st_size, there.st_mtime_ns, there.st_ctime_ns
+    return None

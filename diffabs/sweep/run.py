@@ -4,7 +4,7 @@ import contextlib
 import pathlib
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 
@@ -12,7 +12,7 @@ from diffabs.core.types import Table
 from diffabs.runtime import provenance, stopwatch
 from diffabs.simulate.drive.engine import log_xla_reason
 from diffabs.sweep.engines import Engine, Local
-from diffabs.sweep.manifest import Seals, describe_owner
+from diffabs.sweep.manifest import Seals, describe_owner, read_notes
 from diffabs.sweep.results import Results
 from diffabs.sweep.runner import find_study_objection
 from diffabs.sweep.selection import choose_study_engine
@@ -27,7 +27,7 @@ class SweepProgress(NamedTuple):
         samples: Number of finished samples, those of earlier calls included.
         total: Number of samples of the sweep.
         here: Number of samples that this call has finished.
-        seconds: Time of this call [s]; the time to compile is left out where `stopwatch.listen` was called.
+        seconds: Time of this call [s]; the time to compile is left out after `stopwatch.count_compilations`.
         failed: Number of failed runs of this call.
         diverged: Number of diverged runs of this call.
         damaged: Numbers of the damaged chunks, which are computed again.
@@ -70,61 +70,50 @@ def sweep(
         on: Engine that computes the chunks; None is every device of this process.
         progress: Function that is called with the progress at the start and after every chunk.
         stopping: Function that is called after every chunk; True ends the run, and `resume` continues it later.
-        source: Notes for the manifest, such as name and text of the scenario.
+        source: Texts for the manifest, by name, such as the scenario.
 
     Raises:
-        ValueError: The study cannot be run, or not by its engine; or JAX runs in several processes.
+        ValueError: The study cannot be run, or not by its engine; a note of `source` is no text; or JAX runs in several
+            processes.
         SweepError: The folder contains something else, is in use, or cannot be written.
         OSError: The disk is full. Finished chunks stay, and `resume` continues.
     """
     if jax.process_count() > 1:
         raise ValueError("sweep runs in one process; several machines: on=Dask(...)")
+    notes = read_notes(source or {}, "source")
     study, why_xla = choose_study_engine(study.check(), out, resume=resume, remote=getattr(on, "remote", False))
     if why_xla:
         log_xla_reason(why_xla)
     if study.engine != "xla" and (line := find_study_objection(study)):
         raise ValueError(line)
     store = Store(pathlib.Path(out))
-    with _begin_sweep(store, study, resume, source or {}) as (missing, damaged):
-        counter = _ProgressCounter(study, missing, tuple(damaged), progress)
+    with _begin_sweep(store, study, resume, notes) as (missing, damaged):
+        tell, begun = progress or (lambda _: None), time.monotonic()
+        before = study.samples - sum(b - a for a, b in map(study.bounds, missing))
+        at = SweepProgress(before, study.samples, 0, 0.0, 0, 0, tuple(damaged))
+        tell(at)
         if missing:
             with contextlib.closing((on or Local()).run(study, missing, stopping)) as finished:
                 for done in finished:
                     store.write(done.chunk, done.data)
-                    counter.add(done)
+                    at = at._replace(
+                        samples=at.samples + done.lanes,
+                        here=at.here + done.lanes,
+                        seconds=time.monotonic() - begun - stopwatch.compile_time_since(begun),
+                        failed=at.failed + done.failed,
+                        diverged=at.diverged + done.diverged,
+                        refused=at.refused + done.refused,
+                    )
+                    tell(at)
     return Results(store.folder)
 
 
 @contextlib.contextmanager
 def _begin_sweep(store: Store, study: Study, resume: bool, source: Table) -> Iterator[tuple[list[int], list[int]]]:
     """Hold the folder's lock, and yield the missing chunks, and the damaged ones among them."""
+    notes = {**provenance.source_commit(), "source": source, "units": study.units()}
+    manifest = {**describe_owner(study), **notes}
     with store.lock():
-        notes = {**provenance.source_commit(), "source": dict(source), "units": study.units()}
-        manifest = {**describe_owner(study), **notes}
         store.begin(manifest, resume=resume)
         whole, damaged = store.scan(Seals(manifest))
         yield [chunk for chunk in range(study.chunks) if chunk not in whole], damaged
-
-
-class _ProgressCounter:
-    """A counter of finished runs that reports each change."""
-
-    def __init__(self, study: Study, missing: list[int], damaged: tuple[int, ...], told: Any):
-        self.total, self.told, self.damaged = study.samples, told, damaged
-        self.before = study.samples - sum(b - a for a, b in map(study.bounds, missing))
-        self.here = self.failed = self.diverged = self.refused = 0
-        self.begun = time.monotonic()
-        self.tell()
-
-    def add(self, done: Any) -> None:
-        self.here += done.lanes
-        self.failed += done.failed
-        self.diverged += done.diverged
-        self.refused += done.refused
-        self.tell()
-
-    def tell(self) -> None:
-        if self.told:
-            seconds = time.monotonic() - self.begun - stopwatch.compile_time_since(self.begun)
-            counts = (self.before + self.here, self.total, self.here, seconds, self.failed, self.diverged)
-            self.told(SweepProgress(*counts, self.damaged, self.refused))

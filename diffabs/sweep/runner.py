@@ -6,8 +6,8 @@ A block is a fixed number of runs with one structure of the loop. On D devices, 
 of its own. A program sharded over the devices (`shard_map`) would differ for each D, and round differently. This
 program is the same for all D, so the result of a run does not depend on D.
 
-Without alternative parts a block is a whole chunk. With them a chunk is sorted into blocks of an eighth; copies fill
-the last block of each structure.
+Without alternative parts a block is a whole chunk. With them a chunk is sorted into blocks of an eighth. Copies, which
+do not run, fill the last block of each structure.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import EngineError
 from diffabs.simulate.ensemble import run_batch
 from diffabs.simulate.types import Solver
-from diffabs.sweep.study import FLAG_COLUMNS, Study, noise_key, numeric_values, precision
+from diffabs.sweep.study import FLAG_COLUMNS, Study, noise_key, precision
 
 BLOCKS_PER_CHUNK = 8
 
@@ -93,7 +93,7 @@ class Runner:
         for c, columns in enumerate(drawn):
             names = np.array([np.asarray(columns[path], str) for path in self.study.parts]).T
             names = names.reshape(len(columns["sample"]), len(self.study.parts))
-            values = numeric_values({path: columns[path] for path in self.study.space.paths})
+            values = self.study.numbers({path: columns[path] for path in self.study.space.paths})
             for kind in sorted(set(map(tuple, names.tolist()))):
                 members = np.flatnonzero((names == np.array(kind, dtype=names.dtype)).all(axis=1))
                 for k in range(0, len(members), self.size):
@@ -108,7 +108,8 @@ class Runner:
         with jax.default_device(device):
             asked = batch_admissibility(loop, block.values, self.study.solver)
         with precision(self.study.dtype), _convert_compiler_errors():
-            given = jax.device_put(self._arguments(loop, block, asked.accepted), device)
+            runs = asked.accepted & (np.arange(self.size) < len(block.lanes))  # the rest are copies
+            given = jax.device_put(self._arguments(loop, block, runs), device)
             found = jax.device_get(_measure_block(*given, self.study.solver, self.study.engine))
         return found | {"refused": asked.texts.astype(object)}
 

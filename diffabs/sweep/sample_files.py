@@ -1,5 +1,6 @@
 """Columns of numbers in files: CSV with names in its first line, or Parquet."""
 
+import decimal
 import pathlib
 
 import numpy as np
@@ -29,13 +30,14 @@ def read_column(path: pathlib.Path, column: str) -> np.ndarray:
     try:
         with files.open_regular(path) as file:
             table = TABLE_READERS[path.suffix.lower()](file)
+            names = table.column_names
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or str(error).splitlines()[0]}") from None
-    except pa.ArrowException as error:
+    except (pa.ArrowException, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no {path.suffix[1:]} file: {str(error).splitlines()[0]}") from None
-    if column not in table.column_names:
-        raise unknown_name_error(f"{path} has no column {column}", column, table.column_names)
-    if (count := table.column_names.count(column)) > 1:
+    if column not in names:
+        raise unknown_name_error(f"{path} has no column {column}", column, names)
+    if (count := names.count(column)) > 1:
         raise ValueError(f"{path} has {count} columns called {column}; one is needed")
     values, where = table.column(column), f"{path}, column {column}"
     if len(values) == 0:
@@ -49,7 +51,9 @@ def read_column(path: pathlib.Path, column: str) -> np.ndarray:
 
 def _parse_number(value: object) -> float:
     """Return a value as a float; NaN for a missing value, or one that is not a number."""
+    if isinstance(value, bool) or (isinstance(value, str) and "_" in value):  # Python would take "1_000" for a number
+        return np.nan
     try:
-        return float(value) if isinstance(value, str | float | int) and not isinstance(value, bool) else np.nan
+        return float(value) if isinstance(value, str | float | int | decimal.Decimal) else np.nan
     except (OverflowError, ValueError):
         return np.nan

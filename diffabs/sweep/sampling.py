@@ -11,7 +11,7 @@ than 32.
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import jax
@@ -20,6 +20,7 @@ import numpy as np
 
 from diffabs.config.values import (
     check_sound,
+    find_field_faults,
     format_table,
     kebab_case,
     list_reader,
@@ -56,12 +57,13 @@ class SamplingDesign(Protocol):
         Raises:
             ValueError: The design cannot have the wanted number.
         """
-        ...
+        del variables
+        return _check_samples(samples)
 
     def problems(self, name: str, variables: Table | None = None) -> Iterator[str]:
         """Yield an error for each field that is wrong, alone or with these variables."""
-        del name, variables
-        yield from ()
+        del variables
+        yield from find_field_faults(self, name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,15 +77,6 @@ class Random(SamplingDesign):
         )
         # 32 + 20 bits and half of the last one: never 0 or 1, and exact in float64.
         return (high * 2.0**20 + (low >> 12) + 0.5) * 2.0**-52
-
-    def count(self, variables: Table, samples: int | None) -> int:
-        """Return `samples`, for any `variables`.
-
-        Raises:
-            ValueError: `samples` is None, or outside [1, 2^32 - 1].
-        """
-        del variables
-        return _check_samples(samples)
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
@@ -113,17 +106,8 @@ class Sobol(SamplingDesign):
         return np.concatenate(points)
 
     def count(self, variables: Table, samples: int | None) -> int:
-        """Return `samples`, for any `variables`.
-
-        Raises:
-            ValueError: `samples` is None, or no multiple of the replicates.
-        """
-        del variables
-        return _check_multiple(_check_samples(samples), self.replicates, "the number of replicates")
-
-    def problems(self, name: str, variables: Table | None = None) -> Iterator[str]:
-        if self.replicates < 1:
-            yield f"{name}: replicates = {self.replicates} is not positive"
+        """Return `samples`, a multiple of the replicates, for any `variables`."""
+        return _check_multiple(super().count(variables, samples), self.replicates, "the number of replicates")
 
 
 def _sobol_points(seed: int, replicate: int, start: int, stop: int, dimension: int) -> np.ndarray:
@@ -150,13 +134,8 @@ class LatinHypercube(SamplingDesign):
         return _hypercube_points(seed, samples, dimension)[start:stop]
 
     def count(self, variables: Table, samples: int | None) -> int:
-        """Return `samples`, for any `variables`.
-
-        Raises:
-            ValueError: `samples` is None, or larger than MAX_HYPERCUBE_SAMPLES.
-        """
-        del variables
-        if (count := _check_samples(samples)) > MAX_HYPERCUBE_SAMPLES:
+        """Return `samples`, at most MAX_HYPERCUBE_SAMPLES, for any `variables`."""
+        if (count := super().count(variables, samples)) > MAX_HYPERCUBE_SAMPLES:
             raise ValueError(
                 f"samples = {count} are more than a latin-hypercube can have, {MAX_HYPERCUBE_SAMPLES}; use sobol"
             )
@@ -202,24 +181,21 @@ class Grid(SamplingDesign):
     levels: int | Mapping[str, int | tuple[float, ...]] = table_field(_read_levels)
 
     def over(self, variables: Table) -> "Grid":
-        """Return the grid with the levels u of each of these `variables`, in their order."""
-        return Grid({name: tuple(map(float, self._axis(name, item))) for name, item in variables.items()})
+        """Return the grid with the levels of each of these `variables`, in their order."""
+        return Grid({name: self._levels(name, item) for name, item in variables.items()})
 
-    def _axis(self, name: str, variable: Any) -> Any:
-        levels = self.levels if isinstance(self.levels, int) else self.levels.get(name, 0)
-        if not isinstance(levels, int):
-            return levels
-        return variable.middles() if hasattr(variable, "middles") else np.linspace(0, 1, levels)
+    def _levels(self, name: str, variable: Any) -> int | tuple[float, ...]:
+        levels = self.levels.get(name, 0) if isinstance(self.levels, Mapping) else self.levels
+        return tuple(variable.middles()) if hasattr(variable, "middles") and np.ndim(levels) == 0 else levels
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         """Return samples of a grid made by `over`, or of a grid with one number of levels for all variables."""
         del seed, samples
-        given = [self.levels] * dimension if isinstance(self.levels, int) else list(self.levels.values())
+        given = list(self.levels.values()) if isinstance(self.levels, Mapping) else [self.levels] * dimension
         if len(given) != dimension:
             raise ValueError(f"levels are given for {len(given)} variables, not {dimension}")
-        axes = [np.linspace(0, 1, levels) if isinstance(levels, int) else np.array(levels) for levels in given]
-        places = np.unravel_index(np.arange(start, stop), [len(axis) for axis in axes])
-        return np.stack([axis[place] for axis, place in zip(axes, places, strict=True)], 1)
+        places = np.unravel_index(np.arange(start, stop), list(map(_level_count, given)))
+        return np.stack([_levels_at(place, levels) for place, levels in zip(places, given, strict=True)], 1)
 
     def count(self, variables: Table, samples: int | None) -> int:
         """Return the number of points of the grid over `variables`.
@@ -227,25 +203,40 @@ class Grid(SamplingDesign):
         Raises:
             ValueError: `samples` is given, and is another number.
         """
-        sizes = [len(self._axis(name, item)) for name, item in variables.items()]
+        sizes = [_level_count(self._levels(name, item)) for name, item in variables.items()]
         return _check_exact_count(math.prod(sizes), samples, f"the grid {' x '.join(map(str, sizes))}")
 
     def problems(self, name: str, variables: Table | None = None) -> Iterator[str]:
-        given = {"levels": self.levels} if isinstance(self.levels, int) else self.levels
-        for path, levels in given.items():
-            if isinstance(levels, int) and levels < 2:
-                yield f"{name}: {path} = {levels} levels are fewer than 2"
-            elif not isinstance(levels, int) and not (levels and all(0 <= u <= 1 for u in levels)):
-                yield f"{name}: {path} = {list(levels)} are not quantile levels in [0, 1]"
+        faults = list(super().problems(name))
+        yield from faults
+        if faults:
+            return
+        for path, levels in self.levels.items() if isinstance(self.levels, Mapping) else ():
+            given = np.asarray(levels, float)
+            if given.ndim and not (given.size and np.all((given >= 0) & (given <= 1))):
+                yield f"{name}: {path} = {given.tolist()} are not quantile levels in [0, 1]"
         if variables is None:
             return
-        if not isinstance(self.levels, int):
+        if isinstance(self.levels, Mapping):
             missing = [p for p, v in variables.items() if p not in self.levels and not hasattr(v, "middles")]
             yield from (f"{name}: levels of {path} are missing" for path in missing)
             yield from (f"{name}: {path} is not a variable" for path in self.levels if path not in variables)
         for path, variable in variables.items():
-            if not hasattr(variable, "middles") and {0.0, 1.0} & set(self._axis(path, variable)):
+            levels = self._levels(path, variable)
+            has_end = not isinstance(levels, tuple | list) or {0.0, 1.0} & set(levels)
+            if has_end and not hasattr(variable, "middles"):
                 yield from _support_problems(name, path, variable, "grid")
+
+
+def _level_count(levels: int | Sequence[float]) -> int:
+    return len(levels) if isinstance(levels, Sequence) else int(levels)
+
+
+def _levels_at(places: np.ndarray, levels: int | Sequence[float]) -> np.ndarray:
+    """Return the levels u at these places: given ones, or those of `numpy.linspace` without computing the others."""
+    if isinstance(levels, Sequence):
+        return np.array(levels)[places]
+    return np.where(places == levels - 1, 1.0, places * (1 / (levels - 1)))
 
 
 @dataclasses.dataclass(frozen=True)

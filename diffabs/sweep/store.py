@@ -26,6 +26,7 @@ from diffabs.sweep.seal import SweepError as SweepError
 
 CHUNKS_FOLDER, LOCK_FILE = "chunks", ".lock"
 MAX_VALUE_CHARACTERS = 60
+LEFTOVERS = (".manifest.*.tmp", "manifest.json.tmp", "chunks/.part-*.tmp", "chunks/part-*.tmp")  # of a killed process
 IGNORED_PREFIXES = (".", "_")  # readers of Parquet data sets ignore names with these beginnings
 
 
@@ -40,8 +41,8 @@ class Store:
     def lock(self) -> Iterator[None]:
         """Hold the lock of the folder, which is created if it does not exist.
 
-        A ValueError in the `with` block, such as a scheduler that does not answer, leaves nothing new in the folder
-        unless a chunk is finished.
+        An error in the `with` block, such as a scheduler that does not answer, leaves nothing new in the folder unless
+        a chunk is finished. Ctrl-C leaves the manifest.
 
         Raises:
             SweepError: Another process has the lock, or the folder cannot be written.
@@ -58,19 +59,15 @@ class Store:
             raise SweepError(f"{self.folder} cannot be written: {error.strerror}") from None
         try:
             yield
-        except ValueError:
-            self._remove_new(before, created)  # while the lock is held
+        except Exception:
+            if not self._has_chunks():
+                self._remove_new(before, created)  # while the lock is held
             raise
         finally:
             lock.release()
 
     def _remove_new(self, before: set[str], created: list[pathlib.Path]) -> None:
-        """Remove what a sweep without a finished chunk has written.
-
-        Args:
-            before: Names in the folder before the sweep.
-            created: Folders that the sweep has created, the innermost first.
-        """
+        """Remove all that is not in `before`, and the `created` folders, the innermost first."""
         with contextlib.suppress(OSError):  # a folder that is not empty stays
             if CHUNKS_FOLDER not in before and self.chunks.exists():
                 self.chunks.rmdir()
@@ -82,21 +79,22 @@ class Store:
     def begin(self, manifest: Table, *, resume: bool) -> None:
         """Write the `manifest`, or compare it with the existing one if `resume` is set.
 
-        A sweep without a finished chunk (because its scheduler did not answer, for example) starts again from the
-        beginning.
+        Unless `resume` is set, a sweep without a finished chunk (because its process was killed, for example) starts
+        again from the beginning.
 
         Raises:
             SweepError: The folder contains another configuration (the message names the first differences), finished
                 chunks while `resume` is not set, or other files.
         """
-        for leftover in (self.folder / f"{MANIFEST_NAME}.tmp", *self.chunks.glob("part-*.parquet.tmp")):
-            leftover.unlink(missing_ok=True)
+        for pattern in LEFTOVERS:
+            for leftover in self.folder.glob(pattern):
+                leftover.unlink(missing_ok=True)
         if not (self.folder / MANIFEST_NAME).exists():
             self._begin_new(manifest)
             return
         there = read_manifest(self.folder)
         if not resume:
-            if self.chunks.is_dir() and any(self.chunks.iterdir()):
+            if self._has_chunks():
                 raise SweepError(f"{self.folder} already holds a sweep; --resume continues it")
             self._begin_new(manifest)
             return
@@ -106,8 +104,11 @@ class Store:
             raise SweepError(f"{self.folder} holds another sweep: {'; '.join(found[:3])}{more}")
         self.chunks.mkdir(exist_ok=True)
 
+    def _has_chunks(self) -> bool:
+        return any(self.chunks.glob("*"))
+
     def _begin_new(self, manifest: Table) -> None:
-        if self.chunks.is_dir() and any(self.chunks.iterdir()):
+        if self._has_chunks():
             raise SweepError(f"{self.folder} has chunks but no {MANIFEST_NAME}; it cannot be continued")
         names = (path.name for path in self.folder.iterdir())
         others = sorted(
@@ -155,7 +156,7 @@ def list_chunks(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathli
         number = seal.CHUNK_NAME_PATTERN.fullmatch(path.name)
         if number and int(number[1]) < count:
             named.setdefault(int(number[1]), []).append(path)
-        elif not path.name.startswith(IGNORED_PREFIXES) and path.suffix != ".tmp":
+        elif not path.name.startswith(IGNORED_PREFIXES):
             strays.append(path)
     return named, strays
 

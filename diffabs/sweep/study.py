@@ -1,21 +1,20 @@
 """The definition of a sweep: a loop, its varying parameters, its solver, and its metrics.
 
 Run i is a function of (seed, i), and for a finite design of the number of samples (`sampling`). The design gives its
-parameters, and `fold_in(key, i)` its noise. Chunk i // chunk contains it. The process, device and time of the
-computation do not change it.
+parameters, and `fold_in(key, i)` its noise. Chunk i // chunk contains it. It does not depend on the process, on the
+time, or on which of several equal devices computes it.
 """
 
 import contextlib
 import dataclasses
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
 import numpy as np
 
 from diffabs.compiler import pipeline
-from diffabs.config.values import as_plain, unknown_name_error
+from diffabs.config.values import ScenarioError, as_plain, plain_fields, read_whole, unknown_name_error
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, parameters, replace
@@ -70,7 +69,11 @@ class Study:
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Replace empty objectives by the usual ones for the plant's signals."""
+        """Replace empty objectives by the usual ones for the plant's signals, and arrays of one number by numbers."""
+        for name in RANGES:
+            object.__setattr__(self, name, as_plain(getattr(self, name)))
+        if isinstance(self.solver, Solver):
+            object.__setattr__(self, "solver", dataclasses.replace(self.solver, **plain_fields(self.solver)))
         if not self.objectives:
             object.__setattr__(self, "objectives", default_objectives(self.loop.plant))
 
@@ -132,7 +135,11 @@ class Study:
             raise ValueError(f"sample {i} is outside [0, {self.samples - 1}]")
         values = {path: column[0] for path, column in self.draw(i, i + 1).items()}
         with precision("float64"):
-            return replace(self.variant(values), numeric_values(values)), noise_key(self.seed, i)
+            return replace(self.variant(values), self.numbers(values)), noise_key(self.seed, i)
+
+    def numbers(self, values: Params) -> JsonObject:
+        """Return the `values` by path that are numbers, and not names of parts."""
+        return {path: value for path, value in values.items() if path not in self.parts}
 
     def variant(self, values: Params) -> Loop:
         """Return the loop with the alternative parts that `values` names by path; numbers in `values` are not set."""
@@ -148,26 +155,15 @@ class Study:
         own |= {"failures": self.failure_bounds, "success": self.success}
         if self.engine == "kernel":
             own |= {"engine": {"name": self.engine, **pipeline.describe_kernel_build()}}
-        return json.loads(
-            json.dumps(
-                {
-                    **own,
-                    "solver": describe_solver(self.solver),
-                    "space": self.space.table(),
-                    "loop": as_plain(self.loop),
-                    "parts": as_plain(self.parts),
-                    "objectives": as_plain(self.objectives),
-                }
-            )
-        )
+        own |= {"solver": describe_solver(self.solver), "space": self.space.table()}
+        return as_plain({**own, "loop": self.loop, "parts": self.parts, "objectives": self.objectives})
 
     def _number_problems(self) -> Iterator[str]:
         for name, (least, most) in RANGES.items():
-            value = getattr(self, name)
-            if not isinstance(value, int):
-                yield f"{name} = {value!r} is not a whole number"
-            elif not least <= value <= most:
-                yield f"{name} = {value} is outside [{least}, {most}]"
+            try:
+                read_whole(getattr(self, name), least, most, name)
+            except ScenarioError as error:
+                yield str(error)
         if self.dtype not in DTYPES:
             yield f"dtype = {self.dtype} is neither {' nor '.join(DTYPES)}"
         if self.engine not in REQUESTABLE_ENGINES:
@@ -175,7 +171,7 @@ class Study:
         yield from find_solver_faults(self.solver)
         for name in {"sample", *FLAG_COLUMNS, *self.space.paths} & self.objectives.keys():
             yield f"objectives.{name}: another column of the table has this name"
-        for name, bound in self.failures.items():
+        for name, bound in self.failure_bounds.items():
             if name not in self.objectives:
                 yield str(unknown_name_error(f"failures.{name} is not measured", name, self.objectives))
             elif not np.isfinite(bound):
@@ -214,15 +210,6 @@ def _part_problems(path: str, distribution: Any, choices: Table, loop: Loop) -> 
         yield from find_problems(part, f"{path} {name}: ")
 
 
-def numeric_values(values: Params) -> JsonObject:
-    """Return the values that are numbers, and not names.
-
-    Args:
-        values: Values by path.
-    """
-    return {path: value for path, value in values.items() if np.asarray(value).dtype.kind in "fiu"}
-
-
 @contextlib.contextmanager
 def precision(dtype: str) -> Iterator[None]:
     """Set JAX's default type of numbers in this context.
@@ -253,20 +240,23 @@ def is_accepted(refused: Bool) -> np.ndarray:
     return np.asarray(refused).astype(str) == ""
 
 
-def has_failed(study: Study, columns: Any) -> np.ndarray:
-    """Return which runs diverged, had a wrong end, or exceeded one of `Study.failure_bounds`, shape (samples,).
+def failure_masks(
+    column: Callable[[str], np.ndarray], bounds: Mapping[str, float], success: bool
+) -> dict[str, np.ndarray]:
+    """Return which samples failed, as {kind: mask}, each of shape (samples,).
 
-    A sample that was not run has not failed.
+    The kinds are "diverged", a wrong end ("stopped" or "not stopped"), and "METRIC > BOUND". A sample that was not run
+    has not failed.
 
     Args:
-        study: Study of the sweep.
-        columns: Columns of the table, by name.
+        column: Function that returns a column of the table by its name.
+        bounds: Bounds of metrics; a larger value is a failure.
+        success: Whether reaching the stop is a success.
     """
-    failed = np.asarray(columns["diverged"]) | has_wrong_end(columns["stopped"], study.success)
-    failed = np.any(
-        [failed, *(np.asarray(columns[name]) > bound for name, bound in study.failure_bounds.items())], axis=0
-    )
-    return failed & is_accepted(columns["refused"])
+    run = is_accepted(column("refused"))
+    kinds = {"diverged": column("diverged"), describe_wrong_end(success): has_wrong_end(column("stopped"), success)}
+    kinds |= {f"{name} > {bound:g}": column(name) > bound for name, bound in bounds.items()}
+    return {name: failed & run for name, failed in kinds.items()}
 
 
 def has_wrong_end(stopped: Bool, success: bool) -> np.ndarray:

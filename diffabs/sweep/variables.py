@@ -21,6 +21,7 @@ from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import AnyArray, JsonObject, Matrix, Params, PyTree, Table
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.discrete import Rows as Rows
+from diffabs.sweep.discrete import is_numeric
 from diffabs.sweep.distributions import Distribution, describe_out_of_range
 from diffabs.sweep.sampling import Grid, LatinHypercube, Random, SamplingDesign, Sobol
 
@@ -161,7 +162,7 @@ class Space:
     def normal(self, z: AnyArray) -> dict[str, np.ndarray]:
         """Return the values at independent standard normal coordinates z (n, dimension) by path, each of shape (n,).
 
-        They are correct to their last digits in both tails.
+        Those of `Uniform`, `Normal`, `LogNormal` and `Triangular` are correct to their last digits in both tails.
         """
         columns = self._columns(np.asarray(z, float))
         columns |= self.correlation.correlate(columns) if self.correlation else {}
@@ -191,7 +192,10 @@ class Space:
         for name, item in self.variables.items():
             if isinstance(item, Rows):
                 for path, column in item.columns.items():
-                    if path in specs and not specs[path].holds(column):
+                    if path in specs and not is_numeric(column):
+                        needed = f"a number in {specs[path].interval()} is needed"
+                        yield f"{prefix}{name}: column {path} is text; {needed}"
+                    elif path in specs and not specs[path].holds(column):
                         reached = f"{np.min(column):g} ... {np.max(column):g}"
                         yield f"{prefix}{name}: column {path} = {reached} leaves {specs[path].interval()}"
             elif name in specs and (line := describe_out_of_range(item, specs[name], prefix + name)):

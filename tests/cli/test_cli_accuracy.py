@@ -133,8 +133,6 @@ def test_lanes_that_are_no_result_are_not_drawn():
     study = SimpleNamespace(seed=1)
     table: Any = SimpleNamespace(column=columns.__getitem__)
     assert _choose_samples(study, table, 100).tolist() == [3, 4, 5]
-    del columns["refused"]
-    assert _choose_samples(study, table, 100).tolist() == [3, 4, 5, 6, 7]
     assert len(_choose_samples(study, table, 2)) == 2
 
 

@@ -63,19 +63,22 @@ def test_a_comparison_is_sample_by_sample(swept):
 
 
 @killed_by("cli/show_samples.py", 'if row["never"]:', "if False:")
+@killed_by("cli/show_samples.py", "that diverged or were refused", "that diverged")
 def test_runs_that_never_reach_an_event_are_said(capsys):
-    """Two of seven samples: the other five have statistics."""
+    """Two of seven samples, and one was refused: the other four have statistics."""
     stop = np.array([1.0, np.inf, 2.0, 3.0, 1.5, 2.5, np.inf])
     a, b = (
         SimpleNamespace(
-            column={"stop_time": stop + more, "diverged": np.zeros(7, bool)}.__getitem__, accepted=np.ones(7, bool)
+            column={"stop_time": stop + more, "diverged": np.zeros(7, bool)}.__getitem__, accepted=np.arange(7) > 0
         )
         for more in (0.0, 0.1)
     )
     both: Any = (a, b)
     show_comparison({"first": "a", "second": "b", **_compare_metrics(*both, ["stop_time"])})
     line = "warning: stop_time is infinite (never) in 2 common samples: its statistics leave them out\n"
-    assert line in capsys.readouterr().err
+    shown = capsys.readouterr()
+    assert line in shown.err
+    assert "7 common samples, 1 left out that diverged or were refused" in " ".join(shown.out.split())
 
 
 @killed_by("cli/compare.py", "if len(before) >= FEWEST:", "if len(before) < FEWEST:")

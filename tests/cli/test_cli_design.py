@@ -133,10 +133,14 @@ def test_vertices_are_the_papers(designed):
     assert all(pole < 0 for pole in document["poles"])
 
 
-def test_certificate_is_proved_by_who_shares_nothing(designed):
+def test_certificate_is_proved_by_who_shares_nothing(designed, tmp_path):
+    """Also where another program has written its members in another order."""
     folder, _, document = designed
     assert left_in(folder) == {"c.json"}
     assert checked(folder / "c.json").returncode == 0
+    content = json.loads((folder / "c.json").read_text())
+    (tmp_path / "sorted.json").write_text(json.dumps(content, sort_keys=True))
+    assert checked(tmp_path / "sorted.json").returncode == 0
     assert run("verify", folder / "c.json").stdout.count("proved  ") == 2
     assert Certificate.load(folder / "c.json").gain.ravel().tolist() == document["gain"]
 

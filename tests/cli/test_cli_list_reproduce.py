@@ -12,7 +12,10 @@ from commands import assert_one_error_line, left_in, run, umask
 from mutants import killed_by
 from seams import replace_seam
 
+import diffabs as d
 from diffabs.cli import catalogue
+from diffabs.compiler.runtime import toolchain
+from diffabs.objectives import BRAKING
 from diffabs.papers.digest import Digest
 from diffabs.scenario import registry
 
@@ -107,6 +110,27 @@ def test_reproduce_everything(papers, tmp_path):
     assert result.stderr.count("drawing\n") == 2
     assert f"1 figures, summary.json and report.html: {out / 'slip-lmi'}\n" in result.stderr
     assert os.stat(out / "slip-lmi").st_mode & 0o777 == 0o777 & ~umask()
+
+
+@killed_by("cli/reproduce.py", "            report.check_target(whole)\n", "            pass\n")
+def test_a_foreign_report_is_found_before_any_paper(papers, tmp_path):
+    (tmp_path / "report.html").write_text("a diary")
+    assert_one_error_line(run("reproduce", "--out", tmp_path, status=2))
+    assert left_in(tmp_path) == {"report.html"}
+
+
+@killed_by("cli/console.py", "except (ScenarioError, EngineError) as error:", "except ScenarioError as error:")
+def test_an_engine_that_cannot_make_the_runs_is_one_line(papers, tmp_path, monkeypatch):
+    def needs_a_kernel(folder: pathlib.Path, progress) -> dict:
+        lanes, solver = d.Batch({"plant.mass": [15.0]}), d.FixedStep(1e-3, 0.01)
+        return {"rows": d.run_batch(d.braking(), lanes, solver, BRAKING, accepted=True).metrics}
+
+    papers[0]["slip-lmi"] = needs_a_kernel
+    monkeypatch.setenv("DIFFABS_ENGINE", "kernel")
+    monkeypatch.setenv(toolchain.COMPILER, "")
+    result = run("reproduce", "slip-lmi", "--out", tmp_path, status=2)
+    assert "error: engine = 'kernel' is not possible: " in result.stderr
+    assert left_in(tmp_path) == set()
 
 
 def test_on_a_terminal_the_spinner_says_which_step(papers, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from fractions import Fraction
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -14,9 +14,11 @@ from commands import run
 from marks import cases
 from mutants import killed_by
 
+import diffabs as d
 from diffabs.cli.prove import _document
 from diffabs.cli.show import show_verification
 from diffabs.cli.show_proofs import show_box_proof
+from diffabs.config.values import ScenarioError
 from diffabs.scenario.outside import lend_modules
 from diffabs.scenario.scenario import load
 
@@ -113,6 +115,36 @@ def test_the_table_of_a_proof_has_units_and_no_negative_zero(capsys: pytest.Capt
     shown = capsys.readouterr().out
     assert "proved for every initial.speed 5 to 10 m/s, reference.slip 0.1 to 0.2\n" in shown
     assert "-0" not in shown
+
+
+@killed_by("cli/prove.py", "if n**wide <= MOST_RUNS", "if True", case="7-1-128")
+@killed_by("cli/prove.py", "n > 1 and _is_wide(ends)", "n > 1", case="1-1-9")
+@killed_by("cli/prove.py", "n > 1 and _is_wide(ends)", "_is_wide(ends)", case="10-0-1")
+@killed_by("cli/prove.py", "low and math.nextafter", "math.nextafter", case="1-1-9")
+@pytest.mark.parametrize(("wide", "pinned", "count"), [(1, 1, 9), (3, 1, 125), (4, 0, 625), (7, 1, 128), (10, 0, 1)])
+def test_few_runs_of_a_box_are_simulated(wide: int, pinned: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The runs among which the worst is looked for are a grid of at most 1,000; a single value, also 0, has one."""
+    seen: list[int] = []
+
+    def count_runs(loop: d.Loop, batch: d.Batch, *rest: object) -> NoReturn:
+        seen.append(batch.size)
+        assert np.median(batch.values["plant.mass"]) == 2.5  # a single run is in the middle
+        assert not np.any(batch.values.get("initial.slip", 0.0))
+        raise ScenarioError("enough")
+
+    monkeypatch.setattr("diffabs.run_batch", count_runs)
+    plant = (
+        "mass",
+        "wheel_radius",
+        "body_radius",
+        "wheel_inertia",
+        *(f"road.{x}" for x in ("w1", "w2", "w3", "w4", "a")),
+    )
+    names = [*(f"plant.{name}" for name in plant), "initial.speed"]
+    ranges = [*(f"{name}=2:3" for name in names[:wide]), *["initial.slip=0:0"] * pinned]
+    words = [word for text in ranges for word in ("--over", text)]
+    assert "enough" in run("prove", "slip-lmi", *words, "--claim", "no_lock", status=2).stderr
+    assert seen == [count]
 
 
 @killed_by("cli/prove.py", "if worst and math.isfinite(high)", "if math.isfinite(high)")

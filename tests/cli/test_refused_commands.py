@@ -64,6 +64,11 @@ REFUSALS = [
     ("prove slip-lmi --over plant.mas=5:6", 2, ["did you mean plant.mass?"]),
     ("prove slip-lmi --over plant.mass=6:5", 2, ["is inverted"]),
     ("prove slip-lmi --over plant.mass=-1:5", 2, ["outside (0, inf) kg"]),
+    (
+        "prove slip-lmi --over controller.torque_max=9:inf",
+        2,
+        ["--over controller.torque_max = [9.0, inf]: both ends must be finite"],
+    ),
     ("prove slip-lmi --over plant.mass=5:6 --claim max_slp=1", 2, ["did you mean max_slip?"]),
     ("prove slip-lmi --over plant.mass=5:6 --claim max_slip=x", 2, ["needs a finite number: max_slip=BOUND"]),
     ("prove slip-lmi --over plant.mass=5:6 --claim overshoot=nan", 2, ["needs a finite number: overshoot=BOUND"]),
@@ -167,7 +172,12 @@ REFUSALS = [
     (
         "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --sigma wheel_speed=much",
         2,
-        ['--sigma wheel_speed = "much" is no number in (0, inf) m/s'],
+        ['--sigma wheel_speed = "much" is text; a number in (0, inf) m/s is needed'],
+    ),
+    (
+        "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --sigma slip=0.1 --sigma slip=5",
+        2,
+        ["--sigma slip is given twice"],
     ),
     (
         "identify identify.toml --data run.csv --free plant.mass=4:8 --free road.w4 --column speed",
@@ -204,12 +214,19 @@ REFUSALS = [
         ["design.Q has shape (3,); it needs (2, 2), or its diagonal (2,); the states are"],
     ),
     ("certify slip-lmi --set design.R=1,1", 2, ["design.R has shape (2,); it needs (1, 1)"]),
+    ("certify slip-cured --set design.damping=0.5", 2, ["design.damping = 0.5 needs continuous time"]),
+    ("certify slip-cured --set design.decay=9e6", 2, ["design.decay = 9e+06 is outside [0, 700000] 1/s"]),
     ("certify slip-lmi -q --set controller=relay", 2, ["controller relay is not linear"]),
     ("certify slip-lmi --set design.over.plant.mas=1,2", 2, ["did you mean plant.mass?"]),
     ("certify slip-lmi --out none/c.json", 2, ["No such file or directory"]),
     ("certify slip-lmi --out .", 2, ["is not a regular file"]),
     # tune
     ("tune tune.toml --set 'tune.free={}'", 2, ["tune.free is empty", '"controller.gain" = ']),
+    (
+        "tune tune.toml --set tune.samples=9 --set tune.over={}",
+        2,
+        ["tune.samples = 9 needs ranges to draw from: tune.over is empty"],
+    ),
     ("tune tune.toml --set 'tune.objective={}'", 2, ["tune.objective is empty", "iae = 1.0"]),
     ("tune tune.toml -q --set controller=relay", 2, ["tune.free is empty"]),
     (
@@ -299,6 +316,7 @@ REFUSALS = [
 @killed_by(
     "cli/certificates.py", "    if len(values) != len(states):", "    if False:", case="certify slip-lmi --gain=1,2,3"
 )
+@killed_by("cli/certificates.py", ", reduced.model.period)", ")", case="certify slip-cured --set design.damping=")
 @killed_by(
     "cli/targets.py",
     "if os.path.isfile(source) and",
@@ -312,6 +330,12 @@ REFUSALS = [
     case="margins slip-lmi --set reference=setpoin",
 )
 @killed_by("cli/usage.py", "(Value error, )?", "", case="export slip-cured --to cc")
+@killed_by(
+    "scenario/section_tune.py",
+    "if self.samples and not self.over:",
+    "if False:",
+    case="tune tune.toml --set tune.samples=9 --se",
+)
 @killed_by("cli/rare.py", "if not math.isfinite(value):", "if False:", case="rare rare.toml overshoot=nan")
 @pytest.mark.usefixtures("any_step_is_stable")
 @pytest.mark.parametrize(("command", "status", "needed"), REFUSALS, ids=[readable_id(row[0]) for row in REFUSALS])
@@ -329,6 +353,27 @@ def test_a_refusal_is_one_line_and_leaves_nothing(command, status, needed, tmp_p
     for text in needed:
         assert text.lower() in result.stderr.lower()
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == FILES
+
+
+@killed_by("cli/usage.py", 'given.get("engine", "auto")', '"auto"', case="tune")
+@killed_by("cli/usage.py", 'given.get("engine", "auto")', '"xla"', case="reproduce")
+@pytest.mark.parametrize(
+    ("command", "needed"),
+    [
+        ("tune slip-lmi --engine gpu", "--engine gpu is unknown; there is auto, xla, kernel"),
+        ("reproduce slip-lmi", "DIFFABS_ENGINE = 'gpu' is unknown; there is auto, xla, kernel"),
+        ("prove slip-lmi --over plant.mass=5:6", "DIFFABS_ENGINE = 'gpu' is unknown; there is auto, xla, kernel"),
+    ],
+    ids=["tune", "reproduce", "prove"],
+)
+def test_an_engine_that_is_unknown_is_refused_first(command, needed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if "--engine" not in command:
+        monkeypatch.setenv("DIFFABS_ENGINE", "gpu")
+    result = run(*shlex.split(command), status=2)
+    assert_one_error_line(result)
+    assert needed in result.stderr
+    assert not list(tmp_path.iterdir())
 
 
 FOLDERS_AND_PROOFS = {"file", "first", "from_sweep", "proof", "second"}  # that no command with an output file reads

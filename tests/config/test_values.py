@@ -1,6 +1,7 @@
 """Values that somebody wrote become dataclasses, or one line; parts become values; files are whole."""
 
 import dataclasses
+import importlib
 import os
 import subprocess
 from typing import Any
@@ -58,6 +59,7 @@ def test_a_table_becomes_a_dataclass():
         ({"volume": 0}, "cup.volume = 0 is outside (0, inf) l"),
         ({"volume": "full"}, 'cup.volume = "full" is text; a number in (0, inf) l is needed'),
         ({"volume": None}, "cup.volume = None is nothing; a number in (0, inf) l is needed"),
+        ({"volume": np.arange(2)}, "cup.volume = array([0, 1]) is of type ndarray; a number in (0, inf) l is needed"),
         ({"volume": 1, "handles": 3}, "cup.handles = 3 is outside [0, 2]"),
         (
             {"volume": 1, "handle": 1},
@@ -131,11 +133,18 @@ def test_an_impossible_distribution_is_refused_on_reading():
         load("slip-lmi", ["sweep.over.initial.speed_kmh=36,900"])
 
 
-def test_packages_export_what_they_say_and_no_more():
+@killed_by("runtime/exports.py", ", *homes()})", "})")
+@killed_by("runtime/exports.py", 'if name == "__all__"', "if not name")
+def test_packages_export_what_they_say_and_no_more(tmp_path, monkeypatch):
     export = lazy_getattr("diffabs.roads")
     assert export("Burckhardt") is Burckhardt
     with pytest.raises(AttributeError, match="has no attribute 'Burkhardt'"):
         export("Burkhardt")
+    text = "import diffabs.runtime.exports as e\nif not e:\n    from math import tau as tau\n"
+    (tmp_path / "exporting.py").write_text(f"{text}__getattr__ = e.lazy_getattr(__name__)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("exporting")
+    assert ("tau" in dir(module), "tau" in vars(module), module.__all__) == (True, False, ["tau"])
 
 
 @killed_by(

@@ -21,5 +21,7 @@ def test_entries_in_turn_and_the_last_one_stays():
 
 
 def test_an_empty_record_is_refused():
-    with pytest.raises(ValueError, match=r"commands has shape \(0,\); it needs \(n,\), n at least 1"):
-        d.check(loop(PlayedCommand(commands=np.zeros(0)), Limits()))
+    given = loop(PlayedCommand(commands=np.zeros(0)), Limits())
+    for use in (d.check, lambda given: d.rollout(given, d.FixedStep(2e-3, 0.05))):
+        with pytest.raises(ValueError, match=r"commands has shape \(0,\); it needs \(n,\), n at least 1"):
+            use(given)

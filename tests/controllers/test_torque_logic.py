@@ -25,11 +25,23 @@ def mean(controller, plant=RISING, length=LENGTH):
 
 @killed_by("controllers/torque_logic.py", "phase == 2, 1.0, 0.0", "phase == 2, 2.0, 0.0")
 @killed_by("controllers/torque_logic.py", "self.slip_high - slip, slip - self.slip_low", "1.0, slip - self.slip_low")
-def test_four_phases():
-    """Raise for 0.1 s, hold until slip 0.1 at 0.25 s, lower for 0.05 s, and hold for good: the slip stays high."""
-    logic = FourPhase(torque_low=5.0, torque_high=10.0, slip_low=0.02, slip_high=0.1, rate=100.0)
-    area = 0.5 * 10 * 0.1 + 10 * 0.15 + 7.5 * 0.05 + 5 * 0.2
-    np.testing.assert_allclose(mean(logic), area / LENGTH, rtol=1e-9)
+@killed_by("controllers/torque_logic.py", "(phase == 2) & (slip <= self.slip_low)", "phase > 4", case="falls")
+@killed_by("controllers/torque_logic.py", "jnp.where(phase == 0, slip >= self.slip_high,", "(", case="high")
+@pytest.mark.parametrize(
+    ("plant", "slip_low", "slip_high", "area"),
+    [
+        # Raise for 0.1 s, hold until slip 0.1 at 0.25 s, lower for 0.05 s, and hold for good: the slip stays high.
+        (RISING, 0.02, 0.1, 0.5 * 10 * 0.1 + 10 * 0.15 + 7.5 * 0.05 + 5 * 0.2),
+        # The slip is 0.04 where the torque reaches 10: no hold before it is lowered.
+        (RISING, 0.02, 0.03, 0.5 * 10 * 0.1 + 7.5 * 0.05 + 5 * 0.35),
+        # 0.16 there, and 0.14 where it reaches 5: it rises again at once, and is held for good.
+        (Script(read=lambda t: seen(0.2 - 0.4 * t)), 0.145, 0.15, 0.5 * 10 * 0.1 + 2 * 7.5 * 0.05 + 10 * 0.3),
+    ],
+    ids=["inside", "high", "falls"],
+)
+def test_four_phases(plant, slip_low, slip_high, area):
+    logic = FourPhase(torque_low=5.0, torque_high=10.0, slip_low=slip_low, slip_high=slip_high, rate=100.0)
+    np.testing.assert_allclose(mean(logic, plant), area / LENGTH, rtol=1e-9)
 
 
 @killed_by("controllers/torque_logic.py", "slip > self.slip_high, -self.decay", "slip > self.slip_high, self.decay")

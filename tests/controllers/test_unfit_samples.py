@@ -8,7 +8,7 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.controllers import PID, BackCalculation, ConstantInput, Sampled, SampledOnGrid
+from diffabs.controllers import PID, BackCalculation, BandLogic, ConstantInput, PlayedCommand, Sampled, SampledOnGrid
 from diffabs.core.protocols import no_flow, no_memory
 from diffabs.core.pytree import param, pytree
 from diffabs.core.validity import find_problems
@@ -107,6 +107,59 @@ def test_a_comparison_does_not_hide_that_a_sample_is_lost():
     np.testing.assert_array_equal(commands[LOST], commands[LOST.start - 1])
     assert set(commands) == {1.0, 3.0}
     assert commands[LOST.start] == 3.0
+
+
+@pytree
+class Filter:
+    """A filter of its own, which is no Euler step and has no clock; its margin asks for a rate."""
+
+    cutoff: Any = param(default=500.0, unit="Hz")
+    period: Any = param(default=0.015, unit="s")
+
+    start, flow = no_memory, no_flow
+
+    def output(self, t, memory, signal):
+        return signal.target * jnp.exp(-self.cutoff * PERIOD)
+
+    def margins(self, t, memory, signal, rate):
+        return (rate().target,)
+
+    def event(self, t, memory, signal, fired):
+        return memory
+
+
+@killed_by("controllers/sampled.py", "(decay) * as_rule_array(period) < 1", "(decay) < 1e9")
+@killed_by("controllers/sampled.py", 'hasattr(controller, "period")', "False")
+@killed_by("controllers/sampled.py", 'if offers(controller, "tick") and', "if")
+@killed_by("controllers/sampled.py", "isinstance(controller, PID)", 'hasattr(controller, "cutoff")')
+@pytest.mark.parametrize(
+    ("controller", "line"),
+    [
+        (BandLogic(decay=99.0), ""),  # a sample multiplies its torque by 0.01
+        (
+            BandLogic(decay=101.0),
+            "controller.decay = 101 1/s is outside (0, 100) 1/s: sampled every 0.01 s",
+        ),  # by -0.01
+        (PlayedCommand(period=0.02), ""),
+        (PlayedCommand(period=0.015), "controller.period = 0.015 s is not a multiple of the sampling period"),
+        (PlayedCommand(period=1e-3), "controller.period = 0.001 s is not a multiple of the sampling period"),
+        (Filter(), ""),
+    ],
+)
+def test_a_controller_that_does_not_fit_its_period(controller, line):
+    for computer in (
+        Sampled(controller=controller, period=0.01),
+        SampledOnGrid(controller=controller, sampling_period=0.01),
+    ):
+        problems = list(find_problems(computer))
+        assert len(problems) == bool(line)
+        assert all(one.startswith(line) for one in problems)
+
+
+@killed_by("controllers/sampled.py", "memory, signal, _refuse_rate))", "memory, signal, None))")
+def test_a_sampled_controller_has_no_rate():
+    with pytest.raises(ValueError, match="the signal of a sampled controller has no rate"):
+        d.check(rig(Sampled(controller=Filter())), d.FixedStep(STEP, 1.0))
 
 
 @killed_by(

@@ -12,13 +12,13 @@ from scipy.optimize import brentq
 from signals import H, Mean, Script, close, seen
 
 import diffabs as d
-from diffabs import check
 from diffabs.actuators import Lag, Limits, RateLimit
 from diffabs.controllers import (
     PID,
     BackCalculation,
     Clamping,
     ConstantTorque,
+    FourPhase,
     NoAntiWindup,
     ProportionalFeedback,
     Relay,
@@ -30,9 +30,18 @@ from diffabs.controllers import (
 from diffabs.controllers.pid import PIDMemory
 from diffabs.core.blocks import Series, offers
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, Sample, Tracking
+from diffabs.core.validity import check_part
 from diffabs.objectives import IAE, ITAE, MaxSlip, SettlingTime
 from diffabs.plants import BrakeStart, MirroredRig
-from diffabs.references import FilteredSlip, FixedSlip, PeakLatch, PeakLiteral, PeakRobust, SlipByDeceleration
+from diffabs.references import (
+    ExtremumSeeking,
+    FilteredSlip,
+    FixedSlip,
+    PeakLatch,
+    PeakLiteral,
+    PeakRobust,
+    SlipByDeceleration,
+)
 from diffabs.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, SpeedScale, WheelSpeed
 from diffabs.simulate.step.runge_kutta import rk4_step
 from diffabs.stops import NoStop, SpeedReached, Standstill
@@ -163,17 +172,26 @@ def test_proportional_is_state_feedback_scaled_by_speed():
         close(k.flow(0.0, Memory(-0.03), signal), -0.1)
 
 
+@killed_by("core/units.py", "for name in Units._fields:", 'for name in ("control",):')
+@killed_by("core/rules.py", '"" if unit == "1" else', '"" if unit == "0" else')
+@killed_by("core/validity.py", 'shapes.append(f"{field.name} {line}")', "pass")
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("part", "message"),
     [
-        ({"gains": np.array([-1.0])}, "they need one"),
-        ({"speeds": np.array([3.0, 2.0])}, "do not increase"),
-        ({"torque_min": 3.0, "torque_max": 2.0}, "exceeds torque_max"),
+        (ScheduledFeedback(gains=np.array([-1.0])), "they need one"),
+        (ScheduledFeedback(speeds=np.array([3.0, 2.0])), "do not increase"),
+        (ScheduledFeedback(torque_min=3.0, torque_max=2.0), "exceeds torque_max"),
+        (FourPhase(slip_low=0.5), "^slip_low = 0.5 is not below slip_high = 0.35$"),
+        (SettlingTime(share=0.0), "^share and band are both 0; a settling time needs a band of some width$"),
+        (ExtremumSeeking(slip=0.6), "^slip = 0.6 exceeds greatest_slip = 0.5$"),
+        (Limits(low=[1.0, 2.0], high=3.0), r"^low has shape \(2,\); it needs \(\)$"),
+        (Series(blocks=(Relay(torque_min=[5.0]),)), r"^blocks.0.torque_min has shape \(1,\); it needs \(\)$"),
+        (PID(kp=[1.0, 2.0]), r"^kp has shape \(2,\); it needs \(\)$"),
     ],
 )
-def test_scheduled_feedback_refuses(change, message):
+def test_a_part_is_refused_by_its_own_check(part, message):
     with pytest.raises(ValueError, match=message):
-        check(ScheduledFeedback(**change))
+        check_part(part)
 
 
 @killed_by("controllers/switching.py", "return (self.band + jnp.where", "return (0.0 * self.band + jnp.where")

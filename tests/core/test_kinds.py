@@ -84,7 +84,7 @@ def test_a_list_is_an_array():
     assert listed == tupled == iae(d.replace(RIG, {"controller.gain": np.array([-9e3, -40.0])}))
 
 
-@killed_by("core/validity.py", "kinds.value_shape(value) != spec.shape", "False")
+@killed_by("core/validity.py", "spec.shape in (None, shape)", "True")
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
@@ -98,7 +98,7 @@ def test_a_list_is_an_array():
         ("controller.gain", -9e3, "controller.gain = -9000.0 has shape (); it needs (2,)"),
         ("controller.gain", np.ones((2, 2)), "has shape (2, 2); it needs (2,)"),
         ("plant.mass", np.array([5.3, 6.2]), "plant.mass = [5.3 6.2] has shape (2,); it needs ()"),
-        ("plant.road", roads.Patches(edges=np.array([1.0, 2.0])), "edges has shape (2,); 2 roads need one less"),
+        ("plant.road", roads.Patches(edges=np.array([1.0, 2.0])), "edges has shape (2,); 2 roads need (1,)"),
         ("plant.road", roads.Tabulated(mu=np.array([0.0, 1.0])), "slip and mu have shapes (17,) and (2,)"),
         (
             "controller",
@@ -170,7 +170,7 @@ def test_one_step_may_be_the_whole_run():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"plant.mass": np.array(["5.3", "6.2"])}, "plant.mass = 5.3 is text"),
+        ({"plant.mass": np.array(["5.3", "6.2"])}, "plant.mass = ['5.3' '6.2'] is text"),
         ({"plant.mass": np.array([5.3, 6.2], np.float16)}, "float16"),
         ({"plant.mass": np.ones((2, 2))}, "plant.mass = [1. 1.] has shape (2,); it needs ()"),
         ({"controller.gain": np.ones((2, 3))}, "has shape (3,); it needs (2,)"),

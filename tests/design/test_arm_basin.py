@@ -7,10 +7,12 @@ import pytest
 from balancing import DIRECTION, EFFORT, GAIN, HANGING, MULTIPLES, SHORT, SLOW, SOLVER, START, WEIGHTS, closed, model
 from mutants import killed_by
 from oracles import arm_rates, arm_stays_up
+from scipy.linalg import solve_continuous_are
 
+from diffabs import braking
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.core.pytree import replace
-from diffabs.design import Spec, certify, design
+from diffabs.design import Polytope, Spec, certify, design
 from diffabs.design.attraction import (
     Basin,
     Cells,
@@ -22,7 +24,7 @@ from diffabs.design.attraction import (
 )
 from diffabs.design.capture import capture_ellipsoids
 from diffabs.design.parameter_grid import grid_polytope
-from diffabs.design.state_feedback_balance import reduce_balance_loop
+from diffabs.design.state_feedback import reduce_balance_loop
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import recoverable_bound
 from diffabs.objectives import FinalNorm
@@ -38,7 +40,7 @@ OVER = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "
 # Regions of attraction
 
 
-AXIS = Cells(-0.1, 0.1, 9)
+AXIS, RISING = Cells(-0.1, 0.1, 9), np.linspace(0.0, 0.12, 13)[1:]
 
 
 @pytest.mark.slow
@@ -131,7 +133,7 @@ def test_the_largest_multiple_that_is_recovered(voltage):
     assert not arm_stays_up(HANGING, GAIN, (found.multiple + 1e-4) * START, voltage)
 
 
-@killed_by("design/attraction.py", "if not 0 < radius < np.inf:", "if False:")
+@killed_by("design/attraction.py", "if not 0 < band < np.inf:", "if False:")
 @killed_by("design/attraction.py", "if not 0 < most < np.inf:", "if False:")
 def test_no_band_and_no_search_without_a_size():
     for band in (0.0, -0.1, np.nan):
@@ -140,8 +142,35 @@ def test_no_band_and_no_search_without_a_size():
     for most in (-1.0, 0.0, np.inf):
         with pytest.raises(ValueError, match=rf"most = {most:g} is outside \(0, inf\)"):
             recoverable_multiple(closed(), DIRECTION, SOLVER, most=most)
-    with pytest.raises(ValueError, match=r"direction = \{\}: it needs a value of the initial state"):
-        recoverable_multiple(closed(), {}, SOLVER)
+
+
+ROW, NO_START = {"plant.rider_mass": np.array([50.0])}, r"it needs columns of one length, at least 1"
+NO_DIRECTION = "it needs finite values of the initial state, not all zero"
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda: classify_starts(closed(), {}, SOLVER), NO_START),
+        (lambda: classify_starts(closed(), {"initial.theta": 0.1}, SOLVER), NO_START),
+        (lambda: region_of_attraction(closed(), Cells(-0.1, 0.1, 0), AXIS, SOLVER), NO_START),
+        (lambda: largest_recovered_multiples(closed(), {}, DIRECTION, RISING, SOLVER), NO_START),
+        (lambda: largest_recovered_multiples(closed(), ROW, DIRECTION, [], SOLVER), "multiples = "),
+        (lambda: largest_recovered_multiples(closed(), ROW, DIRECTION, [0.02, 0.01], SOLVER), "multiples = "),
+        (lambda: largest_recovered_multiples(closed(), ROW, DIRECTION, [-0.02, -0.01], SOLVER), "the first above 0"),
+        (lambda: largest_recovered_multiples(closed(), ROW, ROW, RISING, SOLVER), "a direction is one of the initial"),
+        (lambda: recoverable_multiple(closed(), {}, SOLVER), NO_DIRECTION),
+        (lambda: recoverable_multiple(closed(), {"initial.theta": 0.0}, SOLVER), NO_DIRECTION),
+        (lambda: recoverable_multiple(closed(), {"initial.theta": np.nan}, SOLVER), NO_DIRECTION),
+        (
+            lambda: classify_starts(braking(), {"initial.slip": [0.1]}, SOLVER, band=0.1),
+            "QuarterCar is no balance",
+        ),
+    ],
+)
+def test_starts_and_directions_that_say_nothing(ask, message):
+    with pytest.raises(ValueError, match=message):
+        ask()
 
 
 @pytest.mark.slow
@@ -181,9 +210,6 @@ def test_the_lqr_for_fifty_kilograms_holds_riders_of_up_to_71():
     )
     assert gone.unstable.tolist() == [True, True]
     assert not (gone.recovered | gone.undecided).any()
-
-
-RISING = np.linspace(0.0, 0.12, 13)[1:]
 
 
 # The ellipsoid
@@ -326,7 +352,7 @@ def robust():
 
 
 @killed_by(
-    "design/parameter_grid.py",
+    "design/parameter_box.py",
     "np.linspace(low[path], high[path], points)",
     "np.linspace(low[path], high[path], points, endpoint=False)",
 )
@@ -356,6 +382,18 @@ def test_one_gain_for_all_riders_is_proved(robust):
     assert all(np.linalg.eigvals(a + b @ robust.gain).real.max() < 0 for a, b in zip(finer.A, finer.B, strict=True))
 
 
+@killed_by("design/bounds.py", "definite_weight(q + self.k.T @ r @ self.k, 1e-9)", "q + self.k.T @ r @ self.k")
+def test_angles_alone_may_have_a_weight():
+    """The cost of SciPy's Riccati solution; Q + K'RK has rank 4 of 6 there, and 2 with one angle."""
+    a, b = map(np.asarray, model(HANGING))
+    for weights in ((1.0, 100.0, 1.0), (1.0, 0.0, 0.0)):
+        q = np.diag([*weights, 0.0, 0.0, 0.0])
+        trace = np.trace(solve_continuous_are(a, b, q, np.eye(1) / 100))
+        found = design(Polytope([a], [b]), Spec(Q=q, R=0.01))
+        np.testing.assert_allclose((found.trace_cost, found.certificate.guaranteed_cost), trace, rtol=3e-7)
+        assert found.certificate.verified_exactly
+
+
 def test_the_gain_for_one_rider_is_disproved():
     system = grid_polytope(BalanceModel(plant=HANGING), OVER)
     proof = certify(GAIN, system)
@@ -366,8 +404,8 @@ def test_the_gain_for_one_rider_is_disproved():
 
 
 def test_a_grid_has_two_points_and_a_bounded_size():
-    with pytest.raises(ValueError, match=r"points = 1 is outside \[2, inf\)"):
-        grid_polytope(BalanceModel(plant=HANGING), OVER, 1)
+    with pytest.raises(ValueError, match=r"points = 2.5 is no whole number in \[2, inf\)"):
+        grid_polytope(BalanceModel(plant=HANGING), OVER, 2.5)
     with pytest.raises(ValueError, match=r"a grid of 4913 systems is more than 4096"):
         grid_polytope(BalanceModel(plant=HANGING), OVER, 17)
 

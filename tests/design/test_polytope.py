@@ -12,7 +12,9 @@ from seams import replace_seam
 
 from diffabs.actuators import Lag
 from diffabs.core.pytree import param, pytree, replace
+from diffabs.design.frozen import analyse_frozen_loops
 from diffabs.design.parameter_box import polytope, schedule
+from diffabs.design.parameter_grid import grid_polytope
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.slip_model import Sampling, SlipModel
@@ -223,6 +225,18 @@ def test_no_parameter_and_equal_ends():
     np.testing.assert_allclose(single.A[0, 1, 1], 84.6321445666 / (5 * K / 0.099), rtol=1e-10)
 
 
+@killed_by("design/parameter_grid.py", "data, labels, model", "data, labels, _")
+@killed_by("design/frozen.py", "data, labels, model", "data, labels, _")
+def test_a_period_fixed_by_the_box_is_that_of_the_systems():
+    over = {"sampling.period": (4e-3, 4e-3)}
+    slower = replace(SAMPLED, {"sampling.period": 4e-3})
+    a, b = (np.asarray(matrix, float) for matrix in slower.matrices())
+    gain = np.array([[-1.0, -300.0, 0.0]])
+    rate = -np.log(np.abs(np.linalg.eigvals(a + b @ gain)).max()) / 4e-3
+    assert polytope(SAMPLED, over).period == grid_polytope(SAMPLED, over).period == 4e-3
+    np.testing.assert_allclose(analyse_frozen_loops(gain, SAMPLED, over).slowest, rate, rtol=1e-4)
+
+
 def test_schedule():
     chain = schedule(SlipModel(), PAPER, "speed", 4)
     assert chain.parameter == "speed"
@@ -306,6 +320,11 @@ def test_nodes_are_finite_and_a_period_is_a_number():
         Schedule("v", [0.0, np.inf], (cell,))
     with pytest.raises(ValueError, match="period = True is a truth value"):
         Polytope([[[0.5]]], [[[1.0]]], True)
+
+
+def test_a_check_has_a_point():
+    with pytest.raises(ValueError, match=r"most = 0 is outside \[1, inf\)"):
+        polytope(SlipModel(), PAPER, most=0)
 
 
 def test_matrices_that_are_not_finite():

@@ -220,6 +220,14 @@ def decay(gain, A, B, period=None):
     return jax.value_and_grad(lambda k: certified_decay(k, A, B, period))(gain)
 
 
+def test_a_decay_needs_vertices_and_a_period():
+    with pytest.raises(ValueError, match=r"A has shape \(2, 2\); the vertices need \(V, n, n\)"):
+        certified_decay(np.ones(2), RIG.A[0], RIG.B[0])
+    for period in (0.0, -1.0):
+        with pytest.raises(ValueError, match=rf"period = {period:g} is outside \(0, inf\) s"):
+            certified_decay(np.ones(2), RIG.A, RIG.B, period)
+
+
 GAINS = ((-11753.0, -158.17), (-999.7, -111.07), (-0.834, -2.599))
 
 

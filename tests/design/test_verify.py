@@ -60,11 +60,11 @@ def cases():
     yield chain(rates=(-0.5, 0.5)), chain(rates=(-50.0, 50.0))
 
 
-def chain(rates):
+def chain(rates, **cost):
     cells = tuple(Polytope([s * C], [B]) for s in (1.0, 1.1))
     forms = np.array([np.eye(2), 1.1 * np.eye(2), 1.2 * np.eye(2)])
     return Certificate(
-        Schedule("speed", [1.0, 2.0, 3.0], cells), K, (Claim("scheduled", {"P": forms, "rates": rates}),)
+        Schedule("speed", [1.0, 2.0, 3.0], cells), K, (Claim("scheduled", {"P": forms, "rates": rates, **cost}),)
     )
 
 
@@ -85,6 +85,27 @@ def test_each_kind_is_proved_if_it_is_true_and_only_then(tmp_path, pair):
         assert (not verdict.reason) is true
         assert checker.proved(stored["system"], stored["gain"], claim["kind"], claim["data"]) is true
         assert verdict.says
+
+
+@killed_by("design/verify.py", "((kx, ky), (ky, kx)) if", "((kx, ky), (kx, ky)) if")
+@killed_by("design/proof/exact.py", '(Kx.mT @ data["R"] @ Ky + Ky.mT @ data["R"] @ Kx)', 'he(Kx.mT @ data["R"] @ Ky)')
+def test_an_effort_that_is_not_symmetric_is_counted_whole(tmp_path):
+    """Half way V' + x'(Q + K'RK)x = 0.049 x^2, though the symmetric part of Ka'R Kb alone would leave it negative."""
+    k, p, q = np.array([[[-4.11], [0.0]], [[-2.23], [0.01]]]), np.array([2.0, 1.0]), 1e-6
+    r = np.eye(2) + 1e3 * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    a, b = -4 + 4.11 * 2 / 1.88, np.array([[2 / 1.88, 0.0]])
+    middle, gain = p.mean(), k.mean(axis=0)
+    grown = 2 * middle * (a + (b @ gain).item()) + (p[1] - p[0]) + q + (gain.T @ r @ gain).item()
+    np.testing.assert_allclose(grown, 0.049, atol=1e-3)
+    data = {"P": p[:, None, None], "rates": (1.0, 1.0), "Q": [[q]]}
+    system = Schedule("speed", [0.0, 1.0], (Polytope([[[a]]], [b]),))
+    for scale, true in ((1.0, False), (0.9, True)):
+        proof = Certificate(system, k, (Claim("scheduled", data | {"R": scale * r}),))
+        (verdict,) = verify.verify_file(saved(proof, tmp_path))
+        stored = json.loads((tmp_path / "c.json").read_text(), parse_int=float)
+        claim = stored["claims"][0]
+        assert (not verdict.reason) is proof.verified_exactly is true
+        assert checker.proved(stored["system"], stored["gain"], claim["kind"], claim["data"]) is true
 
 
 def test_it_agrees_with_the_checker_of_the_tests(tmp_path):
@@ -219,6 +240,7 @@ DISTURBED = {"P": np.eye(2), "gamma": 2.5, "Bw": [[[1 / 3], [0.0]]], "C": np.eye
 
 
 @killed_by("design/verify.py", '("Bw", "C", "D"))', '("C", "D"))', case="l2")
+@killed_by("design/verify.py", "repr(float(value))", 'f"{float(value):.9g}"', case="above 1")
 @killed_by("design/verify.py", "if math.prod(sizes) > MAX_STATED_NUMBERS:", "if False:", case="large")
 @pytest.mark.parametrize(
     ("proof", "statement"),
@@ -226,14 +248,31 @@ DISTURBED = {"P": np.eye(2), "gamma": 2.5, "Bw": [[[1 / 3], [0.0]]], "C": np.eye
         pytest.param(
             certificate("l2", **DISTURBED),
             "the L2 gain from w to C x + D u is below 2.5, where Bw w acts on the states:"
-            " Bw = [[[0.333333], [0]]], C = [[1, 0], [0, 1]], D = [[0], [1]]",
+            " Bw = [[[0.3333333333333333], [0]]], C = [[1, 0], [0, 1]], D = [[0], [1]]",
             id="l2",
+        ),
+        pytest.param(
+            certificate("l2", 0 * C, 1.0, P=(1 + 1e-9) * np.eye(2), gamma=1.00000000104, Bw=B, C=np.eye(2), D=0 * B),
+            "the L2 gain from w to C x + D u is below 1.00000000104, where Bw w acts on the states:"
+            " Bw = [[0], [1]], C = [[1, 0], [0, 1]], D = [[0], [0]]",
+            id="above 1",
+        ),
+        pytest.param(
+            certificate("cost", P=lyapunov(C), Q=0.9 * np.eye(2), R=np.eye(1)),
+            "the cost from x is at most x'Px, trace P about 1, for Q = [[0.9, 0], [0, 0.9]], R = [[1]]",
+            id="cost",
         ),
         pytest.param(
             certificate("input", P=np.eye(2), limit=[0.123456789], points=[[0.5, -0.5]]),
             "each |u| stays below its limit from every start in the hull of the points:"
             " limit = [0.123456789], points = [[0.5, -0.5]]",
             id="input",
+        ),
+        pytest.param(
+            chain((-0.5, 0.5), Q=0.1 * np.eye(2), R=[[0.1]]),
+            "stable, with a decay of at least 0 1/s, while the parameter p stays within the nodes and moves at"
+            " -0.5 to 0.5 a second, and the cost from x is at most x'P(p)x for Q = [[0.1, 0], [0, 0.1]], R = [[0.1]]",
+            id="scheduled",
         ),
         pytest.param(
             LARGE,

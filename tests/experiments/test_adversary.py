@@ -1,6 +1,7 @@
 """The adversary of experiments/adversary.py: his set, what moves in it, and what was found, by other programs."""
 
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -97,6 +98,29 @@ def test_what_searches_spent_and_found_is_counted(adversary):
     assert log.at(50).tolist() == [-np.inf, -np.inf]
     assert log.cost_of(3.0).tolist() == [64, 94]
     assert log.cost_of(4.5).tolist() == [124, np.inf]
+
+
+def test_failures_are_counted_and_never_averaged_in(adversary, monkeypatch):
+    """By hand: one of two adversaries and two of five random points do not stop; then none stops."""
+    module, nothing = adversary["minmax"], adversary["attack"].NOTHING
+    found = adversary["search"].Log(np.zeros((2, 1)), np.array([0.3, nothing]))
+    monkeypatch.setattr(module, "attacked", lambda *_: found)
+    monkeypatch.setattr(module, "in_the_box", lambda *_: {})
+    random = np.array([0.1, nothing, 0.2, nothing, 0.6])
+    attack = types.SimpleNamespace(
+        bounds=adversary["set"].Bounds(),
+        loop=None,
+        overshoots=lambda z: random[: len(z)],
+        runs=lambda z: types.SimpleNamespace(metrics={"iae": np.array([0.5, 9.0])[: len(z)]}),
+    )
+    row = module.judged(attack, module.Rounds(samples=5), None, 1.0)
+    assert (row["least [%]"], row["random, median [%]"], row["random, greatest [%]"]) == (30.0, 20.0, 60.0)
+    assert (row["not stopped or diverged"], row["IAE, greatest found [s]"]) == (3, 0.5)
+    for each in (random, found.overshoots):
+        each[:] = nothing
+    row = module.judged(attack, module.Rounds(samples=5), None, 1.0)
+    assert row["not stopped or diverged"] == 7
+    assert np.isnan([row["least [%]"], row["random, 95 % [%]"], row["IAE, greatest found [s]"]]).all()
 
 
 @pytest.mark.slow

@@ -113,9 +113,12 @@ def test_every_peer_has_a_ladder_without_a_gap():
         named = re.findall(r"^LADDER = (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
         if named:
             ladders[path.stem] = named[0]
-    assert {"c_adaptive", "kernel_adaptive", "diffrax_event"} <= set(ladders)
+    families = module("peers.serve").FAMILIES.values()
+    ours = {name: peer for family in families for name, peer in module(f"peers.{family}").PEERS.items()}
+    assert set(ladders) | set(ours) == set(module("bench_peers").PEERS)
     assert set(ladders.values()) == {"TOLERANCES", "STEPS"}, ladders
     ladder = module("peers.ladder")
+    assert {peer.LADDER for peer in ours.values()} == {ladder.TOLERANCES, ladder.STEPS}
     for settings in (ladder.TOLERANCES, ladder.STEPS):
         assert all(1 < a / b < 3.4 for a, b in itertools.pairwise(settings))
 
@@ -123,11 +126,12 @@ def test_every_peer_has_a_ladder_without_a_gap():
 @pytest.mark.slow
 def test_a_peer_that_is_not_there_says_so_and_the_others_go_on(tmp_path, monkeypatch, capsys):
     bench, out = module("bench_peers"), tmp_path / "peers.json"
-    monkeypatch.setattr(bench, "PEERS", ("scipy_loop", "nobody"))
+    monkeypatch.setattr(bench, "PEERS", ("scipy_loop", "nobody", "c_none"))
     arguments = [
         "--peers",
         "scipy_loop",
         "nobody",
+        "c_none",
         "--lanes",
         "4",
         "--rounds",
@@ -141,6 +145,7 @@ def test_a_peer_that_is_not_there_says_so_and_the_others_go_on(tmp_path, monkeyp
     bench.main()
     said = capsys.readouterr().out
     assert "nobody: No module named 'peers.nobody'" in said
+    assert "c_none: 'c_none'" in said
     assert all(len(line) <= 80 for line in said.splitlines() if "│" in line)
     rows = json.loads(out.read_text())["rows"]
     assert rows["scipy_loop"]["accurate"]

@@ -19,7 +19,6 @@ import time
 import pytest
 from test_explore import SHORT
 
-from diffabs.explore.guard import STRANGER
 from diffabs.scenario import load, names
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
@@ -330,6 +329,8 @@ def test_another_page_is_not_answered(explorer):
 
 @needs_extra
 def test_who_does_not_know_the_token_is_not_answered(explorer):
+    from diffabs.explore.guard import STRANGER
+
     own = f"Host: 127.0.0.1:{explorer.port}"
     for path in ("/", "/?token=guessed", "/_nicegui/"):
         answer = asked(explorer.port, f"GET {path} HTTP/1.1", own)

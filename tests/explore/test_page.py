@@ -3,6 +3,7 @@
 import ast
 import asyncio
 import contextlib
+import math
 import pathlib
 import threading
 
@@ -12,7 +13,9 @@ from seams import replace_seam
 from test_explore import SHORT
 
 from diffabs.explore import curves, stability
+from diffabs.explore.panels import Fan
 from diffabs.explore.session import AS_GIVEN, CERTIFIED, ProofVerdict, Session, Tools
+from diffabs.tune.result import DescentPoint, TuningProgress
 
 nicegui = pytest.importorskip("nicegui")
 from nicegui.page import page as route  # noqa: E402  # pyright: ignore[reportMissingImports]
@@ -343,12 +346,15 @@ def test_an_error_in_the_check_withdraws_the_number(visit, monkeypatch):
     case="run",
 )
 @killed_by("explore/page.py", "with self._report_error(name, version):", "if True:", case="fan")
+@killed_by("explore/page.py", 'if what == "fan":', "if False:", case="fan")
+@killed_by("explore/page.py", 'self.chart.change(charts.clear_curves("fan"))', "pass", case="fan")
 @pytest.mark.parametrize("failing", ["run", "fan"])
 def test_an_error_stops_no_other_result(visit, monkeypatch, failing):
     async def user(opened):
-        page, asked = opened.page, []
+        page, asked, changes = opened.page, [], []
         monkeypatch.setattr(curves, "draft_solver", curves.drawing_solver)
         await opened.draw()
+        monkeypatch.setattr(page.chart, "change", changes.append)
         monkeypatch.setattr(curves, "run_fan", broken if failing == "fan" else lambda *given: None)
         monkeypatch.setattr(page, "_poles", lambda *given, corners=False: asked.append(corners))
         if failing == "run":
@@ -360,6 +366,9 @@ def test_an_error_stops_no_other_result(visit, monkeypatch, failing):
         assert page.controls.message.text == "TypeError: broken part"
         assert not page.results.proving.visible
         assert not page.results.measuring.visible
+        if failing == "fan":
+            assert page.controls.made.text == "no fan"
+            assert changes == [{"dataset": [{"id": "fan", "source": {"t": []}}]}]
 
     visit(user)
 
@@ -376,12 +385,33 @@ def test_an_error_in_a_proof_file_is_on_its_card(visit):
     visit(user)
 
 
+@killed_by("explore/controls.py", "for note in self.session.given.notes:", "for note in ():")
+def test_entries_that_a_part_removes_are_named(visit):
+    async def user(opened):
+        with opened.client:
+            opened.session.switch(opened.session.load_part("controller", "pid"))
+            opened.page.controls.rebuild()
+        texts = [getattr(one, "text", "") for one in opened.client.elements.values()]
+        assert "controller=pid removes tune.free.controller.gain of the replaced part" in texts
+
+    visit(user)
+
+
+@killed_by("explore/controls.py", '(found.refused, "refused")', '(0, "refused")')
+def test_refused_members_of_a_fan_are_counted(visit):
+    async def user(opened):
+        opened.page.controls.fan(Fan(None, (), 200, 3, 2, "mass ± 90 %"))
+        assert opened.page.controls.made.text == "200 members, mass ± 90 %; 3 refused; 2 diverged"
+
+    visit(user)
+
+
 @killed_by("explore/page.py", "Exception as error:  # also an error in", "ScenarioError as error:  # also an error in")
 @killed_by("explore/page.py", '"" if basis else self.controls.made.text', '""')
 def test_a_part_with_a_defect_changes_nothing(visit, monkeypatch):
     async def user(opened):
         page, asked = opened.page, threading.Event()
-        page.controls.made.set_text("200 runs")
+        page.controls.made.set_text("200 members")
         monkeypatch.setattr(opened.session, "load_part", lambda *given: (asked.set(), broken()))
         page.controls.rebuild(page.controls.made.text)
         with opened.client:
@@ -389,7 +419,7 @@ def test_a_part_with_a_defect_changes_nothing(visit, monkeypatch):
         await settled(opened, lambda: asked.is_set() and not page.switching.locked())
         assert page.controls.message.text == "TypeError: broken part"
         assert opened.session.parts["controller"] == opened.find("controller").value == AS_GIVEN
-        assert page.controls.made.text == "200 runs"
+        assert page.controls.made.text == "200 members"
 
     visit(user)
 
@@ -450,6 +480,32 @@ def test_a_tuning_that_cannot_start_says_why(visit, monkeypatch):
         assert opened.page.controls.message.text == "TypeError: broken part"
 
     visit(user)
+
+
+@killed_by("explore/tuner.py", "if task.samples and task.over else grid", "if False else grid")
+@killed_by("explore/tuner.py", "if not math.isfinite(loss):", "if False:")
+@killed_by("explore/tuner.py", "min(1.0, iteration / most)", "min(1.0, len(self.losses) / most)")
+@killed_by("explore/tuner.py", "if progress.round else", "if False else")
+def test_the_card_counts_runs_rounds_and_iterations(visit):
+    async def user(opened):
+        tuner = opened.page.tuner
+        opened.click("tune")
+        (line,) = (
+            words for one in opened.client.elements.values() if (words := getattr(one, "text", ""))[:5] == "over "
+        )
+        assert line == "over 16 samples of plant.mass; such that iae ≤ 1; at most 4 iterations in each round"
+        opened.click("start")
+        for turn, iteration, loss in ((0, 0, math.inf), (0, 0, 3.5), (0, 0, 2.5), (0, 1, 2.25), (1, 2, 1.5)):
+            point = DescentPoint(iteration, loss, loss, 0.0, 0.0, 1)
+            with opened.client:
+                tuner._show_progress(TuningProgress(turn, 1, point))
+            assert tuner.far.text.endswith(f"iteration {iteration} of at most 4, loss {loss}")
+        assert tuner.losses == [3.5, 2.5, 2.25, 1.5]
+        assert tuner.far.text == "round 2, iteration 2 of at most 4, loss 1.5"
+        assert tuner.bar.value == 0.5
+
+    goal = "iterations = 4\nsamples = 16\n[tune.over]\n'plant.mass' = [5.3, 6.2]\n[tune.limits]\niae = 1.0\n"
+    visit(user, SHORT.replace("iterations = 3\n", goal))
 
 
 @killed_by(

@@ -35,6 +35,7 @@ from diffabs.controllers import (
 from diffabs.core.protocols import BalanceOutput, BrakeOutput
 from diffabs.export import NotExported, c_source, computer_program, difference_equations, structured_text
 from diffabs.export.device import Input
+from diffabs.export.plant_c import plant_source
 from diffabs.plants import ArmBalance, LabRig, MirroredRig, QuarterCar
 from diffabs.references import FilteredSlip, FixedSlip, PeakLatch
 from diffabs.roads import PiecewiseLinear, Tabulated
@@ -354,12 +355,15 @@ def test_the_target_can_come_from_outside(tmp_path):
 
 
 @pytest.mark.slow
+@killed_by("export/difference_equations.py", "with jax.enable_x64(True):", "if True:")
+@killed_by("export/difference_equations.py", "jax.tree.map(lambda x: jnp.asarray(x, float), loop)", "loop")
 def test_difference_equations_are_the_controllers():
-    found = difference_equations(
-        rig(PID(kp=60.0, ki=400.0, kd=0.3, cutoff=55.0, high=np.inf, low=0.0), feedforward=HoldingInput())
-    )
+    """In double precision, also where a session and the loop's own numbers have single precision."""
+    pid = PID(kp=60.0, ki=400.0, kd=0.25, cutoff=55.0, high=np.inf, low=0.0)
+    with jax.enable_x64(False):
+        found = difference_equations(d.arrays(rig(pid, feedforward=HoldingInput())))
     assert found["inputs"] == ["target", "slip", "feedforward"]
-    T, wc, kd = 1e-3, 55.0, 0.3
+    T, wc, kd = float(np.float32(1e-3)), 55.0, 0.25
     np.testing.assert_allclose(found["F"], [[1.0, 0.0], [0.0, 1 - T * wc]], rtol=1e-12)
     np.testing.assert_allclose(found["G"], [[T, -T, 0.0], [T * wc, -T * wc, 0.0]], rtol=1e-12)
     np.testing.assert_allclose(found["H"], [400.0, -kd * wc], rtol=1e-12)
@@ -503,12 +507,12 @@ def test_two_memories_of_one_controller_have_two_names(tmp_path):
     torque, phase, wanted, phases = 0.0, 0, [], set()
     for slip in slips:
         if phase == 0 and torque > high:
-            torque, phase = high, 1
-        elif phase == 1 and slip > above:
+            torque, phase = high, 2 if slip >= above else 1
+        if phase == 1 and slip > above:
             phase = 2
-        elif phase == 2 and torque < low:
-            torque, phase = low, 3
-        elif phase == 3 and slip < below:
+        if phase == 2 and torque < low:
+            torque, phase = low, 0 if slip <= below else 3
+        if phase == 3 and slip < below:
             phase = 0
         wanted.append(min(max(torque, 0.0), high))
         torque += {0: step, 2: -step}.get(phase, 0.0)
@@ -521,6 +525,41 @@ def test_two_memories_of_one_controller_have_two_names(tmp_path):
     np.testing.assert_allclose([*map(float, said.split())], wanted, rtol=1e-12)
     block = Block(structured_text(found, "Unit"))
     np.testing.assert_allclose([block(slip=slip) for slip in slips], wanted, rtol=1e-12)
+
+
+@killed_by("export/device.py", "lines := list(find_problems(part, prefix))", "lines := []", case="delay")
+@pytest.mark.parametrize(
+    ("controller", "said"),
+    [
+        pytest.param(PID(kp=np.array([1.0, 2.0])), r"controller.kp.* has shape \(2,\)", id="shape"),
+        pytest.param(Sampled(controller=PID(kp=np.nan), period=1e-3), r"controller.kp = nan is outside", id="nan"),
+        pytest.param(Sampled(controller=PID(), period=1e-3, delay=1.0), "controller.delay = 1 s exceeds", id="delay"),
+    ],
+)
+def test_numbers_that_make_no_code_are_refused(controller, said):
+    for export in (computer_program, difference_equations):
+        with pytest.raises(NotExported, match=said):
+            export(braking(controller=controller))
+
+
+@killed_by("export/plant_c.py", 'check_numbers(loop.plant, "plant.")', "check_numbers(loop)")
+@killed_by("export/plant_c.py", 'check_numbers(loop.initial, "initial.")', "pass")
+def test_only_what_an_fmu_contains_can_be_refused():
+    loop = braking(plant=MirroredRig(), controller=PID(kp=np.nan))
+    assert plant_source(loop).states == 3
+    for name in ("plant.mass", "initial.speed"):
+        with pytest.raises(NotExported, match=f"{name} = -1 is outside"):
+            plant_source(d.replace(loop, {name: -1.0}))
+
+
+@killed_by("export/device.py", "0 < step < np.inf", "0 <= step <= np.inf", case="options1")
+@killed_by("export/device.py", "not in (np.float32, np.float64)", "== np.int32", case="options4")
+@pytest.mark.parametrize(
+    "options", [{"step": -1e-4}, {"step": 0.0}, {"step": np.inf}, {"dtype": np.int32}, {"dtype": np.float16}]
+)
+def test_an_option_out_of_range_is_named(options):
+    with pytest.raises(ValueError, match=f"{next(iter(options))} = .*(positive and finite|float32 or float64)"):
+        computer_program(LOOPS["state feedback"], **options)
 
 
 @killed_by("export/lowered.py", "if name in found:", "if False:")

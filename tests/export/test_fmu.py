@@ -66,8 +66,8 @@ PLANTS = {
 @killed_by("export/plant_c.py", "plant.project(rk4_step(", "(lambda x: x)(rk4_step(", case="a wheel that locks")
 @killed_by(
     "export/plant_c.py",
-    'yield from (f"  m->{array}[{k}] = n{k};" for k in results)',
-    'yield from (f"  m->{array}[{k}] = n{(k + 1) % len(results)};" for k in results)',
+    'm->{array}[{k}] = {name};"',
+    'm->{array}[{k}] = {names[(k + 1) % len(names)]};"',
     case="balance",
 )
 @pytest.mark.parametrize("name", cases(PLANTS, "laboratory rig", "balance", "quarter car"))
@@ -169,6 +169,25 @@ def test_a_number_of_a_list_has_its_own_unit():
 
     found = {one.name: one.unit for one in plant_source(braking(plant=Laden())).variables}
     assert [found[f"plant.loads.{k}"] for k in range(4)] == ["kg", "kg", "m", "m"]
+
+
+@killed_by("export/plant_c.py", 'f"n{k}_"', 'f"n{k}"')
+@killed_by("export/mockup.py", "static const double STEP = {step!r};", "#define STEP {step!r}")
+def test_a_plant_may_use_the_names_of_the_glue():
+    """Names that the C around the plant's code has: of a result, of two constants and of a type."""
+
+    @d.core.pytree.pytree
+    class Named(MirroredRig):
+        def derivative(self, t, state, control):
+            n0 = control * 2.0
+            STEP = n0 * n0
+            GUID = STEP * n0
+            model = GUID * n0
+            return MirroredRig.derivative(self, t, state, model)
+
+    text = plant_source(braking(plant=Named())).text
+    assert all(f"double {name} =" in text for name in ("n0", "STEP", "GUID", "model"))
+    assert build_fmu(braking(plant=Named()), "plant", step=STEP)
 
 
 @killed_by("export/mockup.py", "enumerate(plant.variables, 1)", "enumerate(plant.variables)")

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from mutants import killed_by
 from scipy.signal import cont2discrete
 
+import diffabs as d
 from diffabs.actuators import AsymmetricLag, Delay, Lag, Limits, RateLimit
 from diffabs.controllers import (
     PID,
@@ -30,6 +31,7 @@ from diffabs.core.protocols import BrakeOutput, Clock, no_flow, no_memory
 from diffabs.core.pytree import canonical_dtypes, param, pytree, replace
 from diffabs.core.validity import check_part
 from diffabs.design.state_feedback import reduce_loop
+from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.linearization import linearize, tracking_dynamics
 from diffabs.linear.opened_loop import open_loop
 from diffabs.linear.operating_point import loop_gain, operating_point
@@ -581,11 +583,22 @@ def test_unknown_parts(parts, message):
         _ = model.states
 
 
-def test_ranges():
-    with pytest.raises(ValueError, match=r"delay = 0.002 s exceeds the period of 0.001 s"):
-        check_part(SlipModel(sampling=Sampling(delay=0.002)))
-    with pytest.raises(ValueError, match=r"slip = 0 is outside \(0, 1\); speed = 0 is outside \(0, 200\] m/s"):
-        check_part(SlipModel(slip=0.0, speed=0.0))
+@killed_by("core/validity.py", "shapes = shapes or list(", "shapes = list(")
+@killed_by("linear/balance_model.py", "as_rule_array(delay) == 0", "True")
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (SlipModel(slip=0.0, speed=0.0), r"^slip = 0 is outside \(0, 1\); speed = 0 is outside \(0, 200\] m/s$"),
+        (SlipModel(sampling=Sampling(delay=0.002)), "^sampling.delay = 0.002 s exceeds the period of 0.001 s$"),
+        (SlipModel(sampling=Sampling(period=-1.0)), r"^sampling.period = -1 is outside \(0, inf\) s$"),
+        (SlipModel(sampling=Sampling(period=np.ones(2))), r"^sampling.period .*has shape \(2,\); it needs \(\)$"),
+        (BalanceModel(sampling=Sampling(delay=1e-4)), r"^sampling.delay = 0.0001 s is outside \[0, 0\] s"),
+    ],
+)
+def test_ranges(model, message):
+    for use in (check_part, d.check):
+        with pytest.raises(ValueError, match=message):
+            use(model)
 
 
 @pytest.mark.slow

@@ -201,6 +201,29 @@ def test_a_record_that_begins_late_is_refused(tmp_path):
         rig.read_record(experiment, tmp_path)
 
 
+@killed_by("papers/measured_rig.py", "TypeError, ValueError, csv.Error", "TypeError, csv.Error", case="no UTF-8")
+@killed_by("papers/measured_rig.py", "ValueError, csv.Error", "ValueError", case="a long cell")
+@killed_by("papers/measured_rig.py", "< MIN_KNOWN:", "< 0:", case="at rest")
+@pytest.mark.parametrize(
+    ("row", "needed"),
+    [
+        (b"\xff,0,0", "needs UTF-8 text with the columns time_s, wheel_speed_rad_per_s, slip_1"),
+        (b'"' + b"1" * 200_000 + b'",0,0', "a number in every row"),
+        (b"0,0", "a number in every row"),
+        (b"0,0,0", "needs 4 rows with a wheel speed above 0 rad/s and a slip below 0.9"),
+    ],
+    ids=["no UTF-8", "a long cell", "a short row", "at rest"],
+)
+def test_a_record_that_cannot_be_read_is_one_line(row, needed, tmp_path):
+    experiment = rig.EXPERIMENTS[1]
+    times = (f"{experiment.start + rig.PERIOD * i:.4f}".encode() for i in range(9))
+    lines = [row.replace(b"0", time, 1) for time in times] if row == b"0,0,0" else [row]
+    content = b"\n".join([b"time_s,wheel_speed_rad_per_s,slip_1", *lines])
+    (tmp_path / f"{experiment.name}.csv").write_bytes(content)
+    with pytest.raises(ScenarioError, match=needed):
+        rig.read_record(experiment, tmp_path)
+
+
 def recorded_by(name):
     """A run of the packaged scenario under the commands of experiment 1."""
     record = rig.read_record(rig.EXPERIMENTS[0])
@@ -246,7 +269,7 @@ def test_derivatives_of_the_readings_agree_with_differences(path):
 def test_a_folder_without_numbers_is_refused(tmp_path):
     (tmp_path / "relay-slip-0.1.csv").write_text("time_s,slip_1\n0,0\n")
     result = run("reproduce", "lab-rig", "--data", tmp_path, "--out", tmp_path / "out", status=2)
-    assert "needs the columns time_s, wheel_speed_rad_per_s, slip_1, with a number in every row" in result.stderr
+    assert "needs UTF-8 text with the columns time_s, wheel_speed_rad_per_s, slip_1" in result.stderr
     assert not (tmp_path / "out" / "lab-rig").exists()
 
 

@@ -166,7 +166,6 @@ def test_motor_and_damper_power_is_the_change_of_energy(plant):
     found = change(*canonical_dtypes((plant, x, volts)))
     gravity = np.max(np.abs(x.theta_rate)) * p.gravity * 107  # the largest rate of an energy that is only exchanged
     np.testing.assert_allclose(found, terms[0] - terms[1], rtol=0, atol=1e-12 * max(gravity, np.max(np.abs(terms))))
-    np.testing.assert_allclose(plant.power(x, volts), terms, rtol=1e-13, atol=1e-9)
 
 
 @killed_by(
@@ -191,6 +190,11 @@ def test_float32_is_as_good_as_its_digits():
     assert {part.dtype for part in rounded} == {jnp.dtype("float32")}
     scale = np.max(np.abs(exact), axis=1, keepdims=True)
     np.testing.assert_allclose(np.array(rounded) / scale, exact / scale, rtol=0, atol=100 * 2.0**-24)
+
+
+@killed_by("plants/arm_balance.py", "self.rider_mass > 0 and not", "not")
+def test_a_rider_without_mass_needs_no_spring():
+    assert list(ACROBOT.cautions()) == []
 
 
 # The paper's printed equations

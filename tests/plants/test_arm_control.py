@@ -15,7 +15,7 @@ from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.controllers.balance import ObserverMemory
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking
 from diffabs.core.pytree import replace
-from diffabs.core.validity import check_part
+from diffabs.core.validity import check_part, find_problems
 from diffabs.linear.gaussian import SELECTION, kalman, lqg
 from diffabs.linear.recoverable import mode_bounds, recoverable_bound
 from diffabs.objectives import FinalNorm
@@ -232,11 +232,10 @@ def test_the_observer_recovers_most_starts_with_noise(observer):
 
 
 def test_shapes_of_an_observer_are_said():
-    with pytest.raises(ValueError, match=r"gain has shape \(2,\); it needs \(6,\), for theta, psi, phi"):
+    with pytest.raises(ValueError, match=r"^gain has shape \(2,\); it needs \(6,\)$"):
         check_part(BalanceFeedback(gain=np.ones(2)))
     with pytest.raises(ValueError, match=r"controller\.correction has shape \(6, 6\); it needs \(6, 2\)"):
         check_part(Sampled(controller=ObserverFeedback(correction=np.eye(6)), period=0.01))
     for name, wrong in (("transition", np.eye(2)), ("entry", np.zeros((6, 1))), ("gain", np.zeros(5))):
-        (line,) = dataclasses.replace(ObserverFeedback(), **{name: wrong}).problems()
+        (line,) = find_problems(dataclasses.replace(ObserverFeedback(), **{name: wrong}))
         assert line.startswith(f"{name} has shape {wrong.shape}; it needs ")
-    assert list(ObserverFeedback().problems()) == []

@@ -295,7 +295,7 @@ def test_the_map_has_the_share_of_failed_runs(found):
     assert figure.get_suptitle() == f"rig: {failed.sum()} failed of 1,200 runs (3 diverged)"
 
 
-@killed_by("sweep/results.py", '"diverged": self.column("diverged"),', '"diverged": ~run,')
+@killed_by("sweep/study.py", '"diverged": column("diverged"),', '"diverged": ~run,')
 @pytest.mark.parametrize("kind", ["diverged", "stopped", "locked", "bound"])
 def test_each_kind_of_failure_is_in_the_map(made, kind):
     bad = A > 0.7

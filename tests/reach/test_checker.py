@@ -241,6 +241,7 @@ def test_a_lost_disturbance_shows(monkeypatch):
 
 
 @killed_by("reach/checker.py", "self.stays_nonnegative(box, chords)", "pass")
+@killed_by("reach/checker.py", "found |= set(e.nonnegative)", "pass")
 @killed_by("reach/checker.py", "if value(a).contains(0):", "if False:")
 @killed_by("reach/checker.py", "not box[s].upper() < FASTEST_SLIP:", "False:")
 @killed_by("reach/checker.py", "not box[self.speed].lower() > float(SLOWEST):", "False:")
@@ -261,6 +262,9 @@ def test_what_has_no_proof_is_refused():
     )
     with pytest.raises(NotProved, match="negative"):
         check_cell(falling, ("x",), [(0.5, 0.6)], [0.1], 10.0)
+    unread = dataclasses.replace(falling, flow=(falling.flow[0], one, one), signals={"t": time})
+    with pytest.raises(NotProved, match="negative"):
+        check_cell(unread, ("t",), [(0.5, 0.6)], [0.1], 10.0)
     rising = t.equations((p, zero, zero), (one, x, one), t("sub", t.number(0.8), time), {"x": x})
     with pytest.raises(NotProved, match="may lock"):
         check_cell(dataclasses.replace(rising, nonnegative=(0,)), ("x",), [(0.5, 0.6)], [0.1], 10.0)
@@ -271,6 +275,23 @@ def test_what_has_no_proof_is_refused():
         check_cell(logistic(2.0, 0.9), ("x",), [(0.8, 0.95)], [0.1], 10.0)
     with pytest.raises(NotProved, match="number of steps"):
         check_cell(held(4.0, 0.75, 0.125, 1.0), ("x",), [(0.3, 0.3)], [0.1], 10.0)
+    end = x
+    for _ in range(2000):
+        end = t("add", end, x)
+    chain = t.equations((p, zero, zero), (end, x, one), t("sub", t.number(9.0), time), {"x": x})
+    with pytest.raises(NotProved, match="a chain of too many operations"):
+        check_cell(chain, ("x",), [(0.5, 0.6)], [0.1], 10.0)
+
+
+@killed_by("reach/checker.py", "x.nonnegative_part() if low >= 0 else x", "x")
+def test_a_state_that_may_not_be_negative_may_be_zero():
+    """x' = 1 from x(0) = p until x = 0.5; half of 0.1 has more digits than the radius of a ball."""
+    t = Tape()
+    p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
+    x, *_ = t.states(3)
+    rising = t.equations((p, zero, zero), (one, x, one), t("sub", t.number(0.5), x), {"x": x}, nonnegative=(0,))
+    low, high = check_cell(rising, ("x",), [(0.0, 0.1)], [0.1], 10.0).stop_time
+    assert within((0.4, 0.5), (low, high))
 
 
 def test_a_horizon_ends_the_proof_early():

@@ -1,7 +1,9 @@
 """Proofs over boxes: against closed forms, against SciPy and runs of the simulator, and false claims."""
 
+import dataclasses
 import math
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,8 @@ from scipy.integrate import solve_ivp
 import diffabs as d
 from diffabs.objectives import Overshoot, StopDistance, StopTime
 from diffabs.reach import NoRule, RunClaim, prove_box
-from diffabs.reach.engine import Prover
+from diffabs.reach.cover import _cut_to_size, comes_from_halving
+from diffabs.reach.engine import FAILURES, Prover
 from diffabs.reach.equations import Equations, RealOperation, derive_equations
 from diffabs.scenario.scenario import load
 
@@ -204,9 +207,71 @@ def test_a_claim_about_no_quantity_is_refused(quantity: str) -> None:
         prove_box(load("slip-lmi", LIMITED).loop, SMALL, [RunClaim(quantity, 0.34)], horizon=2.0)
 
 
-def test_a_signal_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"signals: .slop. is no signal of this loop; there is .*slip, speed"):
-        prove_box(load("slip-lmi", LIMITED).loop, SMALL, signals=("slop",), horizon=2.0)
+@killed_by("reach/cover.py", "if not 0 < value < math.inf:", "if False:", case="a horizon before the start")
+@killed_by("reach/cover.py", "if not math.isfinite(claim.bound):", "if False:", case="a claim without a bound")
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        pytest.param({"signals": ("slop",)}, r"signals: .slop. is no signal .*; there is .*slip, speed", id="a signal"),
+        pytest.param({"over": {}}, r"over: the box has no parameter", id="no box"),
+        pytest.param(
+            {"over": {"plant.mass": (5.4, 5.3), "initial.speed": (6.1, 6.0)}},
+            r"over\.plant\.mass = \[5\.4, 5\.3\]; two finite numbers are needed, the lower first",
+            id="an inverted box",
+        ),
+        pytest.param({"over": {"plant.mass": (5.3, math.inf)}}, r"over\.plant\.mass = \[5\.3, inf\]", id="no end"),
+        pytest.param({"over": {"plant.mass": (math.nan, 5.3)}}, r"over\.plant\.mass = \[nan, 5\.3\]", id="no number"),
+        pytest.param({"horizon": -1.0}, r"horizon = -1 is outside \(0, inf\) s", id="a horizon before the start"),
+        pytest.param({"budget": math.nan}, r"budget = nan is outside \(0, inf\) s", id="a budget that is none"),
+        pytest.param(
+            {"claims": [RunClaim("stop_time", math.nan)]},
+            r"claims: stop_time has the bound nan, outside \(-inf, inf\)",
+            id="a claim without a bound",
+        ),
+    ],
+)
+def test_a_wrong_argument_of_a_proof_is_named(wrong: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {"over": {"plant.mass": (5.3, 5.3)}, "horizon": 2.0, "budget": 1.0, **wrong}
+    with pytest.raises(ValueError, match=message):
+        prove_box(load("slip-lmi", LIMITED).loop, **given)
+
+
+def test_a_setting_that_does_not_exist_is_refused() -> None:
+    wrong: dict[str, Any] = {"tolerances": 1e-9}
+    with pytest.raises(TypeError, match="tolerances"):
+        Prover(oscillator(), ("x",), 2.0, **wrong)
+
+
+@killed_by("reach/cover.py", "FEWEST * np.spacing(np.abs(box).max(1))", "0.0")
+def test_a_side_of_two_floats_is_not_halved() -> None:
+    """A run that stops too late keeps the proof refining; there is no float between two neighbours."""
+    box = {"plant.mass": (float(np.nextafter(5.5, 0.0)), float(np.nextafter(5.5, 6.0)))}
+    fast = load("slip-lmi", [*LIMITED, "initial.speed_kmh=7"]).loop
+    proof = prove_box(fast, box, horizon=1.0, budget=5.0, known={"stop_time": (0.001, 0.002)})
+    assert proof.cells.tolist() == [[list(*box.values())]]
+
+
+@killed_by("reach/cover.py", "_widths(cells) * influence, 0.0)", "_widths(cells) * influence, _widths(cells))")
+@killed_by("reach/cover.py", " & (matters > 0).any(1)", "")
+def test_a_short_side_is_not_halved_untried() -> None:
+    """The first side has the length of two floats, and matters most; the second is halved until it is too short."""
+    box = np.array([[1.0, np.nextafter(1.0, 2.0)], [0.0, 1.0]])
+    kept, rest = _cut_to_size(np.repeat(box[None], 5, 0), 0.0, np.array([1e18, 1.0]), np.array([1e-15, 0.2]))
+    assert not len(rest)
+    assert (kept[:, 0] == box[0]).all()
+    assert sorted(kept[4:, 1].tolist()) == [[k / 8, (k + 1) / 8] for k in range(8)]
+
+
+def test_many_halvings_of_many_sides_are_found() -> None:
+    """A corner of six sides that are halved a hundred times each; without one of the cells, a hole is found."""
+    box, cells = [[0.0, 1.0]] * 6, []
+    left = box
+    for i in range(600):
+        (low, high), rest = left[i % 6], left[i % 6 + 1 :]
+        cells.append([*left[: i % 6], [high / 2, high], *rest])
+        left = [*left[: i % 6], [low, high / 2], *rest]
+    assert comes_from_halving(box, [*cells, left])
+    assert not comes_from_halving(box, [*cells[:-1], left])
 
 
 @killed_by("reach/cover.py", "again = now[~fine]\n", "again = now[~fine][1:]\n")
@@ -307,7 +372,7 @@ BASIC = (("param", (), 0), ("state", (), 0), ("state", (), 1), ("const", (), 0.0
 def test_a_step_across_a_limit_is_enclosed(step: float, width: float) -> None:
     """x' = min(x, 1) from x(0) = 1/2 in steps of equal length: x = 2 at t = 1 + log 2."""
     operations = tape(*BASIC, ("clamp", (1, -1, 4)), ("const", (), 2.0), ("sub", (6, 1)))
-    steps = {"first": step, "shortest": step, "longest": step, "order": 5}
+    steps: dict[str, Any] = {"first": step, "shortest": step, "longest": step, "order": 5}
     found = Prover(single(operations, 5, margin=7), ("x",), 9.0, **steps).prove(np.array([[[0.5, 0.5]]]), 1)
     assert found.status[0] == 1
     assert found.time[0, 0] <= 1 + math.log(2.0) <= found.time[0, 1]
@@ -375,6 +440,37 @@ def test_a_rounding_at_a_tick_is_enclosed() -> None:
     assert np.max(after) <= found.greatest[0, 0]
     assert found.least[0, 0] > np.min(after) - 0.1
     assert found.greatest[0, 0] < np.max(after) + 0.1
+
+
+@killed_by("reach/native/prove.cpp", "x = fill(-INFINITY);", "x = fill(-NEVER);", case="rounding")
+@killed_by(
+    "reach/native/prove.cpp", "symmetric(fill(INFINITY)), both)", "symmetric(fill(NEVER)), both)", case="no value"
+)
+@pytest.mark.parametrize("name", ["rounding", "no value"])
+def test_what_is_not_proved_has_infinite_bounds(name: str) -> None:
+    """x' = -round(x) is relaxed in every step, so no run is followed exactly. 1/x has no value where x may be 0."""
+    operations = tape(*BASIC, ("round", (1,)), ("neg", (5,)), ("inv", (1,)))
+    e = single(operations, {"rounding": 6, "no value": 4}[name])
+    e = dataclasses.replace(e, signals={"x": 1, "y": 7})
+    cell = {"rounding": [3.2, 3.21], "no value": [-0.1, 0.2]}[name]
+    found = Prover(e, ("x", "y"), 0.05).prove(np.array([[cell]]), 1)
+    assert found.status[0] == 2
+    assert found.least[0, 0] <= cell[0]
+    assert found.greatest[0, 0] >= cell[1]
+    if name == "rounding":
+        assert (found.above[0, 0], found.below[0, 0]) == (-math.inf, math.inf)
+    else:
+        assert (found.least[0, 1], found.greatest[0, 1]) == (-math.inf, math.inf)
+
+
+@killed_by("reach/engine.py", "live |= set(e.nonnegative)", "pass")
+def test_a_state_that_may_not_be_negative_is_always_followed() -> None:
+    """x' = -1 from x(0) = p until t = 1/2: nothing reads x, which becomes negative at t = p."""
+    operations = tape(*BASIC, ("neg", (4,)), ("const", (), 0.5), ("sub", (6, 2)))
+    e = dataclasses.replace(single(operations, 5, margin=7), signals={"t": 2}, nonnegative=(0,))
+    found = Prover(e, ("t",), 1.0).prove(np.array([[[0.1, 0.2]], [[0.8, 0.81]]]), 1)
+    assert found.status.tolist() == [0, 1]
+    assert FAILURES[found.failure[0]] == "the slip may become negative"
 
 
 def test_a_tube_holds_the_runs_at_every_time() -> None:

@@ -1,5 +1,6 @@
 """What the equations of a proof take for granted about a loop, and refuse where it does not hold."""
 
+import dataclasses
 import math
 import operator
 from fractions import Fraction
@@ -269,3 +270,29 @@ def test_integers_are_refused() -> None:
     loop = odd_loop(lambda x, a, b, c: ((x > 1).astype(jnp.uint8) - jnp.uint8(1)).astype(float))
     with pytest.raises(NoRule, match="type uint8"):
         derive_equations(loop, ["initial.position"])
+
+
+def chain(x: Scalar, a: Scalar) -> Scalar:
+    """Return a + x/2 400 times: 2 a, by a chain of operations."""
+    for _ in range(400):
+        x = a + 0.5 * x
+    return x
+
+
+@pytree
+class ChainTorque(d.controllers.ConstantTorque):
+    """The torque 2 a."""
+
+    def output(self, t: Scalar, memory: Any, signal: Any) -> Scalar:
+        return chain(signal.measured[0], 0.5 * super().output(t, memory, signal))
+
+
+def test_a_controller_may_have_a_long_chain_of_operations() -> None:
+    loop = dataclasses.replace(load("slip-lmi").loop, controller=ChainTorque())
+    assert len(derive_equations(loop, ["plant.mass"]).operations) > 800
+
+
+def test_a_question_about_the_end_of_a_long_chain_is_refused() -> None:
+    with pytest.raises(NoRule, match="too long a chain of operations") as found:
+        rate_of(lambda x, a, b, c: jnp.where(jnp.isfinite(chain(x, a)), 1.0, 2.0), 0.5)
+    assert isinstance(found.value.__cause__, RecursionError)  # shows where, if a user's part has no end

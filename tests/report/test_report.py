@@ -4,6 +4,7 @@ import base64
 import itertools
 import json
 import math
+import re
 import shlex
 
 import invented
@@ -98,7 +99,6 @@ def leaves(value):
 
 
 @killed_by("report/page.py", 'f"data:{kind};base64,{text}"', "path.as_uri()", case="sweep")
-@killed_by("report/page.py", '(content.get("made") or {}).get("command")', "None", case="tune")
 @pytest.mark.parametrize("kind", cases(SOURCES, *LONG))
 def test_a_report_stands_for_itself(results, kind):
     found = page(results, kind)
@@ -315,9 +315,10 @@ def test_a_sweep_with_figures_writes_its_report(results):
     assert json.loads((results / "sweep.json").read_text())["files"]["report"].endswith("report.html")
 
 
-def invented_sweep(folder, design, variables=("plant.mass", "plant.road.w4"), n=64):
+def invented_sweep(folder, design, variables=("plant.mass", "plant.road.w4"), n=64, never=()):
     """The page of a sweep that was never run; a run fails if its metric is negative, as one in four is."""
     metric = np.where(np.arange(n) % 16 < 4, -1.0, 1.0 + np.arange(n) % 5)
+    metric[[*never]] = np.inf
     table = manifest(n, n, variables, ["margin"], success=True)
     table["study"]["space"]["design"] = design
     columns = {"sample": np.arange(n), **{path: np.linspace(0.0, 1.0, n) for path in variables}, "margin": metric}
@@ -326,11 +327,12 @@ def invented_sweep(folder, design, variables=("plant.mass", "plant.road.w4"), n=
     folder.mkdir()
     store.begin(table, resume=False)
     store.write(0, encode_chunk(columns, Seals(table).of(0)))
-    content = summarise_sweep(SweepResults(folder))
+    content = summarise_sweep(SweepResults(folder))  # as from Python: without an origin
     (folder / "summary.json").write_text(json.dumps(content))
     return content, Page(build_report(find_documents(folder))).text
 
 
+@killed_by("report/studies.py", 'content.get("made", {})', 'content["made"]')
 @killed_by("report/studies.py", 'None not in (one["low"], one["high"])', "True")
 @killed_by("report/studies.py", "return [] if worst is None else [shlex.join(command)]", 'return [" ".join(command)]')
 def test_a_grid_has_a_report_without_intervals(tmp_path):
@@ -346,6 +348,21 @@ def test_of_a_saltelli_design_the_failures_are_among_the_rows_a(tmp_path):
     content, text = invented_sweep(tmp_path / "s", {"type": "saltelli"})
     assert content["failures"]["any"]["count"] == 4
     assert "64 runs; 0 diverged, 0 were refused. 4 of 16 failed: a probability of 0.25 (95 % interval" in text
+
+
+@killed_by("report/studies.py", 'content["never"].items()', "{}.items()")
+def test_runs_that_never_settle_are_in_the_report(tmp_path):
+    _, text = invented_sweep(tmp_path / "s", {"type": "random"}, never=(7, 9, 40))
+    assert "Runs with an infinite margin (never), left out of its statistics: 3, the first is sample 7" in text
+
+
+@killed_by("report/studies.py", "{content['diverged']:,}", "0")
+def test_runs_of_a_rare_event_that_diverged_are_counted(tmp_path):
+    content = {"scenario": "small", "metric": "iae", "bound": 1.0, "unit": "s", "probability": 1e-4, "interval": [0, 1],
+               "levels": [], "failures": {}, "note": "", "reason": "converged", "model": None, "runs": 5000, "seed": 0,
+               "diverged": 1234, "engine": {}, "made": {"command": "diffabs rare small iae=1"}}  # fmt: skip
+    (tmp_path / "x.json").write_text(json.dumps(content))
+    assert "95 % interval 0 to 1. Diverged runs: 1,234." in Page(build_report(find_documents(tmp_path))).text
 
 
 @killed_by("report/studies.py", 'yield from describe_turned_metrics(content.get("accuracy") or {})', "pass")
@@ -395,6 +412,7 @@ def test_commands_of_a_report_can_be_pasted(results, tmp_path):
     assert shlex.split(line)[:3] == ["diffabs", "verify", str(path)]
 
 
+@killed_by("report/documents.py", 'content.get("format", CERTIFICATE_FORMAT) == CERTIFICATE_FORMAT', "True")
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -402,8 +420,12 @@ def test_commands_of_a_report_can_be_pasted(results, tmp_path):
         ({}, "has no document that reproduce, sweep"),
         ({"notes.txt": "hello"}, "has no document that reproduce, sweep"),
         ({"manifest.json": "{}"}, "--resume completes it"),
-        ({"x.json": '{"free": {}, "history": [], "constraints": []}'}, "is not a complete document of tune: KeyError"),
+        (
+            {"x.json": '{"free": {}, "history": [], "constraints": []}'},
+            "cannot be read as a document of tune: KeyError",
+        ),
         ({"x.json": '{"papers": 3}', "y.json": "[" * 100_000}, "has no document"),
+        ({"x.json": '{"format": "of others", "system": {}, "claims": []}'}, "has no document"),
     ],
 )
 def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
@@ -419,11 +441,13 @@ def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
 
 
 @killed_by("report/documents.py", "if named and not found:", "if False:")
-@pytest.mark.parametrize("text", ["hello", '{"a": 1}', "[1, 2]", '{"papers": {}, "out": "x"}'])
+@pytest.mark.parametrize(
+    "text", ["hello", '{"a": 1}', "[1, 2]", '{"papers": {}, "out": "x"}', '{"format": "diffabs box proof 1"}']
+)
 def test_a_file_of_others_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "x.json").write_text(text)
     result = command("report", tmp_path / "x.json", status=2)
-    assert "document that reproduce, sweep" in result.stderr
+    assert re.search("document that reproduce, sweep, .* prove --json, .* write$", result.stderr)
     assert_one_error_line(result)
     assert left_in(tmp_path) == {"x.json"}
 
@@ -477,7 +501,7 @@ def test_a_chart_has_its_points_where_they_are():
 
 def test_what_a_document_lacks_is_named(tmp_path):
     (tmp_path / "x.json").write_text('{"gain": [1.0], "states": ["a"], "over": {}, "poles": []}')
-    with pytest.raises(ReportError, match=r"not a complete document of design: KeyError 'lower_bound'"):
+    with pytest.raises(ReportError, match=r"cannot be read as a document of design: KeyError 'lower_bound'"):
         build_report(find_documents(tmp_path))
 
 

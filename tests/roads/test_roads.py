@@ -1,5 +1,7 @@
 """Friction curves against published numbers, closed forms, NumPy and SciPy."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -300,6 +302,18 @@ def test_monotone_curve_is_best_locked():
     slope = jacobian(found, ice)
     assert np.all(np.isfinite(slope))
     np.testing.assert_allclose(slope[:, 0], 0.0, rtol=0, atol=0)
+
+
+@killed_by("roads/optimum.py", "jnp.isnan(values[1:]).any()", "False")
+def test_a_road_of_nan_has_no_best_slip():
+    assert np.isnan(peak(replace(ICE, {"c1": np.nan})).slip)
+
+
+@killed_by("roads/optimum.py", "values[1:]).any()", "values).any()")
+def test_a_road_of_nan_at_slip_0_is_best_locked():
+    """A user's formula, 0/0 at slip 0."""
+    rising = types.SimpleNamespace(friction=lambda slip, speed, distance: slip * slip / slip)
+    assert peak(rising) == (1.0, 1.0)
 
 
 @killed_by("roads/optimum.py", " & (values[:-1] > 0)", "")

@@ -1,5 +1,6 @@
 """Files and folders that are replaced: by a process that is killed, and by two processes at once."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -55,7 +56,51 @@ def test_a_folder_without_an_exchange_is_replaced(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
-@killed_by("runtime/files.py", ".{secrets.token_hex(4)}{target.suffix}", ".{target.suffix}")
+@killed_by("runtime/files.py", "target.exists() and not target.is_dir()", "False")
+@killed_by("runtime/files.py", "target.exists() and not target.is_file()", "False")
+def test_what_is_no_file_or_folder_is_not_replaced(tmp_path):
+    """A pipe, a folder in place of a file, and a file in place of a folder."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "file").write_text("mine")
+    for target in (tmp_path / "pipe", tmp_path):
+        with pytest.raises(OSError, match="not a regular file"):
+            files.write_file(target, b"new")
+    with pytest.raises(NotADirectoryError), files.new_folder(tmp_path / "file"):
+        pass
+    assert (tmp_path / "pipe").is_fifo()
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@killed_by("runtime/files.py", 'new_file(target, ".tmp")', "new_file(target)")
+@killed_by("runtime/files.py", "os.path.dirname(os.path.realpath(target))", "target.parent")
+@killed_by(
+    "runtime/files.py",
+    "realpath(target))\n    if target.exists() and not target.is_file",
+    "fspath(target))\n    if target.exists() and not target.is_file",
+)
+@killed_by(
+    "runtime/files.py",
+    "realpath(target))\n    if target.exists() and not target.is_dir",
+    "fspath(target))\n    if target.exists() and not target.is_dir",
+)
+def test_what_a_link_points_to_is_replaced(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda at: synced.append((os.fstat(at).st_ino, len([*tmp_path.glob(".*.tmp")]))))
+    (tmp_path / "file").write_text("old")
+    (tmp_path / "folder").mkdir()
+    (links := tmp_path / "links").mkdir()
+    for name in ("file", "folder"):
+        (links / f"to {name}").symlink_to(tmp_path / name)
+    files.write_durably(links / "to file", b"new")
+    with files.new_folder(links / "to folder") as new:
+        (new / "content").touch()
+    assert (tmp_path / "file").read_text() == "new"
+    assert [one.name for one in (tmp_path / "folder").iterdir()] == ["content"]
+    assert all((links / f"to {name}").is_symlink() for name in ("file", "folder"))
+    assert synced == [((tmp_path / "file").stat().st_ino, 1), (tmp_path.stat().st_ino, 0)]
+
+
+@killed_by("runtime/files.py", ".{secrets.token_hex(4)}{suffix or target.suffix}", ".{suffix or target.suffix}")
 def test_several_writers_of_a_file_do_not_disturb_each_other(tmp_path):
     path, contents, wrong = tmp_path / "summary.json", [letter * 200_000 for letter in (b"a", b"b")], []
 

@@ -93,7 +93,7 @@ type = "sampled"
 period = 0.002
 [controller.controller]
 kp = 0.1
-torque_max = inf
+high = inf
 antiwindup = {type = "back-calculation", tracking_time = 0.3}
 [sensor]
 type = "series"
@@ -124,6 +124,59 @@ def test_everything_nested_survives_dump_and_load(file):
     assert list(first.objectives) == [*BRAKING, "effort", "odd name"]
     assert first.solver == FixedStep(step=1e-3, duration=1.25, every=7)
     assert jax.numpy.array_equal(jax.random.key_data(first.key()), jax.random.key_data(jax.random.key(42)))
+
+
+@killed_by("scenario/registry.py", "_numbers(item, depth - 1, spec,", "_numbers(item, 0, spec,")
+def test_a_matrix_survives_dump_and_load(file):
+    first = load("arm-balance", ["controller=observer-feedback"], integrated=False)
+    assert first.loop.controller.transition.shape == (6, 6)
+    assert_same(first, load(file(dump(first), "arm-balance.toml"), integrated=False))
+
+
+CHOOSER = """from diffabs.core.protocols import no_flow, no_memory
+from diffabs.core.pytree import pytree, static
+
+@pytree
+class Chooser:
+    order: int = static(default=0)
+    taps: int = static(default=4)
+    scale: float = static(default=3.0)
+    soft: bool = static(default=False)
+    mode: str = static(default="mild")
+    start = no_memory
+    flow = no_flow
+
+    def output(self, t, memory, signal):
+        return self.scale * signal.target
+"""
+
+
+@killed_by("scenario/registry.py", "1 if least >= 1 else -MAX_STATIC", "1")
+@killed_by("scenario/registry.py", "value if field.default is dataclasses.MISSING else field.default", "value")
+@killed_by("scenario/registry.py", "type(value) is not int", "not isinstance(value, int)")
+@pytest.mark.parametrize("changes", [[], ["order=-2", "taps=9", "scale=4", "soft=true", "mode=firm"]], ids=["0", "5"])
+def test_choices_of_a_part_of_ones_own_are_read_again(changes, tmp_path, file):
+    (tmp_path / "choosers.py").write_text(CHOOSER)
+    with outside.lend_modules(tmp_path, ["choosers"]):
+        first = load("slip-lmi", ["controller=chooser", *(f"controller.{change}" for change in changes)])
+        assert_same(first, load(file(dump(first), "slip-lmi.toml")))
+        chooser = registry.family_types("controller")["chooser"]
+        usual = dataclasses.replace(chooser, order=5)  # where a plant names it
+        assert registry.fill_part(usual, {"order": -2}, "controller", "controller").order == -2
+        about = registry.describe_part("controller", chooser)
+        ranges = {name: row["range"] for name, row in about.items() if row["range"]}
+        assert ranges == {"order": "[-10000000, 10000000]", "taps": "[1, 10000000]"}
+        with pytest.raises(scenario.ScenarioError, match=r"controller\.taps = 0 is outside \[1, 10000000\]"):
+            load("slip-lmi", ["controller=chooser", "controller.taps=0"])
+    sys.modules.pop("choosers")
+
+
+@killed_by("scenario/registry.py", "    if isinstance(part, tuple | list):", "    if isinstance(part, tuple):")
+@killed_by("scenario/registry.py", "if isinstance(value, tuple | list) else", "if isinstance(value, tuple) else")
+def test_parts_in_a_list_are_described_like_those_in_a_tuple():
+    listed, tupled = (roads.Patches(roads=kind([roads.SNOW, roads.SPLINE_B]), edges=[5.0]) for kind in (list, tuple))
+    assert [path for path, _ in registry.part_choices(listed, "road")] == ["road", "road.roads.0", "road.roads.1"]
+    assert registry.describe_part("road", listed) == registry.describe_part("road", tupled)
 
 
 def test_what_is_left_out_has_its_default(file):
@@ -579,17 +632,17 @@ def test_levels_of_a_grid_have_the_paths_of_what_varies(file, levels):
     "scenario/parameter_paths.py", "return [*table, canonical_path", "return [*table] or [*table, canonical_path"
 )
 def test_a_level_of_a_grid_is_changed(file):
-    """The file has the paths with dots, and a limit by its former name."""
+    """The file has the paths with dots."""
     path = file("""plant = "mirrored-rig"
-    controller = {type = "pid", torque_max = 9.0}
+    controller = {type = "pid", high = 9.0}
     [sweep.over]
-    "controller.torque_max" = [5, 9]
+    "controller.high" = [5, 9]
     "initial.speed_kmh" = [20, 40]
     [sweep.design]
     type = "grid"
-    levels = {"controller.torque_max" = 3, "initial.speed_kmh" = 2}""")
+    levels = {"controller.high" = 3, "initial.speed_kmh" = 2}""")
     assert build_study(load(path)).samples == 6
-    changes = ["sweep.design.levels.controller.torque_max=4", "sweep.design.levels.initial.speed=5"]
+    changes = ["sweep.design.levels.controller.high=4", "sweep.design.levels.initial.speed=5"]
     assert build_study(load(path, changes)).samples == 20
 
 

@@ -96,6 +96,12 @@ BAD = [
     ("actuator={type='delay',capacity=9.5}", "actuator.capacity = 9.5 is a number", "a whole number"),
     ("sensor={type='series',blocks=[{type='noise',slip=-1}]}", "sensor.blocks.0.slip = -1 is outside [0, inf)"),
     ("sensor={type='series',blocks=['lag']}", "sensor.blocks.0.type", '"lag" is unknown'),
+    ("controller={type='observer-feedback',correction=[1,2]}", ".0 = 1 is a number", "a list of numbers"),
+    ("controller={type='observer-feedback',correction=5}", " = 5 is a number", "a list of lists of numbers"),
+    (
+        "controller={type='observer-feedback',correction=[[1,2],[1]]}",
+        "controller.correction = [[1, 2], [1]] has rows of different lengths",
+    ),
     ("controller={type='state-feedback',gain=[1]}", "controller.gain has shape (1,); it needs (2,)"),
     ("controller={type='pid',low=100,high=90}", "controller.low = 100 N m exceeds high = 90 N m"),
     (
@@ -202,6 +208,7 @@ BAD = [
 ]
 
 
+@killed_by("scenario/registry.py", "'lists of ' * (depth - 1)", "''")
 @killed_by(
     "scenario/parameter_paths.py",
     "        if not (np.all(low < high) or (not or_else and np.all(low <= high))):",

@@ -14,6 +14,7 @@ import diffabs as d
 from diffabs import objectives, references
 from diffabs.core.protocols import Memory, no_flow, no_memory
 from diffabs.core.pytree import param, pytree
+from diffabs.simulate.contracts import find_misfits
 
 
 class Temperature(NamedTuple):
@@ -223,6 +224,24 @@ OBJECTIVES = {
 def test_a_mistake_in_an_objective_is_one_line(line):
     with pytest.raises(ValueError, match=f"^{re.escape(line)}"):
         measure("mine", objective=with_methods(Highest, **OBJECTIVES[line]))
+
+
+@pytree
+class Weighted(Proportional):
+    """As many weights as the loop has signals."""
+
+    weights: Any = param(default=(1.0, 1.0), unit="1", free=True)
+
+    def output(self, t, memory, signal):
+        return jnp.dot(self.weights, jnp.stack([signal.target, -signal.measured.above]))
+
+
+@killed_by("simulate/contracts.py", "structure = structure, *map(np.shape, leaves)", "structure = structure, ()")
+def test_a_shape_that_does_not_fit_is_found_after_one_that_fits():
+    parts = {"plant": Oven(), "initial": (), "reference": references.Setpoint(value=180.0), "stop": Cold()}
+    fits, broken = (d.Loop(controller=Weighted(weights=np.ones(count)), **parts) for count in (2, 3))
+    assert list(find_misfits(fits, {})) == []
+    assert re.match(r"controller.output fails: TypeError: .*\(test_contracts.py", *find_misfits(broken, {}))
 
 
 def test_objectives_without_names_are_refused():

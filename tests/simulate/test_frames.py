@@ -212,7 +212,7 @@ def test_the_frame_of_a_sweep_has_units_and_says_what_failed(swept, monkeypatch)
 
 
 @pytest.mark.slow
-@killed_by("sweep/results.py", "{name: failed & run for", "{name: failed for")
+@killed_by("sweep/study.py", "{name: failed & run for", "{name: failed for")
 def test_what_was_missed_or_refused_is_told_apart(swept, monkeypatch):
     stopped, refused = np.ones(20, bool), np.full(20, "")
     stopped[3], refused[5] = False, "a step that is too long"

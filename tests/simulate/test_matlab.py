@@ -6,6 +6,9 @@ from commands import assert_one_error_line, left_in
 from commands import run as command
 from mutants import killed_by
 
+import diffabs as d
+from diffabs.simulate.matlab import write_mat
+
 io = pytest.importorskip("scipy.io")
 
 SHORT = ("--set", "initial.speed_kmh=20", "--set", "controller.torque_max=inf")
@@ -43,6 +46,18 @@ def test_a_mat_file_has_metrics_and_parameters(folder):
     raw = io.loadmat(folder / "run.mat")
     assert raw["slip"].shape[1] == 1  # MATLAB's columns
     assert (folder / "run.mat").read_bytes()[:19] == b"MATLAB 5.0 MAT-file"
+
+
+@killed_by("simulate/matlab.py", "while new in found:", "while False:")
+@killed_by("simulate/matlab.py", "if valid in KEYWORDS", "if False")
+@killed_by("simulate/matlab.py", "[:MAX_NAME]", "[:99]")
+def test_every_name_becomes_one_of_matlab(tmp_path):
+    loop, values = d.braking(), {"a.b": 1.0, "a-b": 2.0, "90pct": 3.0, "_c": 4.0, 70 * "d": 5.0}
+    values |= {"end": 6.0, "a_": 7.0, "double": 8.0, "a": 9.0, "a_table": 10.0}
+    write_mat(tmp_path / "run.mat", d.rollout(loop, d.FixedStep(1e-2, 0.02), {}), loop.plant, parameters=values)
+    found = io.loadmat(tmp_path / "run.mat", simplify_cells=True)["parameters"]
+    names = ["a_b", "a_b_2", "x90pct", "x_c", 60 * "d", "end_", "a_", "double", "a", "a_table"]
+    assert found == dict(zip(names, values.values(), strict=True))
 
 
 @killed_by("cli/targets.py", "if places[one] == places[other]:", "if False:")

@@ -145,15 +145,39 @@ class TestBeforeARun:
             found = admissible.batch_admissibility(loop, {"plant.mass": np.array([5.3, -1.0])}, SOLVER)
             assert found.accepted.tolist() == [True, False], found.texts
 
+    @killed_by("simulate/admissible.py", "if not (given is None or isinstance(given, bool)):", "if False:")
     def test_a_solver_that_fits_nothing_is_named(self, any_step):
         for solver, message in (
             (d.FixedStep(0.3, 0.25), "longer than solver.duration"),
             (d.FixedStep(1e-9, 1.0), "too many steps"),
+            (d.FixedStep(1e-3, 1.0, kinks="false"), "solver.kinks = 'false' is not a Python bool"),
+            (d.FixedStep(1e-3, 1.0, kinks=np.False_), "solver.kinks = .* is not a Python bool"),
         ):
             with pytest.raises(ValueError, match=message):
                 admissible.batch_admissibility(RIG, {"plant.mass": np.array([5.0])}, solver)
             with pytest.raises(ValueError, match=message):
                 d.check(RIG, solver)
+
+    @killed_by("simulate/admissible.py", "    step = float(solver.step)", "    step = solver.step")
+    @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+    def test_the_step_may_be_an_array_without_axes(self, any_step, array):
+        solver = dataclasses.replace(SOLVER, step=array(SOLVER.step))
+        found = admissible.batch_admissibility(RIG, {"plant.mass": np.array([5.0, -1.0])}, solver)
+        assert found.accepted.tolist() == [True, False]
+
+    @killed_by("simulate/admissible.py", "if lines := list(find_misshapen(part)):", "if lines := []:")
+    @pytest.mark.parametrize(
+        ("run", "message"),
+        [
+            (d.check, r"plant.mass = \[1.0, 2.0\] has shape \(2,\); it needs \(\)"),
+            (lambda loop: d.check(loop, SOLVER), r"plant.mass = \[1.0, 2.0\] has shape \(2,\)"),
+            (lambda loop: d.measure(loop, SOLVER, {}), r"plant.mass = \[1.0, 2.0\] has shape \(2,\)"),
+            (lambda loop: d.measure(RIG, SOLVER, {}, key=0), "key = 0 is no random key"),
+        ],
+    )
+    def test_a_loop_or_key_of_a_wrong_shape_is_refused(self, run, message):
+        with pytest.raises(ValueError, match=message):
+            run(replace(RIG, {"plant.mass": [1.0, 2.0]}))
 
     @pytest.mark.slow
     @killed_by("simulate/stability.py", "bound = jnp.max(jnp.exp(log)", "bound = 0.5 * jnp.max(jnp.exp(log)")
@@ -308,7 +332,7 @@ SMALL = """
 plant = "mirrored-rig"
 initial = { speed_kmh = 30.0 }
 stop = { type = "speed-reached", speed_kmh = 25.0 }
-controller = { type = "pid", kp = 40.0, torque_max = 9.0 }
+controller = { type = "pid", kp = 40.0, high = 9.0 }
 solver = { step = 1e-3, duration = 0.25 }
 [sweep]
 samples = 48
@@ -426,7 +450,7 @@ def test_the_sweep_of_the_report(tmp_path):
     "as_rule_array(cutoff) * as_rule_array(period) < 2",
     "as_rule_array(cutoff) * as_rule_array(period) < 200",
 )
-@killed_by("controllers/sampled_on_grid.py", "within_period(self.controller,", "within_period(None,")
+@killed_by("controllers/sampled_on_grid.py", "sampling_rules(self.controller,", "sampling_rules(None,")
 @pytest.mark.parametrize(("cutoff", "grows"), [(1990.0, False), (2010.0, True)])
 def test_a_filter_too_fast_for_its_samples_is_refused(cutoff, grows):
     """The oracle is the computer's own recursion, d + T wc (e - d), written out for e = 0."""

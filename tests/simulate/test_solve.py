@@ -124,6 +124,15 @@ def test_the_jump_of_an_angle_is_located():
     assert abs(jax.grad(final)(0.7) - difference) < 1e-6
 
 
+@killed_by("simulate/solve.py", " and op.name != SEARCHSORTED", "")
+@pytest.mark.parametrize("place", [-0.3, 0.4, 0.7, 1.0, 2.6])
+@pytest.mark.parametrize("factor", [1, 2])  # as it is written, and as a product, the search asks in either order
+def test_the_margin_of_a_search_is_a_distance(place, factor):
+    knots = np.array([0.0, 1.0, 2.0])
+    (found,) = d.switches(lambda t, y, args: 1.0 * jnp.searchsorted(knots, factor * y), 0.0, place / factor)
+    assert found.margin == pytest.approx(np.abs(knots - place).min(), abs=1e-15)
+
+
 @pytest.mark.slow
 def test_the_flips_of_a_run_are_listed():
     found = d.switches(steps, 0.0, 0.0, {"switch": 0.7, "up": 1.0, "down": -2.0}, t1=2.0)

@@ -137,7 +137,7 @@ def of_schedule(cells, nodes, gains, d):
             for (Px, Cx, Kx), (Py, Cy, Ky) in ((one, one), (one, two), (two, two)):
                 left = -he(Px @ Cy + Py @ Cx) - 2 * rate * (Px + Py)
                 states = 2 * matrix(d["Q"]) if "Q" in d else 0 * Pa
-                inputs = he(Kx.T @ matrix(d["R"]) @ Ky) if "R" in d else 0 * Pa
+                inputs = Kx.T @ matrix(d["R"]) @ Ky + Ky.T @ matrix(d["R"]) @ Kx if "R" in d else 0 * Pa
                 for moved in ((b - a) / 2 * left - s * (Pb - Pa) for s in (low, high)):
                     yield positive(moved) and positive(moved - (b - a) / 2 * (states + inputs))
 

@@ -23,8 +23,10 @@ from mutants import killed_by
 from seams import replace_seam
 from sweeping import PATIENCE, SCENARIO, chunks, command, described, environment, free_port, started, until
 
+from diffabs.runtime.process import core_count
 from diffabs.sweep import SweepError, cluster, sweep
 from diffabs.sweep.cluster import Dask
+from diffabs.sweep.manifest import Seals, describe_owner
 
 pytestmark = pytest.mark.usefixtures("without_load", "any_step_is_stable", "compiled_before")
 
@@ -401,6 +403,21 @@ def without(folder, name):
     (folder / f"{name}.py").parent.mkdir(parents=True)
     (folder / f"{name}.py").write_text(f"raise ModuleNotFoundError(\"No module named '{name}'\")\n")
     return folder
+
+
+@killed_by("sweep/cluster.py", "_check_worker(get_worker().address, _result_versions(study.engine), versions)", "pass")
+def test_a_worker_that_joins_later_has_the_same_versions(study, monkeypatch):
+    monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(address="tcp://late:1"))
+    owner = describe_owner(study)
+    seal, versions = Seals(owner).of(0), owner["versions"] | {"jax": "0.1"}
+    with pytest.raises(SweepError, match=r'worker tcp://late:1: jax is "\S+" there, "0.1" here; results would'):
+        cluster.compute_chunk(study, seal, versions)
+
+
+def test_a_number_of_workers_that_cannot_be():
+    with pytest.raises(ValueError, match=r"workers = 0 is outside \[1, 65536\]"):
+        Dask(workers=0)
+    assert Dask().workers == core_count()
 
 
 @killed_by("sweep/cluster.py", "for line in describe_differences(there, here):", "for line in ():")

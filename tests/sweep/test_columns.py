@@ -1,5 +1,6 @@
 """Samples that a scenario has in a file: drawn again, kept with the sweep, and refused in one line."""
 
+import decimal
 import json
 
 import numpy as np
@@ -25,7 +26,7 @@ MEASURED = MEASURED.replace("[28.0, 34.0]", '{ type = "empirical", file = "speed
 def scenario(file, tmp_path):
     (tmp_path / "day").mkdir()
     pd.DataFrame({"day": ["mon", "tue", "wed", "thu"], "mass [kg]": MASSES}).to_csv(tmp_path / "day" / "masses.csv")
-    pd.DataFrame({"v": SPEEDS}).to_parquet(tmp_path / "speeds.parquet")
+    pd.DataFrame({"v": list(map(decimal.Decimal, SPEEDS))}).to_parquet(tmp_path / "speeds.parquet")
     return file(MEASURED)
 
 
@@ -67,7 +68,9 @@ def written(folder, text):
     (folder / "day" / "masses.csv").write_text(text)
 
 
-@killed_by("sweep/sample_files.py", "isinstance(value, bool) else np.nan", "isinstance(value, bool) else 0.0")
+@killed_by("sweep/sample_files.py", "(pa.ArrowException, UnicodeDecodeError)", "pa.ArrowException")
+@killed_by("sweep/sample_files.py", 'and "_" in value', "and False")
+@killed_by("sweep/sample_files.py", "decimal.Decimal) else np.nan", "decimal.Decimal) else 0.0")
 @pytest.mark.parametrize(
     ("change", "needed"),
     [
@@ -75,6 +78,8 @@ def written(folder, text):
         (lambda f: written(f, "mas [kg]\n5\n"), "masses.csv has no column mass [kg]; did you mean mas [kg]? There is "),
         (lambda f: written(f, "mass [kg]\n5.5\nheavy\n"), "column mass [kg]: 'heavy' in row 2 is no finite number"),
         (lambda f: written(f, "mass [kg],b\n5.5,1\n,2\n"), "column mass [kg]: None in row 2 is no finite number"),
+        (lambda f: written(f, "mass [kg]\n1_000\n6\n"), "column mass [kg]: '1_000' in row 1 is no finite number"),
+        (lambda f: (f / "day/masses.csv").write_bytes(b"mass [kg],\xfc\n5,6\n"), "masses.csv is no csv file: 'utf-8' "),
         (lambda f: written(f, "mass [kg]\n5.5\ninf\n"), "column mass [kg]: inf in row 2 is no finite number"),
         (lambda f: written(f, "mass [kg]\n"), "column mass [kg] is empty"),
         (

@@ -33,6 +33,7 @@ from diffabs.sweep.sampling import Corners, Grid, LatinHypercube, Random, Saltel
 from diffabs.sweep.variables import Correlation, Rows, Space
 
 MASS = ParameterSpec("kg", 0, open_low=True)
+NUMBERS = "numbers of type float, or texts, are needed"
 HINT = "; truncate it with low and high"
 SAMPLE = (3.0, -1.0, 2.0, 2.0, 7.5)
 CONTINUOUS = {
@@ -145,7 +146,7 @@ def test_rounding_does_not_leave_the_support(low):
         assert ((values >= low) & (values <= high)).all()
 
 
-@killed_by("sweep/discrete.py", "np.ones(count) if weights is None", "np.ones(count) if True")
+@killed_by("sweep/discrete.py", "np.ones(self.size) if self.weights is None", "np.ones(self.size) if True")
 def test_choices_come_by_weight():
     """u below F(k), so the edges belong to the next choice; the last includes u = 1."""
     ours = Categorical(("dry", "wet", "snow"), (1.0, 1.0, 2.0))
@@ -317,6 +318,17 @@ def test_a_grid_is_complete():
     assert Grid(3).unit(0, 2, 4, 2, 9).tolist() == [[0.0, 1.0], [0.5, 0.0]]
 
 
+@killed_by("sweep/sampling.py", "places * (1 / (levels - 1))", "places / levels")
+def test_a_grid_needs_no_memory_for_its_levels():
+    """Those of NumPy, to the bit; and the last of a number that no list could have."""
+    for n in (2, 3, 50, 12_345):
+        np.testing.assert_array_equal(Grid(n).unit(0, 0, n, 1, n)[:, 0], np.linspace(0, 1, n))
+    n = 2**32 - 1
+    ours = Space({"a": Uniform(0.0, 1.0)}, design=Grid(n))
+    assert ours.check() == n
+    assert ours.draw(0, n - 2, n, n)["a"].tolist() == [(n - 2) / (n - 1), 1.0]
+
+
 def test_corners_are_complete():
     variables = {"a": Uniform(1, 2), "b": Normal(0, 1, -3.0, 3.0), "c": Empirical(SAMPLE), "d": Categorical((4.0, 8.0))}
     ours = Space(variables, design=Corners())
@@ -450,6 +462,7 @@ def test_the_table_of_a_space_is_read_back():
     assert space.read_space({"variables": {}}, "sweep").design == Random()
 
 
+@killed_by("sweep/discrete.py", "not all(isinstance(value, str) for value in column)", "False")
 @pytest.mark.parametrize(
     ("ours", "lines"),
     [
@@ -474,6 +487,9 @@ def test_the_table_of_a_space_is_read_back():
         (Rows({"x": [1.0], "y": [1.0, 2.0]}), ["m: columns need one shape (n,); there is x (1,), y (2,)"]),
         (Rows({"x": [[1.0]]}), ["m: columns need one shape (n,); there is x (1, 1)"]),
         (Rows({"x": [1.0, math.nan]}), ["m: column x is not finite in row 1"]),
+        (Rows({"x": np.array([1.0, 2.0], object)}), [f"m: column x is of type object; {NUMBERS}"]),
+        (Rows({"x": np.array([True, False])}), [f"m: column x is of type bool; {NUMBERS}"]),
+        (Uniform("a", 3), ["m: low = 'a' is no number; one in (-inf, inf) is needed"]),
         (Rows({"x": [1.0, 2.0]}, [0.0, 0.0]), ["m: weights have sum 0"]),
         (Rows({"x": [1.0, 2.0]}, [-1.0, 2.0]), ["m: weights = [-1.0, 2.0] are not all in [0, inf)"]),
     ],
@@ -645,9 +661,11 @@ def test_a_design_that_cannot_have_so_many_samples_says_so(design, samples, line
             Space({"a": Uniform(0, 1)}, None, Grid({"b": 3})),
             "design: levels of a are missing; design: b is not a variable",
         ),
-        (Space({"a": Uniform(0, 1)}, None, Sobol(0)), "design: replicates = 0 is not positive"),
+        (Space({"a": Uniform(0, 1)}, None, Sobol(0)), "design: replicates = 0 is outside [1, 4294967295]"),
+        (Space({"a": Uniform(0, 1)}, None, Sobol(2.0)), "design: replicates = 2 is a number; a whole number in [1, "),
+        (Space({"a": Uniform(0, 1)}, None, Grid(2.5)), "design: levels = 2.5 is a number; a whole number in [2, "),
     ],
-    ids=range(21),
+    ids=range(23),
 )
 def test_what_is_wrong_with_a_space_is_said(ours, line):
     with pytest.raises(ValueError, match=r"\w") as caught:
@@ -656,8 +674,9 @@ def test_what_is_wrong_with_a_space_is_said(ours, line):
     assert "\n" not in str(caught.value)
 
 
+@killed_by("config/values.py", "isinstance(value, numbers.Real)", "isinstance(value, int | float)")
 def test_unbounded_variables_may_have_levels_inside():
-    ours = Space({"a": Normal(0.0, 1.0)}, None, Grid({"a": (0.25, 0.5, 0.75)}))
+    ours = Space({"a": Normal(0.0, 1.0)}, None, Grid({"a": (0.25, 0.5, np.float32(0.75))}))
     assert ours.check() == 3
     np.testing.assert_allclose(ours.draw(0, 0, 3, 3)["a"], stats.norm.ppf([0.25, 0.5, 0.75]), atol=1e-15)
 
@@ -706,6 +725,7 @@ def test_what_leaves_the_range_of_a_parameter_is_said(ours, spec, line):
 
 
 def test_rows_that_leave_the_range_of_a_parameter_are_said():
-    ours = Space({"r": Rows({"m": [1.0, 7.0], "n": [5.0, 5.0]})})
-    found = list(ours.describe_out_of_range({"m": ParameterSpec("kg", 0, 6), "n": ParameterSpec("kg", 0, 6)}, "over."))
-    assert found == ["over.r: column m = 1 ... 7 leaves [0, 6] kg"]
+    ours = Space({"r": Rows({"m": [1.0, 7.0], "n": [5.0, 5.0], "o": np.array(["a", "b"])})})
+    found = list(ours.describe_out_of_range(dict.fromkeys("mno", ParameterSpec("kg", 0, 6)), "over."))
+    text = "over.r: column o is text; a number in [0, 6] kg is needed"
+    assert found == ["over.r: column m = 1 ... 7 leaves [0, 6] kg", text]

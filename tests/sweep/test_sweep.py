@@ -28,7 +28,7 @@ from diffabs import roads
 from diffabs.objectives import Effort
 from diffabs.scenario.defaults import balancing
 from diffabs.simulate.run import measure, rollout
-from diffabs.sweep import Categorical, Local, Normal, Results, Space, Study, SweepError, Uniform, sweep
+from diffabs.sweep import Categorical, Local, Normal, Results, Space, Study, SweepError, Uniform, runner, sweep
 from diffabs.sweep.checking import check_accuracy
 from diffabs.sweep.seal import tables_digest
 from diffabs.sweep.store import Store
@@ -166,6 +166,21 @@ def test_worst(swept):
     rows = swept.worst("overshoot", 7)
     assert rows.column("sample").to_numpy().tolist() == np.argsort(values)[::-1][:7].tolist()
     assert rows.column("overshoot").to_numpy().tolist() == np.sort(values)[::-1][:7].tolist()
+
+
+@killed_by("sweep/results.py", "if name not in there", "if False")
+@pytest.mark.parametrize(
+    ("read", "line"),
+    [
+        (lambda found: found.table(["iae", "iea", "a", "b", "c"]), r"iea is no column of \S+; did you mean iae\?"),
+        (lambda found: found.column("iea"), r"iea is no column of \S+; did you mean iae\?"),
+        (lambda found: found.worst("refused"), "refused holds texts; a column of numbers is needed"),
+    ],
+    ids=["table", "column", "worst"],
+)
+def test_a_column_that_is_not_there(swept, read, line):
+    with pytest.raises(ValueError, match=line):
+        read(swept)
 
 
 def test_a_lane_does_not_depend_on_jaxs_precision(study):
@@ -309,6 +324,23 @@ def test_xla_computes_a_chunk_on_each_core(study, swept, tmp_path, monkeypatch):
     assert Local().places(dataclasses.replace(study, engine="kernel")) == devices
     assert Local().places(study) == 3 * devices
     assert sweep(study, tmp_path / "out").digest == swept.digest
+
+
+@killed_by("sweep/runner.py", "np.arange(self.size) < len(block.lanes)", "True")
+@pytest.mark.parametrize("chunk", [2, 4096])
+def test_copies_that_fill_a_block_do_not_run(study, monkeypatch, chunk):
+    """Three samples are three runs, whatever the size of a chunk."""
+    runs = []
+
+    def measure(*given):
+        runs.append(np.asarray(given[5]))
+        return {"iae": np.zeros(chunk), "stopped": np.zeros(chunk, bool), "diverged": np.zeros(chunk, bool)}
+
+    monkeypatch.setattr(runner, "_measure_block", measure)
+    few = dataclasses.replace(study, samples=3, chunk=chunk)
+    runner.Runner(few).run(range(few.chunks))
+    assert {len(one) for one in runs} == {chunk}
+    assert np.sum(runs) == 3
 
 
 def test_every_device_is_used(study, monkeypatch):
@@ -547,15 +579,17 @@ def test_a_manifest_that_cannot_be_read(tmp_path, text):
 WRONG = [
     ({"samples": 0}, "samples = 0 is outside [1, 4294967295]"),
     ({"samples": -3}, "samples = -3 is outside [1, 4294967295]"),
-    ({"samples": 2.5}, "samples = 2.5 is not a whole number"),
+    ({"samples": 2.5}, "samples = 2.5 is a number; a whole number in [1, 4294967295] is needed"),
     ({"chunk": 0}, "chunk = 0 is outside [1, 1048576]"),
-    ({"seed": 1.5}, "seed = 1.5 is not a whole number"),
+    ({"seed": True}, "seed = true is a boolean; a whole number in [0, 4294967295] is needed"),
     ({"seed": -1}, "seed = -1 is outside [0, 4294967295]"),
     ({"dtype": "float16"}, "dtype = float16 is neither float32 nor float64"),
+    ({"solver": d.FixedStep}, "is no solver; d.FixedStep(step=..., duration=...) or d.Adaptive("),
     ({"solver": d.FixedStep(-1.0, 0.25)}, "solver.step = -1.0 is not positive and finite"),
     ({"solver": d.FixedStep(1e-3, math.nan)}, "solver.duration = nan is not positive and finite"),
     ({"failures": {"overshot": 1.0}}, "failures.overshot is not measured"),
     ({"failures": {"overshoot": math.nan}}, "failures.overshoot = nan is not a finite number"),
+    ({"objectives": {"iae": SimpleNamespace(failure=math.inf)}}, "failures.iae = inf is not a finite number"),
     ({"objectives": {"stopped": Effort()}, "failures": {}}, "objectives.stopped: another column"),
     ({"space": Space({"plant.mas": Uniform(5.0, 6.0)})}, "plant.mas is not a parameter of this loop; did you mean"),
     ({"space": Space({"plant.mass": Normal(5.0, 1.0)})}, "plant.mass"),
@@ -564,6 +598,8 @@ WRONG = [
 ]
 
 
+@killed_by("sweep/study.py", "isinstance(self.solver, Solver)", "dataclasses.is_dataclass(self.solver)")
+@killed_by("sweep/study.py", "name, bound in self.failure_bounds", "name, bound in self.failures")
 @pytest.mark.parametrize(("changes", "needed"), WRONG, ids=[readable_id(needed) for _, needed in WRONG])
 def test_a_study_that_cannot_be(study, tmp_path, changes, needed):
     with pytest.raises(ValueError, match=re.escape(needed)) as error:
@@ -582,10 +618,31 @@ def test_several_processes_of_jax_are_refused(study, tmp_path, monkeypatch):
     assert left_in(tmp_path) == set()
 
 
+@killed_by("sweep/run.py", 'read_notes(source or {}, "source")', "dict(source or {})")
+@pytest.mark.parametrize(
+    ("note", "line"),
+    [(1, "source.a = 1 is a number; text is needed"), (Effort, " is of type type; text is needed")],
+    ids=["number", "class"],
+)
+def test_a_note_that_no_reader_would_take_is_refused_first(study, tmp_path, monkeypatch, note, line):
+    """Before a kernel is compiled."""
+    monkeypatch.setattr("diffabs.sweep.run.choose_study_engine", None)
+    with pytest.raises(ValueError, match=re.escape(line)):
+        sweep(study, tmp_path / "out", source={"a": note})
+    assert left_in(tmp_path) == set()
+
+
+@killed_by("sweep/study.py", "as_plain(getattr(self, name))", "getattr(self, name)")
+@killed_by("sweep/study.py", "dataclasses.replace(self.solver, **plain_fields(self.solver))", "self.solver")
 def test_a_study_has_a_table_of_plain_values(study):
     failures = {"overshoot": np.float32(0.5)}
-    table = dataclasses.replace(study, failures=failures).check().table()
+    solver = d.FixedStep(jnp.asarray(2e-3), np.float32(0.25))
+    whole = {"samples": np.uint32(50_000), "chunk": np.int16(20_000), "seed": np.int64(3)}
+    made = dataclasses.replace(study, failures=failures, solver=solver, **whole).check()
+    table = made.table()
     assert json.loads(json.dumps(table)) == table
+    assert hash(made.solver)  # the programs of a sweep are known by it
+    assert (type(made.seed), made.chunks, made.bounds(2)) == (int, 3, (40_000, 50_000))
     assert (table["failures"], table["success"]) == ({"locked_time": 0.0, "overshoot": 0.5}, True)
 
 
@@ -595,10 +652,12 @@ def refuse_later(store, *chunks):
         store.begin({"format": 1}, resume=False)
         for name in chunks:
             (store.chunks / name).write_text("")
-        raise SweepError("the scheduler does not answer")
+        raise RuntimeError("no device answers")
 
 
-@killed_by("sweep/store.py", "            self._remove_new(before, created)", "            pass")
+@killed_by("sweep/store.py", "        except Exception:\n", "        except ValueError:\n")
+@killed_by("sweep/store.py", "                self._remove_new(before, created)", "                pass")
+@killed_by("sweep/store.py", "self.chunks.rmdir()", "pass")
 @pytest.mark.parametrize("there", [None, {}, {"notes.tmp": "mine"}])
 def test_a_refused_sweep_leaves_a_folder_as_it_was(tmp_path, there):
     store = Store(tmp_path / "out" / "sweep")
@@ -606,15 +665,16 @@ def test_a_refused_sweep_leaves_a_folder_as_it_was(tmp_path, there):
         store.folder.mkdir(parents=True)
     for name, text in (there or {}).items():
         (store.folder / name).write_text(text)
-    with pytest.raises(SweepError):
+    with pytest.raises((RuntimeError, SweepError)):
         refuse_later(store)
     assert left_in(tmp_path) == (set() if there is None else {"out"})
     assert there is None or left_in(store.folder) == set(there)
 
 
-@killed_by("sweep/store.py", "self.chunks.rmdir()", "pass")
+@killed_by("sweep/store.py", "if not self._has_chunks()", "if True")
 def test_a_finished_chunk_stays_when_a_sweep_ends_with_an_error(tmp_path):
     store = Store(tmp_path / "out")
-    with pytest.raises(SweepError):
+    store.chunks.mkdir(parents=True)  # by a process that was killed before it wrote the manifest
+    with pytest.raises(RuntimeError):
         refuse_later(store, "part-0.parquet")
     assert left_in(store.folder) == {".lock", "manifest.json", "chunks"}

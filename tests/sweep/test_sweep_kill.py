@@ -165,6 +165,7 @@ def test_killed_at_each_step_of_writing(tmp_path):
         renamed = [k for k in (2, 5, 8) if k < last]
         with store.lock():
             assert (store.folder / "manifest.json").exists() == (len(renamed) > 0)
+            assert len(list(store.chunks.glob("*.parquet"))) == len(renamed[1:])  # also hidden ones, as DuckDB
             store.begin(table, resume=True)
             there, damaged = store.scan(seals)
         assert (sorted(there), damaged) == (list(range(len(renamed) - 1)), [])
@@ -172,9 +173,11 @@ def test_killed_at_each_step_of_writing(tmp_path):
 
 
 def test_what_a_kill_leaves_behind(copy, whole):
-    """Beginnings of files, and a folder of trajectories that were being written."""
-    (copy / "manifest.json.tmp").write_text("{")
-    (copy / "chunks" / "part-00000007-0123456789abcdef.parquet.tmp").write_text("PAR1")
+    """Beginnings of files, also of an earlier diffabs, and a folder of trajectories that were being written."""
+    for name in (".manifest.01234567.tmp", "manifest.json.tmp"):
+        (copy / name).write_text("{")
+    for name in (".part-00000007-0123456789abcdef.01234567.tmp", "part-00000007-0123456789abcdef.parquet.tmp"):
+        (copy / "chunks" / name).write_text("PAR1")
     (copy / "trajectories.zarr.tmp").mkdir()
     (copy / "notes.tmp").write_text("mine")
     result = run("sweep", whole.scenario, "--out", copy, "--resume", "--json")

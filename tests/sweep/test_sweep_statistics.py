@@ -566,6 +566,18 @@ class TestCoverage:
         found = coverage(lambda k: every[k], lambda: random.binomial(n, p), p)
         assert abs(found - exact) < 2
 
+    @killed_by("sweep/statistics/sensitivity.py", " or n < MIN_CORRELATED_SAMPLES", "")
+    @pytest.mark.parametrize("n", [4, 9, 10])
+    def test_correlations_of_few_samples(self, n):
+        """Pearson's of 10 cover 90 %; fewer have no interval."""
+        random, rho = np.random.default_rng(44), 0.9
+        pairs = [binormal(random, n, rho) for _ in range(300)]
+        found = [sensitivity.correlations(x[:, None], y) for x, y in pairs]
+        for kind, truth in (("pearson", rho), ("spearman", 6 / np.pi * math.asin(rho / 2))):
+            ours = [getattr(one, kind)[0] for one in found]
+            assert np.mean([one.low <= truth <= one.high for one in ours]) > 0.86
+            assert {one.high - one.low == 2 for one in ours} == {n < 10}
+
     @pytest.mark.slow
     def test_correlations(self):
         random, rho = np.random.default_rng(35), 0.6

@@ -14,14 +14,13 @@ from scipy.stats import qmc
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references
-from diffabs.core.protocols import Memory
 from diffabs.core.pytree import canonical_dtypes, param, pytree
 from diffabs.design.polytopes import Polytope
 from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
 from diffabs.objectives.balance import PeakTorque
-from diffabs.objectives.tracking import keep_memory, no_integral
+from diffabs.objectives.tracking import FinalValue
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.section_tune import Goal
 from diffabs.simulate.stability import stable_step, stable_steps
@@ -246,15 +245,10 @@ def test_a_metric_that_is_infinite_at_the_start_is_named(where):
 
 
 @pytree
-class Margin:
+class Margin(FinalValue):
     """The logarithm of a negative number: NaN, though no run diverges."""
 
     unit = "1"
-    flow, update = no_integral, keep_memory
-
-    def start(self, sample):
-        """Nothing to remember."""
-        return Memory()
 
     def value(self, memory, ending):
         """NaN."""
@@ -525,16 +519,11 @@ def test_a_worst_case_says_what_found_it(value, corner, screened, words):
 
 @pytest.mark.slow
 @pytree
-class Shortness:
+class Shortness(FinalValue):
     """-distance: what is greatest somewhere within."""
 
     unit = "m"
     physical = (-np.inf, 0.0)
-    flow, update = no_integral, keep_memory
-
-    def start(self, sample):
-        """Nothing to remember."""
-        return Memory()
 
     def value(self, memory, ending):
         """-distance."""

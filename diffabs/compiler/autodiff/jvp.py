@@ -75,19 +75,6 @@ def differentiate_functions(
     return DerivativeProgram(program, differentiable, seeded | {UpdateLevel.STEP: reached})
 
 
-def lower_without_tangents(functions: TracedFunctions) -> DerivativeProgram:
-    """Return the plain program of the functions, as a derivative program without tangents.
-
-    Args:
-        functions: Traced functions.
-
-    Raises:
-        Unsupported: As in `lower_functions`.
-    """
-    none: TangentArrays = dict.fromkeys(INPUT_LEVELS, ())
-    return DerivativeProgram(lower_functions(functions), none, none)
-
-
 def arrange_arrays(
     functions: TracedFunctions, moved_arrays: TangentArrays, per_lane_uniforms: frozenset[int]
 ) -> dict[UpdateLevel, list[ArrayKey]]:
@@ -131,7 +118,7 @@ def replicate_tangents(
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in INPUT_LEVELS}
     for level, keys in arrange_arrays(functions, one.moved_arrays, per_lane_uniforms).items():
         for array, key in enumerate(keys):
-            number = _array_index(functions, one, key)
+            number = _array_index(functions, one.differentiable, key)
             size, copies = old.sizes[key.level][number], many if key.tangent else 1
             for k in range(copies):
                 for entry in range(size):
@@ -151,9 +138,9 @@ def replicate_tangents(
         if name == RUNNING_FUNCTION:
             ends[name] = [(nodes, False)]
             continue
-        arrays = _results_by_array(functions, one, name)
+        arrays = _results_by_array(old, name)
         moving = [
-            _array_index(functions, one, ArrayKey(UpdateLevel.STEP, i, True))
+            _array_index(functions, one.differentiable, ArrayKey(UpdateLevel.STEP, i, True))
             for i in one.moved_arrays[UpdateLevel.STEP]
         ]
         values = arrays[: len(functions.types[UpdateLevel.STEP])]
@@ -169,32 +156,29 @@ def replicate_tangents(
     return check_size(ScalarProgram(inputs, results, sizes, old.dtype, many), len(graph.nodes))
 
 
-def _array_index(functions: TracedFunctions, one: DerivativeProgram, key: ArrayKey) -> int:
+def _array_index(functions: TracedFunctions, differentiable: TangentArrays, key: ArrayKey) -> int:
     """Return the index of an array among those of its level in the program with one tangent."""
     first = len(functions.types[key.level])
-    return first + one.differentiable[key.level].index(key.number) if key.tangent else key.number
+    return first + differentiable[key.level].index(key.number) if key.tangent else key.number
 
 
-def _results_by_array(functions: TracedFunctions, one: DerivativeProgram, name: str) -> list[list[Node]]:
+def _results_by_array(program: ScalarProgram, name: str) -> list[list[Node]]:
     """Return the results of `renew` or `step` (`name`), grouped by array of the carry."""
-    rest = iter(one.program.results[name])
-    return [[next(rest) for _ in range(size)] for size in one.program.sizes[UpdateLevel.STEP]]
+    rest = iter(program.results[name])
+    return [[next(rest) for _ in range(size)] for size in program.sizes[UpdateLevel.STEP]]
 
 
 def _reached_arrays(
     program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays, seeded: TangentArrays
 ) -> tuple[int, ...]:
     """Return the indices of the carry's arrays whose tangents can be nonzero at the start or after some step."""
-    one, ends = (
-        DerivativeProgram(program, differentiable, differentiable),
-        _tangent_results(program, functions, differentiable),
-    )
+    ends = _tangent_results(program, functions, differentiable)
     nodes = live_nodes([node for nodes in ends.values() for node in nodes])
     # A fixed point: arrays that one step reaches may reach more arrays in the next.
     moved_arrays = seeded
     while True:
         starts = {
-            (level, _array_index(functions, one, ArrayKey(level, i, True)))
+            (level, _array_index(functions, differentiable, ArrayKey(level, i, True)))
             for level in INPUT_LEVELS
             for i in moved_arrays[level]
         }
@@ -227,12 +211,10 @@ def _tangent_results(
     program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays
 ) -> dict[int, list[Node]]:
     """Return the tangents that `renew` and `step` assign to each differentiable array of the carry, by its index."""
-    one = DerivativeProgram(program, differentiable, differentiable)
-    arrays = [_results_by_array(functions, one, name) for name in program.results if name != RUNNING_FUNCTION]
-    return {
-        i: [node for each in arrays for node in each[_array_index(functions, one, ArrayKey(UpdateLevel.STEP, i, True))]]
-        for i in differentiable[UpdateLevel.STEP]
-    }
+    arrays = [_results_by_array(program, name) for name in program.results if name != RUNNING_FUNCTION]
+    first = len(functions.types[UpdateLevel.STEP])
+    tangents = enumerate(differentiable[UpdateLevel.STEP], first)
+    return {i: [node for each in arrays for node in each[place]] for place, i in tangents}
 
 
 def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) -> TracedFunctions:

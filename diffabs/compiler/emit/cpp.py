@@ -5,13 +5,12 @@ independent lines, which hides the latency of each result. Between rounds, the n
 has ended.
 """
 
-import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.compiler.emit.cpp_words import is_boolean, literal, scalar_type, vector_type
+from diffabs.compiler.emit.cpp_words import literal, scalar_type, vector_type
 from diffabs.compiler.ir import Node, UpdateLevel, live_nodes
 from diffabs.compiler.operations import OPERATIONS
 from diffabs.compiler.program import InputPlace, ScalarProgram
@@ -280,12 +279,12 @@ class Text:
                 size = self.program.sizes[places][place.array]
                 value = f"((const {scalar_type(node.dtype)}*){array}[{place.array}].data)[j*{size} + {place.entry}]"
                 target = f"b.{name}{node.id}[i]"
-                yield f"  set({target}, q, {value});" if is_boolean(node.dtype) else f"  place({target}, q, {value});"
+                yield f"  set({target}, q, {value});" if node.dtype == bool else f"  place({target}, q, {value});"
         yield "}\nPART void take(const Block& b, int p, i64 j, const Array* carry) {"
         yield "  const int i = p/LANES, q = p%LANES;"
         for place, node in self._given_inputs(UpdateLevel.STEP):
             size, value = self.program.sizes[UpdateLevel.STEP][place.array], f"b.c{node.id}[i]"
-            value = f"get({value}, q)" if is_boolean(node.dtype) else f"at({value}, q)"
+            value = f"get({value}, q)" if node.dtype == bool else f"at({value}, q)"
             yield f"  (({scalar_type(node.dtype)}*)carry[{place.array}].data)[j*{size} + {place.entry}] = {value};"
         yield "}"
 
@@ -368,14 +367,4 @@ class Text:
 
 def _declare_uniform(node: Node, value: str) -> str:
     """Return the declaration of a vector with the number `value` in every lane."""
-    return f"const {vector_type(node.dtype)} v{node.id} = all({'(bool)' if is_boolean(node.dtype) else ''}{value});"
-
-
-def count_operations(source: str) -> int:
-    """Return the number of operations in the C++ text of a program; the vectors of a block count once.
-
-    Args:
-        source: C++ text of `emit_cpp`.
-    """
-    # Vector 0 stands for all vectors, because every operation has one line for each.
-    return len(re.findall(r"^ +(?:const )?\w+ v\d+_0 = ", source, re.MULTILINE))
+    return f"const {vector_type(node.dtype)} v{node.id} = all({'(bool)' if node.dtype == bool else ''}{value});"

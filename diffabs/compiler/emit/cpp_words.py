@@ -9,22 +9,13 @@ CPP_TYPES = {
 }  # fmt: skip
 
 
-def is_boolean(dtype: np.dtype) -> bool:
-    """Return whether a type is boolean.
-
-    Args:
-        dtype: NumPy type.
-    """
-    return dtype.kind == "b"
-
-
 def scalar_type(dtype: np.dtype) -> str:
     """Return the C++ type of one number, such as f64; a boolean is a byte, u8.
 
     Args:
         dtype: NumPy type.
     """
-    return "u8" if is_boolean(dtype) else CPP_TYPES[dtype.name]
+    return "u8" if dtype.kind == "b" else CPP_TYPES[dtype.name]
 
 
 def vector_type(dtype: np.dtype) -> str:
@@ -33,7 +24,7 @@ def vector_type(dtype: np.dtype) -> str:
     Args:
         dtype: NumPy type.
     """
-    return "mask" if is_boolean(dtype) else "v" + CPP_TYPES[dtype.name]
+    return "mask" if dtype.kind == "b" else "v" + CPP_TYPES[dtype.name]
 
 
 def literal(node: Node) -> str:
@@ -43,7 +34,7 @@ def literal(node: Node) -> str:
         node: Constant.
     """
     x = node.attr
-    if is_boolean(node.dtype):
+    if node.dtype == bool:
         return f"all({'true' if x else 'false'})"
     name = CPP_TYPES[node.dtype.name]
     if not is_real(node.dtype):

@@ -9,12 +9,12 @@ from diffabs.core.types import Equation
 
 
 @lowering_rule(
-    "and or xor not neg sqrt exp log log1p expm1 sin cos tan tanh atan asin acos sinh cosh atan2", "accuracy"
+    "and or xor not neg abs sqrt exp log log1p expm1 sin cos tan tanh atan asin acos sinh cosh atan2", "accuracy"
 )
 @lowering_rule("div sub is_finite floor ceil eq ne lt le gt ge pow", "accuracy")
-@lowering_rule("add mul", "out_dtype")
+@lowering_rule("add add_any mul", "out_dtype")
 def _elementwise(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
-    name = eqn.primitive.name
+    name = eqn.primitive.name.removesuffix("_any")
     if eqn.params.get("accuracy") is not None:
         raise Unsupported(name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
     if eqn.params.get("out_dtype") not in (None, eqn.outvars[0].aval.dtype):
@@ -42,11 +42,6 @@ def _integer_quotient(graph: Graph, x: Node, y: Node) -> Node:
     return graph.select(by_zero, found, graph.op("not", zero))
 
 
-@lowering_rule("add_any")
-def _add_any(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
-    return [map_entries(lambda x, y: graph.op("add", x, y), *ins)]
-
-
 @lowering_rule("stop_gradient copy copy_p optimization_barrier pvary")
 @lowering_rule("reshard", "dst_sharding concrete_mesh")
 def _identity(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
@@ -72,11 +67,6 @@ def max_or_min(graph: Graph, name: str, x: Node, y: Node) -> Node:
     if x.dtype == bool:
         return graph.op("or" if name == "max" else "and", x, y)
     return graph.op(name, x, y)
-
-
-@lowering_rule("abs")
-def _abs(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
-    return [map_entries(lambda x: graph.op("abs", x), *ins)]
 
 
 @lowering_rule("sign")

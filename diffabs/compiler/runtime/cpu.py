@@ -7,6 +7,7 @@ import threading
 import jax
 
 from diffabs.compiler.emit import cpp
+from diffabs.compiler.listing import count_by_level
 from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import toolchain
 from diffabs.core.types import PyTree
@@ -29,12 +30,10 @@ def build_target(made: ScalarProgram, shape: cpp.LaunchShape) -> str:
         NoCompiler: No compiler works, or the library does not load.
     """
     # Tangents are independent of each other too and hide latency, so they replace vectors of the block.
-    shape = shape._replace(vectors=max(1, shape.vectors // max(1, made.tangents)))
-    source = cpp.emit_cpp(made, shape)
-    vectors = max(1, MAX_STEP_LINES // max(1, cpp.count_operations(source)))
-    if vectors < shape.vectors:
-        source = cpp.emit_cpp(made, shape._replace(vectors=vectors))
-    return register_library(toolchain.build_library(source))
+    vectors = shape.vectors // max(1, made.tangents)
+    operations = count_by_level(made)["step"]
+    shape = shape._replace(vectors=max(1, min(vectors, MAX_STEP_LINES // max(1, operations))))
+    return register_library(toolchain.build_library(cpp.emit_cpp(made, shape)))
 
 
 def register_library(path: pathlib.Path) -> str:

@@ -7,7 +7,7 @@ import ctypes
 import functools
 import pathlib
 import threading
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -26,43 +26,7 @@ ORDINAL, MULTIPROCESSORS = 9, 16
 _lock = threading.Lock()
 
 
-class GpuDevice(Protocol):
-    """A GPU that compiles and starts kernels."""
-
-    def describe(self) -> dict[str, str]:
-        """Return "compiler", "flags" and "processor": with a program's text they determine its numbers to the last bit.
-
-        Raises:
-            NoCompiler: There is no compiler.
-        """
-        ...
-
-    def compile(self, text: str) -> pathlib.Path:
-        """Return the file with the machine code of a CUDA C++ `text`.
-
-        Raises:
-            NoCompiler: The text does not compile, or there is no compiler.
-        """
-        ...
-
-    def address(self, buffer: Any) -> int:
-        """Return the device address of a `buffer` of XLA."""
-        ...
-
-    def start(self, code: pathlib.Path, arrays: PyTree, room: int, count: int, context: PyTree) -> None:
-        """Start the kernels `begin_all` and then `run_all` of a program.
-
-        Args:
-            code: File with the machine code.
-            arrays: The struct `Arrays` of `threads.h`.
-            room: Device address of the memory for the counter and the shared values.
-            count: Number of lanes.
-            context: XLA's execution context, which has the stream.
-        """
-        ...
-
-
-def find_gpu() -> GpuDevice | None:
+def find_gpu() -> "CudaDevice | None":
     """Return the GPU that JAX runs on by default, or None if JAX runs on a CPU by default.
 
     Raises:
@@ -148,7 +112,11 @@ class CudaDevice:
         self._loaded: dict[tuple[pathlib.Path, int], _LoadedCode] = {}
 
     def describe(self) -> dict[str, str]:
-        """Return "compiler", "flags" and "processor" (the architecture); see `GpuDevice.describe`."""
+        """Return "compiler", "flags" and "processor": with a program's text they determine its numbers to the last bit.
+
+        Raises:
+            NoCompiler: There is no compiler.
+        """
         major, minor = nvrtc.nvrtc_version()
         return {
             "compiler": f"NVRTC {major}.{minor}",
@@ -157,7 +125,11 @@ class CudaDevice:
         }
 
     def compile(self, text: str) -> pathlib.Path:
-        """Return the file with the machine code of a CUDA C++ `text`; see `GpuDevice.compile`."""
+        """Return the file with the machine code of a CUDA C++ `text`.
+
+        Raises:
+            NoCompiler: The text does not compile, or there is no compiler.
+        """
         return nvrtc.build_cubin(text, self.architecture)
 
     def address(self, buffer: Any) -> int:
@@ -165,9 +137,14 @@ class CudaDevice:
         return buffer.__cuda_array_interface__["data"][0]
 
     def start(self, code: pathlib.Path, arrays: PyTree, room: int, count: int, context: PyTree) -> None:
-        """Start `begin_all` and `run_all` on the device that holds `room`.
+        """Start the kernels `begin_all` and then `run_all` of a program, on the device that holds `room`.
 
-        The arguments `code`, `arrays`, `room`, `count` and `context` are those of `GpuDevice.start`.
+        Args:
+            code: File with the machine code.
+            arrays: The struct `Arrays` of `threads.h`.
+            room: Device address of the memory for the counter and the shared values.
+            count: Number of lanes.
+            context: XLA's execution context, which has the stream.
         """
         ordinal = ctypes.c_int()
         # Several devices may run this program: the memory tells which one to use.

@@ -17,6 +17,7 @@ unit matrix of the coordinates of the step.
 Source of the method of centres: S. Boyd and L. El Ghaoui (1993).
 """
 
+import math
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -83,8 +84,15 @@ def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -
         A: State matrices of the vertices, shape (V, n, n).
         B: Input matrices of the vertices, shape (V, n, m).
         period: Sampling period [s] in discrete time; None for continuous time.
+
+    Raises:
+        ValueError: A without an axis for the vertices, or a period that is not positive and finite.
     """
     A, B, K = as_float_arrays(A, B, jnp.atleast_2d(jnp.asarray(gain)))
+    if A.ndim != 3:
+        raise ValueError(f"A has shape {A.shape}; the vertices need (V, n, n)")
+    if isinstance(period, float | int) and not 0 < period < math.inf:
+        raise ValueError(f"period = {period:g} is outside (0, inf) s")
     shift = _least_shift(period is not None, A + B @ K)
     return -shift / 2 if period is None else -jnp.log(shift) / 2 / period
 

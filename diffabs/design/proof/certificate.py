@@ -5,7 +5,7 @@ A file stores no verdict. `Certificate.load` reads matrices and claims, and `Cer
 their data, by kind:
 
     decay       P, rate (factor in discrete time)   V = x' P x falls like exp(-2 rate t), by factor^2 a period
-    cost        P, Q, R, maybe x0                   the cost from x0 is at most x0' P x0; trace P on average
+    cost        P, Q, R, in older files an x0       the cost from any x is at most x' P x
     damping     P, cot, zeta                        every fixed system of the hull has damping above zeta
     l2          P, gamma, Bw, C, D                  the gain from w to C x + D u is below gamma
     input       P, limit, points                    |u| <= limit for ever from the hull of the points
@@ -163,16 +163,6 @@ class Certificate:
         return None
 
     @property
-    def cost_from_start(self) -> float | None:
-        """Cost x0' P x0 of the first proved cost claim that has x0, rounded up."""
-        for data in self.proved_data("cost"):
-            if "x0" in data:
-                # Fractions, so that the sum is rounded once, upwards.
-                x, P = np.vectorize(Fraction, [object])(data["x0"]), np.vectorize(Fraction, [object])(data["P"])
-                return round_up(x @ P @ x)
-        return None
-
-    @property
     def damping(self) -> float | None:
         """Largest damping ratio [1] proved for all fixed systems of the hull."""
         return max((data["zeta"] for data in self.proved_data("damping")), default=None)
@@ -257,7 +247,6 @@ class Certificate:
             "decay_rate": self.decay_rate,
             "trace_cost": self._cost(claim.data for claim in self.claims),
             "guaranteed_cost": self.guaranteed_cost,
-            "cost_from_start": self.cost_from_start,
             "damping": self.damping,
             "l2_gain": self.l2_gain,
             "input_limit": None if limit is None else limit.tolist(),
@@ -271,7 +260,7 @@ class Certificate:
         size = f"{sum(cell.vertices for cell in self.cells)} vertices of order {self.cells[0].order}"
         lines = [f"certificate for {size}, gain {' '.join(str(self.gain.tolist()).split())}"]
         for claim, verdict in zip(self.claims, self.verify(), strict=True):
-            numbers = [f"{name} {value:.6g}" for name, value in claim.data.items() if isinstance(value, float)]
+            numbers = [f"{name} {value!r}" for name, value in claim.data.items() if isinstance(value, float)]
             lines.append("  ".join([f"{claim.kind}:", "proved" if verdict else "NOT PROVED", *numbers]))
         if worst := self.worst_vertex:
             where = ", ".join(f"{name} {value:.6g}" for name, value in (worst["corner"] or {}).items())

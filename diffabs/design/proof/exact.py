@@ -234,7 +234,8 @@ def schedule_conditions(
         for (Px, Cx, Kx), (Py, Cy, Ky) in (ends[:1] * 2, ends, ends[1:] * 2):
             terms = (-0.5 * width * he(Px @ Cy + Py @ Cx), -data.get("rate", 0) * width * (Px + Py))
             spent = (-width * data["Q"],) if "Q" in data else ()
-            spent += (-0.5 * width * he(Kx.mT @ data["R"] @ Ky),) if "R" in data else ()
+            # Both orders: he() of one of them would hide that R is not symmetric.
+            spent += (-0.5 * width * (Kx.mT @ data["R"] @ Ky + Ky.mT @ data["R"] @ Kx),) if "R" in data else ()
             for s in (data["rates"][0], data["rates"][1]):
                 moved = (*terms, -s * (P[c + 1] - P[c]))
                 yield Inequality(moved, vertex)

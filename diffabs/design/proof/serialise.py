@@ -12,16 +12,8 @@ from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.runtime import files
 
 CERTIFICATE_FORMAT, CERTIFICATE_VERSION = "diffabs certificate", 1
-MAX_CERTIFICATE_BYTES, MAX_STATES_OR_INPUTS = 2**24, 64  # as in `design.verify`, so that both read what is written
-
-
-def convert_to_list(value: float | np.ndarray) -> Matrix:
-    """Return a number or nested lists for JSON.
-
-    Args:
-        value: Number or array.
-    """
-    return value.tolist() if isinstance(value, np.ndarray) else value
+# As in `design.verify`, so that both read what is written.
+MAX_CERTIFICATE_BYTES, MAX_STATES_OR_INPUTS, MAX_LIST_ENTRIES = 2**24, 64, 2**12
 
 
 def describe_system(system: Polytope | Schedule) -> dict[str, PyTree]:
@@ -114,12 +106,17 @@ def format_certificate(system: Polytope | Schedule, gain: np.ndarray, claims: It
         ValueError: A certificate that is too large for its readers.
     """
     check_cell_size(system.cells[0] if isinstance(system, Schedule) else system, "system")
+    arrays = [(kind, {name: np.asarray(value) for name, value in data.items()}) for kind, data in claims]
+    nodes = len(system.nodes) if isinstance(system, Schedule) else 0
+    longest = max(nodes, len(arrays), *(n for _, data in arrays for value in data.values() for n in value.shape))
+    if longest > MAX_LIST_ENTRIES:
+        raise ValueError(f"the certificate has a list of {longest} claims, nodes or entries, over {MAX_LIST_ENTRIES}")
     data = {
         "format": CERTIFICATE_FORMAT,
         "version": CERTIFICATE_VERSION,
         "system": describe_system(system),
         "gain": gain.tolist(),
-        "claims": [{"kind": kind, "data": {k: convert_to_list(v) for k, v in data.items()}} for kind, data in claims],
+        "claims": [{"kind": kind, "data": {k: v.tolist() for k, v in data.items()}} for kind, data in arrays],
     }
     content = json.dumps(data, allow_nan=False, indent=1) + "\n"
     if len(content) > MAX_CERTIFICATE_BYTES:
@@ -197,9 +194,9 @@ def read_system(value: Scalar) -> Polytope | Schedule:
 
 
 def read_polytope(value: Scalar, where: str) -> Polytope:
-    """Return a polytope from a JSON value, without its corners.
+    """Return a polytope from a JSON value, whose corners are not read.
 
-    Nothing ties the labels of a file to its matrices, so no output shows them beside a proof.
+    Nothing ties these labels of a file to its matrices, so no output shows them beside a proof.
 
     Args:
         value: JSON value.
@@ -208,16 +205,15 @@ def read_polytope(value: Scalar, where: str) -> Polytope:
     Raises:
         ValueError: A value that is no polytope; the message names the field.
     """
-    A, B, period, states, corners = read_members(value, where, "A", "B", "period", "states", "corners")
+    A, B, period, states, _ = read_members(value, where, "A", "B", "period", "states", "corners")
     if period is not None and not (isinstance(period, float) and 0 < period < math.inf):
         raise ValueError(f"{where}.period must be null or positive [s]")
-    for corner in read_list(corners, f"{where}.corners"):
-        read_list(list(corner.values()), f"values of {where}.corners", float)
-        read_numbers(list(corner.values()), f"{where}.corners")
     states = tuple(read_list(states, f"{where}.states", str))
-    system = Polytope(read_numbers(A, f"{where}.A"), read_numbers(B, f"{where}.B"), period, states)
-    if len(corners) not in (0, system.vertices) or len(states) not in (0, system.order):
-        raise ValueError(f"{where}.corners and {where}.states must be empty or one for each vertex and each state")
+    a, b = read_numbers(A, f"{where}.A"), read_numbers(B, f"{where}.B")
+    try:
+        system = Polytope(a, b, period, states)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
     check_cell_size(system, where)
     return system
 

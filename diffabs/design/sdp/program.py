@@ -1,4 +1,12 @@
-"""A design as one semidefinite program, in the coordinates of a frame."""
+"""A design as one semidefinite program, in the coordinates of a frame.
+
+For V = x'X^-1 x and F = K X each inequality is a positive semidefinite matrix that is affine in X, F, Z and g. `flow`
+is A X + B F, `drift` dX/dt along a schedule. In discrete time x+ = A x + B u, and a Schur complement with X takes the
+place of the derivative.
+
+Sources: Maeda and Sugiura, eqs. (30), (32); M. Chilali and P. Gahinet, H-infinity design with pole placement
+constraints (1996); S. Boyd et al., Linear Matrix Inequalities in System and Control Theory (1994).
+"""
 
 import itertools
 from collections.abc import Iterator, Mapping
@@ -7,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.design.polytopes import Polytope, Schedule
-from diffabs.design.sdp import inequalities
+from diffabs.design.proof.exact import he
 from diffabs.design.sdp.scaling import Frame, whitening_matrix
-from diffabs.design.sdp.solver import SdpBlock, Unknowns, group_blocks
+from diffabs.design.sdp.solver import SdpBlock, Unknowns, group_blocks, symmetric_from_blocks
 from diffabs.design.spec import Spec
 
 # Weight of trace Z in the minimisation of an L2 gain: without it the infimum often needs infinite feedback.
@@ -101,7 +109,10 @@ class DesignProgram:
         for place in self._vertices_at_nodes():
             yield from self._at(place)
         for i in range(self.nodes):
-            yield self.unknowns.affine(lambda v, i=i: inequalities.trace_lmi(v[f"X{i}"], v[f"Z{i}"]))
+            # Z >= X^-1, eq. (32).
+            yield self.unknowns.affine(
+                lambda v, i=i: symmetric_from_blocks([[v[f"Z{i}"]], [np.eye(v[f"X{i}"].shape[-1]), v[f"X{i}"]]])
+            )
 
     def _vertices_at_nodes(self) -> Iterator[VertexAtNode]:
         """Yield the vertices at the nodes where an inequality has to hold.
@@ -134,29 +145,51 @@ class DesignProgram:
             return x, f, place.A @ x + place.B @ f, drift
 
         def cost(v: Values) -> np.ndarray:
-            x, f, flow, drift = evaluate(v)
-            return inequalities.cost_lmi(x, flow, drift, self.root, f, self.even, discrete=discrete)
+            """Return the matrix of dV/dt + x'Qx + u'u <= 0 for R = I, its first rows and columns times `even`."""
+            (x, f, flow, drift), even = evaluate(v), self.even
+            spent = [self.root @ x @ even, f @ even]
+            if discrete:
+                rows = [[even.T @ x @ even], [flow @ even, x], [spent[0], None, np.eye(len(self.root))]]
+                return symmetric_from_blocks([*rows, [spent[1], None, None, np.eye(f.shape[-2])]])
+            rows = [[even.T @ (drift - he(flow)) @ even], [spent[0], np.eye(len(self.root))]]
+            return symmetric_from_blocks([*rows, [spent[1], None, np.eye(f.shape[-2])]])
 
         def decay(v: Values) -> np.ndarray:
+            """Return the matrix of dV/dt + 2 rate V <= 0, or in discrete time of V+ <= exp(-2 rate) V."""
             x, _, flow, drift = evaluate(v)
             rate = spec.decay * (1 + SPECIFICATION_TIGHTENING) * (self.period or 1 / frame.tau)
-            return inequalities.decay_lmi(x, flow, drift, rate, discrete=discrete)
+            if discrete:
+                return symmetric_from_blocks([[np.exp(-2 * rate) * x], [flow, x]])
+            # The inequality of P = X^-1, multiplied by X from both sides; d(X^-1)/dt gives drift its sign.
+            return drift - he(flow) - 2 * rate * x
 
         def damping(v: Values) -> np.ndarray:
             # Tightened in 1 - zeta, so that zeta stays below 1.
             zeta = 1 - (1 - spec.damping) * (1 - SPECIFICATION_TIGHTENING)
-            return inequalities.damping_lmi(evaluate(v)[2], zeta / np.sqrt(1 - zeta**2))
+            return damping_matrix(evaluate(v)[2], zeta / np.sqrt(1 - zeta**2))
 
         def gain(v: Values) -> np.ndarray:
+            """Return the matrix of s dV/dt + |z|^2 - g |w|^2 <= 0, where z = (C X + D F) X^-1 x.
+
+            It is affine in (X, F, s) for a fixed g, and in (X, F, g) for s = 1. The multiplier s lets V serve the cost
+            and the gain at once, although their natural sizes differ.
+            """
             (x, f, flow, drift), l2 = evaluate(v), spec.l2
             assert l2 is not None
             z = (l2.output @ frame.T @ x + l2.feedthrough @ frame.U @ f) / np.sqrt(frame.tau)
             # g is then near 1, as are the other unknowns.
             z, e = z / self.output, place.E / self.disturbance
-            if l2.bound is None:
-                return inequalities.l2_gain_lmi(x, flow, drift, z, e, v["g"], 1.0, discrete=discrete)
-            g = (l2.bound * (1 - SPECIFICATION_TIGHTENING) / self.output / self.disturbance) ** 2
-            return inequalities.l2_gain_lmi(x, flow, drift, z, e, g, v["s"], discrete=discrete)
+            s, bound = v.get("s", 1.0), l2.bound
+            g = (
+                v["g"]
+                if bound is None
+                else (bound * (1 - SPECIFICATION_TIGHTENING) / self.output / self.disturbance) ** 2
+            )
+            # Divided by s and with w in units of s, the inequality is linear in s: its blocks are s E, s g I and s I.
+            limit, one = s * g * np.eye(e.shape[1]), s * np.eye(z.shape[-2])
+            if discrete:
+                return symmetric_from_blocks([[x], [None, limit], [flow, s * e, x], [z, None, None, one]])
+            return symmetric_from_blocks([[drift - he(flow)], [-s * e.T, limit], [z, None, one]])
 
         wanted = ((spec.Q is not None, cost), (spec.decay > 0, decay), (spec.damping > 0, damping), (spec.l2, gain))
         yield from (self.unknowns.affine(formula) for asked, formula in wanted if asked)
@@ -166,13 +199,29 @@ class DesignProgram:
         limit = self.spec.input
         if limit is None:
             return
-        for point in limit.points:
-            start = self.frame.inverse @ point
-            yield self.unknowns.affine(lambda v, start=start: inequalities.start_lmi(v["X0"], start, level))
-        for row, bound in zip(self.frame.U, limit.limit * (1 - SPECIFICATION_TIGHTENING), strict=True):
+        for start in limit.points @ self.frame.inverse.T:
+            # V(start) <= level.
             yield self.unknowns.affine(
-                lambda v, row=row, bound=bound: inequalities.input_limit_lmi(v["X0"], row[None] @ v["F0"], bound, level)
+                lambda v, x=start[:, None]: symmetric_from_blocks([[np.full((1, 1), level)], [x, v["X0"]]])
             )
+        for row, bound in zip(self.frame.U, limit.limit * (1 - SPECIFICATION_TIGHTENING), strict=True):
+            # |u_j| <= bound while V <= level.
+            yield self.unknowns.affine(
+                lambda v, row=row[None], most=bound**2 / level: symmetric_from_blocks(
+                    [[np.full((1, 1), most)], [np.swapaxes(row @ v["F0"], -1, -2), v["X0"]]]
+                )
+            )
+
+
+def damping_matrix(flow: np.ndarray, cot: float) -> np.ndarray:
+    """Return the matrix of the pole region |Im s| <= -Re s/cot, which has the damping cot/sqrt(1 + cot^2).
+
+    Args:
+        flow: A X + B F, or P C of an analysis, shape (..., n, n).
+        cot: Cotangent of the half-angle of the cone about the negative real axis.
+    """
+    skew = cot * (flow - np.swapaxes(flow, -1, -2))
+    return -symmetric_from_blocks([[he(flow)], [-skew, he(flow)]])
 
 
 def _root(q: np.ndarray) -> np.ndarray:

@@ -50,16 +50,26 @@ class Frame(NamedTuple):
 
 
 def whitening_matrix(weight: np.ndarray) -> np.ndarray:
-    """Return D with D' `weight` D = I, except in directions with less than 1e-12 of the largest weight.
+    """Return D with D' `weight` D = I, except in directions with less than 1e-6 of the largest weight.
 
     A slow closed loop beside a fast one has a small cost per unit of time. If M >= 0 is an inequality, the congruence
-    D' M D makes a solver's tolerance relative.
+    D' M D makes a solver's tolerance relative. In a direction without weight it would only magnify rounding.
 
     Args:
         weight: Symmetric positive semidefinite matrix, shape (n, n).
     """
     values, vectors = np.linalg.eigh(weight)
-    return vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    return vectors / np.sqrt(np.maximum(values, 1e-6 * (values[-1] or 1.0)))
+
+
+def definite_weight(q: np.ndarray, share: float) -> np.ndarray:
+    """Return Q plus `share` of its diagonal, which gives every state a weight in its own unit unless Q = 0.
+
+    Args:
+        q: Symmetric positive semidefinite Q, shape (n, n). A diagonal entry below 1e-6 of their mean counts as that.
+        share: Added part [1] of the diagonal.
+    """
+    return q + share * np.diag(np.maximum(np.diag(q), 1e-6 * np.trace(q) / len(q)))
 
 
 def lyapunov_frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: bool) -> Frame:
@@ -97,8 +107,8 @@ def design_frames(system: Polytope, q: np.ndarray, r: np.ndarray) -> Iterator[tu
         ValueError: A vertex without a stabilising Riccati solution.
     """
     # A small weight on every state keeps P definite. It is relative, and too small to change the result.
-    regular = q + 1e-12 * np.diag(np.maximum(np.diag(q), 1e-6 * np.trace(q) / len(q)))
-    solutions = [_riccati(a, b, regular, r, i, system) for i, (a, b) in enumerate(zip(system.A, system.B, strict=True))]
+    q = definite_weight(q, 1e-12)
+    solutions = [_riccati(a, b, q, r, i, system) for i, (a, b) in enumerate(zip(system.A, system.B, strict=True))]
     traces = np.array([np.trace(p) for p in solutions])
     for i in np.argsort(-traces):
         p, b = solutions[i], system.B[i]
@@ -123,8 +133,8 @@ def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int,
     except (np.linalg.LinAlgError, ValueError):
         where = f" ({dict(system.corners[i])})" if system.corners else ""
         raise ValueError(
-            f"vertex {i}{where} has no stabilising Riccati solution: (A, B) is not stabilisable, or Q does not see an "
-            f"undamped mode; A = {a.tolist()}, B = {b.tolist()}"
+            f"vertex {i}{where} has no stabilising Riccati solution P > 0: (A, B) is not stabilisable, or Q is 0 and a "
+            f"mode does not grow; A = {a.tolist()}, B = {b.tolist()}"
         ) from None
     return p
 
@@ -138,7 +148,7 @@ def _solve_by_hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.nda
     n, push = len(a), b @ np.linalg.solve(r, b.T)
     # Scaling by `size` gives both off-diagonal blocks of the Hamiltonian matrix the same norm, for accurate
     # eigenvectors.
-    size = np.sqrt(np.linalg.norm(q) / np.linalg.norm(push)) if push.any() else 1.0
+    size = np.sqrt(np.linalg.norm(q) / np.linalg.norm(push)) if push.any() and q.any() else 1.0
     modes, vectors = np.linalg.eig(np.block([[a, -push * size], [-q / size, -a.T]]))
     stable = vectors[:, np.argsort(np.real(modes))[:n]]
     try:

@@ -117,12 +117,10 @@ struct Group {
   int why[LANES];                               // why a lane was lost
   Ending end;
   I elapsed = I(0.0), gone = I(0.0);  // the variable of integration up to this period, and in it
-  V reached = fill(0.0);
   // box_limit: 0.6 of the last length without a box; grows by 1 % a step. cross_step: longest step across a limit.
   // excess: greatest remainder of the step, in tolerances. about: approximate time or eta, for the choice of weights.
-  // across: attempts across a limit, and limits that ticks cross.
   double h_next = 0, about = 0, box_limit = NEVER, cross_step = NEVER, excess = 0;
-  long steps = 0, across = 0;
+  long steps = 0;
   bool begun = false;
 
   static std::vector<int> roots(const int32_t* a, long count) { return std::vector<int>(a, a + count); }
@@ -380,7 +378,6 @@ struct Group {
     if (!any(alive & ~doomed)) return ACCEPTED;
     if (!enclose(h)) return TOO_LONG;
     if (any(crossing & alive)) {
-      across++;
       if (h > 1.01 * cross_step) return TOO_LONG;  // up to a limit first, then across it in short steps
       mid.real_limits = whole.real_limits = false, fresh = false;
       mid.advance(flow, 0), whole.advance(flow, 0);
@@ -486,10 +483,10 @@ struct Group {
     int state = -1;
     for (int i = 0; i < n; i++) if (state_op[i] == g) state = i;
     if (state < 0) {
-      if (box.kind[g] < 2) return pick(whole.none[g], symmetric(fill(NEVER)), whole.value(g, 0));
+      if (box.kind[g] < 2) return pick(whole.none[g], symmetric(fill(INFINITY)), whole.value(g, 0));
       I smooth = whole.value(g, 0) + span(fill(0.0), fill(h)) * rest.value(g, 1), natural = box.value(g, 0);
       I both = pick(crossing | whole.none[g] | rest.none[g], natural, meet(smooth, natural));
-      return pick(box.none[g], symmetric(fill(NEVER)), both);
+      return pick(box.none[g], symmetric(fill(INFINITY)), both);
     }
     std::vector<I> coefs(order + 1);
     I extra = hull(I(0.0), remainder[state]) + hull(I(0.0), push[state]), range(0.0);
@@ -574,7 +571,7 @@ struct Group {
     for (int i : tick_limits) {
       tick_chords[i] = chord_over(at_tick.value(task.tape.a[i], 0), i, at_tick);
       delta[i] = tick_chords[i].delta;
-      if (any((delta[i] > 0) & alive)) across++, at_tick.seeds.push_back(i);
+      if (any((delta[i] > 0) & alive)) at_tick.seeds.push_back(i);
     }
     if (at_tick.seeds.size() > MOST_LIMITS) { lose(alive, NO_VALUE); return; }
     at_tick.real_limits = at_tick_mid.real_limits = false;
@@ -633,7 +630,6 @@ struct Group {
   // Whether all runs have ended, or are at the horizon. The margin reads only states that a tick does not change.
   void end_runs() {
     gone = I(0.0);
-    reached = alive ? time_now().low() : reached;
     load_set();
     look_at_margin();
     int m = (int)task.margin;
@@ -663,8 +659,8 @@ struct Group {
   void start(const double* cells, long count) {
     alive = mask(true), dead = done = timed = ended = doomed = M{};
     for (int& w : why) w = NOTHING;
-    end = Ending(np, nb), elapsed = I(0.0), reached = fill(0.0);
-    steps = across = 0, h_next = task.first, about = 0, box_limit = NEVER, begun = false;
+    end = Ending(np, nb), elapsed = I(0.0);
+    steps = 0, h_next = task.first, about = 0, box_limit = NEVER, begun = false;
     for (int p = 0; p < np; p++)
       for (int l = 0; l < LANES; l++) {
         const double* c = cells + 2 * np * (l < count ? l : count - 1) + 2 * p;
@@ -690,7 +686,7 @@ struct Group {
     for (int i = 0; i < n; i++) lose(at_tick.none[task.start[i]], NO_VALUE);
     if (task.nonnegative >= 0) lose(at_tick.value(task.start[task.nonnegative], 0).low() < 0, NEGATIVE);
     for (int q = 0; q < task.quadratures; q++) rows[q] = {at_tick.value(task.start[n + q], 0), std::vector<V>(np, fill(0.0)), fill(0.0)};
-    for (auto* every : {&top, &above, &below, &bottom}) for (auto& x : *every) x = fill(-NEVER);
+    for (auto* every : {&top, &above, &below, &bottom}) for (auto& x : *every) x = fill(-INFINITY);
     for (auto& x : reach) x = fill(0.0);
     load_set();
     look_at_margin();
@@ -734,8 +730,7 @@ struct Group {
     out[1] = stopped ? -T.n[lane] : 0, out[2] = stopped ? T.h[lane] : INFINITY;
     bool moved = stopped && task.travelled >= 0;
     out[3] = moved ? -W.n[lane] : task.travelled >= 0 ? 0 : -INFINITY, out[4] = moved ? W.h[lane] : INFINITY;
-    out[5] = reached[lane], out[6] = (double)steps, out[7] = (double)across;
-    double* signal = out + 8;
+    double* signal = out + 5;
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = fine ? -bottom[s][lane] : -INFINITY, signal[1] = fine ? top[s][lane] : INFINITY;
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = sound ? -below[s][lane] : INFINITY, signal[1] = sound ? above[s][lane] : -INFINITY;
     for (int p = 0; p < np; p++) *signal++ = reach[p][lane];
@@ -788,13 +783,13 @@ void apply(int code, long count, const double* a, const double* b, double* out) 
 }
 
 // Proves at most LANES cells, each params x (low, high), into `out`, a row of results for each (`Group::write`).
-// scout, if not null: for each period the speed or time, whether no limit is met, and the Jacobian of one run.
+// scout, if not null: for each period the speed or time, and the Jacobian of one run.
 // trail, if not null: for each step and each cell its time (low, high) and that of each signal; NaN once a cell is over.
 // Returns the number of rows in scout or trail, which have room for `room` rows.
 long prove(const Task* task, long count, const double* cells, double* out, double* scout, double* trail, long room) {
   Upward upward;
   std::feclearexcept(FE_ALL_EXCEPT);
-  const int nb = (int)task->kept, ns = (int)task->signals, width = 9 + 4 * ns + 3 * (int)task->tape.params;
+  const int nb = (int)task->kept, ns = (int)task->signals, width = 6 + 4 * ns + 3 * (int)task->tape.params;
   Group g(*task);
   long written = 0;
   auto follow = [&]() {
@@ -808,13 +803,10 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
   };
   auto report = [&]() {
     if (!scout || written >= room) return;
-    double* to = scout + written++ * (2 + nb * nb);
+    double* to = scout + written++ * (1 + nb * nb);
     to[0] = task->speed >= 0 ? g.X[task->speed].mid()[0] : g.about;
-    to[1] = 1;
-    for (int i : g.limits) to[1] = std::fmin(to[1], g.chords[i].lambda[0]);
-    for (int i : g.tick_limits) to[1] = std::fmin(to[1], g.tick_chords[i].lambda[0]);
     for (int i = 0; i < nb; i++)
-      for (int j = 0; j < nb; j++) to[2 + i * nb + j] = g.J[i * g.nd + g.np + j].mid()[0] / g.set.r[j][0];
+      for (int j = 0; j < nb; j++) to[1 + i * nb + j] = g.J[i * g.nd + g.np + j].mid()[0] / g.set.r[j][0];
   };
   g.start(cells, count);
   for (long number = 0; any(g.alive); number++) {

@@ -9,18 +9,18 @@ import functools
 import logging
 import os
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 from jax._src.xla_bridge import backends_are_initialized  # JAX has no public function that does not start the backends
 
 from diffabs.core.types import PyTree
-from diffabs.simulate.types import Run
 
+T = TypeVar("T")
 REQUESTABLE_ENGINES = ("auto", "xla", "kernel")
 ENGINE_VARIABLE = "DIFFABS_ENGINE"  # environment variable: the engine that "auto" stands for, "xla" or "kernel"
 log = logging.getLogger("diffabs")
-_refused: dict[Hashable, str] = {}  # reason against a kernel, by `describe_structure`
+_refused: dict[Hashable, str] = {}  # reason against a kernel, by `_describe_structure`
 _forked_process = 0  # id of the first process that forked while XLA's threads ran; 0 without one
 
 
@@ -74,12 +74,8 @@ def resolve_request(engine: str) -> str:
     return meant
 
 
-def describe_structure(given: PyTree) -> Hashable:
-    """Return what decides whether a kernel is possible: structure and shapes of the data, and the compiler asked for.
-
-    Args:
-        given: Data of the runs, a pytree.
-    """
+def _describe_structure(given: PyTree) -> Hashable:
+    """Return what decides whether a kernel is possible: structure and shapes of the data, and the asked compiler."""
     from diffabs.compiler.runtime.toolchain import COMPILER
 
     def describe(x: Any) -> Hashable:
@@ -93,13 +89,13 @@ def describe_structure(given: PyTree) -> Hashable:
 
 def run_with_engine(
     engine: str,
-    native: Callable[[], Run],
-    otherwise: Callable[[], Run],
+    native: Callable[[], T],
+    otherwise: Callable[[], T],
     given: PyTree,
     why_not: str = "",
     why_xla: str = "",
-) -> Run:
-    """Return the run of an engine; "auto" uses the kernel if possible, and otherwise XLA.
+) -> T:
+    """Return the result of an engine; "auto" uses the kernel if possible, and otherwise XLA.
 
     If a kernel is impossible, "auto" does not try again for data of the same structure: the trial takes longer than
     many a batch.
@@ -120,7 +116,7 @@ def run_with_engine(
     if engine == "auto" and (why_not or why_xla):
         log_own_choice(why_not or why_xla)
         return otherwise()
-    structure = describe_structure(given) if engine == "auto" else None
+    structure = _describe_structure(given) if engine == "auto" else None
     why_not = why_not or _refused.get(structure, "")
     if not why_not:
         # A local import: `import diffabs` must not need the kernel package.
@@ -155,24 +151,9 @@ def describe_engine(engine: str) -> dict[str, str]:
     return {"name": engine} | pipeline.describe_kernel_build()
 
 
-@functools.cache
-def log_xla_reason(why_not: str) -> None:
-    """Warn that "auto" takes XLA because a kernel is impossible, once for each reason.
-
-    Args:
-        why_not: Reason against a kernel.
-    """
-    log.warning("runs are made by XLA, not by a kernel: %s", why_not)
-
-
-@functools.cache
-def log_own_choice(why: str) -> None:
-    """Log that "auto" takes XLA because the call is of a kind that XLA serves, once for each reason.
-
-    Args:
-        why: Reason for XLA.
-    """
-    log.info("runs are made by XLA: %s", why)
+# Once for each reason: a kernel is impossible, or the call is of a kind that XLA serves.
+log_xla_reason = functools.cache(functools.partial(log.warning, "runs are made by XLA, not by a kernel: %s"))
+log_own_choice = functools.cache(functools.partial(log.info, "runs are made by XLA: %s"))
 
 
 @functools.cache

@@ -93,19 +93,6 @@ def run_with_trajectory(
     return jax.lax.fori_loop(0, count, segment, (carry, seen))
 
 
-def scan_to_end(step: Step, carry: Carry, room: int) -> Carry:
-    """Return the carry at the end of a run; for derivatives.
-
-    A run that needs more attempts than there is room for is still running in the result (`end_unfinished`).
-
-    Args:
-        step: Function from carry to carry: one attempt of a step.
-        carry: Carry at t = 0.
-        room: Capacity for attempts.
-    """
-    return repeat_step(step, carry, room, lambda carry: _any_running(carry.running))
-
-
 def scan_with_trajectory(
     step: Step,
     before: Callable[[Carry, PyTree], PyTree],
@@ -136,11 +123,8 @@ def scan_with_trajectory(
     def segment(carry: Carry, i: Int) -> tuple[Carry, PyTree]:
         until = (i + 1) * every
 
-        def on(carry: Carry) -> PyTree:
-            return _any_running(before(carry, until))
-
         def go_to_sample(carry: Carry) -> Carry:
-            return repeat_step(lambda carry: step(carry, until=until), carry, room, on)
+            return repeat_step(lambda carry: step(carry, until=until), carry, room, lambda carry: before(carry, until))
 
         # The scan has `instants` rounds, the run only `count`: the rest is skipped, not computed and discarded.
         carry = jax.lax.cond(i < count, go_to_sample, lambda carry: carry, carry)
@@ -149,18 +133,12 @@ def scan_with_trajectory(
     return jax.lax.scan(rematerialise(segment), carry, jnp.arange(instants))
 
 
-def _any_running(running: Bool) -> Bool:
-    """Return `any_lane(running)` without a derivative."""
-    return any_lane(jax.lax.stop_gradient(running))
-
-
 def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X], PyTree]) -> X:
     """Return the carry after groups of steps, with room for at least `capacity` steps.
 
-    A group is skipped where `on(carry)` is False. Within a group `on` is not asked: `step` must leave a run
-    that is over as it is. In a batch under `jax.vmap` groups are skipped only if `on` returns one value for all runs
-    (`any_lane`). Reverse mode keeps the carry of each step. Beyond `MAX_SAVED_CARRIES` steps it keeps the carry of each
-    group and computes the steps of a group again.
+    A group is skipped where `on(carry)` is False for all runs of the batch. Within a group `on` is not asked: `step`
+    must leave a run that is over as it is. Reverse mode keeps the carry of each step. Beyond `MAX_SAVED_CARRIES` steps
+    it keeps the carry of each group and computes the steps of a group again.
 
     Args:
         step: Function from carry to carry.
@@ -174,7 +152,8 @@ def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X
         return jax.lax.scan(rematerialise(lambda carry, _: (step(carry), None)), carry, length=inner)[0]
 
     def body(carry: X, _: object) -> tuple[X, None]:
-        return jax.lax.cond(on(carry), group, lambda carry: carry, carry), None
+        running = any_lane(jax.lax.stop_gradient(on(carry)))
+        return jax.lax.cond(running, group, lambda carry: carry, carry), None
 
     # Checkpoints on both levels: memory for the carries of the groups plus those of one group at a time.
     return jax.lax.scan(rematerialise(body) if capacity > MAX_SAVED_CARRIES else body, carry, length=outer)[0]

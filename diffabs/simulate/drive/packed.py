@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.first_order import first_order
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, replace
@@ -24,6 +25,7 @@ from diffabs.simulate.types import Run, Solver
 
 LANES_AT_ONCE = 512  # runs that step at a time: their state stays in a processor's cache
 STEPS_PER_EXCHANGE = 64  # steps between two exchanges of runs
+VALUES_ONLY = "together=False has no derivatives by XLA: leave it out, or take engine='kernel' for forward mode"
 
 
 class EarlyEnd(Protocol):
@@ -48,7 +50,7 @@ def run_packed(
     enough: EarlyEnd | None = None,
     numbers: Array | None = None,
 ) -> Run:
-    """Return the results of `measure` for runs that differ in their values and keys. Not for reverse mode.
+    """Return the results of `measure` for runs that differ in their values and keys. Not for derivatives.
 
     A run that is not accepted has diverged. A run that `enough` ends has no end flag.
 
@@ -63,12 +65,14 @@ def run_packed(
         numbers: Numbers by which `enough` knows the runs, shape (runs,); None for 0, 1, 2, ...
 
     Raises:
-        ValueError: `measure` rejects the arguments.
+        ValueError: `measure` rejects the arguments, or the runs are differentiated.
     """
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
     values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     values = {**values, **forbid_derivatives(loop, values)}
     numbers = jnp.arange(len(accepted)) if numbers is None else numbers
+    # Of the inputs themselves, not of tangents: so already their first derivative is an error.
+    loop, values, objectives = first_order((loop, values, objectives), VALUES_ONLY)
     return _run(loop, values, objectives, method, keys, accepted, enough, numbers, width=LANES_AT_ONCE)
 
 

@@ -180,6 +180,7 @@ class AdaptiveStepping:
     smooth: bool = False
     stable: bool = True
     tableau, has_margin_rates, second_order = TSIT5, True, False
+    step = advance
 
     @property
     def searches(self) -> bool:
@@ -205,13 +206,6 @@ class AdaptiveStepping:
         last = span_step(point, point) if self.keeps_last_step else ()
         control = AdaptiveControl(error_limited, limit, scale, zero, zero, last, zero, 1.0 + 0.0 * self.h, no, zero)
         return cast_floats(carry._replace(length=length, base=length, strikes=strikes, control=control), self.h.dtype)
-
-    def step(self, loop: Loop, objectives: Objectives, key: Key, carry: Carry, until: Scalar = None) -> Carry:
-        """Return the `carry` after one attempt of a step, as `advance` does.
-
-        The run pauses at the instant `until` of the grid. `loop`, `objectives` and `key` are those of `start`.
-        """
-        return advance(self, loop, objectives, key, carry, until)
 
     def renew(self, loop: Loop, carry: Carry) -> Carry:
         """Return the `carry` with a new stability limit of the `loop`, once in `ATTEMPTS_PER_RENEWAL` attempts."""
@@ -242,14 +236,6 @@ class AdaptiveStepping:
         inside = (t < now.t) & (last.flow.end > last.flow.start)
         t, state = select(inside, (t, last.at(t)), (now.t, borrow(now.state, None)))
         return observe(loop, t, state, carry.running | inside)
-
-    def with_trajectory(self) -> "AdaptiveStepping":
-        """Return the method for a run with a trajectory."""
-        return dataclasses.replace(self, keeps_last_step=True)
-
-    def without_trajectory(self) -> "AdaptiveStepping":
-        """Return the method for a run without a trajectory."""
-        return dataclasses.replace(self, keeps_last_step=False)
 
     def for_replay(self) -> "AdaptiveStepping":
         """Return the method for a run that is logged and then replayed with derivatives.

@@ -110,11 +110,6 @@ class Stepping(Protocol):
         ...
 
     @property
-    def steps(self) -> Int:
-        """Number of the last instant of the grid."""
-        ...
-
-    @property
     def tableau(self) -> Tableau:
         """Coefficients of its Runge-Kutta step."""
         ...

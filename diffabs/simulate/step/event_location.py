@@ -34,7 +34,7 @@ import jax.numpy as jnp
 from diffabs.core.lanes import select
 from diffabs.core.numerics import ratio
 from diffabs.core.types import AnyArray, Bool, Int, PyTree, Scalar
-from diffabs.simulate.step.modes import ComparisonAnswers, find_contradicted
+from diffabs.simulate.step.modes import ComparisonAnswers, SurfaceCrossing, find_contradicted
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import Evaluation
 
@@ -116,22 +116,6 @@ class AttemptCrossings(NamedTuple):
     another: Bool
 
 
-class SurfaceCrossing(NamedTuple):
-    """Contradicted comparisons at the end of a step: the numbers there give other answers than the mode of the step.
-
-    Attributes:
-        other: A contradicted comparison other than the sought one, or -1.
-        contradicted: True if the sought comparison is contradicted.
-        chosen: Number of the comparison to search for: the sought one if it is contradicted, else `other`.
-        margin: Margin of the chosen comparison.
-    """
-
-    other: Int
-    contradicted: Bool
-    chosen: Int
-    margin: Scalar
-
-
 class SearchPlan(NamedTuple):
     """A search, and the next attempt that it asks for.
 
@@ -166,15 +150,8 @@ def falls_through(before: list[PyTree], after: list[PyTree]) -> list[PyTree]:
     return [(a >= 0) & (b < 0) for a, b in zip(before, after, strict=True)]
 
 
-def find_event_crossings(which: Scalar, first: int, before: list[PyTree], after: list[PyTree]) -> AttemptCrossings:
-    """Return the crossings of events within an attempt.
-
-    Args:
-        which: Number of the sought margin.
-        first: Number of the first of these margins.
-        before: Margins at the beginning.
-        after: Margins at the end.
-    """
+def _find_event_crossings(which: Scalar, first: int, before: list[PyTree], after: list[PyTree]) -> AttemptCrossings:
+    """Return the crossings of events within an attempt."""
     crossed = falls_through(before, after)
     others = [one & (which != first + i) for i, one in enumerate(crossed)]
     triples = zip(others, before, after, strict=True)
@@ -194,7 +171,7 @@ def find_surface_crossing(seen: Evaluation, which: Scalar, like: Scalar) -> Surf
         like: A number with the type of the margin.
     """
     margins = [(one.numbers, one.value) for one in seen.surfaces]
-    return SurfaceCrossing(*find_contradicted(ComparisonAnswers(seen.words, seen.contradicted, margins), which, like))
+    return find_contradicted(ComparisonAnswers(seen.words, seen.contradicted, margins), which, like)
 
 
 def find_crossings(
@@ -209,7 +186,7 @@ def find_crossings(
         before: Margins of events at the beginning.
         after: Margins of events at the end.
     """
-    events = find_event_crossings(which, bit_count, before, after)
+    events = _find_event_crossings(which, bit_count, before, after)
     if surface is None:
         return events
     unknown, bends = jnp.full_like(surface.margin, jnp.inf), surface.other >= 0
@@ -232,12 +209,12 @@ def continue_search(
         refines: True if the event's time has second derivatives.
     """
     old, length, status = plan
-    search, next, near = bracket_event(old, length, status == RunStatus.RUNNING, crossings, base)
+    search, next, near = _bracket_event(old, length, status == RunStatus.RUNNING, crossings, base)
     seeking = SearchPlan(search, next, jnp.where(near, RunStatus.PROBING, RunStatus.SEEKING))
     # A step ends sqrt(eps) steps beyond a switching surface, so that the comparison has surely changed there.
     beyond = jnp.where(old.which < bit_count, base * jnp.finfo(base.dtype).eps ** OVERSHOOT_EXPONENT, 0.0)
-    search, next = locate_event(old, length, crossings, beyond)
-    next, missed = accept_location(search, length, next)
+    search, next = _locate_event(old, length, crossings, beyond)
+    next, missed = _accept_location(search, length, next)
     located = jnp.where(missed, RunStatus.SEEKING, RunStatus.REFINING if refines else RunStatus.LANDING)
     found = select(status == RunStatus.PROBING, SearchPlan(search, next, located), seeking)
     if refines:
@@ -246,19 +223,12 @@ def continue_search(
     return found._replace(status=found.status.astype(status.dtype))
 
 
-def bracket_event(
+def _bracket_event(
     search: EventSearch, x: Scalar, new: PyTree, crossings: AttemptCrossings, h: Scalar
 ) -> tuple[EventSearch, PyTree, PyTree]:
     """Return three values after an attempt: the search for the earliest event, the next length [s], and a flag.
 
     The flag is True if the next length is the probe: `x` is then near enough to the zero.
-
-    Args:
-        search: Search before the attempt.
-        x: Length of the attempt [s].
-        new: True if no search was active.
-        crossings: Crossings within the attempt.
-        h: Length of a regular step [s], the scale of the tolerances.
     """
     # The search works on values only: the derivative of the event's time comes from the final Newton step.
     x = jax.lax.stop_gradient(x)
@@ -295,19 +265,13 @@ def bracket_event(
     return search, jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier
 
 
-def locate_event(
+def _locate_event(
     search: EventSearch, x: Scalar, crossings: AttemptCrossings, beyond: Scalar
 ) -> tuple[EventSearch, PyTree]:
     """Return the search with the margin's slope, and the length of the step that ends on the zero, after the probe.
 
     The slope is that of the parabola through the place, the probe, and one end of the first attempt. This is the end on
     the same side. It is the other end if that one is uninformative and the margin is smooth up to there.
-
-    Args:
-        search: Search before the probe.
-        x: Length of the probe [s].
-        crossings: Crossings within the probe.
-        beyond: Time [s] to add to the length, so that the margin surely changes its sign.
     """
     x = jax.lax.stop_gradient(x)
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
@@ -358,16 +322,11 @@ def refine(search: EventSearch, x: Scalar, crossings: AttemptCrossings) -> Scala
     return x - (left - jax.lax.stop_gradient(left)) / jnp.where(search.fall < 0, search.fall, -1.0)
 
 
-def accept_location(search: EventSearch, x: Scalar, length: Scalar) -> tuple[PyTree, PyTree]:
+def _accept_location(search: EventSearch, x: Scalar, length: Scalar) -> tuple[PyTree, PyTree]:
     """Return the length to try after the probe, and True if the search continues from the middle of the bracket.
 
     It continues if the final step would end farther from `place` than the probe, or if the margin does not fall there.
     A margin can be almost flat and then fall suddenly.
-
-    Args:
-        search: Search after the probe.
-        x: Length of the probe [s].
-        length: Located length [s].
     """
     probe, off = jnp.abs(x - search.place), jnp.abs(length - search.place)
     missed = ((off > probe) | ((off == 0) & (search.margin != 0))) & (search.far - search.near > probe)

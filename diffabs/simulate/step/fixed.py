@@ -93,6 +93,7 @@ class FixedStepping:
     watches: bool = False
     smooth: bool = False
     tableau = RK4
+    step = advance
 
     @property
     def searches(self) -> bool:
@@ -110,13 +111,6 @@ class FixedStepping:
         carry = start_carry(self, loop, objectives, key, foresee)
         return cast_floats(carry._replace(control=FixedStepControl(carry.k, carry.k)), self.h.dtype)
 
-    def step(self, loop: Loop, objectives: Objectives, key: Key, carry: Carry, until: Scalar = None) -> Carry:
-        """Return the `carry` after one attempt of a step, as `advance` does.
-
-        The run pauses at the instant `until` of the grid. `loop`, `objectives` and `key` are those of `start`.
-        """
-        return advance(self, loop, objectives, key, carry, until)
-
     def renew(self, loop: Loop, carry: Carry) -> Carry:
         """Return the `carry` unchanged: fixed steps of a `loop` need no update between blocks."""
         del loop
@@ -130,10 +124,6 @@ class FixedStepping:
         """Return the signals of the `loop` at this `instant` of the grid, which the `carry` has reached."""
         del instant
         return observe(loop, carry.point.t, carry.point.state, carry.running)
-
-    def with_trajectory(self) -> "FixedStepping":
-        """Return the method for a run with a trajectory."""
-        return self
 
     def for_derivatives(self) -> "FixedStepping":
         """Return the method for derivatives: it locates switching surfaces unless `kinks` is False.

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Bool, Int, PyTree, Scalar
 
 WORD_BITS = 32  # answers in a word
 NO_BIT = -2  # number of no comparison; -1 is the number of a comparison that was not found
@@ -58,16 +58,28 @@ def single_bit(which: Scalar, words: int) -> ModeBits:
     return tuple(jnp.where(word == i, jnp.uint32(1) << place, jnp.uint32(0)) for i in range(words))
 
 
-def find_contradicted(answers: ComparisonAnswers, which: Scalar, like: PyTree) -> tuple[PyTree, PyTree, PyTree, PyTree]:
-    """Return which comparisons are contradicted: (other, crossed, chosen, margin).
+class SurfaceCrossing(NamedTuple):
+    """Contradicted comparisons at the end of a step: the numbers there give other answers than the mode of the step.
 
-    `other` is a contradicted comparison apart from `which`, or -1. `crossed` states whether `which` is contradicted.
-    `chosen` is `which` if it is contradicted or no other comparison is, and `other` otherwise. `margin` is the margin
-    of `chosen`. Comparisons are numbered by their bits.
+    Attributes:
+        other: A contradicted comparison other than the sought one, or -1.
+        contradicted: True if the sought comparison is contradicted.
+        chosen: Number of the comparison to search for: `other` if only that one is contradicted, else the sought one.
+        margin: Margin of the chosen comparison.
+    """
+
+    other: Int
+    contradicted: Bool
+    chosen: Int
+    margin: Scalar
+
+
+def find_contradicted(answers: ComparisonAnswers, which: Scalar, like: PyTree) -> SurfaceCrossing:
+    """Return which comparisons are contradicted. They are numbered by their bits.
 
     Args:
         answers: Answers and margins of an evaluation.
-        which: Number of a bit.
+        which: Number of the sought comparison.
         like: A number with the type of the margin.
     """
     other, crossed = jnp.asarray(-1, which.dtype), jnp.asarray(False)
@@ -85,7 +97,7 @@ def find_contradicted(answers: ComparisonAnswers, which: Scalar, like: PyTree) -
         if jnp.ndim(one):
             inside, one = jnp.any(inside), jnp.sum(jnp.where(inside, one, 0.0))
         margin = jnp.where(inside, one, margin)
-    return other, crossed, chosen, margin
+    return SurfaceCrossing(other, crossed, chosen, margin)
 
 
 class ComparisonTrace:
@@ -124,7 +136,7 @@ class ComparisonTrace:
             self._pack(self.said, first, says())
             self._add(first, shape, x - y)
             return says()
-        taken = unpack_answers(self.mode.words, first, shape)
+        taken = _unpack_answers(self.mode.words, first, shape)
         if not self.look:
             return taken if self.mode.free is None else jnp.where(self.mode.free, says(), taken)
         margin = jnp.where(taken, x - y, y - x)
@@ -132,7 +144,7 @@ class ComparisonTrace:
         if self.mode.released is not None:
             # A margin of exactly 0 (a product that has become 0) is no contradiction; without this line a released
             # answer would stay frozen for ever.
-            gives = unpack_answers(self.mode.released, first, shape)
+            gives = _unpack_answers(self.mode.released, first, shape)
             against |= gives & (margin == 0) & (says() != taken)
             taken ^= against & gives
         self._pack(self.against, first, against)
@@ -190,7 +202,7 @@ class ComparisonTrace:
         if not jnp.ndim(answer):
             words[first // WORD_BITS] |= jnp.where(answer, np.uint32(1 << first % WORD_BITS), np.uint32(0))
             return
-        for start, word, places in locate_bits(first, jnp.shape(answer)):
+        for start, word, places in _locate_bits(first, jnp.shape(answer)):
             here = jnp.ravel(answer)[start : start + len(places)]
             words[word] |= jnp.sum(jnp.where(here, np.uint32(1) << places, np.uint32(0)), dtype=jnp.uint32)
 
@@ -217,28 +229,18 @@ def _rounding_error(x: Scalar) -> Scalar:
     return most.eps**ROUNDING_POWER * jnp.minimum(jnp.abs(x), most.max)
 
 
-def unpack_answers(words: ModeBits, first: int, shape: tuple[int, ...]) -> Scalar:
-    """Return the answers of one comparison as booleans of the comparison's shape.
-
-    Args:
-        words: Packed answers.
-        first: Number of the comparison's first bit.
-        shape: Shape of the comparison.
-    """
+def _unpack_answers(words: ModeBits, first: int, shape: tuple[int, ...]) -> Scalar:
+    """Return the answers of one comparison as booleans of the comparison's shape."""
     if not shape:
         return (words[first // WORD_BITS] & np.uint32(1 << first % WORD_BITS)) != 0
-    parts = [(words[word] & (np.uint32(1) << places)) != 0 for _, word, places in locate_bits(first, shape)]
+    parts = [(words[word] & (np.uint32(1) << places)) != 0 for _, word, places in _locate_bits(first, shape)]
     return jnp.concatenate(parts).reshape(shape)
 
 
-def locate_bits(first: int, shape: tuple[int, ...]) -> list[tuple[int, int, np.ndarray]]:
+def _locate_bits(first: int, shape: tuple[int, ...]) -> list[tuple[int, int, np.ndarray]]:
     """Return the bits of a comparison word by word, as a list of (first element, word, bits).
 
     An entry holds the flat index of the first element in the word, the word's index, and the bits' places in it.
-
-    Args:
-        first: Number of the comparison's first bit.
-        shape: Shape of the comparison.
     """
     size, found, start = int(np.prod(shape)), [], 0
     while start < size:

@@ -16,7 +16,7 @@ Under XLA, both modes log the whole run and then replay it. Forward mode in a ke
 import dataclasses
 import math
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,10 +27,10 @@ from diffabs.core.loop import Loop, LoopState
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
 from diffabs.simulate.step.adaptive import AdaptiveStepping, StateSpan, clip_rtol, span_step
 from diffabs.simulate.step.advance import Carry, Decision, advance, cast_floats, start_carry
-from diffabs.simulate.step.attempt import Attempt, Point, StepRequest, mode_in_step
+from diffabs.simulate.step.attempt import Attempt, StepRequest, mode_in_step
 from diffabs.simulate.step.modes import ModeBits
-from diffabs.simulate.step.runge_kutta import Tableau
-from diffabs.simulate.step.status import RunStatus, is_running
+from diffabs.simulate.step.runge_kutta import TSIT5
+from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import ADAPTIVE_ERROR_ORDER, Adaptive
 
@@ -92,33 +92,17 @@ class ReplayStepping:
 
     Attributes:
         live: Stepping method of the logged run.
-        entry: Log entry of the attempt; None at the start.
+        entry: Log entry of the attempt, a `StepLog`; None at the start.
     """
 
     live: AdaptiveStepping
-    entry: StepLog | None = None
-    has_margin_rates, searches, smooth, second_order = True, False, False, False
-
-    @property
-    def tableau(self) -> Tableau:
-        """Coefficients of the Runge-Kutta step of the logged run."""
-        return self.live.tableau
+    entry: Any = None
+    tableau, has_margin_rates, searches, smooth, second_order = TSIT5, True, False, False, False
 
     @property
     def h(self) -> Scalar:
         """Step of the grid [s]."""
         return self.live.h
-
-    @property
-    def steps(self) -> Int:
-        """Number of the last instant of the grid."""
-        return self.live.steps
-
-    @property
-    def logged(self) -> StepLog:
-        """Log entry of the attempt."""
-        assert self.entry is not None
-        return self.entry
 
     def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a replay at t = 0, from `loop`, `objectives` and random `key`."""
@@ -139,10 +123,10 @@ class ReplayStepping:
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
         """Return True if the logged attempt was accepted; `carry` and `until` have no influence."""
         del carry, until
-        return self.logged.taken
+        return self.entry.taken
 
     def is_switched(self, loop: Loop) -> bool:
-        """Return True: the comparisons of the `loop`'s flow are visible."""
+        """Return True: the comparisons of the `loop`'s flow are always visible."""
         del loop
         return True
 
@@ -153,7 +137,7 @@ class ReplayStepping:
         An attempt that was not accepted becomes a step of length 0. It may have invalid numbers, which reverse mode in
         a batch would multiply by 0.
         """
-        one, k = self.logged, carry.k
+        one, k = self.entry, carry.k
         h = jnp.where(one.refresh | ~one.taken, 0.0, one.length - carry.control.delay)
         end = jnp.where(one.refresh, carry.point.t, one.t)
         words = select(one.refresh, one.next_words, one.words)
@@ -187,7 +171,7 @@ class ReplayStepping:
 
         `active` is True if it was accepted. The numbers of `carry` and `request` have no influence.
         """
-        one, no = self.logged, jnp.asarray(False)
+        one, no = self.entry, jnp.asarray(False)
         margins, tree = jax.tree.flatten(attempt.point.margins)
         triggered = tree.unflatten([one.triggered & (1 << i) != 0 for i in range(len(margins))])
         mode = mode_in_step(system, one.next_words, no)
@@ -199,24 +183,10 @@ class ReplayStepping:
         `carry` is the replay in `system` before the attempt, and `decision` the decision on it.
         """
         delay, last = carry.control
-        delay = jnp.where(decision.taken & ~self.logged.refresh, attempt.shift, delay)
+        delay = jnp.where(decision.taken & ~self.entry.refresh, attempt.shift, delay)
         if self.live.keeps_last_step:
             last = select(decision.taken, span_step(carry.point, attempt.point), last)
         return after._replace(control=ReplayControl(delay, last))
-
-
-class ReplayedRun(NamedTuple):
-    """A replayed run that is over, as `finish_run` expects it.
-
-    Attributes:
-        point: Point at the end.
-        status: Status of the run.
-    """
-
-    point: Point
-    status: Scalar
-
-    running = property(is_running)  # always False
 
 
 class LaggedReplay(NamedTuple):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.protocols import Memory, Objective, Sample, Segment, Shown
+from diffabs.core.protocols import Memory, Objective, Segment, Shown
 from diffabs.core.types import PyTree, Scalar
 from diffabs.simulate.step.comparisons import SwitchedProgram
 from diffabs.simulate.step.modes import ComparisonAnswers, Mode, ModeBits
@@ -211,17 +211,6 @@ def _find_asked_rates(
     return "sample" if "sample" in asked else "shown" if asked else ""
 
 
-def accumulator_rates(objectives: Objectives, accumulators: Accumulators, sample: Sample) -> dict[str, PyTree]:
-    """Return the rates of the objectives' integrals, by name.
-
-    Args:
-        objectives: Objectives by name.
-        accumulators: Accumulators of the objectives.
-        sample: Sample of the signals.
-    """
-    return {name: one.flow(accumulators[name], sample) for name, one in objectives.items()}
-
-
 def split_flow_and_held(state: LoopState, accumulators: Accumulators) -> tuple[PyTree, PyTree]:
     """Return the integrated part of loop and objectives, and the part that is constant between two instants.
 
@@ -254,7 +243,8 @@ def _evaluate_loop(moving: PyTree, fixed: PyTree) -> LoopEvaluation:
     signals = loop.signals(t, state)
     rate = loop.flow(t, state, signals)
     margins = loop.margins(t, state, signals, lambda: rate)
-    return LoopEvaluation(rate, accumulator_rates(objectives, accumulators, signals.sample), signals, margins)
+    accumulator_rates = {name: one.flow(accumulators[name], signals.sample) for name, one in objectives.items()}
+    return LoopEvaluation(rate, accumulator_rates, signals, margins)
 
 
 @jax.jit  # traced and differentiated once for all stages of a step

@@ -233,7 +233,12 @@ def quantile(values: PyTree, level: float, *, confidence: float = 0.95) -> Inter
     Raises:
         ValueError: The level is outside (0, 1), there are no samples, or a value is not finite.
     """
-    return _quantile(np.sort(as_column(values)), level, confidence)
+    ordered, top = np.sort(as_column(values)), upper_level(confidence)
+    if not 0 < level < 1:
+        raise ValueError(f"level = {level:g} is outside (0, 1)")
+    n = len(ordered)
+    r, s = int(stats.binom.ppf(1 - top, n, level)), int(stats.binom.isf(1 - top, n, level)) + 1
+    return quantile_between(ordered, level, r, s, confidence)
 
 
 def quantile_between(ordered: np.ndarray, level: float, low: int, high: int, confidence: float) -> IntervalEstimate:
@@ -274,40 +279,7 @@ def cvar(
     Raises:
         ValueError: The level is outside [0, 1), there are too few replicates, or a value is not finite.
     """
-    return _cvar(np.sort(as_column(values)), level, confidence, replicates, seed)
-
-
-def summarise_column(
-    values: PyTree, confidence: float = 0.95, levels: Sequence[float] = (0.05, 0.5, 0.95), tail: float = 0.95
-) -> dict[str, IntervalEstimate]:
-    """Return each estimate by its name: `mean`, `deviation`, `quantile 0.05` and so on, and `cvar 0.95`.
-
-    Args:
-        values: Samples, shape (n,).
-        confidence: Confidence, in (0, 1).
-        levels: Levels of the quantiles, in (0, 1).
-        tail: Level of CVaR, in [0, 1).
-
-    Raises:
-        ValueError: There are fewer than four values, or one is not finite.
-    """
-    ordered = np.sort(as_column(values, least=4))
-    moments = Moments.of(ordered)
-    found = {"mean": moments.mean(confidence=confidence), "deviation": moments.deviation(confidence=confidence)}
-    found |= {f"quantile {level:g}": _quantile(ordered, level, confidence) for level in levels}
-    found[f"cvar {tail:g}"] = _cvar(ordered, tail, confidence, BOOTSTRAP_REPLICATES, 0)
-    return found
-
-
-def _quantile(ordered: np.ndarray, level: float, confidence: float) -> IntervalEstimate:
-    if not 0 < level < 1:
-        raise ValueError(f"level = {level:g} is outside (0, 1)")
-    n, top = len(ordered), upper_level(confidence)
-    r, s = int(stats.binom.ppf(1 - top, n, level)), int(stats.binom.isf(1 - top, n, level)) + 1
-    return quantile_between(ordered, level, r, s, confidence)
-
-
-def _cvar(ordered: np.ndarray, level: float, confidence: float, replicates: int, seed: int) -> IntervalEstimate:
+    ordered = np.sort(as_column(values))
     if not 0 <= level < 1:
         raise ValueError(f"level = {level:g} is outside [0, 1)")
     n, place = len(ordered), percentile_index(replicates, confidence)
@@ -329,6 +301,28 @@ def _cvar(ordered: np.ndarray, level: float, confidence: float, replicates: int,
     plain = np.sort(found[:, 0])[[place, -1 - place]]
     low, high = np.where(np.isfinite(ends) & (error > 0), ends, plain)
     return IntervalEstimate(float(value), float(low), float(high), confidence, n)
+
+
+def summarise_column(
+    values: PyTree, confidence: float = 0.95, levels: Sequence[float] = (0.05, 0.5, 0.95), tail: float = 0.95
+) -> dict[str, IntervalEstimate]:
+    """Return each estimate by its name: `mean`, `deviation`, `quantile 0.05` and so on, and `cvar 0.95`.
+
+    Args:
+        values: Samples, shape (n,).
+        confidence: Confidence, in (0, 1).
+        levels: Levels of the quantiles, in (0, 1).
+        tail: Level of CVaR, in [0, 1).
+
+    Raises:
+        ValueError: There are fewer than four values, or one is not finite.
+    """
+    ordered = np.sort(as_column(values, least=4))
+    moments = Moments.of(ordered)
+    found = {"mean": moments.mean(confidence=confidence), "deviation": moments.deviation(confidence=confidence)}
+    found |= {f"quantile {level:g}": quantile(ordered, level, confidence=confidence) for level in levels}
+    found[f"cvar {tail:g}"] = cvar(ordered, tail, confidence=confidence)
+    return found
 
 
 def _tail_means(tail: np.ndarray, weights: np.ndarray, share: float, n: int) -> np.ndarray:

@@ -104,7 +104,14 @@ class Replicates:
             ValueError: The level is outside (0, 1), there are no samples, or a value is not finite.
         """
         x = as_column(values)
-        return self._quantile(x, np.sort(x), level)
+        ordered = np.sort(x)
+        if not 0 < level < 1:
+            raise ValueError(f"level = {level:g} is outside (0, 1)")
+        n, value = len(x), np.quantile(ordered, level)
+        # Of equal values, the lower end needs the share below them, the upper end the share up to them.
+        below, above = (self._half_width(mask.astype(float)) for mask in (x < value, x <= value))
+        low, high = max(n * (level - below), 0.0), min(n * (level + above), float(n))
+        return quantile_between(ordered, level, math.floor(low), math.ceil(high) + 1, self.confidence)
 
     def cvar(self, values: PyTree, level: float) -> IntervalEstimate:
         """Return the mean of the largest fraction 1 - level of the samples; the sample at the edge counts in part.
@@ -119,7 +126,12 @@ class Replicates:
             ValueError: The level is outside [0, 1), there are no samples, or a value is not finite.
         """
         x = as_column(values)
-        return self._cvar(x, np.sort(x), level)
+        if not 0 <= level < 1:
+            raise ValueError(f"level = {level:g} is outside [0, 1)")
+        share = round(len(x) * (1 - level), 9)
+        edge = np.sort(x)[max(math.ceil(len(x) * level) - 1, 0)]
+        found = self.mean(edge + np.maximum(x - edge, 0.0) / (1 - level))
+        return found if share >= MIN_TAIL_SAMPLES else found._replace(low=-math.inf, high=math.inf)
 
     def summarise_column(self, values: PyTree, levels: Sequence[float], tail: float) -> dict[str, IntervalEstimate]:
         """Return each estimate by its name: `mean`, `quantile 0.05` and so on, and `cvar 0.95`.
@@ -132,12 +144,9 @@ class Replicates:
         Raises:
             ValueError: A level is outside its range, there are no samples, or a value is not finite.
         """
-        x = as_column(values)
-        ordered = np.sort(x)
-        found = {"mean": self.mean(x)}
-        found |= {f"quantile {level:g}": self._quantile(x, ordered, level) for level in levels}
-        found[f"cvar {tail:g}"] = self._cvar(x, ordered, tail)
-        return found
+        found = {"mean": self.mean(values)}
+        found |= {f"quantile {level:g}": self.quantile(values, level) for level in levels}
+        return found | {f"cvar {tail:g}": self.cvar(values, tail)}
 
     def _half_width(self, x: np.ndarray) -> float:
         """Return t e(x), or infinity if a replicate has no sample."""
@@ -147,20 +156,3 @@ class Replicates:
         shares = np.bincount(self.places, minlength=self.count) / len(x)
         error = math.sqrt(np.square(sums).sum() / (1 - np.square(shares).sum()))
         return float(stats.t.ppf(upper_level(self.confidence), self.count - 1)) * error
-
-    def _quantile(self, x: np.ndarray, ordered: np.ndarray, level: float) -> IntervalEstimate:
-        if not 0 < level < 1:
-            raise ValueError(f"level = {level:g} is outside (0, 1)")
-        n, value = len(x), np.quantile(ordered, level)
-        # Of equal values, the lower end needs the share below them, the upper end the share up to them.
-        below, above = (self._half_width(mask.astype(float)) for mask in (x < value, x <= value))
-        low, high = max(n * (level - below), 0.0), min(n * (level + above), float(n))
-        return quantile_between(ordered, level, math.floor(low), math.ceil(high) + 1, self.confidence)
-
-    def _cvar(self, x: np.ndarray, ordered: np.ndarray, level: float) -> IntervalEstimate:
-        if not 0 <= level < 1:
-            raise ValueError(f"level = {level:g} is outside [0, 1)")
-        share = round(len(x) * (1 - level), 9)
-        edge = ordered[max(math.ceil(len(x) * level) - 1, 0)]
-        found = self.mean(edge + np.maximum(x - edge, 0.0) / (1 - level))
-        return found if share >= MIN_TAIL_SAMPLES else found._replace(low=-math.inf, high=math.inf)
