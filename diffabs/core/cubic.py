@@ -84,8 +84,8 @@ class Cubic(NamedTuple):
         """Return the greatest value of p in [0, 1], if p rises at the start and falls at the end; else the greater end.
 
         Another maximum is an artefact of a step that ends beyond a bend of the quantity, such as the end of a limit.
-        Its derivative is the derivative of p at the place of the extremum. A Newton step moves that place; its effect
-        on the value is of second order.
+        The derivative of the result is that of p at the place of the maximum. A Newton step moves that place, which
+        changes the value in second order.
         """
         c1, c2, c3 = jax.lax.stop_gradient(self.coefficients())
         inside = (self.start_slope > 0) & (self.end_slope < 0)
