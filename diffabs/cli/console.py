@@ -34,6 +34,7 @@ FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, interrupt.INTERRUPTED, interr
 SILENCE_S, SECOND_INTERRUPT_S = progress.SILENCE_S, progress.REPEAT_S
 AWAKE = 0.1  # s between two checks for Ctrl-C
 LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
+CONTINUED = " \\"  # end of a shell's line that continues on the next
 WORKER = "diffabs worker"
 EXTRAS = {
     "sweep": ("filelock", "pyarrow", "scipy", "zarr"),
@@ -160,13 +161,24 @@ def say(line: str) -> None:
 
 
 def say_command(line: str, words: Sequence[str]) -> None:
-    """Write a line that ends in a command, even if quiet. A terminal wraps it itself: it is copied as one line.
+    """Write a line that ends in a command; a narrow terminal gets the command on lines of its own, to copy.
 
     Args:
         line: Text before the command.
         words: Words of the command, which are quoted for a shell.
     """
-    _write(f"{line} {shlex.join(words)}")
+    width, command = _terminal_width(), [shlex.quote(word) for word in words]
+    if width is None or len(" ".join([line, *command])) <= width:
+        say(" ".join([line, *command]))
+        return
+    say(line)
+    rows = [command[0]]
+    for word in command[1:]:
+        if len(rows[-1]) + len(word) + len(" ") + len(CONTINUED) <= width:
+            rows[-1] += f" {word}"
+        else:
+            rows.append(f"    {word}")
+    _write(f"{CONTINUED}\n".join(rows))
 
 
 def _write(text: str) -> None:

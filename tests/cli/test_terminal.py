@@ -306,7 +306,6 @@ def test_a_table_that_fits_is_as_it_was():
     assert printed(*tables.fit_table(table, COLUMNS)) == printed(table)
 
 
-@killed_by("cli/console.py", "shlex.join(words)", "' '.join(words)")
 def test_lines_fold_between_words_and_commands_stay_whole(monkeypatch, capsys):
     replace_seam(monkeypatch, "terminal_width", lambda: 40)
     line = "error: a line that is far too long for such a narrow terminal, controller.controller.gain"
@@ -316,6 +315,7 @@ def test_lines_fold_between_words_and_commands_stay_whole(monkeypatch, capsys):
     assert told.split() == line.split()
     command = ["diffabs", "sweep", "slip-lmi", "--set", "title=a b", "--samples", "100000", "--resume"]
     console.say_command("continue with:", command)
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert shlex.split(told.removeprefix("continue with: ")) == command
+    head, *rest = capsys.readouterr().err.splitlines()
+    assert head == "continue with:"
+    assert max(map(len, rest)) <= 40
+    assert shlex.split("\n".join(rest).replace("\\\n", " ")) == command  # as a shell joins them
