@@ -1,7 +1,8 @@
 """Pure delay: control(t) = command(t - time), and 0 until the first command arrives.
 
-The delay stores one `Piece` for each past step, of any length: the times of both ends and a cubic Hermite polynomial of
-the command. The polynomial interpolates value and rate at both ends, so a smooth command keeps the order of the method.
+The delay stores one `Piece` for each past step, of any length. A piece has the times of both ends and a cubic Hermite
+polynomial of the command. The polynomial interpolates value and rate at both ends, so a smooth command keeps the order
+of the method.
 
 The command breaks where value or rate at the end of one piece differ from those at the start of the next. A step of the
 integration ends where the break leaves the delay. The time of this event carries the tangents of the break's entry time

@@ -107,7 +107,7 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
 
 
 def _follow_speed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoop", PyTree, Box]:
-    """Return the linear model and its box; for a gain that follows the speed, the model in which it is one gain.
+    """Return the linear model and its box. A gain that follows the speed gets the model in which it is constant.
 
     A proof for that model covers every fall of the speed that friction and resistances allow.
     """

@@ -42,8 +42,8 @@ def compile_scenario(
     """Show the program of a kernel after each pass.
 
     Without --show it shows the number of operations after each pass, of values and of tangents. --show prints the
-    program of values; with --by, the one with tangents. Only the pass jvp always has tangents. Without --by, the
-    tangents are by the first tunable parameter of the plant."""
+    program of values. With --by it prints the one with tangents. Only the pass jvp always has tangents. Without --by,
+    the tangents are by the first tunable parameter of the plant."""
     with console.end_on_errors():
         if name is not None and name not in PASSES:
             raise unknown_name_error(f"--show {name} is unknown", name, PASSES)

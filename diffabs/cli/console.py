@@ -219,8 +219,8 @@ def is_animated() -> bool:
 def end_on_errors() -> Iterator[None]:
     """End a command with one line and an exit status for expected errors in the `with` block.
 
-    Expected are bad input, an engine that cannot make the runs, errors of the system such as a full disk, lack of
-    memory, and Ctrl-C. Parts from outside that raise or exit are expected, too.
+    Expected are bad input, an engine that cannot make the runs, and Ctrl-C. So are errors of the system, such as a full
+    disk or lack of memory. Parts from outside that raise or exit are expected, too.
 
     Raises:
         typer.Exit: One of these errors occurred.

@@ -349,7 +349,7 @@ def _eq(graph: Graph, x: Node, y: Node) -> Node | None:
 
 
 def _bounded_integer(value: float, dtype: np.dtype) -> int:
-    """Return a real number as an integer, as XLA does: NaN is 0, and the ends of the type's range bound the others."""
+    """Return a real number as an integer, as XLA does. NaN is 0, and the ends of the type's range bound the others."""
     ends = np.iinfo(dtype)
     if math.isnan(value):
         return 0

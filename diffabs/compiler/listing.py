@@ -3,8 +3,8 @@
     v7 = mul c0.0, u1.0     f64, step
     c0.0 <- v7
 
-u1.0 is entry 0 of the uniform array 1, l0.2 entry 2 of the lane's array 0, and c0.0 entry 0 of the carry's array 0. The
-last word says how often the operation is computed: once a launch (uniform), once a lane, or in each step. Numbers
+u1.0 is entry 0 of the uniform array 1. l0.2 is entry 2 of the lane's array 0, and c0.0 entry 0 of the carry's array 0.
+The last word says how often the operation is computed: once a launch (uniform), once a lane, or in each step. Numbers
 that a function writes into the carry have an arrow. `select` and `gate` have the operands condition, value if false,
 value if true.
 """

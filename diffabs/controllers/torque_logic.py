@@ -21,7 +21,7 @@ analysis of limit cycles in hybrid anti-lock braking systems, Int. J. Control 82
     u' = growth u  for slip < slip_low,   u' = -decay u  for slip > slip_high,   else u' = 0
 
 At torque_max the growth stops. Inside a `sampled` controller of period T, one sample multiplies u by 1 + growth T or by
-1 - decay T, which must be positive: decay T < 1. The usual programs with this rule do so.
+1 - decay T. Both must be positive: decay T < 1. The usual programs with this rule do so.
 """
 
 from collections.abc import Iterator

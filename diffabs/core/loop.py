@@ -182,7 +182,7 @@ class Loop:
 
         Each block, in the order of the signal, has its events, records the step that ends here, and has its tick. An
         event also occurs if the change of an earlier block makes a margin negative. The test covers both ends of the
-        signal's jump, with the jump as the rate, so that the margin of a maximum sees the fall.
+        signal's jump, with the jump as the rate. So the margin of a maximum sees the fall.
 
         Args:
             clock: The instant.

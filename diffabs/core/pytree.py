@@ -341,7 +341,7 @@ def arrays(part: T) -> T:
 def stack_lists(part: T) -> T:
     """Return the part with arrays in place of parameters that are lists or tuples; other values stay.
 
-    A list of plain numbers becomes a NumPy array, which leaves the data type of a run to the JAX arrays among the
+    A list of plain numbers becomes a NumPy array. It leaves the data type of a run to the JAX arrays among the
     parameters.
 
     Args:

@@ -25,7 +25,7 @@ class Traces:
     """Measured signals over time.
 
     The simulated signals are those behind the loop's sensor. They are interpolated linearly between the instants that
-    the solver keeps (`solver.every`). A run that ends before its data stays at its last sample: without the rest, an
+    the solver keeps (`solver.every`). A run that ends before its data stays at its last sample. Without the rest, an
     early end would lower the cost. If the loop's stop ends a run that is not at rest, cut longer data with `until`.
 
     Attributes:

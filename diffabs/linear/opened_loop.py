@@ -308,8 +308,8 @@ class _Surroundings:
 def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: Scalar) -> Matrix:
     """Return three things of the controller, at rest with the command that holds the plant.
 
-    They are: (A, B, C, D) from its signal to its command; the function (signal, memory) -> (rate or next memory,
-    command); and the memory at rest.
+    They are (A, B, C, D) from its signal to its command, a function, and the memory at rest. The function maps (signal,
+    memory) to (rate or next memory, command).
     """
     controller, memory = loop.controller, loop.start().controller
     sampled = isinstance(controller, Sampled)

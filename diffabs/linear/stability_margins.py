@@ -313,8 +313,8 @@ def _complementary_sensitivity(values: np.ndarray) -> np.ndarray:
 
 
 def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places where a function changes its sign between neighbours of a grid, bisected to rounding; and
-    whether it falls there. Zero counts as negative.
+    """Return the places where a function changes its sign between neighbours of a grid, and whether it falls there.
+    Places are bisected to rounding. Zero counts as negative.
     """
 
     def sign(w: np.ndarray) -> np.ndarray:

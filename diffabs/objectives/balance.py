@@ -94,8 +94,8 @@ class PeakArmAngle(HeldValue):
 def _greatest_size(size: Scalar) -> tuple[PyTree, PyTree]:
     """Return start and update of the greatest size(sample).
 
-    The search covers both ends of every step. It covers the inside only of a smooth step, in which no limit is reached:
-    otherwise the cubic may leave the limits.
+    The search covers both ends of every step. It covers the inside only of a smooth step, in which no limit is reached.
+    Otherwise the cubic may leave the limits.
     """
 
     def start(self: Part, sample: Sample) -> Memory:

@@ -77,7 +77,8 @@ def tracking_error(sample: Sample) -> Scalar:
 
 
 def absolute_integral(cubic: Cubic, integral: Callable[[PyTree], PyTree]) -> Scalar:
-    """Return the integral of |p|, or of |p| times a positive weight, over [0, 1]; p changes its sign at most once.
+    """Return the integral of |p|, or of |p| times a positive weight, over [0, 1]. The cubic p changes its sign at most
+    once.
 
     Args:
         cubic: The cubic p; its sign changes if p(0) and p(1) differ in sign.

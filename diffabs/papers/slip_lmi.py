@@ -1,8 +1,8 @@
 """Maeda and Sugiura, robust LQ control of an anti-lock brake in polytopic form: sections 4 and 5, figures 4-7.
 
-The mirrored rig brakes from 50 to 5 km/h under u = tau* + K x with the published gain, at 5.3 and 6.2 kg. The paper
-states its result only in words: the slip overshoots and then follows 0.2. The numbers are therefore compared with an
-independent solution.
+The mirrored rig brakes from 50 to 5 km/h under u = tau* + K x. The gain is the published one, the masses are 5.3 and
+6.2 kg. The paper states its result only in words: the slip overshoots and then follows 0.2. The numbers are therefore
+compared with an independent solution.
 """
 
 import dataclasses

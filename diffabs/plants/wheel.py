@@ -97,7 +97,7 @@ class BrakedWheel:
         the controller is not at a limit. Other slips cover the friction curve, which is steepest near 0.
 
         Under a stop without a speed, such as `NoStop`, a run may last to standstill. The least speed is then the
-        plant's crawl speed: the slip's denominator, and with it the stiffness, is the same at all lower speeds.
+        plant's crawl speed. The slip's denominator, and with it the stiffness, is the same at all lower speeds.
         """
         near = jnp.concatenate([setpoint - jnp.array(PROBED_OFFSETS), setpoint + jnp.array(PROBED_OFFSETS)])
         slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(PROBED_SLIPS)])

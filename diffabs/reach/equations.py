@@ -614,7 +614,7 @@ class _Derivation:
         return self.make(name, tuple(args)) if truths == [None, None] else args[truths[0] is not None]
 
     def division(self, x: int, y: int) -> int:
-        """Return x/y; k u/(u + c) becomes k (1 - c/(u + c)), in which u occurs once: the slopes then do not cancel."""
+        """Return x/y; k u/(u + c) becomes k (1 - c/(u + c)), in which u occurs once. The slopes then do not cancel."""
         inverse, below = self.make("inv", (y,)), self.operations[y]
         above = self.operations[x]
         if below.name == "add":
@@ -790,7 +790,7 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
     included.
 
     A wrong rational function agrees at a random point with a probability of nearly 0. A function with branches, such as
-    max(v, 0.01), is wrong between two thresholds: it passes only if no point lies between them.
+    max(v, 0.01), is wrong between two thresholds. It passes only if no point lies between them.
 
     Args:
         loop: Closed loop of a braked wheel.

@@ -55,7 +55,7 @@ def failure_probability(
 ) -> RareEvent:
     """Return an estimate of P[metric > bound] over the space of a study, with runs on the study's engine.
 
-    The engine "auto" becomes a kernel where one can make the runs; the log says once why XLA makes them, if it does.
+    The engine "auto" becomes a kernel where one can make the runs. The log says once why XLA makes them, if it does.
     The study's design and its number of samples have no influence; its seed determines the sensor noise only. Runs that
     diverge do not count as failures; the result reports their number.
 

@@ -100,7 +100,7 @@ class DriftingSpeed:
 
         v_seen = (1 + e) v,   e = last + (first - last) exp(-t/T),   slip = (v_seen - w)/max(v_seen, floor)
 
-    At a measured slip s, the wheel slips by s - e (1 - s): an error e < 0 hides slip.
+    At a measured slip s, the wheel slips by s - e (1 - s). An error e < 0 hides slip.
 
     Attributes:
         first: Relative error at t = 0 [1], > -1.

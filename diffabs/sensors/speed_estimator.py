@@ -18,7 +18,7 @@ state of the filter: in the first milliseconds of braking it cannot be distingui
 
 **False slip of a rolling wheel.** If the measured deceleration has a bias b < 0, v_seen - v grows by |b| t. A
 controller that holds the estimated slip at s* sets the wheel speed to w = (1 - s*) v_seen. Once v_seen is v/(1 - s*),
-this is w = v: the wheel rolls, its estimated slip is s*, and the controller releases the brake. Then nothing slows the
+this is w = v. The wheel rolls, its estimated slip is s*, and the controller releases the brake. Then nothing slows the
 car, the estimated slip does not end, and the gate never opens. Real slip causes a force, which tells the two cases
 apart. A wheel slower than the car, locked or not, decelerates it by mu(s) g (twice this on the mirrored rig). The
 accelerometer shows exactly this, also on a slope:

@@ -89,8 +89,8 @@ def check(part: T, solver: Solver | None = None) -> T:
 def find_impossible_values(loop: Loop, step: float) -> list[str]:
     """Return one line for each value of a loop that no run may have; an empty list if all are allowed.
 
-    Three groups are checked in order: ranges and rules of the parts, the start against the stop, the parts against the
-    step. The lines are those of the first group with a fault.
+    Three groups are checked in order. They are ranges and rules of the parts, the start against the stop, and the parts
+    against the step. The lines are those of the first group with a fault.
 
     Args:
         loop: Closed loop with concrete parameters.

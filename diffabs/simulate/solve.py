@@ -482,7 +482,7 @@ def solve(
 ) -> Solution:
     """Solve dy/dt = field(t, y, args) from t0 to t1, with events.
 
-    Every comparison in the field that depends on t or y is a switch: steps end where it changes, so that values keep
+    Every comparison in the field that depends on t or y is a switch. Steps end where it changes, so that values keep
     the order of the method, and derivatives are right. `switches` lists them. The function works under `jax.jit`,
     `jax.vmap` and both modes of differentiation, by y0, t0, t1, args, `save` and all values that the functions close
     over. It is compiled again where a constant of a function has changed, so pass parameters by `args`.

@@ -231,8 +231,8 @@ def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
 
     A point is the loop with another start. The plant's `probes` returns starts where the loop may be stiffest.
 
-    Without `probes` there are four points: the start and a start of zero, each with the loop's reference and with a
-    target equal to the plant's signal (`_AtTarget`).
+    Without `probes` there are four points. They are the start and a start of zero, each with the loop's reference and
+    with a target equal to the plant's signal (`_AtTarget`).
     """
     probes = getattr(loop.plant, "probes", None)
     if probes:

@@ -1,6 +1,6 @@
 """Computation of chunks by the workers of a Dask cluster, started on this machine or already running.
 
-A worker compiles a study once and computes one chunk at a time on one device; start one worker for each device. Chunks
+A worker compiles a study once and computes one chunk at a time on one device. Start one worker for each device. Chunks
 return as the bytes of their files. So workers need no common disk, and only this process writes. If a worker dies,
 another one gets its chunk.
 

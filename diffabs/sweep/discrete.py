@@ -66,7 +66,8 @@ class _Weighted(_Discrete):
         raise NotImplementedError
 
     def index(self, u: ArrayLike) -> np.ndarray:
-        """Return the index of the item at u: the smallest k with u < F(k); at u = 1 the last with a positive weight.
+        """Return the index of the item at u. It is the smallest k with u < F(k), at u = 1 the last with a positive
+        weight.
 
         F(k) is the weight of the items 0 to k over the weight of all.
         """

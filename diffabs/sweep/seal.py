@@ -1,8 +1,8 @@
 """Detection of chunks that are damaged, exchanged, or from another sweep.
 
-The file name of a chunk contains the first 16 digits of the SHA-256 of its bytes, which detects any changed bit. The
-file contains, as key-value metadata of Parquet (DuckDB: `parquet_kv_metadata`), its number, the seed, and its owner.
-The owner is a digest of everything in the manifest that decides the numbers. A reader compares all of these, and the
+The file name of a chunk contains the first 16 digits of the SHA-256 of its bytes. They detect any changed bit. The file
+contains, as key-value metadata of Parquet (DuckDB: `parquet_kv_metadata`), its number, the seed, and its owner. The
+owner is a digest of everything in the manifest that decides the numbers. A reader compares all of these, and the
 samples.
 """
 

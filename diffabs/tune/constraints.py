@@ -56,7 +56,7 @@ class Poles:
     Every pole s satisfies -Re s >= decay and -Re s >= damping |s|. In discrete time, s = ln(z)/period.
 
     The closed loop uses the feedback gain of the loop's controller on the states of the polytope. The polytope is
-    fixed: the constraint does not see free parameters that change the model, such as a lag or a filter's cutoff. The
+    fixed. The constraint does not see free parameters that change the model, such as a lag or a filter's cutoff. The
     derivative is undefined where poles coincide; the search rejects a step to such a point.
 
     Attributes:

@@ -9,7 +9,7 @@ ascents again, without derivatives, and the result has only metrics of such plai
 In a box of more than six numbers, the corners have every combination of the ends of the first six. Every further number
 is at its low end in half of these corners, in random order, and at its high end in the others.
 
-The method is local: a run that exceeds a bound is a counterexample, but the worst case found depends on the starts. The
+The method is local. A run that exceeds a bound is a counterexample, but the worst case found depends on the starts. The
 worst case is often a corner; a run of all corners then finds it without a gradient. `WorstCase.report` states how the
 search found the worst case, and whether a certificate covers the box.
 """

@@ -1,8 +1,8 @@
 """Vertex elimination: the tangents that a program computes, chosen for few operations.
 
-A chain of linear operations on a tangent equals one product with the product of the factors, which is the same in all
-tangent directions. A vertex is eliminated if all directions together then need no more operations than before. The
-search is greedy: it need not find the fewest operations.
+A chain of linear operations on a tangent equals one product with the product of the factors. This product is the same
+in all tangent directions. A vertex is eliminated if all directions together then need no more operations than before.
+The search is greedy: it need not find the fewest operations.
 """
 
 from collections.abc import Callable, Iterable

@@ -75,9 +75,9 @@ def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -
     The function works under jit, vmap and both modes of differentiation, to first order only. The derivative uses the
     multipliers W_i of the optimum: sum <W_i, d left side> = 0.
 
-    If the optimum is not unique (two modes equally slow), the derivative is one of the possible ones. If the optimum is
-    not attained (a double pole, a deadbeat loop, whose largest rate is infinite), the rate is one that some P proves.
-    It is then below the largest, and the derivative is NaN. The rate is NaN for input that is not finite.
+    If the optimum is not unique (two modes equally slow), the derivative is one of the possible ones. A double pole, or
+    a deadbeat loop (whose largest rate is infinite), does not attain the optimum. The rate is then one that some P
+    proves. It is below the largest, and the derivative is NaN. The rate is NaN for input that is not finite.
 
     Args:
         gain: Gain K of u = K x, shape (m, n) or (n,).

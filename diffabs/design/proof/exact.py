@@ -300,9 +300,9 @@ def is_satisfied(inequality: Inequality) -> bool:
 def is_robustly_positive(matrix: np.ndarray, error: np.ndarray, bits: int) -> bool:
     """Return whether 2^-bits `matrix` - diag_i(sum_j error_ij s_i / s_j) > 0, with s_i a power of 2 near sqrt(M_ii).
 
-    Both sides are multiplied by 1 / s and by a power of 2 that leaves integers, so that rows of unlike size lose
-    equally. The propagated bound of C' P C is not symmetric. The error itself is symmetric, so either of error_ij and
-    error_ji bounds it.
+    Both sides are multiplied by 1 / s and by a power of 2 that leaves integers. So rows of unlike size lose equally.
+    The propagated bound of C' P C is not symmetric. The error itself is symmetric, so either of error_ij and error_ji
+    bounds it.
 
     Args:
         matrix: Symmetric matrix of Python integers, shape (n, n).

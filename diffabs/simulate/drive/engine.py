@@ -97,7 +97,7 @@ def run_with_engine(
 ) -> T:
     """Return the result of an engine; "auto" uses the kernel if possible, and otherwise XLA.
 
-    If a kernel is impossible, "auto" does not try again for data of the same structure: the trial takes longer than
+    If a kernel is impossible, "auto" does not try again for data of the same structure. The trial takes longer than
     many a batch.
 
     Args:

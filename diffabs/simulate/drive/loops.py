@@ -106,7 +106,7 @@ def scan_with_trajectory(
     """Return the carry after `count` times `every` steps of the grid, and a sample after each `every`-th step.
 
     The samples have a leading axis of `instants`; those beyond `count` come from the final carry. This is the loop for
-    derivatives: reverse mode keeps the carry at each sample, and computes the steps between two samples again.
+    derivatives. Reverse mode keeps the carry at each sample, and computes the steps between two samples again.
 
     Args:
         step: Function of the carry and of `until`, the number of the grid instant at which it pauses: one attempt of a

@@ -20,7 +20,7 @@ a later correction.
     refresh a step of length 0 evaluates the rates after an event, or within the mode beyond a switching surface. In a
             loop with a clock the rates are evaluated after every step, and no step of length 0 is needed
 
-Every margin has a number. That of a comparison is the number of its bit; the stop and the blocks' events have the
+Every margin has a number. That of a comparison is the number of its bit. The stop and the blocks' events have the
 numbers after the last bit. The margin of a comparison is known only at the end of an attempt.
 
 Source: A. Griewank, A. Walther, Evaluating Derivatives, section 15.3 (order of the refinement).

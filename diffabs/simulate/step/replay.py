@@ -1,4 +1,4 @@
-"""Derivatives of a run with adaptive steps: the run is made once for its values and logged, and then its steps are
+"""Derivatives of a run with adaptive steps. The run is made once for its values and logged, and then its steps are
 replayed.
 
     log        for each attempt: whether it was accepted, the time at its end, its mode and the next one, and the

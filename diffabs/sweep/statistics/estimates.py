@@ -9,8 +9,8 @@
 The confidence is 1 - a. An end that the data cannot give is infinite. Columns are finite: diverged runs are counted and
 left out first.
 
-A standard deviation has no interval. Its error depends on the fourth moment of the law, which a sample of a law with
-heavy tails does not show. The coverage of 95 % intervals of 50, 1,000 and 10,000 samples was measured:
+A standard deviation has no interval. Its error depends on the fourth moment of the law. A sample of a law with heavy
+tails does not show it. The coverage of 95 % intervals of 50, 1,000 and 10,000 samples was measured:
 
 - Bonett's method (2006), log-normal law with deviation 1 of the logarithm: 71, 85 and 91 %.
 - Bonett's method (2006), Student's law with four degrees of freedom: 87, 91 and 92 %.
