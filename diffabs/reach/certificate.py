@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 from diffabs.core.types import JsonObject
 from diffabs.reach.cover import BoxProof, RunClaim
+from diffabs.reach.tail import Tail
 from diffabs.runtime import provenance
 
 FORMAT = "diffabs box proof 1"
@@ -48,8 +49,18 @@ def certificate_document(
         "horizon": proof.prover.horizon,
         "bounds": {name: _stated_ends(name, ends, claims) for name, ends in proof.bounds.items()},
         "cells": proof.cells.tolist(),
+        "tail": None if proof.tail is None else tail_document(proof.tail),
         "versions": provenance.versions("numpy"),
     }
+
+
+def tail_document(tail: Tail) -> JsonObject:
+    """Return the JSON object of a tail.
+
+    Args:
+        tail: Tail.
+    """
+    return {**tail._asdict(), "pieces": [piece._asdict() for piece in tail.pieces]}
 
 
 def _stated_ends(name: str, ends: tuple[float, float], claims: Sequence[RunClaim]) -> list[float | None]:

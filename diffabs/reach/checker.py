@@ -24,6 +24,9 @@ steps of half the length. That is its only choice of step lengths.
 **The end** of a run is where the margin m is 0. One set near the end is captured. All boxes from the first possible end
 to the last bound m' < 0. By the mean value theorem a run ends m/|m'| after the captured set, where m is its own margin.
 
+**The tail.** Given pieces of settled states (`reach/tail`), a cell ends once its set is inside one of them. What the
+file says of that piece then holds for the rest of its runs. The file's pieces are checked as cells of their own.
+
 **Series.** Coefficients of operations are computed when they are asked for, in lists of balls. The power u^2.1 has no
 third derivative at u = 0. A step of lower order does not ask for it, and the checker takes such a step there.
 """
@@ -37,6 +40,7 @@ import numpy as np
 from flint import arb, arb_mat, arb_poly, ctx
 
 from diffabs.reach.equations import SLOWEST, Equations, RealOperation
+from diffabs.reach.tail import Tail, TailPiece, stop_speed
 
 LIMITED = ("clamp", "round")  # operations that a chord stands for
 PRECISION = 96  # bits
@@ -49,7 +53,9 @@ PICARD_TRIES = 40
 BALANCE_INTERVAL = 16  # ticks, or steps of a continuous loop, between two choices of the scales of QR
 NEW_SCALE_SHARE = 1 / 16  # of a new choice in the logarithms of the scales: each turn of the axes widens the set
 SPEED_WEIGHT = 256.0  # of the speed over the slip, in the scales of QR for a sampled loop
+ALONE_WEIGHT = 4096.0  # of a state that only itself moves, over the slip: the axes must not turn others into it
 PIECES = 8  # of a step, for the bounds of a signal
+SLICES = 40  # of the speeds that a settled run passes, for its time to the stop
 FASTEST_SLIP = 1.0  # `check_slip_chart` holds for a slip below 1 and a speed above `SLOWEST`
 ZERO, ONE, NO_SLOPE = arb(0), arb(1), arb_poly([])
 
@@ -237,6 +243,24 @@ class _Program:
             if any(b >= 0 and not self.static[b] for b in self.operations[i].args[1:]):
                 raise NotProved("a limit that changes during a run")
         return found
+
+    def states_alone(self) -> set[int]:
+        """Return the states that only they themselves and others of this set move, such as a filtered target."""
+        e, alone = self.equations, set[int]()
+        while True:
+            more = {
+                i
+                for i in self.states
+                if {
+                    self.operations[j].value
+                    for j in self.read_by([e.flow[i], *([e.tick[i]] if e.tick else [])])
+                    if self.operations[j].name == "state"
+                }
+                <= alone | {i}
+            }
+            if more <= alone:
+                return alone
+            alone |= more
 
     def keeps(self, state: int) -> bool:
         """Return whether a tick leaves a state unchanged."""
@@ -611,6 +635,7 @@ class _Check:
         self.constant_mid = _Series(p, self.mids, nothing)
         self.constant_all = _Series(p, self.all, nothing, halves=self.halves)
         self.weights = np.ones(self.n)
+        self.alone = [p.place[i] for i in p.states_alone()]
         self.steps = 0
         self.elapsed = ZERO  # the independent variable
         self.rates: dict[str, arb] | None = None  # of the margin, the time and the distance, near the end
@@ -800,6 +825,7 @@ class _Check:
             return
         if np.isfinite(total).all():
             weights = _balance_matrix(total)
+            weights[self.alone] = ALONE_WEIGHT * weights[self.slip]
             if p.tick and self.speed >= 0 and self.slip >= 0:
                 # An error of the speed stays, while one of the slip decays: the axes must not turn speed into slip.
                 weights[self.speed] = weights[self.slip] * SPEED_WEIGHT
@@ -1125,6 +1151,108 @@ class _Check:
             y += _symmetric(own + pace * slopes[j])
         return _below(y), _above(y)
 
+    # The tail.
+
+    def check_tail(self, tail: Tail) -> None:
+        """Check that a piece of a tail decides what follows: that it bounds all states which a tick or a rate reads."""
+        p, e = self.program, self.program.equations
+        settled = {e.states.index(name) for name in tail.states if name in e.states}
+        if self.speed < 0 or stop_speed(e) is None:
+            raise NotProved("a tail needs a loop that stops at a speed")
+        if len(settled) != len(tail.states) or e.speed in settled:
+            raise NotProved("the states of the tail are not distinct states of the loop without its speed")
+        others = set(p.states) - settled - {e.speed}
+        roots = p.tick if p.tick else p.flow
+        read = {p.operations[i].value for i in p.read_by(roots) if p.operations[i].name == "state"}
+        if not settled <= set(p.states) or others & read or (others and not p.tick):
+            raise NotProved(f"the tail leaves out {', '.join(e.states[i] for i in others)}")
+        decides = {p.operations[i].value for i in p.read_by([e.acceleration]) if p.operations[i].name == "state"}
+        for piece in tail.pieces:
+            if not decides - {e.speed} <= {e.states.index(name) for name in piece.later_states}:
+                raise NotProved("the tail has no range of a state that decides the deceleration")
+
+    def piece_around(self, tail: Tail) -> TailPiece | None:
+        """Return a piece of a tail that contains the set, or None."""
+        speed = self.box()[self.speed]
+        for piece in reversed(tail.pieces):
+            if arb(piece.low) <= speed.lower() and speed.upper() <= arb(piece.high) and self.is_within(tail, piece):
+                return piece
+        return None
+
+    def is_within(self, tail: Tail, piece: TailPiece) -> bool:
+        """Return whether every settled state of the set is as close to its centre as a piece asks."""
+        p, v = self.program, self.speed
+        B, G = ([[arb(float(x)) for x in row] for row in matrix] for matrix in (self.B, self.G))
+        faster = arb(self.c[v]) - piece.middle
+        for i, name in enumerate(tail.states):
+            k, by_speed = p.place[p.equations.states.index(name)], arb(piece.by_speed[i])
+            off = arb(self.c[k]) - piece.centre[i] - by_speed * faster
+            spread = sum(((B[k][j] - by_speed * B[v][j]).abs_upper() * self.r[j] for j in range(self.n)), ZERO)
+            for j in range(self.np):
+                along = G[k][j] - by_speed * G[v][j]
+                if j < len(tail.middle):
+                    by_param = arb(piece.by_param[i][j])
+                    off -= by_param * (self.mids[j] - tail.middle[j])
+                    along -= by_param * self.halves[j]
+                spread += along.abs_upper()
+            if not (off.abs_upper() + spread).upper() <= arb(piece.width[i]):
+                return False
+        return True
+
+    def inverse_deceleration(self, piece: TailPiece, speed: arb) -> arb:
+        """Return 1/a for all settled runs of the cell at these speeds; a is the rate at which the speed falls."""
+        p, e = self.program, self.program.equations
+        states = [ZERO] * self.n
+        for name, ends in piece.later_states.items():
+            states[p.place[e.states.index(name)]] = _between(arb(ends[0]), arb(ends[1]))
+        states[self.speed] = speed
+        a = -self.whole(states).value(e.acceleration)
+        if not a.lower() > 0:
+            raise _Undefined("a settled run may not slow down")
+        return 1 / a
+
+    def settled_bounds(self, piece: TailPiece) -> CheckedBounds:
+        """Return the bounds of runs that are in a piece: each passes every speed down to the stop once."""
+        end, v = stop_speed(self.program.equations), self.speed
+        assert end is not None
+        stop, above, time, way = _constant(end), arb(self.c[v]), ZERO, ZERO
+        for k in range(1, SLICES + 1):
+            lower = arb(self.c[v] * (end / self.c[v]) ** (k / SLICES)) if k < SLICES else stop
+            inverse = self.inverse_deceleration(piece, _hull(above, lower))
+            time += (above - lower) * inverse
+            way += (above - lower) * (above + lower) / 2 * inverse
+            above = lower
+        speeds = self.box()[v]
+        per_speed = self.inverse_deceleration(piece, speeds)
+
+        def total(q: _Quadrature | None, integral: arb, rate: arb) -> tuple[float, float]:
+            if q is None:
+                return -inf, inf
+            y = q.centre + integral + _symmetric(q.rest)
+            for j in range(self.np):
+                y += _symmetric(arb(float(q.slopes[j])) + rate * arb(float(self.G[v, j])))
+            for j in range(self.n):
+                y += _symmetric(rate * arb(float(self.B[v, j])) * self.r[j])
+            return _below(y), _above(y)
+
+        return CheckedBounds(
+            total(self.time(), time, per_speed),
+            total(self.travelled, way, per_speed * speeds),
+            {name: max(_above(x), piece.later_signals[name][1]) for name, x in self.top.items()},
+            {name: min(_below(x), piece.later_signals[name][0]) for name, x in self.bottom.items()},
+        )
+
+    def settle(self, tail: Tail | None, latest: float) -> CheckedBounds | None:
+        """Return the bounds of all runs if they are in a piece of a tail and stop by `latest` [s], else None."""
+        piece = self.piece_around(tail) if tail is not None and self.rates is None else None
+        if piece is None:
+            return None
+        try:
+            found = self.settled_bounds(piece)
+        except _Undefined:
+            return None
+        return found if found.stop_time[1] <= latest else None
+
     def bounds(self, ended: bool) -> CheckedBounds:
         """Return the bounds; up to the horizon only, unless the runs ended."""
         capture, rates = self.capture, self.rates
@@ -1178,6 +1306,9 @@ def check_cell(
     steps: Sequence[float] | int,
     horizon: float,
     order: int = ORDER,
+    *,
+    tail: Tail | None = None,
+    latest: float | None = None,
 ) -> CheckedBounds:
     """Prove bounds of every run of a cell of parameters.
 
@@ -1189,6 +1320,8 @@ def check_cell(
             sampled loop, the number of steps between two ticks.
         horizon: Time at which the proof may stop if no run has ended [s].
         order: Order of the Taylor polynomials.
+        tail: Pieces in which the proof may end; they are taken as true.
+        latest: Time by which runs in the tail must stop [s]; None for the horizon.
 
     Returns:
         Bounds of the end of all runs, and of the signals from the start until the last run ends.
@@ -1199,7 +1332,10 @@ def check_cell(
     before = ctx.prec
     ctx.prec = PRECISION
     try:
-        return _prove(_Check(equations, signals, cell, order), steps, horizon)
+        check = _Check(equations, signals, cell, order)
+        if tail is not None:
+            check.check_tail(tail)
+        return _prove(check, steps, horizon, tail, horizon if latest is None else latest)
     except (_Undefined, _StepFails) as reason:
         raise NotProved(str(reason)) from None
     except RecursionError:
@@ -1208,8 +1344,10 @@ def check_cell(
         ctx.prec = before
 
 
-def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> CheckedBounds:
-    """Move the set of a cell until all runs have ended or the horizon is reached."""
+def _prove(
+    check: _Check, steps: Sequence[float] | int, horizon: float, tail: Tail | None, latest: float
+) -> CheckedBounds:
+    """Move the set of a cell until all runs have ended or are in the tail, or the horizon is reached."""
     e = check.program.equations
     if e.period is not None:
         if not isinstance(steps, int) or steps < 1:
@@ -1225,6 +1363,8 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
                     return check.bounds(True)
             tick += 1
             check.elapsed = period * tick
+            if (settled := check.settle(tail, latest)) is not None:
+                return settled
             if check.past_horizon(horizon):
                 return check.bounds(False)
             if check.elapsed.lower() > 2 * horizon:
@@ -1241,6 +1381,8 @@ def _prove(check: _Check, steps: Sequence[float] | int, horizon: float) -> Check
         number += 1
         if check.is_over():
             return check.bounds(True)
+        if (settled := check.settle(tail, latest)) is not None:
+            return settled
         if check.past_horizon(horizon):
             return check.bounds(False)
         if check.time().box().lower() > 2 * horizon:

@@ -18,6 +18,8 @@ from diffabs.core.loop import Loop
 from diffabs.core.types import PyTree
 from diffabs.reach.engine import FAILURES, CellBounds, Prover
 from diffabs.reach.equations import Equations, derive_equations
+from diffabs.reach.settle import find_tail
+from diffabs.reach.tail import Tail
 
 BATCH = 64  # cells between two looks at the clock
 LARGER, LARGER_TRIED = 1.5, 4  # size of a cell to try, in those proved just before; number that may be larger
@@ -25,7 +27,10 @@ SMALLEST = 2.0**-40  # of the box's side: a smaller cell is not halved again
 FEWEST = 4  # a side that is not wider than so many floats is not halved: its middle must lie between its ends
 PROBE_SIZES = (1e-3, 1e-4, 1e-5)  # sizes of the cell that shows how much each parameter matters, in sides of the box
 SPEED_COST = 3.0
+CURVE_BITS = 12  # of a place on Morton's curve, for each parameter
 CLOSE = 5e-4  # a bound is refined while it is farther than this from the worst run found, relative
+MANY = 256  # cells tried, after which a proof of the tail is worth its time
+TAIL_WIDTH, NARROW_TAIL_WIDTH = 1e-3, 3e-4  # half widths of the tail in the slip; the second where the stop counts
 RUN_ERROR = 1e-3  # of a value found in a run, relative: a run farther beyond a proved bound contradicts it
 
 Box = dict[str, tuple[float, float]]
@@ -58,6 +63,7 @@ class BoxProof(NamedTuple):
         seconds: Computing time [s].
         equations: Equations of the loop.
         prover: Native prover with its settings.
+        tail: Settled states, from which the rest of all runs is proved once; None if no cell ends there.
     """
 
     verdict: str
@@ -71,6 +77,7 @@ class BoxProof(NamedTuple):
     seconds: float
     equations: Equations
     prover: Prover
+    tail: Tail | None
 
 
 def prove_box(
@@ -133,8 +140,12 @@ def prove_box(
     hopeless = not alone.status[0]  # a cell that contains this run is not proved either
     if hopeless:
         failure = f"even one run is not proved: {FAILURES[int(alone.failure[0])]}"
+    tail, sought = None, False
     while len(left) and refuting is None and not hopeless and time.monotonic() - began < budget:
-        left = left[np.lexsort(left[:, ::-1, 0].T)]
+        if tried >= MANY and not sought:
+            sought, tail = True, _find_tail(prover, quantities, over, claims, known or {}, began + budget, threads)
+            prover.use_tail(tail)
+        left = left[_order_neighbours(box, left)]
         now, left = left[:BATCH], left[BATCH:]
         now, rest = _cut_to_size(now, fitting * LARGER, influence, smallest)
         left = np.concatenate([left, rest])
@@ -176,8 +187,28 @@ def prove_box(
         verdict, failure, bounds = "undecided", contradiction, quantities.unbounded
     return BoxProof(
         *(verdict, bounds, cells, merged, left, refuting, failure if verdict == "undecided" else "", tried),
-        *(time.monotonic() - began, equations, prover),
+        *(time.monotonic() - began, equations, prover, tail),
     )
+
+
+def _find_tail(
+    prover: Prover, quantities: "_Quantities", over: Mapping[str, tuple[float, float]], claims: Sequence[RunClaim],
+    known: Mapping[str, tuple[float, float]], until: float, threads: int | None,
+) -> Tail | None:  # fmt: skip
+    """Return a tail of the runs in which all claims hold, or None."""
+    bounds = [claim.bound for claim in claims if claim.quantity == "greatest slip"]
+    greatest = min(bounds, default=known.get("greatest slip", (0.0, math.inf))[1])
+    stops = not claims or any(" " not in claim.quantity for claim in claims)
+    width = NARROW_TAIL_WIDTH if stops else TAIL_WIDTH
+    tail = find_tail(prover, over, width, greatest, until=until, threads=threads)
+    if tail is None:
+        return None
+    for claim in claims:
+        word, _, name = claim.quantity.partition(" ")
+        low, high = tail.pieces[-1].later_signals.get(name, (-math.inf, math.inf))
+        if name and not (low >= claim.bound if word == "least" else high <= claim.bound):
+            return None
+    return tail
 
 
 class _Quantities:
@@ -292,6 +323,20 @@ def _halve(cells: np.ndarray, matters: np.ndarray) -> np.ndarray:
     left, right = cells.copy(), cells.copy()
     left[rows, side, 1] = right[rows, side, 0] = middle
     return np.concatenate([left, right])
+
+
+def _order_neighbours(box: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Return the indices of cells along Morton's curve, so that cells of one group are near each other on every side.
+
+    The lanes of a group share the lengths of their steps, which limits shorten at other times in other cells.
+    """
+    sides = np.where(box[:, 1] > box[:, 0], box[:, 1] - box[:, 0], 1.0)
+    places = ((cells[:, :, 0] - box[:, 0]) / sides * (2**CURVE_BITS - 1)).astype(int)
+    key = np.zeros(len(cells), object)
+    for bit in range(CURVE_BITS - 1, -1, -1):
+        for side in range(len(box)):
+            key = key * 2 + (places[:, side] >> bit & 1)
+    return np.argsort(key, kind="stable")
 
 
 def _widths(cells: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from diffabs.compiler.runtime import toolchain
 from diffabs.reach.equations import Equations, NoRule, RealOperation
+from diffabs.reach.tail import Tail, stop_speed
 from diffabs.runtime.process import core_count
 
 PROVER_FOLDER = pathlib.Path(__file__).parent / "native"
@@ -43,6 +44,19 @@ SCOUTED = 20_000  # periods, or steps, of the run that the weights are chosen by
 # Orders of the Taylor polynomials. With 8, one step lasts from one tick to the next; without ticks, limits need steps
 # that are shorter than order 6 allows.
 SAMPLED_ORDER, CONTINUOUS_ORDER = 8, 6
+TAIL_ARRAYS = (
+    *(
+        "slow",
+        "fast",
+        "middle",
+        "settled_centre",
+        "settled_by_speed",
+        "settled_width",
+        "settled_by_param",
+        "settled_at",
+    ),
+    *("later_states", "later_signals"),
+)
 
 
 class _Tape(ctypes.Structure):
@@ -64,12 +78,15 @@ class _Task(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("start", "flow", "tick")),
         ("signals", ctypes.c_long),
         ("signal", ctypes.c_void_p),
-        *((name, ctypes.c_long) for name in ("margin", "travelled", "clock", "nonnegative", "speed")),
+        *((name, ctypes.c_long) for name in ("margin", "travelled", "clock", "nonnegative", "speed", "acceleration")),
         *((name, ctypes.c_double) for name in ("slowest", "period_low", "period_high", "horizon", "tolerance")),
         *((name, ctypes.c_double) for name in ("longest", "shortest", "first")),
         *((name, ctypes.c_long) for name in ("order", "tables")),
         ("weights", ctypes.c_void_p),
         *((name, ctypes.c_double) for name in ("keys_low", "keys_high")),
+        *((name, ctypes.c_long) for name in ("pieces", "settled_params")),
+        *((name, ctypes.c_void_p) for name in TAIL_ARRAYS),
+        *((name, ctypes.c_double) for name in ("stop_low", "stop_high", "latest")),
     ]
 
 
@@ -167,6 +184,9 @@ class Prover:
         signals: Names of the signals whose range is wanted.
         horizon: Duration after which a run is no longer followed [s].
         weights: Units of Lohner's step, shape (WEIGHT_TABLES, kept states); a choice, no part of the proof.
+        kept: Indices of the states that are kept over a tick.
+        moving: Indices of these and of the states that a tick sets.
+        clockwork: Places among the kept states of those that are the same in all runs.
     """
 
     def __init__(
@@ -195,7 +215,8 @@ class Prover:
         for operation in e.operations:
             if operation.name == "clamp" and any(e.operations[x].name != "const" for x in operation.args[1:] if x >= 0):
                 raise NoRule("a limit that is not a number")
-        self._kept, self._clockwork = len(kept), [place[i] for i in clockwork_states(e, kept)]
+        self.kept, self.moving = kept, [*kept, *passing]
+        self.clockwork = [place[i] for i in clockwork_states(e, kept)]
         moving = len(kept) + len(passing)
         roots = {
             "start": [e.start[i] for i in states],
@@ -214,10 +235,51 @@ class Prover:
             *(moving, len(kept), len(quadratures)),
             *(at["start"], at["flow"], at["tick"], len(self.signals), at["signal"]),
             *(e.margin, place.get(e.travelled, -1), place.get(e.clock, -1) if e.paced else -1),
-            *(place[e.nonnegative[0]] if e.nonnegative else -1, place.get(e.speed, -1)),
+            *(place[e.nonnegative[0]] if e.nonnegative else -1, place.get(e.speed, -1), e.acceleration),
             *(slowest, low, high, horizon, tolerance, longest, shortest, first, order, WEIGHT_TABLES),
             *(self.weights.ctypes.data, 0.0, horizon),
         )
+
+    def use_tail(self, tail: Tail | None, latest: float | None = None) -> None:
+        """End a cell once its runs are in a tail, which must be proved for all parameters of the cells.
+
+        Args:
+            tail: Tail, or None to follow every cell to its stop.
+            latest: Time by which runs in the tail must stop [s]; None for the horizon.
+        """
+        if tail is None or not tail.pieces:
+            self.task.pieces = 0
+            return
+        pieces, n = tail.pieces, len(self.kept)
+        names = [self.equations.states[i] for i in self.moving]
+        settled = [names.index(name) for name in tail.states]
+        by_param = np.zeros((len(pieces), n, len(tail.middle)))
+        columns = {name: np.zeros((len(pieces), n)) for name in ("centre", "by_speed", "width")}
+        later = np.zeros((len(pieces), len(names), 2))
+        for k, piece in enumerate(pieces):
+            by_param[k, settled] = piece.by_param
+            for name, column in columns.items():
+                column[k, settled] = getattr(piece, name)
+            for name, ends in piece.later_states.items():
+                later[k, names.index(name)] = ends
+        signals = [[piece.later_signals.get(name, (-np.inf, np.inf)) for name in self.signals] for piece in pieces]
+        self._tail_arrays = {
+            "slow": np.array([piece.low for piece in pieces]),
+            "fast": np.array([piece.high for piece in pieces]),
+            "middle": np.array([piece.middle for piece in pieces]),
+            **{f"settled_{name}": column for name, column in columns.items()},
+            "settled_by_param": by_param,
+            "settled_at": np.array(tail.middle, float),
+            "later_states": later,
+            "later_signals": np.array(signals, float),
+        }
+        for name in TAIL_ARRAYS:
+            setattr(self.task, name, self._tail_arrays[name].ctypes.data)
+        self.task.pieces = len(pieces)
+        self.task.settled_params, self.task.latest = len(tail.middle), self.horizon if latest is None else latest
+        end = stop_speed(self.equations)
+        assert end is not None
+        self.task.stop_low, self.task.stop_high = decimal_ends(end)
 
     @property
     def _width(self) -> int:
@@ -263,7 +325,9 @@ class Prover:
         n, lanes = len(self.signals), library().lanes()
         trail = np.full((steps, lanes, 2 + 2 * n), np.nan)
         out = np.zeros((1, self._width))
+        pieces, self.task.pieces = self.task.pieces, 0
         count = self._call(np.ascontiguousarray(cell, float)[None], out, trail=trail)
+        self.task.pieces = pieces
         if not out[0, 0] or count == steps:
             raise ValueError(f"the cell {np.asarray(cell).tolist()} is not proved in {steps:,} steps")
         rows = trail[:count, 0][np.isfinite(trail[:count, 0, 0])]
@@ -280,6 +344,38 @@ class Prover:
         room = max(0 if x is None else len(x) for x in (scout, trail))
         return library().prove(ctypes.byref(self.task), ctypes.c_long(len(cells)), *pointers, ctypes.c_long(room))
 
+    def scout(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return speeds [m/s] (or times [s]), kept states and absolute Jacobians of the periods of one run.
+
+        Args:
+            point: Parameters of the run, shape (parameters,).
+        """
+        n = len(self.kept)
+        found = np.zeros((SCOUTED, 1 + n + n * n))
+        cell = np.repeat(np.asarray(point, float)[None, :, None], 2, 2)
+        count = self._call(cell, np.zeros((1, self._width)), scout=found)
+        found = found[:count][np.isfinite(found[:count]).all(1)]  # the first has no axes yet
+        return found[:, 0], found[:, 1 : 1 + n], np.abs(found[:, 1 + n :]).reshape(len(found), n, n)
+
+    def share_weights(self, other: "Prover") -> None:
+        """Take the units of the axes from another prover of the same states.
+
+        Args:
+            other: Prover whose weights were chosen.
+        """
+        self.weights[:] = other.weights
+        self.task.keys_low, self.task.keys_high = other.task.keys_low, other.task.keys_high
+
+    def weights_at(self, speed: float) -> np.ndarray:
+        """Return the units of the axes at a speed [m/s], shape (kept states,).
+
+        Args:
+            speed: Speed.
+        """
+        low, high = self.task.keys_low, self.task.keys_high
+        place = (np.log(max(speed, 1e-3)) - low) / max(high - low, 1e-9) * WEIGHT_TABLES
+        return self.weights[int(np.clip(place, 0, WEIGHT_TABLES - 1))]
+
     def choose_weights(self, point: np.ndarray) -> None:
         """Choose the units of Lohner's step from the Jacobians along one run.
 
@@ -288,14 +384,9 @@ class Prover:
         Args:
             point: Parameters of the run, shape (parameters,).
         """
-        n = self._kept
-        found = np.zeros((SCOUTED, 1 + n * n))
-        cell = np.repeat(np.asarray(point, float)[None, :, None], 2, 2)
-        count = self._call(cell, np.zeros((1, self._width)), scout=found)
-        found = found[:count][np.isfinite(found[:count]).all(1)]  # the first has no axes yet
-        if not len(found):
+        keys, _, jacobians = self.scout(point)
+        if not len(keys):
             return
-        keys, jacobians = found[:, 0], np.abs(found[:, 1:]).reshape(len(found), n, n)
         if self.task.speed >= 0:
             keys = np.log(np.maximum(keys, 1e-3))
         self.task.keys_low, self.task.keys_high = low, high = float(keys.min()), float(keys.max())
@@ -304,7 +395,7 @@ class Prover:
             key = low + (k + 0.5) / WEIGHT_TABLES * (high - low)
             close = np.abs(keys - key) <= max(near, float(np.abs(keys - key).min()))
             self.weights[k] = balance_weights(jacobians[close].max(0))
-            self.weights[k, self._clockwork] = CLOCKWORK_WEIGHT
+            self.weights[k, self.clockwork] = CLOCKWORK_WEIGHT
             if self.task.speed >= 0:
                 self.weights[k, self.task.speed] = self.weights[k, self.task.nonnegative] * SPEED_WEIGHT
 
@@ -339,26 +430,32 @@ def clockwork_states(e: Equations, states: list[int]) -> list[int]:
     """
     alone = set(states)
     while True:
-        read = {i: _reads(e, [e.start[i], e.flow[i], *([e.tick[i]] if e.tick else [])]) for i in alone}
+        read = {i: read_by(e, [e.start[i], e.flow[i], *([e.tick[i]] if e.tick else [])]) for i in alone}
         fewer = {i for i in alone if read[i][0] <= alone and not read[i][1]}
         if fewer == alone:
             return sorted(alone)
         alone = fewer
 
 
-def _reads(e: Equations, roots: list[int]) -> tuple[set[int], bool]:
-    """Return the states that operations read, and whether they read a parameter."""
-    found, left, seen, varies = set(), list(roots), set(), False
+def read_by(e: Equations, roots: Sequence[int]) -> tuple[set[int], set[int]]:
+    """Return the states and the parameters that operations read, through their operands.
+
+    Args:
+        e: Equations of the loop.
+        roots: Operations.
+    """
+    states, params, left, seen = set(), set(), list(roots), set()
     while left:
         i = left.pop()
         if i in seen or i < 0:
             continue
         seen.add(i)
         if e.operations[i].name == "state":
-            found.add(e.operations[i].value)
-        varies |= e.operations[i].name == "param"
+            states.add(e.operations[i].value)
+        if e.operations[i].name == "param":
+            params.add(e.operations[i].value)
         left += list(e.operations[i].args)
-    return found, varies
+    return states, params
 
 
 def balance_weights(matrix: np.ndarray) -> np.ndarray:
@@ -394,12 +491,12 @@ def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], lis
     Raises:
         NoRule: A tick changes a state that the stop reads.
     """
-    asked = _reads(e, [e.margin])[0]
+    asked = read_by(e, [e.margin])[0]
     integrals = [i for i in (e.travelled, e.clock if e.paced else -1) if i >= 0]
-    live = _reads(e, [e.margin, *(e.signals[name] for name in signals), *(e.flow[i] for i in integrals)])[0]
+    live = read_by(e, [e.margin, *(e.signals[name] for name in signals), *(e.flow[i] for i in integrals)])[0]
     live |= set(e.nonnegative)  # the equations hold only where these are not negative
     while True:
-        more = live | _reads(e, [root for i in live for root in (e.flow[i], *((e.tick[i],) if e.tick else ()))])[0]
+        more = live | read_by(e, [root for i in live for root in (e.flow[i], *((e.tick[i],) if e.tick else ()))])[0]
         if more == live:
             break
         live = more
@@ -409,5 +506,5 @@ def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], lis
     for i in asked:
         if e.operations[e.tick[i]] != RealOperation("state", (), i):
             raise NoRule(f"the stop reads {e.states[i]}, which a tick changes")
-    kept = _reads(e, [e.tick[i] for i in live])[0] | asked
+    kept = read_by(e, [e.tick[i] for i in live])[0] | asked
     return sorted(kept), sorted(live - kept), quadratures

@@ -90,6 +90,7 @@ class Equations:
         speed: Index of the state that is the speed, or -1.
         clock: Index of the state that is the time.
         paced: True if the independent variable is eta with d eta = dt/v, so that rates are multiplied by the speed v.
+        acceleration: Operation of the speed's rate of change in time, or -1.
     """
 
     operations: tuple[RealOperation, ...]
@@ -106,6 +107,7 @@ class Equations:
     speed: int
     clock: int
     paced: bool
+    acceleration: int = -1
 
 
 class RealGraph(Graph):
@@ -343,6 +345,7 @@ class _Derivation:
                 ticked[i] = self.make("state", (), i)  # a tick does not move the plant
         flow = [self.convert(x, same) for x in moved] + [self.make("const", (), 1.0)]
         # The slip moves at a rate that goes with 1/v. With d eta = dt/v it does not, and one step suits all speeds.
+        acceleration = flow[speed] if self.charted else -1
         paced = self.charted and self.period is None
         if paced:
             flow = [self.pace_rate(x, speed) for x in flow]
@@ -354,7 +357,7 @@ class _Derivation:
             operations=tuple(self.operations), params=self.paths, states=tuple(names),
             start=(*starts, self.make("const", (), 0.0)), flow=tuple(flow), tick=tuple(ticked), period=self.period,
             signals=signals, margin=margin, nonnegative=(slip,) if self.charted else (), travelled=travelled,
-            speed=speed, clock=n, paced=paced,
+            speed=speed, clock=n, paced=paced, acceleration=acceleration,
         )  # fmt: skip
 
     def loop_state(self, loop: Loop, state: PyTree) -> LoopState:

@@ -18,13 +18,28 @@ from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject
 from diffabs.reach.certificate import FORMAT, proved_ends
 from diffabs.reach.cover import RunClaim, check_box, comes_from_halving
-from diffabs.reach.equations import Equations, derive_equations
+from diffabs.reach.equations import Equations, RealOperation, derive_equations
+from diffabs.reach.tail import Tail, TailPiece, equations_from
 
 SAMPLED_STEPS = 2  # steps of the checker between two ticks
 PACED_STEP, STEPS = 4e-4, 500  # length in eta [s^2/m] of a paced loop; number of steps of other continuous loops
 CELL_HALVINGS = 3  # of a cell whose bounds by the checker are too wide
 
 Cell = list[list[float]]
+
+
+class PlacedCell(NamedTuple):
+    """A cell to check.
+
+    Attributes:
+        piece: Number of the piece of the tail that it belongs to; None for a cell of the box.
+        ends: Ends of each parameter; in the tail the speed [m/s] comes last.
+    """
+
+    piece: int | None
+    ends: Cell
+
+
 Bounds = dict[str, tuple[float | None, float | None]]
 
 
@@ -53,6 +68,7 @@ class ProofFile(NamedTuple):
         claims: Claims of the proof.
         bounds: Proved ends (low, high) of each quantity; None where the file states nothing.
         horizon: Duration after which a run was no longer followed [s].
+        tail: Settled states in which cells may end; None without any.
     """
 
     over: dict[str, tuple[float, float]]
@@ -60,6 +76,12 @@ class ProofFile(NamedTuple):
     claims: tuple[RunClaim, ...]
     bounds: Bounds
     horizon: float
+    tail: Tail | None
+
+    @property
+    def pieces(self) -> tuple[TailPiece, ...]:
+        """The pieces of the tail."""
+        return () if self.tail is None else self.tail.pieces
 
     @property
     def signals(self) -> list[str]:
@@ -114,7 +136,60 @@ def read_proof(document: JsonObject) -> ProofFile:
     for claim in claims.values():
         if claim.quantity not in bounds:
             raise ValueError(f"claims: {claim.quantity} has no bound in the file")
-    return ProofFile(over, list(cells.values()), tuple(claims.values()), bounds, horizon)
+    tail = None if document.get("tail") is None else _read_tail(document, len(over))
+    return ProofFile(over, list(cells.values()), tuple(claims.values()), bounds, horizon, tail)
+
+
+def _read_tail(document: JsonObject, params: int) -> Tail:
+    """Return the tail of a proof's file.
+
+    Args:
+        document: JSON document of the file.
+        params: Number of parameters of the box.
+
+    Raises:
+        ValueError: The tail is wrong.
+    """
+    given = document["tail"]
+    if not isinstance(given, dict):
+        raise ValueError(f"tail = {format_given(given)} is not a table")
+    states = tuple(_read_entries(given, "states", list, str, "a name").values())
+
+    def numbers(values: Any, count: int) -> tuple[float, ...]:
+        if len(values) != count:
+            raise ValueError("another number of numbers")
+        return tuple(map(_number, values))
+
+    def ranges(values: Any) -> dict[str, tuple[float, float]]:
+        return {str(name): (ends[0], ends[1]) for name, ends in ((n, _pair(e)) for n, e in values.items())}
+
+    def piece(entry: Any) -> TailPiece:
+        n = len(states)
+        if len(entry["by_param"]) != n:
+            raise ValueError("another number of states")
+        cells = [[_pair(ends) for ends in cell] for cell in entry["cells"]]
+        if any(len(cell) != params + 1 for cell in cells):
+            raise ValueError("a cell has not one pair for each parameter and the speed")
+        found = TailPiece(
+            low=_number(entry["low"]),
+            high=_number(entry["high"]),
+            centre=numbers(entry["centre"], n),
+            by_speed=numbers(entry["by_speed"], n),
+            by_param=tuple(numbers(row, params) for row in entry["by_param"]),
+            width=numbers(entry["width"], n),
+            later_states=ranges(entry["later_states"]),
+            later_signals=ranges(entry["later_signals"]),
+            cells=tuple(tuple((low, high) for low, high in cell) for cell in cells),
+        )
+        if not (0 < found.low < found.high and all(width >= 0 for width in found.width)):
+            raise ValueError("its speeds are not positive and in order, or a width is negative")
+        return found
+
+    middle = tuple(_read_entries(given, "middle", list, _number, "a finite number").values())
+    pieces = tuple(_read_entries(given, "pieces", list, piece, "a piece of the tail").values())
+    if len(middle) != params:
+        raise ValueError("tail.middle has not one number for each parameter of the box")
+    return Tail(states, middle, pieces)
 
 
 def _read_entries(
@@ -204,14 +279,20 @@ def verify_box(
         if unknown := [name for name in file.signals if name not in equations.signals]:
             raise ValueError(f"bounds: the loop has no signal {unknown[0]}")
         check = partial(_check_cell, equations, file)
-        chosen = [cells[i] for i in _choose_cells(cells, share, suspects)]
+        rest = [
+            PlacedCell(k, [[*ends] for ends in cell]) for k, piece in enumerate(file.pieces) for cell in piece.cells
+        ]
+        chosen = [PlacedCell(None, cells[i]) for i in _choose_cells(cells, share, suspects)]
+        chosen += [rest[i] for i in _choose_cells(rest, share, ())]
         for done, (cell, why) in enumerate(_map_cells(check, chosen, processes), 1):
             if why:
-                ends = (f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in zip(over, cell, strict=True))
-                reason, done = f"cell {', '.join(ends)}: {why}", done - 1
+                where = "cell" if cell.piece is None else "cell of the tail"
+                ends = zip([*over, "speed"], cell.ends, strict=False)
+                text = ", ".join(f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in ends)
+                reason, done = f"{where} {text}: {why}", done - 1
                 break
             progress(f"{done} of {len(chosen)} cells")
-    return FileVerdict(done, len(cells), reason, file.statements)
+    return FileVerdict(done, len(cells) + sum(len(piece.cells) for piece in file.pieces), reason, file.statements)
 
 
 def _find_contradiction(file: ProofFile, horizon: float) -> str:
@@ -227,11 +308,30 @@ def _find_contradiction(file: ProofFile, horizon: float) -> str:
         return "the file states nothing"
     if not comes_from_halving(list(file.over.values()), file.cells):
         return "the cells do not cover the box: they do not come from halving it"
+    return _find_gap(file)
+
+
+def _find_gap(file: ProofFile) -> str:
+    """Return why the pieces of a tail do not follow from their cells and from one another, empty if they do."""
+    for k, piece in enumerate(file.pieces):
+        box = [*map(list, file.over.values()), [piece.low, piece.high]]
+        if not comes_from_halving(box, piece.cells):
+            return f"the cells of piece {k} of the tail do not cover it"
+        for later in ("later_states", "later_signals"):
+            mine, earlier = getattr(piece, later), getattr(file.pieces[max(k - 1, 0)], later)
+            if mine.keys() != earlier.keys() or any(
+                low > earlier[name][0] or high < earlier[name][1] for name, (low, high) in mine.items()
+            ):
+                return f"the ranges of piece {k} of the tail do not contain those of the piece before"
+        if missing := [name for name in file.signals if name not in piece.later_signals]:
+            return f"piece {k} of the tail has no range of {missing[0]}"
     return ""
 
 
-def _choose_cells(cells: Sequence[Cell], share: float, suspects: Sequence[Sequence[float]]) -> list[int]:
+def _choose_cells(cells: Sequence[Any], share: float, suspects: Sequence[Sequence[float]]) -> list[int]:
     """Return the indices of the cells with suspects, then of a random sample of all cells."""
+    if not cells:
+        return []
     holding = [
         i
         for point in suspects
@@ -242,7 +342,9 @@ def _choose_cells(cells: Sequence[Cell], share: float, suspects: Sequence[Sequen
     return list(dict.fromkeys([*holding, *sample]))
 
 
-def _map_cells(check: Callable[[Cell], str], cells: Sequence[Cell], processes: int) -> Iterator[tuple[Cell, str]]:
+def _map_cells(
+    check: Callable[[PlacedCell], str], cells: Sequence[PlacedCell], processes: int
+) -> Iterator[tuple[PlacedCell, str]]:
     """Yield each of the cells and the result of its check, in the given order, from at most `processes` processes.
 
     A cell whose process ends before it answers is not proved.
@@ -272,16 +374,33 @@ def _map_cells(check: Callable[[Cell], str], cells: Sequence[Cell], processes: i
             worker.kill()
 
 
-def _send_results(check: Callable[[Cell], str], cells: Sequence[Cell], results: Connection) -> None:
+def _send_results(check: Callable[[PlacedCell], str], cells: Sequence[PlacedCell], results: Connection) -> None:
     """Send the result of each check. Ctrl-C does not end this process: the parent does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for cell in cells:
         results.send(check(cell))
 
 
-def _check_cell(equations: Equations, file: ProofFile, cell: Cell) -> str:
+def _check_cell(equations: Equations, file: ProofFile, cell: PlacedCell) -> str:
     """Return why the checker does not prove the file's bounds in a cell of the file, empty if it does."""
-    return _check(equations, file, cell, _choose_sides(file.over, cell))
+    if cell.piece is None or file.tail is None:
+        return _check(equations, file, file.bounds, file.tail, None, cell.ends, _choose_sides(file.over, cell.ends))
+    piece, slip = file.pieces[cell.piece], [equations.states[i] for i in equations.nonnegative]
+    known = {name for i, name in enumerate(equations.states) if RealOperation("state", (), i) in equations.operations}
+    if unknown := sorted({*file.tail.states, *piece.later_states} - known):
+        return f"the runs have no state {unknown[0]}"
+    shown = [name for name in piece.later_states if name not in equations.signals]
+    if len(shown) < len(piece.later_states) or equations.speed < 0 or not slip:
+        return "a state of the tail has the name of a signal, or the loop has no slip"
+    runs = equations_from(equations, file.tail, piece, shown)
+    ends = {**piece.later_signals, **piece.later_states}
+    stated: Bounds = {f"least {name}": (low, None) for name, (low, _) in ends.items()}
+    stated |= {f"greatest {name}": (None, high) for name, (_, high) in ends.items()}
+    across = [[-1.0, 1.0]] * len(file.tail.states)
+    box = {**file.over, "speed": (piece.low, piece.high)}
+    sides = _choose_sides(box, cell.ends)
+    entries = file.tail.entries(cell.piece, ends)
+    return _check(runs, file, stated, entries, math.inf, [*cell.ends, *across], sides)
 
 
 def _choose_sides(over: Mapping[str, tuple[float, float]], cell: Cell) -> list[int]:
@@ -296,21 +415,27 @@ def _choose_sides(over: Mapping[str, tuple[float, float]], cell: Cell) -> list[i
     return (order * CELL_HALVINGS)[:CELL_HALVINGS]
 
 
-def _check(equations: Equations, file: ProofFile, cell: Cell, sides: Sequence[int]) -> str:
-    """Return why the checker does not prove the file's bounds in a cell, empty if it does.
+def _check(
+    equations: Equations, file: ProofFile, stated: Bounds, tail: Tail | None, latest: float | None,
+    cell: Cell, sides: Sequence[int],
+) -> str:  # fmt: skip
+    """Return why the checker does not prove stated bounds in a cell, empty if it does.
 
     A cell in which it fails is halved along the first of `sides`: its bounds of a smaller cell are narrower.
     """
     from diffabs.reach.checker import NotProved, check_cell
 
     steps = SAMPLED_STEPS if equations.period is not None else [PACED_STEP if equations.paced else file.horizon / STEPS]
+    signals = list(dict.fromkeys(name.partition(" ")[2] for name in stated if " " in name))
     try:
-        found = check_cell(equations, file.signals, [(low, high) for low, high in cell], steps, file.horizon)
+        found = check_cell(
+            equations, signals, [(low, high) for low, high in cell], steps, file.horizon, tail=tail, latest=latest
+        )
     except NotProved as error:
         reason = f"not proved: {error}"
     else:
         reason = _compare(
-            file.bounds,
+            stated,
             {
                 **{f"greatest {name}": (None, x) for name, x in found.greatest.items()},
                 **{f"least {name}": (x, None) for name, x in found.least.items()},
@@ -324,7 +449,7 @@ def _check(equations: Equations, file: ProofFile, cell: Cell, sides: Sequence[in
     low, high = cell[side]
     middle = 0.5 * (low + high)
     halves = ([*cell[:side], ends, *cell[side + 1 :]] for ends in ([low, middle], [middle, high]))
-    return next((why for half in halves if (why := _check(equations, file, half, sides[1:]))), "")
+    return next((why for half in halves if (why := _check(equations, file, stated, tail, latest, half, sides[1:]))), "")
 
 
 def _compare(stated: Bounds, found: Mapping[str, tuple[float | None, float | None]]) -> str:

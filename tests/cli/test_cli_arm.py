@@ -45,6 +45,7 @@ def test_the_papers_start_falls_and_that_is_said(falling):
     assert [line for line in result.stderr.splitlines() if line.startswith("warning: ")] == [
         "warning: FELL: the frame reached the stop's angle",
         "warning: settling_time is infinite: the run ends before the event that it measures",
+        "warning: the control is at a limit (-48 to 48 V) for 100 % of the run: gains hardly matter there",
     ]
 
 

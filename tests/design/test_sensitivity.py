@@ -65,13 +65,15 @@ def differences(system, weights, step):
 
 
 def agrees(system, weights, tolerance):
-    """To 1e-5 for the cost. The gain is flat at the optimum: its difference has an error of up to 1e-4 itself."""
+    """To 2e-5 for the cost, whose differences miss the sum of 1 by up to 6e-6: the cost is homogeneous in the weights.
+    The gain is flat at the optimum: its difference has an error of up to 1e-4 itself."""
     discrete = system.period is not None
     (cost, gain), (by_cost, by_gain) = by_logarithms(system.A, system.B, jnp.array(weights), discrete=discrete)
     expected = design(system, Spec(Q=weights[:2], R=weights[2]))
     np.testing.assert_allclose(cost, expected.trace_cost, rtol=1e-6)
     np.testing.assert_allclose(gain, expected.gain[0], rtol=1e-3)
-    np.testing.assert_allclose(by_cost / cost, differences(system, weights, 0.1)[0] / cost, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(by_cost.sum() / cost, 1.0, atol=2e-6)
+    np.testing.assert_allclose(by_cost / cost, differences(system, weights, 0.1)[0] / cost, rtol=0, atol=2e-5)
     gains = differences(system, weights, 0.2)[1]
     np.testing.assert_allclose(by_gain / gain[:, None], gains / np.array(gain)[:, None], rtol=0, atol=tolerance)
 

@@ -51,6 +51,8 @@ SEAMS = {
     "checker_remainder": "diffabs.reach.checker._remainder",
     "checker_chord": "diffabs.reach.checker._relax",
     "draw_proof": "diffabs.plot.proofs.draw_proof",
+    "proved_equations": "diffabs.reach.cover.derive_equations",
+    "cells_before_tail": "diffabs.reach.cover.MANY",
     "verified_equations": "diffabs.reach.verification.derive_equations",
     "measure_metric": "diffabs.reliability.failure._measure_metric",
     "outside_named": "diffabs.scenario.outside._named",

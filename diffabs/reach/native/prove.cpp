@@ -14,6 +14,8 @@
 //     Group::prove    start, then periods until every lane is over or lost
 //     Group::period   tick, steps of the flow up to the next tick (without a clock: one step), new axes
 //     Group::step     lengths are tried until `attempt` succeeds, then `commit`
+//
+// A settled set, which is inside a piece of the tail (tail.py), is followed no further: its runs were proved already.
 #include <cstring>
 
 #include "series.h"
@@ -28,12 +30,23 @@ struct Task {
   long margin, travelled, clock;  // operation of the stop's margin; places of distance and time among states and quadratures, or -1
   long nonnegative;               // a state that is never negative, or -1
   long speed;                     // a state that stays above `slowest`, or -1
+  long acceleration;              // operation of its rate in time, or -1
   double slowest, period_low, period_high, horizon;  // m/s, s
   double tolerance;                 // greatest remainder of a step, relative to the state
   double longest, shortest, first;  // of steps [s], paced [s^2/m]; a step of `shortest` or below may have any remainder
   long order, tables;
   const double* weights;  // units of the axes, tables x kept, by the logarithm of the speed, or by the time
   double keys_low, keys_high;
+  // The tail: sets of settled states, slowest first, each of which a run leaves only for a slower one, or to stop. With a
+  // speed v in [low, high] and parameters p, a state i is in centre + by_speed (v - middle) + by_param (p - at) + [-width, width].
+  long pieces, settled_params;
+  const double *slow, *fast, *middle;                        // for each piece
+  const double *settled_centre, *settled_by_speed, *settled_width;  // for each piece and kept state
+  const double *settled_by_param, *settled_at;                      // for each piece, kept state and parameter; for each parameter
+  const double *later_states;         // for each piece and state: low and high from there to the stop
+  const double *later_signals;        // the same for each signal
+  double stop_low, stop_high;         // speed at which a run ends [m/s]
+  double latest;                      // time by which a settled run must stop [s]
 };
 
 constexpr long MOST_STEPS = 50000;    // of a group
@@ -41,6 +54,7 @@ constexpr int MOST_IN_PERIOD = 100;   // steps
 constexpr int MOST_LIMITS = 6;        // limits that a set lies across in one tick; all limits of a flow
 constexpr double WIDEST_SLIP = 0.3;        // a set of slips wider than this proves nothing: a smaller cell may
 constexpr double NEVER = 1e300;
+constexpr int SLICES = 24;            // of the speeds that a settled run passes, for its time to the stop
 
 struct Quadrature { I c; std::vector<V> G; V R; };  // c + G p + [-R, R]
 
@@ -92,10 +106,11 @@ struct Group {
   const I period_;
   std::vector<int> limits, tick_limits, state_op;
   bool nested = false;  // a limit of the flow reads another one
-  Program flow, tick, starts, stop;
+  Program flow, tick, starts, stop, fall;
   // The equations' series, each over another set. mid: at C. whole: over X and C, with slopes. rest: over B, for the
   // remainder. box: over B, for rates. edge: on faces of B. jac: over B, with derivatives by states and disturbances.
-  Series mid, whole, rest, box, edge, jac, at_tick, at_tick_mid;
+  // falling: the speed's rate over settled states.
+  Series mid, whole, rest, box, edge, jac, at_tick, at_tick_mid, falling;
   std::vector<Chord> chords, tick_chords;
   Set set;
   std::vector<Quadrature> rows;
@@ -116,6 +131,9 @@ struct Group {
   M doomed{};                                   // lanes that are dead once the attempted step is committed
   int why[LANES];                               // why a lane was lost
   Ending end;
+  M settled{};                                  // lanes whose runs are in the tail; their time and distance at the stop
+  I settled_time = I(0.0), settled_way = I(0.0);
+  std::vector<V> settled_time_reach, settled_way_reach;  // about the half width that each parameter causes in them
   I elapsed = I(0.0), gone = I(0.0);  // the variable of integration up to this period, and in it
   // box_limit: 0.6 of the last length without a box; grows by 1 % a step. cross_step: longest step across a limit.
   // excess: greatest remainder of the step, in tolerances. about: approximate time or eta, for the choice of weights.
@@ -133,11 +151,11 @@ struct Group {
   explicit Group(const Task& t)
       : task(t), n((int)t.states), nb((int)t.kept), np((int)t.tape.params), nd(np + nb + (t.period_high > 0 ? MOST_LIMITS : 0)), K((int)t.order),
         sampled(t.period_high > 0), period_(span(fill(t.period_low), fill(t.period_high))), state_op(n, -1),
-        flow(t.tape, flow_roots(t)), tick(t.tape, roots(t.tick, t.states)), starts(t.tape, roots(t.start, t.states + t.quadratures)), stop(t.tape, {(int)t.margin}),
+        flow(t.tape, flow_roots(t)), tick(t.tape, roots(t.tick, t.states)), starts(t.tape, roots(t.start, t.states + t.quadratures)), stop(t.tape, {(int)t.margin}), fall(t.tape, {(int)(t.acceleration >= 0 ? t.acceleration : t.margin)}),
         mid(t.tape, K, 0), whole(t.tape, K, nd), rest(t.tape, K + 1, 0), box(t.tape, 1, 0), edge(t.tape, 1, 0), jac(t.tape, 0, n + MOST_LIMITS),
-        at_tick(t.tape, 0, nd), at_tick_mid(t.tape, 0, 0), chords(t.tape.count), tick_chords(t.tape.count),
+        at_tick(t.tape, 0, nd), at_tick_mid(t.tape, 0, 0), falling(t.tape, 0, 0), chords(t.tape.count), tick_chords(t.tape.count),
         set(nb, np), rows(t.quadratures), C(n), J(n * nd), X(n), used(np + nb), B(n), f(n), push(n), remainder(n),
-        top(t.signals), bottom(t.signals), now(t.signals), above(t.signals), below(t.signals), reach(np), pmid(np), phalf(np), end(np, nb) {
+        top(t.signals), bottom(t.signals), now(t.signals), above(t.signals), below(t.signals), reach(np), pmid(np), phalf(np), end(np, nb), settled_time_reach(np), settled_way_reach(np) {
     for (int i : flow.list) if (is_limit(i)) limits.push_back(i);
     for (int i : tick.list) if (is_limit(i)) tick_limits.push_back(i);
     for (int i : limits)
@@ -235,7 +253,7 @@ struct Group {
     for (int i : limits) {
       I raw = whole.value(task.tape.a[i], 0);
       V speed = vabs(coefficient(mid, task.tape.a[i], 1).mid()) + 1e-9;
-      V mine = vmax(0.25 * raw.width() / speed, fill(task.shortest));
+      V mine = vmax(0.1 * raw.width() / speed, fill(task.shortest));
       for (int side : {task.tape.b[i], task.tape.c[i]}) {
         if (side < 0) continue;
         I limit = whole.value(side, 0);
@@ -654,10 +672,116 @@ struct Group {
     M is_over = alive & end.captured & (margin.h < 0);
     M late = alive & ~is_over & (M)(time_now().low() >= task.horizon);
     timed |= late, done |= is_over | late, alive &= ~(is_over | late);
+    settle();
+  }
+
+  // A quadrature, or a state that is one, at this time.
+  struct Sum { I c; std::vector<V> G; V R; };
+  Sum sum_of(long q, I otherwise) const {
+    if (q < 0) return {otherwise, std::vector<V>(np, fill(0.0)), fill(0.0)};
+    if (q >= n) return {rows[q - n].c, rows[q - n].G, rows[q - n].R};
+    Sum s{C[q], std::vector<V>(np), fill(0.0)};
+    for (int j = 0; j < np; j++) s.G[j] = set.G[q * np + j];
+    for (int j = 0; j < nb; j++) s.R += vabs(set.B[q * nb + j]) * set.r[j];
+    return s;
+  }
+
+  // Which lanes lie within the piece of the tail that `piece` names for each lane (-1: none).
+  M within(const int* piece) const {
+    auto gather = [&](const double* from, long width, long i) {
+      V x;
+      for (int l = 0; l < LANES; l++) x[l] = piece[l] < 0 ? 0.0 : from[piece[l] * width + i];
+      return point(x);
+    };
+    const int v = (int)task.speed, tp = (int)task.settled_params;
+    M in = mask(true);
+    for (int l = 0; l < LANES; l++) if (piece[l] < 0) in[l] = 0;
+    I faster = point(set.c[v]) - gather(task.middle, 1, 0);
+    for (int i = 0; i < nb; i++) {
+      if (i == v) continue;
+      I by_speed = gather(task.settled_by_speed, nb, i);
+      I off = point(set.c[i]) - gather(task.settled_centre, nb, i) - by_speed * faster;
+      V spread = fill(0.0);
+      for (int j = 0; j < np; j++) {
+        I g = point(set.G[i * np + j]) - by_speed * point(set.G[v * np + j]);
+        if (j < tp) {
+          I by_param = gather(task.settled_by_param, nb * tp, i * tp + j);
+          off = off - by_param * (point(pmid[j]) - I(task.settled_at[j]));
+          g = g - by_param * point(phalf[j]);
+        }
+        spread += g.mag();
+      }
+      for (int l = 0; l < nb; l++) spread += (point(set.B[i * nb + l]) - by_speed * point(set.B[v * nb + l])).mag() * set.r[l];
+      in &= off.mag() + spread <= gather(task.settled_width, nb, i).h;
+    }
+    return in;
+  }
+
+  // Ends the lanes that have settled. Every run passes each speed down to the stop once, with states in `later_states`:
+  // time and distance are integrals of 1/a and v/a over the speed v, a being the rate at which it falls.
+  void settle() {
+    if (!task.pieces || !any(alive & ~ended)) return;
+    const int v = (int)task.speed;
+    int piece[LANES];
+    bool some = false;
+    for (int l = 0; l < LANES; l++) {
+      piece[l] = -1;
+      if (!alive[l] || ended[l]) continue;
+      for (long k = task.pieces; k-- > 0;)
+        if (task.slow[k] <= -X[v].n[l] && X[v].h[l] <= task.fast[k]) { piece[l] = (int)k, some = true; break; }
+    }
+    if (!some) return;
+    M in = within(piece) & alive;
+    if (!any(in)) return;
+    auto slowing = [&](I speed, M& none) {
+      std::vector<I> at(n);
+      for (int i = 0; i < n; i++)
+        for (int l = 0; l < LANES; l++) {
+          const double* ends = task.later_states + 2 * (std::max(piece[l], 0) * n + i);
+          at[i].n[l] = -ends[0], at[i].h[l] = ends[1];
+        }
+      at[v] = speed;
+      load_states(falling, at, false), falling.advance(fall, 0);
+      I a = -falling.value((int)task.acceleration, 0);
+      none |= falling.none[task.acceleration] | ~(a.low() > 0);
+      return inverse(pick(none, I(1.0), a), none);
+    };
+    M none{};
+    I stop_speed = span(fill(task.stop_low), fill(task.stop_high)), time(0.0), way(0.0), above_ = point(set.c[v]);
+    for (int k = 1; k <= SLICES; k++) {
+      V next;
+      for (int l = 0; l < LANES; l++) next[l] = set.c[v][l] * std::pow(task.stop_high / set.c[v][l], (double)k / SLICES);
+      I below_ = k < SLICES ? point(vmin(vmax(next, fill(task.stop_high)), above_.h)) : stop_speed;
+      I inv = slowing(hull(above_, below_), none);
+      time = time + (above_ - below_) * inv;
+      way = way + scaled((above_ - below_) * (above_ + below_), 0.5) * inv;
+      above_ = below_;
+    }
+    I alpha = slowing(X[v], none);
+    auto total = [&](const Sum& now_, I integral, I rate, std::vector<V>& reach_) {
+      V w = now_.R;
+      for (int j = 0; j < np; j++) {
+        V mine = (point(now_.G[j]) + rate * point(set.G[v * np + j])).mag();
+        reach_[j] = in ? mine : reach_[j], w += mine;
+      }
+      for (int j = 0; j < nb; j++) w += (rate * point(set.B[v * nb + j])).mag() * set.r[j];
+      return now_.c + integral + symmetric(w);
+    };
+    I stop_time = total(sum_of(task.clock, elapsed), time, alpha, settled_time_reach);
+    I stop_way = total(sum_of(task.travelled, I(0.0)), way, alpha * X[v], settled_way_reach);
+    in &= ~none & (M)(stop_time.h <= task.latest) & ~empty(stop_time);
+    settled_time = pick(in, stop_time, settled_time), settled_way = pick(in, stop_way, settled_way);
+    for (int s = 0; s < task.signals; s++)
+      for (int l = 0; l < LANES; l++) {
+        if (!in[l]) continue;
+        const double* ends = task.later_signals + 2 * (piece[l] * task.signals + s);
+        bottom[s][l] = std::fmax(bottom[s][l], -ends[0]), top[s][l] = std::fmax(top[s][l], ends[1]);
+      }
+    settled |= in, done |= in, alive &= ~in;
   }
 
   void start(const double* cells, long count) {
-    alive = mask(true), dead = done = timed = ended = doomed = M{};
+    alive = mask(true), dead = done = timed = ended = doomed = settled = M{};
     for (int& w : why) w = NOTHING;
     end = Ending(np, nb), elapsed = I(0.0);
     steps = 0, h_next = task.first, about = 0, box_limit = NEVER, begun = false;
@@ -667,7 +791,7 @@ struct Group {
         double m = 0.5 * (c[0] + c[1]);
         pmid[p][l] = m, phalf[p][l] = std::fmax(c[1] - m, m - c[0]);
       }
-    for (Series* s : {&mid, &rest, &whole, &box, &edge, &jac, &at_tick, &at_tick_mid}) load_params(*s, s == &mid || s == &at_tick_mid);
+    for (Series* s : {&mid, &rest, &whole, &box, &edge, &jac, &at_tick, &at_tick_mid, &falling}) load_params(*s, s == &mid || s == &at_tick_mid);
     at_tick.real_limits = at_tick_mid.real_limits = true, at_tick.nd = np + nb;
     at_tick.widths.clear(), at_tick.seeds.clear(), at_tick.own = -1;
     at_tick_mid.advance(starts, 0), at_tick.advance(starts, 0);
@@ -725,7 +849,7 @@ struct Group {
   void write(double* out, int lane, bool sound) const {
     const int ns = (int)task.signals;
     bool fine = done[lane] && !dead[lane] && sound, stopped = fine && !timed[lane];
-    I T = end.time(), W = end.way();
+    I T = pick(settled, settled_time, end.time()), W = pick(settled, settled_way, end.way());
     out[0] = fine ? (timed[lane] ? 2 : 1) : 0;
     out[1] = stopped ? -T.n[lane] : 0, out[2] = stopped ? T.h[lane] : INFINITY;
     bool moved = stopped && task.travelled >= 0;
@@ -734,8 +858,8 @@ struct Group {
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = fine ? -bottom[s][lane] : -INFINITY, signal[1] = fine ? top[s][lane] : INFINITY;
     for (int s = 0; s < ns; s++, signal += 2) signal[0] = sound ? -below[s][lane] : INFINITY, signal[1] = sound ? above[s][lane] : -INFINITY;
     for (int p = 0; p < np; p++) *signal++ = reach[p][lane];
-    for (int p = 0; p < np; p++) *signal++ = end.caused(end.time_G, end.pace, p)[lane];
-    for (int p = 0; p < np; p++) *signal++ = end.caused(end.way_G, end.speed, p)[lane];
+    for (int p = 0; p < np; p++) *signal++ = settled[lane] ? settled_time_reach[p][lane] : end.caused(end.time_G, end.pace, p)[lane];
+    for (int p = 0; p < np; p++) *signal++ = settled[lane] ? settled_way_reach[p][lane] : end.caused(end.way_G, end.speed, p)[lane];
     *signal = sound ? why[lane] : TOO_WIDE;
   }
 };
@@ -783,7 +907,7 @@ void apply(int code, long count, const double* a, const double* b, double* out) 
 }
 
 // Proves at most LANES cells, each params x (low, high), into `out`, a row of results for each (`Group::write`).
-// scout, if not null: for each period the speed or time, and the Jacobian of one run.
+// scout, if not null: for each period the speed or time, the states and the Jacobian of one run.
 // trail, if not null: for each step and each cell its time (low, high) and that of each signal; NaN once a cell is over.
 // Returns the number of rows in scout or trail, which have room for `room` rows.
 long prove(const Task* task, long count, const double* cells, double* out, double* scout, double* trail, long room) {
@@ -803,10 +927,11 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
   };
   auto report = [&]() {
     if (!scout || written >= room) return;
-    double* to = scout + written++ * (1 + nb * nb);
+    double* to = scout + written++ * (1 + nb + nb * nb);
     to[0] = task->speed >= 0 ? g.X[task->speed].mid()[0] : g.about;
+    for (int i = 0; i < nb; i++) to[1 + i] = g.X[i].mid()[0];
     for (int i = 0; i < nb; i++)
-      for (int j = 0; j < nb; j++) to[1 + i * nb + j] = g.J[i * g.nd + g.np + j].mid()[0] / g.set.r[j][0];
+      for (int j = 0; j < nb; j++) to[1 + nb + i * nb + j] = g.J[i * g.nd + g.np + j].mid()[0] / g.set.r[j][0];
   };
   g.start(cells, count);
   for (long number = 0; any(g.alive); number++) {

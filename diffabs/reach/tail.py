@@ -1,0 +1,137 @@
+"""The tail of a brake's runs: sets of settled states, which a run leaves only for one at a lower speed, or to stop.
+
+After its transient a run hardly depends on how it began. So the rest of all runs is proved once, from a few sets, and a
+cell's proof ends as soon as its set is inside one of them.
+
+A piece of the tail is the set of all states with a speed v in [low, high] and, for every other state i that a tick
+keeps,
+
+    | x_i - centre_i - by_speed_i (v - middle) - sum_j by_param_ij (p_j - middle_j) | <= width_i.
+
+Here p are the parameters of the box. The claim of a piece: every run from it, for all parameters, enters a slower piece
+or stops. Until its stop, states and signals stay in the ranges `later_states` and `later_signals`, which contain those
+of all slower pieces. By induction over the pieces, the claim needs a proof only up to the entry into a slower piece.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from diffabs.reach.equations import Equations, RealOperation
+
+Ends = tuple[float, float]
+
+
+class TailPiece(NamedTuple):
+    """One set of settled states.
+
+    Attributes:
+        low: Least speed [m/s].
+        high: Greatest speed [m/s].
+        centre: Each settled state at the middle speed and parameters.
+        by_speed: Its change by the speed [per m/s].
+        by_param: Its change by each parameter, shape (settled states, parameters).
+        width: Half width of the set in each settled state.
+        later_states: Range, up to the stop, of each state that decides the deceleration, by name.
+        later_signals: Range of each signal up to the stop, by name.
+        cells: Cells of parameters and speed, by which the claim was proved, shape (cells, parameters + 1, 2).
+    """
+
+    low: float
+    high: float
+    centre: tuple[float, ...]
+    by_speed: tuple[float, ...]
+    by_param: tuple[tuple[float, ...], ...]
+    width: tuple[float, ...]
+    later_states: dict[str, Ends]
+    later_signals: dict[str, Ends]
+    cells: tuple[tuple[Ends, ...], ...]
+
+    @property
+    def middle(self) -> float:
+        """The middle speed [m/s]."""
+        return 0.5 * (self.low + self.high)
+
+
+class Tail(NamedTuple):
+    """The tail of all runs of a box.
+
+    Attributes:
+        states: Names of the settled states: those that a run keeps over a tick, but the speed.
+        middle: Middle of each parameter of the box.
+        pieces: Pieces. A run of one enters an earlier one, or stops.
+    """
+
+    states: tuple[str, ...]
+    middle: tuple[float, ...]
+    pieces: tuple[TailPiece, ...]
+
+    def entries(self, count: int, signals: Iterable[str]) -> "Tail":
+        """Return the first pieces with empty ranges of the signals, so that those of a run end with its entry.
+
+        Args:
+            count: Number of pieces.
+            signals: Names of the signals.
+        """
+        nothing = dict.fromkeys(signals, (math.inf, -math.inf))
+        return self._replace(pieces=tuple(x._replace(later_signals=nothing) for x in self.pieces[:count]))
+
+
+def stop_speed(e: Equations) -> float | None:
+    """Return the speed at which the runs end [m/s], or None if the stop is about something else.
+
+    Args:
+        e: Equations of the loop.
+    """
+    margin = e.operations[e.margin]
+    if e.speed < 0 or margin.name != "sub" or e.operations[margin.args[0]] != RealOperation("state", (), e.speed):
+        return None
+    speed = e.operations[margin.args[1]]
+    return float(speed.value) if speed.name == "const" else None
+
+
+def equations_from(e: Equations, tail: Tail, piece: TailPiece, shown: Iterable[str] = ()) -> Equations:
+    """Return the equations of all runs that start in a piece.
+
+    Further parameters are the speed and, for each settled state, its place in [-1, 1] across the piece.
+
+    Args:
+        e: Equations of the loop.
+        tail: Tail; its pieces are not read.
+        piece: Piece.
+        shown: Names of states that become signals too, of the same name.
+    """
+    operations = list(e.operations)
+
+    def make(name: str, *args: int, value: float | int | None = None) -> int:
+        operations.append(RealOperation(name, args, value))
+        return len(operations) - 1
+
+    def number(value: float) -> int:
+        return make("const", value=float(value))
+
+    speed = make("param", value=len(e.params))
+    faster = make("sub", speed, number(piece.middle))
+    beyond = [
+        make("sub", make("param", value=j), number(middle)) if any(row[j] for row in piece.by_param) else -1
+        for j, middle in enumerate(tail.middle)
+    ]
+    start = list(e.start)
+    start[e.speed] = speed
+    for i, name in enumerate(tail.states):
+        total = make("add", number(piece.centre[i]), make("mul", number(piece.by_speed[i]), faster))
+        for change, by in zip(beyond, piece.by_param[i], strict=True):
+            if by:
+                total = make("add", total, make("mul", number(by), change))
+        place = make("param", value=len(e.params) + 1 + i)
+        start[e.states.index(name)] = make("add", total, make("mul", number(piece.width[i]), place))
+    also = {name: e.operations.index(RealOperation("state", (), e.states.index(name))) for name in shown}
+    names = ("tail.speed", *(f"tail.{name}" for name in tail.states))
+    return dataclasses.replace(
+        e,
+        operations=tuple(operations),
+        params=(*e.params, *names),
+        start=tuple(start),
+        signals={**e.signals, **also},
+    )
