@@ -30,7 +30,7 @@ SPEED_COST = 3.0
 CURVE_BITS = 12  # of a place on Morton's curve, for each parameter
 CLOSE = 5e-4  # a bound is refined while it is farther than this from the worst run found, relative
 MANY = 256  # cells tried, after which a proof of the tail is worth its time
-TAIL_WIDTH, NARROW_TAIL_WIDTH = 1e-3, 3e-4  # half widths of the tail in the slip; the second where the stop counts
+TAIL_WIDTH, NARROW_TAIL_WIDTH = 2e-3, 3e-4  # half widths of the tail in the slip; the second where the stop counts
 RUN_ERROR = 1e-3  # of a value found in a run, relative: a run farther beyond a proved bound contradicts it
 
 Box = dict[str, tuple[float, float]]
@@ -330,12 +330,13 @@ def _order_neighbours(box: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
     The lanes of a group share the lengths of their steps, which limits shorten at other times in other cells.
     """
+    bits = min(CURVE_BITS, 62 // len(box))
     sides = np.where(box[:, 1] > box[:, 0], box[:, 1] - box[:, 0], 1.0)
-    places = ((cells[:, :, 0] - box[:, 0]) / sides * (2**CURVE_BITS - 1)).astype(int)
-    key = np.zeros(len(cells), object)
-    for bit in range(CURVE_BITS - 1, -1, -1):
-        for side in range(len(box)):
-            key = key * 2 + (places[:, side] >> bit & 1)
+    places = ((cells[:, :, 0] - box[:, 0]) / sides * (2**bits - 1)).astype(np.int64)
+    key = np.zeros(len(cells), np.int64)
+    for bit in range(bits - 1, -1, -1):
+        for place in places.T:
+            key = key * 2 + (place >> bit & 1)
     return np.argsort(key, kind="stable")
 
 
