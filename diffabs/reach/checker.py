@@ -1242,7 +1242,7 @@ class _Check:
             {name: min(_below(x), piece.later_signals[name][0]) for name, x in self.bottom.items()},
         )
 
-    def settle(self, tail: Tail | None, latest: float) -> CheckedBounds | None:
+    def end_in_tail(self, tail: Tail | None, latest: float) -> CheckedBounds | None:
         """Return the bounds of all runs if they are in a piece of a tail and stop by `latest` [s], else None."""
         piece = self.piece_around(tail) if tail is not None and self.rates is None else None
         if piece is None:
@@ -1363,7 +1363,7 @@ def _prove(
                     return check.bounds(True)
             tick += 1
             check.elapsed = period * tick
-            if (settled := check.settle(tail, latest)) is not None:
+            if (settled := check.end_in_tail(tail, latest)) is not None:
                 return settled
             if check.past_horizon(horizon):
                 return check.bounds(False)
@@ -1381,7 +1381,7 @@ def _prove(
         number += 1
         if check.is_over():
             return check.bounds(True)
-        if (settled := check.settle(tail, latest)) is not None:
+        if (settled := check.end_in_tail(tail, latest)) is not None:
             return settled
         if check.past_horizon(horizon):
             return check.bounds(False)

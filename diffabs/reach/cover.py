@@ -18,7 +18,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.types import PyTree
 from diffabs.reach.engine import FAILURES, CellBounds, Prover
 from diffabs.reach.equations import Equations, derive_equations
-from diffabs.reach.settle import find_tail
+from diffabs.reach.search_tail import find_tail
 from diffabs.reach.tail import Tail
 
 BATCH = 64  # cells between two looks at the clock

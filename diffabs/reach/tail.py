@@ -1,16 +1,16 @@
-"""The tail of a brake's runs: sets of settled states, which a run leaves only for one at a lower speed, or to stop.
+"""Sets of settled states of a brake. From each set, every run enters a set at lower speeds or stops.
 
-After its transient a run hardly depends on how it began. So the rest of all runs is proved once, from a few sets, and a
-cell's proof ends as soon as its set is inside one of them.
+After its transient a run hardly depends on its start. A few sets contain the later states of nearly all runs. The
+prover proves the runs from these sets once. The proof of a cell then ends when its set lies in one of them.
 
-A piece of the tail is the set of all states with a speed v in [low, high] and, for every other state i that a tick
-keeps,
+A piece of the tail is the set of all states with a speed v in [low, high] and, for every settled state i,
 
     | x_i - centre_i - by_speed_i (v - middle) - sum_j by_param_ij (p_j - middle_j) | <= width_i.
 
-Here p are the parameters of the box. The claim of a piece: every run from it, for all parameters, enters a slower piece
-or stops. Until its stop, states and signals stay in the ranges `later_states` and `later_signals`, which contain those
-of all slower pieces. By induction over the pieces, the claim needs a proof only up to the entry into a slower piece.
+A settled state is one that the next tick or a rate reads, but not the speed. Here p are the parameters of the box. The
+claim of a piece: every run from it, for all parameters, enters an earlier piece or stops. Until its stop, states and
+signals stay in the ranges `later_states` and `later_signals`. These contain the ranges of every earlier piece. So a
+piece needs a proof only up to the entry into an earlier one (induction from the slowest).
 """
 
 import dataclasses
@@ -33,9 +33,9 @@ class TailPiece(NamedTuple):
         by_speed: Its change by the speed [per m/s].
         by_param: Its change by each parameter, shape (settled states, parameters).
         width: Half width of the set in each settled state.
-        later_states: Range, up to the stop, of each state that decides the deceleration, by name.
-        later_signals: Range of each signal up to the stop, by name.
-        cells: Cells of parameters and speed, by which the claim was proved, shape (cells, parameters + 1, 2).
+        later_states: Range, from here to the stop, of each state that decides the deceleration, but the speed.
+        later_signals: Range of each signal from here to the stop, by name.
+        cells: Cells that prove the claim, shape (cells, parameters + 1, 2); the speed is the last side.
     """
 
     low: float
@@ -55,20 +55,20 @@ class TailPiece(NamedTuple):
 
 
 class Tail(NamedTuple):
-    """The tail of all runs of a box.
+    """The pieces of all runs of a box, up to the speed at which these have settled.
 
     Attributes:
-        states: Names of the settled states: those that a run keeps over a tick, but the speed.
+        states: Names of the settled states, without the speed.
         middle: Middle of each parameter of the box.
-        pieces: Pieces. A run of one enters an earlier one, or stops.
+        pieces: The slowest first. Every run from a piece enters an earlier piece or stops.
     """
 
     states: tuple[str, ...]
     middle: tuple[float, ...]
     pieces: tuple[TailPiece, ...]
 
-    def entries(self, count: int, signals: Iterable[str]) -> "Tail":
-        """Return the first pieces with empty ranges of the signals, so that those of a run end with its entry.
+    def without_signals(self, count: int, signals: Iterable[str]) -> "Tail":
+        """Return the first pieces without ranges of signals. The bounds of a run then end with its entry.
 
         Args:
             count: Number of pieces.
@@ -79,7 +79,7 @@ class Tail(NamedTuple):
 
 
 def stop_speed(e: Equations) -> float | None:
-    """Return the speed at which the runs end [m/s], or None if the stop is about something else.
+    """Return the speed at which the runs end [m/s], or None if the margin is not the speed minus a constant.
 
     Args:
         e: Equations of the loop.
@@ -94,11 +94,12 @@ def stop_speed(e: Equations) -> float | None:
 def equations_from(e: Equations, tail: Tail, piece: TailPiece, shown: Iterable[str] = ()) -> Equations:
     """Return the equations of all runs that start in a piece.
 
-    Further parameters are the speed and, for each settled state, its place in [-1, 1] across the piece.
+    Further parameters are the speed and, for each settled state, its place in [-1, 1] across the piece. The other
+    states start as in the loop.
 
     Args:
         e: Equations of the loop.
-        tail: Tail; its pieces are not read.
+        tail: Tail, of which only `states` and `middle` are read.
         piece: Piece.
         shown: Names of states that become signals too, of the same name.
     """

@@ -399,7 +399,7 @@ def _check_cell(equations: Equations, file: ProofFile, cell: PlacedCell) -> str:
     across = [[-1.0, 1.0]] * len(file.tail.states)
     box = {**file.over, "speed": (piece.low, piece.high)}
     sides = _choose_sides(box, cell.ends)
-    entries = file.tail.entries(cell.piece, ends)
+    entries = file.tail.without_signals(cell.piece, ends)
     return _check(runs, file, stated, entries, math.inf, [*cell.ends, *across], sides)
 
 

@@ -18,7 +18,7 @@ from diffabs.reach.certificate import FORMAT, tail_document
 from diffabs.reach.cover import RunClaim, prove_box
 from diffabs.reach.engine import CellBounds, Prover
 from diffabs.reach.equations import Equations, RealOperation
-from diffabs.reach.settle import find_tail
+from diffabs.reach.search_tail import find_tail
 from diffabs.reach.tail import Tail, stop_speed
 from diffabs.reach.verification import FileVerdict, verify_box
 
@@ -84,7 +84,7 @@ def tail_of(prover: Prover) -> Tail:
     return tail
 
 
-@killed_by("reach/settle.py", "return tail if len(tail.pieces) > 1 else None", "return None", case="continuous")
+@killed_by("reach/search_tail.py", "return tail if len(tail.pieces) > 1 else None", "return None", case="continuous")
 @PERIODS
 def test_runs_from_a_piece_stay_in_its_ranges(period: float | None) -> None:
     tail, random = tail_of(prover_of(brake(period))), np.random.default_rng(1)

@@ -37,7 +37,7 @@ struct Task {
   long order, tables;
   const double* weights;  // units of the axes, tables x kept, by the logarithm of the speed, or by the time
   double keys_low, keys_high;
-  // The tail: sets of settled states, slowest first, each of which a run leaves only for a slower one, or to stop. With a
+  // The tail: sets of settled states, slowest first. Every run from a set enters a slower one, or stops. With a
   // speed v in [low, high] and parameters p, a state i is in centre + by_speed (v - middle) + by_param (p - at) + [-width, width].
   long pieces, settled_params;
   const double *slow, *fast, *middle;                        // for each piece

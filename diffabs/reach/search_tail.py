@@ -1,7 +1,7 @@
 """The search for a tail: pieces from slow to fast, each proved by the native prover.
 
-Centres come from single runs, widths from the units of Lohner's axes. A wrong choice costs time, and no more: a piece
-whose claim is not proved ends the tail, and runs are then followed to their stop above its speed.
+Single runs give the centres, the weights of Lohner's axes the widths. A poor choice cannot make the proof wrong. If a
+piece is not proved, the search ends, and faster runs are followed until they enter a slower piece.
 """
 
 import math
@@ -14,17 +14,16 @@ import numpy as np
 from diffabs.reach.engine import CellBounds, Prover, read_by
 from diffabs.reach.tail import Ends, Tail, TailPiece, equations_from, stop_speed
 
-SPACING, HELD = 1.1, 1.135  # ratios of speeds: of one piece to the next, and within a piece
-SMOOTHED = 1.5  # ratio of speeds
-PATIENCE = 2.5  # durations of a piece, after which a run should be in a slower one
-ABOVE_STOP = 1.02  # lowest speed of the tail, in speeds of the stop
-MOST_CELLS = 256  # of a piece
-CLOCKWORK_SHARE = (
-    0.1  # width of a state that is the same in all runs, over that of the slip, both relative to the state
-)
-SLACK = 0.03  # by which the ranges of a piece are wider than proved, in their widths: the checker's are wider
-WIDEST = 6.0  # of the slip's range in a piece, in half widths: beyond, the runs have not settled
-ROOM = 5.0  # between the settled slip and its bound, in half widths of a piece
+SPACING = 1.1  # lowest speed of the next faster piece, over that of this one
+SPAN = 1.135  # highest speed of a piece, over its lowest; pieces overlap
+SMOOTHED = 1.5  # the weights are averaged over speeds from middle/1.5 to 1.5 middle
+PATIENCE = 2.5  # horizon of the proof of a piece, over the time to brake from its highest speed to low/SPAN
+ABOVE_STOP = 1.02  # lowest speed of the slowest piece, at least, over that of the stop
+MOST_CELLS = 256  # of a piece; with more, the search ends
+CLOCKWORK_SHARE = 0.1  # relative width of a state in `Prover.clockwork`, over that of the slip
+SLACK = 0.03  # share of a range that is added at each end, because the checker's enclosures are wider
+WIDEST = 6.0  # range of the slip in a cell up to its entry, in half widths of the piece; a wider cell is halved
+ROOM = 5.0  # least distance of the settled slip from its bound, in half widths of a piece
 
 
 class _Model(NamedTuple):
@@ -35,12 +34,13 @@ class _Model(NamedTuple):
     by_param: np.ndarray  # shape (speeds, settled states, parameters)
 
     def at(self, table: np.ndarray, speed: float) -> np.ndarray:
+        """Return `states` or `by_param` at a speed, by linear interpolation."""
         flat = table.reshape(len(self.speeds), -1)
         return np.array([np.interp(speed, self.speeds, column) for column in flat.T]).reshape(table.shape[1:])
 
 
 class _Cut(NamedTuple):
-    """A cell of a piece, by the halvings that lead to it: each has a side, and 0 for its low or 1 for its high half."""
+    """A cell of a piece, as its path of halvings: pairs (side, 0 for the low or 1 for the high half)."""
 
     path: tuple[tuple[int, int], ...] = ()
 
@@ -54,14 +54,14 @@ class _Cut(NamedTuple):
         return ends
 
     def halves(self, over: Sequence[Ends], piece: TailPiece, sides: Sequence[int]) -> list["_Cut"]:
-        """Return the two halves along the longest of some sides, relative to the parameter."""
+        """Return the two halves along the longest of some sides, relative to its largest magnitude."""
         ends = self.ends(over, piece)
         side = max(sides, key=lambda i: (ends[i][1] - ends[i][0]) / max(abs(ends[i][0]), abs(ends[i][1]), 1e-300))
         return [_Cut((*self.path, (side, upper))) for upper in (0, 1)]
 
 
 def _join_halves(cuts: Sequence[_Cut]) -> list[_Cut]:
-    """Return cells, each pair of halves as one."""
+    """Return the cells, with each pair of sibling halves joined: the next piece may need fewer."""
     whole = {(*cut.path[:-1], (cut.path[-1][0], 1 - cut.path[-1][1])) for cut in cuts if cut.path}
     return list(dict.fromkeys(_Cut(cut.path[:-1]) if cut.path in whole else cut for cut in cuts))
 
@@ -75,14 +75,16 @@ def find_tail(
     until: float = math.inf,
     threads: int | None = None,
 ) -> Tail | None:
-    """Return a proved tail of the runs over a box, or None if the search finds none.
+    """Return a proved tail of the runs over a box, or None if two pieces are not proved.
+
+    There is none for a loop without slip, or without a speed at which it stops.
 
     Args:
         prover: Prover of the loop, with weights.
         over: Range of each parameter of the box.
         width: Greatest half width of the pieces in the slip [1].
-        greatest: Slip that the runs in the tail should not exceed [1].
-        until: Time of `time.monotonic` at which the search ends [s].
+        greatest: Bound of the slip, which limits the width too [1].
+        until: Time of `time.monotonic` after which no further piece is begun [s].
         threads: Number of threads; None for one for each core.
     """
     e = prover.equations
@@ -103,11 +105,11 @@ def find_tail(
     deceleration = (float(model.speeds[-1]) - end) / float(alone.time[0, 1])
     middle = tuple(0.5 * (low + high) for low, high in over.values())
     tail = Tail(tuple(e.states[i] for i in settled), middle, ())
-    cuts = [_Cut(((len(over), upper),)) for upper in (0, 1)]
+    cuts = [_Cut()]
     low = max(end * ABOVE_STOP, float(model.speeds[0]))
-    while width > 0 and low * HELD <= model.speeds[-1] and time.monotonic() < until:
+    while width > 0 and low * SPAN <= model.speeds[-1] and time.monotonic() < until:
         piece = _place_piece(prover, model, tail, low, width)
-        patience = PATIENCE * (piece.high - piece.low / HELD) / deceleration
+        patience = PATIENCE * (piece.high - piece.low / SPAN) / deceleration
         proved = _prove_piece(prover, tail, piece, over, _join_halves(cuts), [*lasting, len(over)], patience, threads)
         if proved is None:
             break
@@ -150,8 +152,8 @@ def _model_settled_states(
 
 
 def _place_piece(prover: Prover, model: _Model, tail: Tail, low: float, width: float) -> TailPiece:
-    """Return a piece above a speed, whose ranges up to the stop are still unknown."""
-    high = low * HELD
+    """Return an unproved piece from a speed on, without cells or later ranges."""
+    high = low * SPAN
     middle = 0.5 * (low + high)
     centre = model.at(model.states, middle)
     by_speed = (model.at(model.states, high) - model.at(model.states, low)) / (high - low)
@@ -159,10 +161,10 @@ def _place_piece(prover: Prover, model: _Model, tail: Tail, low: float, width: f
     e = prover.equations
     places = [prover.kept.index(e.states.index(name)) for name in tail.states]
     slip = tail.states.index(e.states[e.nonnegative[0]])
-    # The units are powers of two. Their mean over nearby speeds changes little from one piece to the next.
+    # The weights are powers of two. Their mean over nearby speeds changes little from one piece to the next.
     near = [prover.weights_at(middle * factor)[places] for factor in np.geomspace(1 / SMOOTHED, SMOOTHED, 15)]
-    units = np.exp(np.log(near).mean(0))
-    widths = width * units[slip] / units
+    weights = np.exp(np.log(near).mean(0))
+    widths = width * weights[slip] / weights
     for i, place in enumerate(places):
         if place in prover.clockwork:
             widths[i] = CLOCKWORK_SHARE * width / max(abs(centre[slip]), 1e-3) * abs(centre[i])
@@ -181,16 +183,17 @@ def _prove_piece(
     patience: float,
     threads: int | None,
 ) -> tuple[TailPiece, list[_Cut]] | None:
-    """Return a piece with its ranges up to the stop, and its proved cells; None without a proof.
+    """Return a piece with its later ranges, and its proved cells; None without a proof.
 
-    Cells that fail are halved along the longest of `sides`, relative to the parameter.
+    A cell fails if its runs enter no slower piece within `patience` [s], or if its slip is wider than WIDEST. It is
+    then halved along the longest of `sides`.
     """
     e, slip = prover.equations, prover.equations.states[prover.equations.nonnegative[0]]
     read = sorted(e.states[i] for i in read_by(e, [e.acceleration])[0] - {e.speed})
     shown = list(dict.fromkeys([slip, *read]))
     own = Prover(equations_from(e, slower, piece, shown), (*prover.signals, *shown), patience)
     own.share_weights(prover)
-    own.use_tail(slower.entries(len(slower.pieces), own.signals), math.inf)
+    own.use_tail(slower.without_signals(len(slower.pieces), own.signals), math.inf)
     places = np.tile([-1.0, 1.0], (len(slower.states), 1))
     column, widest = len(prover.signals), WIDEST * piece.width[slower.states.index(slip)]
     done: list[_Cut] = []
