@@ -144,10 +144,10 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
         box = read_proof(document).over
         derive_equations(chosen.loop, box)  # refuses a loop or a box without rules before anything is simulated
         # The runs that would show a false bound are looked for, and their cells are proved again.
-        suspects = _points(_extreme_runs(chosen, box)[1])
+        known, extreme = _extreme_runs(chosen, box)
         found = console.run_with_progress(
             lambda: verify_box(
-                chosen.loop, chosen.solver.duration, document, share, suspects=suspects,
+                chosen.loop, chosen.solver.duration, document, share, suspects=_points(extreme), known=known,
                 progress=lambda line: far.__setitem__(0, line), processes=core_count(),
             ),
             f"verifying {file}",

@@ -1157,19 +1157,20 @@ class _Check:
         """Check that a piece of a tail decides what follows: that it bounds all states which a tick or a rate reads."""
         p, e = self.program, self.program.equations
         settled = {e.states.index(name) for name in tail.states if name in e.states}
-        if self.speed < 0 or stop_speed(e) is None:
-            raise NotProved("a tail needs a loop that stops at a speed")
+        end = stop_speed(e)
+        if self.speed < 0 or end is None or not end > 0:
+            raise NotProved("a tail needs a loop that stops at a positive speed")
         if len(settled) != len(tail.states) or e.speed in settled:
             raise NotProved("the states of the tail are not distinct states of the loop without its speed")
         others = set(p.states) - settled - {e.speed}
         roots = p.tick if p.tick else p.flow
         read = {p.operations[i].value for i in p.read_by(roots) if p.operations[i].name == "state"}
-        if not settled <= set(p.states) or others & read or (others and not p.tick):
-            raise NotProved(f"the tail leaves out {', '.join(e.states[i] for i in others)}")
+        if wrong := settled - set(p.states) or others & read or (others if not p.tick else set()):
+            raise NotProved(f"the tail has a state that no run needs, or lacks one: {e.states[min(wrong)]}")
         decides = {p.operations[i].value for i in p.read_by([e.acceleration]) if p.operations[i].name == "state"}
         for piece in tail.pieces:
-            if not decides - {e.speed} <= {e.states.index(name) for name in piece.later_states}:
-                raise NotProved("the tail has no range of a state that decides the deceleration")
+            if {e.states.index(name) for name in piece.later_states} != decides - {e.speed}:
+                raise NotProved("the tail has not the ranges of just the states that decide the deceleration")
 
     def piece_around(self, tail: Tail) -> TailPiece | None:
         """Return a piece of a tail that contains the set, or None."""

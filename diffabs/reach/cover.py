@@ -150,6 +150,8 @@ def prove_box(
         now, rest = _cut_to_size(now, fitting * LARGER, influence, smallest)
         left = np.concatenate([left, rest])
         found = prover.prove(now, threads)
+        if tail is not None:
+            found = _follow_to_stop(prover, quantities, claims, now, found, tail, threads)
         tried += len(now)
         refuting = _find_violation(quantities, claims, now, found)
         fine = (found.status > 0) & _satisfy(quantities, claims, found)
@@ -183,12 +185,33 @@ def prove_box(
         raise AssertionError("the cells do not cover the box")
     bounds = quantities.over_all(merged) if covered and merged is not None else quantities.unbounded
     verdict = "refuted" if refuting is not None else "proved" if covered else "undecided"
-    if verdict == "proved" and (contradiction := _find_contradiction(bounds, known or {})):
+    if verdict == "proved" and (contradiction := name_contradiction(bounds, known or {})):
         verdict, failure, bounds = "undecided", contradiction, quantities.unbounded
     return BoxProof(
         *(verdict, bounds, cells, merged, left, refuting, failure if verdict == "undecided" else "", tried),
         *(time.monotonic() - began, equations, prover, tail),
     )
+
+
+def _follow_to_stop(
+    prover: Prover, quantities: "_Quantities", claims: Sequence[RunClaim], cells: np.ndarray, found: CellBounds,
+    tail: Tail, threads: int | None,
+) -> CellBounds:  # fmt: skip
+    """Return the bounds of cells; those that miss a claim about the stop are proved again without the tail.
+
+    The tail has one range of the deceleration for all parameters, so its bounds of the stop are wider.
+    """
+    stops = [claim for claim in claims if " " not in claim.quantity]
+    vague = np.flatnonzero((found.status > 0) & ~_satisfy(quantities, stops, found))
+    if not len(vague):
+        return found
+    prover.use_tail(None)
+    again = prover.prove(cells[vague], threads)
+    prover.use_tail(tail)
+    better = again.status > 0
+    for column, other in zip(found, again, strict=True):
+        column[vague[better]] = other[better]
+    return found
 
 
 def _find_tail(
@@ -283,8 +306,13 @@ def _find_violation(
     return None
 
 
-def _find_contradiction(bounds: Mapping[str, tuple[float, float]], known: Mapping[str, tuple[float, float]]) -> str:
-    """Return the bounds that a run violates by more than the errors of runs, empty without any."""
+def name_contradiction(bounds: Mapping[str, tuple[float, float]], known: Mapping[str, tuple[float, float]]) -> str:
+    """Return in words the first bound that a run violates by more than the errors of runs, empty without any.
+
+    Args:
+        bounds: Bounds (low, high) of quantities.
+        known: Least and greatest value of quantities in simulated runs.
+    """
     for name, (least, greatest) in known.items():
         low, high = bounds.get(name, (-math.inf, math.inf))
         for run, bound, beyond in ((least, low, low - least), (greatest, high, greatest - high)):

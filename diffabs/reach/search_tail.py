@@ -84,7 +84,7 @@ def find_tail(
         over: Range of each parameter of the box.
         width: Greatest half width of the pieces in the slip [1].
         greatest: Bound of the slip, which limits the width too [1].
-        until: Time of `time.monotonic` after which no further piece is begun [s].
+        until: Time of `time.monotonic` at which the search ends [s].
         threads: Number of threads; None for one for each core.
     """
     e = prover.equations
@@ -93,7 +93,7 @@ def find_tail(
         return None
     settled = [i for i in prover.kept if i != e.speed]
     slip = e.nonnegative[0]
-    if slip not in settled or not read_by(e, [e.acceleration])[0] <= set(prover.moving):
+    if slip not in settled or e.travelled in settled or not read_by(e, [e.acceleration])[0] <= set(prover.moving):
         return None
     fastest = np.array([high if path == "initial.speed" else 0.5 * (low + high) for path, (low, high) in over.items()])
     alone = prover.prove(np.repeat(fastest[None, :, None], 2, 2), threads)
@@ -110,7 +110,9 @@ def find_tail(
     while width > 0 and low * SPAN <= model.speeds[-1] and time.monotonic() < until:
         piece = _place_piece(prover, model, tail, low, width)
         patience = PATIENCE * (piece.high - piece.low / SPAN) / deceleration
-        proved = _prove_piece(prover, tail, piece, over, _join_halves(cuts), [*lasting, len(over)], patience, threads)
+        proved = _prove_piece(
+            prover, tail, piece, over, _join_halves(cuts), [*lasting, len(over)], patience, until, threads
+        )
         if proved is None:
             break
         piece, cuts = proved
@@ -181,6 +183,7 @@ def _prove_piece(
     cuts: list[_Cut],
     sides: Sequence[int],
     patience: float,
+    until: float,
     threads: int | None,
 ) -> tuple[TailPiece, list[_Cut]] | None:
     """Return a piece with its later ranges, and its proved cells; None without a proof.
@@ -200,7 +203,7 @@ def _prove_piece(
     rows: list[CellBounds] = []
     left = cuts
     while left:
-        if len(left) + len(done) > MOST_CELLS:
+        if len(left) + len(done) > MOST_CELLS or time.monotonic() > until:
             return None
         cells = np.array([cut.ends(tuple(over.values()), piece) for cut in left])
         found = own.prove(np.concatenate([cells, np.tile(places, (len(cells), 1, 1))], 1), threads)

@@ -17,7 +17,7 @@ from diffabs.config.values import format_given
 from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject
 from diffabs.reach.certificate import FORMAT, proved_ends
-from diffabs.reach.cover import RunClaim, check_box, comes_from_halving
+from diffabs.reach.cover import RunClaim, check_box, comes_from_halving, name_contradiction
 from diffabs.reach.equations import Equations, RealOperation, derive_equations
 from diffabs.reach.tail import Tail, TailPiece, equations_from
 
@@ -215,7 +215,7 @@ def _read_entries(
     for key, entry in given.items() if isinstance(given, dict) else enumerate(given or ()):
         try:
             found[key] = read(entry)
-        except (KeyError, TypeError, ValueError, OverflowError):
+        except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
             raise ValueError(f"{name}.{key} = {format_given(entry)}; {needed} is needed") from None
     return found
 
@@ -246,6 +246,7 @@ def verify_box(
     share: float = 0.01,
     *,
     suspects: Sequence[Sequence[float]] = (),
+    known: Mapping[str, tuple[float, float]] | None = None,
     progress: Callable[[str], None] = lambda line: None,
     processes: int = 1,
 ) -> FileVerdict:
@@ -260,6 +261,8 @@ def verify_box(
         document: Content of the file, from `certificate_document`.
         share: Share of the cells to check, in (0, 1]; at least one is checked.
         suspects: Points of the box whose runs may violate a bound, shape (points, parameters), in SI units.
+        known: Least and greatest value of a quantity in simulated runs. A bound that such a run violates by more than
+            0.1 % is not verified.
         progress: Called with a line about how far the check is.
         processes: Number of processes that check cells at the same time. Several need a main module that can be
             imported, as always with `multiprocessing`.
@@ -273,11 +276,23 @@ def verify_box(
         raise ValueError(f"share = {share:g} is outside (0, 1]")
     file = read_proof(document)
     cells, over = file.cells, file.over
-    reason, done = _find_contradiction(file, horizon), 0
+    ends = {
+        name: (-math.inf if low is None else low, math.inf if high is None else high)
+        for name, (low, high) in file.bounds.items()
+    }
+    reason, done = _find_contradiction(file, horizon) or name_contradiction(ends, known or {}), 0
     if not reason:
         equations = derive_equations(loop, over)
         if unknown := [name for name in file.signals if name not in equations.signals]:
             raise ValueError(f"bounds: the loop has no signal {unknown[0]}")
+        names = {
+            *(() if file.tail is None else file.tail.states),
+            *(name for x in file.pieces for name in x.later_states),
+        }
+        names -= {*equations.states}
+        names |= {name for x in file.pieces for name in x.later_signals} - {*equations.signals}
+        if names:
+            raise ValueError(f"tail: the loop has no state or signal {min(names)}")
         check = partial(_check_cell, equations, file)
         rest = [
             PlacedCell(k, [[*ends] for ends in cell]) for k, piece in enumerate(file.pieces) for cell in piece.cells
@@ -443,6 +458,8 @@ def _check(
                 "stop_distance": found.distance,
             },
         )
+        if reason and tail is not None and latest is None:  # followed to their stop, runs may have narrower bounds
+            return _check(equations, file, stated, None, None, cell, sides)
     if not reason or not sides:
         return reason
     side = sides[0]

@@ -190,10 +190,12 @@ def _over_one_speed(tail: Tail) -> Tail:
     return tail._replace(pieces=tuple(pieces))
 
 
-def judge(monkeypatch: pytest.MonkeyPatch, document: JsonObject) -> FileVerdict:
+def judge(
+    monkeypatch: pytest.MonkeyPatch, document: JsonObject, known: dict[str, tuple[float, float]] | None = None
+) -> FileVerdict:
     pytest.importorskip("flint")
     replace_seam(monkeypatch, "verified_equations", lambda loop, over: brake())
-    return verify_box(LOOP, HORIZON, json.loads(json.dumps(document)), 1.0)
+    return verify_box(LOOP, HORIZON, json.loads(json.dumps(document)), 1.0, known=known)
 
 
 def objection(monkeypatch: pytest.MonkeyPatch, document: JsonObject) -> str:
@@ -250,6 +252,11 @@ EDITS: dict[str, Callable[[JsonObject], object]] = {
     "an infinite width": lambda f: f["tail"]["pieces"][0].update(width=[float("inf")]),
     "another middle": lambda f: f["tail"].update(middle=[2.5]),
     "text": lambda f: f.update(tail="settled"),
+    "a list for a table": lambda f: f["tail"]["pieces"][0].update(later_states=[]),
+    "an unknown signal": lambda f: [p["later_signals"].update(slop=[0.0, 1.0]) for p in f["tail"]["pieces"]],
+    "an unknown later state": lambda f: [p["later_states"].update(slop=[0.0, 1.0]) for p in f["tail"]["pieces"]],
+    "the range of another state": lambda f: [
+        p["later_states"].update({"plant.distance": [0.0, 1.0]}) for p in f["tail"]["pieces"]],
 }  # fmt: skip
 
 
@@ -259,6 +266,24 @@ def test_an_edited_tail_is_noticed(monkeypatch: pytest.MonkeyPatch, honest: Json
     document = copy.deepcopy(honest)
     EDITS[name](document)
     assert objection(monkeypatch, document)
+
+
+@killed_by("reach/verification.py", "or name_contradiction(ends, known or {})", "")
+def test_a_bound_that_a_run_violates_is_not_verified(monkeypatch: pytest.MonkeyPatch, honest: JsonObject) -> None:
+    """A false piece could make it false in all cells."""
+    longest = honest["bounds"]["stop_time"][1]
+    for run, is_beyond in ((0.999 * longest, False), (1.002 * longest, True)):
+        known = {"stop_time": (0.999 * longest, run)}
+        assert bool(judge(monkeypatch, honest, known).reason) == is_beyond
+
+
+@killed_by("reach/verification.py", "if reason and tail is not None and latest is None:", "if False:")
+def test_bounds_of_cells_from_before_the_tail_are_verified(monkeypatch: pytest.MonkeyPatch, honest: JsonObject) -> None:
+    """The tail says less about the stop than the runs do that are followed to it."""
+    document = copy.deepcopy(honest)
+    for piece in document["tail"]["pieces"]:
+        piece["later_states"] = {"plant.slip": [0.1, 0.3]}
+    assert judge(monkeypatch, document).reason == ""
 
 
 @killed_by("reach/checker.py", "or e.speed in settled", "")

@@ -245,7 +245,7 @@ struct Group {
     fresh = true;
   }
 
-  // A length that ends short of the next limit. While the set crosses one, it is a quarter of the time that this takes.
+  // A length that ends short of the next limit. While the set crosses one, it is a tenth of the time that this takes.
   double shorten_before_limits(double h) {
     evaluate_at_start();
     integrate(mid, 0), mid.advance(flow, 1);
