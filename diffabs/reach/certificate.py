@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 from diffabs.core.types import JsonObject
 from diffabs.reach.cover import BoxProof, RunClaim
-from diffabs.reach.tail import Tail
+from diffabs.reach.tail import RunTail
 from diffabs.runtime import provenance
 
 FORMAT = "diffabs box proof 1"
@@ -54,11 +54,11 @@ def certificate_document(
     }
 
 
-def tail_document(tail: Tail) -> JsonObject:
+def tail_document(tail: RunTail) -> JsonObject:
     """Return the JSON object of a tail.
 
     Args:
-        tail: Tail.
+        tail: RunTail.
     """
     return {**tail._asdict(), "pieces": [piece._asdict() for piece in tail.pieces]}
 

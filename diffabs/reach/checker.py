@@ -40,7 +40,7 @@ import numpy as np
 from flint import arb, arb_mat, arb_poly, ctx
 
 from diffabs.reach.equations import SLOWEST, Equations, RealOperation
-from diffabs.reach.tail import Tail, TailPiece, stop_speed
+from diffabs.reach.tail import RunTail, TailPiece, stop_speed
 
 LIMITED = ("clamp", "round")  # operations that a chord stands for
 PRECISION = 96  # bits
@@ -1153,7 +1153,7 @@ class _Check:
 
     # The tail.
 
-    def check_tail(self, tail: Tail) -> None:
+    def check_tail(self, tail: RunTail) -> None:
         """Check that a piece of a tail decides what follows: that it bounds all states which a tick or a rate reads."""
         p, e = self.program, self.program.equations
         settled = {e.states.index(name) for name in tail.states if name in e.states}
@@ -1172,7 +1172,7 @@ class _Check:
             if {e.states.index(name) for name in piece.later_states} != decides - {e.speed}:
                 raise NotProved("the tail has not the ranges of just the states that decide the deceleration")
 
-    def piece_around(self, tail: Tail) -> TailPiece | None:
+    def piece_around(self, tail: RunTail) -> TailPiece | None:
         """Return a piece of a tail that contains the set, or None."""
         speed = self.box()[self.speed]
         for piece in reversed(tail.pieces):
@@ -1180,7 +1180,7 @@ class _Check:
                 return piece
         return None
 
-    def is_within(self, tail: Tail, piece: TailPiece) -> bool:
+    def is_within(self, tail: RunTail, piece: TailPiece) -> bool:
         """Return whether every settled state of the set is as close to its centre as a piece asks."""
         p, v = self.program, self.speed
         B, G = ([[arb(float(x)) for x in row] for row in matrix] for matrix in (self.B, self.G))
@@ -1243,7 +1243,7 @@ class _Check:
             {name: min(_below(x), piece.later_signals[name][0]) for name, x in self.bottom.items()},
         )
 
-    def end_in_tail(self, tail: Tail | None, latest: float) -> CheckedBounds | None:
+    def end_in_tail(self, tail: RunTail | None, latest: float) -> CheckedBounds | None:
         """Return the bounds of all runs if they are in a piece of a tail and stop by `latest` [s], else None."""
         piece = self.piece_around(tail) if tail is not None and self.rates is None else None
         if piece is None:
@@ -1308,7 +1308,7 @@ def check_cell(
     horizon: float,
     order: int = ORDER,
     *,
-    tail: Tail | None = None,
+    tail: RunTail | None = None,
     latest: float | None = None,
 ) -> CheckedBounds:
     """Prove bounds of every run of a cell of parameters.
@@ -1346,7 +1346,7 @@ def check_cell(
 
 
 def _prove(
-    check: _Check, steps: Sequence[float] | int, horizon: float, tail: Tail | None, latest: float
+    check: _Check, steps: Sequence[float] | int, horizon: float, tail: RunTail | None, latest: float
 ) -> CheckedBounds:
     """Move the set of a cell until all runs have ended or are in the tail, or the horizon is reached."""
     e = check.program.equations

@@ -19,7 +19,7 @@ from diffabs.core.types import PyTree
 from diffabs.reach.engine import FAILURES, CellBounds, Prover
 from diffabs.reach.equations import Equations, derive_equations
 from diffabs.reach.search_tail import find_tail
-from diffabs.reach.tail import Tail
+from diffabs.reach.tail import RunTail
 
 BATCH = 64  # cells between two looks at the clock
 LARGER, LARGER_TRIED = 1.5, 4  # size of a cell to try, in those proved just before; number that may be larger
@@ -77,7 +77,7 @@ class BoxProof(NamedTuple):
     seconds: float
     equations: Equations
     prover: Prover
-    tail: Tail | None
+    tail: RunTail | None
 
 
 def prove_box(
@@ -195,7 +195,7 @@ def prove_box(
 
 def _follow_to_stop(
     prover: Prover, quantities: "_Quantities", claims: Sequence[RunClaim], cells: np.ndarray, found: CellBounds,
-    tail: Tail, threads: int | None,
+    tail: RunTail, threads: int | None,
 ) -> CellBounds:  # fmt: skip
     """Return the bounds of cells; those that miss a claim about the stop are proved again without the tail.
 
@@ -217,7 +217,7 @@ def _follow_to_stop(
 def _find_tail(
     prover: Prover, quantities: "_Quantities", over: Mapping[str, tuple[float, float]], claims: Sequence[RunClaim],
     known: Mapping[str, tuple[float, float]], until: float, threads: int | None,
-) -> Tail | None:  # fmt: skip
+) -> RunTail | None:  # fmt: skip
     """Return a tail of the runs in which all claims hold, or None."""
     bounds = [claim.bound for claim in claims if claim.quantity == "greatest slip"]
     greatest = min(bounds, default=known.get("greatest slip", (0.0, math.inf))[1])

@@ -13,7 +13,7 @@ import numpy as np
 
 from diffabs.compiler.runtime import toolchain
 from diffabs.reach.equations import Equations, NoRule, RealOperation
-from diffabs.reach.tail import Tail, stop_speed
+from diffabs.reach.tail import RunTail, stop_speed
 from diffabs.runtime.process import core_count
 
 PROVER_FOLDER = pathlib.Path(__file__).parent / "native"
@@ -240,11 +240,11 @@ class Prover:
             *(self.weights.ctypes.data, 0.0, horizon),
         )
 
-    def use_tail(self, tail: Tail | None, latest: float | None = None) -> None:
+    def use_tail(self, tail: RunTail | None, latest: float | None = None) -> None:
         """End a cell once its runs are in a tail, which must be proved for all parameters of the cells.
 
         Args:
-            tail: Tail, or None to follow every cell to its stop.
+            tail: RunTail, or None to follow every cell to its stop.
             latest: Time by which runs in the tail must stop [s]; None for the horizon.
         """
         if tail is None or not tail.pieces:

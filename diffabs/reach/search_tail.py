@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.reach.engine import CellBounds, Prover, read_by
-from diffabs.reach.tail import Ends, Tail, TailPiece, equations_from, stop_speed
+from diffabs.reach.tail import Ends, RunTail, TailPiece, equations_from, stop_speed
 
 SPACING = 1.1  # lowest speed of the next faster piece, over that of this one
 SPAN = 1.135  # highest speed of a piece, over its lowest; pieces overlap
@@ -21,9 +21,9 @@ PATIENCE = 2.5  # horizon of the proof of a piece, over the time to brake from i
 ABOVE_STOP = 1.02  # lowest speed of the slowest piece, at least, over that of the stop
 MOST_CELLS = 256  # of a piece; with more, the search ends
 CLOCKWORK_SHARE = 0.1  # relative width of a state in `Prover.clockwork`, over that of the slip
-SLACK = 0.03  # share of a range that is added at each end, because the checker's enclosures are wider
+RANGE_SLACK = 0.03  # share of a range that is added at each end, because the checker's enclosures are wider
 WIDEST = 6.0  # range of the slip in a cell up to its entry, in half widths of the piece; a wider cell is halved
-ROOM = 5.0  # least distance of the settled slip from its bound, in half widths of a piece
+SLIP_ROOM = 5.0  # least distance of the settled slip from its bound, in half widths of a piece
 
 
 class _Model(NamedTuple):
@@ -74,7 +74,7 @@ def find_tail(
     *,
     until: float = math.inf,
     threads: int | None = None,
-) -> Tail | None:
+) -> RunTail | None:
     """Return a proved tail of the runs over a box, or None if two pieces are not proved.
 
     There is none for a loop without slip, or without a speed at which it stops.
@@ -101,10 +101,10 @@ def find_tail(
     model = _model_settled_states(prover, over, settled, lasting, fastest)
     if alone.status[0] != 1 or model is None:
         return None
-    width = min(width, (greatest - model.states[0, settled.index(slip)]) / ROOM)
+    width = min(width, (greatest - model.states[0, settled.index(slip)]) / SLIP_ROOM)
     deceleration = (float(model.speeds[-1]) - end) / float(alone.time[0, 1])
     middle = tuple(0.5 * (low + high) for low, high in over.values())
-    tail = Tail(tuple(e.states[i] for i in settled), middle, ())
+    tail = RunTail(tuple(e.states[i] for i in settled), middle, ())
     cuts = [_Cut()]
     low = max(end * ABOVE_STOP, float(model.speeds[0]))
     while width > 0 and low * SPAN <= model.speeds[-1] and time.monotonic() < until:
@@ -153,7 +153,7 @@ def _model_settled_states(
     return _Model(speeds, states, by_param) if len(speeds) else None
 
 
-def _place_piece(prover: Prover, model: _Model, tail: Tail, low: float, width: float) -> TailPiece:
+def _place_piece(prover: Prover, model: _Model, tail: RunTail, low: float, width: float) -> TailPiece:
     """Return an unproved piece from a speed on, without cells or later ranges."""
     high = low * SPAN
     middle = 0.5 * (low + high)
@@ -177,7 +177,7 @@ def _place_piece(prover: Prover, model: _Model, tail: Tail, low: float, width: f
 
 def _prove_piece(
     prover: Prover,
-    slower: Tail,
+    slower: RunTail,
     piece: TailPiece,
     over: Mapping[str, Ends],
     cuts: list[_Cut],
@@ -218,7 +218,7 @@ def _prove_piece(
         ]
     least = np.concatenate([x.least for x in rows]).min(0)
     greatest = np.concatenate([x.greatest for x in rows]).max(0)
-    slack = SLACK * (greatest - least)
+    slack = RANGE_SLACK * (greatest - least)
     ends = dict(zip(own.signals, zip((least - slack).tolist(), (greatest + slack).tolist(), strict=True), strict=True))
     signals, states = ({name: ends[name] for name in names} for names in (prover.signals, read))
     if slower.pieces:

@@ -54,7 +54,7 @@ class TailPiece(NamedTuple):
         return 0.5 * (self.low + self.high)
 
 
-class Tail(NamedTuple):
+class RunTail(NamedTuple):
     """The pieces of all runs of a box, up to the speed at which these have settled.
 
     Attributes:
@@ -67,7 +67,7 @@ class Tail(NamedTuple):
     middle: tuple[float, ...]
     pieces: tuple[TailPiece, ...]
 
-    def without_signals(self, count: int, signals: Iterable[str]) -> "Tail":
+    def without_signals(self, count: int, signals: Iterable[str]) -> "RunTail":
         """Return the first pieces without ranges of signals. The bounds of a run then end with its entry.
 
         Args:
@@ -91,7 +91,7 @@ def stop_speed(e: Equations) -> float | None:
     return float(speed.value) if speed.name == "const" else None
 
 
-def equations_from(e: Equations, tail: Tail, piece: TailPiece, shown: Iterable[str] = ()) -> Equations:
+def equations_from(e: Equations, tail: RunTail, piece: TailPiece, shown: Iterable[str] = ()) -> Equations:
     """Return the equations of all runs that start in a piece.
 
     Further parameters are the speed and, for each settled state, its place in [-1, 1] across the piece. The other
@@ -99,7 +99,7 @@ def equations_from(e: Equations, tail: Tail, piece: TailPiece, shown: Iterable[s
 
     Args:
         e: Equations of the loop.
-        tail: Tail, of which only `states` and `middle` are read.
+        tail: RunTail, of which only `states` and `middle` are read.
         piece: Piece.
         shown: Names of states that become signals too, of the same name.
     """

@@ -19,7 +19,7 @@ from diffabs.core.types import JsonObject
 from diffabs.reach.certificate import FORMAT, proved_ends
 from diffabs.reach.cover import RunClaim, check_box, comes_from_halving, name_contradiction
 from diffabs.reach.equations import Equations, RealOperation, derive_equations
-from diffabs.reach.tail import Tail, TailPiece, equations_from
+from diffabs.reach.tail import RunTail, TailPiece, equations_from
 
 SAMPLED_STEPS = 2  # steps of the checker between two ticks
 PACED_STEP, STEPS = 4e-4, 500  # length in eta [s^2/m] of a paced loop; number of steps of other continuous loops
@@ -76,7 +76,7 @@ class ProofFile(NamedTuple):
     claims: tuple[RunClaim, ...]
     bounds: Bounds
     horizon: float
-    tail: Tail | None
+    tail: RunTail | None
 
     @property
     def pieces(self) -> tuple[TailPiece, ...]:
@@ -140,7 +140,7 @@ def read_proof(document: JsonObject) -> ProofFile:
     return ProofFile(over, list(cells.values()), tuple(claims.values()), bounds, horizon, tail)
 
 
-def _read_tail(document: JsonObject, params: int) -> Tail:
+def _read_tail(document: JsonObject, params: int) -> RunTail:
     """Return the tail of a proof's file.
 
     Args:
@@ -189,7 +189,7 @@ def _read_tail(document: JsonObject, params: int) -> Tail:
     pieces = tuple(_read_entries(given, "pieces", list, piece, "a piece of the tail").values())
     if len(middle) != params:
         raise ValueError("tail.middle has not one number for each parameter of the box")
-    return Tail(states, middle, pieces)
+    return RunTail(states, middle, pieces)
 
 
 def _read_entries(
@@ -431,7 +431,7 @@ def _choose_sides(over: Mapping[str, tuple[float, float]], cell: Cell) -> list[i
 
 
 def _check(
-    equations: Equations, file: ProofFile, stated: Bounds, tail: Tail | None, latest: float | None,
+    equations: Equations, file: ProofFile, stated: Bounds, tail: RunTail | None, latest: float | None,
     cell: Cell, sides: Sequence[int],
 ) -> str:  # fmt: skip
     """Return why the checker does not prove stated bounds in a cell, empty if it does.

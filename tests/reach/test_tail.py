@@ -19,7 +19,7 @@ from diffabs.reach.cover import RunClaim, prove_box
 from diffabs.reach.engine import CellBounds, Prover
 from diffabs.reach.equations import Equations, RealOperation
 from diffabs.reach.search_tail import find_tail
-from diffabs.reach.tail import Tail, stop_speed
+from diffabs.reach.tail import RunTail, stop_speed
 from diffabs.reach.verification import FileVerdict, verify_box
 
 pytestmark = pytest.mark.usefixtures("native_prover")
@@ -78,7 +78,7 @@ def prover_of(equations: Equations) -> Prover:
 PERIODS = pytest.mark.parametrize("period", [None, 0.01], ids=["continuous", "sampled"])
 
 
-def tail_of(prover: Prover) -> Tail:
+def tail_of(prover: Prover) -> RunTail:
     tail = find_tail(prover, BOX, 1e-3, 0.25)
     assert tail is not None
     return tail
@@ -184,7 +184,7 @@ def honest(native_prover: None) -> JsonObject:
     return json.loads(json.dumps(document))
 
 
-def _over_one_speed(tail: Tail) -> Tail:
+def _over_one_speed(tail: RunTail) -> RunTail:
     """The tail for a box with one speed at the start, which no run reads after its start."""
     pieces = (p._replace(cells=tuple((c[0], (4.0, 4.0), c[2]) for c in p.cells)) for p in tail.pieces)
     return tail._replace(pieces=tuple(pieces))
