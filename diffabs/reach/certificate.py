@@ -58,7 +58,7 @@ def tail_document(tail: RunTail) -> JsonObject:
     """Return the JSON object of a tail.
 
     Args:
-        tail: RunTail.
+        tail: Settled states in which cells may end.
     """
     return {**tail._asdict(), "pieces": [piece._asdict() for piece in tail.pieces]}
 

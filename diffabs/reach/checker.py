@@ -825,7 +825,8 @@ class _Check:
             return
         if np.isfinite(total).all():
             weights = _balance_matrix(total)
-            weights[self.alone] = ALONE_WEIGHT * weights[self.slip]
+            if self.slip >= 0:
+                weights[self.alone] = ALONE_WEIGHT * weights[self.slip]
             if p.tick and self.speed >= 0 and self.slip >= 0:
                 # An error of the speed stays, while one of the slip decays: the axes must not turn speed into slip.
                 weights[self.speed] = weights[self.slip] * SPEED_WEIGHT

@@ -143,7 +143,7 @@ def prove_box(
     tail, sought = None, False
     while len(left) and refuting is None and not hopeless and time.monotonic() - began < budget:
         if tried >= MANY and not sought:
-            sought, tail = True, _find_tail(prover, quantities, over, claims, known or {}, began + budget, threads)
+            sought, tail = True, _find_tail(prover, over, claims, known or {}, began + budget, threads)
             prover.use_tail(tail)
         left = left[_order_neighbours(box, left)]
         now, left = left[:BATCH], left[BATCH:]
@@ -215,7 +215,7 @@ def _follow_to_stop(
 
 
 def _find_tail(
-    prover: Prover, quantities: "_Quantities", over: Mapping[str, tuple[float, float]], claims: Sequence[RunClaim],
+    prover: Prover, over: Mapping[str, tuple[float, float]], claims: Sequence[RunClaim],
     known: Mapping[str, tuple[float, float]], until: float, threads: int | None,
 ) -> RunTail | None:  # fmt: skip
     """Return a tail of the runs in which all claims hold, or None."""

@@ -45,17 +45,8 @@ SCOUTED = 20_000  # periods, or steps, of the run that the weights are chosen by
 # that are shorter than order 6 allows.
 SAMPLED_ORDER, CONTINUOUS_ORDER = 8, 6
 TAIL_ARRAYS = (
-    *(
-        "slow",
-        "fast",
-        "middle",
-        "settled_centre",
-        "settled_by_speed",
-        "settled_width",
-        "settled_by_param",
-        "settled_at",
-    ),
-    *("later_states", "later_signals"),
+    *("slow", "fast", "middle", "settled_centre", "settled_by_speed", "settled_width"),
+    *("settled_by_param", "settled_at", "later_states", "later_signals"),
 )
 
 
@@ -244,7 +235,7 @@ class Prover:
         """End a cell once its runs are in a tail, which must be proved for all parameters of the cells.
 
         Args:
-            tail: RunTail, or None to follow every cell to its stop.
+            tail: Proved tail, or None to follow every cell to its stop.
             latest: Time by which runs in the tail must stop [s]; None for the horizon.
         """
         if tail is None or not tail.pieces:

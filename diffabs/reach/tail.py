@@ -99,7 +99,7 @@ def equations_from(e: Equations, tail: RunTail, piece: TailPiece, shown: Iterabl
 
     Args:
         e: Equations of the loop.
-        tail: RunTail, of which only `states` and `middle` are read.
+        tail: Tail, of which only `states` and `middle` are read.
         piece: Piece.
         shown: Names of states that become signals too, of the same name.
     """

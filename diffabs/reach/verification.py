@@ -153,7 +153,8 @@ def _read_tail(document: JsonObject, params: int) -> RunTail:
     given = document["tail"]
     if not isinstance(given, dict):
         raise ValueError(f"tail = {format_given(given)} is not a table")
-    states = tuple(_read_entries(given, "states", list, str, "a name").values())
+    given = {f"tail.{name}": value for name, value in given.items()}
+    states = tuple(_read_entries(given, "tail.states", list, str, "a name").values())
 
     def numbers(values: Any, count: int) -> tuple[float, ...]:
         if len(values) != count:
@@ -185,8 +186,8 @@ def _read_tail(document: JsonObject, params: int) -> RunTail:
             raise ValueError("its speeds are not positive and in order, or a width is negative")
         return found
 
-    middle = tuple(_read_entries(given, "middle", list, _number, "a finite number").values())
-    pieces = tuple(_read_entries(given, "pieces", list, piece, "a piece of the tail").values())
+    middle = tuple(_read_entries(given, "tail.middle", list, _number, "a finite number").values())
+    pieces = tuple(_read_entries(given, "tail.pieces", list, piece, "a piece of the tail").values())
     if len(middle) != params:
         raise ValueError("tail.middle has not one number for each parameter of the box")
     return RunTail(states, middle, pieces)
@@ -276,11 +277,11 @@ def verify_box(
         raise ValueError(f"share = {share:g} is outside (0, 1]")
     file = read_proof(document)
     cells, over = file.cells, file.over
-    ends = {
+    bounds = {
         name: (-math.inf if low is None else low, math.inf if high is None else high)
         for name, (low, high) in file.bounds.items()
     }
-    reason, done = _find_contradiction(file, horizon) or name_contradiction(ends, known or {}), 0
+    reason, done = _find_contradiction(file, horizon) or name_contradiction(bounds, known or {}), 0
     if not reason:
         equations = derive_equations(loop, over)
         if unknown := [name for name in file.signals if name not in equations.signals]:
