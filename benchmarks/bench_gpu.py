@@ -16,8 +16,10 @@ spills of the packaged scenarios for sm_80 and sm_90, as NVRTC's assembler tells
 import argparse
 import ctypes
 import functools
+import itertools
 import pathlib
 import statistics
+import time
 from typing import Any
 from unittest import mock
 
@@ -41,7 +43,8 @@ from diffabs.core.pytree import get
 from diffabs.simulate.drive import kernel as native
 
 ACCURACY = 1e-4
-STEPS, TOLERANCES = (1e-3, 5e-4, 2e-4, 1e-4), (1e-5, 5e-6, 1e-6)
+STEPS, TOLERANCES, TOLERANCES_OF_DIFFRAX = (1e-3, 5e-4, 2e-4, 1e-4), (1e-5, 5e-6, 1e-6), (1e-8, 3e-9)
+SLOW = 10.0  # s: a call that takes longer is timed once
 COUNTED = {"add": 1, "sub": 1, "mul": 1, "div": 1}
 TURNS, CHAINS, THREADS = 1 << 15, 8, 1 << 20  # of the kernel that measures the card
 RATE = f"""
@@ -96,7 +99,8 @@ def programs() -> list[ScalarProgram]:
 
 
 def solvers(masses, speeds, dtype):
-    """Return, by name, the settings of each contender, and what makes its program for one."""
+    """Return, by name, the settings of each contender, and what makes its program for one. XLA has the setting at which
+    the kernel of its kind is accurate, given as `None`: the two solve by the same method."""
     from peers import ours
 
     def of(kind, engine):
@@ -105,8 +109,8 @@ def solvers(masses, speeds, dtype):
     found = {
         "kernel, FixedStep": (STEPS, of("fixed", "kernel")),
         "kernel, Adaptive": (TOLERANCES, of("adaptive", "kernel")),
-        "XLA, FixedStep": (STEPS, of("fixed", "xla")),
-        "XLA, Adaptive": (TOLERANCES, of("adaptive", "xla")),
+        "XLA, FixedStep": (None, of("fixed", "xla")),
+        "XLA, Adaptive": (None, of("adaptive", "xla")),
     }
     try:
         from peers import diffrax_event
@@ -114,63 +118,64 @@ def solvers(masses, speeds, dtype):
         return found
     solve = lambda setting: jax.vmap(functools.partial(diffrax_event.one, tolerance=setting))  # noqa: E731
     found["diffrax, Tsit5"] = (
-        diffrax_event.LADDER,
+        TOLERANCES_OF_DIFFRAX,
         lambda setting: on_devices.spread(solve(setting), masses, speeds, dtype),
     )
     return found
 
 
-def measured(lanes, dtype, rounds, peak):
-    """Return a row for each contender: its setting, error, runs per second, and share of the card's rate."""
-    jax.config.update("jax_enable_x64", dtype == "float64")
+def measured(lanes, dtype, rounds, peak, contenders=("kernel", "XLA", "diffrax")):
+    """Yield a row for each contender: its setting, error, seconds to the first result, runs per second, and the
+    kernel's share of the card's rate."""
     masses, speeds = problem.lanes(lanes)
-    (right, _), seen, chosen = reference.answers(masses, speeds), programs(), {}
+    (right, _), seen, accurate = reference.answers(masses, speeds), programs(), {}
+    jax.config.update("jax_enable_x64", dtype == "float64")
     for name, (settings, prepared) in solvers(masses, speeds, dtype).items():
+        engine, _, kind = name.partition(", ")
+        if engine not in contenders:
+            continue
         points = []
-        for setting in settings:
+        for setting in settings or [accurate.get(kind, STEPS[-1] if kind == "FixedStep" else TOLERANCES[-1])]:
+            begun = time.perf_counter()
             run = prepared(setting)
             found = run()
+            first = time.perf_counter() - begun
             error = float(problem.errors(found, right).max())
-            points.append({"setting": setting, "error": error, "run": run, "time": float(np.mean(found[0]))})
+            points.append({"setting": setting, "error": error, "run": run, "first": first})
             if error <= ACCURACY:
                 break
-        chosen[name] = (record.best(points, ACCURACY) or {}) | {"operations": arithmetic(seen[-1]) if seen else 0}
-    taken = record.in_turn({name: functools.partial(record.timed, one["run"]) for name, one in chosen.items()}, rounds)
-    rows = []
-    for name, one in chosen.items():
-        runs = lanes / statistics.median(taken[name])
-        row = {
-            "name": name,
-            "lanes": lanes,
-            "dtype": dtype,
-            "setting": one["setting"],
-            "error": one["error"],
-            "runs": runs,
-        }
-        if name == "kernel, FixedStep" and dtype == "float32":
-            row["share"] = runs * one["time"] / one["setting"] * one["operations"] / peak
-        rows.append(row)
-    return rows
+        chosen = record.best(points, ACCURACY)
+        once = record.timed(chosen["run"])
+        taken = [once] if once > SLOW else [record.timed(chosen["run"]) for _ in range(rounds)]
+        runs = lanes / statistics.median(taken)
+        shown = {k: chosen[k] for k in ("setting", "error", "first")}
+        row = {"name": name, "lanes": lanes, "dtype": dtype, **shown, "runs": runs, "rounds": len(taken)}
+        if engine == "kernel":
+            accurate[kind] = chosen["setting"]
+        if name == "kernel, FixedStep" and dtype == "float32" and seen:
+            row["share"] = runs * float(np.mean(found[0])) / chosen["setting"] * arithmetic(seen[-1]) / peak
+        yield row
 
 
 def ensemble(lanes, dtype, rounds):
-    """Return a row for each contender on the Lorenz ensemble, on the device that JAX has."""
+    """Yield a row for each contender on the Lorenz ensemble, on the device that JAX has."""
     import bench_yardsticks as yardsticks
 
     jax.config.update("jax_enable_x64", dtype == "float64")
     which, truth = yardsticks.checked(lanes)
-    rho, rows = yardsticks.rhos(lanes).astype(dtype), []
+    rho = yardsticks.rhos(lanes).astype(dtype)
     makers = {
         "Lorenz: kernel": yardsticks.by_diffabs("fixed", rho),
         "Lorenz: diffrax, RK4": yardsticks.by_diffrax("fixed", rho, lanes),
     }
-    calls = {name: prepared(None) for name, prepared in makers.items()}
-    errors = {name: yardsticks.worst(call(), which, truth) for name, call in calls.items()}
-    taken = record.in_turn({name: functools.partial(record.timed, call) for name, call in calls.items()}, rounds)
-    for name, error in errors.items():
+    for name, prepared in makers.items():
+        call = prepared(None)
+        begun = time.perf_counter()
+        error = yardsticks.worst(call(), which, truth)
+        first = time.perf_counter() - begun
+        runs = lanes / statistics.median(record.timed(call) for _ in range(rounds))
         row = {"name": name, "lanes": lanes, "dtype": dtype, "setting": 1 / yardsticks.STEPS, "error": error}
-        rows.append(row | {"runs": lanes / statistics.median(taken[name])})
-    return rows
+        yield row | {"first": first, "runs": runs, "rounds": rounds}
 
 
 class Translated(Exception):
@@ -216,24 +221,29 @@ def on_a_gpu(options):
     on = gpu.find_gpu()
     if on is None:
         raise SystemExit("JAX runs on no GPU here: pip install jax[cuda13] on a machine with one")
-    peak, rounds = rate(on, options.rounds), options.rounds
-    rows = [row for n in options.lanes for dtype in options.dtypes for row in measured(n, dtype, rounds, peak)]
-    rows += [row for n in options.lorenz for dtype in options.dtypes for row in ensemble(n, dtype, rounds)]
-    table = Table("", "lanes", "numbers", "setting", "worst error", "runs/s", "of FP32 peak")
-    for row in rows:
+    peak, rounds, rows = rate(on, options.rounds), options.rounds, []
+    print(f"{on.architecture}, FP32, measured: {peak / 1e12:.1f} Tflop/s", flush=True)
+    cases = [(n, dtype) for n in options.lanes for dtype in options.dtypes]
+    found = [measured(*case, rounds, peak, options.contenders) for case in cases]
+    found += [ensemble(n, dtype, rounds) for n in options.lorenz for dtype in options.dtypes]
+    for row in itertools.chain.from_iterable(found):
         share = f"{row['share']:.1%}" if "share" in row else ""
-        shown = (f"{row['lanes']:,}", row["dtype"], f"{row['setting']:g}", f"{row['error']:.1e}", f"{row['runs']:,.0f}")
-        table.add_row(row["name"], *shown, share)
-    Console().print(table, f"FP32, measured: {peak / 1e12:.1f} Tflop/s")
-    print(record.written("gpu", {"rows": rows, "fp32_flops": peak, "accuracy": ACCURACY}, options.out))
+        print(
+            f"{row['name']:22} {row['lanes']:>9,} {row['dtype']} {row['setting']:<7g} error {row['error']:.1e} "
+            f"first {row['first']:6.1f} s  {row['runs']:>13,.0f} runs/s ({row['rounds']}) {share}",
+            flush=True,
+        )
+        rows.append(row)
+        record.written("gpu", {"rows": rows, "fp32_flops": peak, "accuracy": ACCURACY}, options.out)
 
 
 def main():
     """Do what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lanes", type=int, nargs="+", default=[1 << 17, 1 << 20])
+    parser.add_argument("--lanes", type=int, nargs="*", default=[1 << 17, 1 << 20])
     parser.add_argument("--dtypes", nargs="+", default=["float32", "float64"], choices=("float32", "float64"))
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--contenders", nargs="+", default=["kernel", "XLA", "diffrax"])
     parser.add_argument("--lorenz", type=int, nargs="*", default=[], metavar="LANES")
     parser.add_argument("--out", type=pathlib.Path)
     parser.add_argument("--machine-code", action="store_true")

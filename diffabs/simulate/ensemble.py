@@ -65,10 +65,10 @@ def run_batch(
             for runs that step together.
         engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine, which needs a
             C++ compiler. It returns the same numbers to rounding and has forward derivatives (`jax.jvp`, `jax.jacfwd`),
-            but no reverse mode and no trajectories. "auto" uses a kernel for values on a processor where possible. It
-            uses XLA if the call is traced or the runs step together. It also does so on a GPU or on several devices,
-            and if a kernel is impossible; only then the log has a warning. The environment variable `DIFFABS_ENGINE`
-            replaces "auto" by "xla" or "kernel".
+            but no reverse mode and no trajectories. "auto" uses a kernel for values where possible, on an NVIDIA GPU if
+            JAX runs on one. It uses XLA if the call is traced, the runs step together or lie on several devices, and if
+            a kernel is impossible; only then the log has a warning. The environment variable `DIFFABS_ENGINE` replaces
+            "auto" by "xla" or "kernel".
 
     Examples:
         >>> import diffabs as d

@@ -36,6 +36,7 @@ from diffabs.simulate.drive.engine import (
     log_xla_reason,
     resolve_request,
 )
+from diffabs.simulate.drive.sharding import describe_placement, run_on_all_cores
 from diffabs.tune.method import DerivativeMode
 
 pytestmark = pytest.mark.xdist_group("kernel engines")
@@ -178,6 +179,18 @@ def test_several_devices_of_one_processor():
     words = [sys.executable, "-c", SEVERAL]
     done = subprocess.run(words, env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == ["True", "''", "the runs lie on several devices"]
+
+
+@killed_by("simulate/drive/sharding.py", "- {default_platform()}", '- {"cpu"}')
+@killed_by("simulate/drive/sharding.py", ' or default_platform() != "cpu"', "")
+def test_runs_on_a_gpu(monkeypatch):
+    """A kernel can run them where JAX runs on a GPU by default, and they are not dealt to the processor's cores."""
+    replace_seam(monkeypatch, "default_platform", lambda: "gpu")
+    assert describe_placement(np.zeros(3)) == ""
+    assert describe_placement(jnp.zeros(3)) == "the runs lie on a device (cpu) of another kind than JAX's default"
+    dealt = []
+    run_on_all_cores(lambda _, numbers: dealt.append(len(numbers)) or numbers, np.zeros(4096), 4096)
+    assert dealt == [4096]
 
 
 class TestTune:

@@ -28,6 +28,9 @@ SOLVERS = {"fixed": d.FixedStep(1e-3, 0.12), "adaptive": d.Adaptive(rtol=1e-6, d
 # What a lane's step sequence may make of its last bit, with steps that end on kinks: the solver's own reproducibility.
 CLOSE = {"fixed": {"rtol": 1e-13, "atol": 1e-14}, "adaptive": {"rtol": 1e-7, "atol": 1e-9}}
 
+# CUDA's elementary functions and fused products differ from XLA's in the last digits.
+LOOSER = 10 if jax.default_backend() == "gpu" else 1
+
 # In XLA a last digit of the initial speed changes the final slip error by 8e-12 of slip-real, and of extremum seeking,
 # which waits for a peak to have passed, by 8e-8 and the IAE by 9e-9. Relays that chatter at a valve pass a last digit
 # on to the slip at the end of a run.
@@ -50,7 +53,7 @@ def _own_folder(monkeypatch):
 
 def close(name, kind):
     """How close two engines are, of a part or a scenario."""
-    return LAST_DIGIT.get((name, kind), CLOSE[kind])
+    return {key: LOOSER * bound for key, bound in LAST_DIGIT.get((name, kind), CLOSE[kind]).items()}
 
 
 def with_part(family, name):
@@ -91,7 +94,7 @@ def test_objectives():
     for loop, path in ((braking(), "initial.speed"), (balancing(), "initial.theta")):
         values = {path: float(get(loop, path)) * np.linspace(1 - SPREAD, 1 + SPREAD, LANES) + 1e-3}
         mine = {n: part for n, part in parts.PARTS["objective"].items() if n.startswith("balance") == (path[-1] == "a")}
-        same(*both(loop, values, SOLVERS["fixed"], mine), **CLOSE["fixed"])
+        same(*both(loop, values, SOLVERS["fixed"], mine), **close("all", "fixed"))
 
 
 def test_in_single_precision():

@@ -38,6 +38,7 @@ SEAMS = {
     "build_library": "diffabs.compiler.runtime.toolchain.build_library",
     "find_compiler": "diffabs.compiler.runtime.toolchain.find_compiler",
     "load_driver": "diffabs.compiler.runtime.gpu._load_driver",
+    "default_platform": "diffabs.simulate.drive.sharding.default_platform",
     "find_gpu": "diffabs.compiler.runtime.gpu.find_gpu",
     "vectors_per_block": "diffabs.compiler.pipeline.VECTORS_PER_BLOCK",
     "launch_lanes": "diffabs.compiler.pipeline._launch_lanes",

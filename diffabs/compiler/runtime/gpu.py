@@ -20,6 +20,7 @@ from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import nvrtc
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.types import PyTree
+from diffabs.runtime.process import default_platform
 
 # CUDA's enumerators CU_POINTER_ATTRIBUTE_DEVICE_ORDINAL and CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT.
 ORDINAL, MULTIPROCESSORS = 9, 16
@@ -32,8 +33,7 @@ def find_gpu() -> "CudaDevice | None":
     Raises:
         NoCompiler: JAX runs on an accelerator that is not an NVIDIA GPU.
     """
-    home = jax.config.jax_default_device or jax.devices()[0]  # pyright: ignore[reportAttributeAccessIssue]
-    platform = home if isinstance(home, str) else home.platform
+    platform = default_platform()
     return None if platform == "cpu" else _find_cuda_device(platform)
 
 

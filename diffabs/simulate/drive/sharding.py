@@ -19,7 +19,7 @@ from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding
 
 from diffabs.core.types import Array, PyTree, Scalar
-from diffabs.runtime.process import core_count
+from diffabs.runtime.process import core_count, default_platform
 
 MIN_RUNS_PER_CORE = 256  # a core gets at least so many runs
 TRACED_EXPLICIT_AXES = (
@@ -29,7 +29,9 @@ TRACED_EXPLICIT_AXES = (
 
 
 def describe_placement(given: PyTree) -> str:
-    """Return the reason why XLA places the runs of these arrays by itself, or "" if they run on one processor.
+    """Return the reason why only XLA can run these arrays where they lie, or "" if a kernel can, too.
+
+    A kernel is made for the kind of device that JAX uses by default, and for one device.
 
     Args:
         given: Data of the runs, a pytree.
@@ -37,8 +39,9 @@ def describe_placement(given: PyTree) -> str:
     places = [x.sharding.device_set for x in jax.tree.leaves(given) if isinstance(x, jax.Array)]
     if any(len(devices) > 1 for devices in places):
         return "the runs lie on several devices"
-    if jax.default_backend() != "cpu" or any(device.platform != "cpu" for devices in places for device in devices):
-        return "the runs lie on an accelerator, for which a kernel is made on request only"
+    others = {device.platform for devices in places for device in devices} - {default_platform()}
+    if others:
+        return f"the runs lie on a device ({', '.join(sorted(others))}) of another kind than JAX's default"
     return ""
 
 
@@ -55,7 +58,7 @@ def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, co
         count: Number of runs.
     """
     cores = min(core_count(), count // MIN_RUNS_PER_CORE)
-    if cores < 2 or describe_placement(columns):
+    if cores < 2 or default_platform() != "cpu" or describe_placement(columns):
         return run(columns, jnp.arange(count))
     # Threads do not inherit these settings.
     wide, each = jnp.result_type(float) == jnp.float64, -(-count // cores)
