@@ -4,10 +4,11 @@
 
 The rate is measured first, by a kernel that only multiplies and adds. The share counts the real additions,
 multiplications and divisions of a step as the program has them, one each, times the steps of the runs; selections,
-comparisons, elementary functions and whole numbers count nothing. Times are taken in turn, medians of `--rounds`.
+comparisons, elementary functions and whole numbers count nothing. Times are medians of `--rounds`, or one if a call
+takes longer than 10 s. Each row is printed when it is measured, since XLA may take minutes.
 
-Never run yet where this was written: no machine there has a GPU. With --machine-code no GPU is asked for: registers and
-spills of the packaged scenarios for sm_80 and sm_90, as NVRTC's assembler tells them.
+With --machine-code no GPU is asked for: registers and spills of the packaged scenarios for sm_80 and sm_90, as NVRTC's
+assembler tells them.
 
     python benchmarks/bench_gpu.py [--lanes 131072 1048576] [--dtypes float32 float64] [--rounds 5] [--lorenz 768000]
     python benchmarks/bench_gpu.py --machine-code
