@@ -147,7 +147,7 @@ class Weights:
     Q does not matter: the states are an error and its integral, so that it multiplies a total derivative."""
 
     loop: Loop = part(default=Loop)
-    log_diagonal: Vector = param(default=(0.0, 0.0), unit="1")
+    log_diagonal: Vector = param(default=(0.0, 0.0), unit="1", free=True)
 
     def closed_loop(self) -> Loop:
         """The loop with the gains of these weights."""

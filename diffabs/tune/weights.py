@@ -9,7 +9,7 @@ depends on Q/R alone, so rho is usually held fixed. `design` is any differentiab
     robust_gain_design(polytope)   eqs. (29)-(32) of Maeda and Sugiura over a polytope, by `robust_gain`
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -43,11 +43,17 @@ class LQWeights:
     """
 
     loop: Loop = part(default=Loop)
-    log_diagonal: Vector = param(default=(0.0, 0.0), unit="1")
-    lower: Vector = param(default=(0.0,), unit="1")
+    log_diagonal: Vector = param(default=(0.0, 0.0), unit="1", free=True)
+    lower: Vector = param(default=(0.0,), unit="1", free=True)
     log_effort: Scalar = param(default=0.0, unit="1")
     design: GainDesign = static()
     path: str = static(default="controller.gain")
+
+    def problems(self) -> Iterator[str]:
+        """Yield a message if `lower` has not the entries of a triangle below the diagonal."""
+        n = len(self.log_diagonal)
+        if np.shape(self.lower) != (n * (n - 1) // 2,):
+            yield f"lower has shape {np.shape(self.lower)}; {n} states need ({n * (n - 1) // 2},)"
 
     def weights(self) -> tuple[PyTree, PyTree]:
         """Return Q (n, n) and R (1, 1)."""

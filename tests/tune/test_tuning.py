@@ -15,6 +15,7 @@ from scipy.stats import qmc
 import diffabs as d
 from diffabs import actuators, controllers, plants, references
 from diffabs.core.pytree import canonical_dtypes, param, pytree
+from diffabs.core.validity import find_problems
 from diffabs.design.polytopes import Polytope
 from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from diffabs.linear.slip_model import Sampling, SlipModel
@@ -426,6 +427,18 @@ class TestWeights:
     def test_refuses_what_has_no_logarithm(self, q, r):
         with pytest.raises(ValueError, match="is not positive definite"):
             lq_weights(RIG, q, r, lqr_gain_design(SlipModel()))
+
+    @killed_by(
+        "tune/weights.py",
+        'log_diagonal: Vector = param(default=(0.0, 0.0), unit="1", free=True)',
+        'log_diagonal: Vector = param(default=(0.0, 0.0), unit="1")',
+    )
+    @killed_by("tune/weights.py", "if np.shape(self.lower) != (n * (n - 1) // 2,):", "if False:")
+    def test_any_number_of_states(self):
+        loop = lq_weights(RIG, np.ones(4), 1.0, lqr_gain_design(SlipModel()))
+        assert not list(find_problems(loop))
+        fewer = dataclasses.replace(loop, lower=np.zeros(3))
+        assert list(find_problems(fewer)) == ["lower has shape (3,); 4 states need (6,)"]
 
     @killed_by("tune/weights.py", 'q = as_weight_matrix("Q", Q, len(np.atleast_1d(Q)), definite=True)', "q = Q")
     @killed_by("tune/weights.py", 'r = as_weight_matrix("R", R, 1, definite=True)', "r = np.array([[R]])")
