@@ -1,11 +1,10 @@
-"""The marks of mutants and the lists of test files are true: each text and file that they name exists."""
+"""The marks of mutants are true: each text and file that they name exists."""
 
 import os
 import pathlib
 import time
 
 import pytest
-import versions
 from mutants import Mutant, find_mutants, judge
 from project import ROOT
 
@@ -16,10 +15,6 @@ def test_each_mutant_finds_its_text():
     for mutant in found:
         assert mutant.old != mutant.new, mutant
         assert mutant.old in (ROOT / "diffabs" / mutant.file).read_text(), mutant
-
-
-def test_the_files_that_run_under_other_versions_exist():
-    assert [name for name in versions.TESTS if not (ROOT / "tests" / f"{name}.py").exists()] == []
 
 
 TESTS = """
