@@ -44,7 +44,8 @@ from diffabs.core.pytree import get
 from diffabs.simulate.drive import kernel as native
 
 ACCURACY = 1e-4
-STEPS, TOLERANCES, TOLERANCES_OF_DIFFRAX = (1e-3, 5e-4, 2e-4, 1e-4), (1e-5, 5e-6, 1e-6), (1e-8, 3e-9)
+STEPS, TOLERANCES, TOLERANCES_OF_DIFFRAX = (1e-3, 5e-4, 2e-4, 1e-4), (1e-5, 5e-6, 1e-6), (1e-6, 1e-7, 1e-8, 3e-9)
+CONTENDERS = ("kernel", "XLA", "diffrax")
 SLOW = 10.0  # s: a call that takes longer is timed once
 COUNTED = {"add": 1, "sub": 1, "mul": 1, "div": 1}
 TURNS, CHAINS, THREADS = 1 << 15, 8, 1 << 20  # of the kernel that measures the card
@@ -100,8 +101,8 @@ def programs() -> list[ScalarProgram]:
 
 
 def solvers(masses, speeds, dtype):
-    """Return, by name, the settings of each contender, and what makes its program for one. XLA has the setting at which
-    the kernel of its kind is accurate, given as `None`: the two solve by the same method."""
+    """Return, by name, the settings of each contender, and what makes its program for one. None stands for the setting
+    of the kernel of the same kind, which solves by the same method; for the finest one if no kernel is measured."""
     from peers import ours
 
     def of(kind, engine):
@@ -125,9 +126,12 @@ def solvers(masses, speeds, dtype):
     return found
 
 
-def measured(lanes, dtype, rounds, peak, contenders=("kernel", "XLA", "diffrax")):
-    """Yield a row for each contender: its setting, error, seconds to the first result, runs per second, and the
-    kernel's share of the card's rate."""
+def measured(lanes, dtype, rounds, peak, operations, contenders=CONTENDERS):
+    """Yield a row for each contender: its setting, error, runs per second, seconds to the result of its coarsest
+    setting, compilation included, and the kernel's share of the card's rate.
+
+    operations: real operations of a step, by kernel and type of its numbers, of what is compiled already; those of new
+    kernels are added"""
     masses, speeds = problem.lanes(lanes)
     (right, _), seen, accurate = reference.answers(masses, speeds), programs(), {}
     jax.config.update("jax_enable_x64", dtype == "float64")
@@ -135,7 +139,7 @@ def measured(lanes, dtype, rounds, peak, contenders=("kernel", "XLA", "diffrax")
         engine, _, kind = name.partition(", ")
         if engine not in contenders:
             continue
-        points = []
+        points, known = [], len(seen)
         for setting in settings or [accurate.get(kind, STEPS[-1] if kind == "FixedStep" else TOLERANCES[-1])]:
             begun = time.perf_counter()
             run = prepared(setting)
@@ -143,18 +147,20 @@ def measured(lanes, dtype, rounds, peak, contenders=("kernel", "XLA", "diffrax")
             first = time.perf_counter() - begun
             error = float(problem.errors(found, right).max())
             points.append({"setting": setting, "error": error, "run": run, "first": first})
+            if len(seen) > known:
+                operations[name, dtype] = arithmetic(seen[-1])
             if error <= ACCURACY:
                 break
         chosen = record.best(points, ACCURACY)
         once = record.timed(chosen["run"])
         taken = [once] if once > SLOW else [record.timed(chosen["run"]) for _ in range(rounds)]
         runs = lanes / statistics.median(taken)
-        shown = {k: chosen[k] for k in ("setting", "error", "first")}
-        row = {"name": name, "lanes": lanes, "dtype": dtype, **shown, "runs": runs, "rounds": len(taken)}
+        row = {"name": name, "lanes": lanes, "dtype": dtype, "setting": chosen["setting"], "error": chosen["error"]}
+        row |= {"first": points[0]["first"], "runs": runs, "rounds": len(taken)}
         if engine == "kernel":
             accurate[kind] = chosen["setting"]
-        if name == "kernel, FixedStep" and dtype == "float32" and seen:
-            row["share"] = runs * float(np.mean(found[0])) / chosen["setting"] * arithmetic(seen[-1]) / peak
+        if name == "kernel, FixedStep" and dtype == "float32" and (name, dtype) in operations:
+            row["share"] = runs * float(np.mean(found[0])) / chosen["setting"] * operations[name, dtype] / peak
         yield row
 
 
@@ -225,7 +231,8 @@ def on_a_gpu(options):
     peak, rounds, rows = rate(on, options.rounds), options.rounds, []
     print(f"{on.architecture}, FP32, measured: {peak / 1e12:.1f} Tflop/s", flush=True)
     cases = [(n, dtype) for n in options.lanes for dtype in options.dtypes]
-    found = [measured(*case, rounds, peak, options.contenders) for case in cases]
+    operations: dict[tuple[str, str], int] = {}
+    found = [measured(*case, rounds, peak, operations, options.contenders) for case in cases]
     found += [ensemble(n, dtype, rounds) for n in options.lorenz for dtype in options.dtypes]
     for row in itertools.chain.from_iterable(found):
         share = f"{row['share']:.1%}" if "share" in row else ""
@@ -235,7 +242,8 @@ def on_a_gpu(options):
             flush=True,
         )
         rows.append(row)
-        record.written("gpu", {"rows": rows, "fp32_flops": peak, "accuracy": ACCURACY}, options.out)
+        written = record.written("gpu", {"rows": rows, "fp32_flops": peak, "accuracy": ACCURACY}, options.out)
+    print(written if rows else "nothing to measure")
 
 
 def main():
@@ -244,7 +252,7 @@ def main():
     parser.add_argument("--lanes", type=int, nargs="*", default=[1 << 17, 1 << 20])
     parser.add_argument("--dtypes", nargs="+", default=["float32", "float64"], choices=("float32", "float64"))
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--contenders", nargs="+", default=["kernel", "XLA", "diffrax"])
+    parser.add_argument("--contenders", nargs="+", default=list(CONTENDERS), choices=CONTENDERS)
     parser.add_argument("--lorenz", type=int, nargs="*", default=[], metavar="LANES")
     parser.add_argument("--out", type=pathlib.Path)
     parser.add_argument("--machine-code", action="store_true")

@@ -11,7 +11,10 @@ from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES, resolve_request
 from diffabs.simulate.drive.sharding import describe_placement
 
 Engine = Annotated[
-    str, typer.Option(help="Engine of the runs: kernel (by a C++ compiler), xla, or auto: a kernel where possible.")
+    str,
+    typer.Option(
+        help="Engine of the runs: kernel (by a C++ compiler, or CUDA), xla, or auto: a kernel where possible."
+    ),
 ]
 
 COMPILING_KERNEL = "compiling a kernel"

@@ -56,9 +56,8 @@ class Design:
             mean over the nodes. None without Q, R.
         lower_bound: Largest trace of the vertices' own Riccati solutions, which no common gain can beat. None without
             Q, R, and for a schedule.
-        gap: Bound [1] on (objective - optimum)/objective, by duality or by `lower_bound`. The objective is
-            `trace_cost`, or without Q, R the objective of `design` for an L2 gain. It says nothing about the
-            `guaranteed_cost` of other gains.
+        gap: Bound [1] on (objective - optimum)/objective. The objective is `trace_cost`, or without Q, R the objective
+            of `design` for an L2 gain. It says nothing about the `guaranteed_cost` of other gains.
         residual: Largest eigenvalue over the vertices of He[P(A + BK)] + K'RK + Q, relative to that of Q + K'RK. Both
             are taken in coordinates with P = I. At the active vertices it is 0 up to rounding. None where `lower_bound`
             is.
@@ -180,10 +179,6 @@ def _attempt(
     gain = gains[0] if isinstance(system, Polytope) else gains
     proof = certify(gain, system, spec, fastest=False)
     cost = None if spec.Q is None else value * program.scale
-    if cost and lower is not None:
-        # The Riccati solutions bound the optimum, too, and for one system they are the optimum. The duality gap is
-        # rough where Q + K'RK is singular: there it depends on the last digits of the frame.
-        gap = min(gap, max(0.0, cost - lower) / cost)
     found = Design(gain, proof, cost, lower, gap, residual)
     return found, _rejection_reason(found, spec, isinstance(system, Schedule))
 
@@ -221,7 +216,8 @@ def _rejection_reason(found: Design, spec: Spec, scheduled: bool) -> str:
     # The proof minimises the cost for the gain alone: a larger value shows that the solver's X is inaccurate.
     if cost is not None and guaranteed is not None and not scheduled and guaranteed > cost * (1 + 10 * GAP):
         return f"the gain guarantees {guaranteed:.10g}, not the cost {cost:.10g}"
-    if not found.gap <= (ROUGH_GAP if scheduled or spec.Q is None or proof.period is not None else GAP):
+    # Where Q + K'RK is singular, the last digits of the multipliers leave a gap of some 3e-6.
+    if not found.gap <= (ROUGH_GAP if scheduled or spec.Q is None or proof.period is not None else 10 * GAP):
         return f"the answer may be {found.gap:.2g} (relative) above the optimum"
     return ""
 

@@ -63,12 +63,13 @@ def run_batch(
             all if the call is traced. A batch without values has no accepted run if the step is not stable.
         enough: Condition that ends runs early. Such a run has neither stopped, timed out nor diverged. Not
             for runs that step together.
-        engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine, which needs a
-            C++ compiler. It returns the same numbers to rounding and has forward derivatives (`jax.jvp`, `jax.jacfwd`),
-            but no reverse mode and no trajectories. "auto" uses a kernel for values where possible, on an NVIDIA GPU if
-            JAX runs on one. It uses XLA if the call is traced, the runs step together or lie on several devices, and if
-            a kernel is impossible; only then the log has a warning. The environment variable `DIFFABS_ENGINE` replaces
-            "auto" by "xla" or "kernel".
+        engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine. It needs a
+            C++ compiler on a processor, and NVRTC, which JAX brings, on an NVIDIA GPU. It returns the same numbers to
+            rounding and has forward derivatives (`jax.jvp`, `jax.jacfwd`), but no reverse mode and no trajectories.
+            "auto" uses a kernel for values where possible. It uses XLA if the call is traced, the runs step together,
+            or they lie on several devices or on one of another kind than JAX's default. It also uses XLA if a kernel is
+            impossible, and then logs a warning. The environment variable `DIFFABS_ENGINE` replaces "auto" by "xla" or
+            "kernel".
 
     Examples:
         >>> import diffabs as d

@@ -28,7 +28,7 @@ from diffabs.compiler import pipeline
 from diffabs.config.values import read_whole
 from diffabs.core.types import JsonObject, PyTree, Scalar
 from diffabs.runtime import files, provenance
-from diffabs.runtime.process import core_count
+from diffabs.runtime.process import core_count, default_devices
 from diffabs.sweep.engines import DECISIVE_PACKAGES, ComputedChunk, encode_computed_chunk
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.runner import Runner
@@ -269,4 +269,4 @@ def compute_chunk(study: Study, seal: Seal, versions: JsonObject) -> ComputedChu
         SweepError: This worker, which may have joined later than the others, has other versions.
     """
     _check_worker(get_worker().address, _result_versions(study.engine), versions)
-    return encode_computed_chunk(study, seal, Runner(study, jax.local_devices()[:1]).run([seal.chunk])[0])
+    return encode_computed_chunk(study, seal, Runner(study, default_devices()[:1]).run([seal.chunk])[0])

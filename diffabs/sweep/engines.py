@@ -4,11 +4,10 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, Protocol
 
-import jax
 import numpy as np
 
 from diffabs.core.types import PyTree
-from diffabs.runtime.process import core_count
+from diffabs.runtime.process import core_count, default_devices
 from diffabs.sweep.manifest import DECISIVE_PACKAGES as DECISIVE_PACKAGES
 from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.runner import Columns, Runner
@@ -69,7 +68,7 @@ class Local:
         """
         if self.devices is not None:
             return self.devices
-        devices = jax.local_devices()
+        devices = default_devices()
         alone = study.engine == "kernel" or any(device.platform != "cpu" for device in devices)
         return devices * (1 if alone else max(1, core_count() // len(devices)))
 

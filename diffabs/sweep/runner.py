@@ -23,6 +23,7 @@ import numpy as np
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.protocols import Objective
 from diffabs.core.types import Bool, Int, JsonObject, Params, Part, PyTree
+from diffabs.runtime.process import default_devices, default_platform
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import EngineError
@@ -60,7 +61,7 @@ class Runner:
     def __init__(self, study: Study, devices: Sequence[PyTree] | None = None):
         """Set the `study` and the `devices`, one for each block that runs at a time; by default all local ones once."""
         self.study = study
-        self.devices = list(devices or jax.local_devices())
+        self.devices = list(devices or default_devices())
         self.size = study.chunk if not study.parts else -(-study.chunk // BLOCKS_PER_CHUNK)
         self._pool = ThreadPoolExecutor(len(self.devices))
 
@@ -107,7 +108,13 @@ class Runner:
     def _run_on_device(self, loop: Part, block: _Block, device: Any) -> Columns:
         with jax.default_device(device):
             asked = batch_admissibility(loop, block.values, self.study.solver)
-        with precision(self.study.dtype), _convert_compiler_errors():
+        # A kernel is made for the default platform.
+        other = device.platform != default_platform()
+        with (
+            jax.default_device(device) if other else contextlib.nullcontext(),
+            precision(self.study.dtype),
+            _convert_compiler_errors(),
+        ):
             runs = asked.accepted & (np.arange(self.size) < len(block.lanes))  # the rest are copies
             given = jax.device_put(self._arguments(loop, block, runs), device)
             found = jax.device_get(_measure_block(*given, self.study.solver, self.study.engine))
@@ -131,16 +138,22 @@ def _convert_compiler_errors() -> Iterator[None]:
         raise EngineError.of(error) from None
 
 
-@functools.lru_cache(maxsize=4)
 def find_study_objection(study: Study) -> str | None:
     """Return the reason why the study's engine cannot make the runs of the first chunk, or None.
 
-    Nothing runs, but the programs are compiled.
+    Nothing runs, but the programs are compiled, for the default platform.
 
     Args:
         study: Study to examine.
     """
-    runner = Runner(study, jax.local_devices()[:1])
+    return _find_objection(study, default_platform())
+
+
+@functools.lru_cache(maxsize=4)
+def _find_objection(study: Study, platform: str) -> str | None:
+    """Return what `find_study_objection` returns, on the default `platform`."""
+    del platform
+    runner = Runner(study, default_devices()[:1])
     try:
         for names, blocks in runner._sort_into_blocks([runner._draw_chunk(0)]).items():
             with precision(study.dtype), _convert_compiler_errors():

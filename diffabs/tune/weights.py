@@ -50,10 +50,10 @@ class LQWeights:
     path: str = static(default="controller.gain")
 
     def problems(self) -> Iterator[str]:
-        """Yield a message if `lower` has not the entries of a triangle below the diagonal."""
-        n = len(self.log_diagonal)
-        if np.shape(self.lower) != (n * (n - 1) // 2,):
-            yield f"lower has shape {np.shape(self.lower)}; {n} states need ({n * (n - 1) // 2},)"
+        """Yield a message if `log_diagonal` and `lower` do not have the shapes (n,) and (n (n - 1)/2,)."""
+        shapes, n = (np.shape(self.log_diagonal), np.shape(self.lower)), np.size(self.log_diagonal)
+        if shapes != ((n,), (n * (n - 1) // 2,)):
+            yield f"log_diagonal and lower have shapes {shapes[0]}, {shapes[1]}; n states need (n,), (n (n - 1)/2,)"
 
     def weights(self) -> tuple[PyTree, PyTree]:
         """Return Q (n, n) and R (1, 1)."""

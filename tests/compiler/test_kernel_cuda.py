@@ -194,14 +194,11 @@ class TestObjections:
 
     @killed_by("compiler/runtime/gpu.py", 'if not capability.replace(".", "").isdigit():', "if False:")
     def test_of_a_gpu_of_another_make(self, monkeypatch):
-        monkeypatch.setattr(gpu.jax, "devices", lambda platform=None: [Home("gpu", "gfx942")])
-        gpu._find_cuda_device.cache_clear()
+        replace_seam(monkeypatch, "gpu_devices", lambda: [Home("gpu", "gfx942")])
         line = "kernels are for processors and NVIDIA's GPUs, not for gpu gfx942"
         assert native.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) == line
-        monkeypatch.setattr(gpu.jax, "devices", lambda platform=None: [Home("gpu", "9.0")])
-        gpu._find_cuda_device.cache_clear()
+        replace_seam(monkeypatch, "gpu_devices", lambda: [Home("gpu", "9.0")])
         assert gpu.find_gpu().architecture == "sm_90"
-        gpu._find_cuda_device.cache_clear()
 
 
 @dataclasses.dataclass(frozen=True)

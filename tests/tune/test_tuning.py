@@ -433,12 +433,16 @@ class TestWeights:
         'log_diagonal: Vector = param(default=(0.0, 0.0), unit="1", free=True)',
         'log_diagonal: Vector = param(default=(0.0, 0.0), unit="1")',
     )
-    @killed_by("tune/weights.py", "if np.shape(self.lower) != (n * (n - 1) // 2,):", "if False:")
+    @killed_by("tune/weights.py", "if shapes != ((n,), (n * (n - 1) // 2,)):", "if False:")
     def test_any_number_of_states(self):
         loop = lq_weights(RIG, np.ones(4), 1.0, lqr_gain_design(SlipModel()))
         assert not list(find_problems(loop))
-        fewer = dataclasses.replace(loop, lower=np.zeros(3))
-        assert list(find_problems(fewer)) == ["lower has shape (3,); 4 states need (6,)"]
+        fewer, square = (
+            dataclasses.replace(loop, **one) for one in ({"lower": np.zeros(3)}, {"log_diagonal": np.eye(4)})
+        )
+        needs = "n states need (n,), (n (n - 1)/2,)"
+        assert list(find_problems(fewer)) == [f"log_diagonal and lower have shapes (4,), (3,); {needs}"]
+        assert list(find_problems(square)) == [f"log_diagonal and lower have shapes (4, 4), (6,); {needs}"]
 
     @killed_by("tune/weights.py", 'q = as_weight_matrix("Q", Q, len(np.atleast_1d(Q)), definite=True)', "q = Q")
     @killed_by("tune/weights.py", 'r = as_weight_matrix("R", R, 1, definite=True)', "r = np.array([[R]])")

@@ -20,7 +20,7 @@ from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import nvrtc
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.types import PyTree
-from diffabs.runtime.process import default_platform
+from diffabs.runtime.process import default_devices
 
 # CUDA's enumerators CU_POINTER_ATTRIBUTE_DEVICE_ORDINAL and CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT.
 ORDINAL, MULTIPROCESSORS = 9, 16
@@ -33,8 +33,13 @@ def find_gpu() -> "CudaDevice | None":
     Raises:
         NoCompiler: JAX runs on an accelerator that is not an NVIDIA GPU.
     """
-    platform = default_platform()
-    return None if platform == "cpu" else _find_cuda_device(platform)
+    home = default_devices()[0]
+    if home.platform == "cpu":
+        return None
+    capability = getattr(home, "compute_capability", "")
+    if not capability.replace(".", "").isdigit():
+        raise NoCompiler(f"kernels are for processors and NVIDIA's GPUs, not for {home.platform} {capability}".strip())
+    return _cuda_device(f"sm_{capability.replace('.', '')}")
 
 
 def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[PyTree], results: list[PyTree]) -> list[PyTree]:
@@ -79,12 +84,9 @@ def _pack_addresses(addresses: list[int], sizes: list[int]) -> PyTree:
 
 
 @functools.cache
-def _find_cuda_device(platform: str) -> "CudaDevice":
-    """Return the NVIDIA GPUs of a platform of JAX; raise NoCompiler if its devices are others."""
-    capability = getattr(jax.devices(platform)[0], "compute_capability", "")
-    if not capability.replace(".", "").isdigit():
-        raise NoCompiler(f"kernels are for processors and NVIDIA's GPUs, not for {platform} {capability}".strip())
-    return CudaDevice(f"sm_{capability.replace('.', '')}")
+def _cuda_device(architecture: str) -> "CudaDevice":
+    """Return the NVIDIA GPUs of an architecture; each has its loaded kernels."""
+    return CudaDevice(architecture)
 
 
 class _LoadedCode(NamedTuple):

@@ -15,6 +15,7 @@ import jax
 from jax._src.xla_bridge import backends_are_initialized  # JAX has no public function that does not start the backends
 
 from diffabs.core.types import PyTree
+from diffabs.runtime.process import default_platform
 
 T = TypeVar("T")
 REQUESTABLE_ENGINES = ("auto", "xla", "kernel")
@@ -75,7 +76,7 @@ def resolve_request(engine: str) -> str:
 
 
 def _describe_structure(given: PyTree) -> Hashable:
-    """Return what decides whether a kernel is possible: structure and shapes of the data, and the asked compiler."""
+    """Return what decides whether a kernel is possible: structure and shapes of the data, platform, asked compiler."""
     from diffabs.compiler.runtime.toolchain import COMPILER
 
     def describe(x: Any) -> Hashable:
@@ -84,7 +85,7 @@ def _describe_structure(given: PyTree) -> Hashable:
         return type(x) if isinstance(x, bool | int | float) else repr(x)  # a solver is a leaf
 
     leaves, structure = jax.tree.flatten(given)
-    return structure, tuple(map(describe, leaves)), os.environ.get(COMPILER)
+    return structure, tuple(map(describe, leaves)), default_platform(), os.environ.get(COMPILER)
 
 
 def run_with_engine(

@@ -205,7 +205,7 @@ def _stop_unaccepted(accepted: Scalar, carry: PyTree) -> PyTree:
 def kernel_objection(loop: Loop, values: Params, solver: Solver, objectives: Mapping[str, Objective]) -> str | None:
     """Return one line with the reason why a kernel cannot make these runs, or None if it can.
 
-    A reason is an operation without a translation, no C++ compiler on this machine, or traced numbers. The function
+    A reason is an operation without a translation, no compiler on this machine, or traced numbers. The function
     executes no run, but it compiles and keeps the kernel.
 
     Args:

@@ -36,7 +36,8 @@ def describe_placement(given: PyTree) -> str:
     Args:
         given: Data of the runs, a pytree.
     """
-    places = [x.sharding.device_set for x in jax.tree.leaves(given) if isinstance(x, jax.Array)]
+    # JAX moves an array that is not committed to its device.
+    places = [x.sharding.device_set for x in jax.tree.leaves(given) if isinstance(x, jax.Array) and x.committed]
     if any(len(devices) > 1 for devices in places):
         return "the runs lie on several devices"
     others = {device.platform for devices in places for device in devices} - {default_platform()}
