@@ -62,8 +62,8 @@ class Cubic(NamedTuple):
         implicit function theorem.
         """
         # The iterations run without derivatives; `_refine_zero` adds the derivative of the root once at the end.
-        # The barrier keeps XLA from fusing them with what computes the cubic: on a processor, LLVM's loop vectorizer in
-        # JAX 0.11 and 0.12 takes minutes for such a loop, since its time doubles with each iteration.
+        # The barrier keeps XLA from fusing them with what computes the cubic. LLVM's loop vectorizer in JAX 0.11 and
+        # 0.12 takes minutes for such a loop on a processor.
         still = jax.lax.optimization_barrier(jax.lax.stop_gradient(self))
         spread = still.start - still.end
         x = clamp(still.start / jnp.where(spread == 0, 1.0, spread), 0.0, 1.0)

@@ -31,7 +31,7 @@ from diffabs.design.sdp.program import DesignProgram
 from diffabs.design.sdp.scaling import Frame, design_frames
 from diffabs.design.spec import Spec
 
-GAP = 1e-6  # largest relative distance of an answer from the optimum
+GAP = 1e-6  # relative: how far a cost may be below its lower bound; ten times this above the optimum
 ROUGH_GAP = 1e-4  # the same for a schedule, an L2 gain, and discrete time, where a short period costs digits
 FRAMES_PER_SOLVER = 3  # frames to try for each solver
 # Levels of the invariant set for an input limit, relative to the smallest possible level.
