@@ -33,7 +33,7 @@ T = TypeVar("T")
 FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, interrupt.INTERRUPTED, interrupt.TERMINATED
 SILENCE_S, SECOND_INTERRUPT_S = progress.SILENCE_S, progress.REPEAT_S
 AWAKE = 0.1  # s between two checks for Ctrl-C
-LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
+LOUD = ("error:", "warning:", "verdict:", "interrupted")  # lines that --quiet does not silence
 CONTINUED = " \\"  # end of a shell's line that continues on the next
 WORKER = "diffabs worker"
 EXTRAS = {
@@ -208,6 +208,22 @@ def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
     """
     say(f"error: {line}")
     raise typer.Exit(status)
+
+
+def conclude(line: str) -> NoReturn:
+    """End a command that answers a question with the answer "no", or "undecided", on stderr.
+
+    The command did its work, so the line does not begin with `error:`. The exit status lets a script stop, as `diff`
+    does for files that differ.
+
+    Args:
+        line: Text of the verdict.
+
+    Raises:
+        typer.Exit: Always, with the status `FAILED`.
+    """
+    say(f"verdict: {line}")
+    raise typer.Exit(FAILED)
 
 
 def is_animated() -> bool:

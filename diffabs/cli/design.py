@@ -74,7 +74,7 @@ def certify(
         reason = certificates.describe_unproved(found, task.spec, known)
         _show(certificates.proof_document(task, found, out, reason=reason or None, known=known), task, as_json)
         if reason:
-            console.fail(f"{task.chosen.name}: {reason}", console.FAILED)
+            console.conclude(f"{task.chosen.name}: {reason}")
 
 
 def verify(
@@ -117,7 +117,7 @@ def verify(
         }, as_json)  # fmt: skip
         if not proved:
             why = "; ".join(f"{verdict.kind}: {verdict.reason}" for verdict in verdicts if verdict.reason)
-            console.fail(f"{file}: not proved: {why or 'the file has no claims'}", console.FAILED)
+            console.conclude(f"{file}: not proved: {why or 'the file has no claims'}")
 
 
 def _prepare(

@@ -1,7 +1,7 @@
 """The command `diffabs`: the program, and its command `simulate`.
 
-Exit status: 0 done; 1 not possible (diverged, no gain, not proved); 2 bad input; 130 interrupted. Results go to stdout,
-as tables or with --json as one JSON document. Everything else goes to stderr.
+Exit status: 0 done; 1 the answer is no (not proved, not stable), or not possible (diverged, no gain); 2 bad input; 130
+interrupted. Results go to stdout, as tables or with --json as one JSON document. Everything else goes to stderr.
 """
 
 import gc

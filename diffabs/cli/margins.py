@@ -211,8 +211,8 @@ def _format_place(values: dict[str, float], chosen: Scenario) -> str:
 def _judge(chosen: Scenario, nominal: "System", found: "Band | None") -> None:
     """Raise typer.Exit for a loop that is unstable, here or within the ranges."""
     if not nominal.margins.stable:
-        console.fail(f"{chosen.name}: the closed loop is not stable: no margins", console.FAILED)
+        console.conclude(f"{chosen.name}: the closed loop is not stable: no margins")
     if found and found.unstable:
         first = _format_place(found.unstable[0].values, chosen)
         count = f"{len(found.unstable)} of {len(found.systems)} systems"
-        console.fail(f"{chosen.name}: not stable in {count} of the ranges, as at {first}", console.FAILED)
+        console.conclude(f"{chosen.name}: not stable in {count} of the ranges, as at {first}")

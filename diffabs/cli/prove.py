@@ -104,7 +104,7 @@ def prove(
                 result["files"] = {**result.get("files", {}), "plot": str(plot)}
         views.as_json(result) if as_json else show_proofs.show_box_proof(result, chosen)
         if proof.verdict != "proved":
-            console.fail(f"{chosen.name}: {proof.verdict}: {result['reason']}", console.FAILED)
+            console.conclude(f"{chosen.name}: {proof.verdict}: {result['reason']}")
 
 
 def read_proof_file(file: pathlib.Path) -> JsonObject | None:
@@ -171,7 +171,7 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
         "versions": provenance.versions("numpy"),
     }, as_json)  # fmt: skip
     if found.reason:
-        console.fail(f"{file}: not proved: {found.reason}", console.FAILED)
+        console.conclude(f"{file}: not proved: {found.reason}")
     if not as_json:
         said = show_proofs.describe_box(box, chosen, digits=9)
         where = "" if whole else "in the cells proved again only: "

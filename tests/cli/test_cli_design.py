@@ -226,7 +226,7 @@ def test_published_gain_has_no_common_lyapunov_matrix(tmp_path):
     assert document["worst_vertex"]["margin"] == pytest.approx(22.53, abs=0.01)
     assert "quadratic stability is disproved: no common Lyapunov matrix exists for the 4 vertices" in document["reason"]
     assert "no Q and R give this gain" in document["reason"]
-    assert result.stderr.splitlines()[-1] == f"error: slip-lmi: {document['reason']}"
+    assert result.stderr.splitlines()[-1] == f"verdict: slip-lmi: {document['reason']}"
     assert left_in(tmp_path) == {"c.json"}
     assert checked(tmp_path / "c.json").returncode == 0
     assert run("verify", tmp_path / "c.json").stdout == "proved  infeasible: no common Lyapunov matrix exists\n"
@@ -353,15 +353,16 @@ def test_fastest_decay_and_least_cost_of_a_gain():
     assert document["reason"] is None
 
 
-def test_unstable_gain_says_so():
-    assert "vertex 2 (plant.mass 6.2, speed 1.38889) is unstable even with fixed parameters" in run(
-        "certify", "slip-lmi", "--gain=11753,158", status=1
-    ).stderr  # fmt: skip
+@killed_by("cli/console.py", 'say(f"verdict: {line}")', 'say(f"error: {line}")')
+@killed_by("cli/console.py", '"warning:", "verdict:",', '"warning:",')
+def test_a_verdict_is_no_error():
+    """The command did its work; the status lets a script stop, and -q silences no verdict."""
+    (line,) = run("certify", "slip-lmi", "-q", "--gain=11753,158", status=1).stderr.splitlines()
+    assert line.startswith("verdict: slip-lmi: quadratic stability is disproved")
+    assert line.endswith("vertex 2 (plant.mass 6.2, speed 1.38889) is unstable even with fixed parameters")
 
 
-@killed_by(
-    "cli/design.py", "        if reason:\n            console.fail", "        if False:\n            console.fail"
-)
+@killed_by("cli/design.py", "        if reason:\n            console.c", "        if False:\n            console.c")
 @killed_by("cli/certificates.py", '"damping": (spec.damping > 0,', '"damping": (False,')
 @pytest.mark.parametrize(
     ("change", "said"),

@@ -13,6 +13,7 @@ import pytest
 from commands import run
 from marks import cases
 from mutants import killed_by
+from scipy.linalg import expm
 
 import diffabs as d
 from diffabs.cli.prove import _document
@@ -24,7 +25,7 @@ from diffabs.scenario.scenario import load
 
 pytestmark = pytest.mark.usefixtures("native_prover")
 EXAMPLES = pathlib.Path(__file__).parents[2] / "examples"
-EXACT_POSITION = 0.04890478782180  # [m] after 0.1 s, the competition's benchmark BRKDC01
+EXACT_POSITION = 0.0489094684039968  # [m] after 0.1 s; `exact_position` by mpmath in 30 digits
 
 
 @pytest.fixture
@@ -32,6 +33,33 @@ def brake() -> Iterator[list[str | pathlib.Path]]:
     """The words of a proof about the electro-mechanical brake, a user's own plant."""
     with lend_modules(EXAMPLES, ["embrake"]):
         yield ["prove", EXAMPLES / "embrake.toml", "--over", "reference.value=0.05:0.05", "--json"]
+
+
+def exact_position(samples: int) -> float:
+    """The pads' position [m] after this many samples of 0.1 ms, by the matrix exponential of a held voltage."""
+    inductance, resistance, constant, friction, gear, period = 1e-3, 0.5, 0.02, 0.1, 113.1167, 1e-4
+    rates = [[0, constant / (gear * friction), 0],
+             [0, -(resistance + constant**2 / friction) / inductance, 1 / inductance],
+             [0, 0, 0]]  # fmt: skip
+    held = expm(period * np.array(rates))
+    position = current = total = 0.0
+    for _ in range(samples):
+        error = 0.05 - position
+        position, current, _ = held @ (position, current, 10000.1 * error + 1000.0 * total)
+        total += period * error
+    return position
+
+
+def test_the_page_has_the_position_of_the_brake_after_its_whole_run() -> None:
+    """The benchmark's first sample is at 0.1 ms, so its printed position after 0.1 s is that of 999 samples."""
+    assert exact_position(999) == pytest.approx(0.048904787821800, rel=1e-12)  # printed there
+    assert exact_position(1000) == pytest.approx(EXACT_POSITION, rel=1e-12)
+    with lend_modules(EXAMPLES, ["embrake"]):
+        found = json.loads(run("simulate", EXAMPLES / "embrake.toml", "--json").stdout)
+    # RK4 with steps of 10 us: h^5/120 of a rate of 504 1/s over 1e4 steps
+    assert 0.05 - found["metrics"]["final_error"] == pytest.approx(EXACT_POSITION, rel=1e-10)
+    page = (EXAMPLES.parent / "docs" / "proofs.md").read_text(encoding="utf-8")
+    assert f"position at most 0.04891 m in 0.1 s | {EXACT_POSITION:.7f} m |" in page
 
 
 def test_the_electro_mechanical_brake_stays_below_its_target(brake: list[str | pathlib.Path]) -> None:
@@ -42,8 +70,10 @@ def test_the_electro_mechanical_brake_stays_below_its_target(brake: list[str | p
 
 
 def test_a_false_claim_about_the_brake_is_refuted(brake: list[str | pathlib.Path]) -> None:
-    found = json.loads(run(*brake, "--claim", f"max_position={EXACT_POSITION * 0.999}", status=1).stdout)
+    result = run(*brake, "--claim", f"max_position={EXACT_POSITION * 0.999}", status=1)
+    found = json.loads(result.stdout)
     assert found["verdict"] == "refuted"
+    assert result.stderr.splitlines()[-1] == f"verdict: embrake: refuted: {found['reason']}"
     assert found["refuted_by"] is not None
 
 

@@ -185,7 +185,7 @@ def test_nothing_false_and_no_nonsense_is_proved(tmp_path, content, status, need
     (tmp_path / "c.json").write_text(json.dumps(content))
     result = run("verify", tmp_path / "c.json", status=status)
     assert needed in result.stderr
-    assert result.stderr.startswith("error: ")
+    assert result.stderr.startswith("verdict: " if status == 1 else "error: ")
     assert result.stderr.count("\n") == 1
     assert not any(line.startswith("proved") for line in result.stdout.splitlines())
 

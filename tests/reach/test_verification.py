@@ -131,6 +131,7 @@ def test_a_refuted_file_has_no_hint_to_check_more(proof: pathlib.Path, tmp_path:
     file.write_text(json.dumps(document))
     result = run("verify", file, "--share", "1", status=1)
     assert "NOT PROVED" in result.stdout
+    assert result.stderr.splitlines()[-1].startswith(f"verdict: {file}: not proved: ")
     assert "proves all" not in result.stdout
 
 
