@@ -10,7 +10,6 @@ import sys
 import textwrap
 import threading
 import time
-import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -26,6 +25,7 @@ from diffabs.runtime import files, interrupt, provenance, stopwatch
 from diffabs.scenario import outside
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import Scenario, dump, load, names
+from diffabs.scenario.toml import parse_toml
 from diffabs.simulate.drive.engine import EngineError
 
 T = TypeVar("T")
@@ -65,7 +65,7 @@ def fields_like(context: typer.Context, incomplete: str) -> list[str]:
     """
     words = [context.params.get("scenario"), *context.args]  # an unfinished option leaves words unparsed here
     try:
-        tables = tomllib.loads(dump(load(next(filter(None, words)))))
+        tables = parse_toml(dump(load(next(filter(None, words)))))
     except (StopIteration, OSError, ValueError):
         return []
     return [f"{path}=" for path in _field_paths(tables) if path.startswith(incomplete)]

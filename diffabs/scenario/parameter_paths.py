@@ -208,13 +208,13 @@ def flatten_table(table: Table, section: str) -> JsonObject:
         ScenarioError: A path is given twice, or nested more than `MAX_DEPTH` deep.
     """
     found: JsonObject = {}
-    pending = list(table.items())
+    pending = list(table.items())[::-1]
     while pending:
-        path, value = pending.pop(0)
+        path, value = pending.pop()
         if path.count(".") > MAX_DEPTH:
             raise ScenarioError(f"{section}: {format_given(path)} is nested more than {MAX_DEPTH} deep")
         if isinstance(value, dict) and not {"type", "choices"} & value.keys():
-            pending[:0] = [(f"{path}.{key}", item) for key, item in value.items()]
+            pending += [(f"{path}.{key}", item) for key, item in list(value.items())[::-1]]
             continue
         path = canonical_path(path)
         if path in found:

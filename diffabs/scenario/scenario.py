@@ -58,7 +58,9 @@ from diffabs.simulate.admissible import find_mismatches, find_unstable_step
 from diffabs.simulate.contracts import find_misfits
 from diffabs.simulate.types import Adaptive, Solver
 
-MAX_SCENARIO_BYTES = 1_000_000  # bytes
+MAX_SCENARIO_BYTES = 1_000_000  # bytes of a file
+MAX_WRITTEN_BYTES = 10 * MAX_SCENARIO_BYTES  # bytes of a text in a document, which `dump` writes with all digits
+MAX_OBJECTIVES = 200  # of a scenario; each is traced once to check it
 MAX_PATH_LENGTH = 4096  # characters of a path in a message
 TEXTS = {"title": read_printable_line, "description": read_printable_lines}
 
@@ -226,6 +228,8 @@ def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
 
 def _parse(raw: bytes, origin: str) -> JsonObject:
     quoted = format_given(origin, MAX_PATH_LENGTH)
+    if len(raw) > MAX_WRITTEN_BYTES:
+        raise ScenarioError(f"{quoted} is larger than {MAX_WRITTEN_BYTES} bytes; it is no scenario")
     try:
         return parameter_paths.to_canonical_form(toml.parse_toml(raw.decode("utf-8-sig")))
     except UnicodeDecodeError as error:
@@ -306,6 +310,8 @@ def _assemble(name: str, table: JsonObject, folder: pathlib.Path, notes: Iterabl
     given = table.get("objective", {})
     if not isinstance(given, dict):
         raise wrong_kind_error("objective", given, "a table of objectives")
+    if len(given) > MAX_OBJECTIVES:
+        raise ScenarioError(f"objective has {len(given)} entries, outside [0, {MAX_OBJECTIVES}]")
     loop = _build_loop(table)
     report = default_objectives(loop.plant)
     measured = {}

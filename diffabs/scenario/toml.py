@@ -9,6 +9,14 @@ from diffabs.core.types import JsonObject, PyTree, Scalar
 
 MOST_LEVELS = 50  # of nested tables and lists; a scenario has fewer than 5
 MAX_INTEGER = 2**63  # bound of whole numbers: TOML has 64 bits
+MAX_MESSAGE_LENGTH = 200  # characters
+# What separates the keys of a text: each match is a string, a comment, a dot, or the end of a key. Possessive
+# quantifiers, and an unclosed string that ends with the text, keep the search linear.
+KEY_TOKENS = re.compile(
+    r'''"""(?:[^"\\]|\\.?|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]|\\.?)*+"?'''
+    r"""|'''(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?|#[^\n]*+|(?P<dot>\.)|(?P<end>[=,\[\]{}\n])""",
+    re.DOTALL,
+)
 
 
 def parse_toml(text: str) -> JsonObject:
@@ -19,8 +27,10 @@ def parse_toml(text: str) -> JsonObject:
 
     Raises:
         ValueError: The text is not TOML.
-        ScenarioError: Values are nested too deeply, or a whole number has more than 64 bits.
+        ScenarioError: Keys or values are nested too deeply, or a whole number has more than 64 bits.
     """
+    if _has_long_key(text):
+        raise ScenarioError(f"a key is nested more than {MOST_LEVELS} deep")
     try:
         table = tomllib.loads(text)
     except RecursionError:
@@ -28,19 +38,35 @@ def parse_toml(text: str) -> JsonObject:
     except ValueError as error:
         if "integer string conversion" in str(error):  # the limit of digits that Python converts
             raise ScenarioError("a whole number is outside [-2^63, 2^63)") from None
-        raise
-    # A loop with its own stack: recursion would fail on the deep nesting that it must refuse.
-    pending: list[tuple[str, int, PyTree]] = [(key, 1, item) for key, item in table.items()]
+        raise ValueError(_shorten(str(error))) from None  # the parser repeats a key at any length
+    # A loop with its own stack: recursion would fail on the deep nesting that it must refuse. A path is a tuple until
+    # a message needs it: as texts, the paths below one long key would take more memory than there is.
+    pending: list[tuple[tuple[str | int, ...], PyTree]] = [((key,), item) for key, item in table.items()]
     while pending:
-        where, level, item = pending.pop()
-        if level > MOST_LEVELS:
-            raise ScenarioError(f"{format_given(where.split('.')[0])} is nested more than {MOST_LEVELS} deep")
+        where, item = pending.pop()
+        if len(where) > MOST_LEVELS:
+            raise ScenarioError(f"{format_given(where[0])} is nested more than {MOST_LEVELS} deep")
         if isinstance(item, dict | list):
             inside = item.items() if isinstance(item, dict) else enumerate(item)
-            pending += [(f"{where}.{key}", level + 1, each) for key, each in inside]
+            pending += [((*where, key), each) for key, each in inside]
         elif isinstance(item, int) and not -MAX_INTEGER <= item < MAX_INTEGER:
-            raise ScenarioError(f"{format_given(where)} is a whole number outside [-2^63, 2^63)")
+            raise ScenarioError(f"{format_given('.'.join(map(str, where)))} is a whole number outside [-2^63, 2^63)")
     return table
+
+
+def _shorten(message: str) -> str:
+    """Return a message of bounded length; its end tells the line."""
+    return message if len(message) <= MAX_MESSAGE_LENGTH else f"{message[:100]} ... {message[-40:]}"
+
+
+def _has_long_key(text: str) -> bool:
+    """Return True if a key has more than `MOST_LEVELS` words; `tomllib` takes a time quadratic in their number."""
+    dots = 0
+    for token in KEY_TOKENS.finditer(text):
+        dots = 0 if token["end"] else dots + bool(token["dot"])
+        if dots >= MOST_LEVELS:
+            return True
+    return False
 
 
 def parse_value(text: str) -> Scalar:

@@ -1,12 +1,16 @@
 """Files that are none, numbers and depths beyond all measure, bytes that are no text: one line each, and no waiting."""
 
 import os
+import tomllib
+import tracemalloc
 
 import pytest
 from commands import assert_one_error_line, left_in, run
 from mutants import killed_by
 
+from diffabs.config.values import ScenarioError
 from diffabs.design.proof.certificate import Certificate
+from diffabs.scenario import scenario, toml
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -95,6 +99,77 @@ def test_a_huge_number_or_depth_on_the_command_line(change):
 @pytest.mark.parametrize("change", [BYTES, BYTES.replace("title", "plant.mass"), BYTES.replace("title", "\udcff")])
 def test_bytes_that_are_no_text(change):
     assert refused("simulate", "slip-lmi", "--set", change).endswith("is not UTF-8 text\n")
+
+
+MANY = 51  # words of a key, one more than allowed
+QUOTES = '"""'
+LONG_KEYS = [
+    f"{'a.' * MANY}b = 1",
+    f"{'a . ' * MANY}b = 1",
+    f"title = 'a'\n[plant{'.a' * MANY}]",
+    "[[" + '"a.b".' * MANY + "c]]",
+    "x = [1.0, {" + "'a'." * MANY + "b = 1.0 }]",
+    f'title = {QUOTES}a\\"".b{QUOTES}\nx{".a" * MANY} = 1',
+    f"title = '''a''.b''' # '\nx{'.a' * MANY} = 1",
+]
+SHORT_KEYS = [
+    f"{'a.' * 45}b = {{ a.a = 1.5 }}",
+    f"# {'a.' * MANY}\nx = 1",
+    f'title = \'{"a." * MANY}\'\nnote = "\\"{"." * MANY}"',
+    f"title = '''{'.' * MANY}\n'''\nnote = {QUOTES}\\\"{'.' * MANY}\"{QUOTES}",
+    f"x = [{'1.5, ' * MANY}]",
+]
+
+
+@killed_by("scenario/toml.py", 'dots + bool(token["dot"])', "0")
+@pytest.mark.parametrize("text", LONG_KEYS)
+def test_a_key_of_many_words_is_refused_before_it_is_parsed(monkeypatch, text):
+    """`tomllib` takes hours for a key of 250,000 words."""
+    tomllib.loads(text)  # TOML itself has no limit
+    monkeypatch.setattr(toml.tomllib, "loads", lambda _: pytest.fail("the text was parsed"))
+    with pytest.raises(ScenarioError, match="a key is nested more than 50 deep"):
+        toml.parse_toml(text)
+
+
+@killed_by("scenario/toml.py", '0 if token["end"] else dots', "dots")
+@pytest.mark.parametrize("text", SHORT_KEYS)
+def test_dots_outside_of_keys_are_allowed(text):
+    assert toml.parse_toml(text) == tomllib.loads(text)
+
+
+@pytest.mark.parametrize("change", [f"controller={{{'a.' * 20_000}b=1}}", f"title=[{{a{'.b' * 20_000}=1}}]"])
+def test_a_key_of_many_words_on_the_command_line(change):
+    assert "a key is nested more than 50 deep" in refused("simulate", "slip-lmi", "--set", change)
+
+
+def test_what_stands_below_a_long_key_takes_little_memory():
+    """A path as text for each of the numbers would take 400 MB."""
+    key, numbers = "a" * 200_000, [0] * 2_000
+    tracemalloc.start()
+    try:
+        assert toml.parse_toml(f"{key} = {numbers}") == {key: numbers}
+        assert tracemalloc.get_traced_memory()[1] < 1e8
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_message_does_not_repeat_a_long_key(file):
+    key = "a" * 10_000
+    assert refused("simulate", file(f"[{key}]\n[{key}]")).endswith("twice (at line 2, column 10002)\n")
+
+
+@killed_by("scenario/scenario.py", "if len(given) > MAX_OBJECTIVES:", "if False:")
+def test_more_objectives_than_can_be_checked(file):
+    text = "".join(f"[objective.o{i}]\ntype = 'iae'\n" for i in range(201))
+    assert refused("simulate", file(text)).endswith("objective has 201 entries, outside [0, 200]\n")
+
+
+def test_a_scenario_inside_of_a_document_is_not_longer_than_one_that_is_written():
+    """A scenario that is written has all digits, so it is longer than its file."""
+    text = b"title = 'a'\n" + (b"#" * 999 + b"\n") * 1200
+    assert scenario.loads(text, "x", "proof.json").title == "a"
+    with pytest.raises(ScenarioError, match=r'"proof\.json" is larger than 10000000 bytes; it is no scenario$'):
+        scenario.loads(text * 9, "x", "proof.json")
 
 
 def test_more_digits_than_python_converts(file):
