@@ -9,6 +9,7 @@ The controller skips a sample if a number that it reads is NaN, or if its memory
 and output then keep the values of the previous sample.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from functools import reduce
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.controllers.antiwindup import BackCalculation
+from diffabs.controllers.antiwindup import BackCalculation, Clamping
 from diffabs.controllers.pid import PID
 from diffabs.controllers.torque_logic import BandLogic
 from diffabs.core.arrays import as_rule_array
@@ -105,7 +106,7 @@ class Sampled:
         """
         inner = self._update_memory(clock, memory, signal)
         output = self.controller.output(clock.t, inner, signal)
-        flow = axpy(clock.h, self.controller.flow(clock.t, inner, signal), inner.flow)
+        flow = axpy(clock.h, _at_period(self.controller, clock.h).flow(clock.t, inner, signal), inner.flow)
         return Memory(flow, inner.held), output
 
     def compute_guarded(
@@ -185,6 +186,14 @@ class Sampled:
     def rules(self) -> Iterator[Rule]:
         """Yield the rules that delay and controller fit the period."""
         yield from sampling_rules(self.controller, self.delay, self.period)
+
+
+def _at_period(controller: Part, period: Scalar) -> Part:
+    """Return the controller with an anti-windup that fits Euler steps of `period` [s]."""
+    antiwindup = getattr(controller, "antiwindup", None)
+    if not isinstance(antiwindup, Clamping):
+        return controller
+    return dataclasses.replace(controller, antiwindup=antiwindup.at_period(period))
 
 
 def _refuse_rate() -> PyTree:

@@ -53,7 +53,9 @@ def stable_steps(loops: Loop) -> np.ndarray:
     Args:
         loops: Batch of loops, whose leaves have a leading axis (n,).
     """
-    return _largest_stable_steps(np.asarray(_jacobians(loops)))
+    drain = np.asarray(_drain_rate(loops), float)
+    limits = BOUNDARY_RADII[-1] / np.where(drain > 0, drain, np.nan)
+    return np.fmin(_largest_stable_steps(np.asarray(_jacobians(loops))), limits)
 
 
 def _largest_stable_steps(matrices: np.ndarray) -> np.ndarray:
@@ -129,10 +131,11 @@ def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
     def matrices(values: PyTree) -> jax.Array:
         return jnp.reshape(found := _jacobians_of(_lane_builder(loop)(values)), (-1, *found.shape[-2:]))
 
+    drain = jax.vmap(lambda values: _drain_rate(_lane_builder(loop)(values)))(values)
     one = matrices(jax.tree.map(lambda x: x[0], values))
     balance = _balance(one)
     if not split_batched(matrices, values)[0]:  # the matrices of all runs are equal
-        return jnp.full(count, _power_norm_bound(one, balance, squarings))
+        return jnp.maximum(_power_norm_bound(one, balance, squarings), drain)
     # Whole chunks: a partial chunk would need a second program.
     places = jnp.minimum(jnp.arange(-(-count // LANES_PER_CHUNK) * LANES_PER_CHUNK), count - 1)
     filled = jax.tree.map(lambda x: x[places], values) if count > LANES_PER_CHUNK else values
@@ -142,7 +145,8 @@ def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
             return _power_norm_bound(matrices(values), balance, squarings)
         return _norm_bound(_map_over_probes(_entries, _lane_builder(loop)(values)), balance)
 
-    return jax.lax.map(bound, filled, batch_size=min(LANES_PER_CHUNK, count))[:count]
+    rates = jax.lax.map(bound, filled, batch_size=min(LANES_PER_CHUNK, count))[:count]
+    return jnp.maximum(rates, drain)
 
 
 def _power_norm_bound(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Array:
@@ -165,6 +169,15 @@ def _power_norm_bound(matrices: jax.Array, balance: jax.Array, squarings: int) -
     rows, columns = (jnp.max(jnp.sum(jnp.abs(a), axis), -1) for axis in (-1, -2))
     bound = jnp.max(jnp.exp(log) * jnp.minimum(rows, columns) ** (1 / 2**squarings))
     return jnp.where(jnp.isfinite(bound), BOUND_SAFETY_FACTOR * bound, jnp.inf)
+
+
+def _drain_rate(loop: Loop) -> Scalar:
+    """Return the rate 1/Tt [1/s] at which an anti-windup drains the excess over a limit; 0 without one.
+
+    The points of a linearisation may all lie within the limits.
+    """
+    tracking_time = getattr(getattr(loop.controller, "antiwindup", None), "tracking_time", None)
+    return 0.0 if tracking_time is None else 1.0 / tracking_time
 
 
 def _norm_bound(entries: list[list[jax.Array]], balance: jax.Array) -> jax.Array:

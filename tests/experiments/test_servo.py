@@ -136,8 +136,8 @@ def test_the_servo_at_its_limits_agrees_with_scipy(servo):
         raw = 10 * e + 10 * integral + 0.2 * 200 * (e - filtered)
         u = min(max(raw, -24), 24)
         torque = 0.1 * current - 1e-3 * speed - 0.01 * np.tanh(speed / 0.5) - 0.05
-        held = (raw - u) * e > 0
-        return [speed, torque / 2e-3, (u - current - 0.1 * speed) / 2e-3, 0 if held else e, 200 * (e - filtered)]
+        held = np.clip((raw - u) / (10 * 0.01), min(e, 0.0), max(e, 0.0))
+        return [speed, torque / 2e-3, (u - current - 0.1 * speed) / 2e-3, e - held, 200 * (e - filtered)]
 
     oracle = scipy.integrate.solve_ivp(
         rates, (0, 0.4), [0, -3, 0, 0, 0], rtol=1e-10, atol=1e-12, max_step=1e-3, dense_output=True

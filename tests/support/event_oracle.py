@@ -12,8 +12,8 @@ of a piece as the root of a guard on its dense output; a jump happens there, and
 Relay: torque_max until slip > target + band, torque_min until slip < target - band. PeakLatch: the first target until
 the deceleration falls, then the slip at its maximum; a later maximum counts if it is greater by a millionth.
 PeakRobust: the same of deceleration and slip behind equal low-passes, from the moment at which the filtered
-deceleration lies below (1 - threshold) of its greatest, if that is above `arming`. Clamping: the integral stands still
-while the torque is at a limit and the error would push it further out."""
+deceleration lies below (1 - threshold) of its greatest, if that is above `arming`. ConditionalIntegration: the integral
+stands still while the torque is at a limit and the error would push it further out."""
 
 import argparse
 import dataclasses
@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+from conditional import ConditionalIntegration
 from scipy.integrate import solve_ivp
 from scipy.interpolate import PchipInterpolator
 
@@ -51,7 +52,7 @@ LOOPS = {
     ),
     "fixed slip, PI, clamping": braking(
         **ASPHALT,
-        controller=controllers.PID(kp=2000.0, ki=8000.0, high=150.0, antiwindup=controllers.Clamping(), low=0.0),
+        controller=controllers.PID(kp=2000.0, ki=8000.0, high=150.0, antiwindup=ConditionalIntegration(), low=0.0),
         reference=references.FixedSlip(slip=0.12),
     ),
     "latch, P": braking(
@@ -168,7 +169,7 @@ class Brake:
     def frozen(self, m: Mode) -> bool:
         """Whether the anti-windup holds the integral: at a limit, with an error that pushes further out."""
         outward = (m.torque == "high" and m.side < 0) or (m.torque == "low" and m.side > 0)
-        return outward and isinstance(getattr(self.controller, "antiwindup", None), controllers.Clamping)
+        return outward and isinstance(getattr(self.controller, "antiwindup", None), ConditionalIntegration)
 
     def slip_rate(self, z: Any, m: Mode) -> float:
         r = self.rates(0.0, z, m)

@@ -1,0 +1,99 @@
+"""Loops that slide along a switching surface, or would with the textbook's anti-windup, beside exact solutions."""
+
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from scipy.integrate import solve_ivp
+
+import diffabs as d
+from diffabs.controllers import PID
+from diffabs.core.pytree import param, pytree
+from diffabs.references import Setpoint
+from diffabs.stops import NoStop
+
+PIECES = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
+
+
+class Shown(NamedTuple):
+    y: Any
+    units = MappingProxyType({"y": "1"})
+
+
+class Scalar:
+    """A plant with one state, which is its output."""
+
+    shows, control_unit = Shown, "1"
+
+    def project(self, state):
+        return state
+
+    output = project
+
+
+@pytree
+class Lagging(Scalar):
+    """T y' = k u - y, from rest."""
+
+    T: Any = param(default=2.0, unit="s", above=0.0)
+    k: Any = param(default=0.5, unit="1")
+
+    def start(self, initial):
+        return Shown(0.0 * self.k)
+
+    def derivative(self, t, x, u):
+        return Shown((self.k * u - x.y) / self.T)
+
+    def holding(self, output, target):
+        return target / self.k
+
+
+def limited_pi(antiwindup):
+    """A PI controller that reaches its upper limit and stays on it from 0.19 s to 1.05 s."""
+    pid = PID(kp=2.0, ki=5.0, low=-1.0, high=3.0, antiwindup=antiwindup)
+    return d.Loop(plant=Lagging(), initial=(), reference=Setpoint(value=1.0), controller=pid, stop=NoStop())
+
+
+def limited_pi_iae(ki=5.0, kp=2.0, high=3.0, T=2.0, k=0.5, end=10.0):
+    """IAE of `limited_pi` with conditional integration in Filippov's sense, in three smooth pieces."""
+
+    def free(t, x):
+        return [(k * (kp * (1 - x[0]) + ki * x[1]) - x[0]) / T, 1 - x[0], abs(1 - x[0])]
+
+    def hit(t, x):
+        return kp * (1 - x[0]) + ki * x[1] - high
+
+    def slide(t, x):
+        return [(k * high - x[0]) / T, abs(1 - x[0])]
+
+    def leave(t, x):  # the equivalent rate of the integral reaches the error
+        return (1 - x[0]) - kp * (k * high - x[0]) / T / ki
+
+    hit.terminal = leave.terminal = True
+    hit.direction, leave.direction = 1, -1
+    run = solve_ivp(free, (0, end), [0, 0, 0], events=hit, **PIECES)
+    (y, _, iae), begins = run.y[:, -1], run.t[-1]
+    run = solve_ivp(slide, (begins, end), [y, iae], events=leave, **PIECES)
+    (y, iae), ends = run.y[:, -1], run.t[-1]
+    return solve_ivp(free, (ends, end), [y, (high - kp * (1 - y)) / ki, iae], **PIECES).y[2, -1]
+
+
+def differences(function, at, h=1e-4):
+    """Central differences of a function by each of its arguments."""
+    return [(function(**at | {n: x + h}) - function(**at | {n: x - h})) / (2 * h) for n, x in at.items()]
+
+
+@pytree
+class Block(Scalar):
+    """v' = u - Fc sign(v), from v = 1: dry friction."""
+
+    Fc: Any = param(default=0.7, unit="N", above=0.0)
+
+    def start(self, initial):
+        return Shown(1.0 + 0.0 * self.Fc)
+
+    def derivative(self, t, x, u):
+        return Shown(u - self.Fc * jnp.where(x.y > 0, 1.0, jnp.where(x.y < 0, -1.0, 0.0)))
+
+    def holding(self, output, target):
+        return 0.0 * target
