@@ -17,10 +17,8 @@ from jax.core import Tracer
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.types import AnyArray, Bool, Matrix, PyTree
 from diffabs.linear.riccati import care, dare, symmetric_part
+from diffabs.linear.stabilisability import unstabilisable_mode
 from diffabs.linear.weights import as_weight_matrix, check_symmetric
-
-# The input moves a mode s if the smallest singular value of (A - s I, B), relative to the largest, exceeds this.
-PBH_TOLERANCE = 1e-10
 
 
 class Regulator(NamedTuple):
@@ -123,23 +121,3 @@ def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matri
     unmoved = unstabilisable_mode(a, b, discrete=discrete)
     if unmoved is not None:
         raise ValueError(f"the pair (A, B) is not stabilisable: the input does not move the mode at {unmoved:.6g}")
-
-
-def unstabilisable_mode(A: AnyArray, B: AnyArray, *, discrete: bool = False) -> complex | None:
-    """Return an eigenvalue of A that is not stable and that the input cannot move, or None.
-
-    At such an eigenvalue s, (A - s I, B) has a rank below n (test of Popov, Belevitch and Hautus). Eigenvalues on the
-    stability boundary count as not stable.
-
-    Args:
-        A: State matrix, shape (n, n).
-        B: Input matrix, shape (n, m).
-        discrete: Whether the system is x+ = A x + B u.
-    """
-    a, b = np.asarray(A, float), np.asarray(B, float)
-    for mode in np.linalg.eigvals(a):
-        unstable = abs(mode) >= 1 if discrete else np.real(mode) >= 0
-        pencil = np.hstack([a - mode * np.eye(len(a)), b])
-        if unstable and np.linalg.svd(pencil, compute_uv=False)[-1] <= PBH_TOLERANCE * np.linalg.norm(pencil, 2):
-            return complex(mode) if abs(np.imag(mode)) > 0 else float(np.real(mode))
-    return None

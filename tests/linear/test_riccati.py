@@ -15,8 +15,9 @@ from mutants import killed_by
 
 from diffabs.linear.gaussian import kalman, lqg
 from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
-from diffabs.linear.regulator import dlqr, lqr, unstabilisable_mode
+from diffabs.linear.regulator import dlqr, lqr
 from diffabs.linear.riccati import care, dare
+from diffabs.linear.stabilisability import unstabilisable_mode
 from diffabs.linear.weights import is_symmetric
 from diffabs.plants import ArmBalance
 
@@ -522,3 +523,61 @@ def test_the_mode_that_is_not_moved():
     assert unstabilisable_mode(np.diag([-0.6, 1.0]), [[0.0], [1.0]]) is None
     assert unstabilisable_mode(np.diag([-0.6, 1.0]), [[0.0], [1.0]], discrete=True) is None
     assert unstabilisable_mode(np.diag([-1.6, 0.1]), [[0.0], [1.0]], discrete=True) == -1.6
+
+
+HYDRAULIC = (  # a cylinder: position [m], speed [m/s], pressure [Pa]; the input is a flow [m3/s]
+    np.array([[0.0, 1.0, 0.0], [0.0, -0.5, 1e-5], [0.0, -1e10, -1.0]]),
+    np.array([[0.0], [0.0], [1e13]]),
+)
+
+
+def test_a_cylinder_in_pascal_has_a_regulator():
+    a, b = HYDRAULIC
+    q, r = np.diag([1.0, 0.0, 0.0]), np.array([[1e6]])
+    exact = -np.linalg.solve(r, b.T @ sl.solve_continuous_are(a, b, q, r))
+    np.testing.assert_allclose(lqr(a, b, q, r).gain, exact, rtol=1e-7)  # SciPy's own residual is about 1e-9
+    late, held = sl.expm(1e-3 * a), np.linalg.solve(a + 1e-12 * np.eye(3), (sl.expm(1e-3 * a) - np.eye(3)) @ b)
+    assert unstabilisable_mode(late, held, discrete=True) is None
+    assert bool(kalman(late.T, held.T, q, r).stabilising)
+
+
+def hidden_mode(random, n, growth, *, discrete):
+    """A random system with a mode `growth` that no input moves, in coordinates that do not show it."""
+    a, b = random.normal(size=(n, n)), random.normal(size=(n, 1 + n // 4))
+    a[-1, :-1], b[-1] = 0.0, 0.0
+    a[-1, -1] = 1.0 + growth if discrete else growth
+    basis = random.normal(size=(n, n))
+    return basis @ a @ np.linalg.inv(basis), basis @ b
+
+
+def stiff_chain(random, n):
+    """States in series with rates from 1e-6 to 1e6 1/s, all behind one input."""
+    rates = 10.0 ** random.uniform(-6, 6, n) * random.choice([-1.0, 1.0], n)
+    return np.diag(rates) + np.diag(10.0 ** random.uniform(-6, 6, n - 1), 1), np.eye(n)[:, -1:]
+
+
+@killed_by("linear/stabilisability.py", "* scales[0][:, None] * scales[1]", "")
+@killed_by("linear/stabilisability.py", "return -states - np.log(rates)", "return 0.0 * states")
+@killed_by(
+    "linear/stabilisability.py", "if discrete else np.real(mode) >= -error", "if discrete else np.real(mode) >= 0"
+)
+def test_units_do_not_decide_what_is_stabilisable():
+    """Distinct rates in series make every mode movable; a hidden mode stays hidden. Units differ by up to 1e16."""
+    random = np.random.default_rng(3)
+    for k in range(60):
+        n, discrete = 2 + k % 6, bool(k % 2)
+        hidden = hidden_mode(random, n, (0.0, 0.3, 2.0)[k % 3], discrete=discrete)
+        chain = stiff_chain(random, n)
+        for units in (np.ones(n), *10.0 ** random.uniform(-8, 8, (3, n))):
+            for (a, b), unmoved in ((hidden, True), (chain, False)):
+                mode = unstabilisable_mode(a * units[:, None] / units, b * units[:, None], discrete=discrete)
+                assert (mode is not None) == unmoved, (k, units, mode)
+
+
+@killed_by("linear/stabilisability.py", "reached |= (a[:, reached] != 0).any(axis=1)", "pass")
+def test_a_state_behind_no_input_is_not_moved():
+    """No entry leads from the input to the last state, however large the units make the others."""
+    a = np.array([[1.0, 1e12, 0.0], [0.0, -2.0, 1e12], [0.0, 0.0, 1e-9]])
+    b = np.array([[0.0], [1e12], [0.0]])
+    assert unstabilisable_mode(a, b) == 1e-9
+    assert unstabilisable_mode(a[:2, :2], b[:2]) is None
