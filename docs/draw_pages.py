@@ -16,6 +16,7 @@ NOISE = "--set solver.step=1e-3 --set sensor=noise --set sensor.slip=0.005"
 SWEEP = f"sweep slip-lmi --samples 1000 {NOISE} --figures --out noisy"
 # page: (folder in which it begins, command, the file that it draws)
 COMMANDS = {
+    "first-run": (".", "simulate slip-cured --plot run.png", "run.png"),
     "margins": (".", "margins slip-cured --plot loop.png", "loop.png"),
     "plant-in-15-minutes": ("examples/dc-servo", "simulate servo.toml --parts dc_servo --plot run.png", "run.png"),
     "sweeps": (".", SWEEP, "noisy/figures/distributions.png"),

@@ -597,7 +597,11 @@ def test_fixed_steps_need_concrete_times():
 @pytest.mark.slow
 def test_the_page_runs():
     page = ROOT / "docs/fields.md"
-    slope, source = pages.printed(page.read_text(encoding="utf-8"), str(page))[0].splitlines()
+    first, second = pages.printed(page.read_text(encoding="utf-8"), str(page))
+    # 8 (1 - exp(-t)) up to 3, then 4 + (target - 4) exp(t* - t)
+    wanted = [4 - np.exp(-2) * 8 / 5, np.exp(-2) * 8 * (1 / 5 - 1 / 25)]
+    np.testing.assert_allclose([float(x) for x in first.split()], wanted, rtol=1e-6)  # rtol of the solver is 1e-8
+    slope, source = second.splitlines()
     assert abs(float(slope) - 1.7314957) < 1e-6  # SciPy in pieces, central differences of 1e-5
     assert "fields.md" in source
 
