@@ -1,5 +1,5 @@
-"""An extension of Griffe: an example in a docstring, `>>> ...` up to the next empty line, is code on the page; a class
-has its signature, a part a table of its parameters; and lines `name: what it is` are a list."""
+"""An extension of Griffe: an example in a docstring, `>>> ...` up to the next empty line, is code on the page; a part
+has a table of its parameters, another class its signature; and lines `name: what it is` are a list."""
 
 import importlib.util
 import pathlib
@@ -45,7 +45,12 @@ class Doctests(griffe.Extension):
         del given
         if obj.docstring:
             text = listed(fenced(obj.docstring.value), _names(obj))
-            parts = [parameters.signature(obj.source), text, parameters.table(obj.source)] if obj.is_class else [text]
+            parts = [text]
+            if obj.is_class and parameters.parameters(obj.source):
+                text, meanings = parameters.without_meanings(text)
+                parts = [text, parameters.table(obj.source, meanings)]
+            elif obj.is_class:
+                parts = [parameters.signature(obj.source), text, parameters.table(obj.source)]
             obj.docstring.value = "\n\n".join(part for part in parts if part)
 
 

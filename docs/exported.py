@@ -8,6 +8,8 @@ from typing import Any
 
 ROOT = pathlib.Path(__file__).parent.parent
 MARK = re.compile(r"<!-- exported: ([\w.]+) -->")
+FAMILIES = ("plants", "roads", "controllers", "references", "actuators", "sensors", "objectives", "stops")
+TABLE_ONLY = "\n    options: {members: false, heading_level: 2}"  # the methods of a part are those of its contract
 
 
 def exported(package: str) -> dict[str, str]:
@@ -28,4 +30,9 @@ def on_page_markdown(markdown: str, **given: Any) -> str:
     """Return the page with the marks replaced. Names are those that users import: `diffabs.controllers.PID` has an
     anchor."""
     del given
-    return MARK.sub(lambda mark: "\n\n".join(f"::: {mark[1]}.{name}" for name in exported(mark[1])), markdown)
+    return MARK.sub(lambda mark: _reference(mark[1]), markdown)
+
+
+def _reference(package: str) -> str:
+    options = TABLE_ONLY if package.rpartition(".")[2] in FAMILIES else ""
+    return "\n\n".join(f"::: {package}.{name}{options}" for name in exported(package))

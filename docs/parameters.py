@@ -3,9 +3,10 @@ class: nothing is imported."""
 
 import ast
 import math
+import re
 import textwrap
-from collections.abc import Iterator
-from types import SimpleNamespace
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType, SimpleNamespace
 from typing import NamedTuple
 
 KNOWN = {"math": math, "np": SimpleNamespace(inf=math.inf)}  # what bounds are computed with
@@ -88,13 +89,41 @@ def _after(value: ast.expr | None) -> str:
     return f"={ast.unparse(value)}" if value else ""
 
 
-def table(source: str) -> str:
-    """Return the parameters of a class as a table in Markdown, empty if it has none; and what its class attributes say
-    of units."""
-    rows = [f"| `{p.name}` | `{p.default}` | {p.unit} | {p.interval} |" for p in parameters(source)]
-    head = ["| parameter | default | unit | range |", "|---|---|---|---|"]
+MEANINGS = re.compile(r"^Attributes:\n((?:    .*\n?|\n)+)", re.MULTILINE)
+
+
+def without_meanings(docstring: str) -> tuple[str, dict[str, str]]:
+    """Return a docstring without its section `Attributes`, and what that says of each field, without the unit."""
+    meanings = {}
+    for entry in re.split(r"\n(?=    \S)", "\n" + "".join(MEANINGS.findall(docstring))):
+        name, colon, text = " ".join(entry.split()).partition(": ")
+        if colon:
+            meanings[name] = re.sub(r" \[[^\]]*\]\.$", ".", text).replace("|", "\\|")
+    return MEANINGS.sub("", docstring), meanings
+
+
+def table(source: str, meanings: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return the fields of a class with parameters as a table in Markdown, empty if it has no parameters; and what its
+    class attributes say of units."""
+    numeric = {p.name: p for p in parameters(source)}
+    rows = []
+    for name, default, kind in _fields(source) if numeric else ():
+        p = numeric.get(name) or Parameter(name, default, "", kind)
+        cells = (f"`{p.name}`", f"`{p.default}`" if p.default else "", p.unit, p.interval)
+        rows.append("| " + " | ".join((*cells, meanings.get(name, ""))[: 5 if meanings else 4]) + " |")
+    more = (" meaning |", "---|") if meanings else ("", "")
+    head = [f"| parameter | default | unit | range |{more[0]}", f"|---|---|---|---|{more[1]}"]
     units = [f"{what}: {unit}." for what, unit in _units(source)]
     return "\n".join(["\n".join(head + rows) if rows else "", *([""] if rows and units else []), *units]).strip()
+
+
+def _fields(source: str) -> Iterator[tuple[str, str, str]]:
+    """Name, default and type of each field of a class, in its order."""
+    (tree, *_) = ast.parse(textwrap.dedent(source)).body or [None]
+    for line in tree.body if isinstance(tree, ast.ClassDef) else ():
+        if isinstance(line, ast.AnnAssign):
+            kind = ast.unparse(line.annotation).strip("'").replace("|", "or")
+            yield ast.unparse(line.target), _after(line.value).removeprefix("="), kind
 
 
 def _units(source: str) -> Iterator[tuple[str, str]]:

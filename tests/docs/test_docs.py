@@ -5,9 +5,11 @@ import dataclasses
 import importlib
 import importlib.util
 import inspect
+import json
 import re
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import pytest
 from mutants import killed_by
@@ -95,6 +97,7 @@ def test_the_reference_shows_unit_and_range_of_every_parameter():
 def test_a_part_becomes_a_table():
     text = parameters.table(inspect.getsource(importlib.import_module("diffabs.controllers").PID))
     assert "| `kp` | `3893.0` | control/signal | [0, inf) |" in text.splitlines()
+    assert "| `antiwindup` | `NoAntiWindup` |  | Part |" in text.splitlines()
     assert parameters.table("def f():\n    return 1\n") == ""
     assert parameters.table("class A:\n    unit = 'm'\n") == "Unit of the value: m."
 
@@ -128,10 +131,20 @@ def test_a_mark_becomes_the_names():
 
 def test_a_formula_becomes_mathml_without_any_script():
     pytest.importorskip("latex2mathml", reason="latex2mathml is in the group `docs`")
-    text = loaded("formulas").on_page_markdown("Let\n\n$$\n\\dot v = -g\n$$\n\nbe; a price of $5.")
-    assert text.startswith("Let\n\n<math")
-    assert text.endswith("</math>\n\nbe; a price of $5.")
-    assert "<mover><mi>v</mi>" in text
+    formulas = loaded("formulas")
+    for formula in ("$$\n\\dot v = -g\n$$", "$$ \\dot v =\n-g $$"):
+        text = formulas.on_page_markdown(f"Let\n\n{formula}\n\nbe; a price of $5.")
+        assert text.startswith("Let\n\n<math")
+        assert text.endswith("</math>\n\nbe; a price of $5.")
+        assert "<mover><mi>v</mi>" in text
+
+
+def test_a_formula_that_is_left_as_latex_ends_the_build():
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="a.md"))
+    on_page_content = loaded("formulas").on_page_content
+    assert on_page_content("<p>5 $</p><pre>$$ x $$</pre><code>$$</code>", page=page)
+    with pytest.raises(ValueError, match=r"a.md: \$\$ is left"):
+        on_page_content("<p>Let $$x = 1$$ be.</p>", page=page)
 
 
 def test_every_page_is_in_the_navigation():
@@ -140,10 +153,89 @@ def test_every_page_is_in_the_navigation():
     assert listed == {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")}
 
 
-@pytest.mark.skipif(shutil.which("mkdocs") is None, reason="mkdocs is in the group `docs`")
-def test_the_site_builds_strictly(tmp_path):
-    subprocess.run(["mkdocs", "build", "--strict", "--site-dir", tmp_path], cwd=ROOT, check=True, capture_output=True)
-    assert "margins" in (tmp_path / "reference" / "linear" / "index.html").read_text()
-    assert re.search(
-        r"<td>control/signal/s</td>\s*<td>\[0, inf\)</td>", (tmp_path / "reference/parts/index.html").read_text()
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The built site; a warning is an error."""
+    if shutil.which("mkdocs") is None:
+        pytest.skip("mkdocs is in the group `docs`")
+    folder = tmp_path_factory.mktemp("site")
+    built = subprocess.run(
+        ["mkdocs", "build", "--strict", "--site-dir", folder], cwd=ROOT, capture_output=True, text=True
     )
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+def test_the_site_builds_strictly(site):
+    assert "margins" in (site / "reference" / "linear" / "index.html").read_text()
+    assert re.search(
+        r"<td>control/signal/s</td>\s*<td>\[0, inf\)</td>", (site / "reference/controllers/index.html").read_text()
+    )
+
+
+def test_no_page_shows_latex(site):
+    page = (site / "plant-in-15-minutes" / "index.html").read_text()
+    assert "<math" in page
+    assert "\\dot" not in page
+
+
+def test_a_part_has_one_table_and_no_signature(site):
+    page = (site / "reference" / "controllers" / "index.html").read_text()
+    (pid,) = re.findall(r'<h2 id="diffabs.controllers.PID".*?(?=<h2 )', page, re.DOTALL)
+    assert pid.count("<table>") == 1
+    assert "Proportional gain" in pid
+    assert "antiwindup" in pid
+    assert "<pre" not in pid
+    assert "<h3" not in pid  # no methods
+
+
+# a query of a newcomer, and pages of which one is among the first three
+QUERIES = {
+    "time": {"reference/linear"},
+    "settling time": {"reference/objectives"},
+    "stop time": {"reference/objectives"},
+    "stop_time": {"reference/objectives"},
+    "overshoot": {"reference/objectives", "results"},
+    "first run slow": {"faq"},
+    "what is a limit": {"faq"},
+    "where": {"compiler", "fields"},
+    "FixedStep": {"reference/loops"},
+    "fixedstep": {"reference/loops"},
+    "plant.mass": {"reference/plants"},
+    "phase margin": {"margins", "reference/linear"},
+    "gain schedule": {"reference/controllers"},
+    "PID": {"reference/controllers"},
+    "export C code": {"export", "journeys/c-export", "reference/export"},
+    "structured text": {"export", "reference/export"},
+    "GPU": {"journeys/gpu", "performance"},
+    "matlab": {"howto/matlab"},
+    "vmap": {"library", "reference/loops"},
+    "anti-windup": {"reference/controllers"},
+    "sensor noise": {"reference/sensors", "sweeps"},
+    "float32": {"howto/precision"},
+    "Lyapunov": {"reference/linear"},
+    "how do I plot a run": {"faq"},
+}
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="the search script runs in node")
+def test_the_search_answers(site):
+    """By the site's own script, on its own index."""
+    script = ROOT / "tests" / "support" / "site_search.cjs"
+    ran = subprocess.run(["node", script, site], input=json.dumps([*QUERIES, "a", "i"]), capture_output=True, text=True)
+    assert (ran.returncode, ran.stderr) == (0, "")  # a query that fails says so
+    answers = json.loads(ran.stdout)
+    pages = {
+        query: [page[0].partition("#")[0].strip("/") or "index" for page in found] for query, found in answers.items()
+    }
+    assert {query: pages[query][:3] for query, wanted in QUERIES.items() if not wanted & set(pages[query][:3])} == {}
+    assert len(pages["time"]) > 60
+    assert "reference/objectives" in pages["time"]
+
+
+@killed_by("../docs/site_search.py", "count != 1", "False")
+def test_a_search_script_without_the_fault_is_noticed():
+    repaired = loaded("site_search").repaired
+    assert repaired("e=e+s+o.id}") == 'e=e+s+o.id+","}'
+    with pytest.raises(ValueError, match="0 places"):
+        repaired("e=e+s+o.id+','}")

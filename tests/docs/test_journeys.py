@@ -126,7 +126,7 @@ def test_every_name_in_the_phrase_book_for_matlab_exists():
     assert not found("diffabs margins --plod")
 
 
-@pytest.mark.parametrize("page", EXECUTED + ["howto/cluster.md", "index.md"])
+@pytest.mark.parametrize("page", EXECUTED + ["howto/cluster.md", "index.md", "faq.md"])
 def test_every_command_of_the_page_exists(page):
     lines = re.findall(r"^(?: {4})?(diffabs \w.*?)(?: {2,}#.*)?$", text(page), re.MULTILINE)
     for line in [*lines, *re.findall(r"`(diffabs [^`]+)`", text(page))]:
