@@ -68,10 +68,14 @@ def sweep(
             console.fail(f"--samples {samples} is outside [1, {MAX_UINT32}]")
         if devices:
             jax.config.update("jax_num_cpu_devices", devices)
+        if out:
+            _check_free(out, resume)  # before anything is compiled
         chosen = console.load_scenario(
             scenario, console.add_option_overrides(changes, "sweep", samples=samples, seed=seed)
         )
-        out = out or pathlib.Path("out") / f"sweep-{chosen.name}"
+        if not out:
+            out = pathlib.Path("out") / f"sweep-{chosen.name}"
+            _check_free(out, resume)
         show_samples.say_unused_seed(chosen)
         if figures:
             report.check_target(out / report.DEFAULT_NAME)
@@ -177,6 +181,14 @@ def _check_options(on: str, scheduler: str | None, workers: int | None, devices:
     if figures:
         console.need_matplotlib()
         console.need_extra("report")
+
+
+def _check_free(out: pathlib.Path, resume: bool) -> None:
+    """Raise SweepError if a new sweep cannot begin in the folder."""
+    from diffabs.sweep.store import Store
+
+    if not resume:
+        Store(out).check_free()
 
 
 def _numbers(keep: str | None, samples: int) -> list[int]:

@@ -135,16 +135,16 @@ def relative_difference(difference: Scalar, value: Scalar) -> Scalar:
     return jnp.where(size == 0, 0.0, size / jnp.where(of > 0, of, 1.0) + jnp.where(of > 0, 0.0, jnp.inf))
 
 
-def is_comparable(loop: Loop, solver: Solver, key: Key | None = None) -> Bool:
+def is_comparable(loop: Loop, solver: Solver, key: Key | None = None, divisors: tuple[int, ...] = (2, 4)) -> Bool:
     """Return True if a shorter step changes neither the noise of the loop nor the instants at which a block computes.
 
     Args:
         loop: Closed loop.
         solver: Solver with the original step.
         key: Random key of `jax.random`, for noisy sensors. Without a key (None) the noise is not compared.
+        divisors: Divisors of the step, whole numbers.
     """
-    steady = not any(True for _ in per_step_blocks(loop))
-    return steady & (_has_same_noise(loop, solver, 2, key) & _has_same_noise(loop, solver, 4, key))
+    return (not any(True for _ in per_step_blocks(loop))) & _has_same_noise(loop, solver, divisors, key)
 
 
 def incomparability_reasons(loop: Loop, solver: Solver, key: Key | None = None) -> list[str]:
@@ -158,7 +158,7 @@ def incomparability_reasons(loop: Loop, solver: Solver, key: Key | None = None) 
     lines = [
         f"{name} computes once in every step: with another step it is another {name}" for name in per_step_blocks(loop)
     ]
-    if not (_has_same_noise(loop, solver, 2, key) and _has_same_noise(loop, solver, 4, key)):
+    if not _has_same_noise(loop, solver, (2, 4), key):
         lines.append("a shorter step draws other noise: give the sensor a period that is a multiple of solver.step")
     return lines
 
@@ -185,14 +185,14 @@ def needs_key(loop: Loop) -> bool:
     """
     try:
         # Tracing for shapes alone reaches the sensor's check for a key and computes nothing.
-        jax.eval_shape(lambda one: _draws(one, 1e-3, 1, 1, None), loop)
+        jax.eval_shape(lambda one: _draws(one, 1e-3, 1, None), loop)
     except ValueError:
         return True
     return False
 
 
-def _has_same_noise(loop: Loop, solver: Solver, times: int, key: PyTree) -> Bool:
-    """Return True if the sensor shows the same values at the common instants with steps that are `times` shorter.
+def _has_same_noise(loop: Loop, solver: Solver, divisors: tuple[int, ...], key: PyTree) -> Bool:
+    """Return True if the sensor shows the same values at the common instants with the steps of all `divisors`.
 
     The plant's signal is held constant, so only noise can differ. At most `MAX_COMPARED_INSTANTS` instants are
     compared.
@@ -200,23 +200,27 @@ def _has_same_noise(loop: Loop, solver: Solver, times: int, key: PyTree) -> Bool
     if key is None:
         return jnp.asarray(True)
     count = min(solver.steps, MAX_COMPARED_INSTANTS)
-    a = _draws(loop, solver.step, 1, count, key)
-    b = _draws(loop, solver.step / times, times, count, key)
-    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    same = [jnp.all((x == y) | (jnp.abs(x - y) <= 1e-6 * jnp.abs(x))) for x, y in pairs]  # `==` also matches infinities
-    return jnp.all(jnp.stack(same))
+    steps = jnp.asarray([solver.step, *(solver.step / times for times in divisors)])
+    # All steps share one scan: a program for each would take as long to compile as a run.
+    seen = jax.vmap(lambda h: _draws(loop, h, count * max(divisors), key))(steps)
+
+    def agree(x: Scalar) -> Bool:
+        coarse = x[0, :count]
+        fine = jnp.stack([x[i, : count * times : times] for i, times in enumerate(divisors, 1)])
+        return jnp.all((coarse == fine) | (jnp.abs(coarse - fine) <= 1e-6 * jnp.abs(coarse)))  # infinities are equal
+
+    return jnp.all(jnp.stack([agree(x) for x in jax.tree.leaves(seen)]))
 
 
-def _draws(loop: Loop, h: float, times: int, count: int, key: PyTree) -> Scalar:
-    """Return the sensor's outputs at the times 0, `times` h, 2 `times` h, ..., a pytree with leaves (count, ...).
+def _draws(loop: Loop, h: Scalar, count: int, key: PyTree) -> Scalar:
+    """Return the sensor's outputs at the times 0, h, 2 h, ..., a pytree with leaves (count, ...).
 
     The plant stays in its start state.
 
     Args:
         loop: Closed loop.
         h: Length of a step [s].
-        times: Number of steps from one returned output to the next.
-        count: Number of returned outputs.
+        count: Number of outputs.
         key: Random key, or None.
     """
     signal = loop.plant.output(loop.plant.start(loop.initial))
@@ -229,8 +233,7 @@ def _draws(loop: Loop, h: float, times: int, count: int, key: PyTree) -> Scalar:
         held = jax.tree.map(lambda x, old: jnp.asarray(x, jnp.result_type(old)), ticked.held, start.held)
         return Memory(start.flow, held), sensor.output(k * h, Memory(start.flow, held), signal)
 
-    seen = jax.lax.scan(step, start, jnp.arange(count * times))[1]
-    return jax.tree.map(lambda x: x[::times], seen)
+    return jax.lax.scan(step, start, jnp.arange(count))[1]
 
 
 def _estimate(coarse: Scalar, half: Scalar, quarter: Scalar, comparable: Bool) -> ErrorEstimate:

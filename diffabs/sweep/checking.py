@@ -1,5 +1,6 @@
 """Accuracy of a sweep's metrics: a random sample of its runs, repeated with steps of half the length."""
 
+import dataclasses
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -7,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import JsonObject, Key, Part, PyTree
-from diffabs.simulate.accuracy import is_comparable, measure_finer, relative_difference
+from diffabs.core.pytree import refine_parts
+from diffabs.core.types import Bool, JsonObject, Key, Part
+from diffabs.simulate.accuracy import is_comparable
 from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
-from diffabs.simulate.types import Run, describe_solver, differs_in_kind
+from diffabs.simulate.types import describe_solver, differs_in_kind, refine_solver
+from diffabs.sweep.runner import Columns, Runner
 from diffabs.sweep.study import Study, is_accepted, precision
 
 if TYPE_CHECKING:
@@ -44,28 +47,17 @@ def check_accuracy(study: Study, found: "Results", count: int) -> JsonObject:
     """
     samples = _choose_samples(study, found, count)
     rows = np.searchsorted(found.column("sample"), samples)  # missing chunks have no rows
-    half = {name: np.full(len(samples), np.nan) for name in found.metrics}
-    alike, fine = np.zeros(len(samples), bool), np.zeros(len(samples), bool)
     stopped = found.column("stopped")[rows]
-    loops, keys = zip(*map(study.lane, samples.tolist()), strict=True) if len(samples) else ((), ())
-
-    def rerun(loop: Part, key: Key) -> tuple[Run, PyTree]:
-        return measure_finer(loop, study.solver, study.objectives, 2, key=key), is_comparable(loop, study.solver, key)
-
-    for places in group_by_structure(loops):  # loops of one structure share a program
-        loop, batch = stack_loops([loops[i] for i in places])
-        loop = jax.tree.map(np.asarray, loop)  # an array of JAX would ask for its double precision in single
-        lanes = batch.values, jnp.stack([keys[i] for i in places])
-        with precision(study.dtype):
-            both = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, rerun))(*lanes)
-            run, known = jax.device_get(both)
-        for name, column in half.items():
-            column[places] = run.metrics[name]
-        fine[places] = known
-        alike[places] = ~np.asarray(run.diverged) & (np.asarray(run.stopped) == stopped[places])
+    if len(samples):
+        half = _run_finer(study, samples)
+        alike = ~half["diverged"] & (half["stopped"] == stopped)
+        fine = _draw_same_noise(study, samples)
+    else:
+        half = {name: np.zeros(0) for name in found.metrics}
+        alike = fine = np.zeros(0, bool)
     same = fine & alike
     compared, rows = samples[same], rows[same]
-    pairs = {name: (found.column(name)[rows], column[same]) for name, column in half.items()}
+    pairs = {name: (found.column(name)[rows], half[name][same]) for name in found.metrics}
     turned = {name: compared[differs_in_kind(*pair)].tolist() for name, pair in pairs.items()}
     changes = {name: _summarise_changes(*pair, compared) for name, pair in pairs.items()}
     return {
@@ -119,6 +111,31 @@ def _choose_samples(study: Study, found: "Results", count: int) -> np.ndarray:
     return np.sort(random.choice(good, min(count, len(good)), replace=False))
 
 
+def _run_finer(study: Study, samples: np.ndarray) -> Columns:
+    """Return the columns of samples with half the step, by the engine of the study."""
+    parts = {path: {name: refine_parts(part, 2) for name, part in each.items()} for path, each in study.parts.items()}
+    loop, solver = refine_parts(study.loop, 2), refine_solver(study.solver, 2)
+    # Runs that are no chunk of a sweep, but of its size: JAX then has traced their program already.
+    return Runner(dataclasses.replace(study, loop=loop, parts=parts, solver=solver)).run_samples(samples.tolist())
+
+
+def _draw_same_noise(study: Study, samples: np.ndarray) -> np.ndarray:
+    """Return for each sample whether a half step draws the same noise, and blocks compute at the same instants."""
+    same = np.zeros(len(samples), bool)
+    loops, keys = zip(*map(study.lane, samples.tolist()), strict=True)
+    for places in group_by_structure(loops):  # loops of one structure share a program
+        loop, batch = stack_loops([loops[i] for i in places])
+        loop = jax.tree.map(np.asarray, loop)  # an array of JAX would ask for its double precision in single
+        lanes = batch.values, jnp.stack([keys[i] for i in places])
+
+        def compare(loop: Part, key: Key) -> Bool:
+            return is_comparable(loop, study.solver, key, (2,))
+
+        with precision(study.dtype):
+            same[places] = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, compare))(*lanes)
+    return same
+
+
 def _summarise_changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> JsonObject:
     known = np.isfinite(values) & np.isfinite(half)  # a run that never settles has an infinite settling time
     values, half, samples = values[known], half[known], samples[known]
@@ -126,11 +143,12 @@ def _summarise_changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray
         return {}
     # A value near zero would have a huge relative change, so the median bounds the reference from below.
     typical = np.maximum(np.abs(values), np.median(np.abs(values)))
-    relative = np.asarray(relative_difference(half - values, typical))
+    change = np.abs(half - values)
+    relative = np.divide(change, typical, out=np.where(change > 0, np.inf, 0.0), where=typical > 0)
     worst = int(np.argmax(relative))
     return {
         "median": float(np.median(relative)),
         "largest": float(relative[worst]),
-        "difference": float(abs(half - values)[worst]),
+        "difference": float(change[worst]),
         "sample": int(samples[worst]),
     }

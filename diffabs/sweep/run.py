@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import jax
 
+from diffabs.core.kinds import format_value
+from diffabs.core.loop import Loop
 from diffabs.core.types import Table
 from diffabs.runtime import provenance, stopwatch
 from diffabs.simulate.drive.engine import log_xla_reason
@@ -73,20 +75,25 @@ def sweep(
         source: Texts for the manifest, by name, such as the scenario.
 
     Raises:
-        ValueError: The study cannot be run, or not by its engine; a note of `source` is no text; or JAX runs in several
-            processes.
+        ValueError: `study` is no Study or cannot be run, or not by its engine; a note of `source` is no text; or JAX
+            runs in several processes.
         SweepError: The folder contains something else, is in use, or cannot be written.
         OSError: The disk is full. Finished chunks stay, and `resume` continues.
     """
     if jax.process_count() > 1:
         raise ValueError("sweep runs in one process; several machines: on=Dask(...)")
     notes = read_notes(source or {}, "source")
-    study, why_xla = choose_study_engine(study.check(), out, resume=resume, remote=getattr(on, "remote", False))
+    if not isinstance(study, Study):
+        given = type(study).__name__ if isinstance(study, Loop) else format_value(study)
+        raise ValueError(f"study = {given} is no Study; Study(loop=..., space=..., samples=..., solver=...) makes one")
+    store, study = Store(pathlib.Path(out)), study.check()
+    if not resume:
+        store.check_free()  # before a kernel is compiled
+    study, why_xla = choose_study_engine(study, out, resume=resume, remote=getattr(on, "remote", False))
     if why_xla:
         log_xla_reason(why_xla)
     if study.engine != "xla" and (line := find_study_objection(study)):
         raise ValueError(line)
-    store = Store(pathlib.Path(out))
     with _begin_sweep(store, study, resume, notes) as (missing, damaged):
         tell, begun = progress or (lambda _: None), time.monotonic()
         before = study.samples - sum(b - a for a, b in map(study.bounds, missing))

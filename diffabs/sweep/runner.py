@@ -70,7 +70,16 @@ class Runner:
 
         They are sample, parameters, metrics, stopped, diverged, and refused (the reason, or '').
         """
-        drawn = [self._draw_chunk(c) for c in chunks]
+        return self._run_drawn([self._draw_chunk(c) for c in chunks])
+
+    def run_samples(self, samples: Sequence[int]) -> Columns:
+        """Return the columns of at most a chunk of single `samples`, with the program of a chunk."""
+        rows = [self.study.draw(i, i + 1) for i in samples]
+        drawn = {path: np.concatenate([row[path] for row in rows]) for path in rows[0]}
+        return self._run_drawn([{"sample": np.asarray(samples), **drawn}])[0]
+
+    def _run_drawn(self, drawn: list[Columns]) -> list[Columns]:
+        """Return the columns of chunks, from their samples and drawn values."""
         for columns in drawn:
             columns |= {name: np.zeros(len(columns["sample"]), self.study.dtype) for name in self.study.objectives}
             columns |= {name: np.zeros(len(columns["sample"]), bool) for name in FLAG_COLUMNS[:-1]}

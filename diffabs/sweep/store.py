@@ -76,6 +76,24 @@ class Store:
             for folder in created:
                 folder.rmdir()
 
+    def check_free(self) -> None:
+        """Check that a new sweep can begin in the folder, without writing.
+
+        Raises:
+            SweepError: The folder contains finished chunks, a manifest that is none, or other files.
+        """
+        if known := (self.folder / MANIFEST_NAME).exists():
+            read_manifest(self.folder)
+        if self._has_chunks():
+            why = "already holds a sweep; --resume continues it"
+            why = why if known else f"has chunks but no {MANIFEST_NAME}; it cannot be continued"
+            raise SweepError(f"{self.folder} {why}")
+        ours = {CHUNKS_FOLDER, MANIFEST_NAME, *LEFTOVERS}
+        names = (path.name for path in self.folder.iterdir()) if self.folder.is_dir() else ()
+        others = sorted(name for name in names if name not in ours and not name.startswith("."))
+        if others:
+            raise SweepError(f"{self.folder} is no sweep, but holds {others[0]}; choose a folder that is new or empty")
+
     def begin(self, manifest: Table, *, resume: bool) -> None:
         """Write the `manifest`, or compare it with the existing one if `resume` is set.
 
@@ -89,15 +107,12 @@ class Store:
         for pattern in LEFTOVERS:
             for leftover in self.folder.glob(pattern):
                 leftover.unlink(missing_ok=True)
-        if not (self.folder / MANIFEST_NAME).exists():
-            self._begin_new(manifest)
+        if not (resume and (self.folder / MANIFEST_NAME).exists()):
+            self.check_free()
+            self.chunks.mkdir(exist_ok=True)
+            files.write_durably(self.folder / MANIFEST_NAME, encode_manifest(manifest))
             return
         there = read_manifest(self.folder)
-        if not resume:
-            if self._has_chunks():
-                raise SweepError(f"{self.folder} already holds a sweep; --resume continues it")
-            self._begin_new(manifest)
-            return
         found = list(describe_differences(_decisive_entries(there), _decisive_entries(manifest)))
         if found:
             more = f", and {len(found) - 3} more" if len(found) > 3 else ""
@@ -106,18 +121,6 @@ class Store:
 
     def _has_chunks(self) -> bool:
         return any(self.chunks.glob("*"))
-
-    def _begin_new(self, manifest: Table) -> None:
-        if self._has_chunks():
-            raise SweepError(f"{self.folder} has chunks but no {MANIFEST_NAME}; it cannot be continued")
-        names = (path.name for path in self.folder.iterdir())
-        others = sorted(
-            name for name in names if name not in (CHUNKS_FOLDER, MANIFEST_NAME) and not name.startswith(".")
-        )
-        if others:
-            raise SweepError(f"{self.folder} is no sweep, but holds {others[0]}; choose a folder that is new or empty")
-        self.chunks.mkdir(exist_ok=True)
-        files.write_durably(self.folder / MANIFEST_NAME, encode_manifest(manifest))
 
     def scan(self, seals: Seals) -> tuple[dict[int, pathlib.Path], list[int]]:
         """Return the paths of the intact chunks by number, and the numbers of the damaged ones.

@@ -69,6 +69,7 @@ SEAMS = {
     "timeout_seconds": "diffabs.sweep.cluster.TIMEOUT_SECONDS",
     "chunk_cores": "diffabs.sweep.engines.core_count",
     "runner": "diffabs.sweep.engines.Runner",
+    "checking_runner": "diffabs.sweep.checking.Runner",
     "random_words": "diffabs.sweep.sampling._random_words",
     "max_tail_atoms": "diffabs.sweep.statistics.estimates.MAX_TAIL_ATOMS",
     "max_row_groups": "diffabs.sweep.statistics.sensitivity.MAX_ROW_GROUPS",

@@ -247,6 +247,28 @@ def test_a_half_step_of_a_sweep_with_a_gap(study, swept, tmp_path):
     assert found["metrics"]["iae"]["largest"] < 1e-3
 
 
+@killed_by("sweep/checking.py", "refine_solver(study.solver, 2)", "study.solver")
+def test_half_steps_are_made_by_the_sweeps_own_engine_and_program(study, swept, monkeypatch):
+    """XLA's program of a run compiles for a minute where the sweep's kernel is there already."""
+    asked = []
+
+    class Recording:
+        def __init__(self, study):
+            asked.append(study)
+
+        def run_samples(self, samples):
+            columns = {name: 1.25 * swept.column(name)[samples] for name in swept.metrics}
+            return columns | {name: swept.column(name)[samples] for name in ("stopped", "diverged")}
+
+    replace_seam(monkeypatch, "checking_runner", Recording)
+    study = dataclasses.replace(study, engine="kernel")
+    found = check_accuracy(study, swept, 6)
+    assert [(one.engine, one.chunk, one.solver.step) for one in asked] == [
+        ("kernel", study.chunk, study.solver.step / 2)
+    ]
+    assert found["metrics"]["iae"]["largest"] == pytest.approx(0.25, rel=1e-12)  # 1.25 and 0.25 are exact
+
+
 @killed_by("sweep/checking.py", "for name, one in turned.items() if one", "for name, one in turned.items() if not one")
 @pytest.mark.slow
 def test_a_half_step_that_turns_never_into_a_number(study, swept):
@@ -501,6 +523,8 @@ def test_a_sweep_is_not_begun_again_over_another(file, swept):
     assert_one_error_line(result)
     assert "already holds a sweep; --resume continues it" in result.stderr
     assert before == {path.name: path.read_bytes() for path in swept.folder.iterdir() if path.is_file()}
+    early = run("sweep", "no-such-scenario", "--out", swept.folder, status=2)  # before the scenario is read
+    assert "already holds a sweep; --resume continues it" in early.stderr
 
 
 def test_a_manifest_of_something_else_is_left_alone(study, tmp_path):
