@@ -42,7 +42,8 @@ SPARE = 2  # extra steps, so that the run covers the last instant of the data
 def identify(
     scenario: console.ScenarioName,
     data: Annotated[
-        pathlib.Path, typer.Option(metavar="FILE.csv", help="Measured run, with the columns of simulate --csv.")
+        pathlib.Path,
+        typer.Option(metavar="FILE.csv", help="Measured run, as simulate --csv writes it, or a logger."),
     ],
     free: Annotated[
         list[str],
@@ -57,6 +58,15 @@ def identify(
     ] = None,
     column: Annotated[
         list[str] | None, typer.Option(metavar="COLUMN", help="Compare only this column; may be repeated.")
+    ] = None,
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="COLUMN=NAME", help="Signal, or t, that a column of the file holds, in SI; may be repeated."
+        ),
+    ] = None,
+    separator: Annotated[
+        str | None, typer.Option(metavar="CHARACTER", help="Between the cells, or `tab`; default: guessed.")
     ] = None,
     changes: console.Changes = None,
     as_json: console.Json = False,
@@ -73,7 +83,8 @@ def identify(
         with targets.new_target_file(out, "--out") as file:
             chosen = console.load_scenario(scenario, changes)
             units = chosen.loop.plant.shows.units
-            readings = _compared_columns(data, column, units)
+            file_form = _read_renames(rename or ()), _read_separator(separator)
+            readings = _compared_columns(data, column, units, *file_form)
             noise = _read_noise(sigma or (), readings, units)
             ranges = _read_ranges(free, chosen)
             found, noise, interrupted = _fit_with_progress(chosen, readings, ranges, noise)
@@ -92,9 +103,41 @@ def identify(
         show.as_json(result) if as_json else show.show_identification(result)
 
 
-def _compared_columns(data: pathlib.Path, names: Sequence[str] | None, units: Mapping[str, str]) -> Readings:
-    """Return the columns of a file that are compared."""
-    readings = read_measurements(data, units)
+def _read_renames(given: Sequence[str]) -> dict[str, str]:
+    """Return signals by the name of their column in the file."""
+    found = {}
+    for text in given:
+        column, equals, name = (word.strip() for word in text.rpartition("="))
+        if not (equals and column and name):
+            raise ScenarioError(f"--rename {format_given(text)} is not of the form column=name")
+        if column in found:
+            raise ScenarioError(f"--rename {format_given(column)} is given twice")
+        found[column] = name
+    return found
+
+
+def _read_separator(given: str | None) -> str | None:
+    """Return the character between the cells, or None to guess it."""
+    if given is None:
+        return None
+    separator = {"tab": "\t", "\\t": "\t"}.get(given, given)
+    if len(separator) != 1 or separator.isalnum() or separator in "\"'+-.\r\n_":
+        raise ScenarioError(f"--separator {format_given(given)} is no separator: `tab`, or a character such as ;")
+    return separator
+
+
+def _compared_columns(
+    data: pathlib.Path,
+    names: Sequence[str] | None,
+    units: Mapping[str, str],
+    renamed: Mapping[str, str] | None = None,
+    separator: str | None = None,
+) -> Readings:
+    """Return the columns of a file that are compared. Who names some columns may have others in the file."""
+    strict = not (names or renamed)
+    readings = read_measurements(data, units, renamed=renamed, separator=separator, strict=strict)
+    if readings.unread:
+        console.say(f"note: not compared: {', '.join(readings.unread)}")
     if readings.infinite and not names:
         console.say(f"note: {', '.join(readings.infinite)} is infinite in every row of the data, and is not compared")
     for name in names or ():

@@ -1,17 +1,24 @@
-"""Measured runs as CSV files, with the columns that `diffabs simulate --csv` writes."""
+"""Measured runs as text files, with the columns that `diffabs simulate --csv` writes, or with those of a data logger.
 
-import csv
+The separator is a comma, a semicolon or a tab; without commas as separators, numbers may have a decimal comma. A column
+`name [unit]` may also be called `name (unit)`, with - for the unit 1, and the time `t` or `time`, also without unit.
+"""
+
 import pathlib
+import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from diffabs.config.values import ScenarioError, format_given, unknown_name_error
-from diffabs.runtime import files
+from diffabs.runtime import files, separated
 
 MAX_MEASUREMENT_BYTES = 100_000_000  # bytes
 TIME_COLUMN = "t [s]"
+TIME_NAMES = ("t", "time", "time [s]")  # of the column, beside TIME_COLUMN, in small or capital letters
+RENAME_HINT = '--rename "COLUMN=NAME" gives a column the name of a signal, or t'
+MAX_LISTED = 20  # columns of the file that a message lists
 IGNORED = ("target [", "command [", "control [")  # columns of a simulation without a measurement
 
 
@@ -22,26 +29,38 @@ class Readings(NamedTuple):
         t: Instants [s], increasing.
         columns: Readings at the instants, in SI, by the names of a plant's output.
         infinite: Names of the columns that are left out, because they are infinite in every row.
+        unread: Names of the columns that are left out, because they are unknown.
     """
 
     t: np.ndarray
     columns: dict[str, np.ndarray]
     infinite: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
 
 
-def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
-    """Return the readings in a CSV file.
+def read_measurements(
+    path: pathlib.Path,
+    units: Mapping[str, str],
+    *,
+    renamed: Mapping[str, str] | None = None,
+    separator: str | None = None,
+    strict: bool = True,
+) -> Readings:
+    """Return the readings in a file.
 
     Args:
         path: File of UTF-8 text, at most `MAX_MEASUREMENT_BYTES` long, with the column `t [s]`. Columns of target,
             command and control are ignored. A column that is infinite in every row, such as a limit that the simulation
             lacks, is ignored if another column is left.
         units: Units of the plant's signals by name: a column's header is `name [unit]`.
+        renamed: Signal, or `t`, by the name of its column in the file. Its values have the signal's unit.
+        separator: Character between the cells; None guesses comma, semicolon or tab.
+        strict: Whether to refuse a column with an unknown name; otherwise it is left out.
 
     Raises:
         ScenarioError: The file cannot be read, a column is unknown, or there is no signal or no row. Also raised for a
-            cell that is no finite number in a column that is read, and for an instant that is negative or not after the
-            one before. The message names the line of such a cell or instant.
+            cell that is no finite number in a column that is read, for decimal points beside decimal commas, and for an
+            instant that is negative or not after the one before. The message names the line of such a cell or instant.
     """
     try:
         raw = files.read_content(path, MAX_MEASUREMENT_BYTES + 1)
@@ -50,13 +69,20 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
     if len(raw) > MAX_MEASUREMENT_BYTES:
         raise ScenarioError(f"--data {path}: is larger than {MAX_MEASUREMENT_BYTES} bytes")
     try:
-        rows = list(csv.reader(raw.decode("utf-8-sig").splitlines()))
-    except (UnicodeDecodeError, csv.Error):
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
         raise ScenarioError(f"--data {path}: is not a CSV file of UTF-8 text") from None
-    header = [cell.strip() for cell in rows[0]] if rows else []
-    names = _names(header, path, units)
+    try:
+        rows, separator = separated.split_rows(text, separator)
+    except ValueError as error:
+        hint = " with --separator" if str(error).startswith("separator") else ""
+        raise ScenarioError(f"--data {path}: {error}{hint}") from None
+    given = [cell.strip() for cell in rows[0]] if rows else []
+    header = _translate(given, path, units, renamed or {})
+    names, unread = _names(header, given, path, units, strict)
     used = [header.index(TIME_COLUMN), *names]
-    numbers = np.array([_numbers(row, i, header, used, path) for i, row in enumerate(rows[1:], 2) if row], float)
+    comma = _has_decimal_commas(rows, used, separator, path)
+    numbers = np.array([_numbers(row, i, given, used, comma, path) for i, row in enumerate(rows[1:], 2) if row], float)
     if not len(numbers):
         raise ScenarioError(f"--data {path}: has a header and no numbers")
     lines = [i for i, row in enumerate(rows[1:], 2) if row]
@@ -67,38 +93,85 @@ def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
     for i, j in np.argwhere(~np.isfinite(numbers)):
         if used[j] not in unlimited:
             cell = rows[lines[i] - 1][used[j]].strip()
-            raise ScenarioError(f"--data {path}, line {lines[i]}: {header[used[j]]} = {cell} is outside (-inf, inf)")
+            raise ScenarioError(f"--data {path}, line {lines[i]}: {given[used[j]]} = {cell} is outside (-inf, inf)")
     late = np.flatnonzero(np.diff(t) <= 0)
     if t[0] < 0 or len(late):
         line, before = (lines[late[0] + 1], t[late[0]]) if len(late) else (lines[0], 0.0)
         at = t[late[0] + 1] if len(late) else t[0]
         raise ScenarioError(f"--data {path}, line {line}: t = {at:g} s does not come after {before:g} s")
     columns = {name: compared[i] for i, name in names.items() if i not in unlimited}
-    return Readings(t, columns, tuple(name for name in names.values() if name not in columns))
+    return Readings(t, columns, tuple(name for name in names.values() if name not in columns), unread)
 
 
-def _names(header: Sequence[str], path: pathlib.Path, units: Mapping[str, str]) -> dict[int, str]:
-    """Return the names of the compared columns by column number."""
+def _translate(
+    given: Sequence[str], path: pathlib.Path, units: Mapping[str, str], renamed: Mapping[str, str]
+) -> list[str]:
+    """Return the header with `name [unit]` for each name that is renamed, or written in another way."""
+    headers = {"t": TIME_COLUMN} | {name: f"{name} [{unit}]" for name, unit in units.items()}
+    for column, name in renamed.items():
+        if column not in given:
+            what = f"--rename {format_given(column)} is no column of {path}"
+            raise unknown_name_error(what, column, given)
+        if name not in headers and name not in headers.values():
+            raise unknown_name_error(f"--rename {format_given(name)} is not a signal", name, headers)
+
+    def translate(column: str) -> str:
+        if column in renamed:
+            return headers.get(renamed[column], renamed[column])
+        plain = re.sub(r"\s*[\[(]\s*(.*?)\s*[\])]$", r" [\1]", column).replace("[-]", "[1]")
+        return TIME_COLUMN if plain.lower() in TIME_NAMES else plain if plain in headers.values() else column
+
+    return [translate(column) for column in given]
+
+
+def _names(
+    header: Sequence[str], given: Sequence[str], path: pathlib.Path, units: Mapping[str, str], strict: bool
+) -> tuple[dict[int, str], tuple[str, ...]]:
+    """Return the names of the compared columns by column number, and the names of unknown columns."""
     headers = {f"{name} [{unit}]": name for name, unit in units.items()}
     there = ", ".join((TIME_COLUMN, *headers))
+    has = f"the file has {', '.join(format_given(name) for name in given[:MAX_LISTED])}"
+    has += f" and {len(given) - MAX_LISTED} more" if len(given) > MAX_LISTED else ""
     if TIME_COLUMN not in header:
-        what = f"line 1 has no column {TIME_COLUMN}" if header else "is empty"
-        raise ScenarioError(f"--data {path}: {what}; there is {there}")
+        what = f"line 1 has no column {TIME_COLUMN}; {has}" if header else "is empty"
+        raise ScenarioError(f"--data {path}: {what}; there is {there}{'; ' + RENAME_HINT if header else ''}")
+    unread = []
     for name in header:
-        if header.count(name) > 1:
+        known = name == TIME_COLUMN or name in headers
+        if known and header.count(name) > 1:
             raise ScenarioError(f"--data {path}: column {format_given(name)} occurs twice")
-        if name != TIME_COLUMN and name not in headers and not name.startswith(IGNORED):
-            raise unknown_name_error(
-                f"--data {path}: column {format_given(name)} is unknown", name, (TIME_COLUMN, *headers)
-            )
+        if known or not name or name.startswith(IGNORED):  # without a name: a separator at the end of the lines
+            continue
+        if strict:
+            what = f"--data {path}: column {format_given(name)} is unknown"
+            error = unknown_name_error(what, name, (TIME_COLUMN, *headers))
+            raise ScenarioError(f"{error}; {has}; {RENAME_HINT}")
+        unread.append(name)
     names = {i: headers[name] for i, name in enumerate(header) if name in headers}
     if not names:
-        raise ScenarioError(f"--data {path}: has no column of a measured signal; there is {', '.join(headers)}")
-    return names
+        hint = f"{has}; {RENAME_HINT}"
+        raise ScenarioError(f"--data {path}: has no column of a measured signal; there is {', '.join(headers)}; {hint}")
+    return names, tuple(unread)
+
+
+def _has_decimal_commas(rows: Sequence[Sequence[str]], used: Sequence[int], separator: str, path: pathlib.Path) -> bool:
+    """Return whether the numbers have decimal commas; raise a ScenarioError if some have a comma and some a point."""
+    first = {}
+    for line, row in enumerate(rows[1:], 2):
+        for i in used:
+            for mark in ",.":
+                if i < len(row) and mark in row[i]:
+                    first.setdefault(mark, (line, row[i].strip()))
+    if len(first) == 2:
+        (line, cell), (_, other) = sorted(first.values(), reverse=True)
+        raise ScenarioError(
+            f"--data {path}, line {line}: {format_given(cell)} has another decimal mark than {format_given(other)}"
+        )
+    return "," in first
 
 
 def _numbers(
-    row: Sequence[str], line: int, header: Sequence[str], used: Sequence[int], path: pathlib.Path
+    row: Sequence[str], line: int, header: Sequence[str], used: Sequence[int], comma: bool, path: pathlib.Path
 ) -> list[float]:
     """Return the numbers of the `used` columns of a row."""
     if len(row) != len(header):
@@ -106,7 +179,7 @@ def _numbers(
     found = []
     for i in used:
         try:
-            found.append(float(row[i]))
+            found.append(separated.read_decimal(row[i], comma))
         except ValueError:
             raise ScenarioError(
                 f"--data {path}, line {line}: {header[i]} = {format_given(row[i])} is text; a number is needed"

@@ -70,7 +70,7 @@ def small(file):
 def test_readings_are_what_is_in_the_file(csv):
     """The column of commands is not read, whatever it holds."""
     rows = (row[:-1] + cell for row, cell in zip(ROWS, ("nan", "", "-inf"), strict=True))
-    t, columns, _ = read_measurements(csv("\ufeff" + HEADER, *rows, ""), UNITS)
+    t, columns, *_ = read_measurements(csv("\ufeff" + HEADER, *rows, ""), UNITS)
     assert t.tolist() == [0, 0.1, 0.3]
     assert list(columns) == ["wheel_speed", "slip"]
     assert columns["wheel_speed"].tolist() == [13.8, 12.9, 11.0]
@@ -80,7 +80,7 @@ def test_readings_are_what_is_in_the_file(csv):
 @pytest.mark.slow
 def test_readings_are_what_simulate_writes(small, tmp_path):
     run("simulate", small, "--csv", tmp_path / "run.csv", "--set", "solver.duration=0.02")
-    t, columns, _ = read_measurements(tmp_path / "run.csv", UNITS)
+    t, columns, *_ = read_measurements(tmp_path / "run.csv", UNITS)
     np.testing.assert_allclose(t, 1e-3 * np.arange(21), rtol=1e-11, atol=1e-15)
     assert list(columns) == ["slip", "speed", "wheel_speed", "deceleration", "distance"]
     np.testing.assert_allclose(columns["slip"], 1 - columns["wheel_speed"] / columns["speed"], rtol=0, atol=1e-10)
@@ -224,7 +224,7 @@ def test_table_for_people(small, csv, invented):
 def test_what_simulate_wrote_is_found_again(small, tmp_path):
     truth = ("--set", "plant.mass=6.0", "--set", "road.w4=0.38")
     run("simulate", small, "--csv", tmp_path / "run.csv", *truth)
-    t, columns, _ = read_measurements(tmp_path / "run.csv", UNITS)
+    t, columns, *_ = read_measurements(tmp_path / "run.csv", UNITS)
     noisy = columns["wheel_speed"] + np.random.default_rng(5).normal(0.0, 0.02, len(t))
     lines = (f"{x},{w}" for x, w in zip(t, noisy, strict=True))
     (tmp_path / "noisy.csv").write_text("\n".join(["t [s],wheel_speed [m/s]", *lines]))
