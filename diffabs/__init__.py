@@ -1,5 +1,7 @@
 """Simulate, differentiate, tune and certify controllers for braking wheels and two-wheelers."""
 
+from typing import TYPE_CHECKING
+
 from diffabs.runtime import interrupt as _interrupt
 
 _interrupt.end_early_on_interrupt()  # before JAX, whose import takes seconds
@@ -8,6 +10,7 @@ from diffabs.core.loop import Loop as Loop
 from diffabs.core.pytree import arrays as arrays
 from diffabs.core.pytree import replace as replace
 from diffabs.plants import BrakeStart as BrakeStart
+from diffabs.runtime.exports import lazy_getattr as _lazy_getattr
 from diffabs.scenario.defaults import balancing as balancing
 from diffabs.scenario.defaults import braking as braking
 from diffabs.simulate.admissible import check as check
@@ -23,4 +26,12 @@ from diffabs.simulate.types import Adaptive as Adaptive
 from diffabs.simulate.types import FixedStep as FixedStep
 from diffabs.simulate.types import Run as Run
 
+if TYPE_CHECKING:
+    from diffabs import linear as linear
+    from diffabs import sweep as sweep
+    from diffabs import tune as tune
+    from diffabs.scenario.registry import register_parts as register_parts
+    from diffabs.scenario.scenario import load as load
+
+__getattr__ = _lazy_getattr(__name__)
 __version__ = "0.1.0"

@@ -22,6 +22,7 @@ from diffabs.core.types import Part, PyTree, Scalar
 
 FINITE_SPEC = ParameterSpec("1")
 POSITIVE_SPEC = ParameterSpec("1", low=0.0, open_low=True)
+MIN_LIKENESS = 0.5  # least likeness of two names, of which one is probably a misspelling of the other
 PLAIN_TYPES = (str, bool, int, float, type(None))
 
 Reader = Callable[[Any, str], Any]
@@ -82,9 +83,27 @@ def unknown_name_error(what: str, name: Any, there: Iterable[str]) -> ScenarioEr
         there: Existing names.
     """
     there = list(there)
-    near = difflib.get_close_matches(str(name).lower(), there, 1, 0.5)
-    hint = f"did you mean {near[0]}? There is" if near else "there is"
+    near = _find_near_name(str(name), there)
+    hint = f"did you mean {near}? There is" if near else "there is"
     return ScenarioError(f"{what}; {hint} {', '.join(there) or 'nothing'}")
+
+
+def _find_near_name(name: str, there: list[str]) -> str | None:
+    """Return the existing name that is probably meant: that of a part inside, or one with a similar last word."""
+    words = name.split(".")
+    for path in there:
+        rest = iter(path.split("."))
+        if len(words) > 1 and all(word in rest for word in words):  # `in` moves `rest` on: the words in this order
+            return path
+    # Paths to the fields of one part begin alike. Only their last words show whether one is meant.
+    last = difflib.SequenceMatcher(b=words[-1].lower())
+
+    def is_similar(path: str) -> bool:
+        last.set_seq1(path.rpartition(".")[2].lower())
+        return last.ratio() >= MIN_LIKENESS
+
+    alike = [path for path in there if len(words) == 1 or is_similar(path)]
+    return next(iter(difflib.get_close_matches(name.lower(), alike, 1, MIN_LIKENESS)), None)
 
 
 def wrong_kind_error(path: str, value: Scalar, needed: str) -> ScenarioError:

@@ -217,7 +217,13 @@ def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[P
     Args:
         part: Part, or tuple or list of parts.
         prefix: Text before every path.
+
+    Raises:
+        ValueError: A class is in the place of a part.
     """
+    if isinstance(part, type):
+        name = prefix.removesuffix(".") or "the part"
+        raise ValueError(f"{name} = {part.__name__} is a class; {part.__name__}(...) is needed")
     if isinstance(part, tuple | list):
         for i, item in enumerate(part):
             yield f"{prefix}{i}", None, item
@@ -266,17 +272,18 @@ def get(part: Part, path: str) -> PyTree:
     Raises:
         KeyError: The path does not exist, or leads to a static field; the message names the fields that exist there.
     """
-    for name in path.split("."):
-        names = _names(part)
+    words = path.split(".")
+    for i, name in enumerate(words):
+        names = _names(part, "".join(f"{word}." for word in words[:i]))
         if name not in names:
             raise KeyError(f"no '{name}' in {path}; there is {', '.join(names) or 'nothing'}")
         part = getattr(part, name) if dataclasses.is_dataclass(part) else part[int(name)]
     return part
 
 
-def _names(part: Part) -> list[str]:
+def _names(part: Part, prefix: str) -> list[str]:
     if isinstance(part, tuple | list) or dataclasses.is_dataclass(part):
-        return [child.rpartition(".")[2] for child, _, _ in children(part, "")]
+        return [child.rpartition(".")[2] for child, _, _ in children(part, prefix)]
     return [str(i) for i in range(np.shape(part)[0])] if np.ndim(part) else []
 
 

@@ -254,7 +254,9 @@ def read_entries(
     seen = set()
     for key, given in flatten_table(table, section).items():
         if key not in known:
-            raise unknown_name_error(f"{_where(section, key)} is {otherwise}", key, known)
+            head = f"{key.partition('.')[0]}."
+            beside = [path for path in known if path.startswith(head)]  # a loop has some sixty parameters
+            raise unknown_name_error(f"{_where(section, key)} is {otherwise}", key, beside or known)
         path, spec, shape, scale = known[key]
         if path in seen:
             raise ScenarioError(f"{_where(section, canonical_path(path))} is given twice, in m/s and in km/h")

@@ -41,6 +41,7 @@ from diffabs.scenario.defaults import braking
 
 KMH = 3.6  # km/h in a m/s
 MAX_DEPTH = 16  # parts inside parts; more is a mistake, and Python's stack is finite
+OUTSIDE_HINT = "a part of a module of your own needs --parts MODULE"
 MAX_STATIC = 10_000_000  # largest static whole number: such numbers become shapes of arrays
 DEFAULT_UNITS = units_of(braking().plant)  # units in which `list` shows a part outside of a loop
 
@@ -261,7 +262,8 @@ def build_part(family: str, given: PyTree, default: Any, path: str, units: Units
     if name is not None and not isinstance(name, str):
         raise wrong_kind_error(f"{path}.type", name, f"one of {', '.join(there)}")
     if name is not None and name not in there:
-        raise unknown_name_error(f"{path}.type = {format_given(name)} is unknown", name, there)
+        error = unknown_name_error(f"{path}.type = {format_given(name)} is unknown", name, there)
+        raise ScenarioError(f"{error}; {OUTSIDE_HINT}")
     template = default if name is None else there[name]
     return fill_part(template, {k: v for k, v in table.items() if k != "type"}, family, path, units)
 

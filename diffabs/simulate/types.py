@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -164,6 +164,14 @@ class Run(NamedTuple):
     timed_out: Bool
     ending: Ending
     trajectory: Trajectory | None
+
+    def __getattr__(self, name: str) -> Any:
+        """Raise the AttributeError for a `name` that is no field, with the metrics of the run."""
+        line = f"a Run has no field {name}"
+        if not name.startswith("_") and isinstance(self.metrics, dict):
+            known = f"its metrics are {', '.join(self.metrics)}" if self.metrics else "it has no metrics"
+            line += f'; run.metrics["{name}"] is a metric' if name in self.metrics else f"; {known}"
+        raise AttributeError(line, name=name, obj=self)
 
     def __repr__(self) -> str:
         """Return how the run ended, and its metrics."""

@@ -1,8 +1,9 @@
 """Monte-Carlo sweeps: variables, sampling designs, engines, results and statistics. Needs the extra `sweep`."""
 
+import sys
 from typing import TYPE_CHECKING
 
-from diffabs.runtime.exports import lazy_getattr
+from diffabs.runtime.exports import CallablePackage, lazy_getattr
 
 if TYPE_CHECKING:
     from diffabs.sweep.discrete import Categorical as Categorical
@@ -28,3 +29,4 @@ if TYPE_CHECKING:
     from diffabs.sweep.variables import Space as Space
 
 __getattr__ = lazy_getattr(__name__)
+sys.modules[__name__].__class__ = CallablePackage  # `diffabs.sweep(...)` is `diffabs.sweep.sweep(...)`

@@ -1,8 +1,9 @@
 """Gradient-based tuning of controllers, and the search for worst cases."""
 
+import sys
 from typing import TYPE_CHECKING
 
-from diffabs.runtime.exports import lazy_getattr
+from diffabs.runtime.exports import CallablePackage, lazy_getattr
 
 if TYPE_CHECKING:
     from diffabs.core.reason import Reason as Reason
@@ -29,3 +30,4 @@ if TYPE_CHECKING:
     from diffabs.tune.worst import worst_case as worst_case
 
 __getattr__ = lazy_getattr(__name__)
+sys.modules[__name__].__class__ = CallablePackage  # `diffabs.tune(...)` is `diffabs.tune.tune(...)`

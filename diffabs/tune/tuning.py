@@ -47,9 +47,14 @@ def tune(
         stopping: Called after every evaluation; True ends the search with the best point so far.
 
     Raises:
+        ValueError: `problem` is no Problem.
         EngineError: The engine of the problem is "kernel", and a kernel cannot make the runs.
         StartError: At every start a run diverges or is inadmissible, or the objective or its gradient is not finite.
     """
+    if not isinstance(problem, Problem):
+        given = type(problem).__name__ if isinstance(problem, Loop) else format_value(problem)
+        needed = "build_problem(loop, free=..., objective=..., solver=...) makes one"
+        raise ValueError(f"problem = {given} is no Problem; {needed}")
     subject, paths = problem.subject, [entry.path for entry in problem.space.entries]
     own = {path: get(subject, path) for path in paths}
     one_sided.warn(subject, own, problem.batch, problem.solver, "start")

@@ -86,6 +86,27 @@ def test_a_type_that_is_not_there():
         values.read_one({"cup": Cup}, "cap", "x")
 
 
+PATHS = ["plant.mass", "controller.period", "controller.delay", "controller.controller.gain", "initial.speed"]
+
+
+@killed_by("config/values.py", "if len(words) > 1 and all(", "if False and all(")
+@killed_by("config/values.py", "if len(words) == 1 or is_similar(path)", "if True")
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("controller.gain", "controller.controller.gain"),  # of a part inside
+        ("plant.mas", "plant.mass"),
+        ("plnt.mass", "plant.mass"),
+        ("controller.delai", "controller.delay"),
+        ("controller.kp", None),  # like controller.delay in its first word only
+        ("controller.time_constant", None),
+    ],
+)
+def test_the_name_that_is_meant(name, meant):
+    line = str(values.unknown_name_error("x", name, PATHS))
+    assert line.startswith("x; there is plant.mass" if meant is None else f"x; did you mean {meant}? There is ")
+
+
 def test_nan_is_in_no_range():
     with pytest.raises(ScenarioError, match=r"x = nan is outside \[0, 1\]"):
         read_number_in_range(float("nan"), ParameterSpec("1", 0.0, 1.0), "x")

@@ -24,6 +24,12 @@ BAD = [
     ("plnt.mass=1", "plnt is not a section", "did you mean plant?"),
     ("plant.mas=1", "plant.mas is not a field of quarter-car", "did you mean mass?"),
     ("plant.type=quarter-cart", 'plant.type = "quarter-cart" is unknown', "did you mean quarter-car?", "lab-rig"),
+    ("plant=cart", 'plant.type = "cart" is unknown', "; a part of a module of your own needs --parts MODULE"),
+    (
+        "tune.free={'plant.mas'=[5,6]}",
+        "did you mean plant.mass? There is plant.mass, plant.radius, plant.inertia, plant.crawl_speed, "
+        "plant.crawl_speed_kmh",
+    ),
     ("plant.mass=1979-05-27", "plant.mass = 1979-05-27 is a date or time; a number in (0, inf) kg is needed"),
     ("road=snw", "road.type", '"snw"', "did you mean snow?"),
     ("road.c9=1", "road.c9 is not a field", "there is slip, mu"),
