@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from diffabs.config.values import format_given
 from diffabs.core.types import JsonObject
 from diffabs.papers import PAPERS
 from diffabs.runtime import files
@@ -38,7 +39,7 @@ class Document(NamedTuple):
     Attributes:
         kind: Key of `KEYS_BY_KIND`.
         content: Values of the document.
-        path: File of the document.
+        path: File of the document. A document inside of another has the file where its command writes it.
     """
 
     kind: str
@@ -110,21 +111,43 @@ def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
         return
     if isinstance(content.get("papers"), dict) and isinstance(content.get("out"), str):
         for name, paper in content["papers"].items():
-            yield from _inside(paper, _find_folder(content["out"], path) / name / SUMMARY)
+            folder = _find_folder(pathlib.PurePath(content["out"], name), path)
+            for document in _inside(paper, path):
+                yield (
+                    document._replace(content={**document.content, "figures": []})
+                    if folder is None
+                    else (document._replace(path=folder / SUMMARY))
+                )
         return
     for kind, keys in KEYS_BY_KIND.items():
         if all(key in content for key in keys) and content.get("format", CERTIFICATE_FORMAT) == CERTIFICATE_FORMAT:
             # The output of `sweep --json` counts as the summary in the sweep's folder: figures and manifest are there.
             if kind == "sweep" and not (path.parent / MANIFEST).exists() and isinstance(content.get("out"), str):
-                path = _find_folder(content["out"], path) / SUMMARY
+                if (folder := _find_folder(pathlib.PurePath(content["out"]), path)) is None:
+                    out = format_given(content["out"])
+                    raise ReportError(f"{path}: its sweep {out} is not in the folder of the document; report the sweep")
+                path = folder / SUMMARY
             yield Document(kind, content, path)
             return
 
 
-def _find_folder(out: str, path: pathlib.Path) -> pathlib.Path:
-    """Return the folder `out` that the document of the file `path` names.
+def _find_folder(out: pathlib.PurePath, path: pathlib.Path) -> pathlib.Path | None:
+    """Return the folder `out` that the document in the file `path` names, None unless it is in the file's folder.
 
     A relative name counts from the folder of the file if there is such a folder, else from the working directory.
     """
-    beside = path.parent / out
-    return beside if beside.is_dir() else pathlib.Path(out)
+    places = (path.parent / out, pathlib.Path(out))
+    return next((place for place in places if is_within(place, path.parent) and place.is_dir()), None)
+
+
+def is_within(path: pathlib.Path, folder: pathlib.Path) -> bool:
+    """Return whether a path is in a folder or below, also by its symbolic links: a document may be of somebody else.
+
+    Args:
+        path: Path that a document names.
+        folder: Folder of the document.
+    """
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # a circle of links, a null character
+        return False

@@ -15,7 +15,7 @@ from diffabs.report.page import (
     model_tables,
 )
 from diffabs.scenario.model import describe_model
-from diffabs.scenario.scenario import load
+from diffabs.scenario.scenario import load, names
 
 COLUMNS = {"name": "what", "quantity": "quantity", "unit": "unit", "ours": "ours", "published": "published",
            "reference": "independent", "difference": "difference"}  # fmt: skip
@@ -37,7 +37,9 @@ def paper_section(document: Document) -> Section:
     name = content["paper"]
     if name not in MODULES:
         raise KeyError(f"paper {name}")
-    found, scenario = compact(content), content.get("scenario", name)
+    if (scenario := content.get("scenario", name)) not in names():  # a document must not name a file
+        raise KeyError(f"scenario {scenario}")
+    found = compact(content)
     # A name with a path is skipped, so that a document cannot name files outside of its folder.
     named = [document.folder / name for name in content["figures"] if pathlib.PurePath(name).name == name]
     return Section(
@@ -48,13 +50,13 @@ def paper_section(document: Document) -> Section:
         verdicts=[ReportVerdict(*verdict) for verdict in found.verdicts],
         model=model_tables(describe_model(load(scenario, integrated=False))),
         model_note=f"The packaged scenario {scenario}; the first column of the tables names the change of each row.",
-        figures=[figure for path in named if (figure := embed_image(path))],
+        figures=[figure for path in named if (figure := embed_image(path, document.folder))],
         tables=[ReportTable("In short", found.headings, found.lines), *_tables(content)],
         certificate=_certificates(content.get("design")),
         certificate_tables=_designs(content.get("design")),
         notes=list(content["notes"]),
         provenance=describe_origin(content, **{f"solver, {name}": value for name, value in content["solver"].items()}),
-        again=[content["made"]["command"]],
+        made=content["made"]["command"],
     )
 
 

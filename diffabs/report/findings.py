@@ -11,6 +11,7 @@ from diffabs.report.page import (
     ReportTable,
     ReportVerdict,
     Section,
+    describe_missing,
     describe_origin,
     embed_named,
     format_known,
@@ -44,7 +45,8 @@ def tuning_section(document: Document) -> Section:
         verdicts=[_constraint_row(row) for row in content["constraints"]],
         model=model_tables(content["model"]),
         model_note="Before the tuning.",
-        figures=list(_figures(document)),
+        figures=(figures := list(_figures(document))),
+        figures_note=describe_missing(figures, _picture(document)),
         tables=list(_tuning_tables(content)),
         certificate=proofs.proof_verdicts(content["certificate"]),
         certificate_tables=proofs.proof_tables(content["certificate"], content),
@@ -52,7 +54,7 @@ def tuning_section(document: Document) -> Section:
         provenance=describe_origin(content, gradients=content["evaluations"], mode=content["mode"],
                           seed=content["model"]["solver"]["seed"],
                           engine=format_pairs(content["engine"])),
-        again=[content["made"]["command"]],
+        made=content["made"]["command"],
     )  # fmt: skip
 
 
@@ -69,9 +71,13 @@ def _figures(document: Document) -> Iterator[Figure]:
         yield Figure(
             "The objective after so many gradients", drawn=draw_lines(points, "gradients computed", "objective")
         )
-    plot = document.content["files"].get("plot")
-    if found := embed_named(document.folder, plot, "How the tuning went, and its worst run before and after"):
-        yield found
+    caption = "How the tuning went, and its worst run before and after"
+    if figure := embed_named(document.folder, _picture(document), caption):
+        yield figure
+
+
+def _picture(document: Document) -> str | None:
+    return document.content["files"].get("plot")
 
 
 def _tuning_tables(content: Table) -> Iterator[ReportTable]:
@@ -118,7 +124,7 @@ def identification_section(document: Document) -> Section:
         tables=list(_identification_tables(content)),
         notes=["Interrupted: the values so far, not the best ones."] if content.get("interrupted") else [],
         provenance=describe_origin(content, evaluations=content["evaluations"]),
-        again=[content["made"]["command"]],
+        made=content["made"]["command"],
     )  # fmt: skip
 
 

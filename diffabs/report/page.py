@@ -7,7 +7,9 @@ import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
+from diffabs.config.values import make_printable
 from diffabs.core.types import Params, PyTree, Scalar, Table
+from diffabs.report.documents import is_within
 from diffabs.runtime import files
 from diffabs.runtime.summary import round_for_table
 
@@ -72,7 +74,8 @@ class Section:
         certificate_tables: Numbers of a proof.
         notes: Further sentences.
         provenance: Names and values: date, commit, machine, versions, seeds.
-        again: Commands that compute the result again.
+        made: Command that made the document, as the document says.
+        again: Commands about the result, which this package writes.
     """
 
     title: str
@@ -88,6 +91,7 @@ class Section:
     certificate_tables: list[ReportTable] = dataclasses.field(default_factory=list)
     notes: list[str] = dataclasses.field(default_factory=list)
     provenance: list[tuple[str, PyTree]] = dataclasses.field(default_factory=list)
+    made: str = ""
     again: list[str] = dataclasses.field(default_factory=list)
 
 
@@ -113,14 +117,15 @@ def shown_numbers(value: Scalar) -> list[ShownNumber | str]:
     return [str(value)]
 
 
-def embed_image(path: pathlib.Path, caption: str = "") -> Figure | None:
-    """Return a picture with its bytes as a data URL; None for an unreadable file and for other types.
+def embed_image(path: pathlib.Path, folder: pathlib.Path, caption: str = "") -> Figure | None:
+    """Return a picture with its bytes as a data URL; None for an unreadable file, other types, and outside of `folder`.
 
     Args:
         path: File with the suffix .png or .svg, at most `LARGEST_IMAGE` bytes long.
+        folder: Folder of the document; a link in it may lead out.
         caption: Caption; by default the name of the file.
     """
-    kind = IMAGES.get(path.suffix.lower())
+    kind = IMAGES.get(path.suffix.lower()) if is_within(path, folder) else None
     try:
         data = files.read_content(path, LARGEST_IMAGE + 1) if kind else b""
     except (OSError, ValueError):
@@ -132,20 +137,29 @@ def embed_image(path: pathlib.Path, caption: str = "") -> Figure | None:
 
 
 def embed_named(folder: pathlib.Path, named: str | None, caption: str) -> Figure | None:
-    """Return the picture that a document names, from the document's folder or where it was drawn.
+    """Return the picture that a document names if it is in the document's folder, else None.
 
     Args:
         folder: Folder of the document.
-        named: Path of the picture in the document; None without one.
+        named: Path of the picture in the document, of which only the name need be right; None without one.
         caption: Caption.
-
-    Returns:
-        The picture, or None if there is no readable one.
     """
     if not named:
         return None
-    places = (folder / pathlib.PurePath(named).name, pathlib.Path(named))
-    return next((found for path in places if (found := embed_image(path, caption))), None)
+    places = (folder / pathlib.PurePath(named).name, folder / named)
+    return next((figure for path in places if (figure := embed_image(path, folder, caption))), None)
+
+
+def describe_missing(figures: Sequence[Figure], named: str | None) -> str:
+    """Return the sentence in place of a picture that a document names and that is not among the figures.
+
+    Args:
+        figures: Embedded pictures.
+        named: Path of the picture in the document; None without one.
+    """
+    if not named or any(figure.address for figure in figures):
+        return ""
+    return f"Not shown: {make_printable(named)} is not in the folder of the document."
 
 
 def model_tables(model: Table | None) -> list[ReportTable]:

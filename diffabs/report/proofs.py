@@ -11,6 +11,7 @@ from diffabs.report.page import (
     ReportTable,
     ReportVerdict,
     Section,
+    describe_missing,
     describe_origin,
     embed_named,
     format_known,
@@ -57,7 +58,8 @@ def design_section(document: Document) -> Section:
         certificate_tables=proof_tables(content, content),
         notes=_notes(content),
         provenance=describe_origin(content),
-        again=[content["made"]["command"], *map(_verify_command, content["files"].values())],
+        made=content["made"]["command"],
+        again=list(map(_verify_command, content["files"].values())),
     )  # fmt: skip
 
 
@@ -85,7 +87,9 @@ def proof_verdicts(proof: Table) -> list[ReportVerdict]:
 
 
 def _verify_command(path: Any) -> str:
-    return shlex.join(["diffabs", "verify", str(path)])
+    """Return the command that verifies a file; a document may give the file a name that looks like an option."""
+    path = f"./{path}" if str(path).startswith("-") else str(path)
+    return shlex.join(["diffabs", "verify", path])
 
 
 def _value(kind: str, proof: Table) -> str:
@@ -186,6 +190,7 @@ def box_section(document: Document) -> Section:
     cells = [["proved", content["cells"]], ["left", content["left"]], ["tried", content["tried"]],
              ["share of the box that is left [1]", content["share_left"]],
              ["computing time [s]", content["seconds"]]]  # fmt: skip
+    figures = list(filter(None, [embed_named(document.folder, files.get("plot"), "The cells of the proof")]))
     return Section(
         title=f"Proof over a box of {content['scenario']}",
         question=f"{asked}, for every {ranges}?",
@@ -193,9 +198,8 @@ def box_section(document: Document) -> Section:
         verdicts=[ReportVerdict(verdict, claim) for claim in claims] or [ReportVerdict(verdict, "the bounds below")],
         model=model_tables(content["model"]),
         model_note="The values of the box's parameters stand for nothing: the proof is about all of the box.",
-        figures=[
-            found for found in [embed_named(document.folder, files.get("plot"), "The cells of the proof")] if found
-        ],
+        figures=figures,
+        figures_note=describe_missing(figures, files.get("plot")),
         tables=[
             ReportTable("Box", ("parameter", "low", "high", "unit"), sides, "in SI; the ends belong to the box"),
             ReportTable(
@@ -208,10 +212,8 @@ def box_section(document: Document) -> Section:
         ],
         notes=["The runs are those of the model in real numbers, without the rounding of the simulation."],
         provenance=describe_origin(content),
-        again=[
-            content["made"]["command"],
-            *([_verify_command(files["certificate"])] if verdict == "proved" and "certificate" in files else []),
-        ],
+        made=content["made"]["command"],
+        again=[_verify_command(files["certificate"])] if verdict == "proved" and "certificate" in files else [],
     )
 
 

@@ -70,7 +70,8 @@ def sweep_section(document: Document) -> Section:
             seed=study["seed"], samples=study["samples"], numbers=study["dtype"],
             engine=format_pairs(study.get("engine") or {}) or "xla", digest=content["digest"],
         ),
-        again=[*([made["command"]] if made else []), *_sample(content, document.folder)],
+        made=made.get("command", ""),
+        again=_sample(content, document.folder),
     )  # fmt: skip
 
 
@@ -114,7 +115,7 @@ def _figures(folder: pathlib.Path) -> list[Figure]:
     return [
         figure
         for path in sorted((folder / FIGURES).glob("*"))
-        if (figure := embed_image(path, CAPTIONS.get(path.stem, "")))
+        if (figure := embed_image(path, folder, CAPTIONS.get(path.stem, "")))
     ]
 
 
@@ -212,5 +213,5 @@ def rare_section(document: Document) -> Section:
         provenance=describe_origin(
             content, seed=content["seed"], runs=content["runs"], engine=format_pairs(content["engine"])
         ),
-        again=[content["made"]["command"]],
+        made=content["made"]["command"],
     )  # fmt: skip

@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Callable, Sequence
 
 from diffabs import __version__
+from diffabs.config.values import make_printable
 from diffabs.report import experiments, findings, proofs, studies
 from diffabs.report.documents import Document, ReportError
 from diffabs.report.page import Section, shown_numbers
@@ -40,15 +41,18 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters["numbers"] = shown_numbers
+    environment.filters |= {"numbers": shown_numbers, "printable": make_printable}
     whole = title or (sections[0].title if len(sections) == 1 else f"{len(sections)} results")
-    return environment.from_string(text).render(title=whole, sections=sections, version=__version__)
+    try:
+        return environment.from_string(text).render(title=whole, sections=sections, version=__version__)
+    except RecursionError:  # lists in lists
+        raise ReportError(f"{', '.join(str(one.path) for one in found)}: values are nested too deeply") from None
 
 
 def _section(document: Document) -> Section:
     try:
         return SECTION_BY_KIND[document.kind](document)
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError) as error:
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError, RecursionError) as error:
         said = " ".join(f"{type(error).__name__} {error}".split())
         raise ReportError(f"{document.path}: cannot be read as a document of {document.kind}: {said}") from None
 

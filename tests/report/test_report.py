@@ -236,27 +236,36 @@ def test_hostile_names_are_text(results, tmp_path, kind):
     assert HOSTILE in found.headings[0]
 
 
-@killed_by(
-    "report/page.py",
-    "kind = IMAGES.get(path.suffix.lower())",
-    'kind = IMAGES.get(path.suffix.lower(), "embed_image/png")',
-)
+@killed_by("report/page.py", "if is_within(path, folder) else None", "")
+@killed_by("report/page.py", "IMAGES.get(path.suffix.lower())", 'IMAGES.get(path.suffix.lower(), "image/png")')
 def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
     """Names in a document are not trusted; and what is no picture is none."""
     content = json.loads((results / "tune.json").read_text())
-    (tmp_path / "secret.txt").write_text("secret")
-    (tmp_path / "drawn.png").write_bytes(b"\x89PNG drawn")
-    for plot, count in (("secret.txt", 0), ("/somewhere/else/drawn.png", 1)):
-        content["files"] = {"plot": str(tmp_path / plot) if plot == "secret.txt" else plot}
-        (tmp_path / "x.json").write_text(json.dumps(content))
-        found = Page(build_report(find_documents(tmp_path / "x.json")))
-        assert len(found.images) == count
+    folder = tmp_path / "there"
+    (folder / "deep").mkdir(parents=True)
+    (folder / "secret.txt").write_text("secret")
+    (tmp_path / "secret.png").write_text("secret")
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    (folder / "up").symlink_to(tmp_path)
+    for path in (folder / "deep" / "within.png", folder / "drawn.png"):
+        path.write_bytes(b"\x89PNG drawn")
+
+    def report_with(plot):
+        (folder / "x.json").write_text(json.dumps(content | {"files": {"plot": str(plot)}}))
+        return Page(build_report(find_documents(folder / "x.json")))
+
+    outside = [tmp_path / "secret.png", "../secret.png", "link.png", "up/secret.png", "\0.png"]
+    for plot in [folder / "secret.txt", *outside]:
+        found = report_with(plot)
+        assert found.images == []
+        assert "is not in the folder of the document." in found.text
         assert base64.b64encode(b"secret").decode() not in found.source
-    (data,) = found.images
-    assert base64.b64decode(data.partition(",")[2]) == b"\x89PNG drawn"
+    for plot in ("deep/within.png", folder / "deep" / "within.png", "/somewhere/else/drawn.png"):
+        (data,) = report_with(plot).images
+        assert base64.b64decode(data.partition(",")[2]) == b"\x89PNG drawn"
 
 
-@killed_by("report/documents.py", 'path = _find_folder(content["out"], path) / SUMMARY', "pass")
+@killed_by("report/documents.py", "path = folder / SUMMARY\n", "pass\n")
 @pytest.mark.slow
 def test_a_folder_of_results_is_one_file(results):
     """What `sweep --json` has printed beside the sweep's folder is the same result, and comes once."""
@@ -269,21 +278,92 @@ def test_a_folder_of_results_is_one_file(results):
     assert printed.folder == results / "sweep"
 
 
-@killed_by("report/documents.py", "beside if beside.is_dir() else pathlib.Path(out)", "pathlib.Path(out)")
-@killed_by("report/documents.py", "beside if beside.is_dir() else pathlib.Path(out)", "beside")
+SWEEP_KEYS = {"digest": "", "sensitivity": {}, "failures": {}}
+PAPER_KEYS = {"paper": "", "rows": [], "figures": ["a.png"]}
+
+
+@killed_by("report/documents.py", "places = (path.parent / out, pathlib.Path(out))", "places = (pathlib.Path(out),)")
+@killed_by("report/documents.py", "places = (path.parent / out, pathlib.Path(out))", "places = (path.parent / out,)")
 def test_a_folder_is_looked_for_beside_its_document(tmp_path, monkeypatch):
     """What a command printed in one folder is read in another, which has a folder of the same name."""
-    there, here = tmp_path / "there", tmp_path / "here"
-    for folder in (there / "out", here / "out", here / "more"):
-        folder.mkdir(parents=True)
-    monkeypatch.chdir(here)
-    content = {"digest": "", "sensitivity": {}, "failures": {}}
-    paper = {"paper": "", "rows": [], "figures": []}
-    for name, wanted in (("out", there / "out"), ("more", here / "more"), (str(here / "out"), here / "out")):
-        (there / "sweep.json").write_text(json.dumps(content | {"out": name}))
+    there = tmp_path / "there"
+    for folder in (there / "out", tmp_path / "out", there / "more"):
+        (folder / "one").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    for name, wanted in (("out", there / "out"), ("there/more", there / "more")):
+        (there / "sweep.json").write_text(json.dumps(SWEEP_KEYS | {"out": name}))
         assert find_documents(there / "sweep.json")[0].folder.resolve() == wanted
-        (there / "papers.json").write_text(json.dumps({"out": name, "papers": {"one": paper}}))
+        (there / "papers.json").write_text(json.dumps({"out": name, "papers": {"one": PAPER_KEYS}}))
         assert find_documents(there / "papers.json")[0].folder.resolve() == wanted / "one"
+
+
+@killed_by("report/documents.py", "if is_within(place, path.parent) and place.is_dir()", "if place.is_dir()")
+@pytest.mark.parametrize("out", ["{outside}", "../outside", "outside", "link", "\0"])
+def test_a_folder_outside_of_the_document_is_not_read(tmp_path, monkeypatch, out):
+    """A document of somebody else must not take pictures or a manifest from anywhere."""
+    outside, there = tmp_path / "outside", tmp_path / "there"
+    (outside / "one").mkdir(parents=True)
+    there.mkdir()
+    (there / "link").symlink_to(outside)
+    monkeypatch.chdir(tmp_path)
+    out = out.format(outside=outside)
+    (there / "sweep.json").write_text(json.dumps(SWEEP_KEYS | {"out": out}))
+    with pytest.raises(ReportError, match=r"its sweep .* is not in the folder of the document; report the sweep$"):
+        find_documents(there / "sweep.json")
+    for folder, name in ((out, "one"), (".", f"{out}/one")):
+        (there / "papers.json").write_text(json.dumps({"out": folder, "papers": {name: PAPER_KEYS}}))
+        (document,) = find_documents(there / "papers.json")
+        assert (document.folder, document.content["figures"]) == (there, [])
+
+
+def test_figures_of_a_sweep_do_not_lead_out_of_its_folder(tmp_path):
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "worst.png").write_bytes(b"\x89PNG secret")
+    invented_sweep(tmp_path / "s", {"type": "random"})
+    (tmp_path / "s" / "figures").symlink_to(tmp_path / "outside")
+    assert Page(build_report(find_documents(tmp_path / "s"))).images == []
+
+
+@killed_by("report/experiments.py", "not in names():", "is None:")
+def test_a_reproduction_names_no_file_as_its_scenario(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("[plant]\nmass = 7.0\n")
+    content = PAPER_KEYS | {"paper": "slip-lmi", "scenario": str(path)}
+    (tmp_path / "x.json").write_text(json.dumps(content))
+    with pytest.raises(ReportError, match=r"KeyError 'scenario .*mine\.toml'"):
+        build_report(find_documents(tmp_path / "x.json"))
+
+
+@killed_by("report/report.html.j2", "section.made | printable", "section.made")
+def test_the_command_of_a_document_is_said_to_be_its_own(results, tmp_path):
+    """It is not a command of this package, and hides nothing behind a line's end or a mark of direction."""
+    content = json.loads((results / "tune.json").read_text())
+    content["made"]["command"] = "rm -rf ~ #\n diffabs tune\u202esmall"
+    (tmp_path / "x.json").write_text(json.dumps(content))
+    text = Page(build_report(find_documents(tmp_path / "x.json"))).text
+    theirs = "The document says that this command made it. Read it before you run it."
+    assert text.endswith(f"{theirs} rm -rf ~ #\N{REPLACEMENT CHARACTER} diffabs tune\N{REPLACEMENT CHARACTER}small")
+
+
+def test_the_file_of_a_document_is_no_option_of_a_command(results, tmp_path):
+    content = json.loads((results / "design.json").read_text())
+    content["files"] = {"certificate": "--parts=evil"}
+    (tmp_path / "x.json").write_text(json.dumps(content))
+    text = Page(build_report(find_documents(tmp_path / "x.json"))).text
+    assert text.endswith("diffabs verify ./--parts=evil")
+
+
+@killed_by("report/writing.py", "ValueError, OSError, RecursionError)", "ValueError, OSError)")
+@killed_by("report/writing.py", "except RecursionError:", "except ZeroDivisionError:")
+def test_lists_in_lists_are_one_line(results, tmp_path):
+    invented_sweep(tmp_path / "s", {"type": "random"})
+    (tmp_path / "s" / "manifest.json").write_text("[" * 100_000)
+    with pytest.raises(ReportError, match="cannot be read as a document of sweep: RecursionError"):
+        build_report(find_documents(tmp_path / "s"))
+    deep = '"evaluations": ' + "[" * 800 + "]" * 800 + ', "x": '
+    (tmp_path / "x.json").write_text((results / "tune.json").read_text().replace('"evaluations": ', deep, 1))
+    with pytest.raises(ReportError, match=r"x\.json: values are nested too deeply$"):
+        build_report(find_documents(tmp_path / "x.json"))
 
 
 @killed_by("cli/report.py", 'errors="xmlcharrefreplace"', "")
@@ -401,7 +481,7 @@ def test_what_json_has_no_number_for_is_not_known(results, tmp_path):
     assert "bound not known" in text
 
 
-@killed_by("report/proofs.py", 'shlex.join(["diffabs", "verify", str(path)])', 'f"diffabs verify {path}"')
+@killed_by("report/proofs.py", 'shlex.join(["diffabs", "verify", path])', 'f"diffabs verify {path}"')
 def test_commands_of_a_report_can_be_pasted(results, tmp_path):
     """By a shell's own rules each is one command with the file's name as one word."""
     path = tmp_path / "my $files" / "certificate.json"
