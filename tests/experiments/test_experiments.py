@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 from diffabs import FixedStep
 from diffabs.core.pytree import replace
+from diffabs.linear.balance_model import BalanceModel
 from diffabs.papers import record
 from diffabs.plants import QuarterCar
 from diffabs.scenario.scenario import load
@@ -326,6 +327,43 @@ def test_the_power_of_a_motor_knows_the_limit_of_its_current(monkeypatch, resist
     currents = np.linspace(0.0, 60.0, 60_001)
     assert np.max(currents * (48.0 - resistance * currents)) == pytest.approx(watts, rel=1e-9)
     assert experiment("arm_codesign").motor_power(48.0, resistance, 60.0) == pytest.approx(watts, rel=1e-12)
+
+
+def rows_of_page(page, first, last):
+    """Cells of a table between two lines of a page."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8").partition(first)[2].partition(last)[0]
+    lines = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    return {cells[0].strip("*"): cells[1:] for cells in lines}
+
+
+def test_each_row_of_machines_has_the_bound_of_its_own_machine(monkeypatch):
+    """By the left eigenvector w of the unstable pole s: |w'B| U/(s |w'd|). The page has three digits of a machine."""
+    monkeypatch.syspath_prepend(FOLDER)
+    plant, start = load("arm-hanging").loop.plant, np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])
+    machines = rows_of_page("two-wheeler.md", "The tuned machines:", "**The paper's motor")
+    bounds = rows_of_page("two-wheeler.md", "## A machine for the claim", "The machines of greatest bound")
+    names = {"best flywheel, 3 ohm": "flywheel, 3 ohm", "best rod, 0.3 ohm, 60 A, 1.80 kW": "rod, 0.3 ohm",
+             "best flywheel, 0.3 ohm, 60 A, 1.80 kW": "flywheel, 0.3 ohm",
+             "the same improved for 50 kg alone": "the same for 50 kg",
+             "best flywheel, 0.1 ohm, 60 A, 2.52 kW": "flywheel, 0.1 ohm"}  # fmt: skip
+    for row, name in names.items():
+        mount, centre, arm, constant, gear, _ = machines[name]
+        mass, inertia = arm.split(", ")
+        ohm = 0.1 if "0.1" in name else 3.0 if "3 ohm" in name and "0.3" not in name else 0.3
+        amperes = 16.0 if ohm == 3.0 else 60.0
+        values = {"mount_height": mount, "arm_length": centre, "arm_mass": mass, "arm_inertia": inertia, "gear": gear,
+                  "torque_constant": constant, "rotor_inertia": 2e-4, "resistance": ohm}  # fmt: skip
+        built = replace(plant, {path: float(value) for path, value in values.items()})
+        for printed, rider in zip(bounds[row][0].split("; "), (100.0, 50.0), strict=True):
+            limits = []
+            for emf, volts in ((float(constant), 48.0), (0.0, amperes * ohm)):
+                model = BalanceModel(plant=replace(built, {"back_emf": emf, "rider_mass": rider}))
+                a, b = (np.asarray(x) for x in model.matrices())
+                poles, left = np.linalg.eig(a.T)
+                (i,) = np.flatnonzero(poles.real > 0)
+                w, pole = left[:, i].real, poles[i].real
+                limits.append(abs(w @ b[:, 0]) * volts / (pole * abs(w @ start)))
+            assert float(printed) == pytest.approx(min(limits), rel=0.01), (row, rider)
 
 
 def test_drawn_designs_climb_to_where_most_is_recovered():
