@@ -5,6 +5,7 @@ from diffabs.controllers.antiwindup import Clamping as Clamping
 from diffabs.controllers.antiwindup import NoAntiWindup as NoAntiWindup
 from diffabs.controllers.balance import BalanceFeedback as BalanceFeedback
 from diffabs.controllers.balance import ObserverFeedback as ObserverFeedback
+from diffabs.controllers.cascade import Cascade as Cascade
 from diffabs.controllers.feedback import StateFeedback as StateFeedback
 from diffabs.controllers.feedforward import ConstantInput as ConstantInput
 from diffabs.controllers.feedforward import HoldingInput as HoldingInput

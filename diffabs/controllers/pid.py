@@ -1,11 +1,14 @@
 """PID control of the plant's first signal, with filtered derivative and limits.
 
-    u = clamp(ff + kp e + kI I + kD wc (e - d), low, high),   I' = e,   d' = wc (e - d),   e = target - signal
+    u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high)
+    I' = r - y,   d' = wc (c r - y - d)                                     r: target, y: signal
 
-P, PI and PD controllers are special cases with gains of zero.
+P, PI and PD controllers are special cases with gains of zero. Negative gains are reverse action, for a signal that a
+positive control lowers: cooling, for example. The set-point weights b and c change the response to the target only;
+that to disturbances and the margins of the loop stay. With b = 0 and c = 0 the target acts through the integral alone.
 
-Source: Aoki and Nakamura, eq. (13): C(s) = kp + kI/s + kD s wc/(s + wc). Their u has the opposite sign; here a positive
-u brakes.
+Sources: Aoki and Nakamura, eq. (13), for b = c = 1: C(s) = kp + kI/s + kD s wc/(s + wc). Their u has the opposite
+sign; here a positive u brakes. Astrom and Hagglund, PID Controllers, 2nd ed., sec. 3.4, for b and c.
 """
 
 from collections.abc import Iterator
@@ -26,7 +29,7 @@ class PIDMemory(NamedTuple):
 
     Attributes:
         integral: I, integral of the error [signal s].
-        filtered: d, filtered error [signal].
+        filtered: d, filtered error c r - y [signal].
     """
 
     integral: Scalar
@@ -35,21 +38,25 @@ class PIDMemory(NamedTuple):
 
 @pytree
 class PID:
-    """u = clamp(ff + kp e + kI I + kD wc (e - d), low, high); by default both limits are infinite.
+    """u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high), with any sign of the gains.
 
     Attributes:
-        kp: Proportional gain [control/signal].
+        kp: Proportional gain [control/signal]. Negative gains are reverse action.
         ki: Integral gain kI [control/signal/s].
         kd: Derivative gain kD [control s/signal].
+        b: Set-point weight of the proportional part.
+        c: Set-point weight of the derivative part.
         cutoff: Corner frequency wc of the derivative filter [rad/s].
         low: Lower limit of the control.
         high: Upper limit of the control.
         antiwindup: Anti-windup strategy of the integral.
     """
 
-    kp: Scalar = param(default=3893.0, unit="control/signal", low=0.0)
-    ki: Scalar = param(default=0.0, unit="control/signal/s", low=0.0)
-    kd: Scalar = param(default=0.0, unit="control s/signal", low=0.0)
+    kp: Scalar = param(default=3893.0, unit="control/signal")
+    ki: Scalar = param(default=0.0, unit="control/signal/s")
+    kd: Scalar = param(default=0.0, unit="control s/signal")
+    b: Scalar = param(default=1.0, unit="1", low=0.0)
+    c: Scalar = param(default=1.0, unit="1", low=0.0)
     cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
     low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
     high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
@@ -63,19 +70,22 @@ class PID:
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> PIDMemory:
         """Return I' [signal], as modified by the anti-windup strategy, and d' [signal/s]."""
         raw, limited = self._torque(memory, signal)
-        error = signal.target - signal.measured[0]
-        integral = self.antiwindup.rate(error, self.ki, raw, limited)
-        return PIDMemory(integral, self.cutoff * (error - memory.flow.filtered))
+        integral = self.antiwindup.rate(signal.target - signal.measured[0], self.ki, raw, limited)
+        return PIDMemory(integral, self._filter_rate(memory, signal))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return the limited control, in the plant's unit."""
         return self._torque(memory, signal)[1]
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
-        error = signal.target - signal.measured[0]
-        derivative = self.cutoff * (error - memory.flow.filtered)
-        raw = signal.feedforward + self.kp * error + self.ki * memory.flow.integral + self.kd * derivative
+        proportional = self.kp * (self.b * signal.target - signal.measured[0])
+        derivative = self.kd * self._filter_rate(memory, signal)
+        raw = signal.feedforward + proportional + self.ki * memory.flow.integral + derivative
         return raw, clamp(raw, self.low, self.high)
+
+    def _filter_rate(self, memory: Memory, signal: Tracking) -> Scalar:
+        """Return d' [signal/s]."""
+        return self.cutoff * (self.c * signal.target - signal.measured[0] - memory.flow.filtered)
 
     def limits(self) -> tuple[Scalar, Scalar]:
         """Return the lower and the upper limit of the control."""
@@ -84,3 +94,10 @@ class PID:
     def rules(self) -> Iterator[Rule]:
         """Yield the rule low <= high."""
         yield order_rule(("low", self.low), ("high", self.high), "{control}")
+
+    def cautions(self) -> Iterator[str]:
+        """Yield a line if the gains have different signs."""
+        gains = {name: float(getattr(self, name)) for name in ("kp", "ki", "kd")}
+        if min(gains.values()) < 0 < max(gains.values()):
+            given = ", ".join(f"{name} = {gain:g}" for name, gain in gains.items())
+            yield f"{given} have different signs: reverse action needs the same sign in all gains"

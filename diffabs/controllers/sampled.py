@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.controllers.antiwindup import BackCalculation, Clamping
+from diffabs.controllers.cascade import CASCADED, Cascade
 from diffabs.controllers.pid import PID
 from diffabs.controllers.torque_logic import BandLogic
 from diffabs.core.arrays import as_rule_array
@@ -190,6 +191,9 @@ class Sampled:
 
 def _at_period(controller: Part, period: Scalar) -> Part:
     """Return the controller with an anti-windup that fits Euler steps of `period` [s]."""
+    if isinstance(controller, Cascade):
+        inner = {name: _at_period(getattr(controller, name), period) for name in CASCADED}
+        return dataclasses.replace(controller, **inner)
     antiwindup = getattr(controller, "antiwindup", None)
     if not isinstance(antiwindup, Clamping):
         return controller
@@ -231,29 +235,34 @@ def inner_controller(controller: Part) -> PyTree:
     return controller.controller if isinstance(controller, Sampled) else controller
 
 
-def sampling_rules(controller: Part, delay: Scalar, period: Scalar) -> Iterator[Rule]:
+def sampling_rules(controller: Part, delay: Scalar, period: Scalar, name: str = "controller") -> Iterator[Rule]:
     """Yield the rule delay <= period, and the rules that the controller's own clock and its Euler steps fit the period.
 
     Args:
         controller: Inner controller, or None.
         delay: Computing time [s].
         period: Sampling period [s].
+        name: Path of the inner controller, for messages.
     """
+    if isinstance(controller, Cascade):
+        for one in CASCADED:
+            yield from sampling_rules(getattr(controller, one), delay, period, f"{name}.{one}")
+        return
     yield Rule(
         as_rule_array(delay) <= as_rule_array(period),
         "delay exceeds the period",
         lambda: f"delay = {delay:g} s exceeds the period of {period:g} s",
     )
     if offers(controller, "tick") and hasattr(controller, "period"):
-        yield whole_steps("controller.period", controller.period, as_rule_array(period), "the sampling period")
+        yield whole_steps(f"{name}.period", controller.period, as_rule_array(period), "the sampling period")
     if isinstance(controller, PID):
         # d_(k+1) = d_k + period cutoff (e - d_k)
         cutoff = controller.cutoff
         yield Rule(
             as_rule_array(cutoff) * as_rule_array(period) < 2,
-            "controller.cutoff is too fast for the period",
+            f"{name}.cutoff is too fast for the period",
             lambda: (
-                f"controller.cutoff = {cutoff:g} rad/s is outside (0, {2 / period:g}) rad/s: sampled every"
+                f"{name}.cutoff = {cutoff:g} rad/s is outside (0, {2 / period:g}) rad/s: sampled every"
                 f" {period:g} s, a faster filter is not stable"
             ),
         )
@@ -262,9 +271,9 @@ def sampling_rules(controller: Part, delay: Scalar, period: Scalar) -> Iterator[
         tracking_time = antiwindup.tracking_time
         yield Rule(
             as_rule_array(period) < 2 * as_rule_array(tracking_time),
-            "controller.antiwindup.tracking_time is too short for the period",
+            f"{name}.antiwindup.tracking_time is too short for the period",
             lambda: (
-                f"controller.antiwindup.tracking_time = {tracking_time:g} s is outside ({period / 2:g}, inf) s: sampled"
+                f"{name}.antiwindup.tracking_time = {tracking_time:g} s is outside ({period / 2:g}, inf) s: sampled"
                 f" every {period:g} s, a faster back-calculation is not stable"
             ),
         )
@@ -273,9 +282,9 @@ def sampling_rules(controller: Part, delay: Scalar, period: Scalar) -> Iterator[
         decay = controller.decay
         yield Rule(
             as_rule_array(decay) * as_rule_array(period) < 1,
-            "controller.decay is too fast for the period",
+            f"{name}.decay is too fast for the period",
             lambda: (
-                f"controller.decay = {decay:g} 1/s is outside (0, {1 / period:g}) 1/s: sampled every {period:g} s,"
+                f"{name}.decay = {decay:g} 1/s is outside (0, {1 / period:g}) 1/s: sampled every {period:g} s,"
                 " a faster decay ends below zero"
             ),
         )

@@ -29,6 +29,7 @@ Optional methods or attributes of a part's class, beyond its contract:
                    prepared(), refined(times)           the part for a run; for a step shorter by a factor `times`
                    enable_derivatives(names)            the part for derivatives by its parameters in `names`
                    family = "sensor"                    the family of a block from outside the package
+                   units_inside(name, units)            units of the part in a field, where they are not the loop's
                    jumps = True                         its rates jump where a comparison changes: a step ends there
     block          tick()                               change at an instant of a clock: see Ticking
                    margins(), event()                   change where a margin falls through zero: see Switching

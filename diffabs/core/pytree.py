@@ -25,7 +25,7 @@ from diffabs.core import kinds
 from diffabs.core.arrays import as_array, as_rule_array
 from diffabs.core.compiling import is_traced
 from diffabs.core.types import Params, Part, PyTree, Scalar
-from diffabs.core.units import Units, resolve_unit, units_of
+from diffabs.core.units import Units, resolve_unit, units_inside, units_of
 
 T = TypeVar("T")
 
@@ -206,7 +206,7 @@ def parameters(part: Part, prefix: str = "", units: Units | None = None) -> Iter
         if field is not None and "spec" in field.metadata:
             yield name, field.metadata["spec"].around(units), value
         else:
-            yield from parameters(value, f"{name}.", units)
+            yield from parameters(value, f"{name}.", units_inside(part, name.removeprefix(prefix), units))
 
 
 def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[PyTree] | None, PyTree]]:

@@ -17,10 +17,11 @@ UNIT_FACTOR = re.compile(r"(/?)\s*([^\s/^]+)(?:\^(\d+))?")
 
 
 class Units(NamedTuple):
-    """The units for the words `control` and `signal` in a loop."""
+    """The units for the words `control` and `signal` in a loop, and those of the plant's outputs as (name, unit)."""
 
     control: str
     signal: str
+    outputs: tuple[tuple[str, str], ...] = ()
 
 
 def units_of(plant: Part) -> Units | None:
@@ -30,7 +31,21 @@ def units_of(plant: Part) -> Units | None:
         plant: Plant, or None.
     """
     shown = getattr(getattr(plant, "shows", None), "units", None)
-    return Units(plant.control_unit, next(iter(shown.values()))) if shown else None
+    return Units(plant.control_unit, next(iter(shown.values())), tuple(shown.items())) if shown else None
+
+
+def units_inside(part: Part, name: str, units: Units | None) -> Units | None:
+    """Return the units for the part in a field of another part.
+
+    They are those of the other part, unless it has a method `units_inside(name, units)`.
+
+    Args:
+        part: Part with the field.
+        name: Name of the field.
+        units: Units of the part, or None.
+    """
+    hook = getattr(part, "units_inside", None)
+    return hook(name, units) if hook and units else units
 
 
 @functools.lru_cache(maxsize=1024)
@@ -43,7 +58,8 @@ def resolve_unit(unit: str, units: Units | None) -> str:
     """
     if units is None or not RELATIVE_UNIT.search(unit):
         return unit
-    return ", ".join(_multiply_units(one, units._asdict()) for one in unit.split(", "))
+    meaning = {"control": units.control, "signal": units.signal}
+    return ", ".join(_multiply_units(one, meaning) for one in unit.split(", "))
 
 
 def unit_at(unit: str, place: int, count: int) -> str:
@@ -65,7 +81,7 @@ def insert_unit(text: str, units: Units | None) -> str:
         text: Sentence.
         units: Units of the loop, or None.
     """
-    for name in Units._fields:
+    for name in ("control", "signal"):
         unit = getattr(units, name, "1")
         text = text.replace(f" {{{name}}}", "" if unit == "1" else f" {unit}")
     return text

@@ -16,7 +16,7 @@ from diffabs.core import kinds
 from diffabs.core.pytree import ParameterSpec, children, parameters, stack_lists
 from diffabs.core.rules import Rule
 from diffabs.core.types import Part, PyTree, Scalar
-from diffabs.core.units import Units, insert_unit, units_of
+from diffabs.core.units import Units, insert_unit, units_inside, units_of
 
 T = TypeVar("T")
 
@@ -46,7 +46,7 @@ def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> I
             elif line := _find_wrong_shape(spec, value):
                 shapes.append(f"{field.name} {line}")
         else:
-            within = list(find_problems(value, f"{name}.", units))
+            within = list(find_problems(value, f"{name}.", units_inside(part, name.removeprefix(prefix), units)))
             found |= bool(within)
             yield from within
     if not found:
@@ -102,7 +102,7 @@ def _below(part: Part, prefix: str, units: Units | None, hook: str, *args: PyTre
     """Yield the rules or lines from a method of the part and of the parts in it, the innermost first."""
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:
-            yield from _below(value, f"{name}.", units, hook, *args)
+            yield from _below(value, f"{name}.", units_inside(part, name.removeprefix(prefix), units), hook, *args)
     for found in _own(part, hook, *args):
         yield found.under(prefix, units) if isinstance(found, Rule) else prefix + insert_unit(found, units)
 

@@ -35,7 +35,7 @@ from diffabs.core import blocks, protocols
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
-from diffabs.core.units import Units, resolve_unit, units_of
+from diffabs.core.units import Units, resolve_unit, units_inside, units_of
 from diffabs.scenario import outside
 from diffabs.scenario.defaults import braking
 
@@ -300,7 +300,7 @@ def fill_part(template: Any, table: JsonObject, family: str, path: str, units: U
         if key in edge:
             values[field.name] = read_number_in_range(given, in_kmh(field.metadata["spec"]), where) / KMH
         else:
-            values[field.name] = _value(given, field, getattr(template, key), (family, where), units)
+            values[field.name] = _value(given, field, template, (family, where), units)
     return dataclasses.replace(template, **values) if values else template
 
 
@@ -356,11 +356,11 @@ def join_path(path: str, key: str) -> str:
 
 
 def _value(
-    given: PyTree, field: dataclasses.Field[Any], default: Any, place: tuple[str, str], units: Units | None
+    given: PyTree, field: dataclasses.Field[Any], template: Any, place: tuple[str, str], units: Units | None
 ) -> Any:
-    family, path = place
+    (family, path), default = place, getattr(template, field.name)
     if "part" in field.metadata:
-        inner = family_of(field.name, family)
+        inner, units = family_of(field.name, family), units_inside(template, field.name, units)
         if isinstance(default, tuple):
             return _parts(inner, given, default, path, units)
         return build_part(inner, given, default, path, units)

@@ -89,6 +89,11 @@ CONTROLLERS: dict[str, Any] = {
     "pid, back-calculation": controllers.PID(
         kp=900.0, ki=5000.0, antiwindup=controllers.BackCalculation(), low=0.0, high=90.0
     ),
+    "pid, reverse and weighted": controllers.PID(kp=-9.0, ki=-50.0, kd=-0.05, b=0.5, c=0.0, low=-90.0, high=90.0),
+    "cascade": controllers.Cascade(
+        outer=controllers.PID(kp=20.0, ki=5.0, low=-3.0, high=3.0, antiwindup=controllers.BackCalculation()),
+        inner=controllers.PID(kp=-4.0, ki=-30.0, kd=-0.01, low=0.0, high=90.0, antiwindup=controllers.Clamping()),
+    ),
     "state feedback": controllers.StateFeedback(),
     "state feedback, limited": controllers.StateFeedback(
         gain=np.array([-900.0, -150.0]),
