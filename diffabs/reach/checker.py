@@ -34,12 +34,13 @@ third derivative at u = 0. A step of lower order does not ask for it, and the ch
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from math import inf, isfinite, nextafter
+from sys import float_info
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from flint import arb, arb_mat, arb_poly, ctx
 
-from diffabs.reach.equations import SLOWEST, Equations, RealOperation
+from diffabs.reach.equations import LARGEST_INPUT, SLOWEST, Equations, RealOperation
 from diffabs.reach.tail import RunTail, TailPiece, stop_speed
 
 LIMITED = ("clamp", "round")  # operations that a chord stands for
@@ -316,8 +317,11 @@ class _Series:
         known = self.v[i]
         while len(known) <= k:
             x = self._value(i, len(known))
-            if not x.is_finite():
-                raise _Undefined(f"{self.program.operations[i].name}: no finite value")
+            name = self.program.operations[i].name
+            # The program computes the value itself, but no further coefficient, in doubles.
+            largest = inf if known else LARGEST_INPUT if name in ("state", "param") else float_info.max
+            if not (x.is_finite() and x.abs_upper() < largest):
+                raise _Undefined(f"{name}: no finite value")
             known.append(x)
         return known[k]
 

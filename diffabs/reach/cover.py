@@ -17,7 +17,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.types import PyTree
 from diffabs.reach.engine import FAILURES, CellBounds, Prover
-from diffabs.reach.equations import Equations, derive_equations
+from diffabs.reach.equations import LARGEST_INPUT, Equations, derive_equations
 from diffabs.reach.search_tail import find_tail
 from diffabs.reach.tail import RunTail
 
@@ -185,6 +185,8 @@ def prove_box(
         raise AssertionError("the cells do not cover the box")
     bounds = quantities.over_all(merged) if covered and merged is not None else quantities.unbounded
     verdict = "refuted" if refuting is not None else "proved" if covered else "undecided"
+    if verdict == "proved" and not claims and (nothing := quantities.name_unbounded(bounds)):
+        verdict, failure = "undecided", nothing
     if verdict == "proved" and (contradiction := name_contradiction(bounds, known or {})):
         verdict, failure, bounds = "undecided", contradiction, quantities.unbounded
     return BoxProof(
@@ -266,6 +268,14 @@ class _Quantities:
     def over_all(self, found: CellBounds) -> dict[str, tuple[float, float]]:
         pairs = {name: self.of_cells(found, name) for name in self.names()}
         return {name: (float(low.min()), float(high.max())) for name, (low, high) in pairs.items()}
+
+    def name_unbounded(self, bounds: Mapping[str, tuple[float, float]]) -> str:
+        """Return in words that a proof without claims says nothing about a signal, or nothing at all; else empty."""
+        signals = [name for name in self.names() if " " in name]
+        if infinite := [name for name in signals if not all(map(math.isfinite, bounds[name]))]:
+            return f"no bound of the {infinite[0]} is proved"
+        times = [bounds[name][1] for name in ("stop_time", "stop_distance")]
+        return "" if signals or any(map(math.isfinite, times)) else "no bound is proved, and nothing is claimed"
 
     @property
     def unbounded(self) -> dict[str, tuple[float, float]]:
@@ -397,19 +407,22 @@ def _cut_to_size(
 
 
 def check_box(over: Mapping[str, tuple[float, float]]) -> None:
-    """Check that a box has a parameter, and that the ends of each are finite and in order.
+    """Check that a box has a parameter, and that the ends of each are below `LARGEST_INPUT` and in order.
 
     Args:
         over: Range (low, high) of each parameter of the box, by path, in SI units.
 
     Raises:
-        ValueError: The box is empty, or the ends of a parameter, which is named, are not finite and in order.
+        ValueError: The box is empty, or the ends of a parameter, which is named, are too large or not in order.
     """
     if not over:
         raise ValueError("over: the box has no parameter")
     for path, (low, high) in over.items():
-        if not -math.inf < low <= high < math.inf:
-            raise ValueError(f"over.{path} = [{low:.9g}, {high:.9g}]; two finite numbers are needed, the lower first")
+        if not -LARGEST_INPUT < low <= high < LARGEST_INPUT:
+            raise ValueError(
+                f"over.{path} = [{low:.9g}, {high:.9g}]; two numbers below {LARGEST_INPUT:g} are needed, the lower "
+                "first"
+            )
 
 
 def comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[PyTree]) -> bool:

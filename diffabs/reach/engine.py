@@ -1,11 +1,11 @@
 """The native prover: enclosures of all runs of cells, in upward rounding, several cells at a time."""
 
-import concurrent.futures
 import ctypes
 import functools
 import pathlib
 import re
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -286,15 +286,8 @@ class Prover:
         """
         cells, lanes = np.ascontiguousarray(cells, float), library().lanes()
         out = np.zeros((len(cells), self._width))
-
-        def prove_group(first: int) -> None:
-            part = np.ascontiguousarray(cells[first : first + lanes])
-            result = np.zeros((len(part), self._width))
-            self._call(part, result)
-            out[first : first + lanes] = result
-
-        with concurrent.futures.ThreadPoolExecutor(threads or core_count()) as pool:
-            list(pool.map(prove_group, range(0, len(cells), lanes)))
+        groups = [slice(first, first + lanes) for first in range(0, len(cells), lanes)]
+        self._call([(np.ascontiguousarray(cells[group]), out[group]) for group in groups], threads or core_count())
         n = len(self.signals)
         pairs = out[:, 5 : 5 + 4 * n].reshape(len(out), 2, n, 2)
         return CellBounds(
@@ -317,7 +310,7 @@ class Prover:
         trail = np.full((steps, lanes, 2 + 2 * n), np.nan)
         out = np.zeros((1, self._width))
         pieces, self.task.pieces = self.task.pieces, 0
-        count = self._call(np.ascontiguousarray(cell, float)[None], out, trail=trail)
+        (count,) = self._call([(np.ascontiguousarray(cell, float)[None], out)], trail=trail)
         self.task.pieces = pieces
         if not out[0, 0] or count == steps:
             raise ValueError(f"the cell {np.asarray(cell).tolist()} is not proved in {steps:,} steps")
@@ -328,12 +321,19 @@ class Prover:
         return CellTube(np.stack([begins, ends[:, 1]], 1), pairs[:, :, 0], pairs[:, :, 1])
 
     def _call(
-        self, cells: np.ndarray, out: np.ndarray, *, scout: np.ndarray | None = None, trail: np.ndarray | None = None
-    ) -> int:
-        """Prove one group of cells into `out`, and return how many rows of `scout` or `trail` were written."""
-        pointers = [None if x is None else x.ctypes.data_as(ctypes.c_void_p) for x in (cells, out, scout, trail)]
-        room = max(0 if x is None else len(x) for x in (scout, trail))
-        return library().prove(ctypes.byref(self.task), ctypes.c_long(len(cells)), *pointers, ctypes.c_long(room))
+        self, groups: Sequence[tuple[np.ndarray, np.ndarray]], threads: int = 1, *,
+        scout: np.ndarray | None = None, trail: np.ndarray | None = None,
+    ) -> list[int]:  # fmt: skip
+        """Prove groups of (cells, results) in threads; return for each how many rows of `scout` or `trail` it wrote."""
+        stop, room = ctypes.c_int32(), max(0 if x is None else len(x) for x in (scout, trail))
+
+        def prove_group(cells: np.ndarray, out: np.ndarray) -> int:
+            pointers = [None if x is None else x.ctypes.data_as(ctypes.c_void_p) for x in (cells, out, scout, trail)]
+            counts = ctypes.c_long(len(cells)), *pointers, ctypes.c_long(room)
+            return library().prove(ctypes.byref(self.task), *counts, ctypes.byref(stop))
+
+        library()  # compiled before there are threads
+        return _run_in_threads([lambda group=group: prove_group(*group) for group in groups], threads, stop)
 
     def scout(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return speeds [m/s] (or times [s]), kept states and absolute Jacobians of the periods of one run.
@@ -344,7 +344,7 @@ class Prover:
         n = len(self.kept)
         found = np.zeros((SCOUTED, 1 + n + n * n))
         cell = np.repeat(np.asarray(point, float)[None, :, None], 2, 2)
-        count = self._call(cell, np.zeros((1, self._width)), scout=found)
+        (count,) = self._call([(cell, np.zeros((1, self._width)))], scout=found)
         found = found[:count][np.isfinite(found[:count]).all(1)]  # the first has no axes yet
         return found[:, 0], found[:, 1 : 1 + n], np.abs(found[:, 1 + n :]).reshape(len(found), n, n)
 
@@ -375,6 +375,8 @@ class Prover:
         Args:
             point: Parameters of the run, shape (parameters,).
         """
+        if not self.kept:
+            return
         keys, _, jacobians = self.scout(point)
         if not len(keys):
             return
@@ -389,6 +391,37 @@ class Prover:
             self.weights[k, self.clockwork] = CLOCKWORK_WEIGHT
             if self.task.speed >= 0:
                 self.weights[k, self.task.speed] = self.weights[k, self.task.nonnegative] * SPEED_WEIGHT
+
+
+def _run_in_threads(calls: Sequence[Callable[[], int]], threads: int, stop: ctypes.c_int32) -> list[int]:
+    """Return the results of native calls; an exception in this thread, such as Ctrl-C, sets `stop`.
+
+    No signal reaches Python during a native call in the main thread, and a process waits at its end for the threads of
+    an executor. So the calls run in daemon threads.
+    """
+    results, errors, left = [0] * len(calls), list[BaseException](), iter(range(len(calls)))
+
+    def work() -> None:
+        try:
+            for i in left:
+                if stop.value:
+                    return
+                results[i] = calls[i]()
+        except BaseException as error:
+            errors.append(error)
+
+    workers = [threading.Thread(target=work, daemon=True) for _ in range(min(threads, len(calls)))]
+    try:
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+    except BaseException:
+        stop.value = 1
+        raise
+    if errors:
+        raise errors[0]
+    return results
 
 
 def _tape_arrays(e: Equations, place: dict[int, int]) -> dict[str, np.ndarray]:

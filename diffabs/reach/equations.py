@@ -15,6 +15,7 @@ and only with the slip as a state does an enclosure keep that. `check_slip_chart
 """
 
 import dataclasses
+import math
 import random
 from collections.abc import Callable, Iterable
 from fractions import Fraction
@@ -24,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import DTypeLike
 
 from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, live_nodes
 from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr, scalar_array
@@ -34,16 +36,18 @@ from diffabs.core.messages import Clock
 from diffabs.core.protocols import BrakeOutput
 from diffabs.core.pytree import parameters, replace
 from diffabs.core.types import PyTree, Scalar
+from diffabs.core.validity import check_part
 from diffabs.plants import BrakeStart
 
 # Inputs: parameters of the box, states of the proof, states of the plant's own, and a tick's grid step and number.
 PARAM, STATE, OWN, GRID = "param", "state", "own", "grid"
 TIME = "t"
-# Operations of a program whose result is a number for all numbers.
-TOTAL = (
-    *("input", "add", "sub", "mul", "neg", "abs", "min", "max", "lower", "higher", "select", "any", "gate", "convert"),
-    *("lt", "le", "eq", "ne", "and", "or", "not", "rint", "exp", "sin", "cos", "atan", "tanh", "is_finite"),
-)
+# A program computes with doubles, so a number that may overflow, such as exp(x), may have no value: 0 exp(1000) is NaN.
+LARGEST_INPUT = 1e150  # of a state or a parameter; a proof ends before a state is larger
+LARGEST_NUMBER, MAX_EXPONENT = 1e300, 690.0
+# Operations whose result is not larger than their largest operand, and that are at most 2.
+CHOOSING = ("neg", "abs", "min", "max", "lower", "higher", "select", "any", "gate", "convert")
+SMALL = ("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "sin", "cos", "atan", "tanh", "is_finite")
 CHART_TRIALS = 20  # random rational points; a wrong rational function is right at one with a probability of nearly 0
 SLOWEST, FASTEST = Fraction(2, 100), Fraction(200)  # speeds [m/s] at which the chart is checked, ends included
 CHART_DECADES = 6.0  # by which parameters of the box are changed, up and down
@@ -116,18 +120,41 @@ class RealGraph(Graph):
     def __init__(self) -> None:
         """Create an empty graph."""
         super().__init__()
-        self._valued: dict[int, bool] = {}
+        self._sizes: dict[int, float] = {}
 
     def has_value(self, node: Node) -> bool:
-        """Return whether a number has a value for all values of the inputs; False if that is unknown.
+        """Return whether a number is finite, in doubles, for all values of the inputs; False if that is unknown.
 
         Args:
             node: Number.
         """
-        if node.id not in self._valued:
-            total = node.op in TOTAL or _is_finite(node) or (node.op == "div" and _is_nonzero(node.args[1]))
-            self._valued[node.id] = total and all(map(self.has_value, node.args))
-        return self._valued[node.id]
+        return self._size(node) < LARGEST_NUMBER
+
+    def _size(self, node: Node) -> float:
+        """Return a bound of |number| for all values of the inputs; infinite if it may have no value."""
+        if node.id not in self._sizes:
+            sizes = [self._size(arg) for arg in node.args]
+            self._sizes[node.id] = self._size_of(node, sizes) if max(sizes, default=0.0) < np.inf else np.inf
+        return self._sizes[node.id]
+
+    def _size_of(self, node: Node, sizes: list[float]) -> float:
+        """Return `_size` of an operation from those of its operands, which are finite."""
+        match node.op:
+            case "const" if _is_finite(node):
+                return abs(float(node.attr))
+            case "input":
+                return LARGEST_INPUT
+            case "add" | "sub":
+                return sum(sizes)
+            case "mul":
+                return sizes[0] * sizes[1]
+            case "div" if _is_nonzero(node.args[1]):
+                return sizes[0] / sizes[1] if sizes[1] * LARGEST_NUMBER > sizes[0] else np.inf
+            case "rint":
+                return sizes[0] + 1.0
+            case "exp":
+                return math.exp(sizes[0]) if sizes[0] < MAX_EXPONENT else np.inf
+        return max(sizes) if node.op in CHOOSING else 2.0 if node.op in SMALL else np.inf
 
     def op(self, name: str, *args: Node) -> Node:
         """Return a node for the operation `name` on `args`; see `Graph.op`."""
@@ -147,6 +174,10 @@ class RealGraph(Graph):
                 return self.const(float(value), args[0].dtype)
         found = _simplify(self, name, args)
         return self._make(name, args, args[0].dtype) if found is None else found
+
+    def bits(self, x: Node, dtype: DTypeLike) -> Node:
+        """Refuse the bits of a number, which real numbers have not."""
+        raise Unsupported("lt_to", "a proof has no rule for a search in a table, as of jnp.interp or jnp.searchsorted")
 
     def any(self, which: Node) -> Node:
         """Return the condition itself: a result of a branch that no lane takes is a placeholder only in a kernel.
@@ -229,10 +260,12 @@ def derive_equations(loop: Loop, over: Iterable[str]) -> Equations:
         over: Paths of the parameters of the box.
 
     Raises:
+        ValueError: A parameter is out of range, or an output of the plant has the name of another signal.
         NoRule: A part has events or noise, two blocks have different clocks, an operation has no sound rule, or there
             are too many in a chain.
     """
     paths = tuple(over)
+    check_part(loop)
     try:
         with jax.enable_x64(True):
             return _Derivation(loop, paths).equations()
@@ -294,10 +327,10 @@ class _Derivation:
         first = jax.eval_shape(self.chart, self.loop)
         shown, made = jax.tree_util.tree_leaves_with_path(first), jax.tree.structure(first)
         names: list[str] = []
-        for path, leaf in shown:
+        for (_, leaf), path in zip(shown, _state_names([path for path, _ in shown]), strict=True):
             if not np.issubdtype(leaf.dtype, np.floating):
-                raise NoRule(f"{_text(path)}: a memory that is not a real number (a counter or a random key)")
-            names += [_text(path) + (f".{i}" if leaf.ndim else "") for i in range(int(np.prod(leaf.shape)))]
+                raise NoRule(f"{path}: a memory that is not a real number (a counter or a random key)")
+            names += [path + (f".{i}" if leaf.ndim else "") for i in range(int(np.prod(leaf.shape)))]
         n = len(names)
         nodes = [self.graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(n + 1)]
 
@@ -568,7 +601,7 @@ class _Derivation:
                 return make(node.op, tuple(args))
             case "and" | "or" | "not":
                 return self.logic(node.op, args)
-            case "is_finite" if self.is_total(args[0]):
+            case "is_finite" if self.graph.has_value(node.args[0]):
                 return make("truth", (), True)
             case "is_finite":  # 0 x < 1 is true, and has no value where x has none
                 return make("lt", (make("mul", (args[0], number(0.0))), number(1.0)))
@@ -590,21 +623,6 @@ class _Derivation:
             case "expm1":
                 return make("sub", (self.function("exp", args[0]), number(1.0)))
         raise NoRule(f"{node.op}: the proof has no sound rule for this operation")
-
-    def is_total(self, i: int) -> bool:
-        """Return whether an operation has a value for all parameters and states; False if that is unknown."""
-        operation = self.operations[i]
-        match operation.name:
-            case "const":
-                return bool(np.isfinite(operation.value))
-            case "log":
-                return False
-            case "inv":
-                below = self.operations[operation.args[0]]
-                return below.name == "const" and below.value != 0
-            case "exp" | "sin" | "cos" | "atan" | "power":  # the other operand is the factor of the derivative
-                return self.is_total(operation.args[0])
-        return all(self.is_total(a) for a in operation.args if a >= 0)
 
     def logic(self, name: str, args: list[int]) -> int:
         """Return a logical operation; one that a known truth decides is that truth."""
@@ -779,9 +797,15 @@ def _nodes_below(root: Node) -> set[Node]:
 
 
 def _text(path: PyTree) -> str:
-    """Return a path of a pytree as dotted text, without the words flow and held."""
-    words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
-    return ".".join(word for word in words if word not in ("flow", "held"))
+    """Return a path of a pytree as dotted text."""
+    return ".".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)
+
+
+def _state_names(paths: list[PyTree]) -> list[str]:
+    """Return the names of states; the words flow and held stand only where two states would have one name."""
+    full = [_text(path) for path in paths]
+    short = [".".join(word for word in name.split(".") if word not in ("flow", "held")) for name in full]
+    return [name if short.count(name) == 1 else whole for name, whole in zip(short, full, strict=True)]
 
 
 def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:

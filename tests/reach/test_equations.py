@@ -19,6 +19,7 @@ from diffabs.core.pytree import param, pytree, static
 from diffabs.core.types import PyTree, Scalar
 from diffabs.plants import BrakeStart, QuarterCar
 from diffabs.reach import NoRule
+from diffabs.reach.engine import Prover
 from diffabs.reach.equations import Equations, derive_equations
 from diffabs.references import Setpoint
 from diffabs.scenario.scenario import load
@@ -213,8 +214,13 @@ def rate_of(formula: Any, x: float, **values: float) -> float | bool:
            "self.power(args[0], number(0.5), 0.5)", case="root")  # fmt: skip
 @killed_by("reach/equations.py", 'make("lt", (make("mul", (args[0], number(0.0))), number(1.0)))',
            'make("truth", (), True)', case="test")  # fmt: skip
-@killed_by("reach/equations.py", "return bool(np.isfinite(operation.value))", "return True", case="infinite")
-@killed_by("reach/equations.py", "node.op in TOTAL or _is_finite(node)", "node.op in (*TOTAL, 'const')", case="times")
+@killed_by("reach/equations.py", "else 2.0 if node.op in SMALL else np.inf", "else 2.0", case="zero")
+@killed_by(
+    "reach/equations.py",
+    'case "const" if _is_finite(node):',
+    'case "const" if node.attr == np.inf:\n                return 2.0\n            case "const":',
+    case="times",
+)
 @pytest.mark.parametrize(
     "formula",
     [
@@ -231,6 +237,33 @@ def test_a_number_without_a_value_has_none(formula: Any) -> None:
     """At x = 2 the root is of -1, the division is by 0, and the infinite number is no real one."""
     assert math.isfinite(rate_of(formula, 0.5))
     assert math.isnan(rate_of(formula, 2.0))
+
+
+@pytest.mark.usefixtures("native_prover")
+@killed_by("reach/equations.py", "math.exp(sizes[0]) if sizes[0] < MAX_EXPONENT else np.inf", "2.0", case="times exp")
+@killed_by("reach/equations.py", "return sizes[0] * sizes[1]", "return 2.0", case="times square")
+@pytest.mark.parametrize(
+    ("formula", "x"),
+    [
+        (lambda x, a, b, c: 0.0 * jnp.exp(x), 1000.0),
+        (lambda x, a, b, c: jnp.exp(x) - jnp.exp(x), 710.0),
+        (lambda x, a, b, c: 0.0 * jnp.exp(-x), -1000.0),
+        (lambda x, a, b, c: 0.0 * (x * x * x), 1e110),
+        (lambda x, a, b, c: jnp.where(jnp.isfinite(jnp.exp(x)), 1.0, 2.0), 1000.0),
+    ],
+    ids=["times exp", "difference", "times exp of minus", "times square", "test"],
+)
+def test_a_number_that_no_double_holds_has_no_value(formula: Any, x: float) -> None:
+    """The program computes NaN, or takes the other branch, and a proof must not fold that to 0 or to a truth."""
+    program = float(jax.jit(lambda x: formula(x, 1.0, 1.0, 1.0))(x))
+    assert np.isnan(program) or program == 2.0
+    loop = d.replace(odd_loop(formula), {"initial.position": x})
+    equations = derive_equations(loop, ["plant.a"])
+    found = Prover(equations, ("position",), 1e-3).prove(np.array([[[1.0, 1.1]]]), 1)
+    assert found.status[0] == 0
+    checker = pytest.importorskip("diffabs.reach.checker")
+    with pytest.raises(checker.NotProved, match="no finite value"):
+        checker.check_cell(equations, ["position"], [(1.0, 1.1)], steps=[1e-3], horizon=1e-3)
 
 
 @killed_by("reach/equations.py", "return x.args[2] if is_asked else x", "return x.args[2]")

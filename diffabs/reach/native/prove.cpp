@@ -54,6 +54,7 @@ constexpr int MOST_IN_PERIOD = 100;   // steps
 constexpr int MOST_LIMITS = 6;        // limits that a set lies across in one tick; all limits of a flow
 constexpr double WIDEST_SLIP = 0.3;        // a set of slips wider than this proves nothing: a smaller cell may
 constexpr double NEVER = 1e300;
+constexpr double LARGEST = 1e150;     // of states, also LARGEST_INPUT in equations.py
 constexpr int SLICES = 24;            // of the speeds that a settled run passes, for its time to the stop
 
 struct Quadrature { I c; std::vector<V> G; V R; };  // c + G p + [-R, R]
@@ -106,7 +107,7 @@ struct Group {
   const I period_;
   std::vector<int> limits, tick_limits, state_op;
   bool nested = false;  // a limit of the flow reads another one
-  Program flow, tick, starts, stop, fall;
+  Program flow, tick, starts, margin_, fall;
   // The equations' series, each over another set. mid: at C. whole: over X and C, with slopes. rest: over B, for the
   // remainder. box: over B, for rates. edge: on faces of B. jac: over B, with derivatives by states and disturbances.
   // falling: the speed's rate over settled states.
@@ -126,6 +127,7 @@ struct Group {
   std::vector<V> above, below;  // every run of the cell goes above, and below, these values of the signals; bottom and below are negated
   std::vector<V> reach;         // greatest half width that each parameter causes in the slip, or in state 0 without a slip
   std::vector<V> pmid, phalf;   // middle and half width of each parameter
+  const volatile int32_t* stop; // not 0 once the caller wants no result
   // alive: still followed. dead: the proof failed. done: ended, or at the horizon (timed). ended: a run may have ended.
   M alive{}, dead{}, done{}, timed{}, ended{};
   M doomed{};                                   // lanes that are dead once the attempted step is committed
@@ -148,14 +150,14 @@ struct Group {
     r.push_back((int)t.margin);
     return r;
   }
-  explicit Group(const Task& t)
+  Group(const Task& t, const volatile int32_t* stop_)
       : task(t), n((int)t.states), nb((int)t.kept), np((int)t.tape.params), nd(np + nb + (t.period_high > 0 ? MOST_LIMITS : 0)), K((int)t.order),
         sampled(t.period_high > 0), period_(span(fill(t.period_low), fill(t.period_high))), state_op(n, -1),
-        flow(t.tape, flow_roots(t)), tick(t.tape, roots(t.tick, t.states)), starts(t.tape, roots(t.start, t.states + t.quadratures)), stop(t.tape, {(int)t.margin}), fall(t.tape, {(int)(t.acceleration >= 0 ? t.acceleration : t.margin)}),
+        flow(t.tape, flow_roots(t)), tick(t.tape, roots(t.tick, t.states)), starts(t.tape, roots(t.start, t.states + t.quadratures)), margin_(t.tape, {(int)t.margin}), fall(t.tape, {(int)(t.acceleration >= 0 ? t.acceleration : t.margin)}),
         mid(t.tape, K, 0), whole(t.tape, K, nd), rest(t.tape, K + 1, 0), box(t.tape, 1, 0), edge(t.tape, 1, 0), jac(t.tape, 0, n + MOST_LIMITS),
         at_tick(t.tape, 0, nd), at_tick_mid(t.tape, 0, 0), falling(t.tape, 0, 0), chords(t.tape.count), tick_chords(t.tape.count),
         set(nb, np), rows(t.quadratures), C(n), J(n * nd), X(n), used(np + nb), B(n), f(n), push(n), remainder(n),
-        top(t.signals), bottom(t.signals), now(t.signals), above(t.signals), below(t.signals), reach(np), pmid(np), phalf(np), end(np, nb), settled_time_reach(np), settled_way_reach(np) {
+        top(t.signals), bottom(t.signals), now(t.signals), above(t.signals), below(t.signals), reach(np), pmid(np), phalf(np), stop(stop_), end(np, nb), settled_time_reach(np), settled_way_reach(np) {
     for (int i : flow.list) if (is_limit(i)) limits.push_back(i);
     for (int i : tick.list) if (is_limit(i)) tick_limits.push_back(i);
     for (int i : limits)
@@ -457,7 +459,7 @@ struct Group {
       }
       C[i] = sum + remainder[i] + push[i];
       X[i] = meet(C[i] + symmetric(w), B[i]);
-      lose(empty(X[i]) | ~((X[i].n < 1e200) & (X[i].h < 1e200)), TOO_WIDE);
+      lose(empty(X[i]) | ~((X[i].n < LARGEST) & (X[i].h < LARGEST)), TOO_WIDE);
     }
     if (task.nonnegative >= 0) lose(~(X[task.nonnegative].width() < WIDEST_SLIP), TOO_WIDE);
     fresh = false, steps++;
@@ -624,7 +626,7 @@ struct Group {
     if (sampled) apply_tick();
     gone = I(0.0);
     int count = 0;
-    for (bool is_over = false; !is_over && any(alive);) {
+    for (bool is_over = false; !is_over && any(alive) && !*stop;) {
       is_over = step(sampled ? period_ - gone : I(NEVER));
       seen();
       if (++count > MOST_IN_PERIOD || steps > MOST_STEPS) lose(alive, TOO_MANY_STEPS);
@@ -634,15 +636,15 @@ struct Group {
   void renew() {
     M broken{};
     renew_axes(set, C, J, nd, used, weights_now(), task.nonnegative, broken);
-    for (int i = 0; i < nb; i++) broken |= ~((vabs(set.c[i]) < 1e200) & (set.r[i] < 1e200));
+    for (int i = 0; i < nb; i++) broken |= ~((vabs(set.c[i]) < LARGEST) & (set.r[i] < LARGEST));
     lose(broken, TOO_WIDE);
     int first = task.nonnegative >= 0 ? (int)task.nonnegative : 0;
-    for (int p = 0; p < np; p++) reach[p] = alive ? vmax(reach[p], vabs(set.G[first * np + p])) : reach[p];
+    if (nb > 0) for (int p = 0; p < np; p++) reach[p] = alive ? vmax(reach[p], vabs(set.G[first * np + p])) : reach[p];
   }
 
   void look_at_margin() {
     mid.real_limits = whole.real_limits = true, whole.nd = used;
-    load_states(mid, C, false), mid.advance(stop, 0), load_states(whole, X, true), whole.advance(stop, 0);
+    load_states(mid, C, false), mid.advance(margin_, 0), load_states(whole, X, true), whole.advance(margin_, 0);
     lose(mid.none[task.margin] | whole.none[task.margin], NO_VALUE);
   }
   // Whether all runs have ended, or are at the horizon. The margin reads only states that a tick does not change.
@@ -909,12 +911,13 @@ void apply(int code, long count, const double* a, const double* b, double* out) 
 // Proves at most LANES cells, each params x (low, high), into `out`, a row of results for each (`Group::write`).
 // scout, if not null: for each period the speed or time, the states and the Jacobian of one run.
 // trail, if not null: for each step and each cell its time (low, high) and that of each signal; NaN once a cell is over.
-// Returns the number of rows in scout or trail, which have room for `room` rows.
-long prove(const Task* task, long count, const double* cells, double* out, double* scout, double* trail, long room) {
+// Returns the number of rows in scout or trail, which have room for `room` rows. A lane that is still followed when
+// *stop becomes other than 0 is not proved.
+long prove(const Task* task, long count, const double* cells, double* out, double* scout, double* trail, long room, const volatile int32_t* stop) {
   Upward upward;
   std::feclearexcept(FE_ALL_EXCEPT);
   const int nb = (int)task->kept, ns = (int)task->signals, width = 6 + 4 * ns + 3 * (int)task->tape.params;
-  Group g(*task);
+  Group g(*task, stop);
   long written = 0;
   auto follow = [&]() {
     if (!trail || written >= room) return;
@@ -934,8 +937,9 @@ long prove(const Task* task, long count, const double* cells, double* out, doubl
       for (int j = 0; j < nb; j++) to[1 + nb + i * nb + j] = g.J[i * g.nd + g.np + j].mid()[0] / g.set.r[j][0];
   };
   g.start(cells, count);
-  for (long number = 0; any(g.alive); number++) {
+  for (long number = 0; any(g.alive) && !*stop; number++) {
     g.period(number, follow);
+    if (*stop) break;
     report();
     g.renew();
     if (scout) g.restart_axes();
