@@ -9,7 +9,7 @@ import numpy as np
 
 from diffabs.config.values import ScenarioError
 from diffabs.core.types import JsonObject, Key, Params
-from diffabs.runtime.summary import round_for_table
+from diffabs.runtime.summary import format_metric
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, needs_key
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
@@ -93,17 +93,13 @@ def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[S
     for name, other in finer.metrics.items():
         one, other = float(metrics[name]), float(other)
         if differs_in_kind(one, other):
-            found.append(f"{name} from {_format_value(one)} to {_format_value(other)}")
+            found.append(f"{name} from {format_metric(one)} to {format_metric(other)}")
         elif abs(one - other) > LOOSE * solver.rtol * max(abs(other), LEAST):
             found.append(f"{name} by {100 * abs(one - other) / max(abs(other), LEAST):.2g} %")
     if not found:
         return []
     why = "the run chatters or amplifies its errors; choose a smaller solver.rtol, or see --check"
     return [f"solver.rtol = {closer.rtol:.2g} changes {', '.join(found)}: {why}"]
-
-
-def _format_value(value: float) -> str:
-    return "never" if value == math.inf else round_for_table(value)
 
 
 def describe_check(found: JsonObject) -> list[str]:

@@ -195,6 +195,8 @@ def _warnings(chosen: Scenario, run: Run, limited: float) -> Iterator[str]:
     for name in chosen.objectives:
         if math.isinf(run.metrics[name]):
             yield f"{name} is infinite: the run ends before the event that it measures"
+        elif math.isnan(run.metrics[name]):
+            yield f"{name} is not a number: the run lacks what it measures, as an overshoot needs a step"
     if limited > WARNED_LIMIT_SHARE:
         limits, unit = at_limits(chosen.loop), chosen.loop.plant.control_unit
         ends = f"{float(limits.low):g} to {float(limits.high):g} {unit}"

@@ -297,20 +297,32 @@ def _read_claim(text: str, chosen: Scenario, equations: "Equations") -> "RunClai
     if name == OVERSHOOT:
         if bound < 0:  # the metric is 0 for every run below its target
             raise ScenarioError(f"--claim {OVERSHOOT} = {bound:g} is outside [0, inf)")
-        from diffabs.objectives.tracking import MIN_SETPOINT
-
-        setpoint = equations.operations[equations.signals["setpoint"]]
-        if setpoint.name != "const" or setpoint.value < 0:
-            raise ScenarioError(
-                f"--claim {OVERSHOOT} needs one target for all runs; here it changes in a run or over the box: "
-                "--claim max_slip=BOUND"
-            )
-        below = 1 - 2.0**-50  # the product is rounded, and the target may be a rounded decimal
-        return RunClaim("greatest slip", (setpoint.value + bound * max(setpoint.value, MIN_SETPOINT)) * below)
+        return _overshoot_claim(bound, equations)
     if name in TIMES:
         return RunClaim(name, bound)
     word, _, signal = name.partition("_")
     return RunClaim(f"{'greatest' if word == 'max' else 'least'} {signal}", bound)
+
+
+def _overshoot_claim(bound: float, equations: "Equations") -> "RunClaim":
+    """Return the bound of the slip that bounds the metric `Overshoot`; refuse a step that differs between runs."""
+    from diffabs.reach import RunClaim
+
+    ends = [*(equations.start[i] for i in equations.nonnegative), equations.signals["setpoint"]]
+    operations = [equations.operations[i] for i in ends]
+    numbers = [operation.value for operation in operations if operation.name == "const"]
+    if len(numbers) < 2:
+        raise ScenarioError(
+            f"--claim {OVERSHOOT} needs one start slip and one target for all runs; here one of them changes in a run "
+            "or over the box: --claim max_slip=BOUND"
+        )
+    first, setpoint = numbers
+    step = setpoint - first
+    if step == 0:
+        raise ScenarioError(f"--claim {OVERSHOOT} needs a step; the runs start on their target: --claim max_slip=BOUND")
+    limit = setpoint + bound * step
+    rounding = 2.0**-50 * (abs(setpoint) + bound * abs(step))  # the numbers may be rounded decimals
+    return RunClaim("greatest slip", limit - rounding) if step > 0 else RunClaim("least slip", limit + rounding)
 
 
 def _unit_of(quantity: str, chosen: Scenario) -> str:

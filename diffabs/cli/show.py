@@ -16,7 +16,7 @@ from diffabs.cli.tables import open_console, show_titled_table
 from diffabs.core.loop import run_signals
 from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.papers.digest import Digest
-from diffabs.runtime.summary import round_for_table
+from diffabs.runtime.summary import format_metric, round_for_table
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.types import Trajectory
@@ -81,11 +81,7 @@ def show_run(result: JsonObject, chosen: Scenario) -> None:
     """
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
-        table.add_row(
-            name,
-            "never" if value == math.inf else round_for_table(value),
-            unit_of(chosen.objectives[name], chosen.loop.plant),
-        )
+        table.add_row(name, format_metric(value), unit_of(chosen.objectives[name], chosen.loop.plant))
     show_titled_table(chosen.title or chosen.name, table)
     show_files(result)
 

@@ -37,7 +37,7 @@ def show_sweep(result: JsonObject, chosen: Scenario) -> None:
         say(f"{name} is {format_brief(result['metrics'][name]['mean']['value'])} {unit} in every run")
     for name, row in result["never"].items():
         where = f"{row['count']} runs, the first sample {row['samples'][0]}"
-        say(f"warning: {name} is infinite (never) in {where}: its statistics leave them out")
+        say(f"warning: {name} is infinite (never) or not a number in {where}: its statistics leave them out")
     paths = list(next(iter(result["sensitivity"].values()), {}))
     if paths:
         kind = list(next(iter(result["sensitivity"].values()))[paths[0]])[-1]
@@ -146,7 +146,8 @@ def show_comparison(result: JsonObject) -> None:
             say(f"warning: {name} is finite in {row['samples']} common samples: too few for statistics")
             continue
         if row["never"]:
-            say(f"warning: {name} is infinite (never) in {row['never']} common samples: its statistics leave them out")
+            where = f"{row['never']} common samples"
+            say(f"warning: {name} is infinite (never) or not a number in {where}: its statistics leave them out")
         less = f"{100 * row['share in which the second is less']['value']:.1f} %"
         means = (format_brief(row[key]) for key in ("first", "second"))
         table.add_row(name, *means, *_estimate(row["difference"]), less, format_brief(row["variance reduction"]))

@@ -197,8 +197,8 @@ class Stop(Protocol):
 class Objective(Protocol):
     """A metric of a run, accumulated step by step: a sweep stores no trajectories.
 
-    A run whose value is outside `physical`, or NaN, has `diverged`. An objective may have an attribute `unreached`, an
-    infinite value for a run that does not reach the measured condition.
+    A run whose value is outside `physical`, or NaN, has `diverged`. An objective may have an attribute `unreached`, the
+    infinite value of a run that does not reach the measured condition, or NaN for a run that has no such metric.
     """
 
     @property

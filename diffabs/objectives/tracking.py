@@ -19,7 +19,7 @@ from diffabs.core.pytree import param, parts, pytree
 from diffabs.core.rules import Rule, order_rule
 from diffabs.core.types import Part, PyTree, Scalar, Vector
 
-MIN_SETPOINT = 0.01  # least denominator of an overshoot, in the unit of the first signal
+STEP_EPS = 1000.0  # a shorter step, in eps of the signal, is rounding: a first slip of 0.2 is one of two speeds
 
 
 class FinalValue:
@@ -118,15 +118,11 @@ class ITAE(HeldValue):
         return memory.held + h * absolute_integral(e, lambda x: t * e.integral(x) + h * e.moment(x))
 
 
-class Sided(NamedTuple):
-    """Greatest value on the setpoint's side.
+class Extremes(NamedTuple):
+    """Memory of an overshoot: the first, the least and the greatest value of the signal, in its unit."""
 
-    Attributes:
-        side: -1 for a negative setpoint, else 1.
-        greatest: Greatest side * y.
-    """
-
-    side: Scalar
+    first: Scalar
+    least: Scalar
     greatest: Scalar
 
 
@@ -149,38 +145,42 @@ class MaxSlip(HeldValue):
 
 @pytree
 class Overshoot(HeldValue):
-    """Overshoot as a fraction of the final setpoint r [1]: max(0, (max y - r)/max(r, 0.01)).
+    """Overshoot as a fraction of the step [1]: max(0, max y - r)/(r - y0) for a step up, max(0, r - min y)/(y0 - r) for
+    a step down.
 
-    The floor 0.01, in the unit of y, avoids a division by 0 where a reference ends at slip 0. If the first setpoint is
-    negative, -y and -r take the places of y and r. A run without overshoot has derivative 0.
+    The step is that of `SettlingTime`: from the first value y0 of the signal to the final setpoint r. A reference that
+    filters its target does not change the step. A run without overshoot has value and derivative 0.
 
-    The first value counts, too: a run that starts beyond r, as before a step down, has no overshoot in the usual sense.
+    A run that starts on its final setpoint, to a rounding of 1000 eps, has no step: its overshoot is NaN, with NaN
+    derivatives. The run is valid.
     """
 
     unit = "1"
     physical = (0.0, math.inf)
+    unreached = math.nan
 
     def start(self, sample: Sample) -> Memory:
-        """Return the side of the setpoint and the first value on this side."""
-        side = jnp.where(sample.setpoint < 0, -1.0, 1.0)
-        return Memory(held=Sided(side, side * sample.output[0]))
+        """Return the memory with the first value."""
+        return Memory(held=Extremes(*(sample.output[0],) * 3))
 
-    def update(self, memory: Memory, segment: Segment) -> Sided:
-        """Return the greatest value up to the end of the step, from the step's cubic."""
-        side, greatest = memory.held
-        signal, output = segment.output().times(side), segment.end.output
-        value = smaller(signal.greatest(), getattr(output, "highest", math.inf))
-        return Sided(side, later_of_larger(greatest, value, signal.falls))
+    def update(self, memory: Memory, segment: Segment) -> Extremes:
+        """Return the extremes up to the end of the step, from the step's cubic."""
+        first, least, greatest = memory.held
+        signal, output = segment.output(), segment.end.output
+        mirrored = signal.times(-1.0)
+        top = smaller(signal.greatest(), getattr(output, "highest", math.inf))
+        bottom = -later_of_larger(-least, mirrored.greatest(), mirrored.falls)
+        return Extremes(first, bottom, later_of_larger(greatest, top, signal.falls))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Return the overshoot [1]."""
-        side, greatest = memory.held
-        setpoint = side * ending.sample.setpoint
-        # A small denominator is replaced: a division by 0 in the branch not taken would put NaN into the derivatives.
-        usual = setpoint >= MIN_SETPOINT
-        fraction = greatest / jnp.where(usual, setpoint, MIN_SETPOINT) - 1
-        excess = jnp.where(usual, fraction, (greatest - setpoint) / MIN_SETPOINT)
-        return jnp.where(excess > 0, excess, 0.0)
+        """Return the overshoot [1]; NaN without a step."""
+        first, least, greatest = memory.held
+        setpoint = ending.sample.setpoint
+        step = setpoint - first
+        excess = jnp.where(step > 0, greatest - setpoint, setpoint - least)
+        rounding = STEP_EPS * jnp.finfo(jnp.result_type(step)).eps * larger(jnp.abs(setpoint), jnp.abs(first))
+        # A NaN denominator, unlike a selected NaN, makes the derivatives NaN, too.
+        return larger(excess, 0.0) / jnp.where(jnp.abs(step) <= rounding, jnp.nan, jnp.abs(step))
 
 
 class Settling(NamedTuple):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import html
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +21,15 @@ def round_for_table(value: Scalar, digits: int = 6) -> str:
     """
     value = float(value)
     return "0" if abs(value) < ZERO_TOLERANCE else f"{value:.{digits}g}"
+
+
+def format_metric(value: Scalar) -> str:
+    """Return a metric as text for a table; `never` for infinity, `none` for a run without such a metric (NaN).
+
+    Args:
+        value: Metric of a run that did not diverge, in SI units.
+    """
+    return "never" if value == math.inf else "none" if math.isnan(value) else round_for_table(value)
 
 
 def format_cell(value: Scalar) -> str:

@@ -83,6 +83,8 @@ def _is_impossible(name: str, objective: Objective, value: Scalar) -> Bool:
     inside = (
         (value >= low - PHYSICAL_RANGE_TOLERANCE) & (value <= high + PHYSICAL_RANGE_TOLERANCE) & jnp.isfinite(value)
     )
-    # `unreached` is the infinite value of a run that never reaches the measured condition: a valid answer.
+    # `unreached` is the infinite or NaN value of a run that has no such metric: a valid answer.
     unreached = getattr(objective, "unreached", None)
-    return ~inside if unreached is None else ~(inside | (value == unreached))
+    if unreached is None:
+        return ~inside
+    return ~(inside | (jnp.isnan(value) if math.isnan(unreached) else value == unreached))

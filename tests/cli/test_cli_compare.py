@@ -75,7 +75,7 @@ def test_runs_that_never_reach_an_event_are_said(capsys):
     )
     both: Any = (a, b)
     show_comparison({"first": "a", "second": "b", **_compare_metrics(*both, ["stop_time"])})
-    line = "warning: stop_time is infinite (never) in 2 common samples: its statistics leave them out\n"
+    line = "warning: stop_time is infinite (never) or not a number in 2 common samples: its statistics leave them out\n"
     shown = capsys.readouterr()
     assert line in shown.err
     assert "7 common samples, 1 left out that diverged or were refused" in " ".join(shown.out.split())

@@ -94,19 +94,31 @@ def test_a_bound_of_the_overshoot_is_never_rounded_up() -> None:
 LIMITED = [word for change in ("torque_min=0", "torque_max=9.03") for word in ("--set", f"controller.{change}")]
 
 
-@killed_by("cli/prove.py", 'setpoint.name != "const" or', "False or")
+@killed_by("cli/prove.py", 'if operation.name == "const"', "if operation.value is not None")
 def test_an_overshoot_needs_one_target_for_all_runs() -> None:
     """With a target of 0.149 the slip of one run is 73 % above it, which is 72 % above 0.15."""
     over = ("--over", "reference.slip=0.149:0.15", "--claim", "overshoot=0.725")
-    assert "needs one target for all runs" in run("prove", "slip-lmi", *LIMITED, *over, status=2).stderr
+    assert (
+        "needs one start slip and one target for all runs" in run("prove", "slip-lmi", *LIMITED, *over, status=2).stderr
+    )
 
 
-@killed_by("cli/prove.py", "bound * max(setpoint.value, MIN_SETPOINT)", "bound * setpoint.value")
-def test_an_overshoot_of_a_small_target_is_that_of_the_metric() -> None:
-    """Below a target of 0.01 the metric divides by 0.01."""
-    words = ("--set", "reference.slip=0.004", "--over", "plant.mass=5.5:5.5", "--claim", "overshoot=0.01", "--json")
-    found = json.loads(run("prove", "slip-lmi", *LIMITED, *words, status=1).stdout)
-    assert found["claims"][0]["bound"] == pytest.approx(0.0041)
+@killed_by("cli/prove.py", "bound * step\n", "bound * setpoint\n")
+@pytest.mark.parametrize(
+    ("first", "target", "quantity", "bound"),
+    [(0.0, 0.004, "greatest slip", 0.00404), (0.05, 0.2, "greatest slip", 0.2015), (0.3, 0.2, "least slip", 0.199)],
+)
+def test_an_overshoot_is_that_of_the_step(first, target, quantity, bound) -> None:
+    """1 % of the step from the first slip to the target, up or down."""
+    changes = ("--set", f"reference.slip={target}", "--set", f"initial.slip={first}", "--budget", "1")
+    words = (*changes, "--over", "plant.mass=5.5:5.5", "--claim", "overshoot=0.01", "--json")
+    (claim,) = json.loads(run("prove", "slip-lmi", *LIMITED, *words, status=1).stdout)["claims"]
+    assert (claim["quantity"], claim["bound"]) == (quantity, pytest.approx(bound, rel=1e-12))
+
+
+def test_an_overshoot_without_a_step_cannot_be_claimed() -> None:
+    words = ("--set", "initial.slip=0.2", "--over", "plant.mass=5.5:5.5", "--claim", "overshoot=0.01")
+    assert "the runs start on their target" in run("prove", "slip-lmi", *LIMITED, *words, status=2).stderr
 
 
 @pytest.mark.slow

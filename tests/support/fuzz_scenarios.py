@@ -261,8 +261,9 @@ def wrong(scenario: Scenario, run: Run) -> Iterator[str]:
     for name, value in run.metrics.items():
         value = float(value)
         size = ROUNDING * (1 + abs(value))
-        if value == getattr(scenario.objectives.get(name), "unreached", None):
-            continue  # the run ended before the event that the objective measures
+        unreached = getattr(scenario.objectives.get(name), "unreached", None)
+        if value == unreached or (unreached is not None and math.isnan(unreached) and math.isnan(value)):
+            continue  # the run ended before the event that the objective measures, or has no step
         if not math.isfinite(value):
             yield f"{name} = {value} is not finite"
         elif value < LEAST.get(name, -math.inf) - size or value > MOST.get(name, math.inf) + size:

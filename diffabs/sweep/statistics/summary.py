@@ -47,7 +47,7 @@ def summarise_sweep(found: Results) -> JsonObject:
     - `diverged`, `refused`: `count` and first `samples`; `refused` also counts each reason.
     - `confidence`, `intervals`: Confidence, and the meaning of the intervals as text.
     - `failures`: Probability of each kind of failure, and of `any`, with the `count` of failed samples.
-    - `never`: Runs with an infinite value, by metric, where there are some.
+    - `never`: Runs with an infinite value, or none, by metric, where there are some.
     - `metrics`: Statistics by metric.
     - `sensitivity`: Correlations, or Sobol' indices, by metric and variable.
     - `worst`: Samples with the largest values, by metric.
@@ -87,11 +87,12 @@ def _list_samples(view: RowMasks, rows: np.ndarray) -> JsonObject:
 
 
 def _list_never(found: Results, view: RowMasks, name: str) -> JsonObject:
-    """Return the number and the first samples of runs with an infinite value, which never reach the measured event.
+    """Return the number and the first samples of runs without a finite value: they never reach the measured event, or
+    lack what the metric measures (NaN).
 
-    They violate every bound of the metric. Its other statistics are of the finite values only.
+    An infinite value violates every bound of the metric. Its other statistics are of the finite values only.
     """
-    return _list_samples(view, view.good & view.rows & np.isinf(found.column(name)))
+    return _list_samples(view, view.good & view.rows & ~np.isfinite(found.column(name)))
 
 
 def _replicate_count(found: Results) -> int:
