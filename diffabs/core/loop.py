@@ -8,7 +8,7 @@ An instant is a tick of a clock or an event, at which a margin of a block falls 
 A `Loop` is one pytree: every parameter of every part is a leaf with a dotted path, `loop.plant.road.scale`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, reduce
 from typing import Any, NamedTuple
 
@@ -69,6 +69,8 @@ class Signals(NamedTuple):
 
 Margins = dict[str, tuple[Any, ...]]  # of stop and blocks, by name; each one of "stop" ends a run
 BLOCKS = ("sensor", "reference", "controller", "actuator")
+# Names that files and proofs give to other signals of a loop, and to their own columns and variables.
+RESERVED_SIGNALS = {*Sample._fields, "time", "sample", "metrics", "units"} - {"output"}
 
 
 @pytree
@@ -83,6 +85,12 @@ class Loop:
     controller: Block = part()
     actuator: Block = part(default=Direct)
     stop: Stop = part()
+
+    def problems(self) -> Iterator[str]:
+        """Yield a line if an output of the plant has the name of another signal."""
+        shown = getattr(getattr(self.plant, "shows", None), "_fields", ())
+        if taken := sorted(RESERVED_SIGNALS & set(shown)):
+            yield f"plant.shows: no output can be called {', '.join(taken)}, like a signal of the loop or of its files"
 
     def start(self) -> LoopState:
         """Return the state at t = 0, before the first tick."""
@@ -252,16 +260,11 @@ def run_signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, PyTree]]:
 
     Args:
         sample: Samples of the run.
-        plant: Plant of the loop.
-
-    Raises:
-        ValueError: An output of the plant has the name of another signal.
+        plant: Plant of the loop; `Loop.problems` keeps its outputs from other signals' names.
     """
     units = plant.shows.units
     shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
     asked = {"target": (units[sample.output._fields[0]], sample.target)}
     given = {name: (plant.control_unit, getattr(sample, name)) for name in ("command", "control")}
     time = {"t": ("s", sample.t)}
-    if taken := shown.keys() & {*time, *asked, *given}:
-        raise ValueError(f"plant.shows: no output can be called {', '.join(sorted(taken))}, like a signal of the loop")
     return {**time, **shown, **asked, **given}

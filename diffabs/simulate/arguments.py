@@ -24,6 +24,7 @@ from diffabs.simulate.step.fixed import FixedStepping
 from diffabs.simulate.types import Adaptive, Solver
 
 OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
+RESERVED_METRICS = ("", "stopped", "diverged", "timed_out")  # the plant's audit, and the end flags of a run
 
 
 def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, PyTree, PyTree]:
@@ -113,12 +114,14 @@ def refuse_unnamed(objectives: Mapping[str, Objective] | None) -> None:
         objectives: Objectives by the names of their metrics, or None.
 
     Raises:
-        ValueError: The objectives are no mapping, or a name is no text.
+        ValueError: The objectives are no mapping, or a name is no text, empty, or that of an end flag of a run.
     """
     named = isinstance(objectives, Mapping) and all(isinstance(name, str) for name in objectives)
     if objectives is not None and not named:
         given = kinds.format_value(objectives)
         raise ValueError(f'objectives = {given} is no mapping by name, such as {{"overshoot": Overshoot()}}')
+    if taken := [repr(name) for name in objectives or () if name in RESERVED_METRICS]:
+        raise ValueError(f"objectives: no metric can be called {', '.join(taken)}, like another value of a run")
 
 
 def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:

@@ -1,8 +1,5 @@
 """The unit of a control is what its plant says: the lab rig's is a command between 0 and 1, no torque."""
 
-import collections
-from types import SimpleNamespace
-
 import pytest
 from commands import run
 from matplotlib.figure import Figure
@@ -10,8 +7,6 @@ from matplotlib.text import Text
 from mutants import killed_by
 
 from diffabs import plants, plot
-from diffabs.core.loop import run_signals
-from diffabs.core.protocols import Sample
 from diffabs.objectives import Effort, TorqueRate, Variation
 from diffabs.scenario import scenario
 from diffabs.scenario.registry import unit_of
@@ -29,15 +24,6 @@ SHORT = ("--set", "solver.step=5e-5", "--set", "solver.duration=1e-3", "--set", 
 )
 def test_a_plant_says_the_unit_of_its_control(plant, unit):
     assert plant.control_unit == unit
-
-
-@killed_by("core/loop.py", "{*time, *asked, *given}", "{*time, *asked}")
-def test_an_output_with_the_name_of_a_signal_is_refused():
-    shows = collections.namedtuple("Shows", ["slip", "control"])
-    shows.units = {"slip": "1", "control": "1"}
-    sample = Sample(0.0, shows(0.1, 0.2), 0.2, 0.2, 0.0, 0.0, 0.0)
-    with pytest.raises(ValueError, match=r"^plant.shows: no output can be called control, like a signal of the loop$"):
-        run_signals(sample, SimpleNamespace(shows=shows, control_unit="V"))
 
 
 @pytest.mark.slow
