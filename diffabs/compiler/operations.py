@@ -60,6 +60,12 @@ _ST_TANH = "{0} / " + functools.reduce(lambda rest, k: f"({k}.0 + {{0}} * {{0}} 
 _ST_SINH = "{0}" + functools.reduce(
     lambda rest, k: f" * (1.0 + {{0}} * {{0}} / {k * (k + 1)}.0{rest})", range(12, 0, -2), ""
 )
+# (e^x + e^-x)/2 and (e^x - e^-x)/2. Far from 0 the product of two roots does not overflow before its half does.
+_ST_EXPONENTIALS = {
+    sign: f"SEL(ABS({{0}}) < 80.0, 0.5 * EXP(0.5 * {{0}}) * EXP(0.5 * {{0}}) {sign} 0.5 * EXP(-0.5 * {{0}}) * "
+    f"EXP(-0.5 * {{0}}), (EXP({{0}}) {sign} EXP(-{{0}})) / 2.0)"
+    for sign in "+-"
+}
 
 OPERATIONS: dict[str, Operation] = {
     "add": Operation(np.add, "{0} + {1}", "{0} + {1}", "{0} + {1}", symmetric=True),
@@ -104,8 +110,8 @@ OPERATIONS: dict[str, Operation] = {
     "atan": _function("atan", "ATAN(...)"),
     "atan2": _function("atan2", "ATAN2(...)", arity=2),
     "pow": _function("pow", "EXPT(...)", arity=2),
-    "sinh": _function("sinh", f"SEL(ABS({{0}}) < 0.5, (EXP({{0}}) - EXP(-{{0}})) / 2.0, {_ST_SINH})"),
-    "cosh": _function("cosh", "(EXP({0}) + EXP(-{0})) / 2.0"),
+    "sinh": _function("sinh", f"SEL(ABS({{0}}) < 0.5, {_ST_EXPONENTIALS['-']}, {_ST_SINH})"),
+    "cosh": _function("cosh", _ST_EXPONENTIALS["+"]),
     "tanh": _function("tanh", f"SEL(ABS({{0}}) < 0.5, 1.0 - 2.0 / (EXP(2.0 * {{0}}) + 1.0), {_ST_TANH})"),
 }
 MIRRORED = {"gt": "lt", "ge": "le"}  # the same comparison with the operands exchanged

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax._src.lax import lax  # the comparisons in a total order are not public
 from kernels import FOLDER, applied
 from mutants import killed_by
 from seams import replace_seam
@@ -90,8 +91,26 @@ def test_ends_of_functions(plain, monkeypatch):
             np.testing.assert_array_equal(np.signbit(found[name][zeros]), np.signbit(expected[zeros]), err_msg=name)
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_hyperbolic_functions_up_to_their_overflow(dtype):
+    """The exponential overflows before them, at 709.78; their halves do at 710.47, in single precision at 89.41."""
+    most = {np.float64: 710.475, np.float32: 89.415}[dtype]
+    x = np.concatenate([np.linspace(0.98 * most, most, 50), [-most, 1.001 * most, -1.001 * most, 0.5, -1e-9]]).astype(
+        dtype
+    )
+    with jax.enable_x64(dtype is np.float64):
+        functions = {"sinh": jnp.sinh, "cosh": jnp.cosh, "slope": jax.grad(jnp.sinh), "bend": jax.grad(jnp.cosh)}
+        found = applied({name: lambda x, y, k, f=f: f(x) for name, f in functions.items()}, jnp.asarray(x))
+    with np.errstate(over="ignore"):
+        sinh, cosh = np.sinh(x.astype(np.longdouble)).astype(dtype), np.cosh(x.astype(np.longdouble)).astype(dtype)
+    rtol = 4 * np.finfo(dtype).eps
+    for name, expected in {"sinh": sinh, "cosh": cosh, "slope": cosh, "bend": sinh}.items():
+        np.testing.assert_allclose(found[name], expected, rtol=rtol, err_msg=name)
+
+
 KEY, LEAST = jax.random.key(3), np.int32(-(2**31))
 TABLE, PLACE = jnp.array([3.0, 1.0, 4.0, 1.5, 9.0]), jnp.asarray(2)
+KNOTS = jnp.array([-2.0, -0.5, 0.0, 1.0, 2.5])
 
 
 def _table(x):
@@ -134,6 +153,12 @@ RULES = {
     "diagonal": lambda x, y, k: jnp.diag(jnp.stack([x, y])),
     "turned": lambda x, y, k: (x * jnp.arange(6.0).reshape(2, 3)).T.reshape(2, 3),
     "table": lambda x, y, k: _table(x),
+    "searches": lambda x, y, k: jnp.stack(
+        [jnp.searchsorted(KNOTS, x), jnp.searchsorted(KNOTS, y, side="right"), jnp.digitize(x, KNOTS[::-1])]
+    ),
+    "all compared": lambda x, y, k: jnp.searchsorted(KNOTS.astype(np.float32), y, method="compare_all"),
+    "interpolated": lambda x, y, k: jnp.stack([jnp.interp(x, KNOTS, TABLE), jnp.interp(y, x + KNOTS, y * TABLE)]),
+    "total order": lambda x, y, k: jnp.stack([lax.lt_to_p.bind(x, y), lax.le_to_p.bind(-x, y), lax.lt_to_p.bind(k, k)]),
     "uniform table": lambda x, y, k: TABLE[PLACE] * x,
     "folded": lambda x, y, k: jnp.stack(
         [
@@ -163,6 +188,9 @@ RULES = {
     "compiler/operations.py", 'NEGATED = {"eq": "ne", "ne": "eq"}', 'NEGATED = {"eq": "ne", "ne": "eq", "lt": "le"}'
 )
 @killed_by("compiler/lower/elementwise.py", '"TO_NEAREST_EVEN"', '"NEVER"')
+@killed_by(
+    "compiler/lower/elementwise.py", "graph.const(0, integer)), bits, reverse)", "graph.const(0, integer)), bits, bits)"
+)
 @killed_by(
     "compiler/lower/arrays.py",
     'better = graph.op("or", graph.op(beyond, x, best), nan)',

@@ -26,6 +26,22 @@ def _elementwise(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     return [map_entries(lambda *x: graph.op(name, *x), *ins)]
 
 
+@lowering_rule("lt_to le_to")
+def _total_order(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+    """Compare in the total order of sorting and searching: -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
+    integer = np.dtype(f"i{eqn.invars[0].aval.dtype.itemsize}")
+
+    def key(x: Node) -> Node:
+        if not is_real(x.dtype):
+            return x
+        # The bits of a real number, read as an integer, have its order; those of a negative one have the reverse order.
+        bits = graph.bits(x, integer)
+        reverse = graph.op("xor", bits, graph.const(np.iinfo(integer).max, integer))
+        return graph.select(graph.op("lt", bits, graph.const(0, integer)), bits, reverse)
+
+    return [map_entries(lambda x, y: graph.op(eqn.primitive.name[:2], key(x), key(y)), *ins)]
+
+
 def _integer_quotient(graph: Graph, x: Node, y: Node) -> Node:
     """Return an integer quotient rounded towards zero, with a value where the processor would stop the process.
 

@@ -109,7 +109,9 @@ class SwitchedProgram:
 
         Only the operations that these outputs need are evaluated.
         """
-        values = dict(self._constants)
+        # A NumPy array cannot be indexed by a traced number. It is converted here, within the present trace: a
+        # converted constant that the program kept would belong to the trace in which it was made.
+        values = {i: jnp.asarray(x) if isinstance(x, np.ndarray) else x for i, x in self._constants.items()}
         values.update(zip(self._inputs, map(jnp.asarray, jax.tree.leaves((moving, fixed))), strict=True))
         picked, tree = jax.tree.flatten(pick(self.outputs))
         trace = ComparisonTrace(self.places, self.word_count, mode, look)
