@@ -27,7 +27,7 @@ def _elementwise(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("lt_to le_to")
-def _total_order(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _total_order(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     """Compare in the total order of sorting and searching: -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
     integer = np.dtype(f"i{eqn.invars[0].aval.dtype.itemsize}")
 
