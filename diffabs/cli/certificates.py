@@ -308,7 +308,9 @@ def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings
         spec: Required properties.
         known: Results without a common Lyapunov matrix.
     """
-    stable, refuted = proof.quadratically_stable, any(proof.proved_data("infeasible"))
+    from diffabs.design.proof.schema import DISPROOF_KINDS
+
+    stable, refuted = proof.quadratically_stable, any(proof.proved_data(*DISPROOF_KINDS))
     asked = {
         "decay": (spec.decay > 0, f"decay = {spec.decay:g} 1/s", not refuted),
         "cost": (spec.Q is not None, "a guaranteed cost", True),

@@ -8,7 +8,8 @@
 
 A solver finds P in floating point. Then `design.proof.exact` proves the inequality for that P in exact arithmetic. If
 no common P exists, the multipliers of the same program prove it: W_i >= 0 with sum He[C_i W_i] > 0. If the solver gives
-no such proof, `design.pairs` looks for two vertices that exclude a common P.
+no such proof, `design.pairs` looks for two vertices that exclude a common P. A vertex that is unstable by itself needs
+no program: a P that is not definite proves it.
 """
 
 import math
@@ -17,13 +18,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from diffabs.core.types import Matrix
-from diffabs.design import pairs
+from diffabs.design import instability, pairs
 from diffabs.design.bounds import BOUND_LOOSENINGS, Bounds, decrease_matrix
 from diffabs.design.polytopes import Polytope, Schedule, as_gain_matrix
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
 from diffabs.design.proof.dyadic import RELATIVE_ERROR_BITS
 from diffabs.design.proof.exact import he
+from diffabs.design.proof.schema import DISPROOF_KINDS
 from diffabs.design.sdp import solver
 from diffabs.design.sdp.scaling import analysis_frame, lyapunov_frame
 from diffabs.design.sdp.solver import Unknowns
@@ -98,7 +100,7 @@ class _Analysis:
         stable = None if cost is None or fastest else self._decay_claim(np.asarray(cost.data["P"]), spec.decay)
         stable = stable or self._stability(fastest)
         yield from (claim for claim in (stable, cost) if claim is not None)
-        if stable is None or stable.kind == "infeasible":
+        if stable is None or stable.kind in DISPROOF_KINDS:
             return
         for wanted, find in ((spec.damping, bounds.damping), (spec.l2, bounds.l2), (spec.input, bounds.input)):
             claim = find() if wanted else None
@@ -109,6 +111,8 @@ class _Analysis:
 
     def _stability(self, fastest: bool) -> Claim | None:
         asked = self.spec.decay
+        if unstable := self._refute_by_vertex():
+            return unstable
         for _ in range(MAX_FRAMES):
             p, margin, w = self._common(asked)
             if p is None:
@@ -129,6 +133,15 @@ class _Analysis:
             except np.linalg.LinAlgError:
                 break
         return self._refute_by_pair(asked)
+
+    def _refute_by_vertex(self) -> Claim | None:
+        """Return a proof that one vertex is unstable, or None."""
+        for vertex, a in enumerate(self.closed):
+            for data in instability.witnesses(a, discrete=self.discrete):
+                claim = Claim("unstable", {**data, "vertex": vertex})
+                if self._verify_claim(claim):
+                    return claim
+        return None
 
     def _refute_by_pair(self, asked: float) -> Claim | None:
         """Return a proof of infeasibility from two vertices whose multipliers need no solver, or None."""

@@ -9,7 +9,8 @@ The checker trusts no text of a file: it does not read the names of corners and 
 claim and their ranges. In discrete time V falls by factor^2 a period.
 
     decay       P > 0, -He(P C) - 2 rate P > 0                      infeasible  W >= 0, sum He(C W) + 2 rate W > 0
-    cost        the same without a rate, and with -Q - K'RK         damping, l2, input, scheduled: see `proof.exact`
+    unstable    x'P x < 0, -He(P C) - 2 rate P >= 0 at a vertex
+    cost        decay without a rate, and with -Q - K'RK            damping, l2, input, scheduled: see `proof.exact`
 """
 
 import contextvars
@@ -42,6 +43,7 @@ FIELD_SHAPES = {
     "l2": {"P": "nn", "gamma": "", "Bw": "nw|Vnw", "C": "zn", "D": "zm"},
     "input": {"P": "nn", "limit": "m", "points": "kn"},
     "infeasible": {"W": "Vnn", "rate?": "", "factor?": ""},
+    "unstable": {"P": "nn", "x": "n", "vertex": "", "rate?": "", "factor?": ""},
     "scheduled": {"P": "Nnn", "rates": "2", "rate?": "", "Q?": "nn", "R?": "mm"},
 }
 FIELD_RANGES = {
@@ -55,6 +57,9 @@ FIELD_RANGES = {
     "Q": ("a weight: no diagonal entry below 0", lambda x: min(row[i] for i, row in enumerate(x)) >= 0),
     "R": ("a weight: all diagonal entries above 0", lambda x: min(row[i] for i, row in enumerate(x)) > 0),
 }
+
+
+DISPROOF_KINDS = ("infeasible", "unstable")  # they may also concern growth: a negative rate or a factor above 1
 
 
 class ClaimVerdict(NamedTuple):
@@ -234,8 +239,12 @@ def _read_claim(
         shapes = [shape for shape in fields[name].split("|") if len(shape) == _depth(given)]
         found[name] = _read_tensor(given, (shapes or fields[name].split("|"))[0], own, f"{where}.data.{name}")
         says, holds = FIELD_RANGES.get(name, ("", lambda _: True))
-        if kind != "infeasible" and not holds(found[name]):
+        if kind not in DISPROOF_KINDS and not holds(found[name]):
             raise ValueError(f"{where}.data.{name} is outside {says}")
+    if kind == "unstable" and found["vertex"] not in range(sizes["V"]):
+        raise ValueError(f"{where}.data.vertex is outside 0 to {sizes['V'] - 1}")
+    if any(x <= 0 for name, x in found.items() if name == "factor"):
+        raise ValueError(f"{where}.data.factor is outside (0, inf)")
     return kind, found
 
 
@@ -376,6 +385,8 @@ def _failed_inequality(kind: str, d: Mapping[str, Any], stored: StoredCertificat
         conditions = (
             _infeasibility_conditions(d, loops, stored.discrete)
             if kind == "infeasible"
+            else _instability_conditions(d, loops, stored.discrete)
+            if kind == "unstable"
             else _quadratic_conditions(kind, d, loops, k, stored)
         )
     return next((f"{words} is not positive definite" for words, holds in conditions if not holds), "")
@@ -407,6 +418,14 @@ def _infeasibility_conditions(d: Mapping[str, Any], loops: list[Matrix], discret
             )
         ),
     )
+
+
+def _instability_conditions(d: Mapping[str, Any], loops: list[Matrix], discrete: bool) -> Iterator[tuple[str, bool]]:
+    """Yield the conditions that one loop does not fall faster than the rate: V falls, and is negative at x."""
+    vertex = int(d["vertex"])
+    falls = _decrease_matrix(d["P"], loops[vertex], d, discrete)
+    yield "-x'Px", multiply_matrices([d["x"]], d["P"], transpose_matrix([d["x"]]))[0][0] < 0
+    yield f"vertex {vertex}: what V falls by", is_positive_definite(falls, semi=True)
 
 
 def _quadratic_conditions(
@@ -483,6 +502,8 @@ def _describe_claim(kind: str, d: Mapping[str, Any], discrete: bool) -> str:
     rate, factor = _format_numbers(d.get("rate", 0)), _format_numbers(d.get("factor", 1))
     pace = f"{factor} a period" if discrete else f"{rate} 1/s"
     weights = ", ".join(_describe_numbers(name, d[name]) for name in ("Q", "R") if name in d)
+    if kind == "unstable":
+        return f"vertex {_format_numbers(d['vertex'])} alone does not decay by {pace} or faster"
     if kind == "infeasible":
         some = d.get("factor", 1) < 1 if discrete else d.get("rate", 0) > 0
         return f"no common Lyapunov matrix {f'proves a decay of {pace}' if some else 'exists'}"

@@ -18,6 +18,7 @@ from mutants import killed_by
 from project import ROOT
 from seams import replace_seam
 
+from diffabs.design.analysis import certify
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
@@ -853,3 +854,60 @@ def test_costs_are_rounded_up_and_only_claimed_until_proved():
 def test_a_specification_says_what_does_not_fit(given, message):
     with pytest.raises(ValueError, match=message):
         Spec(**given).check(1, 1)
+
+
+@killed_by("design/analysis.py", "if unstable := self._refute_by_vertex():", "if unstable := None:")
+@killed_by("design/instability.py", "max(0.0, (low + high) / 2)", "0.0", case="None")
+@pytest.mark.parametrize("period", [None, 0.1])
+def test_a_growing_mode_of_one_vertex_disproves_stability(period, tmp_path):
+    """Whatever the other modes and vertices are, and in any units; the growth is 5 % a period, or 0.05 1/s."""
+    pytest.importorskip("cvxpy")
+    random = np.random.default_rng(3)
+    for _ in range(12):
+        n = int(random.integers(1, 6))
+        a, units = random.standard_normal((n, n)), 10.0 ** random.uniform(-5, 5, n)
+        modes = np.linalg.eigvals(a)
+        a = 1.05 * a / abs(modes).max() if period else a - (modes.real.max() - 0.05) * np.eye(n)
+        vertices = [0.5 * np.eye(n) if period else -np.eye(n), a * units[:, None] / units]
+        system, gain = Polytope(vertices, np.ones((2, n, 1)), period), np.zeros((1, n))
+        found = certify(gain, system)
+        assert (found.quadratically_stable, found.stable, found.claims[0].kind) == (False, None, "unstable")
+        assert both(system, gain, "unstable", **found.claims[0].data)
+        found.save(tmp_path / "c.json")
+        assert [verdict.reason for verdict in verify_file(tmp_path / "c.json")] == [""]
+
+
+def test_a_sum_of_states_that_stays_disproves_stability():
+    """The speed of a mass without a force stays: no rounding of its entries changes that."""
+    pytest.importorskip("cvxpy")
+    found = certify([0.0, 0.0], Polytope([[[0.0, 1.0], [0.0, 0.0]]], [[[0.0], [1.0]]]))
+    assert found.quadratically_stable is False
+    assert both(found.system, found.gain, "unstable", **found.claims[0].data)
+
+
+@killed_by("design/proof/exact.py", 'yield Inequality((-(row @ data["P"] @ row.mT),))', "pass")
+@killed_by("design/verify.py", 'd["x"]]))[0][0] < 0', 'd["x"]]))[0][0] < 9')
+@pytest.mark.parametrize(
+    ("a", "period", "data", "proved"),
+    [
+        (-1.0, None, {"P": [[1.0]], "x": [1.0], "vertex": 0.0}, False),  # P > 0: the loop is stable
+        (-1.0, None, {"P": [[-1.0]], "x": [1.0], "vertex": 0.0}, False),
+        (-1.0, None, {"P": [[-1.0]], "x": [1.0], "vertex": 0.0, "rate": 1 + 1e-9}, True),  # slower than that rate
+        (1.0, None, {"P": [[-1.0]], "x": [0.0], "vertex": 0.0}, False),
+        (1.0, None, {"P": [[-1.0]], "x": [1.0], "vertex": 0.0, "rate": -1 + 1e-9}, True),
+        (1.0, None, {"P": [[-1.0]], "x": [1.0], "vertex": 0.0, "rate": -1 - 1e-9}, False),
+        (2.0, 0.1, {"P": [[-1.0]], "x": [1.0], "vertex": 0.0, "factor": 2 - 1e-9}, True),
+        (2.0, 0.1, {"P": [[-1.0]], "x": [1.0], "vertex": 0.0, "factor": 2 + 1e-9}, False),
+    ],
+)
+def test_a_scalar_grows_at_its_rate(a, period, data, proved, tmp_path):
+    system = scalar(a, period)
+    assert both(system, [[0.0]], "unstable", **data) == proved
+    Certificate(system, [[0.0]], (Claim("unstable", data),)).save(tmp_path / "c.json")
+    assert [not verdict.reason for verdict in verify_file(tmp_path / "c.json")] == [proved]
+
+
+def test_a_vertex_that_does_not_exist_is_refused():
+    for vertex in (1.0, 0.5, -1.0):
+        with pytest.raises(ValueError, match=r"^unstable.vertex must be one of 0 to 0; got "):
+            Certificate(scalar(1.0), [[0.0]], (Claim("unstable", {"P": [[-1.0]], "x": [1.0], "vertex": vertex}),))

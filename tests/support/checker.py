@@ -13,6 +13,7 @@ from typing import Any
 # a letter for each axis: n states, m inputs, V vertices, N nodes, 2 itself; "?" need not be there
 FIELDS = {"decay": "P:nn rate?: factor?:", "cost": "P:nn Q:nn R:mm x0?:n", "damping": "P:nn cot: zeta:"}
 FIELDS |= {"l2": "P:nn gamma: Bw:nw|Vnw C:zn D:zm", "input": "P:nn limit:m points:kn"}
+FIELDS |= {"unstable": "P:nn x:n vertex: rate?: factor?:"}
 FIELDS |= {"infeasible": "W:Vnn rate?: factor?:", "scheduled": "P:Nnn rates:2 rate?: Q?:nn R?:mm"}
 RANGES = {"rate": lambda x: x >= 0, "factor": lambda x: 0 < x <= 1, "zeta": lambda x: 0 <= x < 1}
 RANGES |= {"cot": lambda x: x >= 0, "gamma": lambda x: x > 0, "limit": lambda x: min(x) > 0}
@@ -103,6 +104,11 @@ def of_polytope(kind, loops, K, d, discrete):
         S = [C @ w @ C.T - factor**2 * w if discrete else he(C @ w) + 2 * rate * w for C, w in pairs]
         yield all(positive(w, semi=True) for w in W) and positive(sum(S[1:], S[0]))
         return
+    if kind == "unstable":
+        C, x = loops[int(d["vertex"])], matrix([d["x"]])
+        yield positive(-(x @ P @ x.T))
+        yield positive(factor**2 * P - C.T @ P @ C if discrete else -he(P @ C) - 2 * rate * P, semi=True)
+        return
     yield positive(P)
     per_vertex = kind == "l2" and isinstance(d["Bw"][0][0], list)
     for C, Bw in zip(loops, d["Bw"] if per_vertex else [d.get("Bw")] * len(loops), strict=True):
@@ -162,7 +168,7 @@ def checked(kind, data, sizes, discrete):
     for name, value in d.items():
         if not any(fits(value, letters, dict(sizes)) for letters in known[name][0].split("|")):
             raise ValueError(f"{kind}.{name} has another shape than {known[name][0]!r} of {sizes}")
-        growth = kind == "infeasible" and (name == "rate" or (name == "factor" and value > 0))
+        growth = kind in ("infeasible", "unstable") and (name == "rate" or (name == "factor" and value > 0))
         if name in RANGES and not growth and not RANGES[name](value):
             raise ValueError(f"{kind}.{name} is out of its range")
     return d

@@ -10,6 +10,7 @@ their data, by kind:
     l2          P, gamma, Bw, C, D                  the gain from w to C x + D u is below gamma
     input       P, limit, points                    |u| <= limit for ever from the hull of the points
     infeasible  W, rate (factor)                    no common P proves the rate
+    unstable    P, x, vertex, rate (factor)         this vertex alone does not decay by the rate or faster
     scheduled   P, rates, maybe rate, Q, R          the same with P(p), p' between the two `rates`
 """
 
@@ -115,20 +116,24 @@ class Certificate:
 
     @property
     def quadratically_stable(self) -> bool | None:
-        """True if one P is proved to decrease at all vertices, False if a proof excludes such a P, otherwise None."""
+        """True if one P is proved to decrease at all vertices, False if a proof excludes such a P, otherwise None.
+
+        A vertex with a growing mode excludes such a P, whatever the others are.
+        """
         # A scheduled claim with equal P at all nodes is a proof for one P.
         one = [data["P"] for data in self.proved_data("scheduled") if (data["P"] == data["P"][0]).all()]
         if one or any(self.proved_data(*QUADRATIC_KINDS)):
             return True
         # Only a witness against the rate 0 excludes stability; a witness against a faster decay leaves it open.
         refuted = (
-            data.get("rate", 0.0) <= 0 and data.get("factor", 1.0) >= 1 for data in self.proved_data("infeasible")
+            data.get("rate", 0.0) <= 0 and data.get("factor", 1.0) >= 1
+            for data in self.proved_data(*schema.DISPROOF_KINDS)
         )
         return False if any(refuted) else None
 
     @property
     def stable(self) -> bool | None:
-        """True if any proved claim except `infeasible` implies stability; else None, never False.
+        """True if any proved claim except a disproof implies stability; else None, never False.
 
         Every such claim has a P, or a P that depends on a schedule's parameter, that decreases along all trajectories.
         """

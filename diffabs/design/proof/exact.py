@@ -205,6 +205,23 @@ def infeasibility_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> It
     yield Inequality(tuple(S[i] for i in range(W.shape[0])), ALL_VERTICES)
 
 
+def instability_conditions(loop: ClosedLoop, data: Mapping[str, Matrix], vertex: int) -> Iterator[Inequality]:
+    """Yield the conditions that the loop at one vertex falls slower than exp(-rate t), or `factor` a period.
+
+    They are He(P C) + 2 rate P <= 0 and x'P x < 0. From x on, V = x'P x is at most V(0) exp(-2 rate t), so it stays
+    negative, and |x| does not fall faster (Lyapunov's theorem of instability, for a rate of at most 0).
+
+    Args:
+        loop: Closed loops of the vertices.
+        data: Data of the claim.
+        vertex: Number of the vertex.
+    """
+    x = data["x"]
+    row = block_matrix([[x[i : i + 1] * np.eye(1) for i in range(x.shape[0])]])
+    yield Inequality((-(row @ data["P"] @ row.mT),))
+    yield Inequality(decrease_terms(loop._replace(C=loop.C[vertex : vertex + 1]), data["P"], data), vertex, False)
+
+
 def schedule_conditions(
     cells: list[tuple[Matrix, Matrix]], nodes: Matrix, gain: Matrix, data: Mapping[str, Matrix]
 ) -> Iterator[Inequality]:
@@ -275,9 +292,10 @@ def conditions(kind: str, system: Polytope | Schedule, gain: Matrix, data: Param
     if isinstance(system, Schedule):
         cells = [(vertex(cell.A), vertex(cell.B)) for cell in system.cells]
         return schedule_conditions(cells, known(system.nodes), K, lifted)
-    return CLAIM_CONDITIONS[kind](
-        ClosedLoop(K, vertex(system.A) + vertex(system.B) @ K, system.period is not None), lifted
-    )
+    loop = ClosedLoop(K, vertex(system.A) + vertex(system.B) @ K, system.period is not None)
+    if kind == "unstable":
+        return instability_conditions(loop, lifted, int(data["vertex"]))
+    return CLAIM_CONDITIONS[kind](loop, lifted)
 
 
 def is_satisfied(inequality: Inequality) -> bool:
@@ -291,7 +309,7 @@ def is_satisfied(inequality: Inequality) -> bool:
     matrices = total.ints.reshape(-1, k, k)
     if not (matrices == matrices.mT).all():
         return False
-    if total.error is None:
+    if total.error is None or not (inequality.strict or np.any(total.error)):
         return all(is_positive_definite(matrix, inequality.strict) for matrix in matrices.tolist())
     errors = np.broadcast_to(total.error, total.shape).reshape(-1, k, k)
     return all(is_robustly_positive(matrix, error, total.bits) for matrix, error in zip(matrices, errors, strict=True))

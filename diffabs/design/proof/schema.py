@@ -16,6 +16,7 @@ FIELD_SHAPES = {
     "l2": {"P": "nn", "gamma": "", "Bw": "nw|Vnw", "C": "zn", "D": "zm"},
     "input": {"P": "nn", "limit": "m", "points": "kn"},
     "infeasible": {"W": "Vnn", "rate?": "", "factor?": ""},
+    "unstable": {"P": "nn", "x": "n", "vertex": "", "rate?": "", "factor?": ""},
     "scheduled": {"P": "Nnn", "rates": "2", "rate?": "", "Q?": "nn", "R?": "mm"},
 }
 FIELD_RANGES: dict[str, tuple[str, Callable[[PyTree], PyTree]]] = {
@@ -28,7 +29,8 @@ FIELD_RANGES: dict[str, tuple[str, Callable[[PyTree], PyTree]]] = {
     "rates": ("increase", lambda value: value[0] <= value[1]),
 }
 # A disproof may also concern growth: a factor above 1 or a negative rate.
-INFEASIBLE_RANGES = {"factor": ("be positive", FIELD_RANGES["gamma"][1])}
+DISPROOF_KINDS = ("infeasible", "unstable")
+DISPROOF_RANGES = {"factor": ("be positive", FIELD_RANGES["gamma"][1])}
 
 
 def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Params) -> None:
@@ -64,11 +66,13 @@ def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: 
             raise ValueError(f"{kind}.{name} has shape {np.shape(data[name])}; needed: {shape or 'a number'}, {sizes}")
         if not np.isfinite(data[name]).all():
             raise ValueError(f"{kind}.{name} has an entry that is not finite")
-        says, holds = (INFEASIBLE_RANGES if kind == "infeasible" else FIELD_RANGES).get(
+        says, holds = (DISPROOF_RANGES if kind in DISPROOF_KINDS else FIELD_RANGES).get(
             name, ("be finite", np.isfinite)
         )
         if not np.all(holds(data[name])):
             raise ValueError(f"{kind}.{name} must {says}; got {data[name]}")
+    if kind == "unstable" and data["vertex"] not in range(sizes["V"]):
+        raise ValueError(f"unstable.vertex must be one of 0 to {sizes['V'] - 1}; got {data['vertex']}")
 
 
 def check_gain(system: Polytope | Schedule, gain: np.ndarray) -> dict[str, int]:
