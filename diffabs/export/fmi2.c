@@ -61,6 +61,7 @@ EXPORT fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean tolerant, dou
   if (!in(m, INSTANTIATED) || !isfinite(start) || (stops && !(stop >= start)))
     return fmi2Error;
   m->time = start;
+  m->stop = stops ? stop : (double)INFINITY;
   m->ready = 1;
   return fmi2OK;
 }
@@ -140,6 +141,9 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, double from, double length, fmi2Bo
   const double count = fabs(whole - nearest) <= 1e-6 * nearest ? nearest : ceil(whole);
   (void)no_return;
   if (!in(m, RUNNING) || !isfinite(from) || !(length > 0) || !(count < 1e9))
+    return fmi2Error;
+  /* FMI 2.0, section 2.1.6: a step past the stop time is an error. Importers add up times, so rounding is no such step. */
+  if (isfinite(m->stop) && from + length > m->stop + 1e-9 * (fabs(m->stop) + length))
     return fmi2Error;
   for (long i = 0; i < (long)count; i++) {
     const double h = length / count;

@@ -84,7 +84,7 @@ def _source(plant: PlantSource, guid: str, step: float) -> str:
     outputs = sum(one.role == "output" for one in plant.variables)
     number = Words("double", lambda op, place: place).literal  # a literal has no place
     begun = ", ".join(number(one.value) for one in plant.variables)
-    struct = "double v[VARIABLES], x[STATES], time;\n  int phase, ready;\n  char guid[sizeof GUID];"
+    struct = "double v[VARIABLES], x[STATES], time, stop;\n  int phase, ready;\n  char guid[sizeof GUID];"
     limits = {name: ", ".join(number(getattr(one, name)) for one in plant.variables) for name in ("low", "high")}
     head = (
         "#include <math.h>\n#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n\n"

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from diffabs.core.optional import import_optional
 from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.runtime.summary import Summary, round_for_table
 
@@ -92,8 +93,9 @@ def to_pandas(run: PyTree, plant: Part = None) -> Scalar:
 
     Raises:
         ValueError: The runs are a batch with trajectories.
+        ModuleNotFoundError: pandas is not installed.
     """
-    import pandas  # pyright: ignore[reportMissingImports]  # the user has it, or not
+    pandas = import_optional("pandas")
 
     if run.trajectory is None:
         flags = {name: getattr(run, name) for name in ("stopped", "diverged", "timed_out")}
@@ -116,8 +118,9 @@ def to_xarray(run: PyTree, plant: Part = None) -> Scalar:
 
     Raises:
         ValueError: The run has no trajectory, or it is a batch of runs.
+        ModuleNotFoundError: xarray is not installed.
     """
-    import xarray  # pyright: ignore[reportMissingImports]  # the user has it, or not
+    xarray = import_optional("xarray")
 
     found = trajectory_columns(run, plant)
     each = {name: ("t", values, {"units": unit}) for name, (unit, values) in found.items()}

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from diffabs.config.values import ScenarioError, unknown_name_error
+from diffabs.core.optional import import_optional
 from diffabs.core.types import JsonObject, Matrix, PyTree, Scalar
 from diffabs.runtime import files
 from diffabs.runtime.summary import Summary
@@ -165,19 +166,20 @@ class Results:
 
     def pandas(self) -> PyTree:
         """Return a pandas.DataFrame indexed by sample, with a column `failed`, and units in `attrs["units"]`."""
+        import_optional("pandas")
         frame = self.table().to_pandas().set_index("sample").assign(failed=self.failed_samples())
         frame.attrs["units"] = self.units
         return frame
 
     def polars(self) -> Scalar:
         """Return a polars.DataFrame with a column `failed`."""
-        import polars  # pyright: ignore[reportMissingImports]  # optional
-
+        polars = import_optional("polars")
         frame: Matrix = polars.from_arrow(self.table())
         return frame.with_columns(polars.Series("failed", self.failed_samples()))
 
     def xarray(self) -> PyTree:
         """Return an xarray.Dataset over the dimension `sample`, with `units` at its variables."""
+        import_optional("xarray")
         data = self.pandas().to_xarray()
         for name, unit in self.units.items():
             if name in data:

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 from diffabs.config.values import unknown_name_error
 from diffabs.runtime import files
 
+# Of bytes: a thread of pyarrow that still holds an open Python file ends the process when Python ends.
 TABLE_READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
 
 
@@ -29,8 +30,9 @@ def read_column(path: pathlib.Path, column: str) -> np.ndarray:
         raise ValueError(f"{path} is neither {' nor '.join(TABLE_READERS)}")
     try:
         with files.open_regular(path) as file:
-            table = TABLE_READERS[path.suffix.lower()](file)
-            names = table.column_names
+            data = pa.BufferReader(file.read())
+        table = TABLE_READERS[path.suffix.lower()](data)
+        names = table.column_names
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or str(error).splitlines()[0]}") from None
     except (pa.ArrowException, UnicodeDecodeError) as error:

@@ -274,6 +274,25 @@ def test_calls_out_of_order_are_errors(calls, refused, strict):
     assert one.call(*CALLS[last]) == (3 if refused else 0)
 
 
+@killed_by("export/fmi2.c", "if (isfinite(m->stop) && from + length", "if (0 && from + length")
+@killed_by("export/fmi2.c", "m->stop + 1e-9 * (fabs(m->stop) + length)", "m->stop")
+def test_no_step_passes_the_stop_time(strict):
+    """FMI 2.0, 2.1.6: an error. Times that an importer adds up differ from the stop time by rounding."""
+    one = strict()
+    assert one.call("SetupExperiment", 0, ZERO, ZERO, 1, ctypes.c_double(0.1)) == 0
+    assert [one.call(*CALLS[name]) for name in ("enter", "exit")] == [0, 0]
+    assert one.step(0.0, 0.2) == 3
+    time, length = 0.0, 0.01 * (1 + 1e-12)
+    for _ in range(10):
+        assert one.step(time, length) == 0  # the refused step changed nothing
+        time += length
+    assert time > 0.1
+    assert one.step(time, length) == 3
+    assert one.call("Reset") == 0
+    assert [one.call(*CALLS[name]) for name in ("setup", "enter", "exit")] == [0, 0, 0]
+    assert one.step(0.0, 0.2) == 0  # no stop time is declared
+
+
 def test_calls_without_an_instance_are_errors(strict):
     one = strict()
     one.instance = None

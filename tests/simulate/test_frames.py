@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -111,6 +112,15 @@ def test_many_runs_are_counted_and_a_traced_one_can_be_shown():
     frame = many.pandas()
     np.testing.assert_array_equal(frame["iae"], values)
     assert frame["stopped"].tolist() == [True] * 3
+
+
+@killed_by("simulate/convert.py", 'pandas = import_optional("pandas")', "import pandas", case="pandas")
+@killed_by("simulate/convert.py", 'xarray = import_optional("xarray")', "import xarray", case="xarray")
+@pytest.mark.parametrize("package", ["pandas", "xarray"])
+def test_a_package_that_is_missing_is_named(run, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
+    with pytest.raises(ModuleNotFoundError, match=f"^{package} is not installed: pip install {package}$"):
+        getattr(run, package)(rig().plant)
 
 
 @killed_by("simulate/convert.py", "[:count]) for name, (unit, values)", ") for name, (unit, values)")

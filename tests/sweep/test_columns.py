@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from commands import assert_one_error_line, run
 from mutants import killed_by
@@ -12,7 +13,7 @@ from sweeping import SCENARIO
 
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import ScenarioError, dump, load, loads
-from diffabs.sweep import Empirical, Results
+from diffabs.sweep import Empirical, Results, sample_files
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -118,3 +119,17 @@ def test_what_is_wrong_with_the_table_is_said(scenario, given, needed):
         section_sweep.build_study(load(scenario, [f"sweep.over.plant.mass={given}"]))
     assert needed in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@killed_by("sweep/sample_files.py", "pa.BufferReader(file.read())", "file")
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_no_thread_of_the_reader_holds_a_python_file(suffix, tmp_path, monkeypatch):
+    """Such a thread ends the process by an abort if it is alive when Python ends, often with one core."""
+    (tmp_path / f"gap{suffix}").write_bytes(b"")
+    sources = []
+    monkeypatch.setitem(
+        sample_files.TABLE_READERS, suffix, lambda source: sources.append(source) or pa.table({"v": []})
+    )
+    with pytest.raises(ValueError, match="column v is empty"):
+        sample_files.read_column(tmp_path / f"gap{suffix}", "v")
+    assert isinstance(sources[0], pa.BufferReader)

@@ -1,0 +1,17 @@
+"""Packages that a user may have or not."""
+
+import importlib
+from typing import Any
+
+
+def import_optional(name: str) -> Any:
+    """Return the package `name`, which no extra of diffabs brings.
+
+    Raises:
+        ModuleNotFoundError: It, or a package that it needs, is not installed. The message is one line.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        missing = error.name or name
+        raise ModuleNotFoundError(f"{missing} is not installed: pip install {missing}", name=missing) from error
