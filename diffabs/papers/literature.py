@@ -122,8 +122,7 @@ def _time_between(run: Run, row: Table) -> float:
 
 
 def _braking_rate(run: Run, row: Table) -> float:
-    first, last = row["speeds"]
-    return (first - last) / (GRAVITY * _time_between(run, row))
+    return row["rate_times_time"] / _time_between(run, row)
 
 
 def _mean_slip(run: Run, row: Table) -> float:
@@ -277,12 +276,12 @@ def judge_row(row: Table) -> JsonObject:
     """
     overrides, printed, ours = row.get("set", []), row.get("printed"), our_value(row)
     tolerance = row.get("tolerance", row.get("relative", 0.0) * (printed or 0.0))
-    if ours is None or printed is None:
-        verdict, tolerance = "undecidable", None
-    elif row.get("at_most", False):
-        verdict = "reproduced" if ours <= printed + tolerance else "refuted"
-    else:
-        verdict = "reproduced" if abs(ours - printed) <= tolerance else "refuted"
+    verdict = "undecidable"
+    if ours is not None and printed is not None:
+        values = [ours, *(our_value({**row, "set": [*overrides, *near]}) for near in row.get("nearby", []))]
+        excess = (value - printed if row.get("at_most", False) else abs(value - printed) for value in values)
+        verdicts = {"reproduced" if by <= tolerance else "refuted" for by in excess}
+        verdict = verdicts.pop() if len(verdicts) == 1 else verdict
     scenario = row.get("scenario")
     texts = [text for override in overrides for text in ("--set", override)]
     if scenario is not None and scenario.startswith("examples/"):
@@ -295,7 +294,7 @@ def judge_row(row: Table) -> JsonObject:
         "printed": printed,
         "at_most": row.get("at_most", False),
         "ours": ours,
-        "tolerance": tolerance,
+        "tolerance": None if verdict == "undecidable" else tolerance,
         "verdict": verdict,
         "cause": row.get("cause", ""),
         "bound": _bound(row, overrides),

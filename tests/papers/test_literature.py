@@ -118,6 +118,97 @@ def test_the_limit_cycle_and_the_three_broken_conditions():
     assert {row["verdict"] for row in rows} == {"reproduced"}
 
 
+def committed_row(source, quantity):
+    return next(row for row in committed()["rows"] if (row["source"], row["quantity"]) == (source, quantity))
+
+
+@killed_by("papers/literature.py", "[*overrides, *near]", "overrides")
+def test_a_row_whose_verdict_changes_nearby_is_undecidable(monkeypatch):
+    """0.4 s over 3.5 is refuted; with a torque of 798 the number agrees."""
+    row = {"source": "a", "quantity": "b", "unit": "s", "place": "c", "printed": 3.5, "tolerance": 0.04}
+    monkeypatch.setattr(
+        literature, "our_value", lambda row: {(): 3.9, ("798",): 3.52, ("799",): 3.6}[tuple(row["set"])]
+    )
+    judged = {near: judge_row(row | {"set": [], "nearby": [list(near)]}) for near in (("798",), ("799",))}
+    assert [one["verdict"] for one in judged.values()] == ["undecidable", "refuted"]
+    assert [one["tolerance"] for one in judged.values()] == [None, 0.04]
+
+
+def stop_of_band_logic(torque):
+    """Stop time [s] of the combined logic on the wet road, by RK4 with two steps a millisecond."""
+    knots, friction = [0, 0.09, 0.15, 0.21, 0.25, 1], [0, 0.63, 0.75, 0.81, 0.81, 0.51]
+
+    def rate(wheels, torque):
+        car, wheel = wheels
+        mu = np.interp((car - wheel) / car, knots, friction)
+        drag = 0.14649375 * (0.31 * car) ** 2 + 3560 * mu + 0.01 * 350 * 9.81
+        return np.array([-drag / (350 * 0.31), (3560 * 0.31 * mu - torque) / 0.65])
+
+    wheels, h = np.array([100.0, 100.0]), 5e-4
+    for k in range(5000):
+        if wheels[0] < 5:
+            return k * 1e-3
+        slip = 1 - wheels[1] / wheels[0]
+        for _ in range(2):
+            a = rate(wheels, torque)
+            b = rate(wheels + h / 2 * a, torque)
+            c = rate(wheels + h / 2 * b, torque)
+            wheels = np.maximum(wheels + h / 6 * (a + 2 * b + 2 * c + rate(wheels + h * c, torque)), 0.0)
+        torque *= 1.05 if slip < 0.1 else 0.92 if slip > 0.26 else 1.0
+    return np.inf
+
+
+def test_the_combined_logic_on_the_wet_road_is_on_a_knife_edge():
+    """The printed 3.512 s is that of 798 N m within 1 %, and not that of 800."""
+    row = committed_row("pagawali", "stop time, combined logic, wet road")
+    assert (row["verdict"], row["tolerance"]) == ("undecidable", None)
+    assert row["ours"] == pytest.approx(stop_of_band_logic(800.0), abs=0.002)
+    assert row["printed"] == pytest.approx(stop_of_band_logic(798.0), rel=0.01)
+    for torque, stop in ((799.0, 3.63), (801.0, 3.62)):
+        assert stop_of_band_logic(torque) == pytest.approx(stop, abs=0.005)
+        assert f"{stop:.2f}" in row["cause"]
+
+
+def slips_of_pid(counts, brake):
+    """Slips after 10 to 40 ms of the sampled PID, whose integral counts the first error `counts` times."""
+    state, integral, before, filtered, slips = np.array([71.255664, 32.760118, brake]), 0.0, 0.0, 0.0, []
+
+    def slip_of(state):
+        return 1 - 0.3 * state[0] / state[1]
+
+    def rates(t, state, pressure):
+        slip = slip_of(state)
+        mu = 2 * 0.9 * 0.25 * slip / (0.25**2 + slip**2)
+        wheel = (440 * 9.81 * mu * 0.3 - 0.08 * state[0] - state[2]) / 1.6
+        return [wheel, -9.81 * mu - 0.856 / 440 * state[1] ** 2, (0.8 * pressure - state[2]) / 3e-3]
+
+    for k in range(4):
+        error, pressure = 0.25 - slip_of(state), 0.0
+        for _ in range(counts if k == 0 else 1):
+            integral += 0.01 * error
+            filtered = (1e-3 * filtered + error - before) / (1e-3 + 0.01)
+            before, pressure = error, np.clip(3000 * (error + integral / 0.1 + 0.01 * filtered), 0, 1800)
+        state = solve_ivp(rates, (0, 0.01), state, args=(pressure,), rtol=1e-9, atol=1e-9).y[:, -1]
+        slips.append(slip_of(state))
+    return slips
+
+
+def test_the_sampled_pid_counts_its_first_error_twice():
+    """With the second count the slips have the printed six digits, without it they are ours."""
+    rows = [row for row in committed()["rows"] if row["source"] == "astyan"]
+    np.testing.assert_allclose(slips_of_pid(2, 7.269969), [row["printed"] for row in rows], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(slips_of_pid(1, 0.0), [row["ours"] for row in rows], rtol=0, atol=1e-5)
+    assert [row["scheme"] for row in rows] == [row["printed"] for row in rows]
+
+
+def test_the_braking_rate_is_that_of_the_rule():
+    """ECE R13, annex 13: z_AL = 0.849/t_m. Five digits are committed."""
+    rate, time = (
+        committed_row("staroletov", name)["ours"] for name in ("braking rate z_AL", "time from 45 to 15 km/h")
+    )
+    assert rate == pytest.approx(0.849 / time, rel=4e-5)  # half a unit of the last digit of each
+
+
 def position_by_matrix_exponential(plant, kp, ki, target, period, samples):
     """Position before each sample of an exact sampled PI, shape (samples,); the sum counts the present sample."""
     decay = (plant.resistance + plant.constant**2 / plant.friction) / plant.inductance
