@@ -30,7 +30,7 @@ from diffabs.simulate.drive.engine import EngineError
 
 T = TypeVar("T")
 
-FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, interrupt.INTERRUPTED, interrupt.TERMINATED
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, interrupt.INTERRUPTED
 SILENCE_S, SECOND_INTERRUPT_S = progress.SILENCE_S, progress.REPEAT_S
 AWAKE = 0.1  # s between two checks for Ctrl-C
 LOUD = ("error:", "warning:", "verdict:", "interrupted")  # lines that --quiet does not silence
@@ -261,6 +261,23 @@ def end_on_errors() -> Iterator[None]:
         fail(line)
 
 
+@contextlib.contextmanager
+def show_before_errors(show: Callable[[], object]) -> Iterator[None]:
+    """Show results before an error of the `with` block, such as of a full disk, ends the command.
+
+    Args:
+        show: Function that writes the results of the work before the block.
+
+    Raises:
+        BaseException: The block raised it.
+    """
+    try:
+        yield
+    except BaseException:
+        show()
+        raise
+
+
 def _is_output_refused() -> bool:
     """Return True if standard output cannot be written, as on a full disk."""
     try:
@@ -397,12 +414,12 @@ def leave(status: Int) -> NoReturn:
     the work's unfinished files and processes.
 
     Args:
-        status: Exit status. A process that SIGTERM interrupted gets `TERMINATED` in place of `INTERRUPTED`.
+        status: Exit status. A process that another signal interrupted gets its status in place of `INTERRUPTED`.
 
     Raises:
         SystemExit: No work runs, so the interpreter can end as usual.
     """
-    status = TERMINATED if status == INTERRUPTED and interrupt.was_terminated() else status
+    status = interrupt.exit_status() if status == INTERRUPTED else status
     if any(thread.name == WORKER for thread in threading.enumerate()):
         for child in multiprocessing.active_children():
             child.kill()

@@ -4,6 +4,7 @@ import html
 import logging
 import pathlib
 import secrets
+import signal
 import socket
 import sys
 import tempfile
@@ -74,6 +75,16 @@ def serve(
             if browser:
                 webbrowser.open(write_redirect_file(url, pathlib.Path(private)).as_uri())
 
+    hang_up = getattr(signal, "SIGHUP", None)  # a closed terminal; uvicorn hears only SIGINT and SIGTERM
+    answer = signal.getsignal(hang_up) if hang_up else None
+
+    def end_on_hang_up(number: int, frame: Any) -> None:
+        if callable(answer):
+            answer(number, frame)
+        server.should_exit = True
+
+    if hang_up and callable(answer):
+        signal.signal(hang_up, end_on_hang_up)
     with tempfile.TemporaryDirectory(prefix="diffabs-explore-") as private:
         threading.Thread(target=announce, daemon=True).start()
         server.run(sockets=[there])

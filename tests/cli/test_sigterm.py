@@ -1,6 +1,9 @@
-"""SIGTERM is an orderly end: exit status 143, what is whole stays, nothing else does: no file, no process."""
+"""SIGTERM and SIGHUP are an orderly end: exit status 143, 129; what is whole stays, nothing else does."""
 
+import os
+import pty
 import signal
+import subprocess
 import sys
 import time
 
@@ -8,7 +11,10 @@ import psutil
 import pytest
 from commands import left_in
 from mutants import killed_by
+from project import ROOT
 from sweeping import PATIENCE, SCENARIO, chunks, command, started, until
+
+from diffabs.runtime import interrupt
 
 LONG = ("--samples", "640000")
 
@@ -21,9 +27,9 @@ def room(tmp_path, monkeypatch):
     return tmp_path
 
 
-def ended(process, children=()):
+def ended(process, children=(), status=143):
     out, err = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 143, err
+    assert process.returncode == status, err
     assert "Traceback" not in err
     assert not psutil.wait_procs(children, timeout=PATIENCE)[1]
     return out, err
@@ -85,13 +91,14 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.slow
-@killed_by("cli/console.py", "        files.remove_unfinished()\n", "")
-def test_what_a_thread_was_writing_goes_with_it(tmp_path):
+@killed_by("cli/console.py", "        files.remove_unfinished()\n", "", case="SIGTERM")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+def test_what_a_thread_was_writing_goes_with_it(tmp_path, number):
     with started(sys.executable, "-c", LEAVING, str(tmp_path)) as process:
         assert process.stdout.readline() == "begun\n"
         assert left_in(tmp_path) == {"half.tmp"}
-        process.send_signal(signal.SIGTERM)
-        ended(process)
+        process.send_signal(number)
+        ended(process, status=128 + number)
     assert left_in(tmp_path) == set()
 
 
@@ -105,3 +112,58 @@ def test_a_run_leaves_no_half_file(room):
         out, err = ended(process)
     assert (out, err.splitlines()[-1]) == ("", "interrupted")
     assert left_in(room) == {"temporary"}
+
+
+# The module alone, as it is before JAX is imported.
+ALONE = """
+import importlib.util, os, signal, sys, time
+spec = importlib.util.spec_from_file_location("interrupt", sys.argv[1])
+interrupt = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(interrupt)
+sys.argv = ["diffabs"]
+"""
+EARLY = f"""{ALONE}
+interrupt.end_early_on_interrupt()
+print("begun", flush=True)
+time.sleep(100)
+"""
+HUNG_UP = f"""{ALONE}
+interrupt.begin_hearing()
+print("begun", flush=True)
+while not interrupt.take_interrupt():
+    time.sleep(0.01)
+print("a line for a terminal that is gone", file=sys.stderr, flush=True)
+os._exit(interrupt.exit_status())
+"""
+INTERRUPT = ROOT / "diffabs" / "runtime" / "interrupt.py"
+
+
+@killed_by("runtime/interrupt.py", "_answer_end(number, _leave)", "pass", case="SIGTERM")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+def test_a_signal_during_the_imports(number):
+    with started(sys.executable, "-c", EARLY, str(INTERRUPT)) as process:
+        assert process.stdout.readline() == "begun\n"
+        process.send_signal(number)
+        assert ended(process, status=128 + number) == ("", "interrupted\n")
+
+
+@killed_by("runtime/interrupt.py", "os.dup2(nowhere, stream)", "pass")
+def test_what_is_written_to_a_closed_terminal_is_no_error():
+    terminal, line = pty.openpty()
+    command = [sys.executable, "-c", HUNG_UP, str(INTERRUPT)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=line, text=True) as process:
+        os.close(line)
+        assert process.stdout.readline() == "begun\n"
+        os.close(terminal)
+        process.send_signal(signal.SIGHUP)
+        assert process.wait(timeout=PATIENCE) == 129
+
+
+@killed_by("runtime/interrupt.py", "in (signal.SIG_DFL, _leave):", "is not None:")
+def test_under_nohup_a_closed_terminal_is_nothing():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        interrupt.begin_hearing()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
