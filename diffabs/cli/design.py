@@ -3,6 +3,7 @@
 `design` and `certify` need the extra `design`. Modules that need it are imported only when a command runs.
 """
 
+import functools
 import math
 import pathlib
 from collections.abc import Sequence
@@ -43,10 +44,12 @@ def design(
                 if as_json:
                     show.as_json(certificates.proof_document(task, reason=str(error)))
                 console.fail(f"{task.chosen.name}: {error}", console.FAILED)
+            numbers = {name: getattr(found, name) for name in (*certificates.FROM_DESIGN, "trace_cost")}
+            document = functools.partial(certificates.proof_document, task, found.certificate, **numbers)
             if file:
-                found.certificate.save(file)
-        numbers = {name: getattr(found, name) for name in (*certificates.FROM_DESIGN, "trace_cost")}
-        _show(certificates.proof_document(task, found.certificate, out, **numbers), task, as_json)
+                with console.show_before_errors(lambda: _show(document(), task, as_json)):
+                    found.certificate.save(file)
+        _show(document(out), task, as_json)
 
 
 def certify(
@@ -67,7 +70,8 @@ def certify(
             task = _prepare(scenario, changes or (), gain)
             found = console.run_with_progress(lambda: certificates.certify_gain(task), f"certifying {task.chosen.name}")
             if file:
-                found.save(file)
+                with console.show_before_errors(lambda: _show(certificates.proof_document(task, found), task, as_json)):
+                    found.save(file)
         known = console.run_with_progress(
             lambda: certificates.find_further(task, found), "analysing the loops at fixed parameters"
         )

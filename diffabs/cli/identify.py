@@ -4,6 +4,7 @@ It needs the extra `tune`. Modules that need it are imported only when the comma
 """
 
 import dataclasses
+import functools
 import math
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
@@ -89,18 +90,20 @@ def identify(
             ranges = _read_ranges(free, chosen)
             found, noise, interrupted = _fit_with_progress(chosen, readings, ranges, noise)
             result = {**_result(chosen, readings, ranges, found, noise), "interrupted": interrupted}
+            show_result = functools.partial(show.as_json if as_json else show.show_identification, result)
             if interrupted:
-                show.as_json(result) if as_json else show.show_identification(result)
+                show_result()
                 console.say("interrupted: these are the values so far, not the best ones; no file is written")
                 raise typer.Exit(console.INTERRUPTED)
             if result["undetermined"]:  # inside `with`: the exception discards the file
-                show.as_json(result) if as_json else show.show_identification(result)
+                show_result()
                 missing = "; ".join(row["direction"] for row in result["undetermined"])
                 console.fail(f"{chosen.name}: not identifiable from these data: {missing}", console.FAILED)
             if file:
-                file.write_text(dump(chosen.with_loop(found.part, "identified")), encoding="utf-8")
-        result["files"] = {"out": str(out)} if out else {}
-        show.as_json(result) if as_json else show.show_identification(result)
+                with console.show_before_errors(show_result):
+                    file.write_text(dump(chosen.with_loop(found.part, "identified")), encoding="utf-8")
+        result["files"] |= {"out": str(out)} if out else {}
+        show_result()
 
 
 def _read_renames(given: Sequence[str]) -> dict[str, str]:

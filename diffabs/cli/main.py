@@ -147,31 +147,37 @@ def simulate(
                 chosen = console.load_scenario(scenario or "", overrides)
                 key = chosen.key()
             run, limited = console.run_with_progress(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
-            if csv_file and run.trajectory:
-                show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
-            if mat_file:
-                values = {path: value for path, _, value in parameters(chosen.loop)}
-                write_mat(mat_file, run, chosen.loop.plant, parameters=values, scenario=chosen.name)
-            if picture:
-                console.run_with_progress(lambda: _draw(chosen, run, picture), "drawing")
             found = (
                 console.run_with_progress(lambda: check_run_accuracy(chosen, key), "shortening the step")
                 if check
                 else None
             )
             lines = describe_check(found) if found else _find_loose_metrics(chosen, run, key, kept)
-        result = _result(chosen, run, limited, {"csv": csv, "mat": mat, "plot": plot})
-        if from_sweep:  # the sweep's seed and the number of the sample decide the noise
-            result["solver"]["seed"] = None
-            result["sample"] = {"sweep": str(from_sweep), "seed": chosen.sweep.seed, "number": sample}
-        if found:
-            result["accuracy"] = found
-        show.as_json(result) if as_json else show.show_run(result, chosen)
-        if found and not as_json:
-            show.show_accuracy(found)
+            result = _result(chosen, run, limited)
+            if from_sweep:  # the sweep's seed and the number of the sample decide the noise
+                result["solver"]["seed"] = None
+                result["sample"] = {"sweep": str(from_sweep), "seed": chosen.sweep.seed, "number": sample}
+            if found:
+                result["accuracy"] = found
+            with console.show_before_errors(lambda: _show(result, chosen, as_json)):
+                if csv_file and run.trajectory:
+                    show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
+                if mat_file:
+                    values = {path: value for path, _, value in parameters(chosen.loop)}
+                    write_mat(mat_file, run, chosen.loop.plant, parameters=values, scenario=chosen.name)
+                if picture:
+                    console.run_with_progress(lambda: _draw(chosen, run, picture), "drawing")
+        result["files"] |= {name: str(path) for name, path in (("csv", csv), ("mat", mat), ("plot", plot)) if path}
+        _show(result, chosen, as_json)
         for line in lines:
             console.say(f"warning: {line}")
         _judge(chosen, result)
+
+
+def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
+    show.as_json(result) if as_json else show.show_run(result, chosen)
+    if "accuracy" in result and not as_json:
+        show.show_accuracy(result["accuracy"])
 
 
 def _judge(chosen: Scenario, result: JsonObject) -> None:
@@ -233,7 +239,7 @@ def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
     draw(run, title=chosen.title or chosen.name, unit=plant.control_unit).savefig(picture)
 
 
-def _result(chosen: Scenario, run: Run, limited: float, files: dict[str, pathlib.Path | None]) -> JsonObject:
+def _result(chosen: Scenario, run: Run, limited: float) -> JsonObject:
     return {
         "scenario": chosen.name,
         "metrics": {name: float(run.metrics[name]) for name in chosen.objectives},
@@ -246,7 +252,7 @@ def _result(chosen: Scenario, run: Run, limited: float, files: dict[str, pathlib
         "parameters": model.describe_numbers(chosen),
         "solver": {**describe_solver(chosen.solver), "seed": chosen.seed},
         "versions": provenance.versions(),
-        "files": {name: str(path) for name, path in files.items() if path},
+        "files": {},
     }
 
 

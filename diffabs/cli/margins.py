@@ -4,6 +4,7 @@ import importlib
 import math
 import pathlib
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -65,10 +66,13 @@ def margins(
             chosen = console.load_scenario(scenario, changes, integrated=False)
             values, target = _read_places(chosen, at or ())
             nominal, found = _find_margins(chosen, values, target, samples)
+            result = _document(chosen, nominal, found, values, target)
+            show_result = partial(show.as_json, result) if as_json else partial(_show, result, chosen, nominal, found)
             if picture:
-                console.run_with_progress(lambda: _draw(chosen, nominal, found, picture), "drawing")
-        result = _document(chosen, nominal, found, values, target, plot)
-        show.as_json(result) if as_json else _show(result, chosen, nominal, found)
+                with console.show_before_errors(show_result):
+                    console.run_with_progress(lambda: _draw(chosen, nominal, found, picture), "drawing")
+        result["files"] |= {"plot": str(plot)} if plot else {}
+        show_result()
         _judge(chosen, nominal, found)
 
 
@@ -137,7 +141,6 @@ def _document(
     found: "Band | None",
     values: dict[str, float],
     target: float | None,
-    plot: pathlib.Path | None,
 ) -> JsonObject:
     """Return the JSON document, in SI. Infinity (no limit) is a text, as in an override."""
 
@@ -162,7 +165,7 @@ def _document(
         "unstable": len(found.unstable) if found else 0,
         "worst": {name: {"value": plain(one)[name], "values": one.values} for name, one in worst.items()},
         "versions": provenance.versions(),
-        "files": {"plot": str(plot)} if plot else {},
+        "files": {},
     }
 
 

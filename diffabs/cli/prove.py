@@ -1,5 +1,6 @@
 """The command `prove`: bounds of all runs of a box of parameters, of the nonlinear loop with its limits."""
 
+import functools
 import itertools
 import json
 import math
@@ -75,36 +76,44 @@ def prove(
             )
         signals = ("slip",) if "slip" in chosen.loop.plant.shows._fields else ()
         far = [""]
-        with targets.new_target_file(out, "--out") as file, targets.new_target_file(plot, "--plot") as picture:
-            try:
-                equations = derive_equations(chosen.loop, box)  # refuses before anything is simulated
-                claims = [_read_claim(text, chosen, equations) for text in claim or ()]
-                known, where = _extreme_runs(chosen, box)
-                proof = console.run_with_progress(
-                    lambda: prove_box(
-                        chosen.loop, box, claims, signals=signals, horizon=chosen.solver.duration, budget=budget,
-                        known=known, suspects=_points(where), progress=lambda line: far.__setitem__(0, line),
-                    ),
-                    f"proving {chosen.name}",
-                    lambda: far[0],
-                )  # fmt: skip
-            except (NoRule, NoCompiler) as error:
-                raise ScenarioError(str(error)) from None
-            result = _document(proof, chosen, box, claims, known)
-            if file:
-                from diffabs.reach.certificate import certificate_document
+        with targets.new_target_file(plot, "--plot") as picture:
+            with targets.new_target_file(out, "--out") as file:
+                try:
+                    equations = derive_equations(chosen.loop, box)  # refuses before anything is simulated
+                    claims = [_read_claim(text, chosen, equations) for text in claim or ()]
+                    known, where = _extreme_runs(chosen, box)
+                    proof = console.run_with_progress(
+                        lambda: prove_box(
+                            chosen.loop, box, claims, signals=signals, horizon=chosen.solver.duration, budget=budget,
+                            known=known, suspects=_points(where), progress=lambda line: far.__setitem__(0, line),
+                        ),
+                        f"proving {chosen.name}",
+                        lambda: far[0],
+                    )  # fmt: skip
+                except (NoRule, NoCompiler) as error:
+                    raise ScenarioError(str(error)) from None
+                result = _document(proof, chosen, box, claims, known)
+                show_result = functools.partial(_show, result, chosen, as_json)
+                if file:
+                    from diffabs.reach.certificate import certificate_document
 
-                file.write_text(json.dumps(certificate_document(proof, dump(chosen), box, claims)) + "\n")
-                result["files"] = {"certificate": str(out)}
+                    with console.show_before_errors(show_result):
+                        file.write_text(json.dumps(certificate_document(proof, dump(chosen), box, claims)) + "\n")
+            result["files"] = {"certificate": str(out)} if out else {}
             if picture:
                 from diffabs.plot.proofs import draw_proof
 
-                shown = _map_of_proof(proof, chosen, sides, claims, known, where)
-                console.run_with_progress(lambda: draw_proof(shown).savefig(picture), "drawing")
-                result["files"] = {**result.get("files", {}), "plot": str(plot)}
-        views.as_json(result) if as_json else show_proofs.show_box_proof(result, chosen)
+                with console.show_before_errors(show_result):
+                    shown = _map_of_proof(proof, chosen, sides, claims, known, where)
+                    console.run_with_progress(lambda: draw_proof(shown).savefig(picture), "drawing")
+                result["files"] |= {"plot": str(plot)}
+        show_result()
         if proof.verdict != "proved":
             console.conclude(f"{chosen.name}: {proof.verdict}: {result['reason']}")
+
+
+def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
+    views.as_json(result) if as_json else show_proofs.show_box_proof(result, chosen)
 
 
 def read_proof_file(file: pathlib.Path) -> JsonObject | None:

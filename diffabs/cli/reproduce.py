@@ -56,7 +56,8 @@ def reproduce(
                 with targets.new_target_folder(out / paper) as folder:
                     reproduction = REPRODUCTIONS[paper] if data is None else partial(REPRODUCTIONS[paper], data=data)
                     results[paper] = _reproduce_with_progress(paper, reproduction, folder)
-                    report.write_report_file([folder], folder / report.DEFAULT_NAME)
+                # The results are in place: a report that cannot be written does not cost them.
+                report.write_report_file([out / paper], out / paper / report.DEFAULT_NAME)
                 if not as_json:
                     show.show_paper(compact(results[paper]), out / paper)
             if whole:

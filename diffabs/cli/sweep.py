@@ -89,10 +89,12 @@ def sweep(
             if not found.complete:
                 raise KeyboardInterrupt
             check = chosen.sweep.check
-            result = console.run_with_progress(
-                lambda: _result(found, study, out, kept, figures, check), "computing statistics"
-            )
-        show.as_json(result) if as_json else show_samples.show_sweep(result, chosen)
+            result = console.run_with_progress(lambda: _result(found, study, out, check), "computing statistics")
+            with console.show_before_errors(lambda: _show(result, chosen, as_json)):
+                console.run_with_progress(
+                    lambda: _write_files(result, found, study, out, kept, figures), "writing the results"
+                )
+        _show(result, chosen, as_json)
         from diffabs.sweep.checking import accuracy_warnings
 
         for line in accuracy_warnings(result["accuracy"]) if result["accuracy"] else ():
@@ -100,6 +102,10 @@ def sweep(
         if result["refused"]["count"] == result["samples"]:
             why = next(iter(result["refused"]["reasons"]))
             console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
+
+
+def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
+    show.as_json(result) if as_json else show_samples.show_sweep(result, chosen)
 
 
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
@@ -259,16 +265,13 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: 
     return console.run_with_progress(run, f"sweeping {chosen.name}", lambda: far[0], ending)
 
 
-def _result(
-    found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool, check: int
-) -> JsonObject:
+def _result(found: "Results", study: "Study", out: pathlib.Path, check: int) -> JsonObject:
     """Return the JSON document, which is also written into the folder: at first without the names of other files.
 
     A picture that cannot be drawn then loses no statistics.
     """
     from diffabs.sweep.checking import check_accuracy
     from diffabs.sweep.statistics.summary import summarise_sweep
-    from diffabs.sweep.trajectories import write_trajectories
 
     # Half steps run beside the statistics: compiled code and NumPy release Python's global lock.
     with ThreadPoolExecutor(1) as beside:
@@ -277,6 +280,15 @@ def _result(
     accuracy = halved.result() if halved else None
     result = {"out": str(out), **said, "accuracy": accuracy, "made": console.describe_run(), "files": {}}
     _write_summary(out, result)
+    return result
+
+
+def _write_files(
+    result: JsonObject, found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool
+) -> None:
+    """Write trajectories, figures and report, and add their names to the document here and in the folder."""
+    from diffabs.sweep.trajectories import write_trajectories
+
     if kept:
         result["files"]["trajectories"] = str(write_trajectories(study, out, kept))
     if figures:
@@ -290,7 +302,6 @@ def _result(
         _write_summary(out, result)
     if figures:
         report.write_report_file([out], out / report.DEFAULT_NAME)
-    return result
 
 
 def _write_summary(out: pathlib.Path, result: JsonObject) -> None:

@@ -4,8 +4,8 @@ It needs the extra `tune`, and for a proof the extra `design`. Modules that need
 runs.
 """
 
-import contextlib
 import dataclasses
+import functools
 import pathlib
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,20 +45,28 @@ def tune(
         console.need_extra("tune")
         targets.check_picture(plot)
         targets.check_scenario_file(out)
-        with contextlib.ExitStack() as files:
-            out_file = files.enter_context(targets.new_target_file(out, "--out"))
-            picture = files.enter_context(targets.new_target_file(plot, "--plot"))
-            chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "tune", starts=starts))
-            result, told = _tune_and_document(chosen, engine, out_file, picture)
-            if not result["met"]:  # inside `with`: the exception discards the files
-                _show(result, told, chosen, as_json)
-                _leave_if_interrupted(result)
-                console.fail(
-                    f"{chosen.name}: not met: {_unmet_constraints(result)}; {result['reason']}", console.FAILED
-                )
-            drawn = plot if picture and picture.exists() else None
-        result["files"] = {name: str(path) for name, path in (("out", out), ("plot", drawn)) if path}
-        _show(result, told, chosen, as_json)
+        with targets.new_target_file(plot, "--plot") as picture:
+            with targets.new_target_file(out, "--out") as out_file:
+                chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "tune", starts=starts))
+                work = console.run_with_progress(lambda: build_work(chosen), "computing the runs")
+                found, result, told = _tune_and_document(work, engine)
+                show_result = functools.partial(_show, result, told, chosen, as_json)
+                if not result["met"]:  # inside `with`: the exception discards the files
+                    show_result()
+                    _leave_if_interrupted(result)
+                    console.fail(
+                        f"{chosen.name}: not met: {_unmet_constraints(result)}; {result['reason']}", console.FAILED
+                    )
+                if out_file:
+                    with console.show_before_errors(show_result):
+                        out_file.write_text(dump(chosen.with_loop(found.loop, "tuned")), encoding="utf-8")
+            # The scenario is in place: a picture that cannot be drawn does not cost it.
+            result["files"] |= {"out": str(out)} if out else {}
+            if picture:
+                with console.show_before_errors(show_result):
+                    result |= _draw_unless_interrupted(work, found, picture, result["interrupted"])
+                result["files"] |= {"plot": str(plot)} if picture.exists() else {}
+        show_result()
         _leave_if_interrupted(result)
 
 
@@ -79,31 +87,30 @@ def _show(result: JsonObject, told: str, chosen: Scenario, as_json: bool) -> Non
     console.say(told)
 
 
-def _tune_and_document(
-    chosen: Scenario, engine: str, out: pathlib.Path | None, picture: pathlib.Path | None
-) -> tuple[JsonObject, str]:
-    """Return the JSON document and a sentence on the certificate; the files are written if all constraints are met.
+def _tune_and_document(work: Work, engine: str) -> tuple["Tuned", JsonObject, str]:
+    """Return the tuning, its JSON document and a sentence on the certificate.
 
     After Ctrl-C the document lacks the parts that are not computed yet.
     """
-    work = console.run_with_progress(lambda: build_work(chosen), "computing the runs")
     found, interrupted = _tune_with_progress(work, engine)
-    after = chosen.with_loop(found.loop, "tuned")
+    after = work.chosen.with_loop(found.loop, "tuned")
     try:
         proved = console.run_with_progress(lambda: certify_result(after), "certifying the result")
         result = console.run_with_progress(lambda: tuning_document(work, found, proved), "comparing before and after")
     except KeyboardInterrupt:
         interrupted, proved = True, without_certificate("interrupted")
         result = _without_proof(work, tuning_document(work._replace(task=None), found, proved))
-    if out and result["met"]:
-        out.write_text(dump(after), encoding="utf-8")
-    if picture and result["met"]:
-        try:
-            console.run_with_progress(lambda: _draw(work, found, picture), "drawing")
-        except KeyboardInterrupt:
-            picture.unlink()
-            interrupted = True
-    return {**result, "interrupted": interrupted}, proved.sentence
+    return found, {**result, "interrupted": interrupted}, proved.sentence
+
+
+def _draw_unless_interrupted(work: Work, found: "Tuned", picture: pathlib.Path, interrupted: bool) -> JsonObject:
+    """Draw the tuning, and return the document's entry "interrupted", which Ctrl-C changes to true."""
+    try:
+        console.run_with_progress(lambda: _draw(work, found, picture), "drawing")
+    except KeyboardInterrupt:
+        picture.unlink()
+        interrupted = True
+    return {"interrupted": interrupted}
 
 
 def _without_proof(work: Work, result: JsonObject) -> JsonObject:

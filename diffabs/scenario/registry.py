@@ -331,7 +331,12 @@ def build_loop(sections: JsonObject) -> Loop:
     """
     plant = fill_part(braking(), {"plant": sections["plant"]}, "", "").plant if "plant" in sections else braking().plant
     own, units = getattr(plant, "usual_parts", dict), units_of(plant)
-    parts = {"plant": plant, **own()}
+    usual = own()
+    for name, part in usual.items():
+        if not dataclasses.is_dataclass(part) and not isinstance(part, tuple):
+            whose = f"usual_parts of plant {name_of('plant', plant)}"
+            raise wrong_kind_error(f"{whose}: {name}", part, "a part, or a tuple of parts,")
+    parts = {"plant": plant, **usual}
     needed = [f.name for f in dataclasses.fields(Loop) if dataclasses.MISSING is f.default is f.default_factory]
     for family in (name for name in needed if name not in parts):
         if family not in sections:

@@ -359,10 +359,13 @@ def dump(scenario: Scenario) -> str:
     Args:
         scenario: Scenario to write.
     """
-    sections = {field.name: as_plain(getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)}
+    parts = {field.name: as_plain(getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)}
+    sections = {name: part for name, part in parts.items() if isinstance(part, dict)}
+    # A plant's usual part may be a tuple of parts. TOML has no form of an empty one, which `load` takes from the plant.
+    lists = {name: part for name, part in parts.items() if name not in sections and part}
     if "road" in sections["plant"]:
         sections["road"] = sections["plant"].pop("road")
     sections["solver"] = section_solver.write_solver_section(scenario.solver, scenario.seed)
     sections["objective"] = as_plain(scenario.objectives)
     sections |= {name: getattr(scenario, name).table() for name in ("design", "tune", "sweep")}
-    return toml.write_toml({key: getattr(scenario, key) for key in TEXTS}, sections)
+    return toml.write_toml({key: getattr(scenario, key) for key in TEXTS} | lists, sections)

@@ -429,3 +429,49 @@ def test_the_page_is_the_example():
     for name, text in files.items():
         assert text.split() == (HERE / name).read_text().split()
     assert len(files["dc_servo.py"].splitlines()) < 130
+
+
+RESTING = """
+from diffabs.core.pytree import param, pytree
+from dc_servo import DCMotor, ServoOutput, ServoStart
+
+__all__ = ["Resting"]
+
+@pytree
+class Resting(DCMotor):
+    def start(self, initial):
+        return ServoOutput(*(0.0 * self.inertia for _ in range(3)))
+
+    def usual_parts(self):
+        return {"initial": INITIAL}
+"""
+AT_REST = ("servo.toml", "--set", "plant=resting", "--set", "tune.over={}")
+
+
+@pytest.fixture
+def resting(monkeypatch, tmp_path, request):
+    """A module with a plant that has an unusual initial state, and the words that choose it."""
+    (tmp_path / "resting.py").write_text(RESTING.replace("INITIAL", request.param))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "resting", raising=False)
+    yield ("--parts", "dc_servo", "--parts", "resting")
+    sys.modules.pop("resting", None)
+
+
+@killed_by("scenario/scenario.py", "name not in sections and part}", "name not in sections}")
+@pytest.mark.parametrize("resting", ["()", "(ServoStart(), ServoStart(angle=0.5))"], indirect=True)
+def test_a_plant_whose_usual_state_is_a_tuple_is_written_and_read(resting, tmp_path):
+    run("show", *AT_REST, *resting, "--out", tmp_path / "mine.toml")
+    outside.register_modules(["dc_servo", "resting"])
+    read = load(tmp_path / "mine.toml")
+    assert repr(read.loop) == repr(load("servo.toml", ["plant=resting", "tune.over={}"]).loop)
+    assert dump(read) == (tmp_path / "mine.toml").read_text()
+
+
+@killed_by("scenario/registry.py", "not isinstance(part, tuple):", "False:")
+@pytest.mark.parametrize("resting", ["None", "{}", "3.0", "[ServoStart()]"], indirect=True)
+def test_a_usual_part_that_is_none_is_refused(resting):
+    result = run("simulate", *AT_REST, *resting, status=2)
+    assert_one_error_line(result)
+    assert "usual_parts of plant resting: initial = " in result.stderr
+    assert result.stderr.endswith("; a part, or a tuple of parts, is needed\n")

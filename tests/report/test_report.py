@@ -456,7 +456,8 @@ def test_a_metric_that_a_half_step_turns_is_in_the_report(tmp_path):
     assert "margin is finite with one step and never with the other in 2 of 3 runs, the first sample 5" in text
 
 
-@killed_by("cli/sweep.py", "    _write_summary(out, result)\n    if kept:", "    if kept:")
+@killed_by("cli/sweep.py", "    _write_summary(out, result)\n    return result", "    return result")
+@killed_by("cli/sweep.py", "with console.show_before_errors(lambda: _show(result, chosen, as_json)):", "if True:")
 @pytest.mark.slow
 def test_a_sweep_whose_figure_fails_keeps_its_summary(tmp_path, monkeypatch):
     def fail(figure, path):
@@ -467,6 +468,7 @@ def test_a_sweep_whose_figure_fails_keeps_its_summary(tmp_path, monkeypatch):
     out, words = tmp_path / "out", ("--samples", 8, "--engine", "xla", "--figures")
     result = command("sweep", tmp_path / "small.toml", *words, "--out", out, status=1)
     assert "No space left" in result.stderr
+    assert "iae" in result.stdout
     assert json.loads((out / "summary.json").read_text())["samples"] == 8
 
 

@@ -1,0 +1,76 @@
+"""What a command has computed is shown before a file that cannot be written ends it."""
+
+import json
+
+import invented
+import pytest
+from commands import run
+from mutants import killed_by
+from seams import replace_seam
+from small_scenarios import TUNE
+
+from diffabs.cli import main, margins, tune, tuning_task
+from diffabs.design.proof.certificate import Certificate
+from diffabs.scenario.scenario import load
+
+pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
+
+
+def fill_disk(*_):
+    raise OSError(28, "No space left on device")
+
+
+def shown(*words):
+    """The document that a command prints before its error."""
+    result = run(*words, "--json", status=1)
+    assert result.stderr.endswith("No space left on device\n")
+    return json.loads(result.stdout)
+
+
+@pytest.fixture
+def small(file, monkeypatch):
+    replace_seam(monkeypatch, "tune_tune", invented.tuned)
+    replace_seam(monkeypatch, "certify_result", lambda _: tuning_task.without_certificate("not asked for"))
+    return file(TUNE)
+
+
+@killed_by("cli/console.py", "        show()\n        raise\n", "        raise\n")
+def test_a_tuning_that_cannot_be_drawn_is_written_and_shown(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(tune, "_draw", fill_disk)
+    out, plot = tmp_path / "tuned.toml", tmp_path / "tuned.png"
+    content = shown("tune", small, "--out", out, "--plot", plot)
+    assert content["files"] == {"out": str(out)}
+    assert load(out).loop.controller.gain[0] == content["free"]["controller.gain"]["after"][0]
+    assert not plot.exists()
+
+
+def test_a_tuning_that_cannot_be_written_is_shown(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(tune, "dump", fill_disk)
+    content = shown("tune", small, "--out", tmp_path / "tuned.toml")
+    assert content["files"] == {}
+    assert content["objective"]["after"] == 1.5
+    assert not (tmp_path / "tuned.toml").exists()
+
+
+@killed_by("cli/main.py", "with console.show_before_errors(lambda: _show(result, chosen, as_json)):", "if True:")
+def test_a_run_that_cannot_be_drawn_is_shown(file, tmp_path, monkeypatch):
+    monkeypatch.setattr(main, "_draw", fill_disk)
+    content = shown("simulate", file(TUNE), "--plot", tmp_path / "run.png")
+    assert content["metrics"]["iae"] > 0
+    assert content["files"] == {}
+
+
+@killed_by("cli/margins.py", "with console.show_before_errors(show_result):", "if True:")
+def test_margins_that_cannot_be_drawn_are_shown(tmp_path, monkeypatch):
+    monkeypatch.setattr(margins, "_draw", fill_disk)
+    content = shown("margins", "slip-lmi", "--samples", "2", "--plot", tmp_path / "loop.png")
+    assert content["margins"]["stable"] is True
+    assert content["files"] == {}
+
+
+@killed_by("cli/design.py", "with console.show_before_errors(\n", "with (console.contextlib.nullcontext)(\n")
+def test_a_certificate_that_cannot_be_saved_is_shown(tmp_path, monkeypatch):
+    pytest.importorskip("cvxpy")
+    monkeypatch.setattr(Certificate, "save", fill_disk)
+    content = shown("certify", "slip-lmi", "--gain=-11753,-76.7", "--out", tmp_path / "gain.json")
+    assert content["quadratically_stable"] is True
