@@ -5,7 +5,13 @@
     "road.scale" = ...                   the road has a section of its own, here as elsewhere
     "initial.speed_kmh" = ...            speeds may be given in km/h
 
-This module reads paths and units. Each table gives its values another meaning, which the module of its section reads.
+A value has one of three forms, with the same meaning in each table that allows it:
+
+    { low = 5.3, high = 6.2 }            an interval; also the text "5.3:6.2", as on the command line
+    [5.3, 5.75, 6.2]                     a list of values
+    { type = "normal", ... }             a distribution
+
+This module reads paths, units and intervals. The module of each section reads the rest.
 """
 
 import dataclasses
@@ -18,6 +24,7 @@ import numpy as np
 from diffabs.config.values import (
     Reader,
     ScenarioError,
+    as_plain,
     dotted_path,
     format_given,
     read_as_given,
@@ -31,9 +38,11 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
 from diffabs.scenario.registry import KMH, MAX_DEPTH, in_kmh
+from diffabs.scenario.toml import parse_value
 
 Ends = tuple[Any, Any]  # low and high, tuples where the parameter is a list
 
+INTERVAL_KEYS = ("low", "high")
 TABLES = (("design", "over"), ("tune", "free"), ("tune", "over"), ("sweep", "over"), ("sweep", "design", "levels"))
 
 
@@ -76,6 +85,8 @@ class ParameterEntry:
         Raises:
             ScenarioError: The list is empty, or an item is no number in the range.
         """
+        if (ends := interval_ends(self.given, self.where)) is not None:
+            raise ScenarioError(f"{self.where} is an interval; a list [{format_given(ends[0])}, ...] is needed")
         given = self.given if isinstance(self.given, list) else [self.given]
         if not given:
             raise ScenarioError(f"{self.where} = [] is empty; numbers in {self.spec.interval()} are needed")
@@ -93,14 +104,15 @@ class ParameterEntry:
             ScenarioError: The value is not a pair, an end is outside the parameter's range, or the ends are in the
                 wrong order.
         """
-        needed = f"a range [low, high] in {self.spec.interval()}"
-        if not isinstance(self.given, list):
+        needed = f"a range {{ low, high }} in {self.spec.interval()}"
+        given = interval_ends(self.given, self.where)
+        if given is None and not isinstance(self.given, list):
             raise wrong_kind_error(self.where, self.given, needed + or_else)
-        if len(self.given) != 2:
-            raise ScenarioError(
-                f"{self.where} = {format_given(self.given)} is not a range [low, high] in {self.spec.interval()}"
-            )
-        ends = [self._end(item, f"{self.where}.{i}") for i, item in enumerate(self.given)]
+        # A list of values is no range, so the two ends in a list have one meaning here.
+        given = self.given if given is None else given
+        if len(given) != 2:
+            raise ScenarioError(f"{self.where} = {format_given(given)} is not {needed}")
+        ends = [self._end(item, f"{self.where}.{name}") for name, item in zip(INTERVAL_KEYS, given, strict=True)]
         low, high = map(np.asarray, ends)
         closed = dataclasses.replace(self.spec, open_low=False, open_high=False, infinite=True)
         allowed = closed if or_else else self.spec
@@ -120,6 +132,36 @@ class ParameterEntry:
             have = f"has {len(given)} numbers; the parameter has {self.shape[0]}"
             raise ScenarioError(f"{path} = {format_given(given)} {have}")
         return tuple(read_number(item, self.spec, f"{path}.{i}") for i, item in enumerate(given))
+
+
+def interval_ends(given: PyTree, where: str) -> list[PyTree] | None:
+    """Return the ends of an interval as given, or None for a value of another form.
+
+    Args:
+        given: Table `{ low, high }`, or text "low:high".
+        where: Place of the value, for messages.
+
+    Raises:
+        ScenarioError: The table has another key or lacks one.
+    """
+    if isinstance(given, str) and given.count(":") == 1:
+        ends = [parse_value(text.strip()) for text in given.split(":")]
+        return ends if all(isinstance(end, int | float) for end in ends) else None
+    if not isinstance(given, dict) or "type" in given or "choices" in given:
+        return None
+    if given.keys() != set(INTERVAL_KEYS):
+        raise ScenarioError(f"{where} = {format_given(given)} is no interval {{ low = ..., high = ... }}")
+    return [given[key] for key in INTERVAL_KEYS]
+
+
+def interval_table(low: Scalar, high: Scalar) -> JsonObject:
+    """Return an interval as a TOML value.
+
+    Args:
+        low: Lower end, a number or a tuple.
+        high: Upper end, in the same form.
+    """
+    return dict(zip(INTERVAL_KEYS, as_plain((low, high)), strict=True))
 
 
 def scale_to_si(value: Scalar, scale: float) -> Scalar:
@@ -198,7 +240,7 @@ def join_path_keys(keys: list[str]) -> list[str]:
 def flatten_table(table: Table, section: str) -> JsonObject:
     """Return the values of nested tables by dotted path.
 
-    A table with the key `type` or `choices` is a value.
+    A table with the key `type` or `choices` is a value, and so is a table of `low` and `high` below a dotted path.
 
     Args:
         table: Nested tables.
@@ -213,7 +255,8 @@ def flatten_table(table: Table, section: str) -> JsonObject:
         path, value = pending.pop()
         if path.count(".") > MAX_DEPTH:
             raise ScenarioError(f"{section}: {format_given(path)} is nested more than {MAX_DEPTH} deep")
-        if isinstance(value, dict) and not {"type", "choices"} & value.keys():
+        is_interval = isinstance(value, dict) and value.keys() == set(INTERVAL_KEYS) and "." in path
+        if isinstance(value, dict) and not is_interval and not {"type", "choices"} & value.keys():
             pending += [(f"{path}.{key}", item) for key, item in list(value.items())[::-1]]
             continue
         path = canonical_path(path)

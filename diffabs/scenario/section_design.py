@@ -4,8 +4,8 @@
     decay      1/s
     damping    of the poles, in [0, 1)
     [design.over]
-    "plant.mass" = [5.3, 6.2]              # a path of the loop, as elsewhere in scenarios; low and high, in SI
-    "initial.speed_kmh" = [5.0, 50.0]      # or in km/h
+    "plant.mass" = { low = 5.3, high = 6.2 }              # a path of the loop, as elsewhere in scenarios; in SI
+    "initial.speed_kmh" = { low = 5.0, high = 50.0 }      # or in km/h
 
 A path may be one key with dots or nested tables. Only parameters of the loop's linear model can have a range.
 """
@@ -35,7 +35,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Scalar
 from diffabs.linear.slip_model import SlipModel
-from diffabs.scenario.parameter_paths import canonical_path, read_entries
+from diffabs.scenario.parameter_paths import canonical_path, interval_table, read_entries
 
 ENTRY = ParameterSpec("1")
 
@@ -123,7 +123,8 @@ class DesignTask:
 
     def table(self) -> JsonObject:
         """Return the section as TOML values."""
-        return {name: value for name, value in plain_fields(self).items() if value is not None}
+        over = {path: interval_table(*ends) for path, ends in self.over.items()}
+        return {name: value for name, value in (plain_fields(self) | {"over": over}).items() if value is not None}
 
 
 @dataclasses.dataclass(frozen=True)

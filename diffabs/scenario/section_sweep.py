@@ -7,9 +7,9 @@
     design                   "random", "sobol", "latin-hypercube", "corners", "saltelli", or a table such as
                              { type = "grid", levels = 3 }, or levels = { "road.w4" = 5, "plant.mass" = 3 }
     [sweep.over]
-    "plant.mass" = [5.3, 6.2]                                 # uniform between them
+    "plant.mass" = { low = 5.3, high = 6.2 }                  # an interval: uniform between its ends
     "road.scale" = { type = "normal", mean = 1.0, deviation = 0.1, low = 0.5, high = 1.5 }
-    "initial.speed_kmh" = [20.0, 60.0]
+    "initial.speed_kmh" = { low = 20.0, high = 60.0 }
     "controller.gain.0" = { type = "triangular", low = -13e3, mode = -12e3, high = -11e3 }
     "road.w4" = { type = "empirical", file = "roads.csv", column = "w4" }    # or .parquet; beside the scenario
     road = ["dry-asphalt", "snow"]                            # parts: one of them, or a table with weights
@@ -46,7 +46,14 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, elements, get
 from diffabs.core.types import JsonObject, Params, PyTree, Table
-from diffabs.scenario.parameter_paths import ParameterEntry, flatten_table, metric_reader, read_entries
+from diffabs.scenario.parameter_paths import (
+    ParameterEntry,
+    flatten_table,
+    interval_ends,
+    interval_table,
+    metric_reader,
+    read_entries,
+)
 from diffabs.scenario.registry import build_part, describe_missing_inner_parts, family_of, unit_of
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.variables import Correlation, Space, read_correlation
@@ -111,7 +118,7 @@ class SweepSection:
 def _format_item(item: Any) -> PyTree:
     """Return a distribution, or a choice of parts, as a TOML value."""
     if isinstance(item, distributions.Uniform):
-        return [item.low, item.high]
+        return interval_table(item.low, item.high)
     return item.given if isinstance(item, Choice) else as_plain(item, brief=True)
 
 
@@ -173,16 +180,18 @@ def _over(given: Table, loop: Loop, folder: pathlib.Path) -> JsonObject:
 
 
 def _distribution(item: ParameterEntry, folder: pathlib.Path) -> PyTree:
-    """Return the distribution of one parameter, in SI; a pair of numbers is uniform."""
+    """Return the distribution of one parameter, in SI; an interval is uniform."""
     given = item.given
     if isinstance(given, list):
-        if len(given) != 2:
-            raise ScenarioError(
-                f"{item.where} = {format_given(given)} is neither a pair [low, high] nor a table with a type"
-            )
-        given = {"type": "uniform", "low": given[0], "high": given[1]}
+        low, high = (given[0], given[-1]) if given else (0, 1)
+        raise ScenarioError(
+            f"{item.where} = {format_given(given)} is a list; an interval is {{ low = {format_given(low)}, high ="
+            f' {format_given(high)} }}, a choice of values {{ type = "categorical", choices = {format_given(given)} }}'
+        )
+    if (ends := interval_ends(given, item.where)) is not None:
+        given = {"type": "uniform", **interval_table(*ends)}
     if not isinstance(given, dict):
-        raise wrong_kind_error(item.where, given, "a pair [low, high] or a table with a type")
+        raise wrong_kind_error(item.where, given, "an interval { low, high } or a table with a type")
     found = distributions.read_distribution(_with_numbers(given, item.where, folder), item.where)
     if line := distributions.describe_out_of_range(found, item.spec, item.where):
         raise ScenarioError(line)
@@ -238,7 +247,7 @@ def build_study(chosen: Any) -> "Study":
 
     plan: SweepSection = chosen.sweep
     if not plan.over:
-        raise ScenarioError('sweep.over is empty; for example [sweep.over] "plant.mass" = [5.3, 6.2]')
+        raise ScenarioError('sweep.over is empty; for example [sweep.over] "plant.mass" = { low = 5.3, high = 6.2 }')
     choices = {path: item for path, item in plan.over.items() if isinstance(item, Choice)}
     variables = {path: item.names if path in choices else item for path, item in plan.over.items()}
     space = Space(variables, plan.correlation, plan.design)

@@ -3,11 +3,11 @@
     starts, seed     descents: the first from the scenario's own values, the others drawn from the ranges
     iterations       of each descent
     samples          0: every combination of the values of [tune.over] is a run, a lane; N: a Latin hypercube of N lanes
-                     between the smallest and the greatest of each
+                     between the smallest and the greatest of each, or in an interval { low, high }
     decay            1/s that shall be certified over [design.over]; 0 for none
     damping          of the poles of the linear systems there, in [0, 1); 0 for none
     [tune.free]
-    "controller.gain" = [[-1e5, -300.0], [-100.0, -15.0]]    # low and high, lists where the parameter is one, in SI
+    "controller.gain" = { low = [-1e5, -300.0], high = [-100.0, -15.0] }     # lists where the parameter is one, in SI
     "reference.time_constant" = "declared"                   # the declared range
     [tune.objective]
     iae = 1.0                                                # weights of metrics; their sum is that of a lane
@@ -31,7 +31,6 @@ import numpy as np
 
 from diffabs.config.values import (
     ScenarioError,
-    as_plain,
     plain_fields,
     range_reader,
     read_as_given,
@@ -49,6 +48,8 @@ from diffabs.scenario.parameter_paths import (
     Ends,
     ParameterEntry,
     canonical_path,
+    interval_ends,
+    interval_table,
     metric_reader,
     parameters_of,
     read_entries,
@@ -102,7 +103,7 @@ class Goal:
 
     def table(self) -> JsonObject:
         """Return the section as TOML values."""
-        free = {path: DECLARED_RANGE if ends is None else as_plain(ends) for path, ends in self.free.items()}
+        free = {path: DECLARED_RANGE if ends is None else interval_table(*ends) for path, ends in self.free.items()}
         return plain_fields(self) | {"free": free}
 
     def check(self, loop: Loop) -> "Goal":
@@ -113,7 +114,8 @@ class Goal:
                 parameter is in [tune.over], or there are samples without [tune.over]. Also raised if an initial speed
                 in [tune.over] is not above the speed at which runs stop.
         """
-        for name, example in (("free", '"controller.gain" = [-20000.0, -80.0]'), ("objective", "iae = 1.0")):
+        interval = '"controller.gain" = { low = -20000.0, high = -80.0 }'
+        for name, example in (("free", interval), ("objective", "iae = 1.0")):
             if not getattr(self, name):
                 raise ScenarioError(f"tune.{name} is empty; for example [tune.{name}] {example}")
         if self.samples and not self.over:
@@ -159,12 +161,13 @@ def read_tune_section(table: PyTree, loop: Loop, objectives: Mapping[str, Object
     Raises:
         ScenarioError: A value is wrong, or there are more than `MOST_LANES` combinations. The message is one line.
     """
+    samples = table.get("samples") if isinstance(table, Mapping) else 0
     goal: Goal = read_table(
         Goal,
         table,
         "tune",
         free=lambda given, path: free_ranges(table_reader(read_as_given, "ranges")(given, path), loop, path),
-        over=lambda given, path: _over(table_reader(read_as_given, "values")(given, path), loop),
+        over=lambda given, path: _over(table_reader(read_as_given, "values")(given, path), loop, bool(samples)),
         objective=metric_reader(objectives, "weights of metrics"),
         limits=metric_reader(objectives, "greatest values of metrics", lambda one: unit_of(one, loop.plant)),
     )
@@ -199,8 +202,13 @@ def free_ranges(table: JsonObject, loop: Loop, section: str) -> dict[str, Ends |
     return found
 
 
-def _over(table: JsonObject, loop: Loop) -> dict[str, tuple[float, ...]]:
-    return {item.path: item.single("differ between lanes").values() for item in _entries(table, "tune.over", loop)}
+def _over(table: JsonObject, loop: Loop, drawn: bool) -> dict[str, tuple[float, ...]]:
+    """Return values by path; the ends of an interval if the runs are drawn from it."""
+    found = {}
+    for item in _entries(table, "tune.over", loop):
+        one = item.single("differ between lanes")
+        found[item.path] = one.range() if drawn and interval_ends(one.given, one.where) else one.values()
+    return found
 
 
 def check_starts(loop: Loop, free: Mapping[str, Ends | None], section: str) -> None:

@@ -29,7 +29,7 @@ stop = {type = "speed-reached", speed_kmh = 25.0}
 controller = {type = "relay", torque_max = 12.0}
 actuator = {type = "rate-limit", rate = 500.0}
 solver = {step = 2e-3, duration = 1.0}
-sweep = {samples = 40, chunk = 40, seed = 5, check = 6, over = {"plant.mass" = [5.3, 6.2]}}
+sweep = {samples = 40, chunk = 40, seed = 5, check = 6, over = {"plant.mass" ={low=5.3,high=6.2}}}
 """
 
 TURNS = ["never at all", "half", "quarter", "always"]

@@ -18,7 +18,14 @@ from diffabs.sweep import Results
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("any_step_is_stable", "without_load")]
 
 SMALL = ("--samples", "24", "--set", "sweep.chunk=16", "--set", "initial.speed_kmh=30", "--set", "stop.speed_kmh=25")
-SMALL += ("--set", "solver.step=1e-3", "--set", "solver.duration=1.0", "--set", "sweep.over.initial.speed_kmh=[28,32]")
+SMALL += (
+    "--set",
+    "solver.step=1e-3",
+    "--set",
+    "solver.duration=1.0",
+    "--set",
+    "sweep.over.initial.speed_kmh={low=28,high=32}",
+)
 SMALL += ("--set", "sweep.check=0")
 
 
@@ -113,10 +120,13 @@ def test_only_common_samples_are_compared(swept):
     ("options", "message"),
     [
         (("sweep.samples=-5",), "sweep.samples = -5 is outside [0, 4294967295]"),
-        (('sweep.over."plant.mas"=[5.0,6.0]',), "sweep.over.plant.mas is not a parameter of this loop; did you mean"),
+        (
+            ('sweep.over."plant.mas"=5:6',),
+            "sweep.over.plant.mas is not a parameter of this loop; did you mean",
+        ),
         (('sweep.over."plant.mass"={type="normal",mean=5.7,deviation=1.0}',), "outside (0, inf) kg"),
         (('sweep.over."plant.mass"={type="norma",mean=5.7}',), "norma"),
-        (('sweep.over."plant.mass"=[6.0,5.0]',), "low = 6 is not below high = 5"),
+        (('sweep.over."plant.mass"={low=6.0,high=5.0}',), "low = 6 is not below high = 5"),
         (('sweep.design="sobols"',), "did you mean sobol"),
         (("sweep.failures.overshot=1.0",), "did you mean overshoot"),
         (('sweep.dtype="float16"',), "sweep.dtype"),

@@ -136,12 +136,12 @@ REFUSALS = [
     (
         "identify identify.toml --data run.csv --free plant.mass=a:8",
         2,
-        ['--free plant.mass.0 = "a" is text; a number in (0, inf) kg is needed'],
+        ['--free plant.mass.low = "a" is text; a number in (0, inf) kg is needed'],
     ),
     (
         "identify identify.toml --data run.csv --free plant.mass=8:4",
         2,
-        ["--free plant.mass = [8.0, 4.0] is empty: a range [low, high] in (0, inf) kg"],
+        ["--free plant.mass = [8.0, 4.0] is empty: a range { low, high } in (0, inf) kg"],
     ),
     (
         "identify identify.toml --data run.csv --free plant.mass=-1:4",
@@ -265,14 +265,14 @@ REFUSALS = [
     ("sweep sweep.toml --set sweep.chunk=0", 2, ["sweep.chunk = 0 is outside [1, 1048576]"]),
     ("sweep sweep.toml --seed -1", 2, ["sweep.seed = -1 is outside"]),
     (
-        "sweep sweep.toml --set sweep.over.plant.mas=1,2",
+        "sweep sweep.toml --set sweep.over.plant.mas=1:2",
         2,
         ["sweep.over.plant.mas is not a parameter of this loop; did you mean"],
     ),
-    ("sweep sweep.toml --set sweep.over.plant.mass=-1,2", 2, ["sweep.over.plant.mass", "(0, inf) kg"]),
-    ("sweep sweep.toml --set 'sweep.over.plant.mass=[6,5]'", 2, ["sweep.over.plant.mass"]),
+    ("sweep sweep.toml --set sweep.over.plant.mass=-1:2", 2, ["sweep.over.plant.mass", "(0, inf) kg"]),
+    ("sweep sweep.toml --set 'sweep.over.plant.mass={low=6,high=5}'", 2, ["sweep.over.plant.mass"]),
     (
-        "sweep sweep.toml --set sweep.over.controller.gain.7=1,2",
+        "sweep sweep.toml --set sweep.over.controller.gain.7=1:2",
         2,
         ["sweep.over.controller.gain.7 is not a parameter of this loop"],
     ),
@@ -301,7 +301,7 @@ REFUSALS = [
     ("rare rare.toml overshoot=1 --samples -20", 2, ["--samples -20 is not a multiple of 10 in [20, inf)"]),
     ("rare rare.toml overshoot=1 --seed -1", 2, ["sweep.seed = -1 is outside [0, "]),
     (
-        "rare rare.toml overshoot=1 --set sweep.over.plant.mas=1,2",
+        "rare rare.toml overshoot=1 --set sweep.over.plant.mas=1:2",
         2,
         ["sweep.over.plant.mas is not a parameter of this loop"],
     ),

@@ -128,7 +128,7 @@ def test_parts_are_written_whole_and_the_rest_in_short():
 
 
 W4 = "{type='normal', mean=0.4, deviation=0.01, low=0.3, high=0.5}"
-DRAWN = f"sweep.over={{'initial.speed_kmh'=[36,72], 'road.w4'={W4}, 'plant.mass'=[5,6]}}"
+DRAWN = f"sweep.over={{'initial.speed_kmh'={{low=36,high=72}}, 'road.w4'={W4}, 'plant.mass'={{low=5,high=6}}}}"
 
 
 @killed_by(
@@ -151,7 +151,7 @@ def test_a_sweep_is_read_once_into_si_by_path_of_the_loop():
 
 def test_an_impossible_distribution_is_refused_on_reading():
     with pytest.raises(ScenarioError, match=r"sweep.over.initial.speed_kmh = uniform\(36, 900\) reaches \[36, 900\]"):
-        load("slip-lmi", ["sweep.over.initial.speed_kmh=36,900"])
+        load("slip-lmi", ["sweep.over.initial.speed_kmh=36:900"])
 
 
 @killed_by("runtime/exports.py", ", *homes()})", "})")

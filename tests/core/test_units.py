@@ -46,7 +46,7 @@ def test_figure_and_trajectories_of_the_lab_rig(tmp_path, monkeypatch):
     texts = {text.get_text() for text in drawn[0].findobj(Text)}
     assert "control [1]" in texts
     assert not any("N m" in text for text in texts)
-    over = 'sweep.over={"plant.road.w4"=[0.3,0.4]}'
+    over = 'sweep.over={"plant.road.w4"={low=0.3,high=0.4}}'
     study = section_sweep.build_study(scenario.load("lab-rig", [*SHORT[1::2], over]))
     kept = zarr.open_group(write_trajectories(study, tmp_path, [0]), mode="r")
     assert (kept["control"].attrs["units"], kept["command"].attrs["units"]) == ("1", "1")

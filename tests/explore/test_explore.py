@@ -63,7 +63,7 @@ iterations = 3
 [tune.objective]
 iae = 1.0
 [sweep.over]
-"road.w4" = [0.35, 0.45]
+"road.w4" = { low = 0.35, high = 0.45 }
 """
 
 TOKEN = "a-b_c"  # as in an address

@@ -240,7 +240,7 @@ def test_structured_text_takes_parameters_and_lost_samples():
         block.values |= {"KP": 80.0, "HIGH": 4.0}
     np.testing.assert_allclose([command for command, _ in found], wanted, rtol=1e-12)
     assert [flag for _, flag in found] == held
-    assert "kp : LREAL := 60.0; (* [N m] in [0, inf) *)" in text
+    assert "kp : LREAL := 60.0; (* [N m] in (-inf, inf) *)" in text
 
 
 HOSTILE = [

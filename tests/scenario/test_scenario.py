@@ -18,6 +18,7 @@ from diffabs.scenario.section_design import DesignTask
 from diffabs.scenario.section_sweep import build_study
 from diffabs.scenario.section_tune import Goal
 from diffabs.simulate.types import Adaptive, FixedStep
+from diffabs.sweep.distributions import Uniform
 from diffabs.tune import risk
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")
@@ -594,12 +595,54 @@ def test_the_type_of_the_usual_part_replaces_nothing():
     assert other.notes == ("road.type=scaled removes sweep.over.road.w4, sweep.over.road.a of the replaced part",)
 
 
+# Intervals
+
+INTERVALS = (
+    "plant.mass={low=5,high=6}",
+    '"plant.mass"={low=5,high=6}',
+    "plant={mass={low=5,high=6}}",
+    '"plant.mass"="5:6"',
+)
+
+
+@killed_by("scenario/parameter_paths.py", "is_interval = isinstance(value, dict) and", "is_interval = False and")
+@pytest.mark.parametrize("form", INTERVALS)
+def test_an_interval_has_one_notation(file, form):
+    """In files and on the command line, for a design, a tuning, its drawn runs and a sweep."""
+    given = ["tune.samples=4", "tune.objective={iae=1.0}", f"tune.over={{{form}}}"]
+    given += [f"tune.free={{{form}}}".replace("plant", "initial").replace("mass", "speed")]
+    given += [f"design.over={{{form}}}", f"sweep.over={{{form}}}"]
+    found = load("slip-lmi", given)
+    assert found.design.over["plant.mass"] == (5.0, 6.0)
+    assert found.tune.over["plant.mass"] == (5.0, 6.0)
+    assert found.tune.free["initial.speed"] == (5.0, 6.0)
+    assert found.sweep.over["plant.mass"] == Uniform(5.0, 6.0)
+    written = dump(found)
+    assert written.count("{low = 5.0, high = 6.0}") == 3
+    assert dump(dataclasses.replace(load(file(written)), name=found.name)) == written
+
+
+def test_an_interval_on_the_command_line_and_of_a_list():
+    ends = "{low=[-2e4,-300],high=[-100,-15]}"
+    found = load(
+        "slip-lmi", ["design.over.plant.mass=5:6", "sweep.over.plant.mass=5:6", f"tune.free.controller.gain={ends}"]
+    )
+    assert (found.design.over["plant.mass"], found.sweep.over["plant.mass"]) == ((5.0, 6.0), Uniform(5.0, 6.0))
+    assert found.tune.free["controller.gain"] == ((-2e4, -300.0), (-100.0, -15.0))
+    pair = load("slip-lmi", ["design.over.plant.mass=[5,6]"])  # two ends are no list of values here
+    assert pair.design.over["plant.mass"] == (5.0, 6.0)
+    nested = load(
+        "slip-lmi", ["controller=pid", "tune.free={controller={low=[-9,-1],high=[1,9]}}", "tune.objective={iae=1}"]
+    )
+    assert nested.tune.free == {"controller.low": (-9.0, -1.0), "controller.high": (1.0, 9.0)}
+
+
 # What varies in a sweep
 
 
 @killed_by("scenario/parameter_paths.py", 'f"{path}.".startswith("plant.road.")', 'path.startswith("plant.road.")')
 def test_a_choice_of_roads_is_written_and_read(file):
-    there = load("slip-lmi", ['sweep.over={road=["rig", "snow"], plant={mass=[5.3, 6.2]}}'])
+    there = load("slip-lmi", ['sweep.over={road=["rig", "snow"], plant={mass={low=5.3,high=6.2}}}'])
     again = load(file(dump(there)))
     assert dump(dataclasses.replace(again, name=there.name)) == dump(there)
     assert list(again.sweep.over) == ["plant.road", "plant.mass"]
@@ -620,7 +663,7 @@ def test_a_choice_of_roads_is_written_and_read(file):
     ids=["loop", "short", "nested"],
 )
 def test_levels_of_a_grid_have_the_paths_of_what_varies(file, levels):
-    over = '"road.w4" = [0.3, 0.4]\n"initial.speed_kmh" = [20, 40]'
+    over = '"road.w4" = {low = 0.3, high = 0.4}\n"initial.speed_kmh" = "20:40"'
     chosen = load(file(f'plant = "mirrored-rig"\n[sweep]\ndesign = {{type = "grid", levels = {levels}}}\n'
                        f"[sweep.over]\n{over}"))  # fmt: skip
     assert chosen.sweep.design.levels == {"plant.road.w4": 3, "initial.speed": 2}
@@ -636,8 +679,8 @@ def test_a_level_of_a_grid_is_changed(file):
     path = file("""plant = "mirrored-rig"
     controller = {type = "pid", high = 9.0}
     [sweep.over]
-    "controller.high" = [5, 9]
-    "initial.speed_kmh" = [20, 40]
+    "controller.high" = { low = 5, high = 9 }
+    "initial.speed_kmh" = { low = 20, high = 40 }
     [sweep.design]
     type = "grid"
     levels = {"controller.high" = 3, "initial.speed_kmh" = 2}""")

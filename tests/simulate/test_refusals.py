@@ -338,7 +338,7 @@ solver = { step = 1e-3, duration = 0.25 }
 samples = 48
 chunk = 16
 [sweep.over]
-"initial.speed_kmh" = [20.0, 34.0]
+"initial.speed_kmh" = { low = 20.0, high = 34.0 }
 [sweep.failures]
 iae = 1.0
 """
@@ -434,7 +434,7 @@ class TestWhoeverRuns:
 @pytest.mark.slow
 def test_the_sweep_of_the_report(tmp_path):
     """0 diverged, 0 not stopped, a mean stopping time of 0.002 s and a mean distance of -2.6e11 m, once."""
-    over = 'sweep.over={"sensor.time_constant"=[1e-6,1e-5]}'
+    over = 'sweep.over={"sensor.time_constant"={low=1e-6,high=1e-5}}'
     words = ("sweep", "slip-lmi", "--set", "sensor=wheel-speed", "--set", over, "--samples", 8, "--json")
     result = commands.run(*words, "--out", tmp_path / "s", status=1)
     document = json.loads(result.stdout)

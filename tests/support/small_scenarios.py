@@ -21,8 +21,8 @@ samples = 150
 chunk = 64
 seed = 3
 [sweep.over]
-"plant.mass" = [5.3, 6.2]
-"initial.speed_kmh" = [28.0, 34.0]
+"plant.mass" = {{ low = 5.3, high = 6.2 }}
+"initial.speed_kmh" = {{ low = 28.0, high = 34.0 }}
 "controller.gain.0" = {{ type = "triangular", low = -5e3, mode = -4e3, high = -3e3 }}
 "controller.gain.1" = {{ type = "categorical", choices = [-40.0, 1e308], weights = [0.9, 0.1] }}
 [sweep.failures]
@@ -34,4 +34,6 @@ step = 1e-3
 duration = 0.15
 seed = 3
 {tune_section(2, 0.5)}"""
-RARE = SCENARIO.replace("[28.0, 34.0]", "{ type = 'normal', mean = 30.0, deviation = 1.0, low = 26.0, high = 40.0 }")
+RARE = SCENARIO.replace(
+    "{ low = 28.0, high = 34.0 }", "{ type = 'normal', mean = 30.0, deviation = 1.0, low = 26.0, high = 40.0 }"
+)

@@ -58,8 +58,8 @@ chunk = 64
 seed = 3
 check = 0
 [sweep.over]
-"plant.mass" = [5.3, 6.2]
-"initial.speed_kmh" = [28.0, 34.0]
+"plant.mass" = {{ low = 5.3, high = 6.2 }}
+"initial.speed_kmh" = {{ low = 28.0, high = 34.0 }}
 """
 
 

@@ -19,8 +19,12 @@ pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
 MASSES = [5.4, 5.9, 5.5, 6.1]
 SPEEDS = [28, 31, 33]  # km/h
-MEASURED = SCENARIO.replace("[5.3, 6.2]", '{ type = "empirical", file = "day/masses.csv", column = "mass [kg]" }')
-MEASURED = MEASURED.replace("[28.0, 34.0]", '{ type = "empirical", file = "speeds.parquet", column = "v" }')
+MEASURED = SCENARIO.replace(
+    "{ low = 5.3, high = 6.2 }", '{ type = "empirical", file = "day/masses.csv", column = "mass [kg]" }'
+)
+MEASURED = MEASURED.replace(
+    "{ low = 28.0, high = 34.0 }", '{ type = "empirical", file = "speeds.parquet", column = "v" }'
+)
 
 
 @pytest.fixture

@@ -365,7 +365,7 @@ CHANGED = [
     (("--set", "solver.step=5e-4"), "study.solver.step is 0.001 there, 0.0005 here"),
     (("--set", "sensor.slip=0.006"), "study.loop.sensor.slip is 0.005 there, 0.006 here"),
     (("--set", "controller.gain=-4000,-41"), "study.loop.controller.gain is [-4000.0, -40.0] there"),
-    (("--set", "sweep.over.plant.mass=5.3,6.3"), 'study.space.variables.plant.mass.high is 6.2 there, 6.3 here'),
+    (("--set", "sweep.over.plant.mass=5.3:6.3"), 'study.space.variables.plant.mass.high is 6.2 there, 6.3 here'),
     (("--set", "sweep.design=sobol"), 'study.space.design.type is "random" there, "sobol" here'),
     (("--set", "sweep.failures.overshoot=0.5"), "study.failures.overshoot is null there, 0.5 here"),
 ]  # fmt: skip
