@@ -90,8 +90,8 @@ def _trace(chosen: Scenario, paths: list[str]) -> tuple[LaneCall, LaneCall]:
 
     def run(x: Array) -> dict[str, Array]:
         values = {path: x[i][None] for i, path in enumerate(paths)}
-        lanes = Batch(values, jnp.zeros(1, int))
-        return run_batch(chosen.loop, lanes, chosen.solver, chosen.objectives, engine="kernel").metrics
+        lanes, given = Batch(values, jnp.zeros(1, int)), (chosen.solver, chosen.objectives)
+        return run_batch(chosen.loop, lanes, *given, together=False, engine="kernel").metrics
 
     x = jnp.asarray([float(get(chosen.loop, path)) for path in paths])
     try:

@@ -18,6 +18,7 @@ Engine = Annotated[
 ]
 
 COMPILING_KERNEL = "compiling a kernel"
+XLA_NOTE = "note: runs are made by XLA: {}"
 
 
 def check_engine_name(engine: str) -> None:
@@ -52,5 +53,5 @@ def choose_engine(engine: str, objection: Callable[[], str | None]) -> str:
         return engine
     line = console.run_with_progress(lambda: describe_placement(()) or objection(), COMPILING_KERNEL)
     if line:
-        console.say(f"note: runs are made by XLA: {line}")
+        console.say(XLA_NOTE.format(line))
     return "xla" if line else "kernel"

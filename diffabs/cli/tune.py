@@ -22,7 +22,7 @@ from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Trajectory
 
 if TYPE_CHECKING:
-    from diffabs.tune import Problem, Tuned, TuningProgress
+    from diffabs.tune import Tuned, TuningProgress
 
 
 def tune(
@@ -136,27 +136,23 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
     most = None if work.constraints else goal.iterations  # with constraints the number of rounds is unknown
 
-    def build_problem(engine: str) -> "Problem":
-        return tune.build_problem(
-            work.chosen.loop,
-            free=goal.free,
-            objective=goal.objective,
-            over=work.batch,
-            solver=work.chosen.solver,
-            measured=work.chosen.objectives,
-            aggregate=goal.read_aggregate(),
-            constraints=list(work.constraints.values()),
-            engine=engine,
-        )
-
-    def objection() -> str | None:
-        problem = build_problem("kernel")
-        return problem.choose_xla() or problem.objection()
-
-    engine = engines.choose_engine(engine, objection)
+    problem = tune.build_problem(
+        work.chosen.loop,
+        free=goal.free,
+        objective=goal.objective,
+        over=work.batch,
+        solver=work.chosen.solver,
+        measured=work.chosen.objectives,
+        aggregate=goal.read_aggregate(),
+        constraints=list(work.constraints.values()),
+        engine=engine,
+    )
+    _, reason = console.run_with_progress(problem.find_engine, engines.COMPILING_KERNEL)
+    if reason:
+        console.say(engines.XLA_NOTE.format(reason))
 
     def run_tuning() -> "Tuned":
-        return tune.tune(build_problem(engine), method=method, progress=told.append, stopping=ending)
+        return tune.tune(problem, method=method, progress=told.append, stopping=ending)
 
     try:
         return console.run_with_progress(

@@ -9,9 +9,8 @@ search for design points uses
 
     dm/dz_j = sum_i dm/dv_i dv_i/dz_j
 
-The derivative dm/dv passes through the run, in reverse mode or, with a kernel, in forward mode. The derivative dv/dz
-costs no run and comes from central differences. A trial point that `simulate` refuses only shortens a step of the
-search.
+The derivative dm/dv passes through the run. The derivative dv/dz costs no run and comes from central differences. A
+trial point that `simulate` refuses only shortens a step of the search.
 """
 
 import dataclasses
@@ -202,27 +201,14 @@ def _make_gradient(study: Study, metric: str) -> Gradient:
 
 
 def _compile_derivatives(study: Study, metric: str) -> Callable[[Table], PyTree]:
-    """Return a compiled function from values to the metric of each run and its derivatives by the values of that run.
-
-    XLA computes the derivatives in reverse mode, a kernel in forward mode.
-    """
-
-    def forward(values: Params) -> Any:
-        def along(way: Table) -> Any:
-            return jax.jvp(lambda values: _measure_metric(study, metric, values), (values,), (way,))
-
-        # One tangent for each parameter. Runs are independent, so a tangent of ones gives each run's own derivative.
-        rows = dict(zip(values, np.eye(len(values)), strict=True))
-        ways = {path: jnp.outer(rows[path], jnp.ones_like(column)) for path, column in values.items()}
-        scores, rates = jax.vmap(along, out_axes=(None, 0))(ways)
-        return scores, dict(zip(values, rates, strict=True))
+    """Return a compiled function from values to the metric of each run and its derivatives by that run's values."""
 
     def slopes(values: Params) -> Any:
         # Runs are independent, so the gradient of their sum holds each run's own derivative.
         scores, pull = jax.vjp(lambda values: _measure_metric(study, metric, values), values)
         return scores, *pull(jnp.ones_like(scores))
 
-    return jax.jit(forward if study.engine == "kernel" else slopes)
+    return jax.jit(slopes)
 
 
 def _parameter_slopes(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:

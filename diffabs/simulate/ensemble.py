@@ -145,6 +145,10 @@ def _dispatch_batch(
     as_one = trajectories or (live if together is None else together) or (not batch.values and batch.keys is None)
     if as_one and enough is not None:
         raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
+    traced = live or is_traced(given, enough)  # such as by keys, under vmap
+    if traced and engine != "xla" and together is not False and not trajectories:
+        # Each run is a call of its own, whose engine is chosen once it is known how the batch is differentiated.
+        return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories, engine), accepted)
 
     def by_kernel() -> Run:
         from diffabs.simulate.drive.kernel import run_native
@@ -162,10 +166,9 @@ def _dispatch_batch(
             if traced:
                 return run(everything, jnp.arange(count))
             return run_on_all_cores(run, everything, count)
-        return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories), accepted)
+        return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories, "xla"), accepted)
 
     why_not = TOGETHER_REASON if trajectories or together else ""
-    traced = live or is_traced(given, enough)  # such as by keys, under vmap
     why_xla = TRACED_REASON if traced else TOGETHER_REASON if as_one else describe_placement(given)
     return run_with_engine(engine, by_kernel, by_xla, (given, enough), why_not, why_xla)
 
@@ -177,7 +180,7 @@ def _first_member(column: PyTree) -> Any:
 
 
 def _run_vmapped(
-    loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], trajectories: bool
+    loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], trajectories: bool, engine: str
 ) -> Run:
     """Run the batch with `jax.vmap`, in groups of similar duration. With trajectories there is one group, since all
     share their instants.
@@ -186,7 +189,7 @@ def _run_vmapped(
 
     def run_group(lanes: Any, duration: float) -> Run:
         like = dataclasses.replace(solver, duration=duration)
-        return batch.each(loop, lambda one, key: run_unchecked(one, like, objectives, key, every), lanes)
+        return batch.each(loop, lambda one, key: run_unchecked(one, like, objectives, key, every, engine), lanes)
 
     if trajectories or batch.durations is None:
         return run_group(None, solver.duration)

@@ -15,13 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core import kinds
-from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
+from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once, is_traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero
 from diffabs.core.types import Key, PyTree, Scalar
 from diffabs.simulate.arguments import prepare_arguments, refuse_derivative, refuse_values
+from diffabs.simulate.drive.deferred import run_deferred
+from diffabs.simulate.drive.engine import default_engine
 from diffabs.simulate.drive.loops import (
     log_run,
     repeat_step,
@@ -95,10 +97,12 @@ def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, 
         ValueError: The arguments are invalid, as in `rollout`.
     """
     refuse_values(loop, solver, objectives)
-    return run_unchecked(loop, solver, objectives, key, 0)
+    return run_unchecked(loop, solver, objectives, key, 0, default_engine())
 
 
-def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: PyTree, every: int) -> Run:
+def run_unchecked(
+    loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: PyTree, every: int, engine: str = "auto"
+) -> Run:
     """Return a run without a check of the parameters' values.
 
     A run with impossible values has diverged only if its numbers are invalid or not physically possible
@@ -110,6 +114,7 @@ def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
         objectives: Objectives by the names of their metrics.
         key: Random key, or None.
         every: Stride of the trajectory's instants; 0 for a run without a trajectory.
+        engine: Engine of a traced run without a trajectory: "auto", "xla" or "kernel". All others are made by XLA.
 
     Raises:
         ValueError: An argument is invalid, apart from the values of parameters.
@@ -127,7 +132,10 @@ def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
         method = dataclasses.replace(method, keeps_last_step=True)
     capacity = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
-    run = run_differentiable(capacity, (loop, objectives, method, key))
+    given = loop, objectives, method, key
+    if not every and engine != "xla" and is_traced(loop, objectives, key):
+        return run_deferred(run_differentiable, capacity, given, required=engine == "kernel")
+    run = run_differentiable(capacity, given)
     return run._replace(trajectory=_truncate_trajectory(run.trajectory, count + 1)) if every else run
 
 

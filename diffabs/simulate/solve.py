@@ -33,6 +33,7 @@ from jax.sharding import AbstractMesh, Mesh
 from jax.typing import DTypeLike
 
 from diffabs.core import kinds
+from diffabs.core.compiling import is_traced
 from diffabs.core.cubic import Cubic
 from diffabs.core.lanes import any_lane, select
 from diffabs.core.loop import LoopState, Margins, Signals
@@ -42,7 +43,8 @@ from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
 from diffabs.core.types import AnyArray, Array, Bool, Part, PyTree, Scalar
 from diffabs.simulate.admissible import find_solver_faults
 from diffabs.simulate.arguments import build_stepping
-from diffabs.simulate.drive.engine import resolve_request, run_with_engine
+from diffabs.simulate.drive.deferred import run_deferred
+from diffabs.simulate.drive.engine import resolve_request
 from diffabs.simulate.drive.loops import log_run, round_up_capacity
 from diffabs.simulate.run import RunCapacity, run_differentiable
 from diffabs.simulate.step.adaptive import AdaptiveStepping
@@ -541,18 +543,12 @@ def solve(
         method = dataclasses.replace(method, watches=False, smooth=True, **lean)
     saves = {} if kept is None else {"saves": kept}
 
-    def by_kernel() -> Solution:
-        # A local import: `import diffabs` must not need the kernel package.
-        from diffabs.simulate.drive.kernel import run_single
-
-        return run_single(loop, saves, method, _finish_solution)
-
-    def by_xla() -> Solution:
-        capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, asked)
-        capacity = RunCapacity(round_up_capacity(capacity), 0, 0, _finish_solution)
-        return run_differentiable(capacity, (loop, saves, method, None))
-
-    return run_with_engine("kernel" if engine == "kernel" else "xla", by_kernel, by_xla, ())
+    capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, asked)
+    capacity = RunCapacity(round_up_capacity(capacity), 0, 0, _finish_solution)
+    run = loop, saves, method, None
+    if engine == "kernel" or (engine == "auto" and is_traced(loop, saves)):
+        return run_deferred(run_differentiable, capacity, run, required=engine == "kernel")
+    return run_differentiable(capacity, run)
 
 
 def switches(

@@ -134,7 +134,7 @@ class AugmentedLagrangianSearch:
             ],
             mode=problem.mode,
             diverged=(int(self.before.diverged), int(best.evaluation.diverged)),
-            engine=describe_engine(problem.engine),
+            engine=describe_engine(problem.find_engine()[0]),
         )
 
     def _run_rounds(self, descent: Descent) -> list[DescentState]:

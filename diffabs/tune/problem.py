@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.bijectors import FreeSpace
 from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.loop import Loop
@@ -27,8 +26,7 @@ from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar, Vector
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.batch import Batch
-from diffabs.simulate.drive.engine import EngineError, log_kernel, log_own_choice, log_xla_reason, resolve_request
-from diffabs.simulate.drive.sharding import describe_placement
+from diffabs.simulate.drive.deferred import MANY_INPUTS_REASON, find_kernels
 from diffabs.simulate.ensemble import run_batch
 from diffabs.simulate.types import Run, Solver
 from diffabs.tune.constraints import Constraint
@@ -37,8 +35,6 @@ from diffabs.tune.result import build_subject_loop
 from diffabs.tune.risk import Aggregate
 
 MAX_QUICK_COMPILE_RUNS = 64  # above this number of runs, a fully optimised compilation pays for itself
-NO_REVERSE_MESSAGE = "a kernel has no reverse mode; forward mode, or engine = 'xla'"
-MAX_KERNEL_PARAMETERS = 64  # parameters up to which a kernel's forward mode is cheaper than XLA (docs/performance.md)
 MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is cheaper (benchmarks/bench_gradient.py)
 
 
@@ -82,7 +78,7 @@ class Problem:
         aggregate: Map from one number for each run to one number.
         constraints: Constraints on the loop and its metrics.
         mode: Mode of differentiation.
-        engine: Engine of the runs, "xla" or "kernel".
+        engine: Engine of the runs, "xla", "kernel" or "auto".
     """
 
     subject: Part
@@ -94,67 +90,33 @@ class Problem:
     aggregate: Aggregate
     constraints: Sequence[Constraint]
     mode: DerivativeMode
-    engine: str = "xla"
+    engine: str = "auto"
 
     def runs(self, z: AnyArray) -> Run:
         """Return all runs at `z`, without trajectories."""
-        together = True if self.engine == "xla" else None
         loop = build_subject_loop(self.space.at(self.subject, z))
-        return run_batch(loop, self.batch, self.solver, self.measured, together=together, engine=self.engine)
+        return run_batch(loop, self.batch, self.solver, self.measured, engine=self.engine)
 
-    def with_engine(self, engine: str, mode: DerivativeMode | None = None) -> "Problem":
-        """Return the problem with its runs on `engine`: "xla", "kernel" or "auto".
+    def find_engine(self) -> tuple[str, str]:
+        """Return the engine that makes the runs and their derivatives, "xla" or "kernel", and the reason for XLA.
 
-        "auto" chooses a kernel if one can make the runs and forward derivatives are cheap enough. Otherwise it logs the
-        reason once and keeps XLA.
+        The check makes no runs. It compiles the kernel and keeps it.
 
         Raises:
-            ValueError: The engine is unknown.
-            EngineError: The engine is "kernel" and the mode is reverse.
+            EngineError: The engine is "kernel", and a kernel is impossible.
         """
-        engine = resolve_request(engine)
-        if engine == "xla":
-            return self
-        found = dataclasses.replace(self, engine="kernel", mode=DerivativeMode.FORWARD)
-        if engine == "kernel":
-            if mode is DerivativeMode.REVERSE:
-                raise EngineError.of(NO_REVERSE_MESSAGE)
-            return found
-        if line := self.choose_xla(mode):
-            log_own_choice(line)
-            return self
-        if line := found.objection():
-            log_xla_reason(line)
-            return self
-        log_kernel()
-        return found
-
-    def choose_xla(self, mode: DerivativeMode | None = None) -> str:
-        """Return why "auto" keeps XLA even where a kernel is possible, or "".
-
-        `mode` is the requested mode of differentiation, None for any. A kernel has no reverse mode, and its forward
-        mode is dearer than XLA's reverse mode for more than `MAX_KERNEL_PARAMETERS` parameters.
-        """
-        if mode is DerivativeMode.REVERSE:
-            return NO_REVERSE_MESSAGE
-        if self.space.size > MAX_KERNEL_PARAMETERS:
-            return f"{self.space.size} free parameters are more than {MAX_KERNEL_PARAMETERS}"
-        return describe_placement((self.subject, dict(self.batch.values), self.batch.keys))
-
-    def objection(self) -> str | None:
-        """Return why the engine of the problem cannot make the runs and their derivatives, or None.
-
-        The check makes no runs. It compiles the program and keeps it.
-        """
+        if self.engine == "xla":
+            return "xla", ""
         z = jax.ShapeDtypeStruct((1, self.space.size), jnp.result_type(float))
         none = Multipliers(np.zeros((1, self.excesses)), np.ones(1), None)
-        try:
-            self._evaluate.lower(z, none, 1.0)
-        except EngineError as error:
-            return str(error)
-        except NoCompiler as error:  # a kernel of this loop is possible, but its compiler is missing
-            return str(EngineError.of(error))
-        return None
+        if kernels := find_kernels(self._evaluate.trace(z, none, 1.0).jaxpr):
+            reason = next((reason for _, reason in kernels if reason), "")
+            return ("xla" if reason else "kernel"), reason
+        # XLA's reverse mode leaves no run in the program, so the values are asked for the reason.
+        reasons = [
+            reason or MANY_INPUTS_REASON for _, reason in find_kernels(jax.make_jaxpr(jax.vmap(self.evaluate))(z))
+        ]
+        return "xla", next(iter(reasons), "")
 
     def evaluate(self, z: AnyArray) -> ObjectiveEvaluation:
         """Return objective, excesses, number of diverged runs and metrics at `z` (p,).

@@ -6,7 +6,6 @@ import jax
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
-from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.kinds import find_value_objection, format_value, value_shape
 from diffabs.core.loop import Loop
@@ -17,7 +16,7 @@ from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
 from diffabs.simulate.arguments import refuse
 from diffabs.simulate.batch import Batch
-from diffabs.simulate.drive.engine import EngineError
+from diffabs.simulate.drive.engine import resolve_request
 from diffabs.simulate.types import Solver
 from diffabs.tune import one_sided
 from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch
@@ -58,10 +57,7 @@ def tune(
     subject, paths = problem.subject, [entry.path for entry in problem.space.entries]
     own = {path: get(subject, path) for path in paths}
     one_sided.warn(subject, own, problem.batch, problem.solver, "start")
-    try:
-        found = AugmentedLagrangianSearch(problem, method or Method(), progress, stopping).result()
-    except NoCompiler as error:
-        raise EngineError.of(error) from None
+    found = AugmentedLagrangianSearch(problem, method or Method(), progress, stopping).result()
     one_sided.warn(subject, found.values, problem.batch, problem.solver, "result")
     return found
 
@@ -93,15 +89,13 @@ def build_problem(
         measured: Objectives by metric; None takes the default objectives of the plant.
         aggregate: Map from one number for each run to one number: Mean (also for None), SmoothWorst, CVaR, Quantile.
         constraints: Constraints: AtMost of a metric in every run, Poles, CertifiedDecay.
-        mode: Forward or reverse mode of differentiation; None decides by the number of free parameters and the engine.
-        engine: Engine of the runs and their derivatives, "xla", "kernel" or "auto". A kernel computes forward
-            derivatives for any number of parameters. "auto" takes a kernel where one is possible and the parameters
-            are few (`Problem.choose_xla`). `Problem.engine` and `Tuned.engine` name the engine.
+        mode: Forward or reverse mode of differentiation; None decides by the number of free parameters.
+        engine: Engine of the runs and their derivatives, "xla", "kernel" or "auto", as in `run_batch`. `Tuned.engine`
+            names the engine that made them.
 
     Raises:
         ValueError: A path, range, metric, constraint or batch does not fit, or a parameter is out of range.
-        ValueError: `over` or `closed_loop()` overwrites a free parameter.
-        EngineError: The engine is "kernel" and the mode is reverse.
+        ValueError: `over` or `closed_loop()` overwrites a free parameter, or the engine is unknown.
 
     >>> import diffabs as d
     >>> from diffabs import controllers, objectives, plants, roads, stops, tune
@@ -125,7 +119,7 @@ def build_problem(
     constraints = _check_constraints(constraints, measured, batch.size)
     free_space = parameter_space(subject, free)
     _check_not_overwritten(subject, free_space, batch)
-    problem = Problem(
+    return Problem(
         subject=subject,
         space=free_space,
         solver=solver,
@@ -135,8 +129,8 @@ def build_problem(
         aggregate=check_part(aggregate or Mean(), "aggregate."),
         constraints=constraints,
         mode=mode or choose_gradient_mode(free_space),
+        engine=resolve_request(engine),
     )
-    return problem.with_engine(engine, mode)
 
 
 def _check_metrics(objective: Mapping[str, float], measured: Mapping[str, Objective]) -> None:

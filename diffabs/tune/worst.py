@@ -191,9 +191,8 @@ def worst_case(
     worst = np.argsort(-runs.metrics[metric])[:starts]
     # The weight -1 turns the minimisation of Problem into a maximisation.
     problem = Problem(
-        middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), choose_gradient_mode(free)
+        middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), choose_gradient_mode(free), engine
     )
-    problem = problem.with_engine(engine)
     known = runs.metrics[metric][worst]
     known = known[np.isfinite(known)]
     # The scale of the loss. It sets when an ascent ends, and the length of its first step.
@@ -222,7 +221,7 @@ def worst_case(
         bound=bound,
         diverged=_values_by_path(free, points[bad[0]]) if len(bad) else None,
         reasons=[lane.reason or Reason.LIMIT for lane in lanes],
-        engine=describe_engine(problem.engine),
+        engine=describe_engine(problem.find_engine()[0]),
     )
 
 

@@ -74,7 +74,6 @@ SEAMS = {
     "max_tail_atoms": "diffabs.sweep.statistics.estimates.MAX_TAIL_ATOMS",
     "max_row_groups": "diffabs.sweep.statistics.sensitivity.MAX_ROW_GROUPS",
     "read_manifest": "diffabs.sweep.store.read_manifest",
-    "max_kernel_parameters": "diffabs.tune.problem.MAX_KERNEL_PARAMETERS",
     "tune_tune": "diffabs.tune.tune",
 }
 

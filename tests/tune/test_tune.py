@@ -286,7 +286,6 @@ class Constrained:
     """A problem without rollouts: minimise x^2 + 2 y^2 with 1 - x - y <= 0; the minimum is at (2/3, 1/3)."""
 
     mode = DerivativeMode.REVERSE
-    engine = "xla"
     subject = None
 
     def __init__(self, start, excess, objective=lambda z: z[0] ** 2 + 2 * z[1] ** 2):
@@ -317,6 +316,9 @@ class Constrained:
 
     def evaluator(self, scale):
         return self._evaluate
+
+    def find_engine(self):
+        return "xla", ""
 
     def find_refusal(self):
         return None

@@ -102,6 +102,24 @@ def _launch_in_parts(
 mlir.register_lowering(run_lanes_primitive, mlir.lower_fun(_launch_in_parts, multiple_results=True))
 
 
+def build_launches(program: Any) -> None:
+    """Build the kernels that a jaxpr calls, so that an error appears before XLA compiles it.
+
+    Args:
+        program: Jaxpr.
+
+    Raises:
+        Unsupported: A derivative has an operation without a lowering rule.
+        NoCompiler: There is no compiler, or it does not compile a kernel.
+    """
+    for equation in program.eqns:
+        if equation.primitive is run_lanes_primitive:
+            types = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
+            jax.eval_shape(functools.partial(_launch_in_parts, **equation.params), *types)
+    for inner in jex.subjaxprs(program):
+        build_launches(inner)
+
+
 def _launch_once(
     lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: frozenset[int], given: dict[ArrayKey, PyTree]
 ) -> list[PyTree]:

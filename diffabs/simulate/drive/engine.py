@@ -35,15 +35,18 @@ if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
     os.register_at_fork(before=_before_fork)
 
 
-def check_process() -> None:
-    """Raise an error in a process that was forked after JAX had started.
+def is_forked() -> bool:
+    """Return whether this process was forked after JAX had started: a kernel would wait for XLA's threads forever."""
+    return _forked_process not in (0, os.getpid())
 
-    XLA's threads stay in the parent process. A kernel would wait for them forever.
+
+def check_process() -> None:
+    """Raise an error in a process in which no kernel runs (`is_forked`).
 
     Raises:
         RuntimeError: The process was forked after JAX had started.
     """
-    if _forked_process not in (0, os.getpid()):
+    if is_forked():
         raise RuntimeError("no kernel runs after os.fork: XLA's threads stay in the parent; start processes by `spawn`")
 
 
@@ -73,6 +76,11 @@ def resolve_request(engine: str) -> str:
     if meant not in REQUESTABLE_ENGINES:
         raise ValueError(f"{ENGINE_VARIABLE} = {meant!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
     return meant
+
+
+def default_engine() -> str:
+    """Return the engine that "auto" means: that of $DIFFABS_ENGINE if it is set; a kernel is never required."""
+    return "xla" if resolve_request("auto") == "xla" else "auto"
 
 
 def _describe_structure(given: PyTree) -> Hashable:

@@ -24,7 +24,7 @@ from diffabs.core.loop import BLOCKS, Loop, LoopState
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero, read_leaves
-from diffabs.core.types import Params, PyTree, Scalar
+from diffabs.core.types import Key, Params, PyTree, Scalar
 from diffabs.simulate.arguments import forbid_derivatives, prepare_arguments, refuse_derivative
 from diffabs.simulate.drive.engine import check_process
 from diffabs.simulate.drive.loops import STEPS_PER_BLOCK
@@ -86,7 +86,7 @@ def run_native(
     return jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
 
 
-def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish) -> PyTree:
+def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish, key: Key | None = None) -> PyTree:
     """Return one run, as `finish` makes it of the last carry; `jax.vmap` makes a lane of each run of a batch.
 
     Args:
@@ -94,6 +94,7 @@ def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish) ->
         objectives: Objectives by name.
         method: Stepping method.
         finish: Function that returns the result from loop, objectives and the last carry.
+        key: Random key of the run.
 
     Raises:
         Unsupported: The step has an operation without a translation.
@@ -101,7 +102,8 @@ def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish) ->
         RuntimeError: The process was forked after JAX had started.
     """
     check_process()
-    lane = _run_differentiable(finish, (loop, {}, objectives, method, None, jnp.ones(1, bool), None, None))
+    keys = None if key is None else key[None]
+    lane = _run_differentiable(finish, (loop, {}, objectives, method, keys, jnp.ones(1, bool), None, None))
     return jax.tree.map(operator.itemgetter(0), lane)
 
 
