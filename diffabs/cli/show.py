@@ -13,6 +13,7 @@ from rich.table import Table
 
 from diffabs.cli.console import say
 from diffabs.cli.tables import open_console, show_titled_table
+from diffabs.core.bijectors import reached_bound
 from diffabs.core.loop import run_signals
 from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.papers.digest import Digest
@@ -21,7 +22,6 @@ from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.types import Trajectory
 
-BOUND_SHARE = 1e-3  # of its range: a tuned number this close to a bound counts as on it
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
 COSTS = {
     "trace_cost": "trace cost bounds the sum of the costs x'Px of runs from 1 in each single state.",
@@ -308,7 +308,7 @@ def format_brief(value: Scalar) -> str:
 def numbers_at_bounds(free: Params) -> Iterator[str]:
     """Yield each tuned number at a bound of its range, with the bound.
 
-    A number is at a bound if its distance is at most `BOUND_SHARE` of the range.
+    A number is at a bound if it is in the outer hundredth of its range (`reached_bound`).
 
     Args:
         free: Rows of the free parameters by path.
@@ -317,6 +317,5 @@ def numbers_at_bounds(free: Params) -> Iterator[str]:
         after, low, high = np.broadcast_arrays(*(np.asarray(row[key], float) for key in ("after", "low", "high")))
         for at in np.ndindex(after.shape):
             name = ".".join([path, *map(str, at)])
-            for end, what in ((low[at], "lower"), (high[at], "upper")):
-                if abs(after[at] - end) <= BOUND_SHARE * (high[at] - low[at]) < math.inf:
-                    yield f"{name} ({what}, {end:g})"
+            if side := reached_bound(low[at], high[at], after[at]):
+                yield f"{name} ({side}, {(low if side == 'lower' else high)[at]:g})"

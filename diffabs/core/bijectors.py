@@ -24,6 +24,7 @@ from diffabs.core.pytree import ParameterSpec, parameters, replace
 from diffabs.core.types import AnyArray, Part, PyTree, Scalar
 
 LOGARITHMIC_RATIO = 10.0  # ratio of the ends from which a range is mapped in the logarithm
+BOUND_STEEPNESS = 0.0396  # 4 s (1 - s) at s = 0.01: slope of the map at a hundredth of a range, relative to its middle
 END_SHARE = 1e-9  # of a finite range as it is mapped: near an end the map is flat; of a lone end: rounding
 
 Range = tuple[Any, Any]
@@ -135,6 +136,18 @@ def bijection(low: float, high: float, start: float) -> Bijection:
     if math.isfinite(high):
         return HalfLine(high, start - high)
     return UnboundedLine(start, max(abs(start), 1.0))
+
+
+def reached_bound(low: float, high: float, value: float) -> str:
+    """Return "lower" or "upper" if a value is in the outer hundredth of a finite range as it is mapped, else ""."""
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return ""
+    if not low < value < high:
+        return "lower" if value <= low else "upper"
+    scale = bijection(low, high, value)
+    if float(scale.steepness(np.asarray(scale.place(value)))) > BOUND_STEEPNESS:
+        return ""
+    return "lower" if value - low < high - value else "upper"
 
 
 @dataclasses.dataclass(frozen=True)

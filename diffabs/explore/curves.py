@@ -23,6 +23,7 @@ from diffabs.simulate.types import Adaptive, FixedStep, Run, Solver
 
 INSTANTS = 400  # number of instants of a curve
 DRAFT_INSTANTS = 200  # number of instants of a fan, few because the browser lays all of them out with every redraw
+KEPT_MULTIPLE = 16  # a run that stops early must have enough instants: it keeps more, and is thinned afterwards
 MIN_DRAFT_STEPS = 4 * INSTANTS  # number of steps above which a draft is quicker
 DRAFT_RTOL = 1e-3  # relative error of a draft's step
 MEMBERS = 200  # number of runs of a fan
@@ -33,15 +34,22 @@ MIN_TRANSIENT_SHARE = 0.1  # a fan is drawn while this share of its runs goes on
 
 
 def drawing_solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
-    """Return the scenario's solver, with `every` set so that at most about `instants` instants are kept.
+    """Return the scenario's solver, with `every` set for a run that may stop after a small part of its duration.
 
     The step of the integration does not change.
 
     Args:
         chosen: Scenario.
-        instants: Number of instants to keep.
+        instants: Number of instants to draw; over the whole duration `KEPT_MULTIPLE` times as many are kept.
     """
-    return dataclasses.replace(chosen.solver, every=max(1, math.ceil(chosen.solver.steps / instants)))
+    every = math.ceil(chosen.solver.steps / (KEPT_MULTIPLE * instants))
+    return dataclasses.replace(chosen.solver, every=max(1, every))
+
+
+def thin(count: int, instants: int) -> np.ndarray:
+    """Return the places of at most about `instants` of `count` instants, the first and the last among them."""
+    places = np.arange(0, count, max(1, math.ceil((count - 1) / instants)))
+    return places if count == 0 or places[-1] == count - 1 else np.append(places, count - 1)
 
 
 def draft_solver(chosen: Scenario) -> Solver | None:
@@ -55,7 +63,7 @@ def draft_solver(chosen: Scenario) -> Solver | None:
     own = chosen.solver
     if chosen.loop.ticks or not isinstance(own, FixedStep) or own.steps <= MIN_DRAFT_STEPS:
         return None
-    return Adaptive(rtol=DRAFT_RTOL, duration=own.duration, step=own.duration / INSTANTS)
+    return Adaptive(rtol=DRAFT_RTOL, duration=own.duration, step=own.duration / (KEPT_MULTIPLE * INSTANTS))
 
 
 def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
@@ -69,9 +77,10 @@ def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
     assert run.trajectory is not None
     # Samples after the end of the run are no part of the curves.
     count = len(trajectory_columns(run, chosen.loop.plant)["t"][1])
-    t = np.asarray(run.trajectory.sample.t)[:count]
+    shown = thin(count, INSTANTS)
+    t = np.asarray(run.trajectory.sample.t)[shown]
     panels = tuple(
-        Panel(panel.unit, tuple(Curve(line.name, line.values[:count]) for line in panel.lines))
+        Panel(panel.unit, tuple(Curve(line.name, line.values[shown]) for line in panel.lines))
         for panel in _layout(run, chosen.loop.plant)
     )
     metrics = {name: float(run.metrics[name]) for name in chosen.objectives}
@@ -125,10 +134,11 @@ def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
     # Runs end at different times. The longest one has all instants; few remaining runs give no useful quantiles.
     longest = int(np.argmax(going.sum(axis=1)))
     count = int(np.sum(going.mean(axis=0) >= MIN_TRANSIENT_SHARE * max(1e-9, going[:, 0].mean())))
-    shown = [panel.lines[0].values for panel in _layout(run, chosen.loop.plant)]
-    bands = tuple(_quantiles(np.where(going, values, np.nan)[:, :count]) for values in shown)
+    shown = thin(count, DRAFT_INSTANTS)
+    signals = [panel.lines[0].values for panel in _layout(run, chosen.loop.plant)]
+    bands = tuple(_quantiles(np.where(going, values, np.nan)[:, shown]) for values in signals)
     refused = int(np.sum(~accepted))
-    return Fan(t[longest, :count], bands, MEMBERS, refused, int(lost.sum()) - refused, words)
+    return Fan(t[longest, shown], bands, MEMBERS, refused, int(lost.sum()) - refused, words)
 
 
 def fan_members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], str]:

@@ -75,7 +75,10 @@ class Tuner:
             ranges.style("grid-template-columns: 1fr 92px 92px auto")
             free.on_value_change(lambda: self._bounds(ranges, now, list(free.value or ()), fields))
             self._bounds(ranges, now, paths, fields)
-            small = ui.select(list(now.objectives), value=metric, label="make small").props("dense outlined")
+            own = tuning.describe_own_objective(now)
+            goals = {tuning.OWN_OBJECTIVE: f"the scenario's objective: {own}"} if own else {}
+            goals |= {name: name for name in now.objectives}
+            small = ui.select(goals, value=metric, label="make small").props("dense outlined")
             small.classes("w-full").props("data-id=metric")
             ui.label(self._about(now)).classes("note")
             with ui.row().classes("w-full justify-end"):
@@ -154,7 +157,11 @@ class Tuner:
             posed = self.page.tools.pose(chosen)
             before = curves.run_curves(chosen)
             found = tuning.tune_scenario(
-                chosen, posed, lambda progress: later(self._show_progress, progress), lambda: self.stopping
+                chosen,
+                posed,
+                self.page.session.knobs,
+                lambda progress: later(self._show_progress, progress),
+                lambda: self.stopping,
             )
             after = curves.run_curves(found.after)
         except Exception as error:  # the message shows every error
@@ -202,8 +209,10 @@ class Tuner:
         self.card.clear()
         with self.card:
             with ui.element("div").classes("card-title"):
-                ui.label("tuned").props("data-id=tuned")
+                ui.label("NOT tuned" if found.unstable else "tuned").props("data-id=tuned")
                 ui.label(found.reason + ("" if found.met else "; NOT every constraint is met")).classes("note")
+            for sentence in filter(None, (found.unstable, *found.at_bounds)):
+                ui.label(sentence).classes("note").props("data-id=tuning-note")
             place = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
             with place.props("data-id=before-after"):
                 for words in ("", "before", "after"):

@@ -7,13 +7,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from diffabs.config.values import ScenarioError
+from diffabs.core.bijectors import reached_bound
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import PyTree
 from diffabs.explore.knobs import Knob
+from diffabs.explore.stability import linear_stability, linearise_corners
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.tune.result import TuningProgress
+
+OWN_OBJECTIVE = "[tune.objective]"  # no metric has this name
 
 
 class TuningTask(NamedTuple):
@@ -30,11 +34,21 @@ class TuningFound(NamedTuple):
         after: Tuned scenario.
         met: Whether all constraints are met.
         reason: Reason for the end, in words.
+        at_bounds: A sentence for each number that the tuning left at a bound of its range.
+        unstable: What is not stable with these values, in words; empty if nothing is known to be unstable.
     """
 
     after: Scenario
     met: bool
     reason: str
+    at_bounds: tuple[str, ...]
+    unstable: str
+
+
+def describe_own_objective(chosen: Scenario) -> str:
+    """Return the objective of [tune] in words, such as "iae + 0.01 overshoot"; empty without any."""
+    words = (name if weight == 1 else f"{weight:g} {name}" for name, weight in chosen.tune.objective.items())
+    return " + ".join(words)
 
 
 def tunable_parameters(chosen: Scenario) -> list[str]:
@@ -55,10 +69,10 @@ def tunable_parameters(chosen: Scenario) -> list[str]:
 
 
 def default_tuning(chosen: Scenario) -> tuple[list[str], str]:
-    """Return the default free parameters and the default metric.
+    """Return the default free parameters and the default objective.
 
-    The parameters are those of the scenario's [tune], else the first tunable parameter of the controller. The metric is
-    the first one of [tune.objective], else of the scenario; "" without any.
+    The parameters are those of the scenario's [tune], else the first tunable parameter of the controller. The objective
+    is that of the scenario, `OWN_OBJECTIVE`, else the first metric; "" without any.
 
     Args:
         chosen: Scenario.
@@ -66,7 +80,7 @@ def default_tuning(chosen: Scenario) -> tuple[list[str], str]:
     paths = (
         list(chosen.tune.free) or [path for path in tunable_parameters(chosen) if path.startswith("controller.")][:1]
     )
-    return paths, next(iter(chosen.tune.objective or chosen.objectives), "")
+    return paths, OWN_OBJECTIVE if chosen.tune.objective else next(iter(chosen.objectives), "")
 
 
 def bounds_on_page(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> dict[str, tuple[float, float]]:
@@ -104,15 +118,14 @@ def scenario_with_goal(
     known: Mapping[str, Knob],
     bounded: Mapping[str, tuple[PyTree, PyTree]] | None = None,
 ) -> Scenario:
-    """Return the scenario with these free parameters, and an objective that contains this metric.
+    """Return the scenario with these free parameters and this objective.
 
-    If [tune.objective] already weighs the metric, its weights stay, also those of other metrics. Otherwise the metric
-    is the whole objective. The tuning has a single start.
+    The objective is the scenario's own, with all its weights, or one metric. The tuning has a single start.
 
     Args:
         chosen: Scenario; its constraints stay.
         paths: Paths of the free parameters.
-        metric: Name of the metric.
+        metric: Name of the metric, or `OWN_OBJECTIVE`.
         known: Numbers of the loop by key.
         bounded: Texts of the bounds (low, high) in the displayed unit, by key of a number. A bound without a text, or
             with an unchanged one, is that of `bounds_on_page`.
@@ -123,22 +136,53 @@ def scenario_with_goal(
     """
     if not paths:
         raise ScenarioError("tune.free is empty: choose at least one parameter")
-    if metric not in chosen.objectives:
+    own = metric == OWN_OBJECTIVE and chosen.tune.objective
+    if not own and metric not in chosen.objectives:
         raise ScenarioError(f"tune.objective = {metric!r} is not measured; there is {', '.join(chosen.objectives)}")
     ranges = {path: _range(chosen, path, known, bounded or {}) for path in paths}
-    weights = chosen.tune.objective if metric in chosen.tune.objective else {metric: 1.0}
-    task = dataclasses.replace(chosen.tune, free=ranges, objective=weights, starts=1)
+    task = dataclasses.replace(chosen.tune, free=ranges, objective=own or {metric: 1.0}, starts=1)
     return dataclasses.replace(chosen, tune=task)
 
 
+def at_bounds(chosen: Scenario, after: Scenario, known: Mapping[str, Knob]) -> tuple[str, ...]:
+    """Return a sentence for each free number of `chosen` that is at a bound of its range in `after`."""
+    sentences = []
+    for path in chosen.tune.free:
+        for key, (low, high) in bounds_on_page(chosen, path, known).items():
+            knob = known[key]
+            if side := reached_bound(low, high, knob.pick(get(after.loop, path))):
+                sentences.append(f"{knob.label} is at its {side} bound, {knob.words(low if side == 'lower' else high)}")
+    return tuple(sentences)
+
+
+def describe_instability(after: Scenario) -> str:
+    """Return what is not stable in the linearised loop, here and at the corners of [design.over].
+
+    The text is empty if all is stable, and if the loop has no linear model.
+    """
+    try:
+        found = linear_stability(after, linearise_corners(after))
+    except ValueError:
+        return ""
+    lost = [] if found.stable else ["the loop is not stable"]
+    if found.corners.unstable:
+        lost.append(f"{found.corners.unstable} of {found.corners.systems} corners of [design.over] are not stable")
+    return "; ".join(lost)
+
+
 def tune_scenario(
-    chosen: Scenario, posed: TuningTask, told: "Callable[[TuningProgress], None]", stopping: Callable[[], bool]
+    chosen: Scenario,
+    posed: TuningTask,
+    known: Mapping[str, Knob],
+    told: "Callable[[TuningProgress], None]",
+    stopping: Callable[[], bool],
 ) -> TuningFound:
     """Return the result of a tuning by a scenario's [tune], from one start: the current values.
 
     Args:
         chosen: Scenario.
         posed: Runs and constraints.
+        known: Numbers of the loop by key.
         told: Callback with the progress.
         stopping: Callback that returns True to end the tuning.
 
@@ -165,7 +209,10 @@ def tune_scenario(
         progress=told,
         stopping=stopping,
     )
-    return TuningFound(dataclasses.replace(chosen, loop=found.loop), found.met, found.reason.value)
+    after = dataclasses.replace(chosen, loop=found.loop)
+    return TuningFound(
+        after, found.met, found.reason.value, at_bounds(chosen, after, known), describe_instability(after)
+    )
 
 
 def _range(

@@ -347,7 +347,8 @@ def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
     assert words == "mass ± 10 %, friction ± 30 %"
     by = curves.drawing_solver(chosen, curves.DRAFT_INSTANTS)
     each = [replace(chosen.loop, {path: column[i] for path, column in values.items()}) for i in range(5)]
-    slips = [np.asarray(rollout(loop, by).trajectory.sample.output.slip) for loop in each]
+    stride = round(found.t[1] / (by.step * by.every))
+    slips = [np.asarray(rollout(loop, by).trajectory.sample.output.slip)[::stride] for loop in each]
     early = slice(0, 50)  # all of them still run
     expected = np.quantile([slip[early] for slip in slips], curves.QUANTILES, axis=0)
     np.testing.assert_allclose(found.bands[0][:, early], expected, rtol=1e-9, atol=1e-12)
@@ -472,6 +473,7 @@ def test_a_tuning_begins_from_what_is_shown(file):
     assert chosen.tune.free == {"controller.gain": ((-1e5, -300.0), (-100.0, -45.0))}
     assert chosen.tune.objective == {"iae": 1.0}
     assert get(chosen.loop, "controller.gain.1") == -46
+    assert tuning.default_tuning(session.scenario())[1] == tuning.OWN_OBJECTIVE
     other = tuning.scenario_with_goal(session.scenario(), ["reference.slip"], "stop_distance", session.knobs)
     ends = other.tune.free["reference.slip"]
     assert ends
@@ -482,6 +484,54 @@ def test_a_tuning_begins_from_what_is_shown(file):
         tuning.scenario_with_goal(session.scenario(), [], "iae", session.knobs)
     with pytest.raises(ScenarioError, match="is not measured"):
         tuning.scenario_with_goal(session.scenario(), ["reference.slip"], "beauty", session.knobs)
+
+
+def test_the_objective_is_the_scenarios_with_all_weights_or_one_metric(file):
+    now = Session(str(file(SHORT.replace("iae = 1.0", "iae = 1.0\novershoot = 0.01")))).scenario()
+    known = Session(str(file(SHORT))).knobs
+    goals = [
+        tuning.scenario_with_goal(now, ["controller.gain"], metric, known).tune.objective
+        for metric in (tuning.OWN_OBJECTIVE, "iae")
+    ]
+    assert goals == [{"iae": 1.0, "overshoot": 0.01}, {"iae": 1.0}]
+    assert tuning.describe_own_objective(now) == "iae + 0.01 overshoot"
+    none = dataclasses.replace(now, tune=dataclasses.replace(now.tune, objective={}))
+    assert tuning.default_tuning(none)[1] == next(iter(now.objectives))
+    with pytest.raises(ScenarioError, match="is not measured"):
+        tuning.scenario_with_goal(none, ["controller.gain"], tuning.OWN_OBJECTIVE, known)
+
+
+@killed_by("core/bijectors.py", "value - low < high - value", "True")
+@killed_by("core/bijectors.py", "scale = bijection(low, high, value)", "scale = Interval(low, high)")
+def test_a_tuning_names_the_bounds_at_which_it_ended(file):
+    session = Session(str(file(SHORT)))
+    now = session.scenario()
+
+    def sentences(*gain, path="controller.gain"):
+        after = dataclasses.replace(now, loop=replace(now.loop, {path: gain}))
+        return tuning.at_bounds(now, after, session.knobs)
+
+    # bounds [-1e5, -100] and [-300, -15], logarithmic: a hundredth of 3 and 1.3 decades
+    assert sentences(-11753.0, -48.0) == ()
+    assert sentences(-106.0, -48.0) == ("gain 1 is at its upper bound, -100 N m/s",)
+    assert sentences(-95_000.0, -292.0) == (
+        "gain 1 is at its lower bound, -100000 N m/s", "gain 2 is at its lower bound, -300 N m",
+    )  # fmt: skip
+    assert sentences(-11753.0, -15.0) == ("gain 2 is at its upper bound, -15 N m",)
+    assert sentences(-110.0, -16.0) == ()
+
+
+@killed_by("explore/tuning.py", "if found.corners.unstable:", "if False:")
+def test_unstable_corners_are_named(file):
+    """By the poles of the closed loops; a positive gain drives the slip away."""
+    session = Session(str(file(SHORT)))
+    now = session.scenario()
+    assert tuning.describe_instability(now) == ""
+    lost = dataclasses.replace(now, loop=replace(now.loop, {"controller.gain": (11753.0, 48.0)}))
+    assert tuning.describe_instability(lost) == (
+        "the loop is not stable; 4 of 4 corners of [design.over] are not stable"
+    )
+    assert all(np.any(closed_loop_poles(open_loop(loop).transfer()).real > 0) for loop in (lost.loop,))
 
 
 @killed_by("explore/tuning.py", "{knob.words(high)}", "{knob.text(high)} {knob.spec.unit}")
@@ -596,6 +646,20 @@ def test_speeds_of_a_plant_without_a_wheel_stay_in_si(session):
     assert not is_vehicle(Cart())
     assert is_vehicle(session.given.loop.plant)
     assert session.knobs["initial.speed"].spec.unit == "km/h"
+
+
+@killed_by("explore/curves.py", "(KEPT_MULTIPLE * instants))", "instants)")
+@killed_by("explore/curves.py", "np.append(places, count - 1)", "places")
+def test_a_run_that_stops_early_is_drawn_whole(file):
+    """A hundredth of the duration has as many instants as a run needs, and its last one is where it stops."""
+    chosen = Session(str(file(SHORT.replace("duration = 1.0", "duration = 40.0")))).scenario()
+    assert curves.drawing_solver(chosen).steps == 40_000
+    for by in (None, curves.draft_solver(chosen)):
+        found = curves.run_curves(chosen, by)
+        assert 60 < len(found.t) <= 2 * curves.INSTANTS
+        assert 0.3 < found.t[-1] == pytest.approx(found.metrics["stop_time"], rel=1e-3)
+    assert [len(curves.thin(count, 400)) for count in (0, 1, 2, 400, 401, 402, 6401)] == [0, 1, 2, 400, 401, 202, 401]
+    assert curves.thin(403, 400)[-1] == 402
 
 
 def test_a_transient_ends_when_the_signal_has_settled():

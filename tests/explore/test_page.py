@@ -7,13 +7,14 @@ import math
 import pathlib
 import threading
 
+import numpy as np
 import pytest
 from mutants import killed_by
 from seams import replace_seam
 from test_explore import SHORT
 
-from diffabs.explore import curves, stability
-from diffabs.explore.panels import Fan
+from diffabs.explore import curves, stability, tuning
+from diffabs.explore.panels import Curves, Fan
 from diffabs.explore.session import AS_GIVEN, CERTIFIED, ProofVerdict, Session, Tools
 from diffabs.tune.result import DescentPoint, TuningProgress
 
@@ -478,6 +479,23 @@ def test_a_tuning_that_cannot_start_says_why(visit, monkeypatch):
         with contextlib.suppress(TypeError):
             opened.click("start")
         assert opened.page.controls.message.text == "TypeError: broken part"
+
+    visit(user)
+
+
+@killed_by("explore/tuner.py", '"NOT tuned" if found.unstable else "tuned"', '"tuned"')
+@killed_by("explore/tuner.py", "(found.unstable, *found.at_bounds)", "(found.unstable,)")
+def test_a_result_with_unstable_corners_is_not_called_tuned(visit):
+    async def user(opened):
+        tuner, now = opened.page.tuner, opened.session.scenario()
+        found = tuning.TuningFound(now, True, "it ended", ("gain 2 is at its lower bound, -300 N m",), "")
+        drawn = Curves(np.array([0.0]), (), dict.fromkeys(now.objectives, 1.0), "", draft=False)
+        for unstable, head in (("", "tuned"), ("1 of 4 corners of [design.over] are not stable", "NOT tuned")):
+            with opened.client:
+                tuner._table(now, found._replace(unstable=unstable), drawn, drawn)
+            assert opened.find("tuned").text == head
+            notes = [one.text for one in opened.elements("tuning-note")]
+            assert notes == [*filter(None, [unstable]), "gain 2 is at its lower bound, -300 N m"]
 
     visit(user)
 
