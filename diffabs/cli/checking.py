@@ -8,8 +8,8 @@ import jax
 import numpy as np
 
 from diffabs.config.values import ScenarioError
+from diffabs.core.summary import format_metric
 from diffabs.core.types import JsonObject, Key, Params
-from diffabs.runtime.summary import format_metric
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, needs_key
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS

@@ -15,9 +15,9 @@ from diffabs.cli.console import say
 from diffabs.cli.tables import open_console, show_titled_table
 from diffabs.core.bijectors import reached_bound
 from diffabs.core.loop import run_signals
+from diffabs.core.summary import format_metric, round_for_table
 from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.papers.digest import Digest
-from diffabs.runtime.summary import format_metric, round_for_table
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.types import Trajectory

@@ -9,6 +9,7 @@ A `Loop` is one pytree: every parameter of every part is a leaf with a dotted pa
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from functools import cache, reduce
 from typing import Any, NamedTuple
 
@@ -29,7 +30,8 @@ from diffabs.core.protocols import (
     Tracking,
     no_flow,
 )
-from diffabs.core.pytree import part, parts, pytree
+from diffabs.core.pytree import parameters, part, parts, pytree
+from diffabs.core.summary import Summary
 from diffabs.core.types import Int, Part, PyTree, Scalar
 
 
@@ -85,6 +87,12 @@ class Loop:
     controller: Block = part()
     actuator: Block = part(default=Direct)
     stop: Stop = part()
+
+    def _repr_html_(self) -> str:
+        """Return the parts and their parameters as a table for a notebook."""
+        parts_ = ", ".join(f"{field.name} {type(getattr(self, field.name)).__name__}" for field in fields(self))
+        rows = tuple((path, value, spec.interval()) for path, spec, value in parameters(self))
+        return Summary(f"Loop: {parts_}", ("parameter", "value", "range"), rows)._repr_html_()
 
     def problems(self) -> Iterator[str]:
         """Yield a line if an output of the plant has the name of another signal."""

@@ -22,11 +22,12 @@ from scipy.optimize import least_squares
 from diffabs.core.bijectors import FreeSpace, HalfLine, Range, parameter_space
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
+from diffabs.core.summary import Summary, round_for_table
 from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
 from diffabs.core.validity import check_part
 from diffabs.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial, check_prior
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
-from diffabs.runtime.summary import Summary, round_for_table
+from diffabs.runtime.interactive import ProgressLine, report_to
 
 END_COORDINATE = 7.0  # |z| beyond which a value may be held: exp(-7) of the range, or of the start's distance
 MAX_END_DISTANCE = 0.01  # of a held value from its end, in standard deviations with the others fixed
@@ -175,7 +176,7 @@ def fit(
         tolerances: Stopping criteria of each start, with the maximum number of evaluations.
         usable: Function of a part that returns whether it may be evaluated; it runs outside jit.
         progress: Called at each start and accepted point, with the number of evaluations over all starts so far and the
-            cost.
+            cost. None shows a line in a notebook and in an interactive session.
         stopping: Called before every evaluation. True ends the fit at the last accepted point and skips further starts.
 
     Raises:
@@ -209,17 +210,23 @@ def fit(
     if not 2 <= norm < np.inf:
         raise ValueError(f"norm = {norm:g} is outside [2, inf)")
     deviations = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, float), (n,))
-    tolerances, watch = tolerances or Tolerances(), _FitMonitor(progress or (lambda _, __: None), stopping)
+    tolerances = tolerances or Tolerances()
     fits: list[Identified | None] = []
-    for z in points:
-        # An interruption skips further starts only if there is a fit to return.
-        if not (any(fits) and watch.stopping()):
-            fits.append(_fit_start(problem, z, deviations, estimated, tolerances, watch))
+    with ProgressLine() as line:
+        watch = _FitMonitor(report_to(line, progress, _describe_progress) or (lambda _, __: None), stopping)
+        for z in points:
+            # An interruption skips further starts only if there is a fit to return.
+            if not (any(fits) and watch.stopping()):
+                fits.append(_fit_start(problem, z, deviations, estimated, tolerances, watch))
     done = tuple(one for one in fits if one is not None)
     if not done:
         raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
     diverged = tuple(_values_by_path(where, z) for z, one in zip(points, fits, strict=False) if one is None)
     return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
+
+
+def _describe_progress(evaluations: int, cost: float) -> str:
+    return f"identification: {evaluations} evaluations, cost {cost:.6g}"
 
 
 class _FitInterrupted(Exception):

@@ -6,6 +6,7 @@ close to each other differ in their dashes as well.
 Source: M. Okabe and K. Ito, Color Universal Design (2008).
 """
 
+import io
 import os
 import pathlib
 import textwrap
@@ -31,6 +32,7 @@ DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
 GREY = "#767676"
 KMH = 3.6  # km/h per m/s
 DPI = 150
+NOTEBOOK_DPI = 75  # a figure is as wide as a cell
 FEW_DECADES, PLAIN = 2.0, 4  # below FEW_DECADES 2 and 5 have labels, too; powers of ten up to PLAIN are written out
 RAISED = str.maketrans("-0123456789", "\u207b\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079")
 TITLE_SIZE = 9  # characters per inch, with room to spare
@@ -47,6 +49,12 @@ class Sheet(Figure):
         for words in self.findobj(Text):
             words.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
         super().draw(renderer)
+
+    def _repr_png_(self) -> bytes:
+        """Return the figure as a PNG, which a notebook shows for the last expression of a cell."""
+        picture = io.BytesIO()
+        self.savefig(picture, format="png", dpi=NOTEBOOK_DPI)
+        return picture.getvalue()
 
 
 def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float, float] = (5.4, 3.4), **kwargs: Any):

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from xml.sax.saxutils import escape
 
-from diffabs.runtime.summary import round_for_table
+from diffabs.core.summary import round_for_table
 
 CHART_WIDTH, HEIGHT, LEFT, RIGHT, AXIS_TOP, AXIS_BOTTOM = 640, 280, 90, 20, 14, 46
 TICKS = 4

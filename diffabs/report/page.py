@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from diffabs.config.values import make_printable
+from diffabs.core.summary import round_for_table
 from diffabs.core.types import Params, PyTree, Scalar, Table
 from diffabs.report.documents import is_within
 from diffabs.runtime import files
-from diffabs.runtime.summary import round_for_table
 
 IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 LARGEST_IMAGE = 2**25  # bytes

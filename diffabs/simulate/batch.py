@@ -12,6 +12,7 @@ import numpy as np
 
 from diffabs.core import kinds
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace, stack_lists
+from diffabs.core.summary import Summary
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.types import Solver
@@ -59,6 +60,15 @@ class Batch:
     def _columns(self) -> Params:
         others = {name: getattr(self, name) for name in ("keys", "weights", "durations")}
         return {**self.values, **{name: column for name, column in others.items() if column is not None}}
+
+    def _repr_html_(self) -> str:
+        """Return the columns as a table for a notebook."""
+        rows = []
+        for name, column in self._columns().items():
+            numbers = jnp.issubdtype(getattr(column, "dtype", float), jnp.number)
+            rows.append((name, *((np.min(column), np.max(column)) if numbers else ("", "")), str(np.shape(column))))
+        title = f"Batch of {self.size} run{'' if self.size == 1 else 's'}"
+        return Summary(title, ("column", "least", "greatest", "shape"), tuple(rows))._repr_html_()
 
     @property
     def size(self) -> int:

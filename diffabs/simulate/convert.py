@@ -9,8 +9,8 @@ import numpy as np
 from jax.core import Tracer
 
 from diffabs.core.optional import import_optional
+from diffabs.core.summary import Summary, round_for_table
 from diffabs.core.types import Params, Part, PyTree, Scalar
-from diffabs.runtime.summary import Summary, round_for_table
 
 NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
 DEFAULT_CONTROL_UNIT = "control"  # unit of the control if no plant is given

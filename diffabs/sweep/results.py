@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 
 from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.optional import import_optional
+from diffabs.core.summary import Summary
 from diffabs.core.types import JsonObject, Matrix, PyTree, Scalar
 from diffabs.runtime import files
-from diffabs.runtime.summary import Summary
 from diffabs.sweep import seal
 from diffabs.sweep.manifest import Seals, read_manifest
 from diffabs.sweep.seal import SweepError

@@ -12,6 +12,7 @@ from diffabs.core.kinds import format_value
 from diffabs.core.loop import Loop
 from diffabs.core.types import Table
 from diffabs.runtime import provenance, stopwatch
+from diffabs.runtime.interactive import ProgressLine, report_to
 from diffabs.simulate.drive.engine import log_xla_reason
 from diffabs.sweep.engines import Engine, Local
 from diffabs.sweep.manifest import Seals, describe_owner, read_notes
@@ -45,6 +46,11 @@ class SweepProgress(NamedTuple):
     damaged: tuple[int, ...]
     refused: int = 0
 
+    def __str__(self) -> str:
+        """Return the progress in a few words."""
+        failed = f", {self.failed} failed" if self.failed else ""
+        return f"sweep: {self.samples:,} of {self.total:,} runs{failed}, {self.seconds:.0f} s"
+
     @property
     def rate(self) -> float:
         """Samples of this call per second."""
@@ -70,7 +76,8 @@ def sweep(
         out: Folder for the results; it is created.
         resume: Continue with a folder that already contains chunks of this study.
         on: Engine that computes the chunks; None is every device of this process.
-        progress: Function that is called with the progress at the start and after every chunk.
+        progress: Function that is called with the progress at the start and after every chunk. None shows a line in a
+            notebook and in an interactive session.
         stopping: Function that is called after every chunk; True ends the run, and `resume` continues it later.
         source: Texts for the manifest, by name, such as the scenario.
 
@@ -94,8 +101,8 @@ def sweep(
         log_xla_reason(why_xla)
     if study.engine != "xla" and (line := find_study_objection(study)):
         raise ValueError(line)
-    with _begin_sweep(store, study, resume, notes) as (missing, damaged):
-        tell, begun = progress or (lambda _: None), time.monotonic()
+    with _begin_sweep(store, study, resume, notes) as (missing, damaged), ProgressLine() as shown:
+        tell, begun = report_to(shown, progress, str) or (lambda _: None), time.monotonic()
         before = study.samples - sum(b - a for a, b in map(study.bounds, missing))
         at = SweepProgress(before, study.samples, 0, 0.0, 0, 0, tuple(damaged))
         tell(at)

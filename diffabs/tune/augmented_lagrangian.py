@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from diffabs.core.pytree import get
 from diffabs.core.reason import Reason
 from diffabs.core.types import PyTree
 from diffabs.simulate.drive.engine import describe_engine
@@ -135,6 +136,7 @@ class AugmentedLagrangianSearch:
             mode=problem.mode,
             diverged=(int(self.before.diverged), int(best.evaluation.diverged)),
             engine=describe_engine(problem.find_engine()[0]),
+            start={entry.path: get(problem.subject, entry.path) for entry in problem.space.entries},
         )
 
     def _run_rounds(self, descent: Descent) -> list[DescentState]:

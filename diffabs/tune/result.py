@@ -7,8 +7,8 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.reason import Reason
+from diffabs.core.summary import Summary
 from diffabs.core.types import Part, PyTree
-from diffabs.runtime.summary import Summary
 from diffabs.tune.method import DerivativeMode
 
 
@@ -49,6 +49,11 @@ class TuningProgress(NamedTuple):
     starts: int
     point: DescentPoint
 
+    def __str__(self) -> str:
+        """Return the progress in a few words."""
+        point, more = self.point, f"round {self.round + 1}, " if self.round else ""
+        return f"tuning: {more}iteration {point.iteration}, loss {point.loss:.6g}, {point.evaluations} evaluations"
+
 
 class StartResult(NamedTuple):
     """The result from one start.
@@ -88,6 +93,7 @@ class Tuned:
         mode: Mode of differentiation.
         diverged: Pair of numbers of diverged runs; 0 before if such a run is inadmissible.
         engine: Engine of the runs, with compiler and flags if it is a kernel.
+        start: The subject's own values of the free parameters by path.
     """
 
     part: Part
@@ -102,11 +108,18 @@ class Tuned:
     mode: DerivativeMode
     diverged: tuple[int, int]
     engine: dict[str, str]
+    start: dict[str, PyTree] = dataclasses.field(default_factory=dict)
 
     def table(self) -> Summary:
-        """Return a table: free parameters after, means of the finite metrics, and objective before and after."""
-        rows: list[tuple[PyTree, ...]] = [(name, "", value) for name, value in self.values.items()]
-        rows += [(f"mean {name}", *(_finite_mean(one[name]) for one in self.metrics)) for name in self.metrics[0]]
+        """Return a table, before and after: free parameters, metrics (mean and greatest finite value), objective."""
+        rows: list[tuple[PyTree, ...]] = [
+            (name, self.start.get(name, ""), value) for name, value in self.values.items()
+        ]
+        for name in self.metrics[0]:
+            runs = [_finite(metrics[name]) for metrics in self.metrics]
+            rows.append((f"mean {name}", *(float(values.mean()) for values in runs)))
+            if any(values.size > 1 for values in runs):
+                rows.append((f"worst {name}", *(float(values.max()) for values in runs)))
         rows.append(("objective", *self.objective))
         lanes = np.size(next(iter(self.metrics[0].values()), ()))
         title = f"Tuned over {lanes} lane{'' if lanes == 1 else 's'}: {self.reason.value}"
@@ -146,7 +159,7 @@ def build_subject_loop(subject: Part) -> Loop:
     return subject if isinstance(subject, Loop) else subject.closed_loop()
 
 
-def _finite_mean(values: PyTree) -> float:
-    """Return the mean over the finite values, NaN if there are none."""
-    good = np.asarray(values)[np.isfinite(values)]
-    return float(good.mean()) if good.size else float("nan")
+def _finite(values: PyTree) -> np.ndarray:
+    """Return the finite values; one NaN if there are none."""
+    finite = np.asarray(values, float)[np.isfinite(values)]
+    return finite if finite.size else np.array([np.nan])

@@ -14,6 +14,7 @@ from diffabs.core.pytree import canonical_dtypes, get, replace
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
+from diffabs.runtime.interactive import ProgressLine, report_to
 from diffabs.simulate.arguments import refuse
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import resolve_request
@@ -42,7 +43,8 @@ def tune(
     Args:
         problem: The problem, from `build_problem`.
         method: Optimiser, starts, iterations; None is L-BFGS from the subject's own values.
-        progress: Called after every evaluation, with the best of the last points of all starts.
+        progress: Called after every evaluation, with the best of the last points of all starts. None shows a line in a
+            notebook and in an interactive session.
         stopping: Called after every evaluation; True ends the search with the best point so far.
 
     Raises:
@@ -57,7 +59,9 @@ def tune(
     subject, paths = problem.subject, [entry.path for entry in problem.space.entries]
     own = {path: get(subject, path) for path in paths}
     one_sided.warn(subject, own, problem.batch, problem.solver, "start")
-    found = AugmentedLagrangianSearch(problem, method or Method(), progress, stopping).result()
+    with ProgressLine() as line:
+        report = report_to(line, progress, str)
+        found = AugmentedLagrangianSearch(problem, method or Method(), report, stopping).result()
     one_sided.warn(subject, found.values, problem.batch, problem.solver, "result")
     return found
 

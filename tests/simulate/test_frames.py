@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import math
+import re
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +17,12 @@ from mutants import killed_by
 import diffabs as d
 from diffabs import objectives
 from diffabs.controllers import HoldingInput, StateFeedback
+from diffabs.core.summary import Summary, format_cell, round_for_table
 from diffabs.identify import Traces, identify
 from diffabs.plants import BrakeStart, MirroredRig
+from diffabs.plot.style import sheet
 from diffabs.references import FixedSlip
-from diffabs.runtime.summary import Summary, format_cell, round_for_table
+from diffabs.runtime import interactive
 from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached
 from diffabs.sweep import Results, Space, Study, Uniform, sweep
@@ -43,7 +47,7 @@ def run():
     return d.rollout(rig(), SOLVER, objectives.BRAKING)
 
 
-@killed_by("runtime/summary.py", "ZERO_TOLERANCE = 1e-14", "ZERO_TOLERANCE = 0.0")
+@killed_by("core/summary.py", "ZERO_TOLERANCE = 1e-14", "ZERO_TOLERANCE = 0.0")
 @pytest.mark.parametrize(
     ("value", "text"),
     [
@@ -66,7 +70,7 @@ def test_a_cell_of_a_list_is_its_beginning():
     assert format_cell(True) == "True"
 
 
-@killed_by("runtime/summary.py", "<strong>{html.escape(self.title)}</strong>", "<strong>{self.title}</strong>")
+@killed_by("core/summary.py", "<strong>{html.escape(self.title)}</strong>", "<strong>{self.title}</strong>")
 def test_a_summary_is_text_and_html():
     found = Summary("a <title>", ("name", "value"), (("x", 1 / 3), ("longer", 8e-17)), "note")
     assert str(found).splitlines() == [
@@ -162,6 +166,64 @@ def test_a_run_draws_the_figure_of_its_plant(run, tmp_path):
     figure.savefig(tmp_path / "run.png")
 
 
+def cells(html):
+    return [re.findall(r"<td>(.*?)</td>", row) for row in re.findall(r"<tr>(<td>.*?)</tr>", html)]
+
+
+@killed_by("core/loop.py", "spec.interval()) for", '"") for')
+def test_a_loop_and_a_batch_have_tables_in_a_notebook():
+    html = rig()._repr_html_()
+    assert "plant MirroredRig" in html
+    rows = {name: rest for name, *rest in cells(html)}
+    assert rows["plant.mass"] == ["5.3", "(0, inf) kg"]
+    assert rows["controller.gain"][0] == "[-3000, -48]"
+    batch = d.Batch({"plant.mass": [5.3, 5.5, 6.2], "controller.gain": np.full((3, 2), -7.0)}, keys=np.arange(3))
+    html = batch._repr_html_()
+    assert "Batch of 3 runs" in html
+    assert cells(html) == [
+        ["plant.mass", "5.3", "6.2", "(3,)"], ["controller.gain", "-7", "-7", "(3, 2)"], ["keys", "0", "2", "(3,)"],
+    ]  # fmt: skip
+    named = d.Batch({"plant.mass": [5.3]}, keys=jax.random.split(jax.random.key(0), 1))
+    assert cells(named._repr_html_())[1] == ["keys", "", "", "(1,)"]
+
+
+@killed_by("plot/style.py", 'format="png", dpi', 'format="pdf", dpi')
+def test_a_figure_shows_itself_in_a_notebook():
+    """As IPython asks for it, without `%matplotlib inline`."""
+    figure, _ = sheet(title="a rig")
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+@killed_by("runtime/interactive.py", "self.handle.update(Line(self.text))", "pass")
+def test_progress_is_one_line_in_a_notebook_and_in_a_session_and_none_in_a_script(monkeypatch, capsys):
+    shown, now = [], iter(range(100))
+    monkeypatch.setattr(interactive.time, "monotonic", lambda: next(now))
+    words = interactive.report_to(interactive.ProgressLine(), None, str)
+    assert words is None
+    monkeypatch.setattr(sys, "ps1", ">>> ", raising=False)
+    with interactive.ProgressLine() as line:
+        tell = interactive.report_to(line, None, "{} of {}".format)
+        tell(1, 3)
+        tell(2, 3)
+    assert capsys.readouterr().err.replace("\r\x1b[K", "|") == "|1 of 3|2 of 3|2 of 3\n"
+    user = shown.append
+    assert interactive.report_to(line, user, str) is user
+
+    def display(text, display_id):
+        assert display_id
+        shown.append(repr(text))
+        return SimpleNamespace(update=lambda text: shown.append(repr(text)))
+
+    shell = SimpleNamespace(kernel=1)
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=display))
+    with interactive.ProgressLine() as line:
+        line.write("a")
+        line.write("b")
+    assert shown == ["a", "b", "b"]
+    assert capsys.readouterr().err == ""
+
+
 @killed_by("tune/result.py", '("objective", *self.objective)', '("objective", *self.objective[::-1])')
 @pytest.mark.slow
 def test_a_tuning_has_a_table():
@@ -169,7 +231,9 @@ def test_a_tuning_has_a_table():
     found = tune(build_problem(rig(), free=free, objective={"iae": 1.0}, over=over, solver=SOLVER))
     table = found.table()
     rows = {row[0]: row[1:] for row in table.rows}
+    np.testing.assert_array_equal(rows["controller.gain"][0], rig().controller.gain)
     np.testing.assert_array_equal(rows["controller.gain"][1], found.values["controller.gain"])
+    assert rows["worst iae"] == (np.max(found.metrics[0]["iae"]), np.max(found.metrics[1]["iae"]))
     assert rows["mean iae"] == (np.mean(found.metrics[0]["iae"]), np.mean(found.metrics[1]["iae"]))
     assert rows["objective"] == found.objective
     assert repr(found) == str(table)
