@@ -139,7 +139,13 @@ def bijection(low: float, high: float, start: float) -> Bijection:
 
 
 def reached_bound(low: float, high: float, value: float) -> str:
-    """Return "lower" or "upper" if a value is in the outer hundredth of a finite range as it is mapped, else ""."""
+    """Return "lower" or "upper" if a value is in the outer hundredth of a finite range as it is mapped, else "".
+
+    Args:
+        low: Lower end.
+        high: Upper end.
+        value: Value.
+    """
     if not (math.isfinite(low) and math.isfinite(high)):
         return ""
     if not low < value < high:

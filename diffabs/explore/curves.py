@@ -47,7 +47,12 @@ def drawing_solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
 
 
 def thin(count: int, instants: int) -> np.ndarray:
-    """Return the places of at most about `instants` of `count` instants, the first and the last among them."""
+    """Return the places of some instants, the first and the last among them.
+
+    Args:
+        count: Number of instants that there are.
+        instants: Number of intervals between the places, at most.
+    """
     places = np.arange(0, count, max(1, math.ceil((count - 1) / instants)))
     return places if count == 0 or places[-1] == count - 1 else np.append(places, count - 1)
 

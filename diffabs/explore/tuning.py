@@ -46,7 +46,11 @@ class TuningFound(NamedTuple):
 
 
 def describe_own_objective(chosen: Scenario) -> str:
-    """Return the objective of [tune] in words, such as "iae + 0.01 overshoot"; empty without any."""
+    """Return the objective of [tune] in words, such as "iae + 0.01 overshoot"; empty without any.
+
+    Args:
+        chosen: Scenario.
+    """
     words = (name if weight == 1 else f"{weight:g} {name}" for name, weight in chosen.tune.objective.items())
     return " + ".join(words)
 
@@ -145,7 +149,13 @@ def scenario_with_goal(
 
 
 def at_bounds(chosen: Scenario, after: Scenario, known: Mapping[str, Knob]) -> tuple[str, ...]:
-    """Return a sentence for each free number of `chosen` that is at a bound of its range in `after`."""
+    """Return a sentence for each free number that the tuning left at a bound of its range.
+
+    Args:
+        chosen: Scenario with free parameters and their ranges.
+        after: Scenario with the tuned values.
+        known: Numbers of the loop by key.
+    """
     sentences = []
     for path in chosen.tune.free:
         for key, (low, high) in bounds_on_page(chosen, path, known).items():
@@ -159,6 +169,9 @@ def describe_instability(after: Scenario) -> str:
     """Return what is not stable in the linearised loop, here and at the corners of [design.over].
 
     The text is empty if all is stable, and if the loop has no linear model.
+
+    Args:
+        after: Scenario with the tuned values.
     """
     try:
         found = linear_stability(after, linearise_corners(after))

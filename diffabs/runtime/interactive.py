@@ -67,7 +67,13 @@ class Line:
 def report_to(
     line: ProgressLine, progress: Callable[P, None] | None, words: Callable[P, str]
 ) -> Callable[P, None] | None:
-    """Return the user's `progress`, else a function that shows its arguments in `words` on the line, if it is shown."""
+    """Return the user's `progress`, else a function that shows its arguments on a line, else None.
+
+    Args:
+        line: Line; without a place to show it, the result is None.
+        progress: Function of the user, or None.
+        words: Function that returns the text for the same arguments.
+    """
 
     def write(*args: P.args, **kwargs: P.kwargs) -> None:
         line.write(words(*args, **kwargs))
