@@ -25,10 +25,12 @@ from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.transfer import Transfer, check_transfer
 
 GRID_DECADES, PER_DECADE = 4, 60  # beyond the slowest and the fastest pole; points of the grid before it is refined
+UNIT_TOLERANCE = 1e-12  # of |L| = 1, where |L| reaches 1 and does not cross it
 NEIGHBOUR_DISTANCE, MAX_GRID_REFINEMENTS = 0.05, 14  # relative distance of neighbours; how often the grid is refined
 # |L| below which the turns of a delay are not resolved; angle by which a delay turns L between points [rad].
 SMALL_LOOP_GAIN, DELAY_TURN_ANGLE = 1e-3, 0.2
 MAX_GRID_FREQUENCIES = 200_000  # points of a grid
+MIN_FREQUENCY, MAX_RANGE_STEPS = 1e-60, 4  # lowest frequency of a grid [rad/s]; steps to crossovers far from the poles
 ROOT_BISECTIONS, GOLDEN = 70, (math.sqrt(5) - 1) / 2
 REAL_TOLERANCE = 1e-9  # relative: |L(0)| and L at half the sampling rate are real but for rounding
 # Longest delay to try with a sampled loop: in periods, and in multiples of the margin without a new sampling. The most
@@ -131,6 +133,9 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
     if not is_stable(system):
         none = (math.nan, math.nan)
         return Margins(False, none, none, *none, math.nan, *none, *none, crossover)
+    if not len(found.gain_at):
+        found = _touch_unit_circle(system, w, found)
+        crossover = float(found.gain_at.max()) if len(found.gain_at) else math.nan
     i = int(np.argmin(np.abs(found.phases))) if len(found.phases) else None
     phase, phase_at = (math.inf, math.nan) if i is None else (abs(found.phases[i]), found.gain_at[i])
     gain, gain_at = _gain_margins(found)
@@ -164,6 +169,20 @@ def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers
         if far < 0:
             phase_at, factors = np.append(phase_at, math.inf), np.append(factors, -1 / far)
     return Crossovers(gain_at, falls, phases, phase_at, factors)
+
+
+def _touch_unit_circle(system: Transfer, w: np.ndarray, found: Crossovers) -> Crossovers:
+    """Return the crossovers with the highest frequency at which |L| reaches 1 from below, if it does."""
+    with np.errstate(all="ignore"):
+        values = np.abs(_response(system, w))
+    highest = np.flatnonzero(values >= np.nanmax(values) * (1 - UNIT_TOLERANCE))[-1]
+    size, at = _peak(lambda w: np.abs(_response(system, w)), w[max(highest - 1, 0) :])
+    if values[highest] >= size * (1 - UNIT_TOLERANCE):
+        size, at = float(values[highest]), float(w[highest])
+    if abs(size - 1) > UNIT_TOLERANCE:
+        return found
+    gain_at = np.array([at])
+    return found._replace(gain_at=gain_at, falls=np.array([True]), phases=np.angle(-_response(system, gain_at)))
 
 
 def is_stable(system: Transfer) -> bool:
@@ -232,7 +251,8 @@ def closed_loop_poles(system: Transfer) -> np.ndarray:
 def frequency_grid(system: Transfer) -> np.ndarray:
     """Return frequencies (k,) [rad/s] between which L changes little.
 
-    They begin well below the slowest pole, and end well above the fastest or at half the sampling rate.
+    They begin well below the slowest pole and the lowest crossover. They end well above the fastest pole and the
+    highest crossover, or at half the sampling rate.
 
     Args:
         system: Open loop with one input and one output.
@@ -240,11 +260,9 @@ def frequency_grid(system: Transfer) -> np.ndarray:
     poles, closed = system.poles, closed_loop_poles(system._replace(delay=0.0))
     if system.period is not None:
         poles, closed = (np.log(z[np.abs(z) > 1e-12].astype(complex)) / system.period for z in (poles, closed))
-    sizes = np.abs(np.concatenate([poles, closed]))
-    sizes = sizes[sizes > 1e-9]
     half = math.pi / system.period if system.period else math.inf
-    low, high = (sizes.min(), sizes.max()) if len(sizes) else (1.0, 1.0)
-    low, high = min(low, half) * 10.0**-GRID_DECADES, min(high * 10.0**GRID_DECADES, half)
+    low, high = _frequency_range(system, np.abs(np.concatenate([poles, closed])), half)
+    low, high = low * 10.0**-GRID_DECADES, min(high * 10.0**GRID_DECADES, half)
     w = np.geomspace(low, high, int(PER_DECADE * math.log10(high / low)) + 2)
     # Extra points around each lightly damped pole, where L changes fast.
     around = [abs(p.imag) + abs(p.real) * np.linspace(-5, 5, 41) for p in poles if p.imag > 0]
@@ -258,6 +276,29 @@ def frequency_grid(system: Transfer) -> np.ndarray:
     w = _refine_grid(system, w)
     between = _between_crossovers(system)
     return np.union1d(w, between[between < half])
+
+
+def _frequency_range(system: Transfer, sizes: np.ndarray, half: float) -> tuple[float, float]:
+    """Return the lowest and the highest frequency of poles and crossovers, up to `half` the sampling rate [rad/s].
+
+    Poles do not show a crossover that is far from all of them: one of them may be rounding. Beyond the poles L is
+    g w^k, so |L| = 1 at w |L(w)|^(-1/k).
+    """
+    sizes = sizes[sizes > MIN_FREQUENCY]
+    low, high = (min(sizes.min(), half), min(sizes.max(), half)) if len(sizes) else (min(1.0, half),) * 2
+    for way in (-1, 1):
+        for _ in range(MAX_RANGE_STEPS):
+            w = low if way < 0 else high
+            w = w * 10.0 ** (way * GRID_DECADES)
+            if not MIN_FREQUENCY < w < min(half, 1 / MIN_FREQUENCY):
+                break
+            near, far = np.log(np.abs(_response(system._replace(delay=0.0), np.array([w, w * 10.0**way]))))
+            slope = round((far - near) / math.log(10.0))  # of log |L| in the direction away from the poles
+            if not (np.isfinite(near) and slope) or near * slope >= 0:  # constant, or already away from |L| = 1
+                break
+            crossing = w * math.exp(min(-near / slope, 600.0) * way)
+            low, high = (max(crossing, MIN_FREQUENCY), high) if way < 0 else (low, min(crossing, half))
+    return low, high
 
 
 def _between_crossovers(system: Transfer) -> np.ndarray:
@@ -415,7 +456,17 @@ def _count_margin(loop: Transfer, crosses: bool, end: float) -> float:
     period = float(loop.period or math.nan)
     if not crosses and abs(_response(loop, math.pi / period)[0]) < 1:
         return math.inf
-    more = np.arange(1, math.ceil(end / period) + 1) * period
+    # A pair of poles crosses at first + 2 pi k/w, and only the first whole periods after such a delay are asked.
+    found = find_crossovers(loop._replace(delay=0.0))
+    ends = [loop.delay + period]
+    for w, phase in zip(found.gain_at, found.phases, strict=True):
+        turn = 2 * math.pi / w
+        first = phase % (2 * math.pi) / w
+        start = math.floor(max(loop.delay - first, 0.0) / turn)
+        ends += [first + turn * k for k in range(start, start + math.ceil(end / turn) + 2)]
+    periods = np.unique(np.ceil((np.array(ends) - loop.delay) / period))
+    periods = np.union1d(periods, periods + 1)  # a pair that is on the circle has not crossed yet
+    more = periods[(periods >= 1) & (periods <= math.ceil(end / period))] * period
     now, *late = _poles_gained(loop, np.append(0.0, more) + loop.delay)
     unstable = np.flatnonzero(np.array(late) > now)
     return float(more[unstable[0]]) if len(unstable) else math.nan

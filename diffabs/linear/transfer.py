@@ -44,8 +44,10 @@ class Transfer(NamedTuple):
     def rational_response(self, w: Scalar) -> np.ndarray:
         """Return the response (k, p, m) at frequencies w (k,) [rad/s], without the delay; infinite at a pole."""
         w = np.atleast_1d(np.asarray(w, float))
-        point = 1j * w if self.period is None else np.exp(1j * w * self.period)
-        shifted = point[:, None, None] * np.eye(len(self.A)) - self.A
+        # z - A = (z - 1) - (A - 1) keeps the digits of slow modes, whose z is near 1.
+        one = np.eye(len(self.A))
+        point, a = (1j * w, self.A) if self.period is None else (np.expm1(1j * w * self.period), self.A - one)
+        shifted = point[:, None, None] * one - a
         with np.errstate(all="ignore"):
             return self.C @ _solve_or_infinite(shifted, np.asarray(self.B, complex)) + self.D
 

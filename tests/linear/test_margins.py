@@ -650,3 +650,56 @@ def test_the_page_runs(capsys):
     code = page.read_text().partition("```python\n")[2].partition("```")[0]
     exec(compile(code.replace("samples=100", "samples=2"), "margins.md", "exec"), {})
     assert capsys.readouterr().out.count("\n") == 3
+
+
+def companion(*rates):
+    """Matrices of 1/((s + r1)(s + r2) ...), whose states differ by the rates."""
+    a = np.diag(-np.array(rates)) + np.diag(np.ones(len(rates) - 1), 1)
+    return a, np.eye(len(rates))[:, -1:], np.eye(len(rates))[:1]
+
+
+@killed_by("linear/stability_margins.py", "MAX_RANGE_STEPS = 1e-60, 4", "MAX_RANGE_STEPS = 1e-9, 4", case="1e-30")
+@pytest.mark.parametrize("c", [1e-30, 1e-12, 1.0, 1e15])
+def test_margins_do_not_depend_on_the_unit_of_time(c):
+    """L = 2 c^3/(s (s + c)(s + 2c)): gain 3; the rest is of c = 1, by bisection of |L| = 1 here."""
+    a = c * np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, -2.0]])
+    found = margins(Transfer(a, c * np.eye(3)[:, -1:], 2 * np.eye(3)[:1], np.zeros((1, 1))))
+    w = brentq(lambda w: abs(2 / (1j * w * (1j * w + 1) * (1j * w + 2))) - 1, 0.1, 10.0)
+    lag = np.pi / 2 - np.arctan(w) - np.arctan(w / 2)
+    assert found.stable
+    assert found.gain[1] == pytest.approx(3.0, rel=1e-9)
+    assert (found.phase, found.delay * c, found.crossover / c) == pytest.approx((lag, lag / w, w), rel=1e-9)
+    assert found.sensitivity == pytest.approx(2.3123140146, rel=1e-9)
+
+
+@killed_by("linear/stability_margins.py", "for way in (-1, 1):", "for way in ():", case="1e-12")
+@pytest.mark.parametrize("k", [1e-14, 1e-12, 1e15])
+def test_a_crossover_far_below_a_pole_is_found(k):
+    """k/(s (s + 1)): w^2 = (sqrt(1 + 4 k^2) - 1)/2, and the phase margin is 90 deg less atan(w)."""
+    found = margins(Transfer(*companion(0.0, 1.0)[:2], k * companion(0.0, 1.0)[2], np.zeros((1, 1))))
+    w = np.sqrt(2) * k / np.sqrt(1 + np.sqrt(1 + 4 * k**2))
+    assert found.stable
+    assert (found.crossover, found.phase) == pytest.approx((w, np.arctan(1 / w)), rel=1e-9)
+
+
+@killed_by("linear/stability_margins.py", "found = _touch_unit_circle(system, w, found)", "pass")
+def test_a_gain_that_only_reaches_one_has_a_phase_margin():
+    """A sampled gain of 1 is 180 deg from -1 at every frequency; 2 s/(s + 1)^2 is 1 at 1 rad/s and less elsewhere."""
+    found = margins(static(1.0, period=0.1))
+    assert (found.stable, found.phase, found.delay, found.gain) == (True, np.pi, 0.1, (0.0, np.inf))
+    a, b, _ = companion(1.0, 1.0)
+    found = margins(Transfer(a, b, 2 * np.array([[-1.0, 1.0]]), np.zeros((1, 1))))  # s = (s + 1) - 1
+    assert (found.phase, found.phase_at, found.delay) == pytest.approx((np.pi, 1.0, np.pi), rel=1e-6)
+    assert np.isinf(margins(static(0.999, period=0.1)).phase)
+
+
+@killed_by(
+    "linear/transfer.py", "np.expm1(1j * w * self.period)", "np.exp(1j * w * self.period) - 1", case="1e-09-0.001"
+)
+@pytest.mark.parametrize(("period", "k"), [(1e-6, 0.1), (1e-9, 0.1), (1e-9, 1e-3)])
+def test_a_fast_sampled_integrator_has_the_margins_of_its_formula(period, k):
+    """k T/(z - 1): |L| = 1 at sin(w T/2) = k T/2; a lag of m periods reaches -1 at m w T = pi/2 - w T/2."""
+    found = margins(Transfer(np.eye(1), np.array([[k * period]]), np.eye(1), np.zeros((1, 1)), period))
+    w = 2 * np.arcsin(k * period / 2) / period
+    assert (found.crossover, found.phase) == pytest.approx((w, (np.pi - w * period) / 2), rel=1e-7)
+    assert found.delay == pytest.approx(np.ceil((np.pi - w * period) / 2 / (w * period)) * period, rel=1e-7)
