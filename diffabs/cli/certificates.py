@@ -26,6 +26,7 @@ from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import SlipModel
 from diffabs.plants import BrakeStart
 from diffabs.runtime import provenance
+from diffabs.runtime.separated import read_decimal
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -176,7 +177,7 @@ def certify_gain(task: ProofTask) -> "Certificate":
 def _read_gain(text: str, states: Sequence[str]) -> np.ndarray:
     words = text.strip().removeprefix("[").removesuffix("]").split(",")
     try:
-        values = np.array([float(word) for word in words])
+        values = np.array([read_decimal(word) for word in words])
     except ValueError:
         raise ScenarioError(f"--gain {format_given(text)}: numbers are needed, as in --gain=-11753,-48") from None
     if not np.isfinite(values).all():

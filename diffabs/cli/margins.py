@@ -15,6 +15,7 @@ from diffabs.config.values import ScenarioError, format_given, read_number_in_ra
 from diffabs.core.pytree import ParameterSpec, replace
 from diffabs.core.types import JsonObject, Scalar
 from diffabs.runtime import provenance
+from diffabs.runtime.separated import read_decimal
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
@@ -82,7 +83,7 @@ def _read_places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, floa
     for item in given:
         path, _, text = item.partition("=")
         try:
-            value = float(text)
+            value = read_decimal(text)
         except ValueError:
             raise ScenarioError(f"--at {format_given(item)}: a number is needed, as in --at speed=10") from None
         path = SHORT_PATHS.get(path.strip(), path.strip())

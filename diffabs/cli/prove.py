@@ -17,6 +17,7 @@ from diffabs.config.values import ScenarioError, format_given, unknown_name_erro
 from diffabs.core.types import JsonObject
 from diffabs.runtime import files, provenance
 from diffabs.runtime.process import core_count
+from diffabs.runtime.separated import read_decimal
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.scenario import Scenario, dump, loads
 
@@ -211,7 +212,7 @@ def _read_sides(given: Sequence[str], chosen: Scenario) -> list[_Side]:
         path, equals, ends = text.partition("=")
         low, colon, high = ends.partition(":")
         try:
-            pair = [float(low), float(high)]
+            pair = [read_decimal(low), read_decimal(high)]
         except ValueError:
             pair = []
         if not (equals and colon and pair):
@@ -298,7 +299,7 @@ def _read_claim(text: str, chosen: Scenario, equations: "Equations") -> "RunClai
             raise ScenarioError("--claim no_lock has no bound: it says that the slip stays below 1")
         return RunClaim("greatest slip", float(np.nextafter(1.0, 0.0)))
     try:
-        bound = float(given)
+        bound = read_decimal(given)
     except ValueError:
         bound = math.nan
     if not math.isfinite(bound):

@@ -11,6 +11,7 @@ from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import unit_at
 from diffabs.explore.friction import FACTOR_PATH
+from diffabs.runtime.separated import read_decimal
 from diffabs.scenario.parameter_paths import canonical_path
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
@@ -64,7 +65,7 @@ class Knob:
         """
         if isinstance(given, str):
             try:
-                given = float(given.strip())
+                given = read_decimal(given)
             except ValueError:
                 raise wrong_kind_error(self.name, given.strip(), f"a number in {self.spec.interval()}") from None
         return read_number_in_range(given, self.spec, self.name) / self.scale

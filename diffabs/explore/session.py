@@ -19,6 +19,7 @@ from diffabs.core.validity import find_problems
 from diffabs.explore import friction, knobs, tuning
 from diffabs.explore.knobs import Knob
 from diffabs.explore.panels import Spread
+from diffabs.runtime.separated import read_decimal
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import Scenario, load
 from diffabs.simulate.admissible import find_mismatches, find_unstable_step
@@ -159,7 +160,7 @@ class Session:
             ScenarioError: The value is not a number from 0 to 90.
         """
         try:
-            value = float(given)
+            value = read_decimal(given) if isinstance(given, str) else float(given)
         except (TypeError, ValueError):
             raise wrong_kind_error(f"fan.{name}", given, f"a number in {PERCENT.interval()}") from None
         self.spread = dataclasses.replace(

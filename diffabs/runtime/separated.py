@@ -58,15 +58,15 @@ def guess_separator(lines: Sequence[str]) -> str:
     return fits[0]
 
 
-def read_decimal(cell: str, comma: bool) -> float:
-    """Return the number in a cell.
+def read_decimal(cell: str, comma: bool = False) -> float:
+    """Return the number in a cell, or in another text of a person.
 
     Args:
         cell: Text of the cell.
         comma: Whether numbers have a decimal comma.
 
     Raises:
-        ValueError: The cell is no number. So are digits in groups, such as 1.234,5 and 1_000.
+        ValueError: The cell is no number. So are digits in groups, such as 1.234,5 and 1_000, and of other scripts.
     """
     text = cell.strip()
     if "_" in text or not text.isascii() or ("," in text and ("." in text or not comma)):  # `float` takes 1_000

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 
 from diffabs.config.values import unknown_name_error
 from diffabs.runtime import files
+from diffabs.runtime.separated import read_decimal
 
 # Of bytes: a thread of pyarrow that still holds an open Python file ends the process when Python ends.
 TABLE_READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
@@ -53,9 +54,11 @@ def read_column(path: pathlib.Path, column: str) -> np.ndarray:
 
 def _parse_number(value: object) -> float:
     """Return a value as a float; NaN for a missing value, or one that is not a number."""
-    if isinstance(value, bool) or (isinstance(value, str) and "_" in value):  # Python would take "1_000" for a number
+    if isinstance(value, bool):
         return np.nan
     try:
-        return float(value) if isinstance(value, str | float | int | decimal.Decimal) else np.nan
+        if isinstance(value, str):
+            return read_decimal(value)
+        return float(value) if isinstance(value, float | int | decimal.Decimal) else np.nan
     except (OverflowError, ValueError):
         return np.nan

@@ -212,9 +212,7 @@ def test_a_library_leaves_control_c_alone(signals):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@killed_by(
-    "runtime/interrupt.py", "signal.SIG_IGN if CHILD_FLAG in sys.orig_argv else _leave", "_leave", case="a child"
-)
+@killed_by("runtime/interrupt.py", "signal.SIG_IGN if is_child else _leave", "_leave", case="a child")
 @killed_by("runtime/interrupt.py", 'program.parts[-2:] == ("diffabs", "__main__.py")', "False", case="child of -m")
 @pytest.mark.parametrize(
     ("program", "words", "answer"),
