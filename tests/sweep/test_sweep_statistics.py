@@ -637,3 +637,19 @@ class TestCoverage:
             assert coverage(lambda x, level=level: by.quantile(x, level), draw, law.ppf(level), 200) >= 95
         assert coverage(lambda x: by.cvar(x, 0.95), draw, tail, 200) >= 88
         assert coverage(lambda x: by.probability(x > law.isf(0.05)), draw, 0.05, 200) >= 92
+
+
+@killed_by("sweep/statistics/sensitivity.py", "if not varies(np.concatenate([fa, fb])):", "if False:")
+@killed_by("sweep/statistics/sensitivity.py", "outputs if varies(outputs) else np.zeros_like(outputs)", "outputs")
+def test_rounding_has_no_sensitivities():
+    """The error of a settled loop is a difference of numbers near 1: a few multiples of 2^-53."""
+    random = np.random.default_rng(5)
+    x, errors = random.normal(size=(200, 1)), (1 + 3e-16 * random.normal(size=(3, 200))) - 1
+    assert 1 < len(np.unique(errors)) < 20
+    indices = sensitivity.sobol_indices(errors[0], errors[1], errors[2:])
+    found = sensitivity.correlations(x, errors[0])
+    for estimate in (indices.first[0], indices.total[0], found.pearson[0], found.spearman[0]):
+        assert math.isnan(estimate.value)
+    # what is small but has all its digits, or counts something, varies
+    for y in (1e-16 * x[:, 0], np.where(x[:, 0] > 0, 1.0, 0.0), 5e-7 * np.round(x[:, 0])):
+        assert sensitivity.correlations(x, y).pearson[0].value > 0.7

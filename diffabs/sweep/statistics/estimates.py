@@ -9,6 +9,10 @@
 The confidence is 1 - a. An end that the data cannot give is infinite. Columns are finite: diverged runs are counted and
 left out first.
 
+The interval of a mean is too narrow for a skewed law and few samples. For a log-normal law with deviation 1 of the
+logarithm, 95 % intervals of 10, 30 and 100 samples cover 84, 88 and 89 %. A studentised bootstrap covers 88 and 91 % of
+10 and 30 samples, with intervals half as long again. Where the samples are skewed, the summary says so.
+
 A standard deviation has no interval. Its error depends on the fourth moment of the law. A sample of a law with heavy
 tails does not show it. The coverage of 95 % intervals of 50, 1,000 and 10,000 samples was measured:
 
@@ -34,6 +38,9 @@ from scipy import stats
 from diffabs.core.types import PyTree
 
 BOOTSTRAP_REPLICATES = 999
+# Rounding: differences are multiples of 2^-ROUNDING_BITS of their largest, and not larger than this, relative to the
+# largest value, or to 1. Final errors near 0 are differences of numbers near 1.
+ROUNDING_BITS, LARGEST_ROUNDING = 12, 2.0**-30
 MIN_TAIL_SAMPLES = 10  # samples in the tail from which CVaR's interval covers 92 to 95 %
 # Atoms of a resampled tail: the largest half are single samples, the others are means of neighbours.
 MAX_TAIL_ATOMS = 1024
@@ -80,6 +87,24 @@ def as_column(values: PyTree, least: int = 1) -> np.ndarray:
     if x.size < least:
         raise ValueError(f"{x.size} values, at least {least} are needed")
     return x
+
+
+def varies(values: np.ndarray) -> bool:
+    """Return whether values differ by more than rounding.
+
+    Differences that are rounding are few multiples of one small power of two, the spacing of the numbers that were
+    subtracted. No other column looks like that: its values have all digits, or its multiples are of a larger number.
+
+    Args:
+        values: Finite values, shape (n,).
+    """
+    span = float(np.ptp(values)) if values.size else 0.0
+    if not span > 0:
+        return False
+    unit = 2.0 ** (math.floor(math.log2(span)) - ROUNDING_BITS)
+    multiples = (values - values.min()) / unit
+    small = unit <= LARGEST_ROUNDING * max(1.0, float(np.abs(values).max()))
+    return not (small and np.array_equal(multiples, np.round(multiples)))
 
 
 def upper_level(confidence: float) -> float:

@@ -37,6 +37,7 @@ from diffabs.sweep.statistics.estimates import (
     as_column,
     percentile_index,
     upper_level,
+    varies,
 )
 
 MIN_CORRELATED_SAMPLES = 10  # samples from which a correlation has an interval
@@ -71,7 +72,8 @@ class SobolIndices(NamedTuple):
 def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95) -> Correlations:
     """Return the correlations of each column of x with y, in the order of the columns.
 
-    If one of the two is constant, the value is NaN. Its ends, and those of fewer than 10 samples, are -1 and 1.
+    If one of the two is constant but for rounding, the value is NaN. Its ends, and those of fewer than 10 samples, are
+    -1 and 1.
 
     Args:
         x: Inputs, shape (n, d).
@@ -84,6 +86,7 @@ def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95) -> Correlati
     outputs, inputs = as_column(y, least=4), np.asarray(x)
     if inputs.ndim != 2 or len(inputs) != len(outputs):
         raise ValueError(f"inputs of shape {inputs.shape} do not fit {len(outputs)} outputs")
+    outputs = outputs if varies(outputs) else np.zeros_like(outputs)
     ranked = stats.rankdata(outputs)
     found = Correlations([], [])
     for values in inputs.T:
@@ -102,7 +105,8 @@ def sobol_indices(
     replicates: int = BOOTSTRAP_REPLICATES,
     seed: int = 0,
 ) -> SobolIndices:
-    """Return the Sobol' indices of d inputs; NaN with infinite ends if f is constant.
+    """Return the Sobol' indices of d inputs; NaN with infinite ends if f is constant but for
+    rounding.
 
     The intervals assume independent rows. For rows of a low-discrepancy design they are too wide.
 
@@ -121,6 +125,8 @@ def sobol_indices(
     fa, fb, mixed = as_column(a, least=4), as_column(b), np.asarray(ab)
     if fa.shape != fb.shape or mixed.ndim != 2 or mixed.shape[1] != len(fa):
         raise ValueError(f"outputs of shapes {fa.shape}, {fb.shape} and {mixed.shape} do not fit: (n,), (n,), (d, n)")
+    if not varies(np.concatenate([fa, fb])):
+        fa, fb, mixed = (np.zeros_like(x) for x in (fa, fb, mixed))
     d, n, place = len(mixed), len(fa), percentile_index(replicates, confidence)
     random = np.random.default_rng(seed)
     rows = _sum_group_features(fa, fb, mixed, random)

@@ -14,10 +14,11 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from scipy import stats
 
 from diffabs.core.types import JsonObject
 from diffabs.sweep.results import Results
-from diffabs.sweep.statistics.estimates import Count, IntervalEstimate, Tail, summarise_column
+from diffabs.sweep.statistics.estimates import Count, IntervalEstimate, Tail, summarise_column, varies
 from diffabs.sweep.statistics.replicated import Replicates
 from diffabs.sweep.statistics.rows import RowMasks
 from diffabs.sweep.statistics.sensitivity import correlations, sobol_indices
@@ -25,6 +26,7 @@ from diffabs.sweep.statistics.sensitivity import correlations, sobol_indices
 CONFIDENCE, QUANTILE_LEVELS, CVAR_LEVEL = 0.95, (0.05, 0.5, 0.95), 0.95
 MAX_CORRELATED_SAMPLES = 200_000  # correlations use at most this number of samples, the first ones
 MAX_LISTED_SAMPLES = 10
+MAX_SKEWNESS = 0.2  # of the mean: with more, 95 % intervals of a mean cover less than about 92 %
 MIN_SAMPLES = 4  # smallest number of samples with statistics
 INTERVAL_NOTES = {
     "random": "independent samples",
@@ -60,6 +62,8 @@ def summarise_sweep(found: Results) -> JsonObject:
         found: Results of the sweep.
     """
     view = RowMasks(found)
+    skewed = [name for name in found.metrics if _is_skewed(_known_values(found, view, name))]
+    warning = f"; few samples of a skewed law, so intervals of the mean are too narrow: {', '.join(skewed)}"
     refused, count = ~view.accepted, _replicate_count(found)
     reasons, counts = np.unique(found.column("refused")[refused].astype(str), return_counts=True)
     return {
@@ -71,7 +75,8 @@ def summarise_sweep(found: Results) -> JsonObject:
             "reasons": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
         },
         "confidence": CONFIDENCE,
-        "intervals": INTERVAL_NOTES["one sobol" if view.design == "sobol" and count == 1 else view.design],
+        "intervals": INTERVAL_NOTES["one sobol" if view.design == "sobol" and count == 1 else view.design]
+        + (warning if skewed and view.design not in DETERMINISTIC_DESIGNS else ""),
         "failures": dict(_failure_probabilities(found, view)),
         "never": {name: never for name in found.metrics if (never := _list_never(found, view, name))["count"]},
         "metrics": {name: _summarise_metric(found, view, name) for name in found.metrics},
@@ -118,10 +123,24 @@ def _failure_probabilities(found: Results, view: RowMasks) -> Iterator[tuple[str
         yield name, {"count": count.failures, **_json_estimate(one, view)}
 
 
+def _is_known(found: Results, view: RowMasks, name: str) -> np.ndarray:
+    return view.good & view.rows & np.isfinite(found.column(name))
+
+
+def _known_values(found: Results, view: RowMasks, name: str) -> np.ndarray:
+    return found.column(name)[_is_known(found, view, name)]
+
+
+def _is_skewed(values: np.ndarray) -> bool:
+    """Return whether Student's interval of the mean covers clearly less than its confidence: |skewness|/sqrt(n)."""
+    if len(values) < MIN_SAMPLES or not varies(values):
+        return False
+    return abs(float(stats.skew(values))) > MAX_SKEWNESS * math.sqrt(len(values))
+
+
 def _summarise_metric(found: Results, view: RowMasks, name: str) -> JsonObject:
-    values = found.column(name)
-    known = view.good & view.rows & np.isfinite(values)
-    values = values[known]
+    known = _is_known(found, view, name)
+    values = found.column(name)[known]
     if len(values) < MIN_SAMPLES:
         return {}
     rows = summarise_column(values, CONFIDENCE, QUANTILE_LEVELS, CVAR_LEVEL)
