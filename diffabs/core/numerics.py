@@ -67,21 +67,29 @@ def smaller(x: Scalar, y: Scalar) -> Scalar:
 
 
 def invalidate(x: Scalar, invalid: Scalar, inputs: PyTree) -> Scalar:
-    """Return x, or NaN where it is invalid; then its derivatives by every finite input are NaN, too.
+    """Return x, or NaN if it is invalid; then its derivatives by every input are NaN, too.
 
     A selection (`jnp.where`) alone would give an invalid number the derivative zero.
 
     Args:
-        x: Result.
-        invalid: Whether the result is invalid.
+        x: Result, any shape.
+        invalid: Whether the result is invalid, as a whole: in reverse mode an invalid number makes all of it NaN.
         inputs: Pytree of everything that the result may depend on; only its floating-point leaves count.
     """
+    x = jnp.asarray(x)
     leaves = [leaf for leaf in map(jnp.asarray, jax.tree.leaves(inputs)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    leaves = [leaf.astype(x.dtype) for leaf in leaves]
-    # An infinite input, such as a limit, must not make a valid result NaN.
-    one, none = (jnp.where(invalid, jnp.nan, factor).astype(x.dtype) for factor in (1.0, 0.0))
-    # The products come before the sum: the sum of large inputs would overflow, and 0 * inf is NaN.
-    return one * x + sum(jnp.sum(none * jnp.where(jnp.isfinite(leaf), leaf, 0.0)) for leaf in leaves)
+    none = sum((jnp.sum(_vanish(leaf.astype(x.dtype))) for leaf in leaves), jnp.zeros((), x.dtype))
+    one, all = (jnp.where(invalid, jnp.nan, factor).astype(x.dtype) for factor in (1.0, 0.0))
+    return one * x + all * none
+
+
+@jax.custom_jvp
+def _vanish(x: Scalar) -> Scalar:
+    """Return zeros that have the derivative of x, also where x is infinite or NaN."""
+    return jnp.zeros_like(x)
+
+
+_vanish.defjvp(lambda at, moves: (_vanish(*at), moves[0]))
 
 
 @jax.custom_jvp
