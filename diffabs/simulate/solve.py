@@ -10,8 +10,9 @@ The engine of `run` makes the run of a `FieldLoop` in the time s = (t - t0)/(t1 
 So one program serves every span, t0 and t1 have derivatives, and time may run backwards.
 
 Where an event happens its condition is zero, and rounding decides its sign. If the condition rises after the event, as
-at a bounce, the next fall is an event again. If it falls on, it must rise through zero first. A small constant, the
-lift, is added to the condition up to its next event and makes its sign agree.
+at a bounce, the next fall is an event again. If it falls on, and no reset has set it, it must rise through zero first.
+A condition that a reset sets to zero counts as positive, as at the start. A small constant, the lift, is added to the
+condition up to its next event and makes its sign agree.
 
 Some runs have no right answer, or none that could be computed: `SolutionStatus` names them, and every number of such a
 solution is NaN.
@@ -65,6 +66,7 @@ MAX_EVENTS = 24  # kinds of events of a solution: the log of a run has one bit f
 LANDING_FRACTION, MAX_QUICK_EVENTS, COINCIDENCE_FRACTION = 1e-7, 8, 1e-10
 # The lift: time in which the condition moves as far, as a fraction of the span, and multiples of the rounding.
 LIFT_FRACTION, LIFT_EPS = 1e-12, 32
+SAME_RATE_FRACTION = 1e-6  # a reset that changes the rate of a condition by less leaves the condition as it is
 
 SWITCH_SOLVER = Adaptive(1e-6)
 # By the function that hides a comparison: what to write instead.
@@ -85,9 +87,10 @@ class SolutionStatus(enum.IntEnum):
     Attributes:
         FINISHED: It reached t1.
         TERMINATED: A terminal event ended it.
-        DIVERGED: A number is not finite, or the steps would be too many.
+        DIVERGED: A number is not finite, no step meets its tolerance, or the steps would be too many.
         SLID: It slides along a switching surface of the field, or crosses surfaces ever faster.
-        CROWDED: Events follow each other without end, as the bounces of a ball that comes to rest.
+        CROWDED: Events follow each other without end, as the bounces of a ball that comes to rest, or where a reset
+            sets its own condition to zero and it falls.
         GRAZED: A switching surface or the zero of a condition is only touched, or a condition jumps.
     """
 
@@ -100,7 +103,7 @@ class Event:
 
     Attributes:
         condition: Function of (t, y, args): a continuous number. It falls along the run, so backwards in time if
-            t1 < t0. A start at exactly zero counts as positive.
+            t1 < t0. A zero at the start, or set by a reset, counts as positive.
         reset: Function of (t, y, args) that returns the state after the event; None leaves the state.
         terminal: True if the event ends the solution, without a reset. It happens, too, where the reset of another
             event makes its condition negative.
@@ -349,15 +352,23 @@ class FieldLoop:
 
     def _change(self, t: Scalar, state: LoopState, margins: Margins, fired: Sequence[Bool]) -> LoopState:
         was, stops = margins["events"], margins["stop"][1:]
-        y, held = state.plant, state.controller.held
-        moved, happened = False, []
-        for i, (one, happens) in enumerate(zip(self.code.inner, fired, strict=True)):
-            if moved:
-                happens |= (was[i] >= 0) & (self._call(one.condition, t, y) + held.lifts[i] < 0)
-            happened.append(happens)
-            if one.reset is not None:
-                y, moved = select(happens, self._call(one.reset, t, y), y), True
-        each = zip(self.code.inner, happened, fired, was, held.lifts, strict=True)
+        held = state.controller.held
+
+        def apply_resets(t: Scalar, y: PyTree) -> tuple[tuple[PyTree, list[Scalar]], list[Bool]]:
+            """Return the state after the resets with all conditions there, and which events have happened."""
+            moved, happened = False, []
+            for i, (one, happens) in enumerate(zip(self.code.inner, fired, strict=True)):
+                if moved:
+                    condition = self._call(one.condition, t, y) + held.lifts[i]
+                    happens |= (was[i] >= 0) & (condition < -self._rounding(one.condition, t, y))
+                happened.append(happens)
+                if one.reset is not None:
+                    y, moved = select(happens, self._call(one.reset, t, y), y), True
+            return (y, [self._call(one.condition, t, y) for one in self.code.inner]), happened
+
+        follow = jnp.ones_like(t), self._rate(t, state.plant)
+        (y, after), (_, moves), happened = jax.jvp(apply_resets, (t, state.plant), follow, has_aux=True)
+        each = zip(self.code.inner, happened, fired, was, held.lifts, after, moves, strict=True)
         lifts, faults = zip(*(self._arm(t, state.plant, y, *some) for some in each), strict=True)
         events = jnp.stack(happened)
         now = jnp.arange(self.kept) == held.counts[:, None]
@@ -367,7 +378,10 @@ class FieldLoop:
         fault = jnp.where((fault == 0) & (quick >= MAX_QUICK_EVENTS), float(SolutionStatus.CROWDED), fault)
         ends = held.ends
         for i, one in reversed(list(enumerate(self.code.terminal))):
-            ends = jnp.where((stops[i] >= 0) & (self._call(one.condition, t, y) < 0), i + 1.0, ends)
+            condition, rise = self._follow(one.condition, *jax.lax.stop_gradient((t, y)))
+            rounding = self._rounding(one.condition, t, y)
+            falls = (jnp.abs(condition) <= rounding) & (rise < 0)
+            ends = jnp.where(falls | ((stops[i] >= 0) & (condition < -rounding)), i + 1.0, ends)
         fault = jnp.where((fault == 0) & (ends > 0), float(SolutionStatus.TERMINATED), fault)
         held = EventMemory(
             held.counts + events,
@@ -378,38 +392,63 @@ class FieldLoop:
         return state._replace(plant=y, controller=Memory((), jax.tree.map(lambda x: jnp.asarray(x, t.dtype), held)))
 
     def _arm(
-        self, t: Scalar, before: PyTree, y: PyTree, one: Event, happens: Bool, fired: Bool, was: Scalar, lift: Scalar
+        self,
+        t: Scalar,
+        before: PyTree,
+        y: PyTree,
+        one: Event,
+        happens: Bool,
+        fired: Bool,
+        was: Scalar,
+        lift: Scalar,
+        after: Scalar,
+        move: Scalar,
     ) -> tuple[Scalar, Scalar]:
-        """Return the lift of an event's condition after an instant, and the fault that ends the run, or 0."""
-        t, before, y = jax.lax.stop_gradient((t, before, y))
+        """Return the lift of an event's condition after an instant, and the fault that ends the run, or 0.
+
+        The resets may leave the condition as it is. Or they set it, perhaps to zero: then it counts as positive, as at
+        a start. `after` is the condition after them, and `move` its rate along the flow before them.
+        """
+        t, before, y, after, move = jax.lax.stop_gradient((t, before, y, after, move))
         there, fall = self._follow(one.condition, t, before)
         # The second derivative, too: it says when a condition that rises is back at zero.
         moves = (jnp.ones_like(t), self._rate(t, y))
-        (after, rise), (_, bend) = jax.jvp(lambda t, y: self._follow(one.condition, t, y), (t, y), moves)
-        slopes = jax.grad(lambda t, y: self._call(one.condition, t, y), argnums=(0, 1))(t, y)
-        terms = zip(jax.tree.leaves(slopes), jax.tree.leaves((t, y)), strict=True)
-        rounding = LIFT_EPS * jnp.finfo(t.dtype).eps * sum(jnp.sum(jnp.abs(a * b)) for a, b in terms)
-        # The reset leaves the condition, or sets it to zero itself.
-        off = jnp.minimum(jnp.abs(after), jnp.abs(after - there))
-        stays = off <= jnp.maximum(LANDING_FRACTION * jnp.abs(fall), rounding)
+        rise, bend = jax.jvp(lambda t, y: self._follow(one.condition, t, y)[1], (t, y), moves)
+        rounding = self._rounding(one.condition, t, y)
+        left = (jnp.abs(after - there) <= rounding) & (jnp.abs(move - fall) <= SAME_RATE_FRACTION * jnp.abs(fall))
+        # A landing ends near the zero: `exact` is the condition after a landing on it.
+        exact = after - jnp.where(fired & (fall < 0), move * there / jnp.where(fall < 0, fall, -1.0), 0.0)
+        zero = left | (jnp.abs(exact) <= rounding)
         small = LIFT_FRACTION * jnp.abs(rise) + rounding
-        new = jnp.where(rise > 0, small - after, -small - after)
-        returns = happens & stays & (rise > 0) & (2.0 * rise < -bend * LANDING_FRACTION)
+        new = jnp.where(left & ~(rise > 0), -small - after, small - after)
+        returns = happens & zero & (rise > 0) & (2.0 * rise < -bend * LANDING_FRACTION)
         # At rest on its zero a condition has no next sign. One that did not fall before its event has jumped.
-        unclear = happens & stays & (LANDING_FRACTION * jnp.abs(rise) <= rounding)
+        unclear = happens & left & (LANDING_FRACTION * jnp.abs(rise) <= rounding)
         jumps = fired & ~(fall < 0)
         # An earlier event of the list that a later reset makes happen at this instant: there is no order for it.
-        again = ~happens & (was >= 0) & (after + lift < -rounding)
+        again = ~happens & (was >= 0) & ~zero & (after + lift < -rounding)
         fault = jnp.where(again | returns, float(SolutionStatus.CROWDED), 0.0)
         fault = jnp.where(unclear | jumps, float(SolutionStatus.GRAZED), fault)
-        return jax.lax.stop_gradient(jnp.where(happens, jnp.where(stays, new, 0.0), lift)), fault
+        kept = jnp.where(happens, 0.0, lift)
+        return jax.lax.stop_gradient(jnp.where(zero & (happens | ~left), new, kept)), fault
+
+    def _rounding(self, condition: Callable, t: Scalar, y: PyTree) -> Scalar:
+        """Return how far rounding may move a condition in the state `y` at `t`."""
+        t, y = jax.lax.stop_gradient((t, y))
+        slopes = jax.grad(lambda t, y: self._call(condition, t, y), argnums=(0, 1))(t, y)
+        terms = zip(jax.tree.leaves(slopes), jax.tree.leaves((t, y)), strict=True)
+        return LIFT_EPS * jnp.finfo(t.dtype).eps * sum(jnp.sum(jnp.abs(a * b)) for a, b in terms)
 
     def _call(self, function: Callable, t: Scalar, y: PyTree) -> PyTree:
         """Return the result of a function at the time `t` in units of the span."""
         return function(self.time(t), y, self.given["args"], self.given["constants"])
 
     def _rate(self, t: Scalar, y: PyTree) -> PyTree:
-        return jax.tree.map(lambda x: self.span * x, self._call(self.code.field, t, y))
+        return jax.tree.map(lambda x: self.span * x, self.field(t, y))
+
+    def field(self, t: Scalar, y: PyTree) -> PyTree:
+        """Return dy/dt at the time `t` in units of the span."""
+        return self._call(self.code.field, t, y)
 
     def distance(self, condition: Callable, point: Point) -> Scalar:
         """Return the time from the end of a run to the zero of a condition, zero within rounding.
@@ -456,6 +495,7 @@ class Saves:
         begun = jax.lax.stop_gradient(start.t) <= self.places + COINCIDENCE_FRACTION
         x = (self.places - start.t) / jnp.where(segment.h > 0, segment.h, 1.0)
         inside = begun & (jax.lax.stop_gradient(x) <= 2.0)
+        x = jnp.where(inside, x, 0.0)  # far outside of a short step the cubic is infinite
 
         def keep(old: Array, a: Array, b: Array, da: Array, db: Array) -> Array:
             new = jax.vmap(Cubic(a, b, da, db))(x)
@@ -650,7 +690,14 @@ def _build_loop(
     dynamics, found, constants = _read_functions(field, events, t0, y0, args)
     given = {"y0": y0, "t0": t0, "t1": t1, "args": args, "constants": constants}
     loop = FieldLoop(given=given, code=FieldCode(dynamics, found), kept=kept)
-    return loop, None if save is None else Saves(places=(save - t0) / (t1 - t0), times=jnp.asarray(save))
+    return loop, None if save is None else _place_saves(save, t0, t1)
+
+
+def _place_saves(save: AnyArray, t0: Scalar, t1: Scalar) -> Saves:
+    """Return the objective of the times `save`; an empty span has only its end."""
+    empty = t1 == t0
+    at_end = jnp.where(save == t0, 1.0, jnp.nan)
+    return Saves(places=jnp.where(empty, at_end, (save - t0) / jnp.where(empty, 1.0, t1 - t0)), times=jnp.asarray(save))
 
 
 def _trace_program(loop: Part) -> SwitchedProgram:
@@ -688,8 +735,8 @@ def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTre
     status: Scalar = jnp.asarray(SolutionStatus.DIVERGED.value)
     for one, meant in known.items():
         status = jnp.where(carry.status == one, meant.value, status)
-    # A fault of an event ends the run by rates that are NaN.
-    lost: Scalar = (status == SolutionStatus.DIVERGED) & (held.fault > 0)
+    # A fault of an event ends the run by rates that are NaN. Fixed steps then leave their mode, as in a slide.
+    lost: Scalar = ((status == SolutionStatus.DIVERGED) | (status == SolutionStatus.SLID)) & (held.fault > 0)
     status = jnp.where(lost, held.fault.astype(status.dtype), status)
     check = partial(invalidate, invalid=status > SolutionStatus.TERMINATED, inputs=loop.given)
     # The sum of the steps of a grid may miss t1 by its rounding.
@@ -699,8 +746,9 @@ def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTre
         t, places = objectives["saves"].times, objectives["saves"].places
         over = places > jax.lax.stop_gradient(point.t) - COINCIDENCE_FRACTION
         # At t1 the state moves with its own time. After a terminal event it is repeated.
-        late = jnp.where(over & (status == SolutionStatus.FINISHED), places - point.t, 0.0)
+        late = jnp.where(over & (status == SolutionStatus.FINISHED), t - loop.time(point.t), 0.0)
         late -= jax.lax.stop_gradient(late)
+        rates = loop.field(point.t, y)
         outside = jnp.where(jnp.abs(places - 0.5) <= 0.5 + COINCIDENCE_FRACTION, 1.0, jnp.nan)
 
         def pick(y: Array, rate: Array, kept: Array) -> Array:
@@ -708,7 +756,7 @@ def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTre
             moved = y + jnp.reshape(late, shape) * rate
             return jnp.reshape(outside, shape) * jnp.where(jnp.reshape(over, shape), moved, kept)
 
-        y = jax.tree.map(pick, y, point.rates[0][0], point.accumulators["saves"].held)
+        y = jax.tree.map(pick, y, rates, point.accumulators["saves"].held)
     events = _count_events(loop, carry, status == SolutionStatus.TERMINATED)
     times = check(loop.time(events.times))
     return Solution(check(t), jax.tree.map(check, y), events._replace(times=times), status), None

@@ -1,0 +1,62 @@
+"""A result that is NaN has no derivative: it is NaN, never 0, in both modes. Spans that are empty have their start."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mutants import killed_by
+
+import diffabs as d
+from diffabs.objectives import IAE
+from diffabs.simulate.solve import SolutionStatus
+
+SOLVERS = {"adaptive": d.Adaptive(1e-6, 0.2, 1e-2), "fixed": d.FixedStep(1e-4, 0.2, every=500)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [d.Adaptive(1e-8), d.FixedStep(0.1)], ids=["adaptive", "fixed"])
+def test_a_solution_without_a_value_has_no_derivative(solver):
+    def final(p, engine="xla"):
+        return d.solve(lambda t, y, p: p * y, 1.0, 0.0, 1.0, p, solver=solver, engine=engine).y
+
+    numbers = jnp.array([0.5, jnp.nan, jnp.inf])
+    for slopes in (
+        jax.vmap(jax.grad(final)),
+        jax.vmap(jax.jacfwd(final)),
+        jax.vmap(jax.jacfwd(lambda p: final(p, "kernel"))),
+    ):
+        np.testing.assert_allclose(slopes(numbers), [np.exp(0.5), np.nan, np.nan], rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_run_without_a_value_has_no_derivative(name):
+    loop = d.braking(initial=d.BrakeStart(speed=5.0))
+
+    def numbers(mass):
+        heavy = d.replace(loop, {"plant.mass": mass})
+        measured = d.measure(heavy, SOLVERS[name], {"iae": IAE()}).metrics["iae"]
+        run = d.rollout(heavy, SOLVERS[name], {"iae": IAE()})
+        lane = d.run_batch(loop, d.Batch({"plant.mass": jnp.stack([mass])}), SOLVERS[name], {"iae": IAE()})
+        return jnp.stack([measured, run.metrics["iae"], lane.metrics["iae"][0]])
+
+    for mode in (jax.jacrev, jax.jacfwd):
+        values, slopes = jax.jit(lambda mass, mode=mode: (numbers(mass), mode(numbers)(mass)))(jnp.nan)
+        np.testing.assert_array_equal(np.isnan(slopes) | np.isfinite(values), True)
+        assert np.isnan(values[:3]).all()
+
+
+@killed_by("simulate/solve.py", "jnp.where(save == t0, 1.0, jnp.nan)", "jnp.nan")
+def test_an_empty_span_has_its_start_at_its_saves():
+    """dy/dt = -y from 1: exp(t0 - save), which is 1 here with the slopes 1, 0 and -1 by t0, t1 and `save`."""
+
+    def saved(start, end, save):
+        found = d.solve(lambda t, y, args: -y, 1.0, start, end, solver=d.Adaptive(1e-8), save=save)
+        return found.y, found.status
+
+    ends, save = jnp.array([0.2, 0.7, 1.2]), jnp.array([0.2])
+    slopes, status = jax.vmap(jax.jacrev(saved, argnums=(0, 1, 2), has_aux=True), (None, 0, None))(0.2, ends, save)
+    np.testing.assert_allclose(np.concatenate([x.reshape(3, 1) for x in slopes], 1), 3 * [[1.0, 0.0, -1.0]], atol=1e-7)
+    assert set(status.tolist()) == {SolutionStatus.FINISHED}
+    values = jax.jit(jax.vmap(saved, (None, 0, None)))(0.2, ends, jnp.array([0.2, 0.7]))[0]
+    np.testing.assert_allclose(values, [[1.0, np.nan], [1.0, np.exp(-0.5)], [1.0, np.exp(-0.5)]], atol=1e-7)
