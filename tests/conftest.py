@@ -100,6 +100,14 @@ def without_load():
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def without_stability_of_single_runs():
+    """`measure` and `rollout` without the seconds in which the check of a step compiles, which has tests of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        replace_seam(patch, "measured_step", lambda loop, solver: [])
+        yield
+
+
 @pytest.fixture
 def users_engine(monkeypatch: pytest.MonkeyPatch):
     """The default engine is that of users. Elsewhere it is XLA: kernels are compiled only where tests ask for them."""

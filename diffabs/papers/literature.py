@@ -32,7 +32,7 @@ from diffabs.plants import GRAVITY, RoadVehicle
 from diffabs.runtime import files, provenance
 from diffabs.scenario import outside
 from diffabs.scenario.scenario import Scenario, load
-from diffabs.simulate.run import rollout
+from diffabs.simulate.run import run_unchecked
 from diffabs.simulate.types import Run
 from diffabs.stops import Standstill
 
@@ -228,7 +228,7 @@ def _bound(row: Table, overrides: list[str]) -> float | None:
 
 # Rows
 
-_rollout = jax.jit(rollout, static_argnums=1)
+_run_row = jax.jit(run_unchecked, static_argnums=(1, 4))
 
 
 @functools.cache
@@ -240,7 +240,7 @@ def simulate_row(scenario: str, overrides: tuple[str, ...]) -> Run:
         overrides: Texts `path=value`.
     """
     given = load_row_scenario(scenario, overrides)
-    return _rollout(given.loop, given.solver, dict(given.objectives))
+    return _run_row(given.loop, given.solver, dict(given.objectives), None, given.solver.every)
 
 
 def our_value(row: Table) -> float | None:

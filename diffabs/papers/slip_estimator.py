@@ -28,7 +28,7 @@ from diffabs.runtime import provenance
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.batch import stack_loops
 from diffabs.simulate.ensemble import run_batch
-from diffabs.simulate.run import rollout
+from diffabs.simulate.run import rollout, run_unchecked
 from diffabs.simulate.types import FixedStep, Run
 
 TITLE = "Aoki and Nakamura: anti-lock braking at the estimated best slip (quarter car, from 100 km/h)"
@@ -121,7 +121,9 @@ def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
 def run_literal() -> list[Run]:
     """Return the runs of the estimator as printed, under P control, at two sampling periods."""
     printed = loop(CARS["spline B"], PeakLiteral(), PID(kp=3893.0, low=0.0, high=90.0))
-    return [jax.tree.map(np.asarray, rollout(printed, solver, BRAKING)) for solver in LITERAL]
+    # The step of the second one is not stable for this loop, as printed.
+    runs = [run_unchecked(printed, solver, BRAKING, None, solver.every) for solver in LITERAL]
+    return [jax.tree.map(np.asarray, run) for run in runs]
 
 
 def run_all(progress: Callable[[str], None]) -> EstimatorResults:

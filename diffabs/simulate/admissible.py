@@ -178,6 +178,21 @@ def find_unstable_step(loop: Loop, solver: Solver) -> Iterator[str]:
             f"solver.step = {solver.step:g} s is not stable: RK4 follows the fastest mode of this loop"
             f"{where} only with steps in (0, {largest:.3g}] s"
         )
+    else:
+        _stable_steps.add((jax.tree.structure(loop), float(solver.step)))
+
+
+_stable_steps: set[tuple[PyTree, float]] = set()  # structures of loops, with steps that were stable for such a loop
+
+
+def was_step_checked(loop: Loop, solver: Solver) -> bool:
+    """Return True if the step was found stable for a loop of this structure, or the solver finds its own steps.
+
+    Args:
+        loop: Closed loop, perhaps with traced parameters.
+        solver: Solver of the run.
+    """
+    return isinstance(solver, Adaptive) or (jax.tree.structure(loop), float(solver.step)) in _stable_steps
 
 
 def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Admissibility:

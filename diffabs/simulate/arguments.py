@@ -1,5 +1,7 @@
 """Arguments of a run: refusals, and the preparation for a compiled program."""
 
+import functools
+import logging
 from collections.abc import Mapping
 
 import jax
@@ -17,12 +19,18 @@ from diffabs.core.pytree import canonical_dtypes, parameters, replace, stack_lis
 from diffabs.core.types import Params, PyTree
 from diffabs.core.validity import find_broken, find_misshapen, part_rules
 from diffabs.objectives import Variation
-from diffabs.simulate.admissible import find_impossible_values, find_solver_faults
+from diffabs.simulate.admissible import (
+    find_impossible_values,
+    find_solver_faults,
+    find_unstable_step,
+    was_step_checked,
+)
 from diffabs.simulate.contracts import refuse_misfits
 from diffabs.simulate.step.adaptive import AdaptiveStepping, clip_rtol
 from diffabs.simulate.step.fixed import FixedStepping
 from diffabs.simulate.types import Adaptive, Solver
 
+log = logging.getLogger("diffabs")
 OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
 RESERVED_METRICS = ("", "stopped", "diverged", "timed_out")  # the plant's audit, and the end flags of a run
 
@@ -127,6 +135,9 @@ def refuse_unnamed(objectives: Mapping[str, Objective] | None) -> None:
 def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
     """Check a run as `refuse` does and, if all parameters are concrete, their values.
 
+    A warning says once that a step is not stable or, for traced parameters, that it is not checked, unless it was for
+    such a loop.
+
     Args:
         loop: Closed loop.
         solver: Solver of the run.
@@ -137,6 +148,8 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     """
     refuse(loop, solver, objectives)
     if is_traced(loop, dict(objectives)):
+        if not was_step_checked(loop, solver):
+            _warn_unchecked_step(f"{solver.step:g}")
         return
     lines = find_impossible_values(loop, solver.step)
     lines += [
@@ -144,6 +157,17 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     ]
     if lines:
         raise ValueError("; ".join(lines))
+    for line in find_unstable_step(loop, solver):
+        _warn_unstable_step(line)
+
+
+_warn_unstable_step = functools.cache(log.warning)
+_warn_unchecked_step = functools.cache(
+    functools.partial(
+        log.warning,
+        "solver.step = %s s is not checked for stability, because the loop is traced; d.check(loop, solver) checks it",
+    )
+)
 
 
 def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: PyTree) -> None:

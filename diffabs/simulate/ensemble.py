@@ -1,6 +1,8 @@
 """The runs of a batch: by a kernel or by XLA, on all cores, together or packed."""
 
 import dataclasses
+import functools
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,6 +25,7 @@ from diffabs.simulate.drive.sharding import describe_placement, run_on_all_cores
 from diffabs.simulate.run import run_unchecked
 from diffabs.simulate.types import Run, Solver
 
+log = logging.getLogger("diffabs")
 # Part of a message: why a batch cannot run in a kernel.
 TOGETHER_REASON = "lanes run together, for trajectories or for derivatives in either mode"
 TRACED_REASON = "the call is traced (jit, grad, vmap)"
@@ -60,7 +63,8 @@ def run_batch(
             together.
         accepted: Runs to execute, shape (runs,), or True for all. The others have `diverged`, and their metrics are
             NaN, also where they step together with the rest. None means the runs that `batch_admissibility` accepts, or
-            all if the call is traced. A batch without values has no accepted run if the step is not stable.
+            all if the call is traced; a warning says how many runs are refused, and why. A batch without values has no
+            accepted run if the step is not stable.
         enough: Condition that ends runs early. Such a run has neither stopped, timed out nor diverged. Not
             for runs that step together.
         engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine. It needs a
@@ -126,12 +130,20 @@ def _dispatch_batch(
     refuse(replace(loop, {path: _first_member(column) for path, column in batch.values.items()}), solver, objectives)
     # Traced values cannot be checked. A traced batch runs every member, also an impossible one.
     live = is_traced(loop, dict(batch.values), dict(objectives))
-    if accepted is None and (live or batch.values):
-        accepted = live or batch_admissibility(loop, batch.values, solver).accepted
+    if accepted is None and live:
+        accepted = True
+    elif accepted is None and batch.values:
+        found = batch_admissibility(loop, batch.values, solver)
+        accepted = found.accepted
+        for code, reason in enumerate(found.reasons[1:], 1):
+            _warn_refused(int(np.count_nonzero(found.codes == code)), count, reason)
     elif accepted is None:
         if lines := find_impossible_values(loop, solver.step):  # all runs are the same loop
             raise ValueError("; ".join(lines))
-        accepted = not any(find_unstable_step(loop, solver))
+        lines = list(find_unstable_step(loop, solver))
+        accepted = not lines
+        if lines:
+            _warn_refused(count, count, lines[0])
     elif np.shape(accepted) not in ((), (count,)):
         raise ValueError(f"accepted has shape {np.shape(accepted)}; ({count},) is needed, one value for each run")
     given = (
@@ -171,6 +183,9 @@ def _dispatch_batch(
     why_not = TOGETHER_REASON if trajectories or together else ""
     why_xla = TRACED_REASON if traced else TOGETHER_REASON if as_one else describe_placement(given)
     return run_with_engine(engine, by_kernel, by_xla, (given, enough), why_not, why_xla)
+
+
+_warn_refused = functools.cache(functools.partial(log.warning, "%d of %d runs are refused and count as diverged: %s"))
 
 
 def _first_member(column: PyTree) -> Any:

@@ -50,9 +50,9 @@ def rollout(
 
     The function is pure and compiled once per structure of the loop: new values and another duration do not compile
     again. A trajectory or a derivative does compile again if it outgrows its capacity, which is at most an eighth more
-    than requested. The stability of the step is not checked here but in `check`. Traced
-    parameters are not checked against their ranges. A run with impossible ones diverges only if its numbers are invalid
-    or not physically possible (`Run.diverged`).
+    than requested. A warning names an unstable step, which `check` refuses, and a step that is not checked because the
+    loop is traced. Traced parameters are not checked against their ranges. A run with impossible ones diverges only if
+    its numbers are invalid or not physically possible (`Run.diverged`).
 
     Args:
         loop: Closed loop with every part and parameter; differentiable in each leaf, and batched by `jax.vmap` over

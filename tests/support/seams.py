@@ -60,6 +60,7 @@ SEAMS = {
     "outside_named": "diffabs.scenario.outside._named",
     "is_step_stable": "diffabs.simulate.admissible.is_step_stable",
     "stable_step": "diffabs.simulate.admissible.stable_step",
+    "measured_step": "diffabs.simulate.arguments.find_unstable_step",
     "max_saved_carries": "diffabs.simulate.drive.loops.MAX_SAVED_CARRIES",
     "max_lanes_per_launch": "diffabs.simulate.drive.kernel.MAX_LANES_PER_LAUNCH",
     "lanes_at_once": "diffabs.simulate.drive.packed.LANES_AT_ONCE",
