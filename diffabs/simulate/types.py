@@ -152,7 +152,8 @@ class Run(NamedTuple):
         metrics: Values of the objectives by name. All are NaN if the run diverged.
         stopped: True if the run reached its stop within the duration.
         diverged: True if a number is not finite or not physically possible, or if the start is beyond the stop. Also
-            True for a missed landing, for too many attempts, and for a run that was not accepted.
+            True for a missed landing, for steps that are too many or cannot meet their tolerance, and for a run that
+            was not accepted.
         timed_out: True if the duration ended before the stop. Metrics are valid then.
         ending: Last sample, whether the run stopped, and the time and distance that remain.
         trajectory: Signals at the kept instants; None if no trajectory was requested.

@@ -2,7 +2,8 @@
 
     length     0.85 r^(-1/4) times the last length, r = |error|/rtol. The error is the difference between two solutions
                in the middle of the step: the cubic, which represents every signal within the step, and the method's
-               own. The length is at most 3/rho, rho the spectral radius of the loop's Jacobian
+               own. The length is at most 3/rho, rho the spectral radius of the loop's Jacobian. A run whose shortest
+               step has r > 1 has diverged; this step is near the spacing of numbers at its time
     surfaces   a step ends near the predicted change of a comparison. A change between 2 % and 95 % of a step repeats
                the step up to there. Each stage evaluates its comparisons
     events     if a margin falls through zero within a step, the step is attempted again until it ends on the zero
@@ -52,15 +53,17 @@ from diffabs.simulate.step.runge_kutta import TSIT5, midpoint_error
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.step_size import (
     INITIAL_STEP_S,
-    MIN_STEP_FRACTION,
+    MIN_LOCATION_FRACTION,
+    MIN_STEP_EPS,
     MIN_STEP_RATIO,
     error_norm,
     error_scales,
     plan_step,
     propose_length,
+    shortest_step,
     spectral_step_limit,
 )
-from diffabs.simulate.step.surfaces import forecast_crossing, time_since_crossing
+from diffabs.simulate.step.surfaces import forecast_crossing, is_surface_moving, time_since_crossing
 from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import Trajectory
 
@@ -139,7 +142,7 @@ class AdaptiveReport(NamedTuple):
         scale: Largest values of the first signal and of the states so far, as `error_scales` returns them.
         past_crossing: Time from the first change of a comparison inside the step, or the first turn of a margin beyond
             zero, to the end of the step [s]; 0 without one.
-        grazes: True if a margin only touches zero.
+        grazes: True if a margin only touches zero, or crosses it twice in a step that is too short to be cut.
         surface: Contradicted comparisons; None if steps keep to no mode.
     """
 
@@ -188,9 +191,10 @@ class AdaptiveStepping:
         return not self.smooth
 
     @property
-    def least(self) -> Scalar:
-        """Shortest step [s]."""
-        return self.h * self.steps * jnp.maximum(MIN_STEP_FRACTION, 4 * jnp.finfo(self.h.dtype).eps)
+    def closest(self) -> Scalar:
+        """Length of a step [s] within which no crossing is located and no margin's error counts."""
+        rounding = MIN_STEP_EPS * jnp.finfo(self.h.dtype).eps
+        return self.h * self.steps * jnp.maximum(MIN_LOCATION_FRACTION, rounding)
 
     def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
@@ -202,7 +206,7 @@ class AdaptiveStepping:
         scale = error_scales(state, point.sample)
         limit = self._find_stability_limit(loop, point.t, state, scale) if self.stable else self.h * self.steps
         left = self._next_strike(loop, zero) * self.h
-        length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), left, self.least)
+        length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), left)
         last = span_step(point, point) if self.keeps_last_step else ()
         control = AdaptiveControl(error_limited, limit, scale, zero, zero, last, zero, 1.0 + 0.0 * self.h, no, zero)
         return cast_floats(carry._replace(length=length, base=length, strikes=strikes, control=control), self.h.dtype)
@@ -261,7 +265,7 @@ class AdaptiveStepping:
         A step that keeps its mode gets `CROSSING_OVERREACH` times this time, so that the change lies within it. The
         second result is an `Outlook`.
         """
-        fresh = carry.status == RunStatus.REFRESHING
+        fresh = (carry.status == RunStatus.REFRESHING) | carry.unrestricted
         return self._look_ahead(carry.control.error_limited, carry.unrestricted, fresh, seen)
 
     def report(
@@ -282,21 +286,23 @@ class AdaptiveStepping:
         surface = find_surface_crossing(seen, carry.search.which, h) if self.keeps_mode else None
         turns = watch_margins(carry, h, self._select_watched(seen), system.bit_count)
         past_crossing = jnp.maximum(time_since_crossing(seen.surfaces, changed, h), turns.time_since)
+        resolved = carry.length > self.closest
         if self.watches:
-            relative = jnp.maximum(relative, margin_error(system, carry, h, seen, state))
-        return AdaptiveReport(relative, scale, past_crossing, turns.grazes, surface)
+            relative = jnp.maximum(relative, jnp.where(resolved, margin_error(system, carry, h, seen, state), 0.0))
+        grazes = turns.grazes | (~resolved & (turns.time_since > 0))
+        grazes |= carry.unrestricted & is_surface_moving(seen.surfaces, changed)
+        return AdaptiveReport(relative, scale, jnp.where(resolved, past_crossing, 0.0), grazes, surface)
 
     def decide(
         self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
     ) -> Decision:
         """Return the decision on the `attempt` that answers the `request`, by the run of `carry` in `system`.
 
-        Its error must be small, and no comparison may change within it, unless its length is the shortest one. `active`
-        is False if the run needs no attempt.
+        Its error must be small, and no comparison may change within it. `active` is False if the run needs no attempt.
         """
         error, past_crossing = attempt.report.error, attempt.report.past_crossing
         fine = jnp.isfinite(error)  # the maximum over all states: one NaN makes it NaN
-        exact = fine & (((error <= 1) & (past_crossing <= 0)) | (carry.length <= self.least))
+        exact = (error <= 1) & (past_crossing <= 0)
         last = request.strikes & (request.strike >= self.steps)
         return decide_attempt(self, system, carry, attempt, active, fine, exact, last=last, frozen=self.keeps_mode)
 
@@ -312,27 +318,36 @@ class AdaptiveStepping:
         if self.keeps_mode:
             grown = jnp.minimum(STABILITY_FRACTION_GROWTH * fraction, 1.0)
             fraction = jnp.where(taken, jnp.where(new, grown, INITIAL_STABILITY_FRACTION), fraction)
-        longest = jnp.maximum(jnp.minimum(error_limited, fraction * control.limit), self.least)
+        longest = jnp.maximum(jnp.minimum(error_limited, fraction * control.limit), shortest_step(after.point.t))
         left = (self._next_strike(system.loop, after.k) - after.k) * self.h - after.since
-        length, strikes = plan_step(longest, self._ahead(after.point), left, self.least)
+        length, strikes = plan_step(longest, self._ahead(after.point), left)
         # A comparison changed inside the step: the next attempt ends there.
         ends_on_crossing = ~taken & (report.past_crossing > 0) & decision.fine
-        length = jnp.where(ends_on_crossing, jnp.maximum(carry.length - report.past_crossing, self.least), length)
+        length = jnp.where(ends_on_crossing, jnp.maximum(carry.length - report.past_crossing, self.closest), length)
         falls_short = self._jumps_at_end(carry, report, decision)
         length = jnp.where(falls_short, SHORT_OF_SURFACE_FRACTION * carry.length, length)
         searches, status, unrestricted = decision.searches, after.status, carry.unrestricted
-        crossings = control.consecutive_crossings
+        crossings, slides = control.consecutive_crossings, jnp.asarray(False)
         if self.keeps_mode:
             calm = taken & new & (carry.length > RESET_STEP_FRACTION * control.error_limited)
             if self.watches:
                 # Steps without an error are as long as the run, so that no step counts as long beside them.
                 apart = carry.length > SLIDE_INTERVAL_FRACTION * self.h * self.steps
                 calm, crossings = calm | (taken & new & apart), jnp.where(apart, 0, crossings)
-            crossings = jnp.where(decision.crosses_surface, crossings + 1, jnp.where(calm, 0, crossings))
+            crosses = (
+                decision.crosses_surface | (taken & carry.unrestricted) if self.watches else decision.crosses_surface
+            )
+            crossings = jnp.where(crosses, crossings + 1, jnp.where(calm, 0, crossings))
             gave_up = searches & (after.search.tries >= MAX_LOCATION_ATTEMPTS)
             gave_up &= after.search.which < system.bit_count
             becomes_unrestricted = (gave_up | (taken & (crossings > MAX_CONSECUTIVE_CROSSINGS))) & ~unrestricted
             unrestricted = (unrestricted | becomes_unrestricted) & ~(calm & have_same_answers(carry, attempt))
+            if self.watches:
+                # Just before a surface that the run comes to with rate 0, each step may be too long for its mode: the
+                # square root of a level. One step without a mode goes there. If the level stays, so does the run.
+                slides = gave_up | (taken & (crossings > MAX_CONSECUTIVE_CROSSINGS))
+                unrestricted = new & ~decision.fine & (carry.length <= self.closest) & ~carry.unrestricted
+                length = jnp.where(unrestricted, carry.length, length)
             searches &= ~(becomes_unrestricted & gave_up)
             length = jnp.where(becomes_unrestricted & gave_up, longest, length)
             status = jnp.where(becomes_unrestricted & gave_up, RunStatus.RUNNING, status)
@@ -343,13 +358,15 @@ class AdaptiveStepping:
         last_step = control.last_step
         if self.keeps_last_step:
             last_step = select(taken, span_step(carry.point, attempt.point), last_step)
-        lost = (~decision.fine & (carry.length <= self.least)) | (
+        # An error that is NaN is not small. An attempt within a search need not be accurate.
+        fails = jnp.where(new, ~(report.error <= 1), ~decision.fine)
+        lost = (fails & (carry.length <= shortest_step(carry.point.t))) | (
             control.tries > MAX_ATTEMPTS + ATTEMPTS_PER_INSTANT * self.steps
         )
         return after._replace(
             length=length,
             base=jnp.where(status == RunStatus.RUNNING, length, carry.base),
-            strikes=strikes & ~searches & ~ends_on_crossing & ~falls_short & ~refreshes,
+            strikes=strikes & ~searches & ~ends_on_crossing & ~falls_short & ~refreshes & ~unrestricted,
             unrestricted=unrestricted,
             control=control._replace(
                 error_limited=error_limited,
@@ -361,17 +378,15 @@ class AdaptiveStepping:
                 taken=taken,
                 triggered=_pack_events(decision.triggered),
             ),
-            status=jnp.where(lost, RunStatus.DIVERGED, self._judge(carry, report, unrestricted, status)),
+            status=jnp.where(lost, RunStatus.DIVERGED, self._judge(report, slides, status)),
         )
 
-    def _judge(self, carry: Carry, report: AdaptiveReport, unrestricted: Bool, status: Scalar) -> Scalar:
+    def _judge(self, report: AdaptiveReport, slides: Bool, status: Scalar) -> Scalar:
         """Return the `status`, or that of a run which is over because it slides or grazes."""
         if not self.watches:
             return status
-        # The shortest step is accepted in any case, also if a margin crosses zero twice in it.
-        passed = (carry.status == RunStatus.RUNNING) & (report.past_crossing > 0) & (carry.length <= self.least)
-        status = jnp.where(report.grazes | passed, RunStatus.GRAZED, status)
-        return jnp.where(unrestricted, RunStatus.SLID, status)
+        status = jnp.where(report.grazes, RunStatus.GRAZED, status)
+        return jnp.where(slides, RunStatus.SLID, status)
 
     def _find_stability_limit(self, loop: Loop, t: Scalar, state: LoopState, scale: Scalar) -> Scalar:
         """Return the longest stable step [s]; the whole span if the Jacobian of the `loop` is not finite.
@@ -400,7 +415,7 @@ class AdaptiveStepping:
         return jnp.minimum(loop.next_tick(k, self.h), self.steps) if loop.ticks else self.steps
 
     def _forecast_crossing(self, error_limited: Scalar, unrestricted: Bool, seen: Evaluation) -> Scalar:
-        ahead = forecast_crossing(seen.surfaces, error_limited, self.least)
+        ahead = forecast_crossing(seen.surfaces, error_limited, self.closest)
         return jnp.where(unrestricted, 1.0, CROSSING_OVERREACH) * ahead if self.keeps_mode else ahead
 
     def _jumps_at_end(self, carry: Carry, report: AdaptiveReport, decision: Decision) -> Bool:
@@ -433,7 +448,7 @@ class AdaptiveStepping:
             landed = decision.taken & (carry.status == RunStatus.LANDING)
             most = jnp.maximum(LANDED_STEP_RATIO * carry.length, LEAST_LANDED_RATIO * new)
             new = jnp.where(landed, jnp.minimum(new, most), new)
-        return jnp.maximum(new, self.least)
+        return jnp.maximum(new, shortest_step(attempt.point.t))
 
 
 def clip_rtol(rtol: Scalar) -> Scalar:

@@ -19,7 +19,9 @@ from diffabs.core.types import Int, PyTree, Scalar
 INITIAL_STEP_S = 1e-4  # s, the first step
 SAFETY, MIN_ERROR = 0.85, 1e-6  # fraction of the optimal length; offset that keeps the length finite for an error of 0
 MIN_STEP_RATIO, MAX_STEP_RATIO = 0.25, 2.5  # least and greatest ratio of a step to the last one
-MIN_STEP_FRACTION = 1e-9  # fraction of the duration: the shortest step, or 4 times the rounding of the duration
+# Fraction of the duration, at least 4 times its rounding: within a shorter step nothing is located.
+MIN_LOCATION_FRACTION = 1e-9
+MIN_STEP_EPS = 4  # multiples of the rounding of the time: the shortest step
 TWO_STEP_RATIO = 1.2  # ratio to the present length: a nearer switching surface is reached in two equal steps
 CLOCK_REACH_FRACTION = 0.99  # fraction of the time to a clock's instant: a longer step ends on the instant
 STABILITY_RADIUS = 3.0  # the longest step is this number divided by the spectral radius
@@ -68,23 +70,27 @@ def propose_length(length: Scalar, error: Scalar) -> Scalar:
     return length * clamp(SAFETY / jnp.sqrt(jnp.sqrt(error + MIN_ERROR)), MIN_STEP_RATIO, MAX_STEP_RATIO)
 
 
-def plan_step(length: Scalar, ahead: Scalar, left: Scalar, least: Scalar) -> tuple[PyTree, PyTree]:
+def plan_step(length: Scalar, ahead: Scalar, left: Scalar) -> tuple[PyTree, PyTree]:
     """Return the length of the next step [s], and True if the step ends where a clock strikes.
 
     Args:
         length: Length that the error and stability allow [s].
         ahead: Time to the next switching surface [s].
         left: Time to the next instant of a clock [s].
-        least: Shortest length of any step [s].
     """
     # Two steps of 0.6 lengths instead of one full step and a very short one.
     near = jnp.where(ahead < TWO_STEP_RATIO * length, 0.5 * TWO_STEP_RATIO * length, length)
-    length = jnp.where(
-        ahead < length, jnp.maximum(ahead, jnp.maximum(MIN_CROSSING_STEP_FRACTION * length, least)), near
-    )
+    length = jnp.where(ahead < length, jnp.maximum(ahead, MIN_CROSSING_STEP_FRACTION * length), near)
     # A step just short of the clock's instant would leave a remainder near rounding. Else, two halves share the rest.
     ends = length > CLOCK_REACH_FRACTION * left
     return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends
+
+
+def shortest_step(t: Scalar) -> Scalar:
+    """Return the shortest step [s] that changes the time `t` [s] by more than its rounding."""
+    number = jnp.finfo(t.dtype)
+    # At t = 0 numbers are far closer than steps need to be. This one keeps quotients by a step finite.
+    return jnp.maximum(MIN_STEP_EPS * number.eps * jnp.abs(t), number.tiny / number.eps)
 
 
 def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) -> Scalar:

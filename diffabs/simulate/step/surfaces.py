@@ -105,6 +105,17 @@ def _list_changes(
             yield on & early, on & ~early, since
 
 
+def is_surface_moving(surfaces: Sequence[SwitchingFunction], changed: ModeBits) -> Bool:
+    """Return True if the margin of a comparison that changes in a step is not at rest at its end.
+
+    Args:
+        surfaces: Margins of the comparisons at the end of the step, and their rates.
+        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
+    """
+    moving = [jnp.any(read_bits(changed, one.numbers) & (one.rate != 0)) for one in surfaces]
+    return jnp.any(jnp.array(moving, bool))
+
+
 def read_bits(words: ModeBits, numbers: PyTree) -> Scalar:
     """Return the bits with these numbers, bool.
 

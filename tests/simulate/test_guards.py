@@ -1,0 +1,77 @@
+"""Fields that end at a surface with rate 0, behind a guard: a tank that runs empty."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mutants import killed_by
+from scipy.optimize import brentq
+
+import diffabs as d
+from diffabs.simulate.solve import SolutionStatus
+
+SOLVER, END, INFLOW = d.Adaptive(1e-8), 4.0, 0.3
+RATES = jnp.array([0.4, 1.0, 1.3])  # the tank is empty after 2/rate
+
+
+def guarded(t, h, rate):
+    """Outflow of the level, with a guard on both sides of the switch."""
+    return jnp.where(h > 0, -rate * jnp.sqrt(jnp.where(h > 0, h, 1.0)), 0.0)
+
+
+GUARDS = {
+    "double where": guarded,
+    "where": lambda t, h, rate: jnp.where(h > 0, -rate * jnp.sqrt(h), 0.0),
+    "max": lambda t, h, rate: -rate * jnp.sqrt(jnp.maximum(h, 0.0)),
+}
+
+
+def solve(field, engine="xla"):
+    return lambda rate: d.solve(field, 1.0, 0.0, END, rate, solver=SOLVER, engine=engine)
+
+
+@pytest.mark.slow
+@killed_by("simulate/step/adaptive.py", "(carry.length <= self.closest) & ~carry.unrestricted", "False", case="max-xla")
+@killed_by("simulate/step/adaptive.py", "(carry.status == RunStatus.REFRESHING) | carry.unrestricted", "False")
+@pytest.mark.parametrize("engine", ["xla", "kernel"])
+@pytest.mark.parametrize("name", GUARDS)
+def test_an_empty_tank_stays_empty(name, engine):
+    """The level is (1 - rate t/2)^2 until it is 0."""
+    found = jax.vmap(solve(GUARDS[name], engine))(RATES)
+    assert found.status.tolist() == 3 * [SolutionStatus.FINISHED]
+    np.testing.assert_allclose(found.y, np.maximum(1 - RATES * END / 2, 0.0) ** 2, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_an_empty_tank_has_derivatives():
+    slopes = -np.maximum(1 - RATES * END / 2, 0.0) * END
+    for mode in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(jax.vmap(mode(lambda rate: solve(guarded)(rate).y))(RATES), slopes, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_an_empty_tank_fills_again():
+    """An inflow from 3 on. With s = sqrt(h), the time from 0 to s is the integral of 2 s/(inflow - rate s)."""
+
+    def field(t, h, rate):
+        return jnp.where(t < 3.0, 0.0, INFLOW) + guarded(t, h, rate)
+
+    def level(rate):
+        full = INFLOW / rate
+
+        def left(s):
+            return 2 / rate * (full * np.log(full / (full - s)) - s) - 1.0
+
+        return brentq(left, 0.0, full * (1 - 1e-12)) ** 2
+
+    found = jax.vmap(solve(field))(RATES[1:])
+    np.testing.assert_allclose(found.y, [level(float(rate)) for rate in RATES[1:]], atol=1e-6)
+
+
+@pytest.mark.slow
+@killed_by("simulate/step/adaptive.py", "carry.unrestricted & is_surface_moving(seen.surfaces, changed)", "False")
+def test_a_level_that_may_fall_on_is_reported():
+    """With sqrt(|h|) both 0 and -(rate t/2 - 1)^2 are solutions beyond the end."""
+    found = jax.vmap(solve(lambda t, h, rate: -rate * jnp.sqrt(jnp.abs(h))))(RATES)
+    assert found.status.tolist() == [SolutionStatus.FINISHED, SolutionStatus.GRAZED, SolutionStatus.GRAZED]
+    assert np.isnan(found.y).tolist() == [False, True, True]
