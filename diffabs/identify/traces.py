@@ -17,16 +17,21 @@ from diffabs.identify.data import Comparison, check_positive, check_sigma_table
 from diffabs.identify.fit import Identified
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.run import rollout
-from diffabs.simulate.types import Solver
+from diffabs.simulate.types import FixedStep, Solver
+
+# Parts into which the grid of adaptive steps is divided at most; how near to an instant of the data a grid must come,
+# relative to the instant's number.
+MAX_GRID_DIVISOR, INSTANT_TOLERANCE = 1000, 1e-9
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Traces:
     """Measured signals over time.
 
-    The simulated signals are those behind the loop's sensor. They are interpolated linearly between the instants that
-    the solver keeps (`solver.every`). A run that ends before its data stays at its last sample. Without the rest, an
-    early end would lower the cost. If the loop's stop ends a run that is not at rest, cut longer data with `until`.
+    The simulated signals are those behind the loop's sensor. Each run keeps them at the instants t, whatever
+    `solver.every` says. Between the steps of a `FixedStep` they are interpolated linearly. A run that ends before its
+    data stays at its last sample. Without the rest, an early end would lower the cost. If the loop's stop ends a run
+    that is not at rest, cut longer data with `until`.
 
     Attributes:
         t: Instants [s] from the start of the run, shape (n,), increasing, not necessarily equally spaced.
@@ -71,7 +76,7 @@ class Traces:
             if weights is None
             else np.concatenate([self._broadcast_column(weights[name]) for name in self.columns])[kept]
         )
-        simulated = _TraceResiduals(solver, tuple(self.columns))
+        simulated = _TraceResiduals(_keep_instants(solver, np.asarray(self.t, float)), tuple(self.columns))
         return Comparison(
             simulated,
             (over, np.asarray(self.t, float), kept, target),
@@ -144,6 +149,21 @@ def _output_names(loop: Loop) -> tuple[str, ...]:
     return jax.eval_shape(
         lambda loop: loop.plant.output(loop.plant.start(loop.initial)), canonical_dtypes(loop)
     )._fields
+
+
+def _keep_instants(solver: Solver, t: np.ndarray) -> Solver:
+    """Return the solver with the fewest kept instants among which are the instants t [s], or the nearest steps.
+
+    Fixed steps stay as they are. The grid of adaptive steps is divided: their interpolation is as exact as the steps.
+    """
+    divisors = (1,) if isinstance(solver, FixedStep) else range(1, MAX_GRID_DIVISOR + 1)
+    for divisor in divisors:
+        counts = t * divisor / solver.step
+        whole = np.round(counts)
+        if (np.abs(counts - whole) <= INSTANT_TOLERANCE * np.maximum(1.0, counts)).all():
+            every = math.gcd(*whole.astype(int).tolist()) or 1
+            return dataclasses.replace(solver, step=solver.step / divisor, every=every)
+    return dataclasses.replace(solver, step=solver.step / divisors[-1], every=1)
 
 
 @dataclasses.dataclass(frozen=True)

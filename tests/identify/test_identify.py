@@ -20,7 +20,7 @@ from diffabs.identify.fit import Tolerances, fit
 from diffabs.identify.identification import identify
 from diffabs.identify.residuals import gaussian
 from diffabs.identify.table import Table
-from diffabs.identify.traces import Traces
+from diffabs.identify.traces import Traces, _keep_instants
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.stability import stable_step
 
@@ -406,7 +406,8 @@ class TestTraces:
         expected = []
         for name, shift in (("speed", 0.0), ("slip", 1.0)):
             for i, kept in enumerate((t <= np.inf, t <= 0.4)):
-                run = d.rollout(replace(LOOP, {path: x[i] for path, x in over.items()}), solver)
+                # a sparse record is not interpolated: every step is kept
+                run = d.rollout(replace(LOOP, {path: x[i] for path, x in over.items()}), SOLVER)
                 y = getattr(run.trajectory.sample.output, name)
                 expected.append((np.interp(t, run.trajectory.sample.t, y) - shift)[kept])
         assert expected[0][-1] == pytest.approx(24.0, abs=1e-6)  # it has ended there
@@ -565,3 +566,15 @@ def test_the_derivative_through_interpolation_is_right():
 
     slope, h = jax.jacfwd(seen)(0.9), 1e-5
     np.testing.assert_allclose(slope, (seen(0.9 + h) - seen(0.9 - h)) / (2 * h), rtol=1e-6, atol=1e-8)
+
+
+@killed_by("identify/traces.py", "math.gcd(*whole.astype(int).tolist()) or 1", "solver.every")
+def test_a_run_keeps_the_instants_of_its_data():
+    """Of a sparse record no straight line is left: the steps stay, or the grid of adaptive steps is divided."""
+    t = 5 + 37.3 * np.arange(16)
+    fixed = _keep_instants(d.FixedStep(1.0, 600.0, every=100), t)
+    assert (fixed.step, fixed.every) == (1.0, 1)  # no step ends at 42.3 s
+    assert _keep_instants(d.FixedStep(0.1, 600.0, every=7), np.array([20.0, 50.0])).every == 100
+    adaptive = _keep_instants(d.Adaptive(1e-6, 600.0, 100.0), t)
+    counts = t / (adaptive.step * adaptive.every)
+    np.testing.assert_allclose(counts, np.round(counts), rtol=0, atol=1e-6)
