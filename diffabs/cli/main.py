@@ -67,6 +67,17 @@ app = typer.Typer(
 
 AT_LIMIT = "at a limit\n"  # key among a run's objectives; the names in a scenario have no line break
 WARNED_LIMIT_SHARE = 0.5  # share of time at a limit, above which a run gets a warning
+# A command's own arithmetic, whatever the environment says for other programs. NaN is the value of a run that diverged,
+# and a loop without compilation is slower by orders of magnitude.
+JAX_FLAGS = {
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_numpy_rank_promotion": "allow",
+    "jax_transfer_guard": "allow",
+    "jax_debug_nans": False,
+    "jax_debug_infs": False,
+    "jax_disable_jit": False,
+    "jax_enable_checks": False,
+}
 MAX_CSV_ROWS = 20_000  # of a trajectory
 
 
@@ -98,6 +109,8 @@ def setup(
     del version
     compiled.use_compilation_cache()
     jax.config.update("jax_enable_x64", True)
+    for flag, value in JAX_FLAGS.items():
+        jax.config.update(flag, value)
 
 
 def simulate(
