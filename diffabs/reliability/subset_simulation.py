@@ -184,6 +184,11 @@ def subset_simulation(
     the first level, since no sample fails. The interval of `RareEvent.plain` covers the truth in at least 99 % of
     the seeds in all three cases.
 
+    >>> from diffabs.reliability import subset_simulation
+    >>> found = subset_simulation(lambda z: (z[:, 0] + z[:, 1]) / 2**0.5, 2, 4.5)  # exactly 3.4e-6
+    >>> print(f"{found.probability:.1e}")
+    3.3e-06
+
     Args:
         score: Function (n, dimension) -> (n,); n is `samples` once, then samples * share, and `draws` at the end.
         dimension: Number of coordinates z.
