@@ -7,7 +7,7 @@ judges the result. Three braking runs with one step of the command each (Fig. 5.
 
 import dataclasses
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -76,18 +76,32 @@ PARAMETER_RANGES: Params = {
     "loop.actuator.fall": (2e-3, 0.05),
     "counter_lag": (0.0, 0.03),
 }
-# The cost has many minima: a brake that grips a sample earlier shifts a whole cycle. The best of these starts counts.
-STARTS: tuple[Params, ...] = tuple(
-    {
-        "loop.plant.road.w4": 0.22,
-        "loop.plant.brake_gain": torque,
-        "loop.plant.brake_rate": rate,
-        "loop.actuator.rise": rise,
-        "loop.actuator.fall": fall,
-    }
-    for rise, fall in ((0.013, 0.007), (0.016, 0.010))
-    for torque, rate in ((20.0, 400.0), (24.0, 200.0))
-)
+LOAD, FRICTION = "loop.plant.weight_torque", "loop.plant.road.w4"
+LOAD_RANGE = (2.0, 40.0)  # N m
+
+
+def starts_from(brakes: Sequence[tuple[float, float]]) -> tuple[Params, ...]:
+    """Return starts of the fit: two pairs of dead times with each brake, a torque [N m] and a rate of its lag [1/s].
+
+    A brake that grips a sample earlier shifts a whole cycle, so a far start may end in another minimum.
+
+    Args:
+        brakes: Brakes to start from.
+    """
+    return tuple(
+        {
+            FRICTION: 0.22,
+            "loop.plant.brake_gain": torque,
+            "loop.plant.brake_rate": rate,
+            "loop.actuator.rise": rise,
+            "loop.actuator.fall": fall,
+        }
+        for rise, fall in ((0.013, 0.007), (0.016, 0.010))
+        for torque, rate in brakes
+    )
+
+
+STARTS = starts_from([(20.0, 400.0)])
 
 STEP_COMMANDS = (0.65, 0.7, 0.75)  # of the step-braking curves, Fig. 5.6 a
 STEP_DURATION = 1.5  # s
@@ -194,6 +208,24 @@ def build_run(record: Record, given: bool, rig: LabRig) -> RecordedRun:
         rig: Plant.
     """
     return RecordedRun(loop=build_record_loop(record, given, rig))
+
+
+def fit_load(record: Record, rig: LabRig, found: Identified) -> Identified:
+    """Return the other reading of a record: the mask's friction, and a load on the wheel that is free instead.
+
+    A normal force is the moment that presses the wheel on the drum, over a lever. The drum and the wheel feel friction
+    times normal force, so a record of both hardly tells a small friction from a small load.
+
+    Args:
+        record: Record that is fitted.
+        rig: Plant before the fit.
+        found: Fit of the same record with free friction.
+    """
+    friction = float(get(MASK, "road.w4"))
+    load = float(rig.weight_torque * found.values[FRICTION] / friction)
+    free = {path: PARAMETER_RANGES[path] for path in FREE if path != FRICTION} | {LOAD: LOAD_RANGE}
+    run = with_values(build_run(record, True, rig), {**found.values, FRICTION: friction, LOAD: load})
+    return fit_record(run, free, record)
 
 
 def judge(record: Record, rig: LabRig, values: Params) -> JsonObject:
@@ -372,14 +404,16 @@ def fit_step(curves: StepCurves, rig: LabRig) -> Identified:
     )  # fmt: skip
 
 
-def compare_steps(rig: LabRig) -> list[JsonObject]:
-    """Return how far the mask's and the identified rig are from the three step-braking curves.
+def compare_steps(rig: LabRig, loaded: LabRig) -> list[JsonObject]:
+    """Return how far the mask's and the identified rigs are from the three step-braking curves.
 
     Args:
         rig: Identified rig; its brake torque is `brake_gain` at full command, with `brake_offset` 0.
+        loaded: Rig with the mask's friction and another load, of `fit_load`.
 
     Returns:
-        For each command: `measured`, with the `fall_time` [s]; `mask` and `identified`, from `match_step`. `fitted` is
+        For each command: `measured`, with the `fall_time` [s]; `mask`, `identified` and `mask_friction` (the loaded
+        rig), from `match_step`. `fitted` is
         the same for a fit of this rig to each curve alone, with `friction` [1], `brake_torque` [N m], `brake_rate`
         [1/s] and their deviations. No other number depends on this fit.
     """
@@ -399,6 +433,7 @@ def compare_steps(rig: LabRig) -> list[JsonObject]:
             "measured": {"fall_time": _fall_time(curves.t, curves.wheel)},
             "mask": match_step(curves, MASK),
             "identified": match_step(curves, with_scaled_brake(rig)),
+            "mask_friction": match_step(curves, with_scaled_brake(loaded)),
             "fitted": fitted,
         }
         rows.append(row)
@@ -409,7 +444,7 @@ def parameter_rows(found: Identified, coasting: Params) -> list[JsonObject]:
     """Return each identified parameter with the value of the model's mask, unit and standard deviation.
 
     Args:
-        found: Fit of experiment 1.
+        found: Fit of experiment 1, with some of the parameters of `FREE` and the load.
         coasting: Fits of the coasting curves by name.
     """
     rows = [
@@ -419,7 +454,9 @@ def parameter_rows(found: Identified, coasting: Params) -> list[JsonObject]:
         for kind, unit in (("friction", "N m s"), ("stiction", "N m"))
         for mask in [getattr(MASK, f"{name.split('-')[1]}_{kind}")]
     ]  # fmt: skip
-    for path, (unit, what) in FREE.items():
+    for path, (unit, what) in (FREE | {LOAD: ("N m", "moment that presses the wheel on the drum")}).items():
+        if path not in found.values:
+            continue
         head, _, field = path.partition("loop.plant.")
         mask = None if head else float(get(MASK, field))
         if field == "brake_gain":
@@ -451,11 +488,16 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
     )
     progress("lab-rig: judging by experiment 2")
     judged = {name: judge(one, rig, found.values) for name, one in (("fitted", first), ("judged", second))}
+    progress("lab-rig: the mask's friction with another load")
+    loaded = fit_load(first, rig, found)
+    with_load = {FRICTION: float(get(MASK, "road.w4")), **loaded.values}
+    other = {name: judge(one, rig, with_load) for name, one in (("fitted", first), ("judged", second))}
     before = {name: judge(one, MASK, MASK_VALUES) for name, one in (("fitted", first), ("judged", second))}
     parameters = parameter_rows(found, coasting)
     progress("lab-rig: step braking")
-    plant: Any = with_values(build_run(first, True, rig), found.values).loop.plant
-    steps = compare_steps(plant)
+    rigs: Any = (with_values(build_run(first, True, rig), values).loop.plant for values in (found.values, with_load))
+    plant, pressed = rigs
+    steps = compare_steps(plant, pressed)
     progress("lab-rig: figures")
     names = record.save_figures(draw_figures((first, second), rig, found.values, coasting), folder)
     open_directions = [
@@ -468,6 +510,11 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
         "rows": [*_rows(judged), *_step_rows(steps)],
         **judged,
         "before": before,
+        "mask_friction": {
+            **other,
+            "tables": compare_tables(with_scaled_brake(pressed)),
+            "parameters": parameter_rows(loaded, {}),
+        },
         "maker": maker,
         "tables": compare_tables(with_scaled_brake(plant)),
         "steps": steps,
@@ -504,7 +551,7 @@ def _step_rows(steps: list[JsonObject]) -> list[JsonObject]:
     """Return the rows of `record.computed_row` for the step-braking runs."""
     rows = []
     for one in steps:
-        for state in ("mask", "identified", "fitted"):
+        for state in ("mask", "identified", "mask_friction", "fitted"):
             name = f"step braking with {one['command']:g} ({state})"
             for quantity, unit in (("wheel_rms_percent", "%"), ("drum_rms_percent", "%")):
                 rows.append(record.computed_row(name, quantity, unit, one[state][quantity]))
@@ -557,12 +604,17 @@ def compact(summary: Table) -> Digest:
     for number, key in (("1", "fitted"), ("2", "judged")):
         measured = summary[key]["measured"]
         lines.append((f"{number}, measured", "", "", *_cells(measured)))
-        for state, of in (("mask", summary["before"][key]), (f"identified ({key})", summary[key])):
+        states = {
+            "mask": summary["before"][key],
+            f"identified ({key})": summary[key],
+            f"mask's friction, load identified ({key})": summary["mask_friction"][key],
+        }
+        for state, of in states.items():
             rms = (f"{of[f'wheel_rms_percent_{mode}']:.1f}" for mode in ("given", "own"))
             lines.append((f"{number}, {state}", *rms, *_cells(of)))
     values = [
         f"{row['name']} = {row['value']:.4g} +- {row['standard_deviation']:.1g} {row['unit']}"
-        for row in summary["parameters"]
+        for row in [*summary["parameters"], *summary["mask_friction"]["parameters"][-1:]]
         if ":" not in row["name"]
     ]
     rule = "Given, own: rms error of the wheel's speed under the measured commands and under its own relay."

@@ -268,7 +268,8 @@ class RecordResiduals:
 def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Vector) -> tuple[Vector, Vector]:
     """Return the counter's wheel speed [rad/s] and the computer's slip [1] at instants of a run, shape (n,) each.
 
-    The wheel speed is the true one, older by the counter's lag. The slip is that of the encoders.
+    The wheel speed is the true one, older by the counter's lag. The slip is that of the encoders. After the end of the
+    run both are 0: the driver's dead zone hides slower speeds.
 
     Args:
         run: Run with a trajectory of every step.
@@ -277,15 +278,15 @@ def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Vec
         t: Instants [s], shape (n,).
     """
     assert run.trajectory is not None
-    output, measured = run.trajectory.sample.output, run.trajectory.measured
+    output, measured, running = run.trajectory.sample.output, run.trajectory.measured, run.trajectory.running
     rig: Any = recorded.loop.plant
-    turns = output.wheel_speed / rig.wheel_radius
+    turns = jnp.where(running, output.wheel_speed / rig.wheel_radius, 0.0)
     late = jnp.clip((t - recorded.counter_lag) / solver.step, 0.0, len(turns) - 1.0)
     i = jnp.clip(jnp.floor(jax.lax.stop_gradient(late)).astype(int), 0, len(turns) - 2)
     wheel = turns[i] + (late - i) * (turns[i + 1] - turns[i])
     # A sample is held: half a period later it is the same, and no rounding of the time decides.
-    held = jnp.clip(jnp.round((t + 0.5 * PERIOD) / solver.step).astype(int), 0, len(turns) - 1)
-    return wheel, measured.slip[held]
+    now, held = (jnp.clip(jnp.round(at / solver.step).astype(int), 0, len(turns) - 1) for at in (t, t + 0.5 * PERIOD))
+    return wheel, jnp.where(running[now], measured.slip[held], 0.0)
 
 
 def slip_weight(wheel: np.ndarray) -> np.ndarray:
