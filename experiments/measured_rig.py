@@ -379,7 +379,9 @@ def loop_in(around: Mapping[str, Any], parts: Mapping[str, Any]) -> Loop:
     given = dict(parts) if isinstance(around["plant"], MirroredRig) else as_command(parts)
     inner = given.pop("controller")
     if isinstance(windup := getattr(inner, "antiwindup", None), BackCalculation):  # unstable if faster than the samples
-        inner = dataclasses.replace(inner, antiwindup=BackCalculation(max(float(windup.tracking_time), period)))
+        inner = dataclasses.replace(
+            inner, antiwindup=dataclasses.replace(windup, tracking_time=max(float(windup.tracking_time), period))
+        )
     controller = Sampled(controller=inner, period=period)
     if isinstance(given["reference"], LimitedSlip):
         given["reference"] = dataclasses.replace(given["reference"], period=period)
