@@ -59,8 +59,8 @@ def run_batch(
             modes, with respect to the loop and the batch's values. With False, a run that has ended makes room for the
             next, so that a few long runs do not delay the rest. XLA then has no derivatives, a kernel forward ones.
             True and False agree to rounding. None is True if loop, values or objectives are traced (inside jit, grad,
-            vmap). Trajectories always use True. An empty batch uses True under XLA. Runs of a kernel never step
-            together.
+            vmap). Trajectories always use True. An empty batch uses True under XLA. Runs of a kernel never wait for
+            each other.
         accepted: Runs to execute, shape (runs,), or True for all. The others have `diverged`, and their metrics are
             NaN, also where they step together with the rest. None means the runs that `batch_admissibility` accepts, or
             all if the call is traced; a warning says how many runs are refused, and why. A batch without values has no
@@ -69,11 +69,11 @@ def run_batch(
             for runs that step together.
         engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine. It needs a
             C++ compiler on a processor, and NVRTC, which JAX brings, on an NVIDIA GPU. It returns the same numbers to
-            rounding and has forward derivatives (`jax.jvp`, `jax.jacfwd`), but no reverse mode and no trajectories.
-            "auto" uses a kernel for values where possible. It uses XLA if the call is traced, the runs step together,
-            or they lie on several devices or on one of another kind than JAX's default. It also uses XLA if a kernel is
-            impossible, and then logs a warning. The environment variable `DIFFABS_ENGINE` replaces "auto" by "xla" or
-            "kernel".
+            rounding and has first derivatives in both modes, but no trajectories. "auto" uses a kernel where possible.
+            It uses XLA for second derivatives, for reverse mode by more than 64 numbers of a run, for concrete runs
+            that step together, and for runs that lie on several devices or on one of another kind than JAX's default.
+            It also uses XLA if a kernel is impossible. The log says so. The environment variable `DIFFABS_ENGINE`
+            replaces "auto" by "xla" or "kernel".
 
     Examples:
         >>> import diffabs as d

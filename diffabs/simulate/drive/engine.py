@@ -1,4 +1,5 @@
-"""Selection of the engine of a batch: XLA, or a program of this machine (`kernel`).
+"""Selection of the engine of a concrete batch: XLA, or a program of this machine (`kernel`). `deferred` selects that
+of traced runs.
 
 The default engine is "auto": a kernel where one can make the runs, and XLA otherwise. A kernel has its first result
 about as early as XLA if its C++ compiler has to run, and earlier otherwise (`docs/performance.md`). So "auto" does not
