@@ -51,6 +51,7 @@ from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.matlab import write_mat
 from diffabs.simulate.run import measure, rollout
+from diffabs.simulate.sliding import describe_slide
 from diffabs.simulate.types import Adaptive, Run, describe_solver
 
 if COLLECTS:
@@ -184,7 +185,10 @@ def simulate(
         _show(result, chosen, as_json)
         for line in lines:
             console.say(f"warning: {line}")
-        _judge(chosen, result)
+        slides = describe_slide(
+            chosen.loop, chosen.solver, {**chosen.objectives, AT_LIMIT: at_limits(chosen.loop)}, run
+        )
+        _judge(chosen, result, slides)
 
 
 def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
@@ -193,11 +197,13 @@ def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
         show.show_accuracy(result["accuracy"])
 
 
-def _judge(chosen: Scenario, result: JsonObject) -> None:
-    """Write the warnings. Raises typer.Exit for a diverged run, which has no metrics."""
+def _judge(chosen: Scenario, result: JsonObject, slides: str) -> None:
+    """Write the warnings, also that the run `slides`. Raises typer.Exit for a diverged run, which has no metrics."""
     if result["diverged"]:
         why = "a number became infinite or invalid, or a part switched in every step; there are no metrics"
-        console.fail(f"{chosen.name} diverged: {why}", 1)
+        console.fail(f"{chosen.name}: {slides}" if slides else f"{chosen.name} diverged: {why}", 1)
+    if slides:
+        console.say(f"warning: {slides}")
     for warning in result["warnings"]:
         console.say(f"warning: {warning}")
 

@@ -92,6 +92,38 @@ def _vanish(x: Scalar) -> Scalar:
 _vanish.defjvp(lambda at, moves: (_vanish(*at), moves[0]))
 
 
+def void_derivatives(tree: PyTree, void: Scalar, inputs: PyTree) -> PyTree:
+    """Return a pytree of valid numbers whose derivatives by every finite input are NaN if `void`.
+
+    Args:
+        tree: Result.
+        void: Whether its derivatives are invalid.
+        inputs: Pytree of everything that the result may depend on; only its floating-point leaves count.
+    """
+    leaves = [leaf for leaf in map(jnp.asarray, jax.tree.leaves(inputs)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    total = sum((jnp.sum(jnp.where(jnp.isfinite(leaf), leaf, 0.0)) for leaf in leaves), jnp.zeros(()))
+    slope = jnp.where(void, jnp.nan, 0.0)
+
+    def each(x: Scalar) -> Scalar:
+        x = jnp.asarray(x)
+        return _add_slope(x, slope, total) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+    return jax.tree.map(each, tree)
+
+
+@jax.custom_jvp
+def _add_slope(x: Scalar, slope: Scalar, total: Scalar) -> Scalar:
+    """Return x; its derivative is increased by `slope` times that of `total`."""
+    del slope, total
+    return x
+
+
+@_add_slope.defjvp
+def _slope_rule(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
+    x, slope, _ = at
+    return x, moves[0] + (slope * moves[2]).astype(x.dtype)
+
+
 @jax.custom_jvp
 def quotient(x: Scalar, y: Scalar) -> Scalar:
     """Return x/y; its derivatives (dx - (x/y) dy)/y share one 1/y. JAX's own derivatives divide three more times.

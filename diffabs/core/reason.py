@@ -10,6 +10,7 @@ class Reason(enum.Enum):
     CHANGE = "steps no longer change the loss within its tolerance"
     STEP = "no shorter step makes the loss smaller"
     JUMP = "the loss jumps up just beyond, twice in a row"
+    SLIDE = "runs slide along a switching surface just beyond, and have no derivatives there"
     LIMIT = "the limit of iterations or rounds was reached"
     START = "the start diverged, or the integration step is not stable there"
     KEPT = "the best of its steps that meets all constraints is returned; where it ended is worse"

@@ -220,7 +220,8 @@ def fit(
                 fits.append(_fit_start(problem, z, deviations, estimated, tolerances, watch))
     done = tuple(one for one in fits if one is not None)
     if not done:
-        raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
+        causes = "the run diverges, slides along a switching surface, or its step is not stable"
+        raise ValueError(f"{causes}, at each of the {len(fits)} starts")
     diverged = tuple(_values_by_path(where, z) for z, one in zip(points, fits, strict=False) if one is None)
     return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
 

@@ -39,6 +39,9 @@ def summarise_run(run: PyTree) -> Summary:
     seen = f"; a trajectory of {len(run.trajectory.running)} instants" if kept else ""
     end = f"at t = {round_for_table(run.ending.sample.t)} s"
     how = "diverged" if run.diverged else f"reached its stop {end}" if run.stopped else f"ended {end}"
+    if run.slid:
+        begins = f"slides along a switching surface from t = {round_for_table(run.slide.t)} s"
+        how = begins if run.diverged else f"{how} and {begins}, so that it has no derivatives"
     rows = tuple((name, value) for name, value in run.metrics.items())
     return Summary(f"Run that {how}{seen}", ("metric", "value"), rows)
 
@@ -50,6 +53,8 @@ def _summarise_runs(run: PyTree, count: int) -> Summary:
         good = np.asarray(values).reshape(-1)[~lost]
         rows.append((name, *((good.mean(), good.min(), good.max()) if len(good) else ("", "", ""))))
     title = f"{count} runs: {stopped} reached their stop, {int(lost.sum())} diverged"
+    if slid := int(np.sum(run.slid)):
+        title += f", {slid} slide along a switching surface and have no derivatives"
     return Summary(title, ("metric", "mean", "least", "greatest"), tuple(rows), "of those that did not diverge")
 
 

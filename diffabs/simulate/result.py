@@ -11,10 +11,11 @@ from typing import Any
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, LoopState
-from diffabs.core.numerics import invalidate
+from diffabs.core.numerics import invalidate, void_derivatives
 from diffabs.core.protocols import Ending, Objective
 from diffabs.core.pytree import prepare_parts
 from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
+from diffabs.simulate.step.slides import has_slid, slide_of
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.types import Run, Trajectory
 
@@ -49,10 +50,13 @@ def finish_run(loop: Loop, objectives: dict[str, Objective], carry: PyTree) -> t
     ending = Ending(last.sample, stopped, *loop.stop.remainder(last.sample, stopped))
     metrics = {name: o.value(carry.point.accumulators[name], ending) for name, o in objectives.items()}
     wrong = [_is_impossible(name, objectives[name], value) for name, value in metrics.items()]
-    diverged = jnp.any(jnp.stack([carry.status == RunStatus.DIVERGED, *wrong]))
+    lost = (carry.status == RunStatus.DIVERGED) | (carry.status == RunStatus.SLID)
+    diverged = jnp.any(jnp.stack([lost, *wrong]))
     metrics = {n: invalidate(value, diverged, loop) for n, value in metrics.items() if n != AUDIT_METRIC}
     timed_out = (carry.status == RunStatus.TIMED_OUT) & ~diverged
-    return Run(metrics, stopped & ~diverged, diverged, timed_out, ending, None), last
+    slide = slide_of(carry)
+    metrics, ending, last = void_derivatives((metrics, ending, last), has_slid(slide), loop)
+    return Run(metrics, stopped & ~diverged, diverged, timed_out, ending, None, slide), last
 
 
 def observe(loop: Loop, t: Scalar, state: LoopState, running: AnyArray) -> Trajectory:

@@ -17,6 +17,7 @@ import numpy as np
 from diffabs.core import kinds
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once, is_traced
 from diffabs.core.loop import Loop
+from diffabs.core.numerics import void_derivatives
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero
@@ -231,7 +232,8 @@ def _run_reversible(
     carry, seen = scan_with_trajectory(
         stepped, method.is_active, partial(method.observe_at, loop), carry, every, count, instants, tries
     )
-    return _attach_trajectory(finish_run(loop, objectives, end_unfinished(carry)), first, seen)
+    judged = finish_run(loop, objectives, end_unfinished(carry))
+    return _attach_trajectory(judged, *_void_trajectories(loop, judged[0], first, seen))
 
 
 def _run_by_replay(
@@ -261,7 +263,8 @@ def _run_by_replay(
         start,
         log,
     )
-    judged = finish(loop, objectives, again._replace(status=status))
+    slide = jax.tree.map(jax.lax.stop_gradient, carry.slides)
+    judged = finish(loop, objectives, again._replace(status=status, slides=slide))
     if not every:
         return judged[0]
 
@@ -269,7 +272,13 @@ def _run_by_replay(
     states = states_between(spans, log.taken, instants)
     goes_on = instants < jax.lax.stop_gradient(again.point.t)
     first = observe(loop, start.point.t, start.point.state, jnp.asarray(True))
-    return _attach_trajectory(judged, first, jax.vmap(partial(observe, loop))(instants, states, goes_on))
+    seen = jax.vmap(partial(observe, loop))(instants, states, goes_on)
+    return _attach_trajectory(judged, *_void_trajectories(loop, judged[0], first, seen))
+
+
+def _void_trajectories(loop: Loop, run: Run, *signals: Trajectory) -> PyTree:
+    """Return the signals of a run, without derivatives if it slides."""
+    return void_derivatives(signals, run.slid, loop)
 
 
 def _prepare_run(loop: Loop, objectives: dict[str, Objective], method: PyTree, key: Key) -> tuple[Loop, PyTree, PyTree]:

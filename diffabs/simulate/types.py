@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.protocols import Ending, Sample
-from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar
+from diffabs.core.types import AnyArray, Bool, Int, Part, PyTree, Scalar
 from diffabs.simulate import convert
 
 
@@ -143,6 +143,18 @@ class Trajectory(NamedTuple):
         return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self.sample)]))
 
 
+class Slide(NamedTuple):
+    """The first slide of a run.
+
+    Attributes:
+        which: Number of the comparison along whose surface the run slides; -1 without a slide.
+        t: Time at which it begins [s]; NaN without a slide.
+    """
+
+    which: Int
+    t: Scalar
+
+
 class Run(NamedTuple):
     """The result of a run: metrics, end flags and, on request, a trajectory. At most one end flag is True.
 
@@ -152,11 +164,13 @@ class Run(NamedTuple):
         metrics: Values of the objectives by name. All are NaN if the run diverged.
         stopped: True if the run reached its stop within the duration.
         diverged: True if a number is not finite or not physically possible, or if the start is beyond the stop. Also
-            True for a missed landing, for steps that are too many or cannot meet their tolerance, and for a run that
-            was not accepted.
+            True for a missed landing, for steps that are too many or cannot meet their tolerance, for a run that was
+            not accepted, and for a run with adaptive steps that slides.
         timed_out: True if the duration ended before the stop. Metrics are valid then.
         ending: Last sample, whether the run stopped, and the time and distance that remain.
         trajectory: Signals at the kept instants; None if no trajectory was requested.
+        slide: First slide along a switching surface; None if it is not known. All derivatives of such a run are NaN.
+            The values of a run with fixed steps stay. Values alone do not always show a slide: see `slid`.
     """
 
     metrics: dict[str, PyTree]
@@ -165,6 +179,15 @@ class Run(NamedTuple):
     timed_out: Bool
     ending: Ending
     trajectory: Trajectory | None
+    slide: Slide | None = None
+
+    @property
+    def slid(self) -> Bool:
+        """True if the run slides along a switching surface, because the flows of both sides push onto it.
+
+        A run with fixed steps for values notices it only if it ends steps on switching surfaces (`FixedStep.kinks`).
+        """
+        return False if self.slide is None else self.slide.which >= 0
 
     def __getattr__(self, name: str) -> Any:
         """Raise the AttributeError for a `name` that is no field, with the metrics of the run."""

@@ -72,7 +72,7 @@ class AugmentedLagrangianSearch:
             slice_start(problem.evaluator(1.0)(alike, self._multipliers()).evaluation, 0)
         )
         if self.refused:  # the results of inadmissible runs are meaningless
-            self.before = jax.tree.map(lambda x: np.full(np.shape(x), np.nan), self.before)._replace(diverged=0)
+            self.before = jax.tree.map(lambda x: np.full(np.shape(x), np.nan), self.before)._replace(diverged=0, slid=0)
         size = abs(float(self.before.objective))
         self.scale = size if np.isfinite(size) and size > 0 else 1.0
         self.round = 0
@@ -194,6 +194,10 @@ class AugmentedLagrangianSearch:
         lost, lanes = int(self.before.diverged), self.problem.batch.size
         if lost or self.refused:
             return f"{Reason.START.value}: {self.refused or f'{lost} of {lanes} lanes diverge there'}"
+        if slid := int(self.before.slid):
+            return (
+                f"{slid} of {lanes} lanes slide along a switching surface at the start, and have no derivatives there"
+            )
         bounds = filter(None, (getattr(one, "metric", None) for one in self.problem.constraints))
         for name in (*self.problem.weights, *bounds):
             value, unreached = self.before.metrics[name], getattr(self.problem.measured[name], "unreached", np.nan)

@@ -63,6 +63,7 @@ class DescentState:
         trials: Number of trials since the last accepted step.
         idle: Number of consecutive accepted steps without a significant change of the loss.
         jumps: Number of consecutive line searches that end at `MAX_TRIALS` with an upper bound on t.
+        slides: Whether runs slide at the least t known to be too long.
         evaluations: Number of gradients so far.
         iterations: Number of accepted steps so far.
         reason: Reason for the end; None while the descent continues.
@@ -84,6 +85,7 @@ class DescentState:
     trials: int = 0
     idle: int = 0
     jumps: int = 0
+    slides: bool = False
     evaluations: int = 1
     iterations: int = 0
     reason: Reason | None = None
@@ -245,7 +247,7 @@ class Descent:
         if fine and not self.searches:
             return z, found
         if not fine or float(found.loss) > descent_state.loss + ARMIJO_FRACTION * descent_state.t * slope:
-            descent_state.high = descent_state.t
+            descent_state.high, descent_state.slides = descent_state.t, bool(found.evaluation.slid > 0)
         elif float(found.gradient @ descent_state.update) < WOLFE_FRACTION * slope and not longest:
             descent_state.low, descent_state.better = descent_state.t, (z, found)
         else:
@@ -257,7 +259,7 @@ class Descent:
             return descent_state.better
         descent_state.t = _next_step_factor(descent_state, float(found.loss) if fine else np.inf, slope)
         if descent_state.t < MIN_STEP_FACTOR:
-            descent_state.reason = Reason.STEP
+            descent_state.reason = Reason.SLIDE if descent_state.slides else Reason.STEP
         return None
 
     def _take(self, descent_state: DescentState, z: np.ndarray, found: LossEvaluation) -> None:
@@ -292,7 +294,7 @@ class Descent:
         if descent_state.idle >= MAX_IDLE_STEPS:
             return Reason.CHANGE
         if descent_state.jumps >= MAX_JUMPS:
-            return Reason.JUMP
+            return Reason.SLIDE if descent_state.slides else Reason.JUMP
         return Reason.LIMIT if descent_state.iterations >= self.stopping.iterations else None
 
     def _steepness_at_ends(self, z: np.ndarray) -> np.ndarray:

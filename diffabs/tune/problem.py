@@ -23,7 +23,7 @@ from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.core.types import AnyArray, Bool, Part, PyTree, Scalar, Vector
+from diffabs.core.types import AnyArray, Bool, Int, Part, PyTree, Scalar, Vector
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.deferred import MANY_INPUTS_REASON, find_kernels
@@ -39,12 +39,15 @@ MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is cheaper (be
 
 
 class ObjectiveEvaluation(NamedTuple):
-    """The evaluation at one z: objective J, excesses (k,), number of diverged runs, and the metrics of every run."""
+    """The evaluation at one z: objective J, excesses (k,), number of diverged runs, metrics of every run, and number
+    of sliding runs.
+    """
 
     objective: Any
     excess: Any
     diverged: Bool
     metrics: dict[str, PyTree]
+    slid: Int = 0
 
 
 class LossEvaluation(NamedTuple):
@@ -119,7 +122,7 @@ class Problem:
         return "xla", next(iter(reasons), "")
 
     def evaluate(self, z: AnyArray) -> ObjectiveEvaluation:
-        """Return objective, excesses, number of diverged runs and metrics at `z` (p,).
+        """Return objective, excesses, number of diverged runs, metrics, and number of sliding runs at `z` (p,).
 
         If the batch has weights, each multiplies its run's sum of metrics before the aggregate.
         """
@@ -129,7 +132,8 @@ class Problem:
         each = each if self.batch.weights is None else each * jnp.asarray(self.batch.weights)
         loop = build_subject_loop(self.space.at(self.subject, z))
         excess = self._excess(loop, runs.metrics)
-        return ObjectiveEvaluation(self.aggregate(jnp.asarray(each)), excess, jnp.sum(runs.diverged), runs.metrics)
+        lost, slid = jnp.sum(runs.diverged), jnp.sum(jnp.asarray(runs.slid))
+        return ObjectiveEvaluation(self.aggregate(jnp.asarray(each)), excess, lost, runs.metrics, slid)
 
     @functools.cached_property
     def excesses(self) -> int:

@@ -306,7 +306,7 @@ class TestFit:
             ),
             (
                 {"data": (X, np.full(13, np.nan))},
-                "the run diverges, or its step is not stable, at each of the 1 starts",
+                "the run diverges, slides along a switching surface, or its step is not stable, at each of the 1",
             ),
             ({"free": ["q"]}, "q is not a parameter; there is a, k, c"),
             ({"free": {"k": "1:5"}}, r"k: the range '1:5' is not a pair \(low, high\) of numbers"),

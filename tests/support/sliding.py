@@ -4,6 +4,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from scipy.integrate import solve_ivp
 
 import diffabs as d
@@ -97,3 +98,87 @@ class Block(Scalar):
 
     def holding(self, output, target):
         return 0.0 * target
+
+
+class Pair(NamedTuple):
+    y: Any
+    w: Any
+    units = MappingProxyType({"y": "1", "w": "1"})
+
+
+MOST_CROSSINGS = 60  # beyond, a run spirals into the intersection of two surfaces
+DRIFT = np.array([[0.0, 1.0], [-4.0, -0.4]])
+
+
+@pytree
+class Switched:
+    """z' = A z + b + d1 sign(n1 z - c1) + d2 sign(n2 z - c2): an oscillator with two switches."""
+
+    b: Any = param(default=np.zeros(2), unit="1")
+    d: Any = param(default=np.zeros((2, 2)), unit="1")
+    n: Any = param(default=np.eye(2), unit="1")
+    c: Any = param(default=np.zeros(2), unit="1")
+
+    shows, control_unit = Pair, "1"
+
+    def start(self, initial):
+        return Pair(1.0 + 0.0 * self.c[0], 0.3 + 0.0 * self.c[0])
+
+    def project(self, state):
+        return state
+
+    output = project
+
+    def derivative(self, t, x, u):
+        z = jnp.stack([x.y, x.w])
+        sides = [jnp.where(self.n[i] @ z > self.c[i], 1.0, -1.0) for i in range(2)]
+        rate = DRIFT @ z + self.b + self.d[0] * sides[0] + self.d[1] * sides[1]
+        return Pair(rate[0] + 0.0 * u, rate[1])
+
+    def holding(self, output, target):
+        return 0.0 * target
+
+
+def draw_switched(rng):
+    """Random numbers of `Switched`, by field."""
+    return {
+        "b": rng.normal(0, 0.3, 2),
+        "d": rng.normal(0, 0.7, (2, 2)),
+        "n": rng.normal(0, 1, (2, 2)),
+        "c": rng.normal(0, 0.3, 2),
+    }
+
+
+class Piecewise(NamedTuple):
+    """What SciPy finds: integral of y^2, whether the run slides, and the least speed of a crossing."""
+
+    cost: float
+    slides: bool
+    slowest: float
+
+
+def solve_switched(p, end):
+    """`Switched` in smooth pieces by SciPy, up to its first slide."""
+    z, t, cost, slowest, crossings = np.array([1.0, 0.3]), 0.0, 0.0, np.inf, 0
+    sides = np.where(p["n"] @ z > p["c"], 1.0, -1.0)
+
+    def flow(sides):
+        return lambda t, x: [*(DRIFT @ x[:2] + p["b"] + sides @ p["d"]), x[0] ** 2]
+
+    while t < end:
+        events = [lambda t, x, i=i, side=sides[i]: side * (p["n"][i] @ x[:2] - p["c"][i]) for i in range(2)]
+        for one in events:
+            one.terminal, one.direction = True, -1
+        run = solve_ivp(flow(sides), (t, end), [*z, cost], events=events, **PIECES)
+        t, z, cost = run.t[-1], run.y[:2, -1], run.y[2, -1]
+        if run.status == 0:
+            break
+        i = int(np.argmax([len(times) for times in run.t_events]))
+        before = sides[i] * p["n"][i] @ flow(sides)(t, z)[:2]
+        sides = np.where(np.arange(2) == i, -sides, sides)
+        after = sides[i] * p["n"][i] @ flow(sides)(t, z)[:2]
+        slowest = min(slowest, abs(before), abs(after))
+        crossings += 1
+        if after < 0 or crossings > MOST_CROSSINGS:
+            return Piecewise(cost, True, slowest)
+    return Piecewise(cost, False, slowest)

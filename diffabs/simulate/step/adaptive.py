@@ -50,6 +50,7 @@ from diffabs.simulate.step.event_location import (
 )
 from diffabs.simulate.step.outlook import look_ahead, margin_error, watch_margins
 from diffabs.simulate.step.runge_kutta import TSIT5, midpoint_error
+from diffabs.simulate.step.slides import begin_slide, has_slid, slide_of
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.step_size import (
     INITIAL_STEP_S,
@@ -63,7 +64,13 @@ from diffabs.simulate.step.step_size import (
     shortest_step,
     spectral_step_limit,
 )
-from diffabs.simulate.step.surfaces import forecast_crossing, is_surface_moving, time_since_crossing
+from diffabs.simulate.step.surfaces import (
+    find_imminent,
+    find_return,
+    forecast_crossing,
+    is_surface_moving,
+    time_since_crossing,
+)
 from diffabs.simulate.step.system import Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import Trajectory
 
@@ -80,6 +87,10 @@ INITIAL_STABILITY_FRACTION, STABILITY_FRACTION_GROWTH = 1 / 16, 1.6
 MAX_CONSECUTIVE_CROSSINGS = 16  # steps in a row that end on switching surfaces; later ones keep to no mode
 # Fraction of the duration: crossings that follow each other faster are those of a slide.
 SLIDE_INTERVAL_FRACTION = 1e-6
+# A step without a mode that crosses a surface and moves back at its end adds `RETURN_SCORE`, any other one takes 1
+# away. With `MAX_RETURN_SCORE` the run slides. A return with a smaller error, as a multiple of the allowed one, is
+# rounding.
+RETURN_SCORE, MAX_RETURN_SCORE, MIN_RETURN_ERROR = 16, 1024, 1e-3
 # The first step after a landing, of a method that `watches`: greatest ratio to the step that has landed, and least
 # ratio to the length that the error allows.
 LANDED_STEP_RATIO, LEAST_LANDED_RATIO = 4.0, 1e-3
@@ -116,7 +127,7 @@ class AdaptiveControl(NamedTuple):
         tries_at_renewal: Number of attempts at the last update of the stability limit.
         last_step: Last step, a `StateSpan`; () without a trajectory.
         consecutive_crossings: Number of steps that ended on switching surfaces since the last long regular step
-            (`RESET_STEP_FRACTION`).
+            (`RESET_STEP_FRACTION`). If steps keep to no mode, the score of returns (`RETURN_SCORE`).
         stability_fraction: Fraction of the longest stable step that a step may have after an event.
         taken: True if the last attempt was accepted.
         triggered: Bit mask of the events at its end.
@@ -143,6 +154,7 @@ class AdaptiveReport(NamedTuple):
         past_crossing: Time from the first change of a comparison inside the step, or the first turn of a margin beyond
             zero, to the end of the step [s]; 0 without one.
         grazes: True if a margin only touches zero, or crosses it twice in a step that is too short to be cut.
+        returns: Number of a comparison that has changed and moves back at the end; -1 without one, or within a mode.
         surface: Contradicted comparisons; None if steps keep to no mode.
     """
 
@@ -150,6 +162,7 @@ class AdaptiveReport(NamedTuple):
     scale: PyTree
     past_crossing: Scalar
     grazes: Bool
+    returns: Int
     surface: SurfaceCrossing | None
 
 
@@ -255,6 +268,10 @@ class AdaptiveStepping:
         del loop
         return True
 
+    def is_calm(self, carry: Carry) -> Bool:
+        """Return True if the attempt of `carry` is not far shorter than the error allows."""
+        return carry.length > RESET_STEP_FRACTION * carry.control.error_limited
+
     def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
         return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.keeps_mode)
@@ -282,7 +299,7 @@ class AdaptiveStepping:
         off = midpoint_error(self.tableau, error[0], seen.rates[0], h)
         relative = error_norm(system.loop, state, off, scale, sample) / self.rtol
         if self.smooth:
-            return AdaptiveReport(relative, scale, jnp.zeros_like(h), jnp.asarray(False), None)
+            return AdaptiveReport(relative, scale, jnp.zeros_like(h), jnp.asarray(False), jnp.asarray(-1), None)
         surface = find_surface_crossing(seen, carry.search.which, h) if self.keeps_mode else None
         turns = watch_margins(carry, h, self._select_watched(seen), system.bit_count)
         past_crossing = jnp.maximum(time_since_crossing(seen.surfaces, changed, h), turns.time_since)
@@ -291,7 +308,11 @@ class AdaptiveStepping:
             relative = jnp.maximum(relative, jnp.where(resolved, margin_error(system, carry, h, seen, state), 0.0))
         grazes = turns.grazes | (~resolved & (turns.time_since > 0))
         grazes |= carry.unrestricted & is_surface_moving(seen.surfaces, changed)
-        return AdaptiveReport(relative, scale, jnp.where(resolved, past_crossing, 0.0), grazes, surface)
+        returns = jnp.asarray(-1)
+        if not self.keeps_mode:
+            which = find_return(point.forecast[2], seen.surfaces, changed, h)
+            returns = jnp.where(relative > MIN_RETURN_ERROR, which, -1)
+        return AdaptiveReport(relative, scale, jnp.where(resolved, past_crossing, 0.0), grazes, returns, surface)
 
     def decide(
         self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
@@ -328,6 +349,7 @@ class AdaptiveStepping:
         length = jnp.where(falls_short, SHORT_OF_SURFACE_FRACTION * carry.length, length)
         searches, status, unrestricted = decision.searches, after.status, carry.unrestricted
         crossings, slides = control.consecutive_crossings, jnp.asarray(False)
+        watch = after.slides
         if self.keeps_mode:
             calm = taken & new & (carry.length > RESET_STEP_FRACTION * control.error_limited)
             if self.watches:
@@ -351,6 +373,11 @@ class AdaptiveStepping:
             searches &= ~(becomes_unrestricted & gave_up)
             length = jnp.where(becomes_unrestricted & gave_up, longest, length)
             status = jnp.where(becomes_unrestricted & gave_up, RunStatus.RUNNING, status)
+        elif watch:
+            score = jnp.maximum(crossings + jnp.where(report.returns >= 0, RETURN_SCORE, -1), 0)
+            crossings = jnp.where(taken, score, crossings)
+            slide = begin_slide(watch.slide, crossings >= MAX_RETURN_SCORE, report.returns, after.point.t)
+            after = after._replace(slides=watch._replace(slide=slide))
         # A landing with invalid numbers is no landing: the step is attempted again, and its event located again.
         status = jnp.where(~taken & ~searches & (status == RunStatus.LANDING), RunStatus.RUNNING, status)
         refreshes = status == RunStatus.REFRESHING
@@ -378,13 +405,13 @@ class AdaptiveStepping:
                 taken=taken,
                 triggered=_pack_events(decision.triggered),
             ),
-            status=jnp.where(lost, RunStatus.DIVERGED, self._judge(report, slides, status)),
+            status=jnp.where(lost, RunStatus.DIVERGED, self._judge(report, after, slides, status)),
         )
 
-    def _judge(self, report: AdaptiveReport, slides: Bool, status: Scalar) -> Scalar:
+    def _judge(self, report: AdaptiveReport, after: Carry, slides: Bool, status: Scalar) -> Scalar:
         """Return the `status`, or that of a run which is over because it slides or grazes."""
         if not self.watches:
-            return status
+            return jnp.where(has_slid(slide_of(after)), RunStatus.SLID, status)
         status = jnp.where(report.grazes, RunStatus.GRAZED, status)
         return jnp.where(slides, RunStatus.SLID, status)
 
@@ -404,7 +431,9 @@ class AdaptiveStepping:
         """Return the forecast, nothing if `smooth`; `fresh` is True if the answers are new."""
         if self.smooth:
             return ()
-        return self._forecast_crossing(error_limited, unrestricted, seen), look_ahead(fresh, self._select_watched(seen))
+        outlook = look_ahead(fresh, self._select_watched(seen))
+        ahead = self._forecast_crossing(error_limited, unrestricted, seen), outlook
+        return ahead if self.keeps_mode else (*ahead, find_imminent(seen.surfaces, error_limited))
 
     def _select_watched(self, seen: Evaluation) -> Evaluation:
         """Return the dynamics with those margins only whose turns are looked for: of events, or all if it `watches`."""

@@ -44,6 +44,7 @@ from diffabs.simulate.step.event_location import (
 )
 from diffabs.simulate.step.modes import Mode
 from diffabs.simulate.step.runge_kutta import Tableau
+from diffabs.simulate.step.slides import init_watch, watch_landing
 from diffabs.simulate.step.status import RunStatus, is_running, status_after_step
 from diffabs.simulate.step.system import UNCONSTRAINED, Evaluation, LoopSystem, Objectives, build_system
 
@@ -61,6 +62,7 @@ class Carry(NamedTuple):
             with fixed steps it is the step of the grid.
         search: Search for an event.
         unrestricted: True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode.
+        slides: Watch for slides (`SlideWatch`); () if switching surfaces are not located.
         control: Numbers of the stepping method.
         status: Status of the run, a `RunStatus`.
     """
@@ -73,6 +75,7 @@ class Carry(NamedTuple):
     base: Scalar
     search: EventSearch
     unrestricted: Bool
+    slides: PyTree
     control: PyTree
     status: Scalar
 
@@ -140,6 +143,10 @@ class Stepping(Protocol):
 
     def is_switched(self, loop: Loop) -> bool:
         """Return True if the comparisons of the `loop`'s flow are visible."""
+        ...
+
+    def is_calm(self, carry: Carry) -> Bool:
+        """Return True if the attempt of `carry` is so long that an earlier landing is over."""
         ...
 
     def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
@@ -232,6 +239,10 @@ def advance(
     point = select(decision.taken, point, start)
     since = jnp.where(strikes, 0.0, jnp.where(decision.taken, carry.since + request.h, carry.since))
     after = carry._replace(point=point, k=k, since=since)
+    if carry.slides:
+        landed, running = decision.crosses_surface, carry.status == RunStatus.RUNNING
+        calm = decision.taken & running & stepping.is_calm(carry)
+        after = after._replace(slides=watch_landing(carry.slides, carry.search, landed, calm, attempt.point.t))
     if stepping.searches:
         after = _search(stepping, system, carry, attempt, decision, after)
     elif stepping.smooth:
@@ -297,7 +308,8 @@ def start_carry(
     status = jnp.where(point.margins["stop"][0] > 0, zero + RunStatus.RUNNING, zero + RunStatus.DIVERGED)
     point = point._replace(state=borrow(state, logs))
     search, yes, no = init_search(stepping.h), jnp.asarray(True), jnp.asarray(False)
-    return Carry(point, zero, none, stepping.h, yes, stepping.h, search, no, (), status)
+    slides = init_watch(system.word_count, none) if system.bit_count and stepping.searches else ()
+    return Carry(point, zero, none, stepping.h, yes, stepping.h, search, no, slides, (), status)
 
 
 def propose_step(stepping: Stepping, system: LoopSystem, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:

@@ -32,6 +32,7 @@ from diffabs.simulate.step.attempt import Attempt, StepRequest
 from diffabs.simulate.step.event_location import MAX_LOCATION_ATTEMPTS, SurfaceCrossing, find_surface_crossing
 from diffabs.simulate.step.outlook import look_ahead, watch_margins
 from diffabs.simulate.step.runge_kutta import RK4
+from diffabs.simulate.step.slides import begin_slide
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import UNCONSTRAINED, Evaluation, LoopSystem, Objectives
 from diffabs.simulate.types import Trajectory
@@ -39,6 +40,7 @@ from diffabs.simulate.types import Trajectory
 EVENT_ATTEMPTS_PER_STEP, SPARE_ATTEMPTS = 4, 64  # attempts to locate events: for each step of the grid, and in addition
 CROSSING_ATTEMPTS_PER_STEP = 1  # attempts on switching surfaces per step of the grid; beyond, steps are unrestricted
 MAX_ATTEMPTS_PER_STEP = 32  # attempts within one step of the grid; beyond, steps are unrestricted
+CALM_STEP_FRACTION = 0.02  # of a step of the grid: after a longer step without a landing, a run does not slide
 # Greatest change of a state in a step: a multiple of the rates at both ends, plus a fraction of the state.
 MAX_RATE_RATIO, MAX_STATE_FRACTION = 4, 1e-3
 
@@ -147,6 +149,10 @@ class FixedStepping:
         """Return True if the comparisons of the `loop`'s flow are visible."""
         return loop.jumps if self.kinks is None else self.kinks
 
+    def is_calm(self, carry: Carry) -> Bool:
+        """Return True if the attempt of `carry` goes to the grid, and is no short rest of a step."""
+        return carry.strikes & (carry.length > CALM_STEP_FRACTION * self.h)
+
     def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
         strike = carry.k + 1
@@ -201,12 +207,18 @@ class FixedStepping:
         here = jnp.where(on_grid, 0, control.here + extra - control.extra)
         unrestricted, status = carry.unrestricted, after.status
         if system.program:
+            crowded = control.here >= MAX_ATTEMPTS_PER_STEP
             gave_up = (
-                (after.search.tries >= MAX_LOCATION_ATTEMPTS)
-                | (control.here >= MAX_ATTEMPTS_PER_STEP)
+                crowded
+                | (after.search.tries >= MAX_LOCATION_ATTEMPTS)
                 | (control.extra > CROSSING_ATTEMPTS_PER_STEP * carry.k + SPARE_ATTEMPTS)
             )
             gave_up &= decision.searches & (after.search.which < system.bit_count)
+            if watch := after.slides:
+                # So many landings within one step that there is no room for another return.
+                begins = gave_up & crowded & (watch.returns > 0)
+                slide = begin_slide(watch.slide, begins, after.search.which, after.point.t)
+                after = after._replace(slides=watch._replace(slide=slide))
             becomes_unrestricted = ~decision.taken & ~unrestricted & (~decision.fine | gave_up)
             unrestricted = (unrestricted | becomes_unrestricted) & ~(on_grid & have_same_answers(carry, attempt))
             status = jnp.where(becomes_unrestricted, RunStatus.RUNNING, status)

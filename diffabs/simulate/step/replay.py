@@ -130,6 +130,11 @@ class ReplayStepping:
         del loop
         return True
 
+    def is_calm(self, carry: Carry) -> Bool:
+        """Return True: a replay of `carry` looks for no slide."""
+        del carry
+        return jnp.asarray(True)
+
     def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
         """Return the logged attempt, for the replay `carry` in `system`.
 
@@ -201,6 +206,7 @@ class LaggedReplay(NamedTuple):
     behind: Carry
 
     running = property(lambda self: self.ahead.running, doc="True if the run for values needs another attempt.")
+    slides = property(lambda self: self.ahead.slides, doc="Watch for slides of the run for values.")
     status = property(lambda self: self.ahead.status, doc="Status of the run for values.")
     point = property(lambda self: self.behind.point, doc="Point of the replay.")
 

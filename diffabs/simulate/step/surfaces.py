@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.core.types import Array, Bool, PyTree, Scalar
+from diffabs.core.types import Array, Bool, Int, PyTree, Scalar
 from diffabs.simulate.step.modes import WORD_BITS, ModeBits
 
 NEVER_S = 1e9  # s; time to the next crossing if no crossing is predicted
@@ -66,6 +66,51 @@ def time_since_crossing(surfaces: Sequence[SwitchingFunction], changed: ModeBits
     for _, later, since in _list_changes(surfaces, changed, length):
         first = jnp.where(later & (since > first), since, first)
     return jnp.where(first > low, first, 0.0)
+
+
+class Imminent(NamedTuple):
+    """The comparison that a run is about to change.
+
+    Attributes:
+        which: Number of the comparison; -1 without one.
+        time: Predicted time to the change [s].
+    """
+
+    which: Int
+    time: Scalar
+
+
+def find_imminent(surfaces: Sequence[SwitchingFunction], natural: Scalar) -> Imminent:
+    """Return the comparison with the first predicted change, however near; later than `NEVER_S` counts as none.
+
+    Args:
+        surfaces: Margins of the comparisons and their rates, at an instant.
+        natural: A number with the type of a time [s].
+    """
+    which, time = jnp.asarray(-1), jnp.full_like(natural, NEVER_S)
+    for one in surfaces:
+        ahead = -_times_since_crossing(one)
+        for number, each in zip(jnp.ravel(jnp.asarray(one.numbers)), ahead, strict=True):
+            nearer = (each >= 0) & (each < time)
+            which, time = jnp.where(nearer, number, which), jnp.where(nearer, each, time)
+    return Imminent(which, time)
+
+
+def find_return(imminent: Imminent, surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> Int:
+    """Return the number of a comparison that a step crosses and that moves back in it or at its end; -1 without one.
+
+    Args:
+        imminent: What is about to change at the beginning of the step.
+        surfaces: Margins of the comparisons and their rates, at the end of the step.
+        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
+        length: Length of the step [s].
+    """
+    back = (imminent.time < STEP_START_FRACTION * length) & ~read_bits(changed, imminent.which)
+    which = jnp.where(back, imminent.which, -1)
+    for one in surfaces:
+        back = read_bits(changed, one.numbers) & (one.value * one.rate < 0)
+        which = jnp.maximum(which, jnp.max(jnp.where(back, jnp.asarray(one.numbers), -1)))
+    return which
 
 
 def _times_since_crossing(surface: SwitchingFunction) -> Array:
