@@ -21,7 +21,7 @@ from diffabs.simulate.step.system import build_system
 from diffabs.simulate.types import Adaptive, Run, Solver
 
 FRAMES_OF_A_COMPARISON = 6  # calls that are read to find the line that compares, from the innermost one on
-ADVICE = (
+SLIDE_ADVICE = (
     "make the jump continuous over a small band (jnp.tanh(x / band)), give the switch a hysteresis by an event, or use"
     " Clamping or BackCalculation for an integral at a limit"
 )
@@ -45,7 +45,7 @@ def describe_slide(loop: Loop, solver: Solver, objectives: Mapping[str, Objectiv
     who = f"{int(slid.sum())} of {len(slid)} runs slide, run {first}" if np.ndim(run.slid) else "the run slides"
     place = _describe_comparison(_trace_program(loop, solver, objectives), int(which[first]))
     left = "it has no metrics with adaptive steps" if isinstance(solver, Adaptive) else "its derivatives are NaN"
-    return f"{who} from t = {times[first]:.4g} s along {place}: both sides push onto it, so {left}; {ADVICE}"
+    return f"{who} from t = {times[first]:.4g} s along {place}: both sides push onto it, so {left}; {SLIDE_ADVICE}"
 
 
 def _trace_program(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> SwitchedProgram | None:

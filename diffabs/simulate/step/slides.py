@@ -42,7 +42,12 @@ class SlideWatch(NamedTuple):
 
 
 def init_watch(words: int, t: Scalar) -> SlideWatch:
-    """Return the watch at the start `t` [s] of a run whose comparisons need this number of `words`."""
+    """Return the watch at the start of a run.
+
+    Args:
+        words: Number of words that hold the answers to the comparisons.
+        t: Time of the start [s].
+    """
     zero = jnp.asarray(0)
     none = tuple(jnp.uint32(0) for _ in range(words))
     return SlideWatch(none, zero, Slide(zero - 1, t + jnp.nan))
@@ -69,13 +74,24 @@ def watch_landing(watch: SlideWatch, search: EventSearch, landed: Bool, calm: Bo
 
 
 def begin_slide(slide: Slide, begins: Bool, which: Int, t: Scalar) -> Slide:
-    """Return the `slide`, or one along the comparison `which` from `t` [s] on if it `begins` and is the first."""
+    """Return the slide, or a new one if it begins and is the first.
+
+    Args:
+        slide: First slide so far.
+        begins: True if a slide begins.
+        which: Number of its comparison.
+        t: Time [s].
+    """
     first = begins & (slide.which < 0)
     return Slide(jnp.where(first, which, slide.which), jnp.where(first, jax.lax.stop_gradient(t), slide.t))
 
 
 def slide_of(carry: Any) -> Slide:
-    """Return the first slide of the run of a carry, without derivatives."""
+    """Return the first slide of a run, without derivatives.
+
+    Args:
+        carry: Carry of the run.
+    """
     watch = carry.slides
     if watch == ():
         none = jnp.asarray(-1)
@@ -84,5 +100,9 @@ def slide_of(carry: Any) -> Slide:
 
 
 def has_slid(slide: Slide) -> Array:
-    """Return True for a run that slides."""
+    """Return True for a run that slides.
+
+    Args:
+        slide: First slide of the run.
+    """
     return jnp.asarray(slide.which) >= 0
