@@ -106,7 +106,10 @@ def void_derivatives(tree: PyTree, void: Scalar, inputs: PyTree) -> PyTree:
 
     def each(x: Scalar) -> Scalar:
         x = jnp.asarray(x)
-        return _add_slope(x, slope, total) if jnp.issubdtype(x.dtype, jnp.floating) else x
+        if not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        # Under `vmap` a number must be batched like its derivative, which the rule alone would not ensure.
+        return _add_slope(jnp.where(void | (total > 0), x, x), slope, total)
 
     return jax.tree.map(each, tree)
 
