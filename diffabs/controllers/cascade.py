@@ -92,7 +92,7 @@ class Cascade:
         if name not in names:
             raise ValueError(f"controller.inner_signal = {name} is no output of the plant; there is {', '.join(names)}")
         order = (name, *(other for other in names if other != name))
-        measured = _reordered(order)(*(getattr(signal.measured, one) for one in order))
+        measured = _reorder_fields(order)(*(getattr(signal.measured, one) for one in order))
         return Tracking(self.outer.output(t, outer, self._outer_signal(signal)), measured, signal.feedforward)
 
 
@@ -102,6 +102,6 @@ def _inner_name(name: str, names: tuple[str, ...]) -> str:
 
 
 @cache
-def _reordered(names: tuple[str, ...]) -> type:
+def _reorder_fields(names: tuple[str, ...]) -> type:
     """Return the named tuple with these fields; one class for each order, as JAX compares the classes of trees."""
     return namedtuple("InnerOutput", names)

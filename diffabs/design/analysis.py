@@ -137,7 +137,7 @@ class _Analysis:
     def _refute_by_vertex(self) -> Claim | None:
         """Return a proof that one vertex is unstable, or None."""
         for vertex, a in enumerate(self.closed):
-            for data in instability.witnesses(a, discrete=self.discrete):
+            for data in instability.growing_modes(a, discrete=self.discrete):
                 claim = Claim("unstable", {**data, "vertex": vertex})
                 if self._verify_claim(claim):
                     return claim

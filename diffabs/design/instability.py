@@ -16,7 +16,7 @@ import numpy as np
 BOUNDARY_TOLERANCE = 1e-9  # of the largest singular value of A: below it a sum of states may be constant
 
 
-def witnesses(a: np.ndarray, *, discrete: bool) -> Iterator[dict[str, float | np.ndarray]]:
+def growing_modes(a: np.ndarray, *, discrete: bool) -> Iterator[dict[str, float | np.ndarray]]:
     """Yield data of claims `unstable`, the most promising first; nothing if no mode grows or stays. None is proved yet.
 
     Args:

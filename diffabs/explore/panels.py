@@ -75,7 +75,7 @@ class Spread:
     road: float = 0.2
 
 
-def format_metric(value: float) -> str:
+def format_reading(value: float) -> str:
     """Return a metric as text, without digits that are rounding errors.
 
     Args:

@@ -6,7 +6,7 @@ from diffabs.core.types import JsonObject, PyTree
 from diffabs.explore import charts
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words
-from diffabs.explore.panels import NO_VALUE, format_metric
+from diffabs.explore.panels import NO_VALUE, format_reading
 from diffabs.explore.session import CERTIFIED, REFUTED, UNDECIDED, ProofVerdict
 from diffabs.explore.stability import Stability, format_margin
 from diffabs.scenario.registry import unit_of
@@ -89,7 +89,7 @@ class ResultsPanel:
         """Show the metrics `found`; `fresh` says that they belong to the current numbers."""
         self.measuring.set_visibility(not fresh)
         for name, value in found.items():
-            self.cells[name].set_text(format_metric(value))
+            self.cells[name].set_text(format_reading(value))
 
     def stability(self, found: Stability | str, *, fresh: bool) -> None:
         """Show poles and margins, or the reason why there are none.

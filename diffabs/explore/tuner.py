@@ -11,7 +11,7 @@ from diffabs.core.types import PyTree, Scalar
 from diffabs.explore import curves, tuning
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words
-from diffabs.explore.panels import Curves, format_metric
+from diffabs.explore.panels import Curves, format_reading
 from diffabs.explore.work import NewestJobThread
 from diffabs.scenario.scenario import Scenario
 
@@ -223,7 +223,7 @@ class Tuner:
                         self._line(knob.label, *map(knob.text, pair))
                 for name in chosen.objectives:
                     pair = (one.metrics[name] for one in (before, after))
-                    self._line(name.replace("_", " "), *map(format_metric, pair))
+                    self._line(name.replace("_", " "), *map(format_reading, pair))
             with ui.row().classes("gap-2"):
                 ui.button("keep", on_click=self._keep).props("flat dense no-caps size=sm data-id=keep")
                 ui.button("go back", on_click=self._go_back).props("flat dense no-caps size=sm data-id=go-back")

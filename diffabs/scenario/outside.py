@@ -33,7 +33,7 @@ CONTRACTS = {
     "a stop": protocols.Stop,
     "an objective": protocols.Objective,
 }
-MIN_LIKENESS = 0.6  # least likeness of two names, of which one is probably a misspelling of the other
+MIN_METHOD_LIKENESS = 0.6  # least likeness of two names, of which one is probably a misspelling of the other
 
 _named: dict[str, ModuleType] = {}
 
@@ -174,7 +174,7 @@ def _missing_methods(cls: type) -> tuple[str, list[str]]:
         return "", []
 
     def distance(contract: frozenset[str]) -> tuple[int, int]:
-        close = [name for name in contract if difflib.get_close_matches(name, own, cutoff=MIN_LIKENESS)]
+        close = [name for name in contract if difflib.get_close_matches(name, own, cutoff=MIN_METHOD_LIKENESS)]
         return -len(close), len(contract - own)
 
     needed = {kind: _public_methods(contract) for kind, contract in CONTRACTS.items()}

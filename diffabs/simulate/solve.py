@@ -360,7 +360,7 @@ class FieldLoop:
             for i, (one, happens) in enumerate(zip(self.code.inner, fired, strict=True)):
                 if moved:
                     condition = self._call(one.condition, t, y) + held.lifts[i]
-                    happens |= (was[i] >= 0) & (condition < -self._rounding(one.condition, t, y))
+                    happens |= (was[i] >= 0) & (condition < -self._rounding_error(one.condition, t, y))
                 happened.append(happens)
                 if one.reset is not None:
                     y, moved = select(happens, self._call(one.reset, t, y), y), True
@@ -379,7 +379,7 @@ class FieldLoop:
         ends = held.ends
         for i, one in reversed(list(enumerate(self.code.terminal))):
             condition, rise = self._follow(one.condition, *jax.lax.stop_gradient((t, y)))
-            rounding = self._rounding(one.condition, t, y)
+            rounding = self._rounding_error(one.condition, t, y)
             falls = (jnp.abs(condition) <= rounding) & (rise < 0)
             ends = jnp.where(falls | ((stops[i] >= 0) & (condition < -rounding)), i + 1.0, ends)
         fault = jnp.where((fault == 0) & (ends > 0), float(SolutionStatus.TERMINATED), fault)
@@ -414,7 +414,7 @@ class FieldLoop:
         # The second derivative, too: it says when a condition that rises is back at zero.
         moves = (jnp.ones_like(t), self._rate(t, y))
         rise, bend = jax.jvp(lambda t, y: self._follow(one.condition, t, y)[1], (t, y), moves)
-        rounding = self._rounding(one.condition, t, y)
+        rounding = self._rounding_error(one.condition, t, y)
         left = (jnp.abs(after - there) <= rounding) & (jnp.abs(move - fall) <= SAME_RATE_FRACTION * jnp.abs(fall))
         # A landing ends near the zero: `exact` is the condition after a landing on it.
         exact = after - jnp.where(fired & (fall < 0), move * there / jnp.where(fall < 0, fall, -1.0), 0.0)
@@ -432,7 +432,7 @@ class FieldLoop:
         kept = jnp.where(happens, 0.0, lift)
         return jax.lax.stop_gradient(jnp.where(zero & (happens | ~left), new, kept)), fault
 
-    def _rounding(self, condition: Callable, t: Scalar, y: PyTree) -> Scalar:
+    def _rounding_error(self, condition: Callable, t: Scalar, y: PyTree) -> Scalar:
         """Return how far rounding may move a condition in the state `y` at `t`."""
         t, y = jax.lax.stop_gradient((t, y))
         slopes = jax.grad(lambda t, y: self._call(condition, t, y), argnums=(0, 1))(t, y)

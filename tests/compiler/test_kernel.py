@@ -280,9 +280,7 @@ class TestSweep:
         with pytest.raises(SweepError, match="engine"):
             sweep(dataclasses.replace(study, engine="xla"), tmp_path / "kernel", resume=True)
 
-    @killed_by(
-        "sweep/run.py", "choose_study_engine(study.check(), out, resume=resume,", "choose_study_engine(study, out,"
-    )
+    @killed_by("sweep/run.py", "choose_study_engine(study, out, resume=resume,", "choose_study_engine(study, out,")
     @killed_by("sweep/selection.py", "if resume and (", "if False and (")
     @pytest.mark.slow
     def test_resumed_keeps_its_engine(self, users_engine, tmp_path, monkeypatch):

@@ -91,8 +91,8 @@ def test_pid_by_hand():
 
 @killed_by(
     "controllers/pid.py",
-    "return PIDMemory(integral, self.cutoff * (error - memory.flow.filtered))",
-    "return PIDMemory(integral, 0.0 * error)",
+    "return PIDMemory(integral, self._filter_rate(memory, signal))",
+    "return PIDMemory(integral, 0.0 * integral)",
 )
 def test_pi_and_filtered_derivative_to_a_step():
     """u = kp e + ki e t + kd wc e exp(-wc t)."""
@@ -172,7 +172,7 @@ def test_proportional_is_state_feedback_scaled_by_speed():
         close(k.flow(0.0, Memory(-0.03), signal), -0.1)
 
 
-@killed_by("core/units.py", "for name in Units._fields:", 'for name in ("control",):')
+@killed_by("core/units.py", 'for name in ("control", "signal"):', 'for name in ("control",):')
 @killed_by("core/rules.py", '"" if unit == "1" else', '"" if unit == "0" else')
 @killed_by("core/validity.py", 'shapes.append(f"{field.name} {line}")', "pass")
 @pytest.mark.parametrize(

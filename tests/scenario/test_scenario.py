@@ -335,7 +335,7 @@ damping = 0.25
 
 @killed_by(
     "scenario/parameter_paths.py",
-    '            pending[:0] = [(f"{path}.{key}", item) for key, item in value.items()]\n            continue',
+    '            pending += [(f"{path}.{key}", item) for key, item in list(value.items())[::-1]]\n            continue',
     "            found[path] = value\n            continue",
 )
 def test_ranges_are_the_same_however_they_are_written(file):

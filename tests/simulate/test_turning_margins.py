@@ -260,11 +260,11 @@ def touches(level):
 
 @killed_by(
     "core/numerics.py",
-    "return one * x + sum(",
-    "return jnp.where(invalid, jnp.nan, x) if x.size else sum(",
+    "return one * x + all * none",
+    "return jnp.where(invalid, jnp.nan, x)",
     case="grows",
 )
-@killed_by("core/numerics.py", "return one * x + sum(", "return one * x if x.size else sum(", case="touches")
+@killed_by("core/numerics.py", "return one * x + all * none", "return one * x", case="touches")
 @pytest.mark.parametrize("result", cases([grows, touches], touches))
 def test_an_invalid_result_has_no_derivative(result):
     assert all(np.isnan(x) for x in (result(1.0), jax.jacfwd(result)(1.0), jax.grad(result)(1.0)))
