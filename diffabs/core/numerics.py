@@ -66,43 +66,34 @@ def smaller(x: Scalar, y: Scalar) -> Scalar:
     return jnp.where(jnp.less_equal(x, y), x, y)
 
 
-def invalidate(x: Scalar, invalid: Scalar, inputs: PyTree) -> Scalar:
-    """Return x, or NaN if it is invalid; then its derivatives by every input are NaN, too.
+def invalidate(tree: PyTree, invalid: Scalar, inputs: PyTree) -> PyTree:
+    """Return a pytree of real numbers, or NaN if they are invalid; then their derivatives by every input are NaN, too.
 
     A selection (`jnp.where`) alone would give an invalid number the derivative zero.
 
     Args:
-        x: Result, any shape.
-        invalid: Whether the result is invalid, as a whole: in reverse mode an invalid number makes all of it NaN.
+        tree: Result.
+        invalid: Whether the result is invalid, as a whole.
         inputs: Pytree of everything that the result may depend on; only its floating-point leaves count.
     """
-    x = jnp.asarray(x)
-    leaves = [leaf for leaf in map(jnp.asarray, jax.tree.leaves(inputs)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    none = sum((jnp.sum(_vanish(leaf.astype(x.dtype))) for leaf in leaves), jnp.zeros((), x.dtype))
-    one, all = (jnp.where(invalid, jnp.nan, factor).astype(x.dtype) for factor in (1.0, 0.0))
-    return one * x + all * none
-
-
-@jax.custom_jvp
-def _vanish(x: Scalar) -> Scalar:
-    """Return zeros that have the derivative of x, also where x is infinite or NaN."""
-    return jnp.zeros_like(x)
-
-
-_vanish.defjvp(lambda at, moves: (_vanish(*at), moves[0]))
+    factor = jnp.where(invalid, jnp.nan, 1.0)
+    numbers = jax.tree.map(jnp.asarray, tree)
+    return void_derivatives(jax.tree.map(lambda x: factor.astype(x.dtype) * x, numbers), invalid, inputs)
 
 
 def void_derivatives(tree: PyTree, void: Scalar, inputs: PyTree) -> PyTree:
-    """Return a pytree of valid numbers whose derivatives by every finite input are NaN if `void`.
+    """Return a pytree of valid numbers whose derivatives by every input are NaN if `void`.
 
     Args:
         tree: Result.
-        void: Whether its derivatives are invalid.
+        void: Whether its derivatives are invalid, as a whole: in reverse mode one such number makes all of it NaN.
         inputs: Pytree of everything that the result may depend on; only its floating-point leaves count.
     """
+    real = jnp.result_type(float)
     leaves = [leaf for leaf in map(jnp.asarray, jax.tree.leaves(inputs)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    total = sum((jnp.sum(jnp.where(jnp.isfinite(leaf), leaf, 0.0)) for leaf in leaves), jnp.zeros(()))
-    slope = jnp.where(void, jnp.nan, 0.0)
+    # Zero, with the sum of all tangents as its derivative: one number for all results, since a run has many inputs.
+    total = sum((jnp.sum(_vanish(leaf.astype(real))) for leaf in leaves), jnp.zeros((), real))
+    slope = jnp.where(void, jnp.nan, jnp.zeros((), real))
 
     def each(x: Scalar) -> Scalar:
         x = jnp.asarray(x)
@@ -112,6 +103,15 @@ def void_derivatives(tree: PyTree, void: Scalar, inputs: PyTree) -> PyTree:
         return _add_slope(jnp.where(void | (total > 0), x, x), slope, total)
 
     return jax.tree.map(each, tree)
+
+
+@jax.custom_jvp
+def _vanish(x: Scalar) -> Scalar:
+    """Return zeros that have the derivative of x, also where x is infinite or NaN."""
+    return jnp.zeros_like(x)
+
+
+_vanish.defjvp(lambda at, moves: (_vanish(*at), moves[0]))
 
 
 @jax.custom_jvp

@@ -52,7 +52,7 @@ def finish_run(loop: Loop, objectives: dict[str, Objective], carry: PyTree) -> t
     wrong = [_is_impossible(name, objectives[name], value) for name, value in metrics.items()]
     lost = (carry.status == RunStatus.DIVERGED) | (carry.status == RunStatus.SLID)
     diverged = jnp.any(jnp.stack([lost, *wrong]))
-    metrics = {n: invalidate(value, diverged, loop) for n, value in metrics.items() if n != AUDIT_METRIC}
+    metrics = invalidate({n: value for n, value in metrics.items() if n != AUDIT_METRIC}, diverged, loop)
     timed_out = (carry.status == RunStatus.TIMED_OUT) & ~diverged
     slide = slide_of(carry)
     metrics, ending, last = void_derivatives((metrics, ending, last), has_slid(slide), loop)
