@@ -8,16 +8,16 @@ tyre and belt.
 
 Last, controllers run on the rig as its mask describes it and as it was identified (docs/measured-rig.md).
 
-    python experiments/measured_rig.py [--data FOLDER]
+    python experiments/measured_rig.py [PART ...] [--data FOLDER]
 """
 
 import argparse
 import dataclasses
+import functools
 import json
 import math
 import pathlib
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -61,6 +61,7 @@ class Config:
     """Every number of the experiment."""
 
     data: str | None = None
+    parts: tuple[str, ...] = ()  # of PARTS; all without one
     controllers_step: float = 5e-4  # s
     draws: int = 200  # of the identified parameters
     out: str = "out/experiments/measured_rig"
@@ -219,7 +220,7 @@ def free_in(recorded: RecordedRun, free: Mapping[str, tuple[float, float]]) -> d
     return {path: range_ for path, range_ in free.items() if has(path)}
 
 
-def effects(first: Record, second: Record, rig: Any) -> tuple[list[dict[str, Any]], list[str]]:
+def effects(first: Record, second: Record, rig: Any) -> list[dict[str, Any]]:
     """One row for each effect: errors in both halves of experiment 1, whether it stays, and experiment 2's error."""
     rows: list[dict[str, Any]] = []
 
@@ -245,7 +246,7 @@ def effects(first: Record, second: Record, rig: Any) -> tuple[list[dict[str, Any
     mask = lab_rig.build_run(first, True, MASK)
     row("the mask, no dead time", replace(mask, {"loop.actuator": Direct()}), 0, None)
     recorded, free = changed(lab_rig.build_run(first, True, rig), BASE), dict(BASE.free)
-    best, kept = (math.inf, math.inf), []
+    best = (math.inf, math.inf)
 
     def add_row(effect: Effect, found: Identified) -> tuple[float, float]:
         line = row(effect.name, found.part, len(found.values), None)
@@ -254,8 +255,6 @@ def effects(first: Record, second: Record, rig: Any) -> tuple[list[dict[str, Any
         line["determined"] = all(abs(found.values[path]) > 2 * deviations[path] for path in effect.free)
         better = seen[0] < (1 - LEAST_GAIN) * best[0] and seen[1] <= best[1]
         line["stays"] = better and line["determined"]
-        if line["stays"]:
-            kept.append(effect.name)
         return seen
 
     for effect in (BASE, *CHAIN):
@@ -265,7 +264,7 @@ def effects(first: Record, second: Record, rig: Any) -> tuple[list[dict[str, Any
             recorded, free, best = found.part, wanted, seen
     for effect in SINGLE:
         add_row(effect, try_effect(recorded, free, effect)[0])
-    return rows, kept
+    return rows
 
 
 def from_ten_starts(first: Record, second: Record, rig: LabRig) -> list[dict[str, Any]]:
@@ -356,10 +355,10 @@ def as_command(parts: Mapping[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def surroundings(rig: LabRig, rise: float, fall: float) -> dict[str, dict[str, Any]]:
+def surroundings(rig: LabRig, dead: DeadTime) -> dict[str, dict[str, Any]]:
     """Plant, sensor, actuator and sampling of each row of the comparison."""
     start = BrakeStart(speed=measured_rig.BRAKING_SPEED * float(rig.drum_radius))
-    dead = DeadTime(rise=rise, fall=fall, capacity=32)
+    dead = dataclasses.replace(dead, capacity=32)
     lag = {"initial": BrakeStart(speed=50 / 3.6), "sensor": Direct(), "actuator": Lag(time_constant=1e-3)}
     return {
         "rig of [lmi], lag 1 ms": {"plant": MirroredRig(mass=5.75), "period": 1e-3, **lag},
@@ -388,11 +387,11 @@ def loop_in(around: Mapping[str, Any], parts: Mapping[str, Any]) -> Loop:
     return braking(**{**around, **given, "controller": controller, "stop": SpeedReached(speed=5 / 3.6)})
 
 
-def old_controllers(config: Config, rig: LabRig, rise: float, fall: float) -> list[dict[str, Any]]:
+def old_controllers(config: Config, rig: LabRig, dead: DeadTime) -> list[dict[str, Any]]:
     """What the controllers of the earlier pages do on each rig."""
     rows, solver = [], FixedStep(step=config.controllers_step, duration=8.0)
     for name, parts in torque_controllers().items():
-        for where, around in surroundings(rig, rise, fall).items():
+        for where, around in surroundings(rig, dead).items():
             metrics = measure(loop_in(around, parts), solver, BRAKING).metrics
             rows.append(outcome(name, where, metrics))
     return rows
@@ -429,7 +428,7 @@ def tuned_pi(config: Config, loop: Loop, over: Mapping[str, Any]) -> tuple[tuple
     return (float(kp[best]), float(ki[best])), float(iae.mean(axis=1)[best])
 
 
-def new_controllers(config: Config, rig: LabRig, found: Any) -> list[dict[str, Any]]:
+def new_controllers(config: Config, rig: LabRig, dead: DeadTime, found: Identified) -> list[dict[str, Any]]:
     """A PI tuned on the mask, on the identified rig, and on draws of its parameters, each judged on the draws."""
     names, draws = list(found.uncertainty.names), np.random.default_rng(0).multivariate_normal(
         [float(found.values[name]) for name in found.uncertainty.names], found.uncertainty.covariance, config.draws
@@ -437,7 +436,6 @@ def new_controllers(config: Config, rig: LabRig, found: Any) -> list[dict[str, A
     of_loop = {name.removeprefix("loop."): draws[:, i] for i, name in enumerate(names) if name != "counter_lag"}
     slope = of_loop["plant.brake_gain"] / (1 - float(rig.brake_threshold))
     of_loop |= {"plant.brake_gain": slope, "plant.brake_offset": -float(rig.brake_threshold) * slope}
-    dead = DeadTime(rise=float(found.values["loop.actuator.rise"]), fall=float(found.values["loop.actuator.fall"]))
     rows = []
     for name, plant, actuator, over in (
         ("PI tuned on the mask", MASK, Direct(), {}),
@@ -460,36 +458,51 @@ def new_controllers(config: Config, rig: LabRig, found: Any) -> list[dict[str, A
     return rows
 
 
+PARTS = {
+    "effects": "Effects, one at a time (wheel rms in per cent of 1,800 rpm)",
+    "minima": "Minima from ten starts",
+    "experiment-2": "What experiment 2 asks for (fitted after it has judged)",
+    "controllers": "Controllers of the earlier pages",
+    "pi": "A PI at 10 ms, tuned on three rigs and judged on draws of the identified one",
+}
+
+
 def main(config: Config | None = None) -> dict[str, Any]:
-    """Run, print, save; returns the results."""
+    """Run, print, save; returns the results by part."""
     config = config or Config()
     data = None if config.data is None else pathlib.Path(config.data)
     first, second = (measured_rig.read_record(one, data) for one in measured_rig.EXPERIMENTS)
-    coasting = lab_rig.fit_coasting()
-    rig = lab_rig.build_rig(coasting)
-    free = {path: lab_rig.PARAMETER_RANGES[path] for path in lab_rig.FREE}
-    with ThreadPoolExecutor(1) as other:  # beside the fit: XLA compiles and computes without Python's lock
-        ladder = other.submit(effects, first, second, rig)
-        found = fit_record(lab_rig.build_run(first, True, rig), free, first, starts=lab_rig.STARTS)
-        after = diagnosis(first, second, rig, found)
-        minima = from_ten_starts(first, second, rig)
-        identified = lab_rig.with_scaled_brake(found.part.loop.plant)
-        rise, fall = (float(found.values[f"loop.actuator.{side}"]) for side in ("rise", "fall"))
-        old = old_controllers(config, identified, rise, fall)
-        new = new_controllers(config, identified, found)
-        rows, kept = ladder.result()
-    record.print_rows("Effects, one at a time (wheel rms in per cent of 1,800 rpm)", rows)
-    print(found.table())
-    record.print_rows("Minima from ten starts", minima)
-    record.print_rows("What experiment 2 asks for (fitted after it has judged)", after)
-    record.print_rows("Controllers of the earlier pages", old)
-    record.print_rows("A PI at 10 ms, tuned on three rigs and judged on draws of the identified one", new)
-    results = {"effects": rows, "kept": kept, "minima": minima, "diagnosis": after, "controllers": old, "tuned": new}
-    return record.experiment(config, results, lab_rig.draw_figures((first, second), rig, found.values, coasting))
+    rig = lab_rig.build_rig(lab_rig.fit_coasting())
+
+    @functools.cache
+    def identified() -> Identified:
+        free = {path: lab_rig.PARAMETER_RANGES[path] for path in lab_rig.FREE}
+        return fit_record(lab_rig.build_run(first, True, rig), free, first, starts=lab_rig.STARTS)
+
+    def with_brake() -> tuple[LabRig, DeadTime]:
+        loop = identified().part.loop
+        return lab_rig.with_scaled_brake(loop.plant), loop.actuator
+
+    make = {
+        "effects": lambda: effects(first, second, rig),
+        "minima": lambda: from_ten_starts(first, second, rig),
+        "experiment-2": lambda: diagnosis(first, second, rig, identified()),
+        "controllers": lambda: old_controllers(config, *with_brake()),
+        "pi": lambda: new_controllers(config, *with_brake(), identified()),
+    }
+    results = {}
+    for name in config.parts or PARTS:
+        results[name] = make[name]()
+        record.print_rows(PARTS[name], results[name])
+    return record.experiment(config, results, {})
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; all without one")
     parser.add_argument("--data", help="folder with finer readings than the packaged ones")
-    main(Config(data=parser.parse_args().data))
+    given = parser.parse_args()
+    if unknown := [name for name in given.parts if name not in PARTS]:
+        parser.error(f"PART = {unknown[0]!r} is unknown; known are {', '.join(PARTS)}")
+    main(Config(data=given.data, parts=tuple(given.parts)))

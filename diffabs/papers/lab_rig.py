@@ -41,6 +41,7 @@ from diffabs.papers.measured_rig import (
     fit_record,
     read_curves,
     read_record,
+    run_at_step,
     simulate,
     simulate_readings,
     solver_for,
@@ -49,7 +50,6 @@ from diffabs.papers.measured_rig import (
 from diffabs.plants import BrakeStart, LabRig
 from diffabs.runtime import provenance
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.run import rollout
 from diffabs.simulate.types import FixedStep, Run
 from diffabs.stops import Standstill
 
@@ -351,7 +351,7 @@ def _rims(run: Run, speed: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def _step_residuals(step: StepRun, t: Vector, wheel: Vector, drum_t: Vector, drum: Vector) -> Vector:
-    run = rollout(step.loop, FixedStep(step=FIT_STEP, duration=STEP_DURATION))
+    run = run_at_step(step.loop, FixedStep(step=FIT_STEP, duration=STEP_DURATION))
     at, ours, ours_drum = _rims(run, step.loop.initial.speed)
     return jnp.concatenate(
         [jnp.interp(t - step.instant, at, ours) - wheel, jnp.interp(drum_t - step.instant, at, ours_drum) - drum]
@@ -413,9 +413,8 @@ def compare_steps(rig: LabRig, loaded: LabRig) -> list[JsonObject]:
 
     Returns:
         For each command: `measured`, with the `fall_time` [s]; `mask`, `identified` and `mask_friction` (the loaded
-        rig), from `match_step`. `fitted` is
-        the same for a fit of this rig to each curve alone, with `friction` [1], `brake_torque` [N m], `brake_rate`
-        [1/s] and their deviations. No other number depends on this fit.
+        rig), from `match_step`. `fitted` is the same for a fit of `rig` to each curve alone, with `friction` [1],
+        `brake_torque` [N m], `brake_rate` [1/s] and their deviations. No other number depends on this fit.
     """
     rows = []
     for command in STEP_COMMANDS:
@@ -613,9 +612,10 @@ def compact(summary: Table) -> Digest:
             rms = (f"{of[f'wheel_rms_percent_{mode}']:.1f}" for mode in ("given", "own"))
             lines.append((f"{number}, {state}", *rms, *_cells(of)))
     values = [
-        f"{row['name']} = {row['value']:.4g} +- {row['standard_deviation']:.1g} {row['unit']}"
-        for row in [*summary["parameters"], *summary["mask_friction"]["parameters"][-1:]]
-        if ":" not in row["name"]
+        f"{note}{row['name']} = {row['value']:.4g} +- {row['standard_deviation']:.1g} {row['unit']}"
+        for note, rows in (("", summary["parameters"]), ("mask's friction: ", summary["mask_friction"]["parameters"]))
+        for row in rows
+        if ":" not in row["name"] and (not note or row["name"] == LOAD)
     ]
     rule = "Given, own: rms error of the wheel's speed under the measured commands and under its own relay."
     steps = [

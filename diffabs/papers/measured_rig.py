@@ -34,12 +34,12 @@ from diffabs.roads import RIG_UNROUNDED
 from diffabs.runtime import files
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import EncoderSlip
-from diffabs.simulate.run import rollout
+from diffabs.simulate.run import run_unchecked
 from diffabs.simulate.types import FixedStep, Run
 from diffabs.stops import Standstill
 
 PERIOD = 0.01  # s, sampling of the rig's computer
-RUN_STEP = 1.25e-4  # s, stable down to standstill
+RUN_STEP = 1.25e-4  # s; stable down to standstill, with the mask's friction down to 0.07 m/s
 FIT_STEP = 1e-3  # s; against RUN_STEP it changes the wheel's error by 0.005 % of full scale, the stop by 3 ms
 RPM = 2 * np.pi / 60  # rad/s
 FULL_SCALE = 1800 * RPM  # rad/s, to which the manual accelerates the wheel: 100 % of an error
@@ -108,7 +108,19 @@ class Experiment(NamedTuple):
     printed_distance: float  # m
 
 
-simulate = jax.jit(rollout, static_argnums=1)  # one function, so that runs of one structure compile once
+def run_at_step(loop: Loop, solver: FixedStep) -> Run:
+    """Return a run with a trajectory of every step, whose step is not checked.
+
+    `FIT_STEP` is not stable below some 0.5 m/s; the comment at its value says how much that changes.
+
+    Args:
+        loop: Closed loop.
+        solver: Solver of the run.
+    """
+    return run_unchecked(loop, solver, {}, None, solver.every)
+
+
+simulate = jax.jit(run_at_step, static_argnums=1)  # one function, so that runs of one structure compile once
 EXPERIMENTS = (Experiment("relay-slip-0.1", 0.1, 6.46, 26.5), Experiment("relay-slip-0.7", 0.7, 6.12, 22.8))
 
 
@@ -230,14 +242,13 @@ def build_record_loop(record: Record, given: bool, rig: LabRig = MASK) -> Loop:
     )
 
 
-def solver_for(record: Record, step: float = RUN_STEP) -> FixedStep:
+def solver_for(record: Record) -> FixedStep:
     """Return the solver of runs that last 1 s longer than a record.
 
     Args:
         record: Record of an experiment.
-        step: Step [s], a divisor of 10 ms.
     """
-    return FixedStep(step=step, duration=round(float(record.t[-1]) + 1.0, 2))
+    return FixedStep(step=RUN_STEP, duration=round(float(record.t[-1]) + 1.0, 2))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -260,7 +271,7 @@ class RecordResiduals:
             slip: Measured slip [1], shape (n,).
             weight: Weights of the slips [1], shape (n,).
         """
-        run = rollout(recorded.loop, self.solver)
+        run = run_at_step(recorded.loop, self.solver)
         turns, slips = simulate_readings(run, recorded, self.solver, t)
         return jnp.concatenate([(turns - wheel) / SIGMA_SPEED, weight * (slips - slip) / SIGMA_SLIP])
 
@@ -319,10 +330,11 @@ def fit_record(
         tolerance: Relative change of the cost at which a fit ends.
     """
     kept = record.t <= until
+    solver = FixedStep(step=FIT_STEP, duration=round(float(record.t[kept][-1]) + PERIOD, 2))  # to the last sample's end
     columns = (record.t, record.wheel, record.slip, slip_weight(record.wheel))
     data = tuple(jnp.asarray(x[kept]) for x in columns)
     return fit(
-        recorded, free, RecordResiduals(solver_for(record, FIT_STEP)), data=data, sigma=np.array(1.0), absolute=False,
+        recorded, free, RecordResiduals(solver), data=data, sigma=np.array(1.0), absolute=False,
         tolerances=Tolerances(cost=tolerance, step=1e-6, gradient=1e-6, evaluations=40), starts=starts,
     )  # fmt: skip
 
