@@ -49,6 +49,7 @@ from diffabs.objectives import at_limits
 from diffabs.runtime import interrupt, provenance
 from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.faults import describe_faults
 from diffabs.simulate.matlab import write_mat
 from diffabs.simulate.run import measure, rollout
 from diffabs.simulate.sliding import describe_slide
@@ -200,7 +201,7 @@ def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
 def _judge(chosen: Scenario, result: JsonObject, slides: str) -> None:
     """Write the warnings, also that the run `slides`. Raises typer.Exit for a diverged run, which has no metrics."""
     if result["diverged"]:
-        why = "a number became infinite or invalid, or a part switched in every step; there are no metrics"
+        why = f"{result['fault']}; there are no metrics"
         console.fail(f"{chosen.name}: {slides}" if slides else f"{chosen.name} diverged: {why}", 1)
     if slides:
         console.say(f"warning: {slides}")
@@ -264,6 +265,7 @@ def _result(chosen: Scenario, run: Run, limited: float) -> JsonObject:
         "metrics": {name: float(run.metrics[name]) for name in chosen.objectives},
         "stopped": bool(run.stopped),
         "diverged": bool(run.diverged),
+        "fault": describe_faults(run),
         "at_limit": limited,
         "warnings": list(_warnings(chosen, run, limited)),
         "title": chosen.title,

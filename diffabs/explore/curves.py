@@ -18,6 +18,7 @@ from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.convert import trajectory_columns
 from diffabs.simulate.ensemble import run_batch
+from diffabs.simulate.faults import describe_faults
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Adaptive, FixedStep, Run, Solver
 
@@ -207,7 +208,7 @@ def _in_kmh(panel: Panel) -> Panel:
 
 def _describe_end(chosen: Scenario, run: Run, t: np.ndarray) -> str:
     if run.diverged:
-        return "diverged: a number became infinite or impossible, or something switched in every step"
+        return f"diverged: {describe_faults(run)}"
     stop, end = chosen.loop.stop, f"after {float(t[-1]):.4g} s"
     if bool(run.stopped) == stop.success:
         return f"ends {end}"

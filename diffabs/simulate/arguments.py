@@ -135,8 +135,7 @@ def refuse_unnamed(objectives: Mapping[str, Objective] | None) -> None:
 def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
     """Check a run as `refuse` does and, if all parameters are concrete, their values.
 
-    A warning says once that a step is not stable or, for traced parameters, that it is not checked, unless it was for
-    such a loop.
+    For traced parameters a warning says once that the step is not checked, unless it was for such a loop.
 
     Args:
         loop: Closed loop.
@@ -144,7 +143,8 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
         objectives: Objectives by the names of their metrics.
 
     Raises:
-        ValueError: An argument is invalid, or a concrete parameter has a value that no run may have.
+        ValueError: An argument is invalid, or a concrete parameter has a value that no run may have. Also if the
+            step is not stable.
     """
     refuse(loop, solver, objectives)
     if is_traced(loop, dict(objectives)):
@@ -155,13 +155,10 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     lines += [
         line for name, part in objectives.items() for line in find_broken(part_rules(part, f"objectives.{name}."))
     ]
-    if lines:
+    if lines := lines or list(find_unstable_step(loop, solver)):
         raise ValueError("; ".join(lines))
-    for line in find_unstable_step(loop, solver):
-        _warn_unstable_step(line)
 
 
-_warn_unstable_step = functools.cache(log.warning)
 _warn_unchecked_step = functools.cache(
     functools.partial(
         log.warning,

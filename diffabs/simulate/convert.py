@@ -11,6 +11,7 @@ from jax.core import Tracer
 from diffabs.core.optional import import_optional
 from diffabs.core.summary import Summary, round_for_table
 from diffabs.core.types import Params, Part, PyTree, Scalar
+from diffabs.simulate.faults import describe_faults
 
 NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
 DEFAULT_CONTROL_UNIT = "control"  # unit of the control if no plant is given
@@ -38,7 +39,9 @@ def summarise_run(run: PyTree) -> Summary:
         return _summarise_runs(run, int(np.prod(shape)))
     seen = f"; a trajectory of {len(run.trajectory.running)} instants" if kept else ""
     end = f"at t = {round_for_table(run.ending.sample.t)} s"
-    how = "diverged" if run.diverged else f"reached its stop {end}" if run.stopped else f"ended {end}"
+    how = f"reached its stop {end}" if run.stopped else f"ended {end}"
+    if run.diverged:
+        how = f"diverged: {describe_faults(run)}"
     if run.slid:
         begins = f"slides along a switching surface from t = {round_for_table(run.slide.t)} s"
         how = begins if run.diverged else f"{how} and {begins}, so that it has no derivatives"
@@ -53,6 +56,8 @@ def _summarise_runs(run: PyTree, count: int) -> Summary:
         good = np.asarray(values).reshape(-1)[~lost]
         rows.append((name, *((good.mean(), good.min(), good.max()) if len(good) else ("", "", ""))))
     title = f"{count} runs: {stopped} reached their stop, {int(lost.sum())} diverged"
+    if why := describe_faults(run):
+        title += f" ({why})"
     if slid := int(np.sum(run.slid)):
         title += f", {slid} slide along a switching surface and have no derivatives"
     return Summary(title, ("metric", "mean", "least", "greatest"), tuple(rows), "of those that did not diverge")

@@ -22,6 +22,7 @@ from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.engine import check_process, resolve_request, run_with_engine
 from diffabs.simulate.drive.packed import EarlyEnd, run_packed
 from diffabs.simulate.drive.sharding import describe_placement, run_on_all_cores, run_on_auto_mesh
+from diffabs.simulate.faults import Fault
 from diffabs.simulate.run import run_unchecked
 from diffabs.simulate.types import Run, Solver
 
@@ -221,4 +222,5 @@ def _mark_refused(run: Run, accepted: Bool) -> Run:
     accepted = jnp.asarray(accepted, bool)
     metrics = {name: jnp.where(accepted, value, jnp.nan) for name, value in run.metrics.items()}
     flags = {"stopped": run.stopped & accepted, "timed_out": run.timed_out & accepted}
-    return run._replace(metrics=metrics, diverged=run.diverged | ~accepted, **flags)
+    fault = jnp.where(accepted, jnp.asarray(run.fault), Fault.REFUSED.value)
+    return run._replace(metrics=metrics, diverged=run.diverged | ~accepted, fault=fault, **flags)

@@ -15,12 +15,20 @@ from diffabs.core.numerics import invalidate, void_derivatives
 from diffabs.core.protocols import Ending, Objective
 from diffabs.core.pytree import prepare_parts
 from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
+from diffabs.simulate.faults import Fault
 from diffabs.simulate.step.slides import has_slid, slide_of
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.types import Run, Trajectory
 
 PHYSICAL_RANGE_TOLERANCE = 1e-9  # a metric may exceed its physical range by this much
 Finish = Callable[[Any, Any, PyTree], tuple[Any, PyTree]]  # from loop, objectives and last carry: result, last instant
+FAULTS = {
+    RunStatus.DIVERGED: Fault.NUMBER,
+    RunStatus.EXHAUSTED: Fault.STEPS,
+    RunStatus.MISSED: Fault.LANDING,
+    RunStatus.REFUSED: Fault.REFUSED,
+    RunStatus.SLID: Fault.SLIDE,
+}
 AUDIT_METRIC = ""  # name of a plant's audit among the objectives; no metric has an empty name
 
 
@@ -49,14 +57,18 @@ def finish_run(loop: Loop, objectives: dict[str, Objective], carry: PyTree) -> t
     stopped = carry.status == RunStatus.STOPPED
     ending = Ending(last.sample, stopped, *loop.stop.remainder(last.sample, stopped))
     metrics = {name: o.value(carry.point.accumulators[name], ending) for name, o in objectives.items()}
-    wrong = [_is_impossible(name, objectives[name], value) for name, value in metrics.items()]
-    lost = (carry.status == RunStatus.DIVERGED) | (carry.status == RunStatus.SLID)
-    diverged = jnp.any(jnp.stack([lost, *wrong]))
+    fault = jnp.asarray(Fault.NONE.value)
+    for status, name in FAULTS.items():
+        fault = jnp.where(carry.status == status, name.value, fault)
+    for name, value in metrics.items():
+        wrong = (fault == Fault.NONE) & _is_impossible(name, objectives[name], value)
+        fault = jnp.where(wrong, (Fault.AUDIT if name == AUDIT_METRIC else Fault.METRIC).value, fault)
+    diverged = fault != Fault.NONE
     metrics = invalidate({n: value for n, value in metrics.items() if n != AUDIT_METRIC}, diverged, loop)
     timed_out = (carry.status == RunStatus.TIMED_OUT) & ~diverged
     slide = slide_of(carry)
     metrics, ending, last = void_derivatives((metrics, ending, last), has_slid(slide), loop)
-    return Run(metrics, stopped & ~diverged, diverged, timed_out, ending, None, slide), last
+    return Run(metrics, stopped & ~diverged, diverged, timed_out, ending, None, slide, fault), last
 
 
 def observe(loop: Loop, t: Scalar, state: LoopState, running: AnyArray) -> Trajectory:

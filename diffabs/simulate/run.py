@@ -51,9 +51,9 @@ def rollout(
 
     The function is pure and compiled once per structure of the loop: new values and another duration do not compile
     again. A trajectory or a derivative does compile again if it outgrows its capacity, which is at most an eighth more
-    than requested. A warning names an unstable step, which `check` refuses, and a step that is not checked because the
-    loop is traced. Traced parameters are not checked against their ranges. A run with impossible ones diverges only if
-    its numbers are invalid or not physically possible (`Run.diverged`).
+    than requested. Traced parameters are not checked: a warning says so of the step, unless it was stable for such a
+    loop. A run with impossible ones diverges only if its numbers are invalid or not physically possible
+    (`Run.diverged`).
 
     Args:
         loop: Closed loop with every part and parameter; differentiable in each leaf, and batched by `jax.vmap` over
@@ -71,7 +71,8 @@ def rollout(
     Raises:
         ValueError: A step, duration or stride is not positive, or the step is longer than the duration. A parameter is
             not a real number of at least 32 bits, or has a wrong shape. A concrete parameter is out of range or breaks
-            a rule of its part. The start is beyond the stop, or a clock is off the grid.
+            a rule of its part. The start is beyond the stop, or a clock is off the grid. The step
+            is not stable; `run_batch` with `accepted=True` makes such a run all the same.
     """
     objectives = objectives or {}
     refuse_values(loop, solver, objectives)

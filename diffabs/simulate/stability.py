@@ -20,7 +20,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
+from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Memory, Reference
 from diffabs.core.pytree import canonical_dtypes, part, pytree, replace
@@ -261,7 +261,8 @@ def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
     return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
 
-@compile_once(options=SAME_RESULT_OPTIONS)
+# A caller waits for the compiler, and the limit is printed with three digits.
+@compile_once(options=QUICK_COMPILE_OPTIONS)
 def _jacobians(loops: Loop) -> jax.Array:
     return jax.vmap(_jacobians_of)(loops)
 

@@ -171,6 +171,7 @@ class Run(NamedTuple):
         trajectory: Signals at the kept instants; None if no trajectory was requested.
         slide: First slide along a switching surface; None if it is not known. All derivatives of such a run are NaN.
             The values of a run with fixed steps stay. Values alone do not always show a slide: see `slid`.
+        fault: Reason for `diverged` as a number (`simulate.faults.Fault`); None if it is not known. `repr` has words.
     """
 
     metrics: dict[str, PyTree]
@@ -180,6 +181,7 @@ class Run(NamedTuple):
     ending: Ending
     trajectory: Trajectory | None
     slide: Slide | None = None
+    fault: Int | None = None
 
     @property
     def slid(self) -> Bool:

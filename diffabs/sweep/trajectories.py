@@ -3,7 +3,6 @@
 `xarray.open_zarr(folder / "trajectories.zarr", consolidated=False)` opens it.
 """
 
-import dataclasses
 import pathlib
 from collections.abc import Sequence
 
@@ -14,7 +13,7 @@ import zarr
 
 from diffabs.core.loop import run_signals
 from diffabs.runtime import files
-from diffabs.simulate.run import rollout
+from diffabs.simulate.run import run_unchecked
 from diffabs.simulate.types import Trajectory
 from diffabs.sweep.study import Study, precision
 
@@ -63,6 +62,6 @@ def rerun_sample(study: Study, i: int) -> Trajectory:
     every = max(study.solver.every, -(-study.solver.steps // MAX_TRAJECTORY_INSTANTS))
     with precision(study.dtype):
         loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
-        run = jax.device_get(rollout(loop, dataclasses.replace(study.solver, every=every), key=key))
+        run = jax.device_get(run_unchecked(loop, study.solver, {}, key, every))
     assert run.trajectory is not None
     return run.trajectory

@@ -74,7 +74,7 @@ def whole(tmp_path_factory, runs):
 def test_json_has_what_scripts_rely_on(whole):
     folder, document = whole
     old = {"scenario", "metrics", "stopped", "diverged", "solver", "versions", "files"}
-    assert set(document) == old | {"title", "parts", "parameters", "at_limit", "warnings"}
+    assert set(document) == old | {"fault", "title", "parts", "parameters", "at_limit", "warnings"}
     assert document["scenario"] == "slip-lmi"
     assert list(document["metrics"]) == list(BRAKING)
     assert document["stopped"] is True

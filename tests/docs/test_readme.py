@@ -132,7 +132,7 @@ def test_4096_masses_and_roads_in_one_call():
 def test_values_have_the_shapes_of_the_table():
     """Names for sizes, such as `runs`, mean the same number in every row."""
     jaxtyping = pytest.importorskip("jaxtyping", reason="jaxtyping comes with the group `ecosystem`")
-    names = {name: getattr(jaxtyping, name) for name in ("Array", "Bool", "Float")}
+    names = {name: getattr(jaxtyping, name) for name in ("Array", "Bool", "Float", "Int")}
     exec(compile(CODE.partition("masses, grips =")[0], "library.md", "exec"), names)
     loop, solver, metrics = names["rig"], d.FixedStep(1e-3, 0.02), {"iae": objectives.IAE()}
     gains = jnp.array([[-11753.0, -48.0]] * 3)
@@ -140,7 +140,7 @@ def test_values_have_the_shapes_of_the_table():
     names |= {"loop": loop, "batch": batch, "run": d.rollout(loop, solver, metrics)}
     names["runs"] = d.run_batch(loop, batch, solver, metrics, trajectories=True)
     table = re.findall(r"^\| `(.+?)`, `(.+?)`.* \| `(.+?)` \| `(.+?)` \|$", LIBRARY, re.MULTILINE)
-    assert len(table) == 6
+    assert len(table) == 7
     with jaxtyping.jaxtyped("context"):
         for one, many, type_of_one, type_of_many in table:
             for value, kind in ((one, type_of_one), (many, type_of_many)):

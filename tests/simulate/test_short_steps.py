@@ -1,5 +1,8 @@
 """Steps far shorter than the span. A step that cannot meet its tolerance ends the run."""
 
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +10,8 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
+from diffabs import controllers, objectives, references, stops
+from diffabs.core.pytree import param, pytree
 from diffabs.simulate.solve import SolutionStatus
 
 ACCURACY = 1e-6  # for an rtol of 1e-8
@@ -69,3 +74,59 @@ def test_a_singularity_beyond_the_end_is_no_fault():
         found = d.solve(coast, jnp.array([20.0, 0.0], dtype), dtype(0.0), dtype(end), solver=d.Adaptive(1e-5))
         assert found.status == SolutionStatus.FINISHED
         assert found.y[1] == pytest.approx(np.log(20 / (20 - 9.81 * end)) / 9.81, rel=accuracy)
+
+
+class CoastOutput(NamedTuple):
+    pace: Any
+    speed: Any
+    units = MappingProxyType({"pace": "s^2/m", "speed": "m/s"})
+
+
+@pytree
+class CoastStart:
+    speed: Any = param(default=20.0, unit="m/s", above=0.0)
+
+
+@pytree
+class Coast:
+    """`coast` as a plant: no control moves it."""
+
+    brake: Any = param(default=9.81, unit="m/s^2", above=0.0)
+    shows, control_unit = CoastOutput, "N"
+
+    def start(self, initial):
+        return CoastOutput(0.0 * initial.speed, initial.speed)
+
+    def derivative(self, t, state, control):
+        return CoastOutput(1 / state.speed + 0.0 * control, -self.brake)
+
+    def project(self, state):
+        return state
+
+    def output(self, state):
+        return state
+
+    def holding(self, output, target):
+        return 0.0 * target
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["xla", "kernel"])
+def test_no_step_of_a_loop_passes_over_a_singularity(engine):
+    """The IAE of a setpoint of 0 is the integral of log(20/v)/brake: v - v log(v/20) from the end to the start."""
+    parts = {"reference": references.Setpoint(value=0.0), "controller": controllers.PID(), "stop": stops.NoStop()}
+    loop = d.Loop(plant=Coast(), initial=CoastStart(), **parts)
+    end, measured = 1.9, {"iae": objectives.IAE()}
+
+    def iae(brakes):
+        batch = d.Batch({"plant.brake": brakes})
+        run = d.run_batch(loop, batch, d.Adaptive(1e-7, end, 0.1), measured, engine=engine)
+        return run.metrics["iae"], run.diverged
+
+    brakes = jnp.array([9.81, 10.0, 11.0, 12.0])  # standstill after 2.04, 2, 1.82, 1.67 s
+    run, slopes, diverged = jax.jvp(iae, (brakes,), (jnp.ones(4),), has_aux=True)
+    last = 20.0 - brakes * end
+    truth = (20.0 - last + last * jnp.log(last / 20.0)) / brakes**2
+    np.testing.assert_allclose(run, jnp.where(last > 0, truth, jnp.nan), rtol=1e-5)
+    assert np.isnan(slopes).tolist() == [False, False, True, True]
+    assert diverged.tolist() == [False, False, True, True]

@@ -200,7 +200,7 @@ def _stop_unaccepted(accepted: Scalar, carry: PyTree) -> PyTree:
     """Return the carry, over from the beginning if the run is not accepted."""
     if isinstance(carry, LaggedReplay):
         return carry._replace(ahead=_stop_unaccepted(accepted, carry.ahead))
-    status = jnp.where(accepted, carry.status, RunStatus.DIVERGED)
+    status = jnp.where(accepted, carry.status, RunStatus.REFUSED)
     return carry._replace(status=status.astype(carry.status.dtype))
 
 

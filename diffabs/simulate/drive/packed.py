@@ -143,7 +143,7 @@ def _run(
         """Return leaves, keys and carries of these runs at t = 0; beyond the last run a copy that does not step."""
         mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
         carry = start(mine, key)
-        status = jnp.where(run & (number < count), carry.status, RunStatus.DIVERGED)
+        status = jnp.where(run & (number < count), carry.status, RunStatus.REFUSED)
         return mine, key, carry._replace(status=status.astype(carry.status.dtype))
 
     def step_and_exchange(slots: _LaneSlots) -> _LaneSlots:

@@ -387,9 +387,9 @@ class AdaptiveStepping:
             last_step = select(taken, span_step(carry.point, attempt.point), last_step)
         # An error that is NaN is not small. An attempt within a search need not be accurate.
         fails = jnp.where(new, ~(report.error <= 1), ~decision.fine)
-        lost = (fails & (carry.length <= shortest_step(carry.point.t))) | (
-            control.tries > MAX_ATTEMPTS + ATTEMPTS_PER_INSTANT * self.steps
-        )
+        lost = fails & (carry.length <= shortest_step(carry.point.t))
+        exhausted = control.tries > MAX_ATTEMPTS + ATTEMPTS_PER_INSTANT * self.steps
+        judged = jnp.where(exhausted, RunStatus.EXHAUSTED, self._judge(report, after, slides, status))
         return after._replace(
             length=length,
             base=jnp.where(status == RunStatus.RUNNING, length, carry.base),
@@ -405,7 +405,7 @@ class AdaptiveStepping:
                 taken=taken,
                 triggered=_pack_events(decision.triggered),
             ),
-            status=jnp.where(lost, RunStatus.DIVERGED, self._judge(report, after, slides, status)),
+            status=jnp.where(lost, RunStatus.DIVERGED, judged),
         )
 
     def _judge(self, report: AdaptiveReport, after: Carry, slides: Bool, status: Scalar) -> Scalar:

@@ -305,7 +305,7 @@ def start_carry(
         has_margin_rates=stepping.has_margin_rates,
     )
     point = evaluate_point(system, none, state, accumulators, UNCONSTRAINED, forecast)
-    status = jnp.where(point.margins["stop"][0] > 0, zero + RunStatus.RUNNING, zero + RunStatus.DIVERGED)
+    status = jnp.where(point.margins["stop"][0] > 0, zero + RunStatus.RUNNING, zero + RunStatus.MISSED)
     point = point._replace(state=borrow(state, logs))
     search, yes, no = init_search(stepping.h), jnp.asarray(True), jnp.asarray(False)
     slides = init_watch(system.word_count, none) if system.bit_count and stepping.searches else ()

@@ -223,10 +223,11 @@ class FixedStepping:
             unrestricted = (unrestricted | becomes_unrestricted) & ~(on_grid & have_same_answers(carry, attempt))
             status = jnp.where(becomes_unrestricted, RunStatus.RUNNING, status)
         most = (EVENT_ATTEMPTS_PER_STEP + CROSSING_ATTEMPTS_PER_STEP) * self.steps + SPARE_ATTEMPTS
-        lost = (~decision.fine & (carry.unrestricted if system.program else True)) | (extra > most)
+        lost = ~decision.fine & (carry.unrestricted if system.program else True)
         if self.watches:
             grazes = attempt.report.grazes & (decision.taken | decision.searches)
             status = jnp.where(unrestricted, RunStatus.SLID, jnp.where(grazes, RunStatus.GRAZED, status))
+        status = jnp.where(extra > most, RunStatus.EXHAUSTED, status)
         strikes = status == RunStatus.RUNNING
         length = jnp.where(strikes, self.h - after.since, jnp.where(status == RunStatus.REFRESHING, 0.0, after.length))
         return after._replace(

@@ -25,12 +25,16 @@ class RunStatus(enum.IntEnum):
         REFRESHING: A step of length 0 evaluates the rates after the event, or beyond the switching surface.
         STOPPED: The run is over and has reached its stop.
         TIMED_OUT: The run is over because its duration has passed.
-        DIVERGED: The run is over because its numbers are invalid.
+        DIVERGED: The run is over because its numbers are invalid, or no step meets its tolerance.
+        EXHAUSTED: The run is over because its attempts are too many.
+        MISSED: The run is over because its landing misses the stop, or its start is beyond the stop.
+        REFUSED: The run was not accepted, and over from the beginning.
         SLID: The run is over because it slides along a switching surface; only of a method that `watches`.
         GRAZED: The run is over because a margin only touches zero; only of a method that `watches`.
     """
 
-    RUNNING, SEEKING, PROBING, REFINING, LANDING, REFRESHING, STOPPED, TIMED_OUT, DIVERGED, SLID, GRAZED = range(11)
+    RUNNING, SEEKING, PROBING, REFINING, LANDING, REFRESHING, STOPPED, TIMED_OUT = range(8)
+    DIVERGED, EXHAUSTED, MISSED, REFUSED, SLID, GRAZED = range(8, 14)
 
 
 def is_running(carry: PyTree) -> Bool:
@@ -43,19 +47,19 @@ def is_running(carry: PyTree) -> Bool:
 
 
 def end_unfinished(carry: PyTree) -> PyTree:
-    """Return the carry after the last attempt for which there is capacity: a run that still goes on has diverged.
+    """Return the carry after the last attempt for which there is capacity: a run that still goes on is exhausted.
 
     Args:
         carry: Carry of the run, with a `status`.
     """
-    status = jnp.where(is_running(carry), RunStatus.DIVERGED, carry.status)
+    status = jnp.where(is_running(carry), RunStatus.EXHAUSTED, carry.status)
     return carry._replace(status=status.astype(carry.status.dtype))
 
 
 def status_after_step(loop: Loop, carry: PyTree, attempt: PyTree, decision: PyTree) -> Scalar:
     """Return the status after an accepted attempt.
 
-    A landing whose margin is too far from zero (`MAX_MISSED_FRACTION`) makes the run diverge.
+    A landing whose margin is too far from zero (`MAX_MISSED_FRACTION`) misses the stop.
 
     Args:
         loop: Closed loop.
@@ -69,7 +73,7 @@ def status_after_step(loop: Loop, carry: PyTree, attempt: PyTree, decision: PyTr
         stop & ~(jnp.abs(b) <= MAX_MISSED_FRACTION * (a + at_full))
         for a, b, stop in zip(before, after, stops, strict=True)
     ]
-    landed = jnp.where(reduce(jnp.logical_or, misses), RunStatus.DIVERGED, RunStatus.STOPPED)
+    landed = jnp.where(reduce(jnp.logical_or, misses), RunStatus.MISSED, RunStatus.STOPPED)
     further = jnp.asarray(RunStatus.RUNNING)
     if not loop.ticks:
         changed = jnp.any(jnp.stack([decision.crosses_surface, *jax.tree.leaves(decision.triggered)]))
