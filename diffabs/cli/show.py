@@ -317,5 +317,5 @@ def numbers_at_bounds(free: Params) -> Iterator[str]:
         after, low, high = np.broadcast_arrays(*(np.asarray(row[key], float) for key in ("after", "low", "high")))
         for at in np.ndindex(after.shape):
             name = ".".join([path, *map(str, at)])
-            if side := reached_bound(low[at], high[at], after[at]):
+            if side := reached_bound(*(float(column[at]) for column in (low, high, after))):
                 yield f"{name} ({side}, {(low if side == 'lower' else high)[at]:g})"
