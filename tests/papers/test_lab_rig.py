@@ -327,7 +327,7 @@ def test_the_reproduction_has_every_number_that_the_page_prints(tmp_path):
         assert row["fitted"]["wheel_rms_percent"] < 2.5
         assert min(row[state]["wheel_rms_percent"] for state in ("mask", "identified", "mask_friction")) > 20
     scenario = load("lab-rig-measured").loop
-    # The minima are narrow: other flags of the compiler lead to another one nearby.
+    # The minimum is a flat valley: other flags of the compiler end elsewhere in it.
     for path, share in (("plant.wheel_inertia", 0.05), ("plant.road.w4", 0.03), ("actuator.rise", 0.2)):
         value = next(row["value"] for row in summary["parameters"] if row["name"] == f"loop.{path}")
         assert float(get(scenario, path)) == pytest.approx(value, rel=share)
