@@ -4,6 +4,9 @@ The heater y' = p (8 if y < x else 4) - y from y = 0 reaches x at t1 = -log(1 - 
 y(T) = 4 p + (x - 4 p) exp(-T)/(1 - x/(8 p)), which every nesting of transformations is applied to as well."""
 
 import logging
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -122,6 +125,43 @@ def test_common_nestings_are_right_and_made_by_a_kernel(name, engines):
 @pytest.mark.parametrize("name", FURTHER)
 def test_further_nestings_are_right(name):
     compare(FURTHER[name])
+
+
+SHARDED = """
+import jax
+import jax.numpy as jnp
+import diffabs as d
+
+mesh = jax.make_mesh((2,), ("runs",), axis_types=(jax.sharding.AxisType.Auto,))
+rates, shared = jnp.linspace(0.5, 1.5, 4), jax.P()
+
+def decay(rate, gain):
+    return d.solve(lambda t, y, a: -a[0] * a[1] * y, 1.0, 0.0, 1.0, (rate, gain), solver=d.FixedStep(0.05)).y
+
+def slopes(f):
+    def local(rates, gain):
+        return jax.vmap(f, (0, None))(rates, gain)
+
+    def inside(rates, gain):
+        return jax.grad(lambda gain: jax.lax.pmean(local(rates, gain).mean(), "runs"))(gain)
+
+    outside = jax.shard_map(local, mesh=mesh, in_specs=(jax.P("runs"), shared), out_specs=jax.P("runs"))
+    inside = jax.shard_map(inside, mesh=mesh, in_specs=(jax.P("runs"), shared), out_specs=shared)
+    return jnp.stack([jax.jit(jax.grad(lambda gain: outside(rates, gain).mean()))(1.0), jax.jit(inside)(rates, 1.0)])
+
+assert jax.local_device_count() == 2
+print(jnp.allclose(slopes(decay), slopes(lambda rate, gain: jnp.exp(-gain * rate)), rtol=1e-5))
+"""
+
+
+@pytest.mark.slow
+@killed_by("simulate/drive/deferred.py", "    words = _vary_alike(words)\n", "")
+def test_a_number_that_devices_share_has_the_derivative_by_all_runs():
+    """Of exp(-gain rate); Runge-Kutta steps of 0.05 have errors below 1e-6."""
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+    words = [sys.executable, "-c", SHARDED]
+    done = subprocess.run(words, env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True"]
 
 
 def test_only_the_values_of_a_single_run_stay_with_xla(engines):

@@ -32,6 +32,7 @@ import numpy as np
 from jax.core import ShapedArray, Tracer
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
+from jax.sharding import NamedSharding, PartitionSpec
 
 from diffabs.core.types import PyTree
 from diffabs.runtime.process import default_platform
@@ -97,6 +98,7 @@ def run_deferred(by_xla: Callable[[Any, PyTree], PyTree], capacity: Any, run: Py
     is_key = [jnp.issubdtype(getattr(x, "dtype", float), jax.dtypes.prng_key) for x in leaves]
     kinds = tuple(jax.random.key_impl(x) if on else None for x, on in zip(leaves, is_key, strict=True))
     words = [jax.random.key_data(x) if on else jnp.asarray(x) for x, on in zip(leaves, is_key, strict=True)]
+    words = _vary_alike(words)
     result = _result_shape(structure, kinds, capacity.finish, tuple(map(_type, words)))
     deferred = DeferredRun(structure, kinds, tuple(jax.tree.leaves(result)), capacity, by_xla, required)
     return jax.tree.unflatten(jax.tree.structure(result), _Call(deferred, ()).bind(*words))
@@ -121,6 +123,21 @@ def _rebuild(structure: Any, kinds: tuple[Any, ...], leaves: Leaves) -> tuple[Py
     return jax.tree.unflatten(
         structure, [x if kind is None else jax.random.wrap_key_data(x, impl=kind) for x, kind in pairs]
     )
+
+
+def _vary_alike(arrays: Leaves) -> list[PyTree]:
+    """Return arrays that all vary between the devices of `jax.shard_map` if one does: JAX adds up the cotangents."""
+    own = [_varying_axes(jax.typeof(x)) for x in arrays]
+    every = frozenset().union(*own)
+    return [
+        jax.lax.pcast(x, tuple(every - axes), to="varying") if every - axes else x
+        for x, axes in zip(arrays, own, strict=True)
+    ]
+
+
+def _varying_axes(kind: Any) -> frozenset[Any]:
+    # The attribute's name depends on JAX's version.
+    return kind.mat.varying if hasattr(kind, "mat") else kind.vma
 
 
 def _type(x: Any) -> jax.ShapeDtypeStruct:
@@ -196,10 +213,19 @@ class _Call(NamedTuple):
         """Return shapes and types of the results for those of the arguments."""
         sizes = self.level_sizes(arguments)[::-1]  # the outermost level is the first axis
         runs = [size for size, level in zip(sizes, self.levels[::-1], strict=True) if self.moves_runs(level)]
-        values = [ShapedArray((*runs, *x.shape), x.dtype) for x in self.deferred.results]
+
+        def type_result(axes: list[int], result: jax.ShapeDtypeStruct) -> ShapedArray:
+            shape = (*axes, *result.shape)
+            if not any(map(_varying_axes, arguments[:1])):
+                return ShapedArray(shape, result.dtype)
+            # A result varies between the devices of `jax.shard_map` as the leaves do.
+            place = NamedSharding(arguments[0].sharding.mesh, PartitionSpec(*(None for _ in shape)))
+            return arguments[0].update(shape=shape, dtype=result.dtype, weak_type=False, sharding=place)
+
+        values = [type_result(runs, x) for x in self.deferred.results]
         if self.moving is None:
             return values
-        return values + [ShapedArray((*sizes, *x.shape), x.dtype) for x in self.deferred.results if _is_real(x)]
+        return values + [type_result(sizes, x) for x in self.deferred.results if _is_real(x)]
 
     def level_sizes(self, arguments: Sequence[Any]) -> list[int]:
         """Return the number of members of each level, the innermost first."""
