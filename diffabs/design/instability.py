@@ -9,6 +9,7 @@ On the boundary, a sum w'x of states that stays constant gives P = -w w', with V
 """
 
 import itertools
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
@@ -34,10 +35,12 @@ def growing_modes(a: np.ndarray, *, discrete: bool) -> Iterator[dict[str, float 
     choices = [(min(growth - low, high - growth), growth) for growth, low, high in between if growth < high]
     for _, growth in sorted(choices, reverse=True):
         try:
-            if discrete:
-                p = solve_discrete_lyapunov((balanced * np.exp(-growth)).T, np.eye(len(a)))
-            else:
-                p = solve_continuous_lyapunov((balanced - growth * np.eye(len(a))).T, -np.eye(len(a)))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of a solution near a pair of opposite eigenvalues
+                if discrete:
+                    p = solve_discrete_lyapunov((balanced * np.exp(-growth)).T, np.eye(len(a)))
+                else:
+                    p = solve_continuous_lyapunov((balanced - growth * np.eye(len(a))).T, -np.eye(len(a)))
         except np.linalg.LinAlgError:
             continue
         p = (p + p.T) / 2

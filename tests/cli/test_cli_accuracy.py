@@ -36,7 +36,7 @@ TURNS = ["never at all", "half", "quarter", "always"]
 PAIRS = {
     "to never": (0.3, np.inf, ["settling_time from 0.3 to never"]),
     "from never": (np.inf, 0.3, ["settling_time from never to 0.3"]),
-    "to NaN": (0.3, np.nan, ["settling_time from 0.3 to nan"]),
+    "to NaN": (0.3, np.nan, ["settling_time from 0.3 to none"]),
     "never": (np.inf, np.inf, []),
     "both NaN": (np.nan, np.nan, []),
     "near": (0.3, 0.3002, []),

@@ -621,9 +621,11 @@ def test_deadbeat_loops_and_zero_loops_have_an_answer():
     found = certify((0.0, 0.0), chain, Spec(Q=(1.0, 1.0), R=1.0), fastest=True)
     assert found.decay_rate > 10
     np.testing.assert_allclose(found.guaranteed_cost, 3.0, rtol=1e-6)  # 1 for the first unit vector, 2 for the second
-    assert certify((0.0,), Polytope([[[0.0]]], [[[1.0]]])).claims == ()  # constant: nothing falls, nothing grows
     still = Polytope([np.zeros((2, 2)), -np.eye(2)], [np.eye(2)] * 2)
-    assert certify(np.zeros((2, 2)), still).claims == ()
+    for gain, constant in (((0.0,), Polytope([[[0.0]]], [[[1.0]]])), (np.zeros((2, 2)), still)):
+        found = certify(gain, constant)  # nothing grows, and a state that stays is not stable
+        assert [claim.kind for claim in found.claims] == ["unstable"]
+        assert found.quadratically_stable is False
 
 
 def test_unstabilisable_vertex():

@@ -63,7 +63,7 @@ def test_every_exported_name_comes_from_where_it_is_defined(package):
     names = exported.exported(package)
     own = {name: getattr(value, "__module__", None) or "" for name, value in vars(module).items()}
     made = {name for name, home in own.items() if not name.startswith("_") and home.startswith(package)}
-    assert made <= names.keys()
+    assert made - {"simulate"} <= names.keys()  # the package `diffabs.simulate`, which says that it is no function
     for name, path in names.items():
         home, _, last = path.rpartition(".")
         assert getattr(importlib.import_module(home), last) is getattr(module, name)
@@ -169,7 +169,7 @@ def site(tmp_path_factory):
 def test_the_site_builds_strictly(site):
     assert "margins" in (site / "reference" / "linear" / "index.html").read_text()
     assert re.search(
-        r"<td>control/signal/s</td>\s*<td>\[0, inf\)</td>", (site / "reference/controllers/index.html").read_text()
+        r"<td>control/signal/s</td>\s*<td>\(-inf, inf\)</td>", (site / "reference/controllers/index.html").read_text()
     )
 
 

@@ -213,6 +213,14 @@ LOOPS = {
             blocks=(actuators.Lag(time_constant=0.004), actuators.IntegratingValve(gain=2100.0, low=3.0, high=130.0))
         ),
     ),
+    "cascade": braking(
+        **CAR,
+        controller=controllers.Cascade(
+            outer=controllers.PID(kp=20.0, ki=5.0, low=-3.0, high=3.0),
+            inner=controllers.PID(kp=-4.0, ki=-30.0, low=0.0, high=90.0),
+        ),
+        reference=references.FixedSlip(slip=0.15),
+    ),
     "delay": braking(
         **CAR,
         controller=controllers.PID(kp=300.0, kd=1.0, high=250.0, low=0.0),

@@ -287,6 +287,7 @@ class Constrained:
 
     mode = DerivativeMode.REVERSE
     subject = None
+    entries = ()
 
     def __init__(self, start, excess, objective=lambda z: z[0] ** 2 + 2 * z[1] ** 2):
         self.space, self.start, self._excess = self, np.asarray(start, float), excess

@@ -123,6 +123,7 @@ def sobol_indices(
             finite.
     """
     fa, fb, mixed = as_column(a, least=4), as_column(b), np.asarray(ab)
+    as_column(np.ravel(mixed))
     if fa.shape != fb.shape or mixed.ndim != 2 or mixed.shape[1] != len(fa):
         raise ValueError(f"outputs of shapes {fa.shape}, {fb.shape} and {mixed.shape} do not fit: (n,), (n,), (d, n)")
     if not varies(np.concatenate([fa, fb])):
