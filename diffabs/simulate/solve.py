@@ -540,8 +540,8 @@ def solve(
         events: Events; several at one instant happen in this order. One exactly at t1 does not happen. A terminal
             event at the instant of others may come before or after them; after it, none happens.
         save: Times between t0 and t1 at which the state is returned, shape (n,); None for the state at the end.
-        engine: "xla", or "kernel": a program of this machine for a batch by `jax.vmap`, with forward derivatives.
-            "auto" is that of $DIFFABS_ENGINE, or else "xla", which has both modes.
+        engine: "xla", or "kernel": a program of this machine, with first derivatives in both modes. "auto" is that of
+            $DIFFABS_ENGINE, or else a kernel inside JAX's transformations where one is possible, and XLA elsewhere.
         kept_events: Number of times that are kept of each event.
 
     Returns:

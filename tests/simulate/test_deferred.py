@@ -38,7 +38,12 @@ def _kernels_by_default(users_engine, monkeypatch):
 def engines(caplog):
     """The lines in which the package says which engine makes the runs."""
     caplog.set_level(logging.INFO, "diffabs")
-    return lambda: [record.getMessage().split(" (")[0] for record in caplog.records]
+
+    def lines():
+        messages = [record.getMessage() for record in caplog.records]
+        return [message.split(" (")[0] for message in messages if "kernel" in message]
+
+    return lines
 
 
 def heater(t, y, args):
@@ -208,6 +213,42 @@ def test_without_a_compiler_xla_makes_the_runs(no_compiler, engines):
 def test_a_required_kernel_that_is_impossible_is_an_error(no_compiler):
     with pytest.raises(EngineError, match="engine = 'kernel' is not possible: DIFFABS_KERNEL_COMPILER is empty"):
         over_targets(lambda x, gain: d.solve(heater, 0.0, 0.0, END, (x, gain), solver=no_compiler, engine="kernel").y)
+
+
+@killed_by("simulate/drive/deferred.py", "if jax.config.jax_disable_jit else", "if False else")
+def test_without_jit_xla_makes_the_runs():
+    with jax.disable_jit():
+        start, rate = jax.value_and_grad(lambda a: decay(1.0, a))(jnp.asarray(0.5))
+    np.testing.assert_allclose([start, rate], [np.exp(-0.5), -np.exp(-0.5)], rtol=1e-4)
+
+
+def decay(start, rate):
+    return d.solve(lambda t, y, a: -jnp.real(a) * y, start, 0.0, 1.0, rate, solver=d.FixedStep(0.25)).y
+
+
+@killed_by("simulate/drive/deferred.py", "return by_xla(capacity, run)  # a kernel", "pass  # a kernel")
+def test_a_complex_number_has_a_derivative():
+    slope = jax.vmap(lambda z: jax.jvp(lambda z: decay(1.0, z), (z,), (1.0 + 0j,))[1])(jnp.array([0.5 + 0j, 1.0]))
+    np.testing.assert_allclose(slope, -np.exp(-np.array([0.5, 1.0])), rtol=1e-3)
+
+
+def test_a_derivative_of_known_numbers_inside_a_checkpoint():
+    """Here d(x exp(-t))/dx of the known derivative by t: -exp(-t)."""
+
+    @jax.checkpoint
+    def product(x, t):
+        return x * jax.jvp(lambda a: decay(1.0, a), (t,), (1.0,))[1]
+
+    np.testing.assert_allclose(jax.grad(product)(1.0, 1.0), -np.exp(-1.0), rtol=1e-3)
+
+
+def test_an_empty_argument_has_an_empty_derivative():
+    def final(p):
+        return d.solve(lambda t, y, p: -p["a"] * y + jnp.sum(p["e"]), 1.0, 0.0, 1.0, p, solver=d.FixedStep(0.25)).y
+
+    slopes = jax.grad(final)({"a": 1.0, "e": jnp.zeros(0)})
+    np.testing.assert_allclose(slopes["a"], -np.exp(-1.0), rtol=1e-3)
+    assert slopes["e"].shape == (0,)
 
 
 class TestLoops:

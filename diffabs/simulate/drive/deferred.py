@@ -11,17 +11,20 @@ and its rules decide as late as JAX allows:
 
 Where a kernel is impossible, XLA makes everything.
 
-`run_derivative` returns values and tangents together, so that a kernel computes both in one launch. Reverse mode needs
+`run_derivative` returns values and tangents together, so that a kernel computes values and up to eight tangents in one
+launch. Reverse mode needs
 no transpose of a kernel: the Jacobian of each run is computed with its values, and what is transposed is its product
 with the tangents. A number that all runs share counts as one input, and `jax.vmap` sums its cotangents.
 
-`levels` records the calls of `jax.vmap` around the primitive, the innermost first: for each argument whether it has an
-axis of that level. An argument that all runs share has none, so it stays one number in the kernel's registers.
+`levels` has one entry for each `jax.vmap` around the primitive, the innermost first: a tuple with True for each
+argument that has an axis of it. An argument that all runs share has none, so it stays one number in the kernel's
+registers. An axis of tangents only adds directions, not runs.
 """
 
 import functools
 import logging
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -60,7 +63,7 @@ class DeferredRun(NamedTuple):
         capacity: What `by_xla` needs besides the run: a hashable object with an attribute `finish`, the function that
             returns the result from loop, objectives and the last carry.
         by_xla: Function of the capacity and the run that returns the result by XLA, with both modes of derivatives.
-        required: True if the engine is "kernel": XLA does not replace it.
+        required: True if the engine is "kernel": XLA makes none of its values and first derivatives.
     """
 
     structure: Any
@@ -95,6 +98,8 @@ def run_deferred(by_xla: Callable[[Any, PyTree], PyTree], capacity: Any, run: Py
         EngineError: A kernel is required and impossible, at the time at which XLA compiles the program.
     """
     leaves, structure = jax.tree.flatten(run)
+    if any(jnp.issubdtype(getattr(x, "dtype", float), jnp.complexfloating) for x in leaves):
+        return by_xla(capacity, run)  # a kernel has real numbers, and unit tangents are real
     is_key = [jnp.issubdtype(getattr(x, "dtype", float), jax.dtypes.prng_key) for x in leaves]
     kinds = tuple(jax.random.key_impl(x) if on else None for x, on in zip(leaves, is_key, strict=True))
     words = [jax.random.key_data(x) if on else jnp.asarray(x) for x, on in zip(leaves, is_key, strict=True)]
@@ -269,9 +274,9 @@ def _replace_leaves(leaves: Leaves, places: Sequence[int], new: Leaves) -> list[
 
 
 @functools.lru_cache(MAX_KEPT_PROGRAMS)
-def _trace_kernel(call: _Call, arguments: tuple[jax.ShapeDtypeStruct, ...], platform: str) -> Any:
+def _trace_kernel(call: _Call, arguments: tuple[jax.ShapeDtypeStruct, ...], platform: str, compiler: str | None) -> Any:
     """Return the call by a kernel as a closed jaxpr whose kernels are built, or one line on why that is impossible."""
-    del platform  # a part of the key: another default device has another compiler
+    del platform, compiler  # parts of the key: on another device, or with another compiler, the answer may differ
     from diffabs.compiler.lower.rules import Unsupported
     from diffabs.compiler.runtime.jax_primitive import build_launches
     from diffabs.compiler.runtime.toolchain import NoCompiler
@@ -295,13 +300,15 @@ def _find_kernel(call: _Call, arguments: Sequence[Any], objection: str) -> tuple
     Raises:
         EngineError: A kernel is required, and it is impossible.
     """
+    from diffabs.compiler.runtime.toolchain import COMPILER
+
     required, program, line = call.deferred.required, None, objection
     if required:
         check_process()
     if not line and call.moving is None and call.count_runs(arguments) < MIN_RUNS and not required:
         line = "the values of a single run would wait for its compiler"
     if not line:
-        program = _trace_kernel(call, tuple(map(_type, arguments)), default_platform())
+        program = _trace_kernel(call, tuple(map(_type, arguments)), default_platform(), os.environ.get(COMPILER))
         if isinstance(program, str):
             line, program = program, None
     if line and required:
@@ -374,6 +381,13 @@ def _compile_call(call: _Call) -> Callable[..., list[PyTree]]:
     return jax.jit(call.bind)
 
 
+def _evaluate(*arrays: PyTree, **named: Any) -> list[PyTree]:
+    """Return the results of an eager call, compiled; under `jax.disable_jit` by XLA's single operations."""
+    call = _Call(**named)
+    function = call.by(call.deferred.call_xla) if jax.config.jax_disable_jit else _compile_call(call)  # pyright: ignore
+    return function(*arrays)
+
+
 def _add_level(
     arrays: Sequence[PyTree], axes: Sequence[int | None], **named: Any
 ) -> tuple[list[PyTree], list[int | None]]:
@@ -442,13 +456,15 @@ def _split_for_checkpoint(
 
     `jax.checkpoint` asks for it, where tangents are unknown and values must be known.
     """
-    del saveable  # what is kept is never more than the arguments
+    del saveable  # the backward pass computes the run again from its arguments
     call = _Call(**equation.params)
     arguments, results = list(equation.invars), list(equation.outvars)
     residuals = [x for x, here in zip(arguments, staged, strict=True) if not here and isinstance(x, jex.Var)]
     values, _ = call.split(results)
-    if any(unknown[: call.inputs]) or not any(unknown):
-        return None, equation, [any(unknown)] * len(results), [True] * len(results), residuals
+    if not any(unknown):
+        return equation, None, [False] * len(results), [False] * len(results), []
+    if any(unknown[: call.inputs]):
+        return None, equation, [True] * len(results), [True] * len(results), residuals
 
     def compute_values(*leaves: PyTree) -> list[PyTree]:
         tangents = [jnp.zeros(x.aval.shape, x.aval.dtype) for x in arguments[call.inputs :]]
@@ -465,17 +481,24 @@ def _split_for_checkpoint(
 
 def _has_cheap_jacobian(call: _Call, leaves: Leaves) -> bool:
     """Return whether a kernel's Jacobian of each run costs less than XLA's vector-Jacobian product."""
-    wider, units = _unit_tangents(call, leaves)
-    arguments, directions = [*leaves, *units], len(units[0])
-    objection = _placement_objection((), 1)
+    directions, objection = sum(map(math.prod, _moving_shapes(call, leaves))), _placement_objection((), 1)
     if not call.deferred.required and any(map(_has_tangent, leaves)):
         objection = objection or "it has second derivatives"
     if not call.deferred.required and directions > MAX_DIRECTIONS:
         objection = objection or MANY_INPUTS_REASON
-    program, line = _find_kernel(wider, arguments, objection)
+    if objection and not call.deferred.required:
+        _log_choice("reverse mode", objection)  # before unit vectors take memory, the square of the directions
+        return False
+    wider, units = _unit_tangents(call, leaves)
+    program, line = _find_kernel(wider, [*leaves, *units], objection)
     if line:
         _log_choice("reverse mode", line)
     return program is not None
+
+
+def _moving_shapes(call: _Call, leaves: Leaves) -> list[tuple[int, ...]]:
+    """Return the shapes of the differentiated leaves in one run."""
+    return [leaves[i].shape[sum(level[i] for level in call.levels) :] for i in call.moving or ()]
 
 
 def _has_tangent(x: PyTree) -> bool:
@@ -490,13 +513,11 @@ def _has_tangent(x: PyTree) -> bool:
 
 def _unit_tangents(call: _Call, leaves: Leaves) -> tuple[_Call, list[np.ndarray]]:
     """Return the call for all directions of one run, and the tangents: unit vectors, which all runs share."""
-    moving = call.moving or ()
-    axes = [sum(level[i] for level in call.levels) for i in moving]
-    shapes = [leaves[i].shape[n:] for i, n in zip(moving, axes, strict=True)]
+    moving, shapes = call.moving or (), _moving_shapes(call, leaves)
     counts = [math.prod(shape) for shape in shapes]
     columns = np.split(np.eye(sum(counts)), np.cumsum(counts)[:-1], axis=1)
     units = [
-        column.reshape(-1, *shape).astype(leaves[i].dtype)
+        column.reshape(len(column), *shape).astype(leaves[i].dtype)
         for i, shape, column in zip(moving, shapes, columns, strict=True)
     ]
     levels = [(*level[: call.inputs], *(False for _ in moving)) for level in call.levels]
@@ -509,7 +530,7 @@ def _multiply(call: _Call, jacobian: list[PyTree], tangents: Leaves) -> list[PyT
 
     def product(jacobian: list[PyTree], tangents: list[PyTree]) -> list[PyTree]:
         flat = jnp.concatenate([jnp.ravel(x) for x in tangents])
-        return [jnp.tensordot(flat, columns, 1) for columns in jacobian]
+        return [jnp.tensordot(flat, columns, 1, precision="highest") for columns in jacobian]
 
     function = product
     for level in call.levels:
@@ -535,7 +556,7 @@ def _transpose(cotangents: Sequence[PyTree], *arguments: PyTree, **named: Any) -
 
 
 for _primitive in (run_primitive, derivative_primitive):
-    _primitive.def_impl(lambda *arrays, **named: _compile_call(_Call(**named))(*arrays))
+    _primitive.def_impl(_evaluate)
     _primitive.def_abstract_eval(lambda *types, **named: _Call(**named).result_types(*types))
     mlir.register_lowering(_primitive, _lower)
 batching.primitive_batchers[run_primitive] = _add_level
