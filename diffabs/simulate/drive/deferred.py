@@ -12,9 +12,9 @@ and its rules decide as late as JAX allows:
 Where a kernel is impossible, XLA makes everything.
 
 `run_derivative` returns values and tangents together, so that a kernel computes values and up to eight tangents in one
-launch. Reverse mode needs
-no transpose of a kernel: the Jacobian of each run is computed with its values, and what is transposed is its product
-with the tangents. A number that all runs share counts as one input, and `jax.vmap` sums its cotangents.
+launch. Reverse mode needs no transpose of a kernel: the Jacobian of each run is computed with its values, and JAX
+transposes its product with the tangents. A number that all runs share counts as one input, and `jax.vmap` sums its
+cotangents.
 
 `levels` has one entry for each `jax.vmap` around the primitive, the innermost first: a tuple with True for each
 argument that has an axis of it. An argument that all runs share has none, so it stays one number in the kernel's
