@@ -20,6 +20,7 @@ import diffabs as d
 from diffabs.controllers import (
     PID,
     BackCalculation,
+    Cascade,
     Clamping,
     ConstantInput,
     FourPhase,
@@ -73,6 +74,8 @@ LOOPS = {
     "holding torque": rig(StateFeedback(gain=(-300.0, -48.0)), feedforward=HoldingInput()),
     "holding command, table of friction": rig(SlidingMode(gain=0.2, low=0.0, high=90.0), feedforward=HoldingInput(),
         plant=LabRig(road=Tabulated())),
+    "cascade": rig(Cascade(outer=PID(kp=60.0, ki=40.0, low=0.0, high=30.0), inner_signal="speed",
+        inner=PID(kp=0.8, ki=9.0, kd=0.01, low=0.0, high=9.03, antiwindup=BackCalculation()))),
     "observer": balancing(controller=Sampled(controller=observer(), period=0.01)),
     "four phases": rig(FourPhase(torque_low=3.0, torque_high=9.0, rate=900.0)),
 }  # fmt: skip
