@@ -248,8 +248,8 @@ def end_on_errors() -> Iterator[None]:
     except BrokenPipeError:
         raise
     except OSError as error:
-        where = "standard output: " if error.filename is None and _is_output_refused() else ""
-        fail(where + " ".join((error.strerror or str(error) if where else str(error)).split()), FAILED)
+        at_output = (error.filename is None or error.errno in files.DISK_ERRORS) and _is_output_refused()
+        fail(f"standard output: {error.strerror or error}" if at_output else files.describe_error(error), FAILED)
     except MemoryError:
         fail("out of memory", FAILED)
     except KeyboardInterrupt:

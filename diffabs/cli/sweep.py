@@ -154,8 +154,8 @@ def _explain_resume(out: pathlib.Path, resume: bool) -> Iterator[None]:
     try:
         yield
     except (OSError, EngineError) as error:
-        where = f"{out}: {error.strerror}" if isinstance(error, OSError) and not error.filename else str(error)
-        console.fail(f"{' '.join(where.split())}; finished chunks are kept; --resume continues", console.FAILED)
+        line = files.describe_error(error) if isinstance(error, OSError) else str(error)
+        console.fail(f"{' '.join(line.split())}; finished chunks are kept; --resume continues", console.FAILED)
     except KeyboardInterrupt:
         if not any((out / "chunks").glob("*.parquet")):
             raise

@@ -8,11 +8,9 @@ import hashlib
 import importlib.resources
 import io
 import math
-import pathlib
 import platform
 import subprocess
 import sys
-import tempfile
 import uuid
 import zipfile
 from typing import Any
@@ -24,6 +22,7 @@ from diffabs.config.values import make_printable
 from diffabs.core.loop import Loop
 from diffabs.export.device import NotExported
 from diffabs.export.plant_c import FmuVariable, PlantSource, plant_source
+from diffabs.runtime import files
 
 FMU_COMPILER_FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC")
 MOCKUP_COMPILE_TIMEOUT_S = 600
@@ -102,8 +101,8 @@ def _source(plant: PlantSource, guid: str, step: float) -> str:
 
 def _compile_library(source: str) -> bytes:
     """Return a library for this machine; raise NotExported if there is no compiler or compilation fails."""
-    with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
-        text, result = pathlib.Path(folder) / "fmu.c", pathlib.Path(folder) / "fmu.lib"
+    with files.temporary_folder("diffabs-") as folder:
+        text, result = folder / "fmu.c", folder / "fmu.lib"
         text.write_text(source, encoding="utf-8")
         try:
             command = [*find_compiler().command, *FMU_COMPILER_FLAGS, str(text), "-o", str(result), "-lm"]

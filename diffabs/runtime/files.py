@@ -15,6 +15,8 @@ from typing import BinaryIO
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux, <fcntl.h> and <linux/fs.h>
 NONBLOCKING_FLAG = getattr(os, "O_NONBLOCK", 0)  # without it, opening a pipe without a writer blocks for ever
+# Errors of a full, failing or read-only disk. A write to an open file raises them without the file's name.
+DISK_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EIO, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 _unfinished: set[pathlib.Path] = set()
 
@@ -92,6 +94,52 @@ def temporary_path(path: pathlib.Path) -> Iterator[pathlib.Path]:
     _unfinished.discard(path)
 
 
+def describe_error(error: OSError) -> str:
+    """Return an error of the system in one line: the file or folder, if it has one, and the reason.
+
+    Args:
+        error: Error to describe.
+    """
+    reason = error.strerror or str(error)
+    return " ".join((reason if error.filename is None else f"{os.fsdecode(error.filename)}: {reason}").split())
+
+
+@contextlib.contextmanager
+def name_in_disk_errors(target: str | os.PathLike[str], temporary: pathlib.Path | None = None) -> Iterator[None]:
+    """Name `target` in an error of the disk in the `with` block that names no file, or one in `temporary`.
+
+    Args:
+        target: File or folder that the block writes.
+        temporary: File or folder that stands for `target` until it is whole.
+
+    Raises:
+        OSError: The block raised it.
+    """
+    try:
+        yield
+    except OSError as error:
+        named = error.filename
+        inside = named and temporary and pathlib.Path(os.fsdecode(named)).is_relative_to(temporary)
+        if error.errno in DISK_ERRORS and (named is None or inside):
+            error.filename, error.filename2 = os.fspath(target), None
+        raise
+
+
+@contextlib.contextmanager
+def temporary_folder(prefix: str, parent: pathlib.Path | None = None) -> Iterator[pathlib.Path]:
+    """Yield an empty folder that vanishes at the end. Errors of the disk name it.
+
+    Args:
+        prefix: Beginning of its name.
+        parent: Folder that holds it; None is that of the system (`TMPDIR`).
+
+    Raises:
+        OSError: The folder cannot be created.
+    """
+    with tempfile.TemporaryDirectory(prefix=prefix, dir=parent) as name, name_in_disk_errors(name):
+        yield pathlib.Path(name)
+
+
 @contextlib.contextmanager
 def new_file(target: pathlib.Path, suffix: str | None = None) -> Iterator[pathlib.Path]:
     """Yield an empty file beside `target` that replaces `target` at the end, or vanishes after an error.
@@ -110,8 +158,8 @@ def new_file(target: pathlib.Path, suffix: str | None = None) -> Iterator[pathli
     if target.exists() and not target.is_file():
         raise OSError(errno.EINVAL, "not a regular file", str(target))
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{suffix or target.suffix}")
-    temporary.touch(exist_ok=False)
-    with temporary_path(temporary):
+    with name_in_disk_errors(target, temporary), temporary_path(temporary):
+        temporary.touch(exist_ok=False)
         yield temporary
         if temporary.exists():
             temporary.replace(target)
@@ -208,7 +256,8 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     if target.exists() and not target.is_dir():
         raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(target))
     target.parent.mkdir(parents=True, exist_ok=True)
-    with temporary_path(pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))) as room:
+    room = pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    with name_in_disk_errors(target, room), temporary_path(room):
         new, old = room / "new", room / "old"
         new.mkdir()
         yield new

@@ -234,7 +234,7 @@ def test_failure_at_the_end_leaves_old_files_as_they_were(tmp_path, monkeypatch,
     (tmp_path / "a.csv").write_text("old")
     files = ("--csv", tmp_path / "a.csv", "--plot", tmp_path / "a.png")
     result = run("simulate", "slip-lmi", *files, status=1)
-    assert result.stderr.splitlines()[-1] == "error: [Errno 28] No space left on device"
+    assert result.stderr.splitlines()[-1] == f"error: {tmp_path / 'a.png'}: No space left on device"
     assert (tmp_path / "a.csv").read_text() == "old"
     assert left_in(tmp_path) == {"a.csv"}
 

@@ -4,7 +4,7 @@ import json
 
 import invented
 import pytest
-from commands import run
+from commands import file_size_limit, left_in, run
 from mutants import killed_by
 from seams import replace_seam
 from small_scenarios import TUNE
@@ -78,3 +78,12 @@ def test_a_certificate_that_cannot_be_saved_is_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(Certificate, "save", fill_disk)
     content = shown("certify", "slip-lmi", "--gain=-11753,-76.7", "--out", tmp_path / "gain.json")
     assert content["quadratically_stable"] is True
+
+
+def test_a_picture_without_room_is_named(file, tmp_path):
+    plot = tmp_path / "run.png"
+    with file_size_limit(4096):
+        result = run("simulate", file(TUNE), "--plot", plot, status=1)
+    assert result.stderr.splitlines()[-1] == f"error: {plot}: File too large"
+    assert "iae" in result.stdout
+    assert left_in(tmp_path) == {"mine.toml"}

@@ -1,12 +1,16 @@
 """Files and folders that are replaced: by a process that is killed, and by two processes at once."""
 
+import errno
 import os
+import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 
 import pytest
+from commands import file_size_limit, left_in
 from mutants import killed_by
 
 from diffabs.runtime import files
@@ -121,3 +125,41 @@ def test_several_writers_of_a_file_do_not_disturb_each_other(tmp_path):
         thread.join()
     assert wrong == []
     assert [one.name for one in tmp_path.iterdir()] == ["summary.json"]
+
+
+def write_figure_like(target):
+    """As a library writes: it opens the temporary file itself."""
+    with files.new_file(target) as temporary, temporary.open("wb") as file:
+        file.write(b"new")
+
+
+def write_into_folder(target):
+    with files.new_folder(target) as new:
+        (new / "content").write_bytes(b"new")
+
+
+@killed_by("runtime/files.py", "(named is None or inside)", "False")
+@pytest.mark.parametrize("write", [files.write_file, files.write_durably, write_figure_like, write_into_folder])
+def test_a_full_disk_names_the_file_and_leaves_nothing(tmp_path, write):
+    target = tmp_path / "target"
+    with file_size_limit(1), pytest.raises(OSError, match="File too large") as caught:
+        write(target, b"new") if write in (files.write_file, files.write_durably) else write(target)
+    assert files.describe_error(caught.value) == f"{target}: File too large"
+    assert left_in(tmp_path) == set()
+
+
+def test_a_full_folder_of_the_system_is_named(tmp_path, monkeypatch):
+    """The file that is written beside it is another one, and not to blame."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with file_size_limit(1), pytest.raises(OSError, match="File too large") as caught:  # noqa: SIM117
+        with files.new_file(tmp_path / "target"), files.temporary_folder("work-") as folder:
+            (folder / "source").write_text("text")
+    assert re.fullmatch(rf"{tmp_path}/work-\w+: File too large", files.describe_error(caught.value))
+    assert left_in(tmp_path) == set()
+
+
+@killed_by("runtime/files.py", "error.errno in DISK_ERRORS and", "")
+def test_an_error_that_is_not_of_the_disk_names_no_file(tmp_path):
+    with pytest.raises(OSError, match="refused") as caught, files.new_file(tmp_path / "target"):
+        raise ConnectionRefusedError(errno.ECONNREFUSED, "refused")
+    assert caught.value.filename is None

@@ -1,8 +1,10 @@
 """Running the command line in this process, for the tests of every command."""
 
+import contextlib
 import os
 import pathlib
 
+import pytest
 from typer.testing import CliRunner
 
 from diffabs.cli import main
@@ -31,3 +33,15 @@ def umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+@contextlib.contextmanager
+def file_size_limit(size: int):
+    """The system refuses to make a file longer than `size` [bytes], as a full disk does."""
+    resource = pytest.importorskip("resource", reason="the limit is of POSIX")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -16,13 +16,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from typing import NamedTuple
 
 import jax.ffi
 
 from diffabs.compiler.runtime.library_cache import cache_folder, find_library, make_cache_folder, write_library
-from diffabs.runtime import stopwatch
+from diffabs.runtime import files, stopwatch
 
 NATIVE_FOLDER = pathlib.Path(__file__).parents[1] / "native"
 COMPILER = "DIFFABS_KERNEL_COMPILER"  # environment variable: compiler command; empty means no compiler
@@ -70,8 +69,8 @@ def _probe_compiler(command: tuple[str, ...]) -> Compiler | str:
 
 def _check_loads(command: tuple[str, ...]) -> None:
     """Compile a library of one function and load it; raise NoCompiler or OSError if that fails."""
-    with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
-        source, library = pathlib.Path(folder) / "one.cpp", pathlib.Path(folder) / "one.so"
+    with files.temporary_folder("diffabs-") as folder:
+        source, library = folder / "one.cpp", folder / "one.so"
         # functions.h needs vector extensions and headers, so this line fails where a kernel would fail.
         source.write_text('#include "functions.h"\nextern "C" double one(double x) { return k_exp(all(x))[0]; }\n')
         _compile(command, source, library, PROBE_TIMEOUT_S)
@@ -120,8 +119,8 @@ def build_library(text: str, flags: tuple[str, ...] = ()) -> pathlib.Path:
         if path := find_library(digest, ".so"):
             return path
         # Compile inside the cache folder, which only this user can write to.
-        with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=make_cache_folder()) as own:
-            source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
+        with files.temporary_folder(f".{digest[:16]}-", make_cache_folder()) as own:
+            source, result = own / "kernel.cpp", own / "kernel.so"
             source.write_text(text)
             with stopwatch.count_as_compiling():
                 _compile(made.command, source, result, COMPILE_TIMEOUT_S, *given)
