@@ -28,7 +28,12 @@ ST_KEYWORDS_TEXT = (
     "namespace not of on or out overlap override pointer priority private program protected public read read_only "
     "read_write real ref ref_to repeat reset resource retain return rol ror shl shr sel sin single sint sqrt st "
     "step string struct super tan task then this time to transition true trunc type udint uint ulint until using "
-    "usint var while with word wstring write xor le ge gt eq ne add sub mul div r s n p l d sd ds sl"
+    "usint var while with word wstring write xor le ge gt eq ne add sub mul div r s n p l d sd ds sl "
+    "abstract and_then andn any_bit any_date any_derived any_elementary any_int any_magnitude any_num any_real "
+    "any_string cal calc calcn char class concat continue ctd ctu ctud date_and_time delete en eno extends f_edge "
+    "f_trig find final implements insert internal jmpc jmpcn ldate ldate_and_time ldn ldt left ltime_of_day ltod "
+    "non_retain null or_else orn r_edge r_trig replace retc retcn right round rs sr stn time_of_day tod tof ton tp "
+    "var_access var_config var_external var_global var_in_out var_input var_output var_temp wchar xorn"
 )
 ST_KEYWORDS = set(ST_KEYWORDS_TEXT.split())
 OWN = {"command", "held", "reset", "started", "i"}  # names that the block itself uses
@@ -49,7 +54,7 @@ def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()
     Raises:
         NotExported: The name is no identifier, an operation has no translation, or a constant is NaN.
     """
-    if not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in ST_KEYWORDS | OWN:
+    if not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name) or _is_reserved(name) or name.lower() in OWN:
         raise NotExported(f"{name!r} is no name that Structured Text has for a block: letters, digits and single _")
     with jax.enable_x64(True):
         try:
@@ -243,6 +248,12 @@ class _Block:
         return f"{before}_TO_{after}({arg})"
 
 
+def _is_reserved(name: str) -> bool:
+    """Return whether the language has another meaning for a name: a keyword, the end of one such as END_IF, or
+    a standard function or block."""
+    return name.lower() in ST_KEYWORDS or name.lower().startswith("end_")
+
+
 def _scientific(x: float) -> str:
     return np.format_float_scientific(x, trim="0", exp_digits=1).replace("e", "E")
 
@@ -250,7 +261,7 @@ def _scientific(x: float) -> str:
 def _fresh(path: str, taken: set[str]) -> str:
     """Return a new identifier for a path and add it to `taken`; identifiers ignore case, and `_table` is reserved."""
     name = re.sub(r"[\W_]+", "_", path, flags=re.ASCII).strip("_")
-    name = f"x_{name}".strip("_") if name.lower() in ST_KEYWORDS or not name[:1].isalpha() else name
+    name = f"x_{name}".strip("_") if _is_reserved(name) or not name[:1].isalpha() else name
     number, fresh = 2, name
     while taken & (both := {fresh.lower(), f"{fresh}_table".lower()}):
         number, fresh = number + 1, f"{name}_{number}"

@@ -281,6 +281,50 @@ def test_a_comment_ends_where_it_should(text, tmp_path):
     assert not re.search(r"[{}$]", written)
 
 
+# Of IEC 61131-3, table of keywords.
+ST_RESERVED = """
+ABSTRACT CONTINUE DATE_AND_TIME END_IF END_VAR EN ENO F_EDGE IMPLEMENTS LTOD NON_RETAIN R_EDGE TIME_OF_DAY TOD VAR_INPUT
+WCHAR"""
+# Of the headers that the C text includes, of compilers without -std=c99, and of the texts themselves.
+C_RESERVED = """
+NAN INFINITY HUGE_VAL FP_NAN EOF NULL BUFSIZ SEEK_SET INT64_MAX math_errhandling stdin errno linux unix asm typeof
+double exp isnan printf main s p held command reset started i first n0_ x_table
+"""
+
+
+@needs_cc
+@killed_by("compiler/emit/c99_words.py", "or C_MACRO.fullmatch(name)", "")
+@killed_by("export/structured_text.py", 'or name.lower().startswith("end_")', "")
+@pytest.mark.parametrize("standard", ["c99", "gnu17"])
+def test_names_that_a_language_has_taken_get_others(standard, tmp_path):
+    """Fields of a part, and entries of its memory, whose text could also end a comment."""
+    reserved = [*ST_RESERVED.split(), *C_RESERVED.split()]
+    memory = ("*/", "*)", 'a"b', "line\nbreak", "x" * 5000)
+    fields = {name: d.core.pytree.param(default=float(k), unit="1") for k, name in enumerate(reserved, 1)}
+
+    def start(self, signal):
+        return d.core.protocols.Memory({name: jnp.asarray(signal.measured.slip) for name in memory}, ())
+
+    def flow(self, t, kept, signal):
+        return jax.tree.map(jnp.zeros_like, kept.flow)
+
+    def output(self, t, kept, signal):
+        return sum(getattr(self, name) for name in fields) * signal.measured.slip + sum(kept.flow.values())
+
+    methods = {"start": start, "flow": flow, "output": output, "limits": lambda self: (-1e9, 1e9)}
+    part = type("Taken", (), {"__annotations__": dict.fromkeys(fields, float), **fields, **methods})
+    found = computer_program(rig(d.core.pytree.pytree(part)()))
+    (tmp_path / "a.c").write_text(c_source(found, "unit"))
+    subprocess.run(["cc", f"-std={standard}", "-DUNIT_MAIN", "-o", tmp_path / "a", tmp_path / "a.c", "-lm"], check=True)
+    said = subprocess.run([tmp_path / "a"], input="0.5\n", capture_output=True, text=True, check=True).stdout
+    command = 0.5 * sum(range(1, len(reserved) + 1)) + 0.5 * len(memory)
+    assert float(said) == pytest.approx(command, rel=1e-14)  # sums of a few ten numbers in another order
+    written = structured_text(found, "Unit")
+    assert Block(written)(slip=0.5) == pytest.approx(command, rel=1e-14)
+    declared = set(re.findall(r"^  (\w+) :", written, re.MULTILINE)) - {"reset", "command", "held", "started"}
+    assert not {name.lower() for name in declared} & set(ST_RESERVED.lower().split())
+
+
 @needs_cc
 def test_names_that_c_does_not_have_get_others(tmp_path):
     """Fields whose letters are not of ASCII, two of which would be called the same."""

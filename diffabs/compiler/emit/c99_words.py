@@ -18,9 +18,13 @@ FUNCTION = re.compile(r"(\w+)\{f\}")  # a function of the C library, in a templa
 C_KEYWORDS_TEXT = (
     "auto break case char const continue default do double else enum extern float for goto if inline int long "
     "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
-    "bool true false"
+    "bool true false "
+    "asm typeof linux unix "  # of compilers without -std=c99
+    "alignas alignof constexpr nullptr static_assert thread_local typeof_unqual"  # of C23
 )
 C_KEYWORDS = set(C_KEYWORDS_TEXT.split())
+# Macros of the headers that the texts include, which replace also a struct's field: NAN, EOF, INT64_MAX.
+C_MACRO = re.compile(r"[A-Z][A-Z0-9_]{2,}|L_tmpnam|math_errhandling|std(in|out|err)")
 C_FUNCTIONS = {name for row in OPERATIONS.values() for name in FUNCTION.findall(row.c99 or "")}
 TAKEN = {*C_FUNCTIONS, "s", "p", "in", "i", "m", "t", "h"}  # names that a variable must not hide
 
@@ -140,7 +144,7 @@ def identifier(path: str) -> str:
     """
     name = re.sub(r"\W+", "_", path, flags=re.ASCII).strip("_")
     name = f"x{name}" if name[:1].isdigit() else name
-    return f"{name}_" if name in C_KEYWORDS else name
+    return f"{name}_" if name in C_KEYWORDS or C_MACRO.fullmatch(name) else name
 
 
 def identifiers(paths: Iterable[str]) -> dict[str, str]:
