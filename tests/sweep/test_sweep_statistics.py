@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from mutants import killed_by
-from scipy import stats
+from scipy import optimize, stats
 from seams import replace_seam
 
 from diffabs.sweep.statistics import estimates, paired, sensitivity
@@ -81,9 +81,29 @@ class TestMoments:
         np.testing.assert_allclose(found, [1000, self.X.mean(), np.sum(d**2)], rtol=1e-12, atol=0)
         np.testing.assert_allclose(one.deviation().value, np.std(self.X, ddof=1), rtol=1e-12, atol=0)
 
-    def test_the_mean_has_the_interval_of_the_t_test(self):
-        theirs = stats.ttest_1samp(self.X, 0.0).confidence_interval(0.9)
-        np.testing.assert_allclose(ends(Moments.of(self.X).mean(confidence=0.9)), theirs, rtol=1e-12, atol=0)
+    def test_the_mean_of_a_symmetric_sample_has_the_interval_of_the_t_test(self):
+        x = np.concatenate([self.X, -self.X])
+        theirs = stats.ttest_1samp(x, 0.0).confidence_interval(0.9)
+        np.testing.assert_allclose(ends(Moments.of(x).mean(confidence=0.9)), theirs, rtol=1e-9, atol=0)
+
+    @killed_by("sweep/statistics/estimates.py", "skewness / (6 * n)", "skewness / (3 * n)")
+    @pytest.mark.parametrize("sign", [1, -1])
+    @pytest.mark.parametrize("n", [2, 3, 10, 1000])
+    def test_the_mean_has_the_wider_ends_of_the_t_test_and_of_hall(self, n, sign):
+        """Hall's ends are where his polynomial of (x - mu)/s, solved here by Brent's method, is Student's quantile."""
+        x = sign * np.random.default_rng(2).lognormal(size=n)
+        scale, skewness = x.std(ddof=1), stats.skew(x)
+        quantile = stats.t.ppf(0.95, n - 1) / math.sqrt(n)
+
+        def end(side):
+            def distance(t):
+                return t + skewness * t**2 / 3 + skewness**2 * t**3 / 27 + skewness / (6 * n) - side * quantile
+
+            return x.mean() - scale * optimize.brentq(distance, -100, 100, xtol=1e-14)
+
+        student = stats.ttest_1samp(x, 0.0).confidence_interval(0.9)
+        theirs = [min(student.low, end(1)), max(student.high, end(-1))]
+        np.testing.assert_allclose(ends(Moments.of(x).mean(confidence=0.9)), theirs, rtol=1e-9, atol=1e-12)
 
 
 class TestCount:
@@ -476,7 +496,8 @@ class TestSobol:
 
 class TestPaired:
     A = np.random.default_rng(19).gamma(4.0, size=150)
-    B = A + np.round(np.random.default_rng(20).normal(0.3, 0.5, size=150), 1)
+    NOISE = np.round(np.random.default_rng(20).normal(0.0, 0.5, size=75), 1)
+    B = A + (0.3 + np.concatenate([NOISE, -NOISE]))  # differences without skewness: the interval is Student's
 
     @killed_by("sweep/statistics/paired.py", "difference = one - other", "difference = other - one")
     def test_is_scipys_each_by_each(self):
@@ -506,10 +527,22 @@ def binormal(random, n, rho):
 
 
 class TestCoverage:
-    def test_mean(self):
-        random = np.random.default_rng(30)
-        found = coverage(lambda x: Moments.of(x).mean(), lambda: random.exponential(size=400), 1.0)
-        assert abs(found - 95) < 2
+    @pytest.mark.parametrize(
+        ("law", "n", "least", "greatest"),
+        [
+            (stats.lognorm(1.0), 30, 92, 96),  # Student's interval: 88
+            (stats.expon(), 10, 92.5, 96.5),  # 90
+            (stats.gamma(4), 10, 93, 97.5),
+            (stats.norm(), 30, 93, 97.5),
+            (stats.t(5), 30, 93, 97.5),  # Hall's interval alone: 93.1
+        ],
+        ids=["log-normal", "exponential", "gamma", "normal", "t5"],
+    )
+    def test_mean(self, law, n, least, greatest):
+        """Within three standard errors of what `experiments/mean_intervals.py` measures."""
+        samples = law.rvs(size=(REPETITIONS, n), random_state=np.random.default_rng(30))
+        found = coverage(lambda x: Moments.of(x).mean(), iter(samples).__next__, law.mean())
+        assert least < found < greatest
 
     @pytest.mark.parametrize("n", [50, 1000])
     @pytest.mark.parametrize("law", [stats.lognorm(1.0), stats.t(4)], ids=["log-normal", "t4"])

@@ -1,6 +1,6 @@
 """Estimates from one column of a sweep, each with a confidence interval.
 
-    mean            m -+ t s/sqrt(n)                                                   Student
+    mean            m - s g(t/sqrt(n)), m - s g(-t/sqrt(n)), not inside m -+ t s/sqrt(n)    Hall (1992), Student
     deviation       no interval, see below                                             Bahadur and Savage (1956)
     probability     Beta quantiles of k failures among n                               Clopper and Pearson (1934)
     quantile        x_(r), x_(s):  P(B < r) <= a/2,  P(B >= s) <= a/2,  B ~ Bin(n, p)  order statistics, any law
@@ -9,9 +9,21 @@
 The confidence is 1 - a. An end that the data cannot give is infinite. Columns are finite: diverged runs are counted and
 left out first.
 
-The interval of a mean is too narrow for a skewed law and few samples. For a log-normal law with deviation 1 of the
-logarithm, 95 % intervals of 10, 30 and 100 samples cover 84, 88 and 89 %. A studentised bootstrap covers 88 and 91 % of
-10 and 30 samples, with intervals half as long again. Where the samples are skewed, the summary says so.
+The mean of a skewed sample has Hall's interval, which removes the skewness k from the t statistic:
+
+    g(y) = 3 ((1 + k (y - k/(6 n)))^(1/3) - 1)/k
+
+Each end is the outer one of Hall's and Student's. So heavy symmetric tails do not lower the coverage. 95 % intervals of
+10, 30, 100 and 1,000 samples cover, in % (`experiments/mean_intervals.py`; the brackets have Student's intervals):
+
+- Log-normal law with deviation 1 of the logarithm: 91, 94, 95 and 96 (84, 88, 92 and 94).
+- Exponential law: 94, 96, 96 and 96 (90, 93, 94 and 95).
+- Log-normal law with deviation 0.5 of the logarithm, gamma law of shape 4, normal law, uniform law, and Student's law
+  with five degrees of freedom: 95 to 97 (93 to 95).
+
+For the first law and 10 samples the median length is 1.4 of Student's, for the exponential law 1.2, for the normal law
+1.06. A law with a longer tail has less: a log-normal law with deviation 1.5 has 86, 90, 93 and 95. Where the samples
+are clearly skewed, the summary says so.
 
 A standard deviation has no interval. Its error depends on the fourth moment of the law. A sample of a law with heavy
 tails does not show it. The coverage of 95 % intervals of 50, 1,000 and 10,000 samples was measured:
@@ -22,9 +34,9 @@ tails does not show it. The coverage of 95 % intervals of 50, 1,000 and 10,000 s
 
 The quantiles have intervals that hold for every law.
 
-Sources: R. R. Bahadur and L. J. Savage, The nonexistence of certain statistical procedures in nonparametric problems,
-Ann. Math. Stat. 27 (1956). R. T. Rockafellar and S. Uryasev, Optimization of conditional value-at-risk, J. Risk 2
-(2000).
+Sources: P. Hall, On the removal of skewness by transformation, J. R. Stat. Soc. B 54 (1992). R. R. Bahadur and L. J.
+Savage, The nonexistence of certain statistical procedures in nonparametric problems, Ann. Math. Stat. 27 (1956). R. T.
+Rockafellar and S. Uryasev, Optimization of conditional value-at-risk, J. Risk 2 (2000).
 """
 
 import dataclasses
@@ -41,6 +53,7 @@ BOOTSTRAP_REPLICATES = 999
 # Rounding: differences are multiples of 2^-ROUNDING_BITS of their largest, and not larger than this, relative to the
 # largest value, or to 1. Final errors near 0 are differences of numbers near 1.
 ROUNDING_BITS, LARGEST_ROUNDING = 12, 2.0**-30
+MIN_SKEWNESS = 1e-6  # below it Hall's transformation changes an end by less than its rounding, 1e-16/MIN_SKEWNESS
 MIN_TAIL_SAMPLES = 10  # samples in the tail from which CVaR's interval covers 92 to 95 %
 # Atoms of a resampled tail: the largest half are single samples, the others are means of neighbours.
 MAX_TAIL_ATOMS = 1024
@@ -141,17 +154,19 @@ def percentile_index(replicates: int, confidence: float) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Moments:
-    """Count, mean, and sum of squares of deviations from the mean.
+    """Count, mean, and sums of powers of deviations from the mean.
 
     Attributes:
         count: Number of samples.
         centre: Mean.
         second: Sum of squares of deviations from the mean.
+        third: Sum of cubes of deviations from the mean.
     """
 
     count: int
     centre: float
     second: float
+    third: float
 
     @classmethod
     def of(cls, values: PyTree) -> "Moments":
@@ -162,18 +177,21 @@ class Moments:
         """
         x = as_column(values, least=0)
         if not x.size:
-            return cls(0, 0.0, 0.0)
-        return cls(x.size, float(x.mean()), float(np.square(x - x.mean()).sum()))
+            return cls(0, 0.0, 0.0, 0.0)
+        d = x - x.mean()
+        return cls(x.size, float(x.mean()), float(np.square(d).sum()), float((d * d * d).sum()))
 
     def mean(self, *, confidence: float = 0.95) -> IntervalEstimate:
-        """Return the mean with Student's interval at this `confidence`.
+        """Return the mean with the hull of Hall's and Student's intervals at this `confidence`.
 
         Raises:
             ValueError: There are fewer than two samples.
         """
         n = self._check_count(2)
-        half = float(stats.t.ppf(upper_level(confidence), n - 1)) * math.sqrt(self.second / (n - 1) / n)
-        return IntervalEstimate(self.centre, self.centre - half, self.centre + half, confidence, n)
+        scale, y = math.sqrt(self.second / (n - 1)), float(stats.t.ppf(upper_level(confidence), n - 1)) / math.sqrt(n)
+        skewness = self.third / n / (self.second / n) ** 1.5 if self.second > 0 else 0.0
+        low, high = max(y, _unskewed(y, skewness, n)), min(-y, _unskewed(-y, skewness, n))
+        return IntervalEstimate(self.centre, self.centre - scale * low, self.centre - scale * high, confidence, n)
 
     def deviation(self, *, confidence: float = 0.95) -> IntervalEstimate:
         """Return the standard deviation with n - 1 in the denominator, between infinite ends at every `confidence`.
@@ -348,6 +366,13 @@ def summarise_column(
     found |= {f"quantile {level:g}": quantile(ordered, level, confidence=confidence) for level in levels}
     found[f"cvar {tail:g}"] = cvar(ordered, tail, confidence=confidence)
     return found
+
+
+def _unskewed(y: float, skewness: float, n: int) -> float:
+    """Return the t statistic over sqrt(n) at which Hall's polynomial of it is y."""
+    if abs(skewness) < MIN_SKEWNESS:
+        return y
+    return 3 * (math.cbrt(1 + skewness * (y - skewness / (6 * n))) - 1) / skewness
 
 
 def _tail_means(tail: np.ndarray, weights: np.ndarray, share: float, n: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Comparison of two variants on the same samples: their difference, and the gain from common samples.
 
-    mean(a - b)    t interval                median(a - b)    order statistics
+    mean(a - b)    hull of Hall and Student  median(a - b)    order statistics
     P(a < b)       Clopper-Pearson           reduction        (var a + var b)/var(a - b)
 
 The reduction is the gain from common random numbers. Independent samples would need this factor more for an equally
