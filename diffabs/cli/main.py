@@ -43,6 +43,7 @@ from diffabs.cli import (
     usage,
 )
 from diffabs.cli.checking import check_run_accuracy, describe_check, describe_loose_metrics
+from diffabs.core import jax_flags
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Key, Scalar
 from diffabs.objectives import at_limits
@@ -69,17 +70,8 @@ app = typer.Typer(
 
 AT_LIMIT = "at a limit\n"  # key among a run's objectives; the names in a scenario have no line break
 WARNED_LIMIT_SHARE = 0.5  # share of time at a limit, above which a run gets a warning
-# A command's own arithmetic, whatever the environment says for other programs. NaN is the value of a run that diverged,
-# and a loop without compilation is slower by orders of magnitude.
-JAX_FLAGS = {
-    "jax_numpy_dtype_promotion": "standard",
-    "jax_numpy_rank_promotion": "allow",
-    "jax_transfer_guard": "allow",
-    "jax_debug_nans": False,
-    "jax_debug_infs": False,
-    "jax_disable_jit": False,
-    "jax_enable_checks": False,
-}
+# A command's own arithmetic, whatever the environment says for other programs: without compilation it would take hours.
+JAX_FLAGS = {**jax_flags.DEFAULTS, "disable_jit": False, "enable_checks": False}
 MAX_CSV_ROWS = 20_000  # of a trajectory
 
 
@@ -112,7 +104,7 @@ def setup(
     compiled.use_compilation_cache()
     jax.config.update("jax_enable_x64", True)
     for flag, value in JAX_FLAGS.items():
-        jax.config.update(flag, value)
+        jax.config.update(f"jax_{flag}", value)
 
 
 def simulate(

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import Matrix
 from diffabs.design import instability, pairs
 from diffabs.design.bounds import BOUND_LOOSENINGS, Bounds, decrease_matrix
@@ -36,6 +37,7 @@ DECAY_TOLERANCE = 1e-3  # relative width at which the search for the fastest dec
 MAX_SEARCH_PROGRAMS = 20  # programs of the search for the fastest decay, at most
 
 
+@default_flags()
 def certify(
     gain: Matrix, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False
 ) -> Certificate:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.pytree import parameters, replace
 from diffabs.core.types import AnyArray, Matrix, Part, PyTree
 from diffabs.core.validity import check_part
@@ -50,6 +51,7 @@ class _SystemRows(NamedTuple):
         return a.reshape(-1, n, n), b.reshape(-1, n, m)
 
 
+@default_flags()
 def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9, most: int = 20_000) -> Polytope:
     """Return the polytope that covers `model` over a box {path: (low, high)}.
 

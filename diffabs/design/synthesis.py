@@ -22,6 +22,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.design.analysis import certify
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof.certificate import Certificate
@@ -71,6 +72,7 @@ class Design:
     residual: float | None
 
 
+@default_flags()
 def design(system: Polytope | Schedule, spec: Spec) -> Design:
     """Return the gain that minimises the bound of the cost (with Q, R), or else the L2 gain, under all specifications.
 

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from diffabs.core.bijectors import FreeSpace, HalfLine, Range, parameter_space
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary, round_for_table
@@ -140,6 +141,7 @@ class Identified:
         return self.table()._repr_html_()
 
 
+@default_flags()
 def fit(
     part: Part,
     free: Sequence[str] | Mapping[str, Range | None],

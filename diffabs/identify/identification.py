@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import jax
 
 from diffabs.core.bijectors import Range
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.types import Part, Table
@@ -25,6 +26,7 @@ from diffabs.simulate.stability import stable_steps
 from diffabs.simulate.types import Solver
 
 
+@default_flags()
 def identify(
     loop: Loop,
     data: Data,

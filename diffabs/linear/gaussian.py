@@ -15,6 +15,7 @@ from jax.core import Tracer
 
 from diffabs.controllers import ObserverFeedback, Sampled
 from diffabs.controllers.balance import MEASURED_NAMES, STATE_NAMES
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.types import AnyArray, Bool, Part
 from diffabs.linear.balance_model import BalanceModel
@@ -41,6 +42,7 @@ class Filter(NamedTuple):
     stabilising: Bool
 
 
+@default_flags()
 def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
     """Return the steady-state Kalman filter of x+ = A x + w, y = C x + v; NaN where no such filter exists.
 
@@ -68,6 +70,7 @@ def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
     return Filter(jnp.linalg.solve(spread, C @ found.P).T, found.P, found.stabilising)
 
 
+@default_flags()
 def lqg(
     plant: Plant,
     Q: AnyArray,

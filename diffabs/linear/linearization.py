@@ -17,6 +17,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import AnyArray, Bool, Matrix, PyTree, Scalar
@@ -40,6 +41,7 @@ class StateSpace(NamedTuple):
     B: AnyArray
 
 
+@default_flags()
 def linearize(plant: Plant, state: PyTree, control: Scalar) -> StateSpace:
     """Return df/dx (n, n) and df/du (n, m) of a plant x' = f(x, u), at a state and a control.
 

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import Matrix, PyTree
 
 MAX_SMITH_STEPS = 50  # C^(2^50) is 0 for a spectral radius of 1 - 1e-13, and not for a radius of 1
@@ -32,6 +33,7 @@ class Lyapunov(NamedTuple):
     residual: PyTree
 
 
+@default_flags()
 def lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
     """Return P of A' P + P A + Q = 0 and its relative residual.
 
@@ -51,6 +53,7 @@ def lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
     return Lyapunov(P, relative_residual(A.T @ P + P @ A + Q, A.T @ P, P @ A, Q))
 
 
+@default_flags()
 def discrete_lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
     """Return P of A' P A - P + Q = 0 and its relative residual.
 

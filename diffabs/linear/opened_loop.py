@@ -22,6 +22,7 @@ from jax.flatten_util import ravel_pytree
 from diffabs.actuators import Delay
 from diffabs.controllers import Sampled
 from diffabs.core.blocks import Direct, Series, offers
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import canonical_dtypes
@@ -93,6 +94,7 @@ def _check_halves(loop: OpenLoop) -> None:
         raise ValueError(f"controller: B has {controller.B.shape[1]} columns; the plant has {len(plant.C)} outputs")
 
 
+@default_flags()
 def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
     """Return a loop, linearised at rest on its setpoint and opened at the controller's command.
 

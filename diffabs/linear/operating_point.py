@@ -18,6 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from diffabs.core.blocks import Direct, NoFeedforward
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Feedforward, Memory, Plant, Reference, Tracking
 from diffabs.core.pytree import canonical_dtypes, part, pytree, static
@@ -98,6 +99,7 @@ class OperatingPoint:
         return _smooth_model(self).K[np.array(self.kept, int)]
 
 
+@default_flags()
 def operating_point(loop: Loop) -> OperatingPoint:
     """Return the linear model of a loop at rest on its setpoint, in continuous time.
 

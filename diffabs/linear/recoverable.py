@@ -18,6 +18,7 @@ Trans. Autom. Control 46, 2001.
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import AnyArray, PyTree, Scalar
 from diffabs.linear.riccati import care
 
@@ -25,6 +26,7 @@ UNIT_SWEEPS = 30  # over the states, for their units; enough where these differ 
 ROUNDING = 1e-12  # products below this, relative to the norms of their factors, are rounding
 
 
+@default_flags()
 def recoverable_bound(A: AnyArray, B: AnyArray, start: PyTree, limit: Scalar) -> AnyArray:
     """Return the largest multiple of `start` from which some |u| <= limit returns, for a system with one unstable pole.
 

@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import Tracer
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import AnyArray, Bool, Matrix, PyTree
 from diffabs.linear.riccati import care, dare, symmetric_part
 from diffabs.linear.stabilisability import unstabilisable_mode
@@ -37,6 +38,7 @@ class Regulator(NamedTuple):
     stabilising: Bool
 
 
+@default_flags()
 def lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Regulator:
     """Return the regulator that minimises the integral of x'Q x + 2 x'S u + u'R u for x' = A x + B u.
 
@@ -63,6 +65,7 @@ def lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None =
     return _solve_lqr(A, B, Q, R, S)
 
 
+@default_flags()
 def dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Regulator:
     """Return the regulator that minimises the sum of x'Q x + 2 x'S u + u'R u for x(k+1) = A x(k) + B u(k).
 

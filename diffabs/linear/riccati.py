@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import AnyArray, Bool, Matrix, PyTree
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.lyapunov import discrete_lyapunov as _discrete_lyapunov
@@ -58,6 +59,7 @@ class Riccati(NamedTuple):
     stabilising: Bool
 
 
+@default_flags()
 def care(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Riccati:
     """Return the stabilising solution P of the continuous Riccati equation, with its proof.
 
@@ -79,6 +81,7 @@ def care(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
     return _riccati(_solve_continuous, A, B, Q, R, S)
 
 
+@default_flags()
 def dare(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Riccati:
     """Return the stabilising solution P of the discrete Riccati equation, with its proof.
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
 from diffabs.core.types import Scalar
@@ -70,6 +71,7 @@ class Band(NamedTuple):
         return {name: max(self.systems, key=lambda one, bad=bad: bad(one.margins)) for name, bad in BADNESS.items()}
 
 
+@default_flags()
 def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, target: Scalar = None) -> Band:
     """Return the margins of a loop over a box {path: (low, high)}: at its corners, and at samples that fill it evenly.
 

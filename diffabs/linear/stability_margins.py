@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import Matrix, Scalar
 from diffabs.linear.delay_steps import LEAST_DISTANCE, REACHING, DelayedLoop
 from diffabs.linear.opened_loop import OpenLoop
@@ -99,6 +100,7 @@ class Crossovers(NamedTuple):
     factors: np.ndarray
 
 
+@default_flags()
 def margins(loop: OpenLoop | Transfer) -> Margins:
     """Return the margins of an open loop.
 

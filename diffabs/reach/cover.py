@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.types import PyTree
 from diffabs.reach.engine import FAILURES, CellBounds, Prover
@@ -80,6 +81,7 @@ class BoxProof(NamedTuple):
     tail: RunTail | None
 
 
+@default_flags()
 def prove_box(
     loop: Loop,
     over: Mapping[str, tuple[float, float]],

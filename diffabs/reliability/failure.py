@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import Params, PyTree, Scalar, Table
 from diffabs.core.units import resolve_unit, units_of
 from diffabs.reliability.importance_sampling import DESIGN_POINT_STARTS, Gradient
@@ -43,6 +44,7 @@ DIFFERENCE_STEP = 1e-4  # step in z: relative errors of 1e-9 (truncation) and 1e
 _Level = TypeVar("_Level", SubsetLevel, SubsetProgress)
 
 
+@default_flags()
 def failure_probability(
     study: Study,
     metric: str,

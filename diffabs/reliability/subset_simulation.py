@@ -36,6 +36,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.types import PyTree
 from diffabs.reliability.importance_sampling import (
@@ -152,6 +153,7 @@ class RareEvent:
         return self.evaluations + self.price * self.gradients
 
 
+@default_flags()
 def subset_simulation(
     score: Score,
     dimension: int,

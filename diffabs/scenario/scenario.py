@@ -33,6 +33,7 @@ from diffabs.config.values import (
     unknown_name_error,
     wrong_kind_error,
 )
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import get
@@ -135,6 +136,7 @@ def read_header(name_or_path: str | pathlib.Path) -> dict[str, str]:
     return {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
 
 
+@default_flags()
 def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, integrated: bool = True) -> Scenario:
     """Return the scenario in a TOML file, or a packaged scenario, with overrides such as `controller.kp=4000`.
 
@@ -153,6 +155,7 @@ def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, int
     return loads(raw, name, str(name_or_path), overrides, folder=folder, integrated=integrated)
 
 
+@default_flags()
 def loads(
     raw: bytes,
     name: str,

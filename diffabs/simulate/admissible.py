@@ -21,6 +21,7 @@ from jax.core import Tracer
 from diffabs.core import kinds
 from diffabs.core.arrays import as_array
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once, is_traced
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.rules import Rule
@@ -62,6 +63,7 @@ class Admissibility(NamedTuple):
         return int(np.count_nonzero(self.codes))
 
 
+@default_flags()
 def check(part: T, solver: Solver | None = None) -> T:
     """Return the part itself if its parameters are in their ranges and, with a solver, if the loop may be run.
 

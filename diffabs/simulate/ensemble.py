@@ -12,6 +12,7 @@ import numpy as np
 
 from diffabs.core import kinds
 from diffabs.core.compiling import is_traced
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import get, replace
@@ -32,6 +33,7 @@ TOGETHER_REASON = "lanes run together, for trajectories or for derivatives in ei
 TRACED_REASON = "the call is traced (jit, grad, vmap)"
 
 
+@default_flags()
 def run_batch(
     loop: Loop,
     batch: Batch,

@@ -16,6 +16,7 @@ import numpy as np
 
 from diffabs.core import kinds
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once, is_traced
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import void_derivatives
 from diffabs.core.protocols import Objective
@@ -41,6 +42,7 @@ from diffabs.simulate.step.status import end_unfinished
 from diffabs.simulate.types import Adaptive, Run, Solver, Trajectory
 
 
+@default_flags()
 def rollout(
     loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | None = None, *, key: Key | None = None
 ) -> Run:
@@ -79,6 +81,7 @@ def rollout(
     return run_unchecked(loop, solver, objectives, key, solver.every)
 
 
+@default_flags()
 def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Key | None = None) -> Run:
     """Run a loop and return a `Run` with metrics only: memory does not grow with the number of steps.
 

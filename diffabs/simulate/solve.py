@@ -36,6 +36,7 @@ from jax.typing import DTypeLike
 from diffabs.core import kinds
 from diffabs.core.compiling import is_traced
 from diffabs.core.cubic import Cubic
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.lanes import any_lane, select
 from diffabs.core.loop import LoopState, Margins, Signals
 from diffabs.core.numerics import invalidate
@@ -509,6 +510,7 @@ class Saves:
         return memory.held
 
 
+@default_flags()
 def solve(
     field: Field,
     y0: PyTree,
@@ -591,6 +593,7 @@ def solve(
     return run_differentiable(capacity, run)
 
 
+@default_flags()
 def switches(
     field: Field, t: Scalar, y: PyTree, args: PyTree = None, *, t1: Scalar = None, solver: Adaptive = SWITCH_SOLVER
 ) -> list[Switch]:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Ending, Sample
 from diffabs.core.types import AnyArray, Bool, Int, Part, PyTree, Scalar
 from diffabs.simulate import convert
@@ -184,6 +185,7 @@ class Run(NamedTuple):
     fault: Int | None = None
 
     @property
+    @default_flags()
     def slid(self) -> Bool:
         """True if the run slides along a switching surface, because the flows of both sides push onto it.
 

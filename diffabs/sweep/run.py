@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.kinds import format_value
 from diffabs.core.loop import Loop
 from diffabs.core.types import Table
@@ -57,6 +58,7 @@ class SweepProgress(NamedTuple):
         return self.here / self.seconds if self.seconds > 0 else 0.0
 
 
+@default_flags()
 def sweep(
     study: Study,
     out: str | pathlib.Path,

@@ -21,6 +21,7 @@ import jax
 import numpy as np
 
 from diffabs.compiler.runtime.toolchain import NoCompiler
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Objective
 from diffabs.core.types import Bool, Int, JsonObject, Params, Part, PyTree
 from diffabs.runtime.process import default_devices, default_platform
@@ -78,6 +79,7 @@ class Runner:
         drawn = {path: np.concatenate([row[path] for row in rows]) for path in rows[0]}
         return self._run_drawn([{"sample": np.asarray(samples), **drawn}])[0]
 
+    @default_flags()
     def _run_drawn(self, drawn: list[Columns]) -> list[Columns]:
         """Return the columns of chunks, from their samples and drawn values."""
         for columns in drawn:
@@ -114,6 +116,7 @@ class Runner:
                     found.setdefault(kind, []).append(block)
         return found
 
+    @default_flags()
     def _run_on_device(self, loop: Part, block: _Block, device: Any) -> Columns:
         with jax.default_device(device):
             asked = batch_admissibility(loop, block.values, self.study.solver)

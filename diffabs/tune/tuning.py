@@ -7,6 +7,7 @@ import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.kinds import find_value_objection, format_value, value_shape
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
@@ -28,6 +29,7 @@ from diffabs.tune.result import Tuned, TuningProgress, build_subject_loop
 from diffabs.tune.risk import Aggregate, Mean
 
 
+@default_flags()
 def tune(
     problem: Problem,
     *,
@@ -66,6 +68,7 @@ def tune(
     return found
 
 
+@default_flags()
 def build_problem(
     subject: Part,
     *,

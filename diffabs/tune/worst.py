@@ -26,6 +26,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.kinds import format_value
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
@@ -131,6 +132,7 @@ class WorstCase:
         return f"Gradients found it from {first} ({worst})."
 
 
+@default_flags()
 def worst_case(
     loop: Part,
     *,

@@ -37,6 +37,7 @@ from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 from jax.sharding import NamedSharding, PartitionSpec
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import PyTree
 from diffabs.runtime.process import default_platform
 from diffabs.simulate.drive.engine import EngineError, check_process, describe_engine, is_forked
@@ -360,6 +361,7 @@ def _placement_objection(platforms: Sequence[str], devices: int) -> str:
     return ""
 
 
+@default_flags()
 def _lower(context: Any, *operands: Any, **named: Any) -> Any:
     """Return the operations of a call: of its kernel, or of XLA's program."""
     call = _Call(**named)
@@ -381,6 +383,7 @@ def _compile_call(call: _Call) -> Callable[..., list[PyTree]]:
     return jax.jit(call.bind)
 
 
+@default_flags()
 def _evaluate(*arrays: PyTree, **named: Any) -> list[PyTree]:
     """Return the results of an eager call, compiled; under `jax.disable_jit` by XLA's single operations."""
     call = _Call(**named)
@@ -388,6 +391,7 @@ def _evaluate(*arrays: PyTree, **named: Any) -> list[PyTree]:
     return function(*arrays)
 
 
+@default_flags()
 def _add_level(
     arrays: Sequence[PyTree], axes: Sequence[int | None], **named: Any
 ) -> tuple[list[PyTree], list[int | None]]:
@@ -400,6 +404,7 @@ def _add_level(
     return results, [0 if call.moves_runs(mapped) else None] * len(values) + [0] * len(rates)
 
 
+@default_flags()
 def _differentiate(primals: Leaves, tangents: Leaves, **named: Any) -> tuple[PyTree, PyTree]:
     """Return values and tangents of `run`, by one call of `run_derivative`."""
     call = _Call(**named)
@@ -414,6 +419,7 @@ def _differentiate(primals: Leaves, tangents: Leaves, **named: Any) -> tuple[PyT
     return values, [next(real_rates) if _is_real(x) else _zero(x) for x in values]
 
 
+@default_flags()
 def _differentiate_twice(primals: Leaves, tangents: Leaves, **named: Any) -> tuple[PyTree, PyTree]:
     """Return results and tangents of `run_derivative`, by XLA."""
     call = _Call(**named)
@@ -429,6 +435,7 @@ def _zero(x: PyTree) -> ad.Zero:
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
+@default_flags()
 def _linearize(trace: Any, *tracers: Any, **named: Any) -> Sequence[Any]:
     """Return the results of `run_derivative` for known leaves and unknown tangents: known values and linear tangents.
 
@@ -449,6 +456,7 @@ def _linearize(trace: Any, *tracers: Any, **named: Any) -> Sequence[Any]:
     return [trace.to_jaxpr_tracer(x) for x in (*values, *rates)]
 
 
+@default_flags()
 def _split_for_checkpoint(
     saveable: Any, unknown: Sequence[bool], staged: Sequence[bool], equation: Any
 ) -> tuple[Any, Any, list[bool], list[bool], list[Any]]:
@@ -540,6 +548,7 @@ def _multiply(call: _Call, jacobian: list[PyTree], tangents: Leaves) -> list[PyT
     return function(jacobian, list(tangents))
 
 
+@default_flags()
 def _transpose(cotangents: Sequence[PyTree], *arguments: PyTree, **named: Any) -> list[PyTree]:
     """Return the cotangents of the tangents of a `run_derivative` that JAX has staged as it is."""
     call = _Call(**named)

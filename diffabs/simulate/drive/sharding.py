@@ -18,6 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding
 
+from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import Array, PyTree, Scalar
 from diffabs.runtime.process import core_count, default_platform
 
@@ -66,7 +67,7 @@ def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, co
     device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
     def run_share(numbers: np.ndarray) -> PyTree:
-        with jax.enable_x64(wide), jax.default_device(device):
+        with default_flags(), jax.enable_x64(wide), jax.default_device(device):
             mine = jax.tree.map(lambda x: x[numbers], columns)
             return jax.block_until_ready(run(mine, jnp.asarray(numbers)))
 
