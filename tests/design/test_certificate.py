@@ -9,6 +9,7 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+import warnings
 from fractions import Fraction
 
 import checker
@@ -911,3 +912,33 @@ def test_a_vertex_that_does_not_exist_is_refused():
     for vertex in (1.0, 0.5, -1.0):
         with pytest.raises(ValueError, match=r"^unstable.vertex must be one of 0 to 0; got "):
             Certificate(scalar(1.0), [[0.0]], (Claim("unstable", {"P": [[-1.0]], "x": [1.0], "vertex": vertex}),))
+
+
+def is_stable(loop, *, discrete):
+    """Of a 2 x 2 matrix of fractions: the conditions of Routh and of Jury, without rounding."""
+    trace = loop[0][0] + loop[1][1]
+    determinant = loop[0][0] * loop[1][1] - loop[0][1] * loop[1][0]
+    return abs(determinant) < 1 and abs(trace) < 1 + determinant if discrete else trace < 0 < determinant
+
+
+@killed_by("design/sdp/scaling.py", 'warnings.simplefilter("ignore", RuntimeWarning)', "pass")
+@pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
+def test_ill_conditioned_loops_are_right_or_undecided(discrete):
+    """Of condition 1e12, with gains that nearly cancel, in units far apart, and down to 1e-12 from the edge."""
+    draw, verdicts = np.random.default_rng(3), []
+    for case in range(24):
+        one, other = (np.linalg.qr(draw.normal(size=(2, 2)))[0] for _ in range(2))
+        change = one @ np.diag([1.0, 10.0 ** draw.choice([2, 12])]) @ other
+        margin = draw.choice([-1, 1]) * draw.choice([0.3, 1e-3, 1e-6, 1e-12])
+        modes = [1 + margin, draw.uniform(-0.9, 0.9)] if discrete else [margin, -np.exp(draw.uniform(-6, 6))]
+        b, k = draw.normal(size=(2, 1)), np.zeros((1, 2))
+        if case % 3:
+            b, k = (x * 10.0 ** draw.uniform(-6, 6, x.shape) for x in (b, draw.normal(size=(1, 2))))
+        a = change @ np.diag(modes) @ np.linalg.inv(change) - b @ k
+        loop = [[Fraction(a[i, j]) + Fraction(b[i, 0]) * Fraction(k[0, j]) for j in range(2)] for i in range(2)]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            found = certify(k, Polytope([a], [b], period=0.01 if discrete else None))
+        verdicts.append((found.quadratically_stable, is_stable(loop, discrete=discrete)))
+    assert all(found in (None, right) for found, right in verdicts)
+    assert {found for found, _ in verdicts} > {None}

@@ -7,6 +7,7 @@ gain as optimal. The coordinates of a Riccati solution P = T^-T T^-1 (or a Lyapu
 unit matrix. The weights of the input and, with tau, the closed loop are then near it too.
 """
 
+import warnings
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -176,10 +177,33 @@ def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | N
         discrete: Whether the system is in discrete time.
         weight: Cost rate on the right side of the Lyapunov equations, shape (n, n); None for the unit matrix.
     """
-    from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
+    from scipy.linalg import matrix_balance
+
+    units = matrix_balance(np.abs(closed).mean(axis=0), permute=False, separate=True)[1][0]
+    try:
+        p = _mean_lyapunov_solution(closed, units, discrete=discrete, weight=weight)
+        return lyapunov_frame(p, closed, np.eye(1), discrete=discrete)
+    except np.linalg.LinAlgError:  # a mode on the edge of stability, or a weight that is blind to a state
+        return lyapunov_frame(np.diag(units**-2.0), closed, np.eye(1), discrete=discrete)
+
+
+def _mean_lyapunov_solution(
+    closed: np.ndarray, units: np.ndarray, *, discrete: bool, weight: np.ndarray | None
+) -> np.ndarray:
+    """Return the mean of the Lyapunov solutions of closed loops, each shifted until it is stable.
+
+    Args:
+        closed: Closed loops, shape (V, n, n).
+        units: Units of the states in which the equations are solved, shape (n,).
+        discrete: Whether the system is in discrete time.
+        weight: As in `analysis_frame`.
+
+    Raises:
+        LinAlgError: An equation is singular in floating point.
+    """
+    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
     n = closed.shape[1]
-    units = matrix_balance(np.abs(closed).mean(axis=0), permute=False, separate=True)[1][0]
     mean = np.zeros((n, n))
     for a in closed:
         modes = np.linalg.eigvals(a)
@@ -192,10 +216,10 @@ def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | N
             a = a - (max(0.0, 1.02 * modes.real.max()) + 1e-6 * size) * np.eye(n)
         a = a * units / units[:, None]
         q = np.eye(n) if weight is None else weight * units * units[:, None]
-        p = solve_discrete_lyapunov(a.T, q) if discrete else solve_continuous_lyapunov(a.T, -q)
+        with warnings.catch_warnings():
+            # The solution is only a choice of coordinates, and an inaccurate one is as good.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            p = solve_discrete_lyapunov(a.T, q) if discrete else solve_continuous_lyapunov(a.T, -q)
         # Without a weight all solutions count equally: each is divided by its trace.
         mean += p / units / units[:, None] / (np.trace(p) if weight is None else len(closed))
-    try:
-        return lyapunov_frame(mean, closed, np.eye(1), discrete=discrete)
-    except np.linalg.LinAlgError:  # a mode on the edge of stability, or a weight that is blind to a state
-        return lyapunov_frame(np.diag(units**-2.0), closed, np.eye(1), discrete=discrete)
+    return mean
