@@ -40,6 +40,7 @@ from diffabs.simulate.ensemble import run_batch
 from diffabs.sweep.study import Study, noise_key, precision
 
 DIFFERENCE_STEP = 1e-4  # step in z: relative errors of 1e-9 (truncation) and 1e-12 (rounding)
+MAX_BATCH = 1 << 17  # runs; their states and programs' temporaries are in memory at a time
 
 _Level = TypeVar("_Level", SubsetLevel, SubsetProgress)
 
@@ -154,7 +155,10 @@ def _cast_arguments(study: Study, metric: str, values: Params) -> PyTree:
 
 
 def _run_scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
-    """Return the metric at z (n, dimension), NaN where the run diverges."""
+    """Return the metric at z (n, dimension), NaN where the run diverges; MAX_BATCH runs are made at a time."""
+    if len(z) > MAX_BATCH:
+        parts = np.split(z, range(MAX_BATCH, len(z), MAX_BATCH))
+        return np.concatenate([_run_scores(study, metric, part) for part in parts])
     # Padding to a power of two keeps the number of batch shapes, and so of compilations, small.
     values = study.space.normal(_pad_with_last(z, 1 << (len(z) - 1).bit_length()))
     _check_runnable(study, values, len(z))

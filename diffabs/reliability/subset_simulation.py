@@ -53,6 +53,7 @@ from diffabs.sweep.statistics.estimates import Count
 
 TARGET_ACCEPTANCE, FIRST_SPREAD = 0.44, 0.6  # acceptance aimed at, and s of the first step: Papaioannou et al.
 MAX_FAILING_POINTS = 100  # greatest number of failures in a result
+MAX_LEVEL_NUMBERS = 50_000_000  # coordinates of all samples of a level; a few arrays of this size are in memory
 Rng = np.random.Generator
 
 
@@ -261,6 +262,10 @@ def _make_plan(dimension: int, threshold: float, samples: int, share: float, lev
     for name, value, least in (("dimension", dimension, 1), ("samples", samples, 4), ("levels", levels, 1)):
         _check_integer(name, value, least)
     _check_integer("draws", draws, 0)
+    most = MAX_LEVEL_NUMBERS // dimension
+    for name, value in (("samples", samples), ("draws", draws)):
+        if value > most:
+            raise ValueError(f"{name} = {value} need too much memory: at most {most} with {dimension} coordinates")
     check_number("threshold", threshold)
     check_number("share", share)
     chains = round(samples * share)

@@ -472,6 +472,8 @@ class TestErrors:
             ({"threshold": "0.9"}, r"threshold = '0.9' is text; a number in \(-inf, inf\) is needed"),
             ({"threshold": [1.0, 2.0]}, r"threshold = \[1.0, 2.0\] is no single number"),
             ({"samples": 2800.0}, r"samples = 2800.0 is no integer; an integer in \[4, inf\) is needed"),
+            ({"samples": 10**9}, "samples = 1000000000 need too much memory: at most 25000000 with 2 coordinates"),
+            ({"draws": 10**9}, "draws = 1000000000 need too much memory"),
             ({"share": np.nan}, r"share = nan is outside"),
             ({"samples": 10}, "at least 2 that divides samples, not 10\\*0.1"),
             ({"samples": 2805}, "integer of at least 2 that divides samples, not 2805\\*0.1"),
