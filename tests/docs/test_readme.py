@@ -184,15 +184,6 @@ def test_commands_exist(command, tmp_path, monkeypatch):
     assert CliRunner().invoke(app, command.split()).exit_code == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("command", "said"), re.findall(r"^```console\n\$ diffabs (.*?)\n(.*?)^```$", COMMANDS, re.MULTILINE | re.DOTALL)
-)
-def test_a_command_prints_what_its_section_shows(command, said):
-    result = CliRunner().invoke(app, command.split(), env={"COLUMNS": "100"})
-    assert result.stdout.strip() == said.strip()
-
-
 def test_the_promised_message():
     result = CliRunner().invoke(app, ["simulate", "slip-lmi", "--set", "plant.mass=-1"])
     assert result.exit_code == 2

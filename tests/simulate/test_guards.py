@@ -1,10 +1,13 @@
 """Fields that end at a surface with rate 0, behind a guard: a tank that runs empty."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from mutants import killed_by
+from project import ROOT
 from scipy.optimize import brentq
 
 import diffabs as d
@@ -75,3 +78,55 @@ def test_a_level_that_may_fall_on_is_reported():
     found = jax.vmap(solve(lambda t, h, rate: -rate * jnp.sqrt(jnp.abs(h))))(RATES)
     assert found.status.tolist() == [SolutionStatus.FINISHED, SolutionStatus.GRAZED, SolutionStatus.GRAZED]
     assert np.isnan(found.y).tolist() == [False, True, True]
+
+
+# The rows of the table of guards in docs/fields.md: fields, steps, statuses beyond the end, whether there is a value, and
+# whether a derivative; None is either.
+FIXED = d.FixedStep(1e-3)
+TABLE = {
+    "the double `where` above": ([guarded], SOLVER, {"FINISHED"}, (True, True)),
+    "`jnp.sqrt(jnp.maximum(h, 0.0))`, or one `where` around `jnp.sqrt(h)`": (
+        [GUARDS["max"], GUARDS["where"]],
+        SOLVER,
+        {"FINISHED"},
+        (True, None),
+    ),
+    "`jnp.sqrt(jnp.abs(h))`, also times `jnp.sign(h)`": (
+        [
+            lambda t, h, rate: -rate * jnp.sqrt(jnp.abs(h)),
+            lambda t, h, rate: -rate * jnp.sign(h) * jnp.sqrt(jnp.abs(h)),
+        ],
+        SOLVER,
+        {"GRAZED"},
+        (False, False),
+    ),
+    "none": ([lambda t, h, rate: -rate * jnp.sqrt(h)], SOLVER, {"DIVERGED"}, (False, False)),
+    "any, with fixed steps": (list(GUARDS.values()), FIXED, {"SLID"}, (False, False)),
+    "any, with an outflow that goes on at 0": (
+        [lambda t, h, rate, guard=guard: guard(t, h, rate) - 0.1 for guard in GUARDS.values()],
+        SOLVER,
+        {"DIVERGED", "GRAZED", "SLID"},
+        (False, False),
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", TABLE, ids=["double", "single", "abs", "none", "fixed", "outflow"])
+def test_a_row_of_the_table_of_guards(row):
+    page = (ROOT / "docs" / "fields.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| guard \| result \|\n.*?\n\n", page, re.MULTILINE | re.DOTALL)[0].splitlines()[2:]
+    assert {line.split(" | ")[0].removeprefix("| ") for line in rows if line} == TABLE.keys()
+    fields, solver, statuses, finite = TABLE[row]
+    for field in fields:
+
+        def level(rate, field=field):
+            found = d.solve(field, 1.0, 0.0, END, rate, solver=solver, engine="xla")
+            return found.y, (found.y, found.status)
+
+        slope, (value, status) = jax.jit(jax.grad(level, has_aux=True))(1.3)
+        assert SolutionStatus(int(status)).name in statuses
+        for number, needed in zip((value, slope), finite, strict=True):  # both are 0 in the empty tank
+            assert needed is None or bool(jnp.isfinite(number)) == needed
+            if jnp.isfinite(number):
+                np.testing.assert_allclose(number, 0.0, atol=1e-6)

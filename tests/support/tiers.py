@@ -54,6 +54,7 @@ def jobs_of_tier(tier: str, today: datetime.date) -> list[Job]:
         "fast": [Job("fast tests", (*PYTEST, "-m", "not slow"))],
         "nightly": [
             slow_tests("a twentieth of the slow tests", day % SLOW_NIGHTS, SLOW_NIGHTS),
+            Job("outputs of the commands", ("-m", "pytest", "-n", "0", "tests/docs/test_commands_page.py")),
             Job("a notebook", ("-m", "pytest", "-n", "0", "tests/docs/test_notebook.py")),
             Job("the engine's tests, users' flags", (*PYTEST, "-m", "not slow", *ENGINE), USERS_FLAGS),
             Job("a seventh of the mutants", (mutants, "--part", f"{day % MUTANT_NIGHTS}/{MUTANT_NIGHTS}")),

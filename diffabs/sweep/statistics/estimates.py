@@ -53,7 +53,7 @@ BOOTSTRAP_REPLICATES = 999
 # Rounding: differences are multiples of 2^-ROUNDING_BITS of their largest, and not larger than this, relative to the
 # largest value, or to 1. Final errors near 0 are differences of numbers near 1.
 ROUNDING_BITS, LARGEST_ROUNDING = 12, 2.0**-30
-MIN_SKEWNESS = 1e-6  # below it Hall's transformation changes an end by less than its rounding, 1e-16/MIN_SKEWNESS
+MIN_SKEWNESS = 1e-6  # below it Hall's correction is less than 1e-6 of the interval
 MIN_TAIL_SAMPLES = 10  # samples in the tail from which CVaR's interval covers 92 to 95 %
 # Atoms of a resampled tail: the largest half are single samples, the others are means of neighbours.
 MAX_TAIL_ATOMS = 1024
@@ -190,7 +190,7 @@ class Moments:
         n = self._check_count(2)
         scale, y = math.sqrt(self.second / (n - 1)), float(stats.t.ppf(upper_level(confidence), n - 1)) / math.sqrt(n)
         skewness = self.third / n / (self.second / n) ** 1.5 if self.second > 0 else 0.0
-        low, high = max(y, _unskewed(y, skewness, n)), min(-y, _unskewed(-y, skewness, n))
+        low, high = max(y, _invert_hall(y, skewness, n)), min(-y, _invert_hall(-y, skewness, n))
         return IntervalEstimate(self.centre, self.centre - scale * low, self.centre - scale * high, confidence, n)
 
     def deviation(self, *, confidence: float = 0.95) -> IntervalEstimate:
@@ -368,7 +368,7 @@ def summarise_column(
     return found
 
 
-def _unskewed(y: float, skewness: float, n: int) -> float:
+def _invert_hall(y: float, skewness: float, n: int) -> float:
     """Return the t statistic over sqrt(n) at which Hall's polynomial of it is y."""
     if abs(skewness) < MIN_SKEWNESS:
         return y
