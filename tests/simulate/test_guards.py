@@ -80,8 +80,8 @@ def test_a_level_that_may_fall_on_is_reported():
     assert np.isnan(found.y).tolist() == [False, True, True]
 
 
-# The rows of the table of guards in docs/fields.md: fields, steps, statuses beyond the end, whether there is a value, and
-# whether a derivative; None is either.
+# The rows of the table of guards in docs/fields.md: fields, steps, statuses beyond the end, whether there is a value,
+# and whether a derivative; None is either.
 FIXED = d.FixedStep(1e-3)
 TABLE = {
     "the double `where` above": ([guarded], SOLVER, {"FINISHED"}, (True, True)),
