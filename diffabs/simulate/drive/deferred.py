@@ -165,44 +165,44 @@ class _Call(NamedTuple):
     Attributes:
         deferred: The run.
         levels: Levels of vmap.
-        moving: Numbers of the leaves that have a tangent, in the order of the tangents, which follow the leaves among
-            the arguments; None for `run`.
+        tangent_leaves: Numbers of the leaves that have a tangent, in the order of the tangents, which follow the
+            leaves among the arguments; None for `run`.
     """
 
     deferred: DeferredRun
     levels: Levels
-    moving: tuple[int, ...] | None = None
+    tangent_leaves: tuple[int, ...] | None = None
 
     def bind(self, *arrays: PyTree) -> list[PyTree]:
         """Bind the primitive of this call."""
         named = {"deferred": self.deferred, "levels": self.levels}
-        if self.moving is None:
+        if self.tangent_leaves is None:
             return run_primitive.bind(*arrays, **named)
-        return derivative_primitive.bind(*arrays, **named, moving=self.moving)
+        return derivative_primitive.bind(*arrays, **named, tangent_leaves=self.tangent_leaves)
 
     @property
-    def inputs(self) -> int:
+    def leaf_count(self) -> int:
         """Number of leaves."""
         return len(self.deferred.key_kinds)
 
-    def moves_runs(self, level: tuple[bool, ...]) -> bool:
+    def has_own_runs(self, level: tuple[bool, ...]) -> bool:
         """Return whether runs differ in this level; else only tangents do, and it adds directions."""
-        return any(level[: self.inputs])
+        return any(level[: self.leaf_count])
 
-    def by(self, run: Function) -> Function:
-        """Return the primitive as a function of its arguments, with `run` as the function of the leaves of one run."""
+    def vectorize(self, run: Function) -> Function:
+        """Return `run`, a function of the leaves of one run, as a function of the arguments of the primitive."""
 
         def derivative(*arrays: PyTree) -> tuple[list[PyTree], list[PyTree]]:
-            leaves, tangents = arrays[: self.inputs], arrays[self.inputs :]
-            if self.moving is None:
+            leaves, tangents = arrays[: self.leaf_count], arrays[self.leaf_count :]
+            if self.tangent_leaves is None:
                 return run(*leaves), []
-            values, rates = _push_forward(run, leaves, self.moving, tangents)
+            values, rates = _push_forward(run, leaves, self.tangent_leaves, tangents)
             return values, [rate for value, rate in zip(values, rates, strict=True) if _is_real(value)]
 
         function = derivative
         for level in self.levels:
             axes = tuple(0 if mapped else None for mapped in level)
-            function = jax.vmap(function, in_axes=axes, out_axes=(0 if self.moves_runs(level) else None, 0))
+            function = jax.vmap(function, in_axes=axes, out_axes=(0 if self.has_own_runs(level) else None, 0))
 
         def flat(*arrays: PyTree) -> list[PyTree]:
             values, rates = function(*arrays)
@@ -218,7 +218,7 @@ class _Call(NamedTuple):
     def result_types(self, *arguments: ShapedArray) -> list[ShapedArray]:
         """Return shapes and types of the results for those of the arguments."""
         sizes = self.level_sizes(arguments)[::-1]  # the outermost level is the first axis
-        runs = [size for size, level in zip(sizes, self.levels[::-1], strict=True) if self.moves_runs(level)]
+        runs = [size for size, level in zip(sizes, self.levels[::-1], strict=True) if self.has_own_runs(level)]
 
         def type_result(axes: list[int], result: jax.ShapeDtypeStruct) -> ShapedArray:
             shape = (*axes, *result.shape)
@@ -229,7 +229,7 @@ class _Call(NamedTuple):
             return arguments[0].update(shape=shape, dtype=result.dtype, weak_type=False, sharding=place)
 
         values = [type_result(runs, x) for x in self.deferred.results]
-        if self.moving is None:
+        if self.tangent_leaves is None:
             return values
         return values + [type_result(sizes, x) for x in self.deferred.results if _is_real(x)]
 
@@ -244,25 +244,25 @@ class _Call(NamedTuple):
     def count_runs(self, arguments: Sequence[Any]) -> int:
         """Return the number of runs."""
         sizes = zip(self.level_sizes(arguments), self.levels, strict=True)
-        return math.prod(size for size, level in sizes if self.moves_runs(level))
+        return math.prod(size for size, level in sizes if self.has_own_runs(level))
 
     def count_directions(self, arguments: Sequence[Any]) -> int:
         """Return the number of tangents of a run; 0 for values."""
-        if self.moving is None:
+        if self.tangent_leaves is None:
             return 0
         sizes = zip(self.level_sizes(arguments), self.levels, strict=True)
-        return math.prod(size for size, level in sizes if not self.moves_runs(level))
+        return math.prod(size for size, level in sizes if not self.has_own_runs(level))
 
 
 def _push_forward(
-    function: Function, primals: Leaves, moving: Sequence[int], tangents: Leaves
+    function: Function, primals: Leaves, places: Sequence[int], tangents: Leaves
 ) -> tuple[list[PyTree], list[PyTree]]:
-    """Return values and tangents of a function, for tangents of the arguments `moving`; the others are constants."""
+    """Return values and tangents of a function, for tangents of the arguments `places`; the others are constants."""
 
-    def move(moved: list[PyTree]) -> list[PyTree]:
-        return function(*_replace_leaves(primals, moving, moved))
+    def restricted(arguments: list[PyTree]) -> list[PyTree]:
+        return function(*_replace_leaves(primals, places, arguments))
 
-    return jax.jvp(move, ([primals[i] for i in moving],), (list(tangents),))
+    return jax.jvp(restricted, ([primals[i] for i in places],), (list(tangents),))
 
 
 def _replace_leaves(leaves: Leaves, places: Sequence[int], new: Leaves) -> list[PyTree]:
@@ -283,7 +283,7 @@ def _trace_kernel(call: _Call, arguments: tuple[jax.ShapeDtypeStruct, ...], plat
     from diffabs.compiler.runtime.toolchain import NoCompiler
 
     try:
-        program = jax.make_jaxpr(call.by(call.deferred.call_kernel))(*arguments)
+        program = jax.make_jaxpr(call.vectorize(call.deferred.call_kernel))(*arguments)
         build_launches(program.jaxpr)
     except (Unsupported, NoCompiler) as error:
         return str(error)
@@ -303,24 +303,24 @@ def _find_kernel(call: _Call, arguments: Sequence[Any], objection: str) -> tuple
     """
     from diffabs.compiler.runtime.toolchain import COMPILER
 
-    required, program, line = call.deferred.required, None, objection
+    required, program = call.deferred.required, None
     if required:
         check_process()
-    if not line and call.moving is None and call.count_runs(arguments) < MIN_RUNS and not required:
-        line = "the values of a single run would wait for its compiler"
-    if not line:
+    if not objection and call.tangent_leaves is None and call.count_runs(arguments) < MIN_RUNS and not required:
+        objection = "the values of a single run would wait for its compiler"
+    if not objection:
         program = _trace_kernel(call, tuple(map(_type, arguments)), default_platform(), os.environ.get(COMPILER))
         if isinstance(program, str):
-            line, program = program, None
-    if line and required:
-        raise EngineError.of(line)
-    return program, line
+            objection, program = program, None
+    if objection and required:
+        raise EngineError.of(objection)
+    return program, objection
 
 
 @functools.cache  # a line once, since JAX may ask for an engine several times
-def _log_choice(what: str, line: str) -> None:
+def _log_choice(what: str, objection: str) -> None:
     """Log the engine of some runs, and the reason for XLA."""
-    engine = f"XLA, not a kernel: {line}" if line else f"a kernel ({describe_engine('kernel')['compiler']})"
+    engine = f"XLA, not a kernel: {objection}" if objection else f"a kernel ({describe_engine('kernel')['compiler']})"
     log.info("%s: %s", what, engine)
 
 
@@ -367,13 +367,13 @@ def _lower(context: Any, *operands: Any, **named: Any) -> Any:
     call = _Call(**named)
     module = context.module_context
     devices = getattr(module.axis_context, "num_devices", None) or 1
-    program, line = _find_kernel(call, context.avals_in, _placement_objection(module.platforms, devices))
+    program, objection = _find_kernel(call, context.avals_in, _placement_objection(module.platforms, devices))
     runs, directions = call.count_runs(context.avals_in), call.count_directions(context.avals_in)
     what = f"{runs} run{'s' * (runs > 1)}"
     if directions:
         what += f" with {directions} derivative{'s' * (directions > 1)}"
-    _log_choice(what, line)
-    function = call.by(call.deferred.call_xla) if program is None else jex.jaxpr_as_fun(program)
+    _log_choice(what, objection)
+    function = call.vectorize(call.deferred.call_xla) if program is None else jex.jaxpr_as_fun(program)
     return mlir.lower_fun(function, multiple_results=True)(context, *operands)
 
 
@@ -387,7 +387,8 @@ def _compile_call(call: _Call) -> Callable[..., list[PyTree]]:
 def _evaluate(*arrays: PyTree, **named: Any) -> list[PyTree]:
     """Return the results of an eager call, compiled; under `jax.disable_jit` by XLA's single operations."""
     call = _Call(**named)
-    function = call.by(call.deferred.call_xla) if jax.config.jax_disable_jit else _compile_call(call)  # pyright: ignore
+    without_jit = jax.config.jax_disable_jit  # pyright: ignore
+    function = call.vectorize(call.deferred.call_xla) if without_jit else _compile_call(call)
     return function(*arrays)
 
 
@@ -398,23 +399,25 @@ def _add_level(
     """Return the results under one more vmap, whose axis comes first in the arguments and results that have it."""
     call = _Call(**named)
     mapped = tuple(axis is not None for axis in axes)
-    moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes, strict=True)]
-    results = call._replace(levels=(*call.levels, mapped)).bind(*moved)
+    arrays = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes, strict=True)]
+    results = call._replace(levels=(*call.levels, mapped)).bind(*arrays)
     values, rates = call.split(results)
-    return results, [0 if call.moves_runs(mapped) else None] * len(values) + [0] * len(rates)
+    return results, [0 if call.has_own_runs(mapped) else None] * len(values) + [0] * len(rates)
 
 
 @default_flags()
 def _differentiate(primals: Leaves, tangents: Leaves, **named: Any) -> tuple[PyTree, PyTree]:
     """Return values and tangents of `run`, by one call of `run_derivative`."""
     call = _Call(**named)
-    moving = tuple(i for i, (x, dx) in enumerate(zip(primals, tangents, strict=True)) if _moves(x, dx))
-    if not moving:
+    pairs = zip(primals, tangents, strict=True)
+    tangent_leaves = tuple(i for i, (x, dx) in enumerate(pairs) if _has_real_tangent(x, dx))
+    if not tangent_leaves:
         values = call.bind(*primals)
         return values, [_zero(x) for x in values]
-    levels = tuple((*level, *(level[i] for i in moving)) for level in call.levels)  # a tangent has its leaf's axes
-    moved = _Call(call.deferred, levels, moving)
-    values, rates = moved.split(moved.bind(*primals, *(tangents[i] for i in moving)))
+    # A tangent has the axes of its leaf.
+    levels = tuple((*level, *(level[i] for i in tangent_leaves)) for level in call.levels)
+    derivative = _Call(call.deferred, levels, tangent_leaves)
+    values, rates = derivative.split(derivative.bind(*primals, *(tangents[i] for i in tangent_leaves)))
     real_rates = iter(rates)
     return values, [next(real_rates) if _is_real(x) else _zero(x) for x in values]
 
@@ -423,11 +426,11 @@ def _differentiate(primals: Leaves, tangents: Leaves, **named: Any) -> tuple[PyT
 def _differentiate_twice(primals: Leaves, tangents: Leaves, **named: Any) -> tuple[PyTree, PyTree]:
     """Return results and tangents of `run_derivative`, by XLA."""
     call = _Call(**named)
-    moving = [i for i, (x, dx) in enumerate(zip(primals, tangents, strict=True)) if _moves(x, dx)]
-    return _push_forward(call.by(call.deferred.call_xla), primals, moving, [tangents[i] for i in moving])
+    places = [i for i, (x, dx) in enumerate(zip(primals, tangents, strict=True)) if _has_real_tangent(x, dx)]
+    return _push_forward(call.vectorize(call.deferred.call_xla), primals, places, [tangents[i] for i in places])
 
 
-def _moves(x: PyTree, tangent: PyTree) -> bool:
+def _has_real_tangent(x: PyTree, tangent: PyTree) -> bool:
     return type(tangent) is not ad.Zero and _is_real(x)
 
 
@@ -443,12 +446,12 @@ def _linearize(trace: Any, *tracers: Any, **named: Any) -> Sequence[Any]:
     """
     call = _Call(**named)
     known = [tracer.pval.get_known() for tracer in tracers]
-    leaves, tangents = known[: call.inputs], tracers[call.inputs :]
+    leaves, tangents = known[: call.leaf_count], tracers[call.leaf_count :]
     if any(x is None for x in leaves) or all(x is not None for x in known):
         return trace.default_process_primitive(derivative_primitive, tracers, named)
     if not _has_cheap_jacobian(call, leaves):
         with jex.set_current_trace(trace):
-            return [trace.to_jaxpr_tracer(x) for x in call.by(call.deferred.call_xla)(*tracers)]
+            return [trace.to_jaxpr_tracer(x) for x in call.vectorize(call.deferred.call_xla)(*tracers)]
     wider, units = _unit_tangents(call, leaves)
     values, jacobian = wider.split(wider.bind(*leaves, *units))
     with jex.set_current_trace(trace):
@@ -471,14 +474,14 @@ def _split_for_checkpoint(
     values, _ = call.split(results)
     if not any(unknown):
         return equation, None, [False] * len(results), [False] * len(results), []
-    if any(unknown[: call.inputs]):
+    if any(unknown[: call.leaf_count]):
         return None, equation, [True] * len(results), [True] * len(results), residuals
 
     def compute_values(*leaves: PyTree) -> list[PyTree]:
-        tangents = [jnp.zeros(x.aval.shape, x.aval.dtype) for x in arguments[call.inputs :]]
+        tangents = [jnp.zeros(x.aval.shape, x.aval.dtype) for x in arguments[call.leaf_count :]]
         return call.split(call.bind(*leaves, *tangents))[0]
 
-    leaves = arguments[: call.inputs]
+    leaves = arguments[: call.leaf_count]
     program = jax.make_jaxpr(compute_values)(*(_type(x.aval) for x in leaves))
     known = jex.new_jaxpr_eqn(
         leaves, values, jex.primitives.closed_call_p, {"call_jaxpr": program}, program.effects, equation.source_info
@@ -489,7 +492,7 @@ def _split_for_checkpoint(
 
 def _has_cheap_jacobian(call: _Call, leaves: Leaves) -> bool:
     """Return whether a kernel's Jacobian of each run costs less than XLA's vector-Jacobian product."""
-    directions, objection = sum(map(math.prod, _moving_shapes(call, leaves))), _placement_objection((), 1)
+    directions, objection = sum(map(math.prod, _input_shapes(call, leaves))), _placement_objection((), 1)
     if not call.deferred.required and any(map(_has_tangent, leaves)):
         objection = objection or "it has second derivatives"
     if not call.deferred.required and directions > MAX_DIRECTIONS:
@@ -498,15 +501,15 @@ def _has_cheap_jacobian(call: _Call, leaves: Leaves) -> bool:
         _log_choice("reverse mode", objection)  # before unit vectors take memory, the square of the directions
         return False
     wider, units = _unit_tangents(call, leaves)
-    program, line = _find_kernel(wider, [*leaves, *units], objection)
-    if line:
-        _log_choice("reverse mode", line)
+    program, objection = _find_kernel(wider, [*leaves, *units], objection)
+    if objection:
+        _log_choice("reverse mode", objection)
     return program is not None
 
 
-def _moving_shapes(call: _Call, leaves: Leaves) -> list[tuple[int, ...]]:
-    """Return the shapes of the differentiated leaves in one run."""
-    return [leaves[i].shape[sum(level[i] for level in call.levels) :] for i in call.moving or ()]
+def _input_shapes(call: _Call, leaves: Leaves) -> list[tuple[int, ...]]:
+    """Return the shapes of the leaves that have a tangent, in one run."""
+    return [leaves[i].shape[sum(level[i] for level in call.levels) :] for i in call.tangent_leaves or ()]
 
 
 def _has_tangent(x: PyTree) -> bool:
@@ -521,15 +524,15 @@ def _has_tangent(x: PyTree) -> bool:
 
 def _unit_tangents(call: _Call, leaves: Leaves) -> tuple[_Call, list[np.ndarray]]:
     """Return the call for all directions of one run, and the tangents: unit vectors, which all runs share."""
-    moving, shapes = call.moving or (), _moving_shapes(call, leaves)
+    tangent_leaves, shapes = call.tangent_leaves or (), _input_shapes(call, leaves)
     counts = [math.prod(shape) for shape in shapes]
     columns = np.split(np.eye(sum(counts)), np.cumsum(counts)[:-1], axis=1)
     units = [
         column.reshape(len(column), *shape).astype(leaves[i].dtype)
-        for i, shape, column in zip(moving, shapes, columns, strict=True)
+        for i, shape, column in zip(tangent_leaves, shapes, columns, strict=True)
     ]
-    levels = [(*level[: call.inputs], *(False for _ in moving)) for level in call.levels]
-    levels.append((*(False for _ in leaves), *(True for _ in moving)))
+    levels = [(*level[: call.leaf_count], *(False for _ in tangent_leaves)) for level in call.levels]
+    levels.append((*(False for _ in leaves), *(True for _ in tangent_leaves)))
     return call._replace(levels=tuple(levels)), units
 
 
@@ -543,7 +546,7 @@ def _multiply(call: _Call, jacobian: list[PyTree], tangents: Leaves) -> list[PyT
     function = product
     for level in call.levels:
         # The directions are the Jacobian's first axis, so that of a level is the second one.
-        own, axes = call.moves_runs(level), [0 if mapped else None for mapped in level[call.inputs :]]
+        own, axes = call.has_own_runs(level), [0 if mapped else None for mapped in level[call.leaf_count :]]
         function = jax.vmap(function, in_axes=(1 if own else None, axes))
     return function(jacobian, list(tangents))
 
@@ -556,7 +559,7 @@ def _transpose(cotangents: Sequence[PyTree], *arguments: PyTree, **named: Any) -
     types = [jax.ShapeDtypeStruct(arguments[i].aval.shape, arguments[i].aval.dtype) for i in unknown]
 
     def rates(*tangents: PyTree) -> list[PyTree]:
-        return call.split(call.by(call.deferred.call_xla)(*_replace_leaves(arguments, unknown, tangents)))[1]
+        return call.split(call.vectorize(call.deferred.call_xla)(*_replace_leaves(arguments, unknown, tangents)))[1]
 
     _, cotangents = call.split(cotangents)
     given = [ad.instantiate_zeros(x) for x in cotangents]
