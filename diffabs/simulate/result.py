@@ -64,7 +64,8 @@ def finish_run(loop: Loop, objectives: dict[str, Objective], carry: PyTree) -> t
         wrong = (fault == Fault.NONE) & _is_impossible(name, objectives[name], value)
         fault = jnp.where(wrong, (Fault.AUDIT if name == AUDIT_METRIC else Fault.METRIC).value, fault)
     diverged = fault != Fault.NONE
-    metrics = invalidate({n: value for n, value in metrics.items() if n != AUDIT_METRIC}, diverged, loop)
+    metrics = {name: value for name, value in metrics.items() if name != AUDIT_METRIC}
+    metrics = invalidate(metrics, diverged, (loop, objectives))
     timed_out = (carry.status == RunStatus.TIMED_OUT) & ~diverged
     slide = slide_of(carry)
     metrics, ending, last = void_derivatives((metrics, ending, last), has_slid(slide), loop)

@@ -7,7 +7,11 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
+from diffabs import controllers, objectives
+from diffabs.simulate.arguments import prepare_arguments
+from diffabs.simulate.result import finish_run, prepare
 from diffabs.simulate.solve import SolutionStatus
+from diffabs.simulate.step.status import RunStatus
 
 
 @pytest.mark.slow
@@ -39,3 +43,36 @@ def test_an_empty_span_has_its_start_at_its_saves():
     assert set(status.tolist()) == {SolutionStatus.FINISHED}
     values = jax.jit(jax.vmap(saved, (None, 0, None)))(0.2, ends, jnp.array([0.2, 0.7]))[0]
     np.testing.assert_allclose(values, [[1.0, np.nan], [1.0, np.exp(-0.5)], [1.0, np.exp(-0.5)]], atol=1e-7)
+
+
+LOOP = d.braking(controller=controllers.ConstantTorque(torque=300.0))
+
+
+def weighted(weight):
+    return {"cost": objectives.QuadraticCost(q=jnp.stack([weight, 0.0]), r=1e-3)}
+
+
+@killed_by("simulate/result.py", "diverged, (loop, objectives))", "diverged, loop)")
+def test_a_diverged_run_has_no_derivative_by_a_number_of_its_objective():
+    def cost(weight):
+        loop, measured, method = prepare_arguments(LOOP, d.Adaptive(1e-6, 1.0, 1e-2), weighted(weight))
+        loop, audit = prepare(loop)
+        carry = jax.lax.stop_gradient(method.start(loop, measured | audit, None))
+        status = jnp.full_like(carry.status, RunStatus.DIVERGED)
+        return finish_run(loop, measured | audit, carry._replace(status=status))[0].metrics["cost"]
+
+    assert np.isnan(jax.jit(jax.grad(cost))(1.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["xla", "kernel"])
+@pytest.mark.parametrize("solver", [d.Adaptive(1e-5, 0.2, 1e-2), d.FixedStep(1e-2, 0.2)], ids=["adaptive", "fixed"])
+def test_a_run_without_a_value_has_no_derivative(solver, engine, monkeypatch):
+    monkeypatch.setenv("DIFFABS_ENGINE", engine)
+
+    def cost(torque, weight):
+        return d.measure(d.replace(LOOP, {"controller.torque": torque}), solver, weighted(weight)).metrics["cost"]
+
+    assert np.isnan(jax.vmap(cost, (0, None))(jnp.array([jnp.nan, jnp.nan]), 1.0)).all()
+    for mode in (jax.jacrev, jax.jacfwd):
+        assert np.isnan(mode(cost, (0, 1))(jnp.nan, 1.0)).all()
