@@ -3,6 +3,7 @@
 The heater y' = p (8 if y < x else 4) - y from y = 0 reaches x at t1 = -log(1 - x/(8 p)). So its end is
 y(T) = 4 p + (x - 4 p) exp(-T)/(1 - x/(8 p)), which every nesting of transformations is applied to as well."""
 
+import functools
 import logging
 import os
 import subprocess
@@ -13,11 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from kernels import FOLDER
+from marks import cases
 from mutants import killed_by
+from random_nestings import NESTINGS, field_case, find_differences, loop_case, score
+from seams import replace_seam
 
 import diffabs as d
 from diffabs import controllers, plants, sensors
-from diffabs.compiler.runtime import library_cache
+from diffabs.compiler.runtime import library_cache, toolchain
 from diffabs.objectives import BRAKING
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.drive import deferred
@@ -215,7 +219,7 @@ def test_a_required_kernel_that_is_impossible_is_an_error(no_compiler):
         over_targets(lambda x, gain: d.solve(heater, 0.0, 0.0, END, (x, gain), solver=no_compiler, engine="kernel").y)
 
 
-@killed_by("simulate/drive/deferred.py", "if jax.config.jax_disable_jit else", "if False else")
+@killed_by("simulate/drive/deferred.py", "if without_jit else", "if False else")
 def test_without_jit_xla_makes_the_runs():
     with jax.disable_jit():
         start, rate = jax.value_and_grad(lambda a: decay(1.0, a))(jnp.asarray(0.5))
@@ -289,3 +293,73 @@ class TestLoops:
         expected = jax.jit(jax.value_and_grad(lambda m: self.distances(m, solver)))(5.7)
         np.testing.assert_array_equal(found, expected)
         assert engines() == ["5 runs with 1 derivative: a kernel"]
+
+
+@pytest.fixture
+def programs(monkeypatch):
+    """Names of XLA's programs that are compiled, and texts of kernels that are built."""
+    names, texts, build = [], set(), toolchain.build_library
+
+    def record(event, seconds, **told):
+        if event.endswith("backend_compile_duration"):
+            names.append(told.get("fun_name"))
+
+    def build_recorded(text, flags=()):
+        texts.add(text)
+        return build(text, flags)
+
+    replace_seam(monkeypatch, "build_library", build_recorded)
+    jax.monitoring.register_event_duration_secs_listener(record)
+    yield names, texts
+    jax.monitoring.unregister_event_duration_listener(record)
+
+
+@killed_by(
+    "simulate/drive/deferred.py", "@functools.lru_cache(MAX_KEPT_PROGRAMS)\ndef _compile_call", "def _compile_call"
+)
+def test_nothing_is_compiled_twice(programs):
+    """An optimiser calls with new numbers, with equal functions made anew, and with batches of other sizes."""
+    names, texts = programs
+
+    def new_slope(targets=TARGETS):
+        def field(t, y, args):
+            return args[1] * jnp.where(y < args[0], 8.0, 4.0) - y
+
+        def end(x, gain):
+            return d.solve(field, 0.0, 0.0, END, (x, gain), solver=SOLVER).y
+
+        return jax.value_and_grad(lambda gain: jnp.mean(jax.vmap(end, (0, None))(targets, gain)))
+
+    compiled = jax.jit(new_slope())
+    for slope in (compiled, new_slope()):
+        slope(1.0)
+        assert names
+        names.clear()
+        slope(1.1)
+        assert names == []
+    new_slope()(1.2)
+    assert names == []
+    jax.jit(new_slope(TARGETS[:3]))(1.0)
+    assert len(texts) == 1
+
+
+@functools.cache
+def random_case(kind, name, adaptive):
+    """A case, its differences, and XLA's Jacobians where they are wanted."""
+    case = (field_case if kind == "field" else loop_case)(name, 3, 4, adaptive)
+    return case, find_differences(case)
+
+
+def check_random(kind, name, adaptive, nesting, engines):
+    case, differences = random_case(kind, name, adaptive)
+    found = score(case, nesting, differences)
+    # A nesting whose program an earlier one has compiled logs nothing.
+    assert all(line.endswith("a kernel") for line in engines()), engines()
+    assert found.compared > 20
+    assert (found.wrong, found.lost) == (0, 0)
+
+
+@pytest.mark.parametrize("nesting", cases(NESTINGS, *(NESTINGS.keys() - {"vmap jacrev"})))
+def test_random_fields_in_all_nestings(nesting, engines):
+    """Fields with switches and events, against differences of their values."""
+    check_random("field", 0, False, nesting, engines)

@@ -173,14 +173,14 @@ def _at(loop: Any, measures: Any, path: str) -> np.ndarray:
 
 
 def _moved(loop: Any, measures: Any, places: dict[str, Any], x: Any) -> tuple[Any, Any]:
-    """Loop and objectives with the numbers x at their places."""
+    """Loop and objectives with the numbers x, an array or a list, at their places."""
     new: dict[str, dict[str, Any]] = {}
     start = 0
     for path, all in places.items():
         part, _, own = path.rpartition(":")
         value = jnp.asarray(get(measures[part] if part else loop, own))
         here = x[start : start + len(all)]
-        whole = here[0] if value.ndim == 0 else value.at[tuple(np.array(all).T)].set(here)
+        whole = here[0] if value.ndim == 0 else value.at[tuple(np.array(all).T)].set(jnp.asarray(here))
         new.setdefault(part, {})[own] = whole
         start += len(all)
     measures = {name: replace(part, new.get(name, {})) for name, part in measures.items()}
