@@ -16,7 +16,7 @@ import pytest
 from kernels import FOLDER
 from marks import cases
 from mutants import killed_by
-from random_nestings import NESTINGS, field_case, find_differences, loop_case, score
+from random_nestings import NESTINGS, field_case, find_differences, find_xla_jacobians, loop_case, score
 from seams import replace_seam
 
 import diffabs as d
@@ -363,3 +363,19 @@ def check_random(kind, name, adaptive, nesting, engines):
 def test_random_fields_in_all_nestings(nesting, engines):
     """Fields with switches and events, against differences of their values."""
     check_random("field", 0, False, nesting, engines)
+
+
+RANDOM = [("field", 1, True), ("field", 2, False), ("loop", "lab rig, relay", False)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nesting", ["shared, jacrev", "grad in a scan", "vmap jacfwd"])
+@pytest.mark.parametrize(("kind", "name", "adaptive"), RANDOM)
+def test_more_random_runs_in_some_nestings(kind, name, adaptive, nesting, engines):
+    check_random(kind, name, adaptive, nesting, engines)
+
+
+@pytest.mark.slow
+def test_kernel_and_xla_have_one_jacobian():
+    case, differences = random_case("field", 1, True)
+    assert score(case, "vmap jacfwd", differences, find_xla_jacobians(case)).unlike == 0

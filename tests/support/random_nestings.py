@@ -294,16 +294,15 @@ class Differences(NamedTuple):
 
 
 def find_differences(case: Case) -> Differences:
-    """Values and differences of the rows; an infinite value is none."""
+    """Values and differences of the rows; an infinite value, a time that is never reached, has no differences."""
     X = case.rows
     size = np.where(np.abs(X) > 1e-6, np.abs(X), 1e-2)
     moves = [sign * width for width in WIDTHS for sign in (1, -1)]
     lanes = [x + move * np.diag(s) for x, s in zip(X, size, strict=True) for move in moves]
     found = np.asarray(jax.jit(jax.vmap(case.exact))(np.concatenate([X, *lanes])))
-    found = np.where(np.isinf(found), np.nan, found)
     n, m = X.shape[1], found.shape[1]
     sides = found[len(X) :].reshape(len(X), len(WIDTHS), 2, n, m).swapaxes(-1, -2)
-    return Differences(found[: len(X)], size, sides)
+    return Differences(found[: len(X)], size, np.where(np.isinf(sides), np.nan, sides))
 
 
 def find_xla_jacobians(case: Case) -> np.ndarray:
@@ -334,7 +333,7 @@ def score(case: Case, nesting: str, differences: Differences, by_xla: np.ndarray
     values, size, sides = (x[rows] for x in differences)
     X, finite = case.rows[rows], finite[rows]
     J = np.asarray(NESTINGS[nesting](case.function("auto"), jnp.asarray(X), case.shared), float)
-    lost = ~finite[:, :, None] & ~np.isnan(J) & (np.arange(X.shape[1]) > 0)
+    lost = np.isnan(values)[:, :, None] & ~np.isnan(J) & (np.arange(X.shape[1]) > 0)
     unlike = np.zeros_like(lost)
     if by_xla is not None:
         expected = by_xla[rows]
