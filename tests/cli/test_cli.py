@@ -360,7 +360,9 @@ def test_a_title_that_stdout_cannot_encode_is_escaped(tmp_path):
     assert r'title = "\u30d6\u30ec\u30fc\u30ad"' in result.stdout
 
 
-@killed_by("cli/console.py", "error.filename is None and _is_output_refused()", "False")
+@killed_by(
+    "cli/console.py", "(error.filename is None or error.errno in files.DISK_ERRORS) and _is_output_refused()", "False"
+)
 def test_help_on_a_full_disk_is_one_error_line(monkeypatch, capsys):
     class Full(io.StringIO):
         def write(self, text):

@@ -130,3 +130,50 @@ def test_no_step_of_a_loop_passes_over_a_singularity(engine):
     np.testing.assert_allclose(run, jnp.where(last > 0, truth, jnp.nan), rtol=1e-5)
     assert np.isnan(slopes).tolist() == [False, False, True, True]
     assert diverged.tolist() == [False, False, True, True]
+
+
+class WakingOutput(NamedTuple):
+    heat: Any
+    speed: Any
+    units = MappingProxyType({"heat": "J", "speed": "m/s"})
+
+
+@pytree
+class Waking:
+    """A speed 1 - t, and heat that is exactly zero until the speed is below `wakes`, with a kink or a jump."""
+
+    wakes: Any = param(default=0.5, unit="m/s", above=0.0)
+    slope: Any = param(default=1.0, unit="W/(m/s)", above=0.0)
+    jump: Any = param(default=0.0, unit="W", low=0.0)
+    shows, control_unit = WakingOutput, "N"
+
+    def start(self, initial):
+        return WakingOutput(0.0 * initial.speed, initial.speed)
+
+    def derivative(self, t, state, control):
+        below = self.wakes - state.speed
+        return WakingOutput(jnp.where(below > 0, self.slope * below + self.jump, 0.0) + 0.0 * control, -1.0)
+
+    def project(self, state):
+        return state
+
+    def output(self, state):
+        return state
+
+    def holding(self, output, target):
+        return 0.0 * target
+
+
+@killed_by("simulate/step/adaptive.py", "jnp.where(starts & (before == 0), jnp.inf, now)", "now")
+@pytest.mark.parametrize("rtol", [1e-5, 1e-8, 1e-11])
+def test_a_state_that_is_zero_until_a_comparison_changes(rtol):
+    """Heat is jump s + slope s^2/2 a time s after the change; its integral up to the end is the IAE of a setpoint 0."""
+    parts = {"reference": references.Setpoint(value=0.0), "controller": controllers.PID(kp=0.0), "stop": stops.NoStop()}
+    loop = d.Loop(plant=Waking(), initial=CoastStart(speed=1.0), **parts)
+    wakes, slope, jump = (x.ravel() for x in np.meshgrid([0.3, 0.5, 1 / 1.3], [1e-3, 1.0, 1e6], [0.0, 1e-3, 1e3]))
+    batch = d.Batch({"plant.wakes": wakes, "plant.slope": slope, "plant.jump": jump})
+    run = d.run_batch(loop, batch, d.Adaptive(rtol, 1.0, 0.1), {"iae": objectives.IAE()})
+    assert not np.any(run.diverged)
+    np.testing.assert_allclose(
+        run.metrics["iae"], jump * wakes**2 / 2 + slope * wakes**3 / 6, rtol=max(30 * rtol, 1e-9)
+    )

@@ -19,7 +19,7 @@ is one with a margin that only touches zero (`GRAZED`). It looks for turns of th
 """
 
 import dataclasses
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import jax
@@ -296,14 +296,20 @@ class AdaptiveStepping:
         sample, point = seen.signals.sample, carry.point
         changed = tuple(a ^ b for a, b in zip(seen.words, point.words, strict=True))
         scale = jax.tree.map(jnp.maximum, carry.control.scale, error_scales(state, sample))
+        resolved = carry.length > self.closest
+        # A state that is zero until a comparison changes has no scale, and its error in the step with the change is a
+        # large share of it, however short the step. The shortest step that locates a change bounds this error.
+        starts = ~resolved & reduce(jnp.logical_or, [word != 0 for word in changed], jnp.asarray(False))
+        scales = jax.tree.map(
+            lambda before, now: jnp.where(starts & (before == 0), jnp.inf, now), carry.control.scale, scale
+        )
         off = midpoint_error(self.tableau, error[0], seen.rates[0], h)
-        relative = error_norm(system.loop, state, off, scale, sample) / self.rtol
+        relative = error_norm(system.loop, state, off, scales, sample) / self.rtol
         if self.smooth:
             return AdaptiveReport(relative, scale, jnp.zeros_like(h), jnp.asarray(False), jnp.asarray(-1), None)
         surface = find_surface_crossing(seen, carry.search.which, h) if self.keeps_mode else None
         turns = watch_margins(carry, h, self._select_watched(seen), system.bit_count)
         past_crossing = jnp.maximum(time_since_crossing(seen.surfaces, changed, h), turns.time_since)
-        resolved = carry.length > self.closest
         if self.watches:
             relative = jnp.maximum(relative, jnp.where(resolved, margin_error(system, carry, h, seen, state), 0.0))
         grazes = turns.grazes | (~resolved & (turns.time_since > 0))
