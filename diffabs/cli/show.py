@@ -1,5 +1,6 @@
 """Output of the commands: tables for a person, JSON and CSV for a script."""
 
+import csv
 import json
 import math
 import pathlib
@@ -67,7 +68,7 @@ def write_csv(trajectory: Trajectory, plant: Part, path: pathlib.Path) -> None:
     columns = {f"{name} [{unit}]": values for name, (unit, values) in run_signals(trajectory.sample, plant).items()}
     rows = int(trajectory.running.sum()) + 1  # after the end the trajectory repeats its last sample
     with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(",".join(columns) + "\n")
+        csv.writer(file, lineterminator="\n").writerow(columns)  # a plant from outside may have a comma in a unit
         for row in zip(*(values[:rows].tolist() for values in columns.values()), strict=True):
             file.write(",".join(f"{value:.12g}" for value in row) + "\n")
 

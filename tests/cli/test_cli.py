@@ -1,5 +1,7 @@
 """The command line as a script sees it: exit status, stdout, stderr, and the files it leaves."""
 
+import collections
+import csv
 import io
 import json
 import math
@@ -23,7 +25,7 @@ from seams import replace_seam
 from typer.testing import CliRunner
 
 import diffabs
-from diffabs.cli import main
+from diffabs.cli import main, show
 from diffabs.core.pytree import parameters
 from diffabs.objectives import BRAKING
 from diffabs.scenario import model, registry, scenario
@@ -95,6 +97,20 @@ def test_metrics_are_the_reference_numbers(whole):
     assert metrics["iae"] == pytest.approx(0.005443262785, abs=2e-8)
     assert metrics["overshoot"] == pytest.approx(0.308331266209 / 0.2 - 1, abs=1e-7)
     assert metrics["locked_time"] == 0.0
+
+
+@killed_by("cli/show.py", 'csv.writer(file, lineterminator="\\n").writerow(columns)', 'file.write(",".join(columns))')
+def test_a_unit_with_a_comma_is_one_column(tmp_path):
+    unit, numbers = 'deg, of the "wheel"', np.arange(2.0)
+    plant = types.SimpleNamespace(shows=types.SimpleNamespace(units={"angle": unit}), control_unit="V")
+    output = collections.namedtuple("Output", ["angle"])(numbers)
+    sample = types.SimpleNamespace(t=numbers, output=output, target=numbers, command=numbers, control=numbers)
+    trajectory = types.SimpleNamespace(sample=sample, running=np.array([True, False]))
+    show.write_csv(trajectory, plant, tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header == ["t [s]", f"angle [{unit}]", f"target [{unit}]", "command [V]", "control [V]"]
+    assert rows == [["0"] * 5, ["1"] * 5]
 
 
 def test_csv_is_the_run(whole):

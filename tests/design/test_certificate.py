@@ -921,6 +921,7 @@ def is_stable(loop, *, discrete):
     return abs(determinant) < 1 and abs(trace) < 1 + determinant if discrete else trace < 0 < determinant
 
 
+@pytest.mark.slow
 @killed_by("design/sdp/scaling.py", 'warnings.simplefilter("ignore", RuntimeWarning)', "pass")
 @pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
 def test_ill_conditioned_loops_are_right_or_undecided(discrete):
