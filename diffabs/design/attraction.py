@@ -117,9 +117,9 @@ class _Ellipsoids(NamedTuple):
         mine = self.system[jnp.minimum(number, len(self.system) - 1)]
         return self.roots[mine], self.hopeless[mine]
 
-    def has_reached(self, own: PyTree, output: PyTree) -> Scalar:
+    def has_reached(self, data: PyTree, output: PyTree) -> Scalar:
         """Return whether a run is inside its ellipsoid, with a margin, or unstable."""
-        root, hopeless = own
+        root, hopeless = data
         return (jnp.sum((root @ state_of(output)) ** 2) <= CAPTURE_LEVEL) | hopeless
 
     def contain(self, x: np.ndarray) -> np.ndarray:

@@ -36,17 +36,9 @@ RESERVED_METRICS = ("", "stopped", "diverged", "timed_out")  # the plant's audit
 
 
 def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, PyTree, PyTree]:
-    """Return loop, objectives and stepping method of one data type.
+    """Return loop, objectives and stepping method of one data type; invalid arguments are a ValueError (`refuse`).
 
     In a traced loop the derivative by a parameter that is not tunable raises an error (`forbid_derivatives`).
-
-    Args:
-        loop: Closed loop with every part and parameter.
-        solver: Solver of the run.
-        objectives: Objectives by the names of their metrics.
-
-    Raises:
-        ValueError: An argument is invalid, apart from the values of parameters.
     """
     refuse(loop, solver, objectives)
     loop, objectives = canonical_dtypes(
@@ -59,12 +51,7 @@ def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objec
 
 
 def build_stepping(solver: Solver, dtype: DTypeLike) -> FixedStepping | AdaptiveStepping:
-    """Return the stepping method of a solver, with numbers of one data type: a pytree, for compiled programs.
-
-    Args:
-        solver: Solver of the run.
-        dtype: Floating-point type.
-    """
+    """Return the stepping method of a solver, with numbers of one data type: a pytree, for compiled programs."""
     number = jnp.asarray if is_traced() else as_array
     # `device_put` instead of `jnp.asarray`, which would compile a program.
     h, steps = number(float(solver.step), dtype), jax.device_put(solver.steps)
@@ -77,27 +64,13 @@ def forbid_derivatives(loop: Loop, values: Params) -> dict[str, PyTree]:
     """Return the values of all parameters that are not tunable, wrapped so that their derivative raises a ValueError.
 
     A run does not depend smoothly on these parameters. Other values are left out.
-
-    Args:
-        loop: Closed loop that specifies the parameters.
-        values: Values by dotted path.
     """
     coarse = {path for path, spec, _ in parameters(loop) if not spec.tunable}
     return {path: without_derivative(path, value) for path, value in values.items() if path in coarse}
 
 
 def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
-    """Check solver, shapes, objectives and contracts of a run, independent of the parameters' values.
-
-    Args:
-        loop: Closed loop.
-        solver: Solver of the run.
-        objectives: Objectives by the names of their metrics.
-
-    Raises:
-        ValueError: An argument has a wrong type, a field of the solver is invalid, or a parameter has a wrong shape.
-            Also if a part is not an objective, or does not fit its contract (`find_misfits`).
-    """
+    """Raise a ValueError for faults of solver, shapes, objectives and contracts, whatever the parameters' values."""
     if not isinstance(loop, Loop):
         raise ValueError(f"loop = {kinds.format_value(loop)} is no Loop; d.Loop(...) or d.braking() is needed")
     refuse_unnamed(objectives)
@@ -116,35 +89,20 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
 
 
 def refuse_unnamed(objectives: Mapping[str, Objective] | None) -> None:
-    """Check that objectives have names.
-
-    Args:
-        objectives: Objectives by the names of their metrics, or None.
-
-    Raises:
-        ValueError: The objectives are no mapping, or a name is no text, empty, or that of an end flag of a run.
-    """
+    """Raise a ValueError for objectives that are no mapping by name, or with a name that a run uses itself."""
     named = isinstance(objectives, Mapping) and all(isinstance(name, str) for name in objectives)
     if objectives is not None and not named:
-        given = kinds.format_value(objectives)
-        raise ValueError(f'objectives = {given} is no mapping by name, such as {{"overshoot": Overshoot()}}')
-    if taken := [repr(name) for name in objectives or () if name in RESERVED_METRICS]:
-        raise ValueError(f"objectives: no metric can be called {', '.join(taken)}, like another value of a run")
+        text = kinds.format_value(objectives)
+        raise ValueError(f'objectives = {text} is no mapping by name, such as {{"overshoot": Overshoot()}}')
+    if reserved := [repr(name) for name in objectives or () if name in RESERVED_METRICS]:
+        raise ValueError(f"objectives: no metric can be called {', '.join(reserved)}, like another value of a run")
 
 
 def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
-    """Check a run as `refuse` does and, if all parameters are concrete, their values.
+    """Raise a ValueError as `refuse` does and, if all parameters are concrete, for impossible values or an unstable
+    step.
 
     For traced parameters a warning says once that the step is not checked, unless it was for such a loop.
-
-    Args:
-        loop: Closed loop.
-        solver: Solver of the run.
-        objectives: Objectives by the names of their metrics.
-
-    Raises:
-        ValueError: An argument is invalid, or a concrete parameter has a value that no run may have. Also if the
-            step is not stable.
     """
     refuse(loop, solver, objectives)
     if is_traced(loop, dict(objectives)):
@@ -168,21 +126,13 @@ _warn_unchecked_step = functools.cache(
 
 
 def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: PyTree) -> None:
-    """Check that the objectives of a run have right derivatives.
+    """Raise a ValueError if an objective of a run would have a wrong derivative.
 
-    Wrong is only the derivative of a `Variation` behind a pure delay with adaptive steps.
-
-    Args:
-        loop: Closed loop.
-        objectives: Objectives by the names of their metrics.
-        method: Stepping method.
-
-    Raises:
-        ValueError: The derivative of an objective would be wrong.
+    It is that of a `Variation` behind a pure delay with adaptive steps.
     """
     if isinstance(method, AdaptiveStepping) and loop.recorders:
         # Rounding moves the kinks of the delayed command between the logged run and its replay.
-        names = [name for name, one in objectives.items() if isinstance(one, Variation)]
+        names = [name for name, objective in objectives.items() if isinstance(objective, Variation)]
         if names:
             raise ValueError(
                 f"{', '.join(names)}: Variation has no derivative behind a pure delay with adaptive steps. Leave it"

@@ -44,8 +44,8 @@ class Batch:
     def __post_init__(self) -> None:
         """Raise a ValueError if `values` are no mapping, or a column has no numbers (or, for `keys`, no keys)."""
         if not isinstance(self.values, Mapping):
-            given = kinds.format_value(self.values)
-            raise ValueError(f'values = {given} is no mapping by path, such as {{"plant.mass": [12.0, 18.0]}}')
+            text = kinds.format_value(self.values)
+            raise ValueError(f'values = {text} is no mapping by path, such as {{"plant.mass": [12.0, 18.0]}}')
         for name, column in self._columns().items():
             if name == "keys" and jnp.issubdtype(getattr(column, "dtype", float), jax.dtypes.prng_key):
                 continue
@@ -58,8 +58,8 @@ class Batch:
                 raise ValueError(f"{name} = {kinds.format_value(column)} {line}; one value for each run is needed")
 
     def _columns(self) -> Params:
-        others = {name: getattr(self, name) for name in ("keys", "weights", "durations")}
-        return {**self.values, **{name: column for name, column in others.items() if column is not None}}
+        named = {name: getattr(self, name) for name in ("keys", "weights", "durations")}
+        return {**self.values, **{name: column for name, column in named.items() if column is not None}}
 
     def _repr_html_(self) -> str:
         """Return the columns as a table for a notebook."""
@@ -80,10 +80,10 @@ class Batch:
         columns = self._columns()
         lengths = {name: np.shape(column)[0] if np.ndim(column) else 0 for name, column in columns.items()}
         if len(set(lengths.values())) > 1 or 0 in lengths.values():
-            said = {
+            descriptions = {
                 name: f"has {n} values" if np.ndim(columns[name]) else "is one number" for name, n in lengths.items()
             }
-            listed = ", ".join(f"{name} {words}" for name, words in said.items())
+            listed = ", ".join(f"{name} {words}" for name, words in descriptions.items())
             raise ValueError(f"a batch needs columns of the same length, with one value for each run: {listed}")
         return next(iter(lengths.values()), 1)
 
@@ -116,23 +116,17 @@ class Batch:
         return self
 
     def groups(self, duration: float) -> list[tuple[np.ndarray, float]]:
-        """Return groups of runs whose `durations` differ by less than a factor of 2.
+        """Return groups of runs whose `durations`, each at most `duration` [s], differ by less than a factor of 2.
 
         Each group is a pair: the numbers of its runs, and the longest of their durations [s]. The batch must have
         `durations`.
-
-        Args:
-            duration: Upper limit of all durations [s].
-
-        Raises:
-            ValueError: A duration is not positive.
         """
-        wanted = np.minimum(np.asarray(self.durations, float), duration)
-        if not (wanted > 0).all():
-            raise ValueError(f"durations = {np.min(wanted):g} s is not positive")
-        classes = np.floor(np.log(wanted.max() / wanted) / np.log(MAX_LENGTH_RATIO)).astype(int)
+        durations = np.minimum(np.asarray(self.durations, float), duration)
+        if not (durations > 0).all():
+            raise ValueError(f"durations = {np.min(durations):g} s is not positive")
+        classes = np.floor(np.log(durations.max() / durations) / np.log(MAX_LENGTH_RATIO)).astype(int)
         members = [np.flatnonzero(classes == i) for i in np.unique(classes)]
-        return [(lanes, float(wanted[lanes].max())) for lanes in members]
+        return [(lanes, float(durations[lanes].max())) for lanes in members]
 
     def lane(self, loop: Part, i: int) -> PyTree:
         """Return the loop of run `i`, given the common `loop`."""
@@ -143,12 +137,7 @@ class Batch:
         differentiable.
 
         The values get the floating-point type of the loop. A batch without values and keys calls the function once,
-        with the key None, and repeats its result.
-
-        Args:
-            loop: Loop that the runs have in common.
-            function: Function of the loop and the key of one run. The key is None in a batch without keys.
-            lanes: Numbers of the runs to include; None for all runs.
+        with the key None, and repeats its result. `lanes` holds the numbers of the runs to include; None includes all.
         """
         if not self.values and self.keys is None:
             count = self.size if lanes is None else len(lanes)
@@ -173,11 +162,7 @@ def _are_seeds(column: Any) -> bool:
 
 
 def group_by_structure(loops: Sequence[PyTree]) -> list[list[int]]:
-    """Return the indices of the loops in groups of equal structure and shapes; each group can be one batch.
-
-    Args:
-        loops: Loops to group.
-    """
+    """Return the indices of the loops in groups of equal structure and shapes; each group can be one batch."""
     groups: dict[PyTree, list[int]] = {}
     for place, loop in enumerate(map(stack_lists, loops)):
         groups.setdefault((jax.tree.structure(loop), *map(np.shape, jax.tree.leaves(loop))), []).append(place)
@@ -187,17 +172,11 @@ def group_by_structure(loops: Sequence[PyTree]) -> list[list[int]]:
 def stack_loops(loops: Sequence[PyTree]) -> tuple[PyTree, Batch]:
     """Return loops of one structure as a batch for `run_batch`: the first loop, and every parameter of each, shape
     (runs, ...).
-
-    Args:
-        loops: Loops of one structure (see `group_by_structure`).
-
-    Raises:
-        ValueError: The loops have different structures.
     """
     if (count := len(group_by_structure(loops))) != 1:
         raise ValueError(f"loops of {count} structures are no lanes of one batch")
     each = [{path: value for path, _, value in parameters(loop)} for loop in loops]
-    return loops[0], Batch({path: np.stack([np.asarray(one[path], float) for one in each]) for path in each[0]})
+    return loops[0], Batch({path: np.stack([np.asarray(values[path], float) for values in each]) for path in each[0]})
 
 
 def grid(values: Mapping[str, Sequence[float]]) -> Batch:

@@ -44,16 +44,8 @@ class Misfit(Exception):
 
 
 def refuse_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> None:
-    """Check the contracts of all parts.
-
-    Args:
-        loop: Closed loop. The types and shapes of its parameters must be correct (`find_misshapen`).
-        objectives: Objectives by the names of their metrics.
-
-    Raises:
-        ValueError: A part does not fit its contract (`find_misfits`).
-    """
-    if lines := list(find_misfits(loop, {f"objectives.{name}": one for name, one in objectives.items()})):
+    """Raise a ValueError for the misfits of a loop with parameters of correct types and shapes (`find_misshapen`)."""
+    if lines := list(find_misfits(loop, {f"objectives.{name}": objective for name, objective in objectives.items()})):
         raise ValueError("; ".join(lines))
 
 
@@ -61,14 +53,8 @@ def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[st
     """Yield one line for each misfit: a method that fails, or that returns something else than its contract asks for.
 
     The first misfit of a part of the loop ends the check. If the loop fits, each objective gives at most one line. A
-    structure that fits is not traced again for other values of its parameters, of the same shapes.
-
-    Args:
-        loop: Loop to trace, with its ticks and events.
-        objectives: Objectives of its runs, by the path that messages show.
-
-    Raises:
-        ValueError: A packaged part raises it itself.
+    structure that fits is not traced again for other values of its parameters, of the same shapes. `objectives` have
+    the paths that messages show.
     """
     leaves, structure = jax.tree.flatten((loop, list(objectives.values())))
     structure = structure, *map(np.shape, leaves)
@@ -117,10 +103,10 @@ def _follow_loop(loop: Loop) -> tuple[Sample, Ending]:
     _expect_real("stop.margin", _call("stop", loop.stop, "margin", output))
     sample = Sample(t, output, target, setpoint, feedforward, command, control)
     stopped = jnp.asarray(True)
-    left = _call("stop", loop.stop, "remainder", sample, stopped)
-    if not isinstance(left, tuple) or len(left) != 2:
-        raise Misfit(f"stop.remainder returns {_describe(left)}; (time left [s], distance left [m]) is needed")
-    return sample, Ending(sample, stopped, *left)
+    remainder = _call("stop", loop.stop, "remainder", sample, stopped)
+    if not isinstance(remainder, tuple) or len(remainder) != 2:
+        raise Misfit(f"stop.remainder returns {_describe(remainder)}; (time left [s], distance left [m]) is needed")
+    return sample, Ending(sample, stopped, *remainder)
 
 
 def _follow_block(name: str, block: Part, signal: PyTree, *, is_real: bool = False) -> Any:
@@ -186,22 +172,23 @@ def _call(path: str, part: Part, method: str, *args: Any) -> Any:
 def _explain_missing(path: str, part: Part, method: str, error: AttributeError) -> str:
     """Return a line about a missing attribute: which part reads it, and which fields exist."""
     frames = [frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    reader = ([one for one in frames if dataclasses.is_dataclass(one)] or [part])[-1]
-    there = getattr(error.obj, "_fields", None)
-    if there is None and dataclasses.is_dataclass(error.obj):
-        there = [field.name for field in dataclasses.fields(error.obj)]
-    if there is None or error.obj is reader:
+    reader = ([frame_self for frame_self in frames if dataclasses.is_dataclass(frame_self)] or [part])[-1]
+    fields = getattr(error.obj, "_fields", None)
+    if fields is None and dataclasses.is_dataclass(error.obj):
+        fields = [field.name for field in dataclasses.fields(error.obj)]
+    if fields is None or error.obj is reader:
         return f"{path}.{method} fails: {next(iter(str(error).splitlines()), '')}"
     needs = f"{path}: {kebab_case(type(reader).__name__)} needs {error.name}"
-    return f"{needs}; there is only {', '.join(there)}: these parts do not fit together"
+    return f"{needs}; there is only {', '.join(fields)}: these parts do not fit together"
 
 
 def _place(error: Exception) -> str:
     """Return the innermost line of the user's code that the error passed, as ` (file.py, line 7)`; empty if none."""
     frames = traceback.extract_tb(error.__traceback__)
-    own = [one for one in frames if not set(NOT_USERS) & set(pathlib.Path(one.filename).parents)]
-    own = [one for one in own if not one.filename.startswith("<string")]  # methods that dataclasses generate
-    return f" ({pathlib.Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
+    user_frames = [frame for frame in frames if not set(NOT_USERS) & set(pathlib.Path(frame.filename).parents)]
+    # Dataclasses generate methods in "files" whose names begin so.
+    user_frames = [frame for frame in user_frames if not frame.filename.startswith("<string")]
+    return f" ({pathlib.Path(user_frames[-1].filename).name}, line {user_frames[-1].lineno})" if user_frames else ""
 
 
 def _check_shown(plant: Part, output: PyTree) -> None:
@@ -241,8 +228,8 @@ def _expect_reals(path: str, tree: PyTree) -> None:
 
 def _expect_like(path: str, tree: PyTree, like: PyTree, name: str) -> None:
     """Check that a result has structure, shapes and kinds of numbers of `like`; `name` stands for it in the message."""
-    same = jax.tree.structure(tree) == jax.tree.structure(like)
-    if not same or list(map(_describe_leaf, jax.tree.leaves(tree))) != list(map(_describe_leaf, jax.tree.leaves(like))):
+    fits = jax.tree.structure(tree) == jax.tree.structure(like)
+    if not fits or list(map(_describe_leaf, jax.tree.leaves(tree))) != list(map(_describe_leaf, jax.tree.leaves(like))):
         raise Misfit(f"{path} returns {_describe(tree)}; {_describe(like)} is needed, like {name}")
 
 

@@ -136,10 +136,10 @@ def _dispatch_batch(
     if accepted is None and live:
         accepted = True
     elif accepted is None and batch.values:
-        found = batch_admissibility(loop, batch.values, solver)
-        accepted = found.accepted
-        for code, reason in enumerate(found.reasons[1:], 1):
-            _warn_refused(int(np.count_nonzero(found.codes == code)), count, reason)
+        checks = batch_admissibility(loop, batch.values, solver)
+        accepted = checks.accepted
+        for code, reason in enumerate(checks.reasons[1:], 1):
+            _warn_refused(int(np.count_nonzero(checks.codes == code)), count, reason)
     elif accepted is None:
         if lines := find_impossible_values(loop, solver.step):  # all runs are the same loop
             raise ValueError("; ".join(lines))
@@ -149,7 +149,7 @@ def _dispatch_batch(
             _warn_refused(count, count, lines[0])
     elif np.shape(accepted) not in ((), (count,)):
         raise ValueError(f"accepted has shape {np.shape(accepted)}; ({count},) is needed, one value for each run")
-    given = (
+    arguments = (
         loop,
         batch.values,
         batch._keys(),
@@ -160,7 +160,7 @@ def _dispatch_batch(
     as_one = trajectories or (live if together is None else together) or (not batch.values and batch.keys is None)
     if as_one and enough is not None:
         raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
-    traced = live or is_traced(given, enough)  # such as by keys, under vmap
+    traced = live or is_traced(arguments, enough)  # such as by keys, under vmap
     if traced and engine != "xla" and together is not False and not trajectories:
         # Each run is a call of its own, whose engine is chosen once it is known how the batch is differentiated.
         return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories, engine), accepted)
@@ -168,11 +168,11 @@ def _dispatch_batch(
     def by_kernel() -> Run:
         from diffabs.simulate.drive.kernel import run_native
 
-        return run_native(*given, enough)
+        return run_native(*arguments, enough)
 
     def by_xla() -> Run:
         if not as_one:
-            everything = given[1], given[2], given[-1]  # values, keys, accepted
+            everything = arguments[1], arguments[2], arguments[-1]  # values, keys, accepted
 
             def run(columns: PyTree, numbers: Array) -> Run:
                 values, keys, accepted = columns
@@ -184,8 +184,8 @@ def _dispatch_batch(
         return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories, "xla"), accepted)
 
     why_not = TOGETHER_REASON if trajectories or together else ""
-    why_xla = TRACED_REASON if traced else TOGETHER_REASON if as_one else describe_placement(given)
-    return run_with_engine(engine, by_kernel, by_xla, (given, enough), why_not, why_xla)
+    why_xla = TRACED_REASON if traced else TOGETHER_REASON if as_one else describe_placement(arguments)
+    return run_with_engine(engine, by_kernel, by_xla, (arguments, enough), why_not, why_xla)
 
 
 _warn_refused = functools.cache(functools.partial(log.warning, "%d of %d runs are refused and count as diverged: %s"))
@@ -207,7 +207,7 @@ def _run_vmapped(
 
     def run_group(lanes: Any, duration: float) -> Run:
         like = dataclasses.replace(solver, duration=duration)
-        return batch.each(loop, lambda one, key: run_unchecked(one, like, objectives, key, every, engine), lanes)
+        return batch.each(loop, lambda member, key: run_unchecked(member, like, objectives, key, every, engine), lanes)
 
     if trajectories or batch.durations is None:
         return run_group(None, solver.duration)

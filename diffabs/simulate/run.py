@@ -111,18 +111,8 @@ def run_unchecked(
     """Return a run without a check of the parameters' values.
 
     A run with impossible values has diverged only if its numbers are invalid or not physically possible
-    (`Run.diverged`).
-
-    Args:
-        loop: Closed loop with every part and parameter.
-        solver: Solver of the run.
-        objectives: Objectives by the names of their metrics.
-        key: Random key, or None.
-        every: Stride of the trajectory's instants; 0 for a run without a trajectory.
-        engine: Engine of a traced run without a trajectory: "auto", "xla" or "kernel". All others are made by XLA.
-
-    Raises:
-        ValueError: An argument is invalid, apart from the values of parameters.
+    (`Run.diverged`). `every` is the stride of the trajectory's instants, or 0 for none. `engine` is that of a traced
+    run without a trajectory: "auto", "xla" or "kernel". All others are made by XLA.
     """
     if not (key is None or np.ndim(key) or jnp.issubdtype(getattr(key, "dtype", float), jax.dtypes.prng_key)):
         raise ValueError(f"key = {kinds.format_value(key)} is no random key; one of jax.random.key is needed")
@@ -137,10 +127,10 @@ def run_unchecked(
         method = dataclasses.replace(method, keeps_last_step=True)
     capacity = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
-    given = loop, objectives, method, key
+    arguments = loop, objectives, method, key
     if not every and engine != "xla" and is_traced(loop, objectives, key):
-        return run_deferred(run_differentiable, capacity, given, required=engine == "kernel")
-    run = run_differentiable(capacity, given)
+        return run_deferred(run_differentiable, capacity, arguments, required=engine == "kernel")
+    run = run_differentiable(capacity, arguments)
     return run._replace(trajectory=_truncate_trajectory(run.trajectory, count + 1)) if every else run
 
 
@@ -167,12 +157,7 @@ def _truncate_trajectory(trajectory: PyTree, count: int) -> PyTree:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def run_differentiable(capacity: RunCapacity, run: PyTree) -> PyTree:
-    """Return the run of (loop, objectives, method, key), as `capacity.finish` makes it of the last carry.
-
-    Args:
-        capacity: Capacities that are fixed at compilation.
-        run: The loop, its objectives by name, the stepping method, and the random key or None.
-    """
+    """Return the run of (loop, objectives, method, key), as `capacity.finish` makes it of the last carry."""
     loop, objectives, method, key = run
     _, instants, every, finish = capacity
     return _run(loop, objectives, method, key, jax.device_put(every), instants=instants, finish=finish)
@@ -211,11 +196,11 @@ def _run(
     if not instants:
         return finish(loop, objectives, run_to_end(stepped, partial(method.renew, loop), carry))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
-    seen = partial(method.observe_at, loop)
-    carry, seen = run_with_trajectory(
-        stepped, partial(method.renew, loop), method.is_active, seen, carry, every, count, instants
+    look = partial(method.observe_at, loop)
+    carry, trajectory = run_with_trajectory(
+        stepped, partial(method.renew, loop), method.is_active, look, carry, every, count, instants
     )
-    return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
+    return _attach_trajectory(finish_run(loop, objectives, carry), first, trajectory)
 
 
 @partial(jax.jit, static_argnames="capacity")
@@ -233,11 +218,11 @@ def _run_reversible(
         carry = repeat_step(stepped, carry, tries, lambda carry: carry.running)
         return finish(loop, objectives, end_unfinished(carry))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
-    carry, seen = scan_with_trajectory(
+    carry, trajectory = scan_with_trajectory(
         stepped, method.is_active, partial(method.observe_at, loop), carry, every, count, instants, tries
     )
     judged = finish_run(loop, objectives, end_unfinished(carry))
-    return _attach_trajectory(judged, *_void_trajectories(loop, judged[0], first, seen))
+    return _attach_trajectory(judged, *_void_trajectories(loop, judged[0], first, trajectory))
 
 
 def _run_by_replay(
@@ -276,8 +261,8 @@ def _run_by_replay(
     states = states_between(spans, log.taken, instants)
     goes_on = instants < jax.lax.stop_gradient(again.point.t)
     first = observe(loop, start.point.t, start.point.state, jnp.asarray(True))
-    seen = jax.vmap(partial(observe, loop))(instants, states, goes_on)
-    return _attach_trajectory(judged, *_void_trajectories(loop, judged[0], first, seen))
+    trajectory = jax.vmap(partial(observe, loop))(instants, states, goes_on)
+    return _attach_trajectory(judged, *_void_trajectories(loop, judged[0], first, trajectory))
 
 
 def _void_trajectories(loop: Loop, run: Run, *signals: Trajectory) -> PyTree:
@@ -292,13 +277,13 @@ def _prepare_run(loop: Loop, objectives: dict[str, Objective], method: PyTree, k
     return loop, objectives, partial(method.step, loop, objectives, key)
 
 
-def _attach_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: PyTree) -> Run:
+def _attach_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, later: PyTree) -> Run:
     """Return the run with its trajectory: first and later instants, and the last one repeated after the end."""
     run, last = judged
 
     def join(a: Scalar, b: Scalar, c: Scalar) -> PyTree:
         # Rows after the end contain anything, so the last instant replaces them.
-        b = jnp.where(jnp.expand_dims(seen.running, range(1, b.ndim)), b, c)
+        b = jnp.where(jnp.expand_dims(later.running, range(1, b.ndim)), b, c)
         return jnp.concatenate([jnp.asarray(a)[None], b])
 
-    return run._replace(trajectory=jax.tree.map(join, first, seen, last))
+    return run._replace(trajectory=jax.tree.map(join, first, later, last))

@@ -206,8 +206,8 @@ class Function:
 
     def __call__(self, t: Scalar, y: PyTree, args: PyTree, constants: list[PyTree]) -> PyTree:
         """Return the result at (`t`, `y`, `args`), with the type of `t`, and the `constants` of all functions."""
-        found = self.call(t, y, args) if self.place is None else self.call(t, y, args, constants[self.place])
-        return jax.tree.map(lambda x: jnp.asarray(x, t.dtype), found)
+        values = self.call(t, y, args) if self.place is None else self.call(t, y, args, constants[self.place])
+        return jax.tree.map(lambda x: jnp.asarray(x, t.dtype), values)
 
 
 class FieldCode(NamedTuple):
@@ -224,12 +224,12 @@ class FieldCode(NamedTuple):
     @property
     def inner(self) -> list[Event]:
         """The events that do not end the solution."""
-        return [one for one in self.events if not one.terminal]
+        return [event for event in self.events if not event.terminal]
 
     @property
     def terminal(self) -> list[Event]:
         """The events that end the solution."""
-        return [one for one in self.events if one.terminal]
+        return [event for event in self.events if event.terminal]
 
 
 @pytree
@@ -250,25 +250,25 @@ class FieldLoop:
     """A field with its events, as the engine reads a loop (`core.loop.Loop`), in the time s.
 
     Attributes:
-        given: Pytree of y0, t0, t1, args, and the constants of the functions.
+        inputs: Pytree of y0, t0, t1, args, and the constants of the functions.
         code: The functions.
-        kept: Number of times that are kept of each event.
+        times_per_event: Number of times that are kept of each event.
     """
 
-    given: dict[str, PyTree] = part()
+    inputs: dict[str, PyTree] = part()
     code: FieldCode = static()
-    kept: int = static()
+    times_per_event: int = static()
     plant = FieldPlant()
     ticks, jumps, recorders = False, True, ()
 
     @property
     def span(self) -> Scalar:
         """t1 - t0."""
-        return self.given["t1"] - self.given["t0"]
+        return self.inputs["t1"] - self.inputs["t0"]
 
     def time(self, s: Scalar) -> Scalar:
         """Return the time at `s`, exactly t0 and t1 at 0 and 1."""
-        return self.given["t0"] * (1.0 - s) + self.given["t1"] * s
+        return self.inputs["t0"] * (1.0 - s) + self.inputs["t1"] * s
 
     @property
     def changes(self) -> bool:
@@ -282,10 +282,10 @@ class FieldLoop:
 
     def start(self) -> LoopState:
         """Return the state at t0."""
-        y0, zero = self.given["y0"], jnp.zeros_like(self.given["t0"])
+        y0, zero = self.inputs["y0"], jnp.zeros_like(self.inputs["t0"])
         count = len(self.code.inner)
         none = jnp.zeros(count, zero.dtype)
-        times = jnp.full((count, self.kept), jnp.nan, zero.dtype)
+        times = jnp.full((count, self.times_per_event), jnp.nan, zero.dtype)
         held = EventMemory(none, times, none, zero - 1.0, zero, zero, zero)
         return LoopState(y0, Memory(), Memory(), Memory((), held), Memory())
 
@@ -311,14 +311,14 @@ class FieldLoop:
         del signals, flow
         stops = (
             jnp.ones_like(jnp.asarray(t)),
-            *(self._call(one.condition, t, state.plant) for one in self.code.terminal),
+            *(self._call(event.condition, t, state.plant) for event in self.code.terminal),
         )
         if not self.changes:
             return {"stop": stops}
         lifts = state.controller.held.lifts
         pairs = zip(self.code.inner, lifts, strict=True)
-        own = (self._call(one.condition, t, state.plant) + lift for one, lift in pairs)
-        return {"events": tuple(own), "stop": stops}
+        conditions = (self._call(event.condition, t, state.plant) + lift for event, lift in pairs)
+        return {"events": tuple(conditions), "stop": stops}
 
     def change(
         self,
@@ -329,18 +329,7 @@ class FieldLoop:
         fired: Margins,
         passed: dict[str, PyTree] | None = None,
     ) -> LoopState:
-        """Return the state after the events that have `fired`, in the order of the argument `events`.
-
-        A reset may turn the condition of a later event negative: then that event happens, too.
-
-        Args:
-            clock: The instant.
-            state: State before the instant.
-            before: Signals before the instant.
-            margins: Margins before the instant.
-            fired: For each margin, whether it has just fallen through zero.
-            passed: The step that ends here, by block; None at the start of a run.
-        """
+        """Return the state after the events that have `fired`; a reset may make a later event of the list happen."""
         del before
         if passed is None:  # the start, where no condition has fallen
             return state
@@ -358,29 +347,29 @@ class FieldLoop:
         def apply_resets(t: Scalar, y: PyTree) -> tuple[tuple[PyTree, list[Scalar]], list[Bool]]:
             """Return the state after the resets with all conditions there, and which events have happened."""
             moved, happened = False, []
-            for i, (one, happens) in enumerate(zip(self.code.inner, fired, strict=True)):
+            for i, (event, happens) in enumerate(zip(self.code.inner, fired, strict=True)):
                 if moved:
-                    condition = self._call(one.condition, t, y) + held.lifts[i]
-                    happens |= (was[i] >= 0) & (condition < -self._rounding_error(one.condition, t, y))
+                    condition = self._call(event.condition, t, y) + held.lifts[i]
+                    happens |= (was[i] >= 0) & (condition < -self._rounding_error(event.condition, t, y))
                 happened.append(happens)
-                if one.reset is not None:
-                    y, moved = select(happens, self._call(one.reset, t, y), y), True
-            return (y, [self._call(one.condition, t, y) for one in self.code.inner]), happened
+                if event.reset is not None:
+                    y, moved = select(happens, self._call(event.reset, t, y), y), True
+            return (y, [self._call(event.condition, t, y) for event in self.code.inner]), happened
 
         follow = jnp.ones_like(t), self._rate(t, state.plant)
         (y, after), (_, moves), happened = jax.jvp(apply_resets, (t, state.plant), follow, has_aux=True)
         each = zip(self.code.inner, happened, fired, was, held.lifts, after, moves, strict=True)
         lifts, faults = zip(*(self._arm(t, state.plant, y, *some) for some in each), strict=True)
         events = jnp.stack(happened)
-        now = jnp.arange(self.kept) == held.counts[:, None]
+        now = jnp.arange(self.times_per_event) == held.counts[:, None]
         quick = jnp.where(t - held.last < LANDING_FRACTION, held.quick + 1.0, 0.0)
         quick, last = select(jnp.any(events), (quick, t), (held.quick, held.last))
         fault = jnp.max(jnp.stack([held.fault, *faults]))
         fault = jnp.where((fault == 0) & (quick >= MAX_QUICK_EVENTS), float(SolutionStatus.CROWDED), fault)
         ends = held.ends
-        for i, one in reversed(list(enumerate(self.code.terminal))):
-            condition, rise = self._follow(one.condition, *jax.lax.stop_gradient((t, y)))
-            rounding = self._rounding_error(one.condition, t, y)
+        for i, event in reversed(list(enumerate(self.code.terminal))):
+            condition, rise = self._follow(event.condition, *jax.lax.stop_gradient((t, y)))
+            rounding = self._rounding_error(event.condition, t, y)
             falls = (jnp.abs(condition) <= rounding) & (rise < 0)
             ends = jnp.where(falls | ((stops[i] >= 0) & (condition < -rounding)), i + 1.0, ends)
         fault = jnp.where((fault == 0) & (ends > 0), float(SolutionStatus.TERMINATED), fault)
@@ -397,7 +386,7 @@ class FieldLoop:
         t: Scalar,
         before: PyTree,
         y: PyTree,
-        one: Event,
+        event: Event,
         happens: Bool,
         fired: Bool,
         was: Scalar,
@@ -411,27 +400,29 @@ class FieldLoop:
         a start. `after` is the condition after them, and `move` its rate along the flow before them.
         """
         t, before, y, after, move = jax.lax.stop_gradient((t, before, y, after, move))
-        there, fall = self._follow(one.condition, t, before)
+        condition, fall = self._follow(event.condition, t, before)
         # The second derivative, too: it says when a condition that rises is back at zero.
         moves = (jnp.ones_like(t), self._rate(t, y))
-        rise, bend = jax.jvp(lambda t, y: self._follow(one.condition, t, y)[1], (t, y), moves)
-        rounding = self._rounding_error(one.condition, t, y)
-        left = (jnp.abs(after - there) <= rounding) & (jnp.abs(move - fall) <= SAME_RATE_FRACTION * jnp.abs(fall))
+        rise, bend = jax.jvp(lambda t, y: self._follow(event.condition, t, y)[1], (t, y), moves)
+        rounding = self._rounding_error(event.condition, t, y)
+        unmoved = (jnp.abs(after - condition) <= rounding) & (
+            jnp.abs(move - fall) <= SAME_RATE_FRACTION * jnp.abs(fall)
+        )
         # A landing ends near the zero: `exact` is the condition after a landing on it.
-        exact = after - jnp.where(fired & (fall < 0), move * there / jnp.where(fall < 0, fall, -1.0), 0.0)
-        zero = left | (jnp.abs(exact) <= rounding)
+        exact = after - jnp.where(fired & (fall < 0), move * condition / jnp.where(fall < 0, fall, -1.0), 0.0)
+        zero = unmoved | (jnp.abs(exact) <= rounding)
         small = LIFT_FRACTION * jnp.abs(rise) + rounding
-        new = jnp.where(left & ~(rise > 0), -small - after, small - after)
+        new = jnp.where(unmoved & ~(rise > 0), -small - after, small - after)
         returns = happens & zero & (rise > 0) & (2.0 * rise < -bend * LANDING_FRACTION)
         # At rest on its zero a condition has no next sign. One that did not fall before its event has jumped.
-        unclear = happens & left & (LANDING_FRACTION * jnp.abs(rise) <= rounding)
+        unclear = happens & unmoved & (LANDING_FRACTION * jnp.abs(rise) <= rounding)
         jumps = fired & ~(fall < 0)
         # An earlier event of the list that a later reset makes happen at this instant: there is no order for it.
         again = ~happens & (was >= 0) & ~zero & (after + lift < -rounding)
         fault = jnp.where(again | returns, float(SolutionStatus.CROWDED), 0.0)
         fault = jnp.where(unclear | jumps, float(SolutionStatus.GRAZED), fault)
-        kept = jnp.where(happens, 0.0, lift)
-        return jax.lax.stop_gradient(jnp.where(zero & (happens | ~left), new, kept)), fault
+        old_lift = jnp.where(happens, 0.0, lift)
+        return jax.lax.stop_gradient(jnp.where(zero & (happens | ~unmoved), new, old_lift)), fault
 
     def _rounding_error(self, condition: Callable, t: Scalar, y: PyTree) -> Scalar:
         """Return how far rounding may move a condition in the state `y` at `t`."""
@@ -442,7 +433,7 @@ class FieldLoop:
 
     def _call(self, function: Callable, t: Scalar, y: PyTree) -> PyTree:
         """Return the result of a function at the time `t` in units of the span."""
-        return function(self.time(t), y, self.given["args"], self.given["constants"])
+        return function(self.time(t), y, self.inputs["args"], self.inputs["constants"])
 
     def _rate(self, t: Scalar, y: PyTree) -> PyTree:
         return jax.tree.map(lambda x: self.span * x, self.field(t, y))
@@ -452,12 +443,7 @@ class FieldLoop:
         return self._call(self.code.field, t, y)
 
     def distance(self, condition: Callable, point: Point) -> Scalar:
-        """Return the time from the end of a run to the zero of a condition, zero within rounding.
-
-        Args:
-            condition: Condition of an event.
-            point: End of the run.
-        """
+        """Return the time from the end of a run to the zero of an event's condition, zero within rounding."""
         t, y = jax.lax.stop_gradient((point.t, point.state.plant))
         margin, rate = self._follow(condition, t, y)
         away = jnp.where(rate < 0, jnp.abs(margin) / jnp.where(rate < 0, -rate, 1.0), jnp.inf)
@@ -491,7 +477,7 @@ class Saves:
     def update(self, memory: Memory, segment: Segment) -> PyTree:
         """Return the states, with those in the step."""
         (start, end), rates = (segment.start, segment.end), segment.shown_rates()
-        first, last = (jax.tree.map(lambda rate: segment.h * rate, one.output.y) for one in rates)
+        first, last = (jax.tree.map(lambda rate: segment.h * rate, shown.output.y) for shown in rates)
         # Each time is overwritten from step to step up to the one in which it lies, so that an event on it is over.
         begun = jax.lax.stop_gradient(start.t) <= self.places + COINCIDENCE_FRACTION
         x = (self.places - start.t) / jnp.where(segment.h > 0, segment.h, 1.0)
@@ -557,8 +543,8 @@ def solve(
     Examples:
         >>> import diffabs as d
         >>> heater = lambda t, y, target: jnp.where(y < target, 2.0, -1.0)
-        >>> found = d.solve(lambda t, y, rate: -rate * y, 1.0, 0.0, 2.0, 0.5, solver=d.Adaptive(1e-8))
-        >>> print(f"{found.y:.6f}")
+        >>> solution = d.solve(lambda t, y, rate: -rate * y, 1.0, 0.0, 2.0, 0.5, solver=d.Adaptive(1e-8))
+        >>> print(f"{solution.y:.6f}")
         0.367879
     """
     engine = resolve_request(engine)
@@ -569,12 +555,12 @@ def solve(
         raise ValueError(f"events has {len(events)} entries; at most {MAX_EVENTS} are possible")
     if isinstance(kept_events, bool) or not isinstance(kept_events, int | np.integer) or kept_events < 1:
         raise ValueError(f"kept_events = {kept_events!r} is no whole number of at least 1")
-    loop, kept = _build_loop(field, y0, t0, t1, args, events, save, int(kept_events))
-    asked: Any = solver
-    method, count = _read_solver(asked, t0, t1, loop.given["t0"].dtype)
+    loop, save_objective = _build_loop(field, y0, t0, t1, args, events, save, int(kept_events))
+    any_solver: Any = solver
+    method, count = _read_solver(any_solver, t0, t1, loop.inputs["t0"].dtype)
     program = _trace_program(loop)
     switched = bool(program.bit_count or events)
-    if switched and loop.given["t0"].dtype != jnp.float64:
+    if switched and loop.inputs["t0"].dtype != jnp.float64:
         raise ValueError(
             "float32 cannot locate the switches and events of a field; call"
             ' jax.config.update("jax_enable_x64", True), and give float64 numbers'
@@ -583,9 +569,9 @@ def solve(
         adaptive = isinstance(method, AdaptiveStepping)
         lean = {"keeps_mode": False, "stable": False} if adaptive else {"kinks": False}
         method = dataclasses.replace(method, watches=False, smooth=True, **lean)
-    saves = {} if kept is None else {"saves": kept}
+    saves = {} if save_objective is None else {"saves": save_objective}
 
-    capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, asked)
+    capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, any_solver)
     capacity = RunCapacity(round_up_capacity(capacity), 0, 0, _finish_solution)
     run = loop, saves, method, None
     if engine == "kernel" or (engine == "auto" and is_traced(loop, saves)):
@@ -609,8 +595,8 @@ def switches(
 
     Examples:
         >>> import diffabs as d
-        >>> found = d.switches(lambda t, y, args: -abs(y), 0.0, 3.0)
-        >>> print(found[0].operation, found[0].margin)
+        >>> comparisons = d.switches(lambda t, y, args: -abs(y), 0.0, 3.0)
+        >>> print(comparisons[0].operation, comparisons[0].margin)
         abs 3.0
 
     Raises:
@@ -619,24 +605,24 @@ def switches(
     if _is_traced(t, y, args, t1):
         raise ValueError("switches lists numbers of one run: call it outside of jit, vmap and grad")
     loop, _ = _build_loop(field, y, t, float(t) + 1.0 if t1 is None else t1, args, (), None, 1)
-    program, zero = _trace_program(loop), jnp.zeros_like(loop.given["t0"])
+    program, zero = _trace_program(loop), jnp.zeros_like(loop.inputs["t0"])
     system = build_system(loop, {}, zero, loop.start(), {}, switched=True)
-    seen = system.evaluate(zero, loop.start(), {}, UNCONSTRAINED).surfaces
+    surfaces = system.evaluate(zero, loop.start(), {}, UNCONSTRAINED).surfaces
     flips = [] if t1 is None else _list_flips(loop, solver)
-    found = []
+    comparisons = []
     for (first, shape), op in zip(program.places, program.origins, strict=True):
         bits = range(first, first + int(np.prod(shape)))
-        margins = [one.value for one in seen if int(np.min(one.numbers)) in bits]
+        margins = [surface.value for surface in surfaces if int(np.min(surface.numbers)) in bits]
         margin = margins[0] if len(margins) == 1 else min(margins, key=abs)
         turned = op.queries[0][1] and op.name != SEARCHSORTED  # the distance to a knot has no side
         times = tuple(time for time, bit in flips if bit in bits)
-        found.append(Switch(summarize(op.source), op.name, -margin if turned else margin, times))
-    return found
+        comparisons.append(Switch(summarize(op.source), op.name, -margin if turned else margin, times))
+    return comparisons
 
 
 def _list_flips(loop: Part, solver: Adaptive) -> list[tuple[float, int]]:
     """Return time and number of each comparison that changes in a run."""
-    method, _ = _read_solver(solver, 0.0, 1.0, loop.given["t0"].dtype)
+    method, _ = _read_solver(solver, 0.0, 1.0, loop.inputs["t0"].dtype)
     if not isinstance(method, AdaptiveStepping):
         raise ValueError(f"solver = {solver} has fixed steps; d.Adaptive is needed")
 
@@ -664,13 +650,9 @@ def _build_loop(
     args: PyTree,
     events: tuple[Event, ...],
     save: AnyArray | None,
-    kept: int,
+    times_per_event: int,
 ) -> tuple[Any, Saves | None]:
-    """Return the field as a `FieldLoop`, and the objective of the times `save`.
-
-    Raises:
-        ValueError: An argument is invalid.
-    """
+    """Return the field as a `FieldLoop`, and the objective of the times `save`."""
     _read_times(t0, t1, save)
     _refuse_leaves("y0", y0)
     for path, leaf in jax.tree_util.tree_leaves_with_path(args):
@@ -690,9 +672,9 @@ def _build_loop(
                 f"t1 - t0 is lost in the rounding of t0 = {start:.10g} and t1 = {end:.10g} as {t0.dtype}: shift the"
                 ' time, or call jax.config.update("jax_enable_x64", True)'
             )
-    dynamics, found, constants = _read_functions(field, events, t0, y0, args)
-    given = {"y0": y0, "t0": t0, "t1": t1, "args": args, "constants": constants}
-    loop = FieldLoop(given=given, code=FieldCode(dynamics, found), kept=kept)
+    dynamics, event_functions, constants = _read_functions(field, events, t0, y0, args)
+    inputs = {"y0": y0, "t0": t0, "t1": t1, "args": args, "constants": constants}
+    loop = FieldLoop(inputs=inputs, code=FieldCode(dynamics, event_functions), times_per_event=times_per_event)
     return loop, None if save is None else _place_saves(save, t0, t1)
 
 
@@ -704,15 +686,11 @@ def _place_saves(save: AnyArray, t0: Scalar, t1: Scalar) -> Saves:
 
 
 def _trace_program(loop: Part) -> SwitchedProgram:
-    """Return the program of the loop's flow, with its comparisons.
-
-    Raises:
-        ValueError: The field has a switch that no step can end on.
-    """
-    program = build_system(loop, {}, jnp.zeros_like(loop.given["t0"]), loop.start(), {}, switched=True).program
+    """Return the program of the loop's flow, or raise a ValueError for a switch that no step can end on."""
+    program = build_system(loop, {}, jnp.zeros_like(loop.inputs["t0"]), loop.start(), {}, switched=True).program
     assert program is not None
     for worst in program.hidden:
-        advice = next((one for names, one in REFUSAL_ADVICE if worst.function in names), REFUSAL_ADVICE[-1][1])
+        advice = next((text for names, text in REFUSAL_ADVICE if worst.function in names), REFUSAL_ADVICE[-1][1])
         raise ValueError(
             f"field has the comparison '{worst.name}' within '{worst.function}' at {summarize(worst.source)}: no step"
             f" can end where its answer changes. {advice}"
@@ -729,21 +707,21 @@ def _trace_program(loop: Part) -> SwitchedProgram:
 def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree) -> tuple[Solution, None]:
     """Return the solution of a run that is over."""
     point, held = carry.point, carry.point.state.controller.held
-    known = {
+    statuses = {
         RunStatus.TIMED_OUT: SolutionStatus.FINISHED,
         RunStatus.STOPPED: SolutionStatus.TERMINATED,
         RunStatus.SLID: SolutionStatus.SLID,
         RunStatus.GRAZED: SolutionStatus.GRAZED,
     }
     status: Scalar = jnp.asarray(SolutionStatus.DIVERGED.value)
-    for one, meant in known.items():
-        status = jnp.where(carry.status == one, meant.value, status)
+    for run_status, meant in statuses.items():
+        status = jnp.where(carry.status == run_status, meant.value, status)
     # A fault of an event ends the run by rates that are NaN. Fixed steps then leave their mode, as in a slide.
     lost: Scalar = ((status == SolutionStatus.DIVERGED) | (status == SolutionStatus.SLID)) & (held.fault > 0)
     status = jnp.where(lost, held.fault.astype(status.dtype), status)
-    check = partial(invalidate, invalid=status > SolutionStatus.TERMINATED, inputs=loop.given)
+    check = partial(invalidate, invalid=status > SolutionStatus.TERMINATED, inputs=loop.inputs)
     # The sum of the steps of a grid may miss t1 by its rounding.
-    t = jnp.where(status == SolutionStatus.FINISHED, loop.given["t1"], loop.time(point.t))
+    t = jnp.where(status == SolutionStatus.FINISHED, loop.inputs["t1"], loop.time(point.t))
     y = point.state.plant
     if objectives:
         t, places = objectives["saves"].times, objectives["saves"].places
@@ -754,10 +732,10 @@ def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTre
         rates = loop.field(point.t, y)
         outside = jnp.where(jnp.abs(places - 0.5) <= 0.5 + COINCIDENCE_FRACTION, 1.0, jnp.nan)
 
-        def pick(y: Array, rate: Array, kept: Array) -> Array:
+        def pick(y: Array, rate: Array, saved: Array) -> Array:
             shape = (-1, *(jnp.ndim(y) * [1]))
             moved = y + jnp.reshape(late, shape) * rate
-            return jnp.reshape(outside, shape) * jnp.where(jnp.reshape(over, shape), moved, kept)
+            return jnp.reshape(outside, shape) * jnp.where(jnp.reshape(over, shape), moved, saved)
 
         y = jax.tree.map(pick, y, rates, point.accumulators["saves"].held)
     events = _count_events(loop, carry, status == SolutionStatus.TERMINATED)
@@ -768,29 +746,25 @@ def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTre
 def _count_events(loop: FieldLoop, carry: PyTree, terminated: Bool) -> SolutionEvents:
     """Return times, in units of the span, and counts of all events in their order."""
     point, held = carry.point, carry.point.state.controller.held
-    distances = [loop.distance(one.condition, point) for one in loop.code.terminal]
+    distances = [loop.distance(event.condition, point) for event in loop.code.terminal]
     last = jnp.argmin(jnp.stack(distances)) if distances else 0
     last = jnp.where(held.ends > 0, held.ends - 1.0, last)
-    never = jnp.full(loop.kept, jnp.nan, point.t.dtype)
+    never = jnp.full(loop.times_per_event, jnp.nan, point.t.dtype)
     inner, ends, rows = iter(range(len(loop.code.inner))), iter(range(len(distances))), []
-    for one in loop.code.events:
-        if one.terminal:
+    for event in loop.code.events:
+        if event.terminal:
             happens = jnp.asarray(terminated & (last == next(ends)))
             rows.append((jnp.where(happens, never.at[0].set(point.t), never), happens.astype(point.t.dtype)))
         else:
             i = next(inner)
             rows.append((held.times[i], held.counts[i]))
-    times = jnp.stack([time for time, _ in rows]) if rows else jnp.zeros((0, loop.kept), point.t.dtype)
+    times = jnp.stack([time for time, _ in rows]) if rows else jnp.zeros((0, loop.times_per_event), point.t.dtype)
     counts = jnp.stack([count for _, count in rows]) if rows else jnp.zeros(0, point.t.dtype)
     return SolutionEvents(times, counts.astype(int))
 
 
 def _read_times(t0: Scalar, t1: Scalar, save: AnyArray | None) -> None:
-    """Check the times of a solution as far as they are concrete.
-
-    Raises:
-        ValueError: A time is invalid.
-    """
+    """Raise a ValueError for an invalid time of a solution, as far as the times are concrete."""
     for name, x, rank in (("t0", t0, 0), ("t1", t1, 0), ("save", save, 1)):
         if x is None:
             continue
@@ -822,11 +796,7 @@ def _refuse_leaves(name: str, tree: PyTree) -> None:
 
 
 def _read_solver(solver: Any, t0: Scalar, t1: Scalar, dtype: DTypeLike) -> tuple[FixedStepping | AdaptiveStepping, int]:
-    """Return the stepping method in units of the span, and the number of its steps.
-
-    Raises:
-        ValueError: The solver or a field of it is invalid.
-    """
+    """Return the stepping method in units of the span, and the number of its steps."""
     count = 1
     if isinstance(solver, Adaptive):
         solver = dataclasses.replace(solver, step=1.0, duration=1.0, every=1)
@@ -850,19 +820,15 @@ def _read_solver(solver: Any, t0: Scalar, t1: Scalar, dtype: DTypeLike) -> tuple
 def _read_functions(
     field: Field, events: Sequence[Event], t: Scalar, y: PyTree, args: PyTree
 ) -> tuple[Function, tuple[Event, ...], list[PyTree]]:
-    """Return the field, the events, and the traced constants of their functions.
-
-    Raises:
-        ValueError: A function or what it returns is invalid, or the field has a switch that cannot be located.
-    """
+    """Return the field, the events, and the traced constants of their functions."""
     constants: list[PyTree] = []
 
     def read(function: Any, name: str, like: PyTree) -> Function:
         if not callable(function):
             raise ValueError(f"{name} = {kinds.format_value(function)} is no function of (t, y, args)")
         # What a function closes over may have changed. A new wrapper makes JAX trace it again.
-        program, found = jax.make_jaxpr(lambda *given: function(*given), return_shape=True)(t, y, args)
-        _check_result(name, found, like)
+        program, shapes = jax.make_jaxpr(lambda *inputs: function(*inputs), return_shape=True)(t, y, args)
+        _check_result(name, shapes, like)
         traced = any(map(_is_traced, program.consts))
         hidden: list[Any] = []
         key = _describe_program(program, [jax.typeof(x) if traced else x for x in program.consts], hidden)
@@ -872,31 +838,31 @@ def _read_functions(
             return Function(key, function)
 
         # The compiled programs of the engine know no tracer from outside: the closure becomes an argument.
-        def call(t: Scalar, y: PyTree, args: PyTree, given: PyTree) -> PyTree:
-            run = jex.jaxpr_as_fun(jex.ClosedJaxpr(program.jaxpr, given))
-            return jax.tree.unflatten(jax.tree.structure(found), run(*jax.tree.leaves((t, y, args))))
+        def call(t: Scalar, y: PyTree, args: PyTree, closure: PyTree) -> PyTree:
+            run = jex.jaxpr_as_fun(jex.ClosedJaxpr(program.jaxpr, closure))
+            return jax.tree.unflatten(jax.tree.structure(shapes), run(*jax.tree.leaves((t, y, args))))
 
         constants.append(list(program.consts))
         return Function(key, call, len(constants) - 1)
 
-    dynamics, found = read(field, "field", y), []
-    for i, one in enumerate(events):
-        if not isinstance(one, Event):
-            raise ValueError(f"events.{i} = {kinds.format_value(one)} is no d.Event")
-        if one.terminal and one.reset is not None:
+    dynamics, event_functions = read(field, "field", y), []
+    for i, event in enumerate(events):
+        if not isinstance(event, Event):
+            raise ValueError(f"events.{i} = {kinds.format_value(event)} is no d.Event")
+        if event.terminal and event.reset is not None:
             raise ValueError(f"events.{i} is terminal and has a reset; a terminal event has none")
-        condition = read(one.condition, f"events.{i}.condition", t)
-        reset = None if one.reset is None else read(one.reset, f"events.{i}.reset", y)
-        found.append(Event(condition, reset, one.terminal))
-    return dynamics, tuple(found), constants
+        condition = read(event.condition, f"events.{i}.condition", t)
+        reset = None if event.reset is None else read(event.reset, f"events.{i}.reset", y)
+        event_functions.append(Event(condition, reset, event.terminal))
+    return dynamics, tuple(event_functions), constants
 
 
-def _check_result(name: str, found: PyTree, like: PyTree) -> None:
+def _check_result(name: str, shapes: PyTree, like: PyTree) -> None:
     """Check that a function returns real numbers with structure and shapes of `like`."""
-    if jax.tree.structure(found) != jax.tree.structure(like):
-        here, there = jax.tree.structure(found), jax.tree.structure(like)
-        raise ValueError(f"{name} returns the structure {here}; {there} is needed")
-    paths = jax.tree_util.tree_leaves_with_path(found)
+    if jax.tree.structure(shapes) != jax.tree.structure(like):
+        structure, needed = jax.tree.structure(shapes), jax.tree.structure(like)
+        raise ValueError(f"{name} returns the structure {structure}; {needed} is needed")
+    paths = jax.tree_util.tree_leaves_with_path(shapes)
     for (path, a), b in zip(paths, jax.tree.leaves(like), strict=True):
         place = jax.tree_util.keystr(path)
         if a.shape != b.shape:
@@ -911,14 +877,14 @@ def _describe_program(program: jex.ClosedJaxpr | jex.Jaxpr, constants: Sequence[
 
     def read(atoms: Sequence[Any]) -> tuple:
         return tuple(
-            (one.aval, _describe(one.val, hidden))
-            if isinstance(one, jex.Literal)
-            else numbers.setdefault(one, len(numbers))
-            for one in atoms
+            (atom.aval, _describe(atom.val, hidden))
+            if isinstance(atom, jex.Literal)
+            else numbers.setdefault(atom, len(numbers))
+            for atom in atoms
         )
 
-    begins = [(one.aval, *read([one])) for one in (*x.constvars, *x.invars)]
-    rows = [(one.primitive, _describe(one.params, hidden), read(one.invars), read(one.outvars)) for one in x.eqns]
+    begins = [(variable.aval, *read([variable])) for variable in (*x.constvars, *x.invars)]
+    rows = [(eqn.primitive, _describe(eqn.params, hidden), read(eqn.invars), read(eqn.outvars)) for eqn in x.eqns]
     return tuple(begins), tuple(rows), read(x.outvars), _describe(list(constants), hidden)
 
 
@@ -927,9 +893,9 @@ def _describe(x: Any, hidden: list[Any]) -> Any:
     if isinstance(x, jex.ClosedJaxpr | jex.Jaxpr):
         return _describe_program(x, getattr(x, "consts", ()), hidden)
     if isinstance(x, dict):
-        return tuple((name, _describe(one, hidden)) for name, one in sorted(x.items()))
+        return tuple((name, _describe(entry, hidden)) for name, entry in sorted(x.items()))
     if isinstance(x, list | tuple):
-        return type(x), tuple(_describe(one, hidden) for one in x)
+        return type(x), tuple(_describe(element, hidden) for element in x)
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         x = jax.random.key_data(x)
     if isinstance(x, jax.Array | np.ndarray | np.generic | float):

@@ -84,10 +84,6 @@ def refine_solver(solver: Solver, times: int) -> Solver:
 
     The time is the original duration, rounded up to whole steps. An `Adaptive` solver also gets `rtol`/`times`^4, so
     that its own steps shrink about as much.
-
-    Args:
-        solver: Solver to refine.
-        times: Divisor of the step, a whole number.
     """
     step = solver.step / times
     # The duration is a multiple of the original step, so both solvers end at the same time.
@@ -98,30 +94,23 @@ def refine_solver(solver: Solver, times: int) -> Solver:
 
 
 def describe_solver(solver: Solver) -> dict[str, PyTree]:
-    """Return the fields of a solver that decide the metrics, by name, as JSON values.
+    """Return the fields of a solver that decide the metrics, by name, as JSON values: step and duration [s].
 
-    It has step and duration [s]. `Adaptive` adds its type and `rtol`, `FixedStep` its `kinks` unless they are None.
-
-    Args:
-        solver: Solver of the run.
+    `Adaptive` adds its type and `rtol`, `FixedStep` its `kinks` unless they are None.
     """
-    said = {"step": solver.step, "duration": solver.duration}
+    fields = {"step": solver.step, "duration": solver.duration}
     if isinstance(solver, Adaptive):
-        return said | {"type": "adaptive", "rtol": solver.rtol}
-    return said if solver.kinks is None else said | {"kinks": solver.kinks}
+        return fields | {"type": "adaptive", "rtol": solver.rtol}
+    return fields if solver.kinks is None else fields | {"kinks": solver.kinks}
 
 
-def differs_in_kind(one: Scalar, other: Scalar) -> Bool:
+def differs_in_kind(first: Scalar, second: Scalar) -> Bool:
     """Return True where two values of a metric differ and are not both finite, such as 0.3 s and "never".
 
     Such a change has no size: the difference would be infinite or NaN.
-
-    Args:
-        one: Values of the metric, any shape.
-        other: Other values, same shape.
     """
-    finite = np.isfinite(one) & np.isfinite(other)
-    return ~finite & (np.asarray(one) != other) & ~(np.isnan(one) & np.isnan(other))
+    finite = np.isfinite(first) & np.isfinite(second)
+    return ~finite & (np.asarray(first) != second) & ~(np.isnan(first) & np.isnan(second))
 
 
 class Trajectory(NamedTuple):
@@ -197,8 +186,8 @@ class Run(NamedTuple):
         """Raise the AttributeError for a `name` that is no field, with the metrics of the run."""
         line = f"a Run has no field {name}"
         if not name.startswith("_") and isinstance(self.metrics, dict):
-            known = f"its metrics are {', '.join(self.metrics)}" if self.metrics else "it has no metrics"
-            line += f'; run.metrics["{name}"] is a metric' if name in self.metrics else f"; {known}"
+            metrics = f"its metrics are {', '.join(self.metrics)}" if self.metrics else "it has no metrics"
+            line += f'; run.metrics["{name}"] is a metric' if name in self.metrics else f"; {metrics}"
         raise AttributeError(line, name=name, obj=self)
 
     def __repr__(self) -> str:

@@ -111,8 +111,8 @@ class TestLanes:
     @pytest.mark.slow
     @killed_by(
         "simulate/drive/packed.py",
-        "known = numbers[jnp.minimum(slots",
-        "known = slots.number + 0 * numbers[jnp.minimum(slots",
+        "lane_numbers = numbers[jnp.minimum(slots",
+        "lane_numbers = slots.number + 0 * numbers[jnp.minimum(slots",
     )
     def test_are_those_of_single_runs_on_two_cores(self, keys, expected, monkeypatch):
         """Shares of different runs, the last ones filled by copies; each run knows its own speed at which it ends."""

@@ -40,7 +40,7 @@ LEVEL = d.Event(lambda t, y, above: y[0] - 0.5, lambda t, y, above: y.at[0].set(
 @METHODS
 @pytest.mark.parametrize("start", [1.0, 0.5], ids=["later", "at t0"])
 @killed_by(
-    "simulate/solve.py", "left & ~(rise > 0), -small - after", "~(rise > 0), -small - after", case="later-adaptive"
+    "simulate/solve.py", "unmoved & ~(rise > 0), -small - after", "~(rise > 0), -small - after", case="later-adaptive"
 )
 @killed_by("simulate/solve.py", "| (status == SolutionStatus.SLID)) & (held", ") & (held", case="later-fixed")
 def test_a_condition_that_its_reset_sets_near_zero_falls_again(solver, engine, start):
@@ -52,7 +52,9 @@ def test_a_condition_that_its_reset_sets_near_zero_falls_again(solver, engine, s
 
 @pytest.mark.slow
 @METHODS
-@killed_by("simulate/solve.py", "zero & (happens | ~left), new, kept", "zero & happens, new, kept", case="adaptive")
+@killed_by(
+    "simulate/solve.py", "zero & (happens | ~unmoved), new, old_lift", "zero & happens, new, old_lift", case="adaptive"
+)
 def test_a_condition_that_another_reset_sets_near_zero_falls(solver, engine):
     """A timer sets the state to 2 at 0.3. There the second event sets it to 5, of which 2.7 are left at 3; or it ends
     the run."""

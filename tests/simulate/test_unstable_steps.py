@@ -56,7 +56,7 @@ def test_a_traced_step_is_named_once_unless_it_was_checked(fresh):
     assert len(said(fresh)) == 1
 
 
-@killed_by("simulate/ensemble.py", "np.count_nonzero(found.codes == code)", "0")
+@killed_by("simulate/ensemble.py", "np.count_nonzero(checks.codes == code)", "0")
 def test_a_batch_says_why_runs_are_refused(fresh):
     batch = d.Batch({"plant.mass": np.array([14.0, 15.0, -1.0])})
     run = d.run_batch(d.braking(), batch, LONG, MEASURED, engine="xla")

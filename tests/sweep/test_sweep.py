@@ -283,7 +283,7 @@ def test_a_half_step_that_turns_never_into_a_number(study, swept):
     assert found["metrics"]["overshoot"]["sample"] == repeated[2]
 
 
-@killed_by("simulate/types.py", "said if solver.kinks is None else", "said if True else")
+@killed_by("simulate/types.py", "fields if solver.kinks is None else", "fields if True else")
 def test_steps_on_kinks_are_another_sweep(study, tmp_path):
     """Without a choice the table stays that of older versions, whose sweeps can be continued."""
     entries = {}

@@ -87,16 +87,9 @@ class DeferredRun(NamedTuple):
 
 
 def run_deferred(by_xla: Callable[[Any, PyTree], PyTree], capacity: Any, run: PyTree, required: bool = False) -> PyTree:
-    """Return by_xla(capacity, run), or the same result by a kernel.
+    """Return by_xla(capacity, run), or the same result by a kernel; the arguments are those of `DeferredRun`.
 
-    Args:
-        by_xla: Function of the capacity and the run, as in `DeferredRun`.
-        capacity: Capacities of the run, as in `DeferredRun`.
-        run: Loop, objectives by name, stepping method, and the random key or None.
-        required: True if only a kernel may make the run.
-
-    Raises:
-        EngineError: A kernel is required and impossible, at the time at which XLA compiles the program.
+    A kernel that is `required` and impossible is an EngineError at the time at which XLA compiles the program.
     """
     leaves, structure = jax.tree.flatten(run)
     if any(jnp.issubdtype(getattr(x, "dtype", float), jnp.complexfloating) for x in leaves):
@@ -133,11 +126,11 @@ def _rebuild(structure: Any, kinds: tuple[Any, ...], leaves: Leaves) -> tuple[Py
 
 def _vary_alike(arrays: Leaves) -> list[PyTree]:
     """Return arrays that all vary between the devices of `jax.shard_map` if one does: JAX adds up the cotangents."""
-    own = [_varying_axes(jax.typeof(x)) for x in arrays]
-    every = frozenset().union(*own)
+    axis_sets = [_varying_axes(jax.typeof(x)) for x in arrays]
+    every = frozenset().union(*axis_sets)
     return [
         jax.lax.pcast(x, tuple(every - axes), to="varying") if every - axes else x
-        for x, axes in zip(arrays, own, strict=True)
+        for x, axes in zip(arrays, axis_sets, strict=True)
     ]
 
 
@@ -293,13 +286,8 @@ def _trace_kernel(call: _Call, arguments: tuple[jax.ShapeDtypeStruct, ...], plat
 def _find_kernel(call: _Call, arguments: Sequence[Any], objection: str) -> tuple[Any, str]:
     """Return the closed jaxpr of a kernel for this call and "", or None and the reason for which XLA makes it.
 
-    Args:
-        call: The call of a primitive.
-        arguments: Its arrays, or their types.
-        objection: Reason against a kernel that is already known, or "".
-
-    Raises:
-        EngineError: A kernel is required, and it is impossible.
+    `objection` is a reason against a kernel that is already known, or "". A kernel that is required and impossible is
+    an EngineError.
     """
     from diffabs.compiler.runtime.toolchain import COMPILER
 
@@ -318,22 +306,16 @@ def _find_kernel(call: _Call, arguments: Sequence[Any], objection: str) -> tuple
 
 
 @functools.cache  # a line once, since JAX may ask for an engine several times
-def _log_choice(what: str, objection: str) -> None:
+def _log_choice(subject: str, objection: str) -> None:
     """Log the engine of some runs, and the reason for XLA."""
     engine = f"XLA, not a kernel: {objection}" if objection else f"a kernel ({describe_engine('kernel')['compiler']})"
-    log.info("%s: %s", what, engine)
+    log.info("%s: %s", subject, engine)
 
 
 def find_kernels(program: Any) -> list[tuple[Any, str]]:
     """Return for each run of a traced program its kernel's closed jaxpr and "", or None and the reason for XLA.
 
     The kernels are built. A reverse mode by XLA has no run left in its program.
-
-    Args:
-        program: Closed jaxpr, such as `jax.make_jaxpr(f)(x)`.
-
-    Raises:
-        EngineError: A kernel is required, and it is impossible.
     """
     return [
         _find_kernel(_Call(**run.params), [x.aval for x in run.invars], _placement_objection((), 1))
@@ -369,10 +351,10 @@ def _lower(context: Any, *operands: Any, **named: Any) -> Any:
     devices = getattr(module.axis_context, "num_devices", None) or 1
     program, objection = _find_kernel(call, context.avals_in, _placement_objection(module.platforms, devices))
     runs, directions = call.count_runs(context.avals_in), call.count_directions(context.avals_in)
-    what = f"{runs} run{'s' * (runs > 1)}"
+    subject = f"{runs} run{'s' * (runs > 1)}"
     if directions:
-        what += f" with {directions} derivative{'s' * (directions > 1)}"
-    _log_choice(what, objection)
+        subject += f" with {directions} derivative{'s' * (directions > 1)}"
+    _log_choice(subject, objection)
     function = call.vectorize(call.deferred.call_xla) if program is None else jex.jaxpr_as_fun(program)
     return mlir.lower_fun(function, multiple_results=True)(context, *operands)
 
@@ -445,9 +427,9 @@ def _linearize(trace: Any, *tracers: Any, **named: Any) -> Sequence[Any]:
     JAX asks for it in `jax.grad`, `jax.vjp` and `jax.linearize`.
     """
     call = _Call(**named)
-    known = [tracer.pval.get_known() for tracer in tracers]
-    leaves, tangents = known[: call.leaf_count], tracers[call.leaf_count :]
-    if any(x is None for x in leaves) or all(x is not None for x in known):
+    known_values = [tracer.pval.get_known() for tracer in tracers]
+    leaves, tangents = known_values[: call.leaf_count], tracers[call.leaf_count :]
+    if any(x is None for x in leaves) or all(x is not None for x in known_values):
         return trace.default_process_primitive(derivative_primitive, tracers, named)
     if not _has_cheap_jacobian(call, leaves):
         with jex.set_current_trace(trace):
@@ -470,7 +452,7 @@ def _split_for_checkpoint(
     del saveable  # the backward pass computes the run again from its arguments
     call = _Call(**equation.params)
     arguments, results = list(equation.invars), list(equation.outvars)
-    residuals = [x for x, here in zip(arguments, staged, strict=True) if not here and isinstance(x, jex.Var)]
+    residuals = [x for x, is_staged in zip(arguments, staged, strict=True) if not is_staged and isinstance(x, jex.Var)]
     values, _ = call.split(results)
     if not any(unknown):
         return equation, None, [False] * len(results), [False] * len(results), []
@@ -483,11 +465,11 @@ def _split_for_checkpoint(
 
     leaves = arguments[: call.leaf_count]
     program = jax.make_jaxpr(compute_values)(*(_type(x.aval) for x in leaves))
-    known = jex.new_jaxpr_eqn(
+    known_equation = jex.new_jaxpr_eqn(
         leaves, values, jex.primitives.closed_call_p, {"call_jaxpr": program}, program.effects, equation.source_info
     )
     unknown_results = [i >= len(values) for i in range(len(results))]
-    return known, equation, unknown_results, [True] * len(results), residuals
+    return known_equation, equation, unknown_results, [True] * len(results), residuals
 
 
 def _has_cheap_jacobian(call: _Call, leaves: Leaves) -> bool:
@@ -546,8 +528,8 @@ def _multiply(call: _Call, jacobian: list[PyTree], tangents: Leaves) -> list[PyT
     function = product
     for level in call.levels:
         # The directions are the Jacobian's first axis, so that of a level is the second one.
-        own, axes = call.has_own_runs(level), [0 if mapped else None for mapped in level[call.leaf_count :]]
-        function = jax.vmap(function, in_axes=(1 if own else None, axes))
+        has_runs, axes = call.has_own_runs(level), [0 if mapped else None for mapped in level[call.leaf_count :]]
+        function = jax.vmap(function, in_axes=(1 if has_runs else None, axes))
     return function(jacobian, list(tangents))
 
 
@@ -562,8 +544,8 @@ def _transpose(cotangents: Sequence[PyTree], *arguments: PyTree, **named: Any) -
         return call.split(call.vectorize(call.deferred.call_xla)(*_replace_leaves(arguments, unknown, tangents)))[1]
 
     _, cotangents = call.split(cotangents)
-    given = [ad.instantiate_zeros(x) for x in cotangents]
-    transposed = dict(zip(unknown, jax.linear_transpose(rates, *types)(given), strict=True))
+    real_cotangents = [ad.instantiate_zeros(x) for x in cotangents]
+    transposed = dict(zip(unknown, jax.linear_transpose(rates, *types)(real_cotangents), strict=True))
     return [transposed.get(i) for i in range(len(arguments))]
 
 

@@ -42,11 +42,7 @@ def is_forked() -> bool:
 
 
 def check_process() -> None:
-    """Raise an error in a process in which no kernel runs (`is_forked`).
-
-    Raises:
-        RuntimeError: The process was forked after JAX had started.
-    """
+    """Raise a RuntimeError in a process in which no kernel runs (`is_forked`)."""
     if is_forked():
         raise RuntimeError("no kernel runs after os.fork: XLA's threads stay in the parent; start processes by `spawn`")
 
@@ -61,14 +57,7 @@ class EngineError(ValueError):
 
 
 def resolve_request(engine: str) -> str:
-    """Return the engine that a request means: the engine itself, or that of $DIFFABS_ENGINE for "auto" if it is set.
-
-    Args:
-        engine: "auto", "xla" or "kernel".
-
-    Raises:
-        ValueError: The name is unknown.
-    """
+    """Return the engine that a request means: itself, or that of $DIFFABS_ENGINE for "auto" if it is set."""
     if engine not in REQUESTABLE_ENGINES:
         raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
     if engine != "auto":
@@ -84,7 +73,7 @@ def default_engine() -> str:
     return "xla" if resolve_request("auto") == "xla" else "auto"
 
 
-def _describe_structure(given: PyTree) -> Hashable:
+def _describe_structure(data: PyTree) -> Hashable:
     """Return what decides whether a kernel is possible: structure and shapes of the data, platform, asked compiler."""
     from diffabs.compiler.runtime.toolchain import COMPILER
 
@@ -93,7 +82,7 @@ def _describe_structure(given: PyTree) -> Hashable:
             return x.shape, x.dtype
         return type(x) if isinstance(x, bool | int | float) else repr(x)  # a solver is a leaf
 
-    leaves, structure = jax.tree.flatten(given)
+    leaves, structure = jax.tree.flatten(data)
     return structure, tuple(map(describe, leaves)), default_platform(), os.environ.get(COMPILER)
 
 
@@ -101,32 +90,22 @@ def run_with_engine(
     engine: str,
     native: Callable[[], T],
     otherwise: Callable[[], T],
-    given: PyTree,
+    data: PyTree,
     why_not: str = "",
     why_xla: str = "",
 ) -> T:
     """Return the result of an engine; "auto" uses the kernel if possible, and otherwise XLA.
 
     If a kernel is impossible, "auto" does not try again for data of the same structure. The trial takes longer than
-    many a batch.
-
-    Args:
-        engine: "kernel", "xla" or "auto", as `resolve_request` returns it.
-        native: Function that runs the kernel.
-        otherwise: Function that runs XLA.
-        given: Data of the runs, a pytree.
-        why_not: Reason against a kernel that is already known, or "".
-        why_xla: Reason for which "auto" does not try a kernel, or "".
-
-    Raises:
-        EngineError: Engine "kernel" is requested but not possible.
+    many a batch. `native` runs the kernel and `otherwise` XLA. `why_not` is a reason against a kernel that is already
+    known, and `why_xla` one for which "auto" does not try it.
     """
     if engine == "xla":
         return otherwise()
     if engine == "auto" and (why_not or why_xla):
         log_own_choice(why_not or why_xla)
         return otherwise()
-    structure = _describe_structure(given) if engine == "auto" else None
+    structure = _describe_structure(data) if engine == "auto" else None
     why_not = why_not or _refused.get(structure, "")
     if not why_not:
         # A local import: `import diffabs` must not need the kernel package.
@@ -148,12 +127,7 @@ def run_with_engine(
 
 
 def describe_engine(engine: str) -> dict[str, str]:
-    """Return the name of the engine of a result and, for a kernel, the properties that determine the bits of the
-    result.
-
-    Args:
-        engine: Name of the engine.
-    """
+    """Return the name of the engine of a result and, for a kernel, what determines the bits of the result."""
     if engine != "kernel":
         return {"name": engine}
     from diffabs.compiler import pipeline

@@ -49,33 +49,21 @@ def run_native(
 ) -> Run:
     """Return the result of `packed.run_packed`, equal to rounding and with forward derivatives.
 
-    Args:
-        loop: Loop that the runs have in common.
-        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
-        keys: Random keys, shape (runs,), or None.
-        solver: Solver of all runs.
-        objectives: Objectives by the names of their metrics.
-        accepted: Runs to execute, bool, shape (runs,).
-        enough: Condition that ends runs early, or None.
-
-    Raises:
-        Unsupported: The step has an operation without a translation.
-        NoCompiler: This machine has no compiler.
-        ValueError: `measure` rejects the arguments.
+    A step with an operation without a translation raises Unsupported, a machine without a compiler NoCompiler.
     """
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
     values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     values = {**values, **forbid_derivatives(loop, values)}
     count = len(accepted)
     enough = jax.tree.map(jnp.asarray, enough)
-    own = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
-    lanes = values, keys, accepted, own
+    early_data = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
+    lanes = values, keys, accepted, early_data
 
-    def run_launch(mine: PyTree) -> Run:
-        """Return the runs of one launch; `mine` holds their rows of `lanes`."""
-        given = loop, mine[0], dict(objectives), method, *mine[1:], enough
+    def run_launch(rows: PyTree) -> Run:
+        """Return the runs of one launch; `rows` are theirs of `lanes`."""
+        inputs = loop, rows[0], dict(objectives), method, *rows[1:], enough
         # A call through a derivative rule costs more than a short run.
-        return _run_differentiable(finish_run, given) if is_traced(given) else _run(*given, finish=finish_run)
+        return _run_differentiable(finish_run, inputs) if is_traced(inputs) else _run(*inputs, finish=finish_run)
 
     if count <= MAX_LANES_PER_LAUNCH:
         return run_launch(lanes)
@@ -89,17 +77,7 @@ def run_native(
 def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish, key: Key | None = None) -> PyTree:
     """Return one run, as `finish` makes it of the last carry; `jax.vmap` makes a lane of each run of a batch.
 
-    Args:
-        loop: Loop of the run.
-        objectives: Objectives by name.
-        method: Stepping method.
-        finish: Function that returns the result from loop, objectives and the last carry.
-        key: Random key of the run.
-
-    Raises:
-        Unsupported: The step has an operation without a translation.
-        NoCompiler: This machine has no compiler.
-        RuntimeError: The process was forked after JAX had started.
+    The errors are those of `run_native`, and a RuntimeError in a process that was forked after JAX had started.
     """
     check_process()
     keys = None if key is None else key[None]
@@ -108,9 +86,9 @@ def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish, ke
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _run_differentiable(finish: Finish, given: PyTree) -> PyTree:
+def _run_differentiable(finish: Finish, arguments: PyTree) -> PyTree:
     """Return the runs of (loop, values, objectives, method, keys, accepted, data for early ends, early ends)."""
-    return _run(*given, finish=finish)
+    return _run(*arguments, finish=finish)
 
 
 def _rule(finish: Finish, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
@@ -124,16 +102,16 @@ def _rule(finish: Finish, primals: PyTree, tangents: PyTree) -> tuple[PyTree, Py
     refuse_derivative(given_loop, measured, method)
     paths = differentiated_paths(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
 
-    def run(given: PyTree) -> PyTree:
+    def run(arguments: PyTree) -> PyTree:
         # Only paths with a nonzero tangent are prepared for derivatives.
-        loop, values, objectives, method, *rest = given
+        loop, values, objectives, method, *lane_data = arguments
         loop = prepare_derivatives(loop, paths)
         method = (
             LaggedReplayStepping(method.for_replay())
             if isinstance(method, AdaptiveStepping)
             else method.for_derivatives()
         )
-        return _run(loop, values, objectives, method, *rest, finish=finish)
+        return _run(loop, values, objectives, method, *lane_data, finish=finish)
 
     return jvp_nonzero(run, primals, tangents)
 
@@ -149,16 +127,16 @@ def _run(
     method: PyTree,
     keys: PyTree,
     accepted: Scalar,
-    own: PyTree,
+    early_data: PyTree,
     enough: EarlyEnd | None,
     *,
     finish: Finish,
 ) -> PyTree:
-    """Return the results of all runs; `method` is the stepping method, and `own` the runs' data for `enough`."""
+    """Return the results of all runs; `method` is the stepping method, `early_data` the runs' data for `enough`."""
     leaves, build_lane = split_by_lane(loop, values, objectives)
 
-    def start(mine: PyTree, key: PyTree, accepted: Scalar) -> PyTree:
-        return _stop_unaccepted(accepted, method.start(*build_lane(mine), key))
+    def start(lane_leaves: PyTree, key: PyTree, accepted: Scalar) -> PyTree:
+        return _stop_unaccepted(accepted, method.start(*build_lane(lane_leaves), key))
 
     def is_running(lane: PyTree, carry: PyTree) -> Scalar:
         if enough is None:
@@ -166,8 +144,8 @@ def _run(
         output = build_lane(lane[0])[0].plant.output(carry.point.state.plant)
         return carry.running & ~enough.has_reached(lane[2], output)
 
-    def judge(mine: PyTree, carry: PyTree) -> PyTree:
-        return finish(*build_lane(mine), carry)[0]
+    def judge(lane_leaves: PyTree, carry: PyTree) -> PyTree:
+        return finish(*build_lane(lane_leaves), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)
     _check_logs(loop, begins.point.state)
@@ -176,7 +154,7 @@ def _run(
         lambda lane, carry: method.renew(build_lane(lane[0])[0], carry),
         lambda lane, carry: method.step(*build_lane(lane[0]), lane[1], carry),
         is_running,
-        (leaves, keys, own),
+        (leaves, keys, early_data),
         begins,
         steps=STEPS_PER_BLOCK,
         rounds=1 if enough is None else STEPS_PER_EXCHANGE // STEPS_PER_BLOCK,
@@ -208,17 +186,7 @@ def kernel_objection(loop: Loop, values: Params, solver: Solver, objectives: Map
     """Return one line with the reason why a kernel cannot make these runs, or None if it can.
 
     A reason is an operation without a translation, no compiler on this machine, or traced numbers. The function
-    executes no run, but it compiles and keeps the kernel.
-
-    Args:
-        loop: Loop that the runs have in common.
-        values: Values of the parameters that differ, shape (runs, ...), by dotted path; at least one path.
-        solver: Solver of all runs.
-        objectives: Objectives by the names of their metrics.
-
-    Raises:
-        ValueError: `measure` rejects the arguments.
-        RuntimeError: The process was forked after JAX had started.
+    executes no run, but it compiles and keeps the kernel. `values` have at least one path, with columns (runs, ...).
     """
     check_process()
     if is_traced(loop, dict(values), dict(objectives)):

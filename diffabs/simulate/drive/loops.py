@@ -30,11 +30,7 @@ STEPS_PER_BLOCK = 16  # steps between two checks of `running`, which is a reduct
 
 
 def round_up_capacity(count: int) -> int:
-    """Return the least number of at most four significant bits that is not less than `count`: up to an eighth more.
-
-    Args:
-        count: Number of attempts or instants.
-    """
+    """Return the least number of at most four significant bits that is not less than `count`: up to an eighth more."""
     unit = 1 << max((count - 1).bit_length() - 4, 0)
     return -(-count // unit) * unit
 
@@ -42,10 +38,7 @@ def round_up_capacity(count: int) -> int:
 def run_to_end(step: Step, renew: Step, carry: Carry) -> Carry:
     """Return the carry at the end of a run, or of a batch under `jax.vmap`. Not for reverse mode.
 
-    Args:
-        step: Function from carry to carry: one attempt of a step.
-        renew: Function from carry to carry, called once before each block of `STEPS_PER_BLOCK` steps.
-        carry: Carry at t = 0.
+    `renew` is called once before each block of `STEPS_PER_BLOCK` steps.
     """
 
     def block(carry: Carry) -> Carry:
@@ -66,20 +59,10 @@ def run_with_trajectory(
 ) -> tuple[Carry, PyTree]:
     """Return the carry after `count` times `every` steps of the grid, and a sample after each `every`-th step.
 
-    The samples have a leading axis of `room`; those beyond `count` are zero. Not for reverse mode.
-
-    Args:
-        step: Function of the carry and of `until`, the number of the grid instant at which it pauses: one attempt of a
-            step.
-        renew: Function from carry to carry, called once before each attempt.
-        before: Function of the carry and an instant's number: True if the run goes on and has not reached that instant.
-        look: Function of the carry and an instant's number that returns the sample there.
-        carry: Carry at t = 0.
-        every: Number of grid steps between two samples.
-        count: Number of samples.
-        room: Capacity for samples, at least `count`.
+    `before(carry, i)` is True if the run goes on and has not reached the grid instant i, and `look(carry, i)` is the
+    sample there. The samples have a leading axis of `room`; those beyond `count` are zero. Not for reverse mode.
     """
-    seen = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(look, carry, count))
+    samples = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(look, carry, count))
 
     def segment(i: Int, at: tuple[Carry, PyTree]) -> tuple[Carry, PyTree]:
         until = (i + 1) * every
@@ -90,7 +73,7 @@ def run_with_trajectory(
         carry = jax.lax.while_loop(lambda carry: any_lane(before(carry, until)), attempt, at[0])
         return carry, jax.tree.map(lambda all, x: all.at[i].set(x), at[1], look(carry, until))
 
-    return jax.lax.fori_loop(0, count, segment, (carry, seen))
+    return jax.lax.fori_loop(0, count, segment, (carry, samples))
 
 
 def scan_with_trajectory(
@@ -103,21 +86,10 @@ def scan_with_trajectory(
     instants: int,
     room: int,
 ) -> tuple[Carry, PyTree]:
-    """Return the carry after `count` times `every` steps of the grid, and a sample after each `every`-th step.
+    """Return what `run_with_trajectory` does, for derivatives. There is `room` for attempts between two samples.
 
-    The samples have a leading axis of `instants`; those beyond `count` come from the final carry. This is the loop for
-    derivatives. Reverse mode keeps the carry at each sample, and computes the steps between two samples again.
-
-    Args:
-        step: Function of the carry and of `until`, the number of the grid instant at which it pauses: one attempt of a
-            step.
-        before: Function of the carry and an instant's number: True if the run goes on and has not reached that instant.
-        look: Function of the carry and an instant's number that returns the sample there.
-        carry: Carry at t = 0.
-        every: Number of grid steps between two samples.
-        count: Number of samples.
-        instants: Capacity for samples, at least `count`.
-        room: Capacity for attempts between two samples.
+    The samples have a leading axis of `instants`; those beyond `count` come from the final carry. Reverse mode keeps
+    the carry at each sample, and computes the steps between two samples again.
     """
 
     def segment(carry: Carry, i: Int) -> tuple[Carry, PyTree]:
@@ -134,17 +106,11 @@ def scan_with_trajectory(
 
 
 def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X], PyTree]) -> X:
-    """Return the carry after groups of steps, with room for at least `capacity` steps.
+    """Return the carry after whole groups of steps, with room for at least `capacity` steps.
 
     A group is skipped where `on(carry)` is False for all runs of the batch. Within a group `on` is not asked: `step`
     must leave a run that is over as it is. Reverse mode keeps the carry of each step. Beyond `MAX_SAVED_CARRIES` steps
     it keeps the carry of each group and computes the steps of a group again.
-
-    Args:
-        step: Function from carry to carry.
-        carry: Carry before the first step.
-        capacity: Least number of steps; whole groups are computed.
-        on: Function of the carry: True if the run goes on.
     """
     outer, inner = nested_scan_lengths(capacity)
 
@@ -164,9 +130,6 @@ def nested_scan_lengths(count: int) -> tuple[int, int]:
 
     Up to `MAX_SAVED_CARRIES` steps a group has `SCAN_GROUP_STEPS` steps. Beyond, both numbers together are at most 3/2
     `MAX_SAVED_CARRIES`, up to a count of MAX_SAVED_CARRIES^2/2.
-
-    Args:
-        count: Number of steps.
     """
     inner = math.ceil(count / MAX_SAVED_CARRIES) if count > MAX_SAVED_CARRIES else min(SCAN_GROUP_STEPS, count)
     return math.ceil(count / inner), inner
@@ -175,25 +138,18 @@ def nested_scan_lengths(count: int) -> tuple[int, int]:
 def log_run(
     step: Step, renew: Step, log: Callable[[Carry, Carry], PyTree], carry: Carry, room: int
 ) -> tuple[Carry, PyTree]:
-    """Return the carry at the end of a run, and the log of its attempts.
+    """Return the carry at the end of a run, and the entry log(before, after) of each attempt, at least `room` of them.
 
-    There is room for at least `room` attempts, in whole groups of blocks. The log is in blocks of shape (blocks,
-    `STEPS_PER_BLOCK`, ...). Blocks after the end of the run are zero.
-
-    Args:
-        step: Function from carry to carry: one attempt of a step.
-        renew: Function from carry to carry, called once before each block.
-        log: Function of the carries before and after an attempt that returns its log entry.
-        carry: Carry at t = 0.
-        room: Capacity for attempts.
+    The log is in blocks of shape (blocks, `STEPS_PER_BLOCK`, ...). Blocks after the end of the run are zero. `renew` is
+    called once before each block.
     """
 
-    def one(carry: Carry, _: None) -> tuple[Carry, PyTree]:
+    def attempt(carry: Carry, _: None) -> tuple[Carry, PyTree]:
         new = step(carry)
         return new, log(carry, new)
 
     def block(carry: Carry, _: None) -> tuple[Carry, PyTree]:
-        return jax.lax.scan(one, renew(carry), length=STEPS_PER_BLOCK)
+        return jax.lax.scan(attempt, renew(carry), length=STEPS_PER_BLOCK)
 
     return _scan_active(
         block,
@@ -207,34 +163,27 @@ def log_run(
 def replay_log(
     step: Callable[[Carry, PyTree], Carry],
     keep: Callable[[Carry], PyTree],
-    taken: Callable[[PyTree], Array],
+    accepted: Callable[[PyTree], Array],
     carry: Carry,
     log: PyTree,
 ) -> tuple[Carry, PyTree]:
-    """Return the carry after all logged attempts, and the kept values of each, in the blocks of the log.
+    """Return the carry after all logged attempts, and keep(carry) after each, in the blocks of the log.
 
-    A block without an accepted attempt is skipped, and its kept values are zero. Reverse mode keeps the carry before
-    each block, and computes the attempts of a block again.
-
-    Args:
-        step: Function of the carry and a log entry: one attempt.
-        keep: Function of the carry after an attempt that returns what is kept.
-        taken: Function of a block of the log: True for each attempt that was accepted.
-        carry: Carry at t = 0.
-        log: Log of a run, as `log_run` returns it.
+    A block in which no attempt is `accepted` is skipped: zeros. Reverse mode keeps the carry before each block, and
+    computes the attempts of a block again.
     """
 
-    def one(carry: Carry, entry: PyTree) -> tuple[Carry, PyTree]:
+    def attempt(carry: Carry, entry: PyTree) -> tuple[Carry, PyTree]:
         carry = step(carry, entry)
         return carry, keep(carry)
 
     # Checkpoints on both levels: memory for the states of the blocks plus those of one block.
     @rematerialise
-    def block(carry: Carry, some: PyTree) -> tuple[Carry, PyTree]:
-        return jax.lax.scan(rematerialise(one), carry, some)
+    def block(carry: Carry, entries: PyTree) -> tuple[Carry, PyTree]:
+        return jax.lax.scan(rematerialise(attempt), carry, entries)
 
-    blocks = len(taken(log))
-    return _scan_active(block, lambda _, some: jnp.any(taken(some)), carry, log, blocks)
+    blocks = len(accepted(log))
+    return _scan_active(block, lambda _, entries: jnp.any(accepted(entries)), carry, log, blocks)
 
 
 def _scan_active(

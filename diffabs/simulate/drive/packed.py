@@ -35,8 +35,8 @@ class EarlyEnd(Protocol):
         """Return the data for run `number` that the condition needs, a pytree."""
         ...
 
-    def has_reached(self, own: PyTree, output: PyTree) -> Scalar:
-        """Return True if the run ends, given its `own` data and the present `output` of its plant."""
+    def has_reached(self, data: PyTree, output: PyTree) -> Scalar:
+        """Return True if the run ends, given its `data` and the present `output` of its plant."""
         ...
 
 
@@ -52,20 +52,8 @@ def run_packed(
 ) -> Run:
     """Return the results of `measure` for runs that differ in their values and keys. Not for derivatives.
 
-    A run that is not accepted has diverged. A run that `enough` ends has no end flag.
-
-    Args:
-        loop: Loop that the runs have in common.
-        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
-        keys: Random keys, shape (runs,), or None.
-        solver: Solver of all runs.
-        objectives: Objectives by the names of their metrics.
-        accepted: Runs to execute, bool, shape (runs,).
-        enough: Condition that ends runs early, or None.
-        numbers: Numbers by which `enough` knows the runs, shape (runs,); None for 0, 1, 2, ...
-
-    Raises:
-        ValueError: `measure` rejects the arguments, or the runs are differentiated.
+    A run that is not accepted has diverged. A run that `enough` ends has no end flag. `values` have shape (runs, ...)
+    by dotted path, and `keys`, `accepted` and `numbers`, by which `enough` knows the runs, shape (runs,).
     """
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
     values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
@@ -79,21 +67,14 @@ def run_packed(
 def split_by_lane(
     loop: Loop, values: dict[str, PyTree], objectives: dict[str, Objective]
 ) -> tuple[PyTree, Callable[[PyTree], tuple[PyTree, PyTree]]]:
-    """Return the leaves of the prepared loops that depend on the values, and a function from the leaves of one run to
-    loop and objectives.
-
-    The objectives include the audit of the plant. Leaves that do not depend on the values are computed once.
-
-    Args:
-        loop: Loop that the runs have in common.
-        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
-        objectives: Objectives by the names of their metrics.
+    """Return the leaves of the prepared loops that depend on the values, and a function from those of one run to its
+    loop and objectives, with the plant's audit. All other leaves are computed once.
     """
     leaves, whole = split_batched(lambda v: prepare(replace(loop, v)), values)
 
-    def build_lane(mine: PyTree) -> tuple[Loop, dict[str, Objective]]:
-        one, audit = whole(mine)
-        return one, objectives | audit
+    def build_lane(lane_leaves: PyTree) -> tuple[Loop, dict[str, Objective]]:
+        lane_loop, audit = whole(lane_leaves)
+        return lane_loop, objectives | audit
 
     return leaves, build_lane
 
@@ -134,17 +115,17 @@ def _run(
     """Return the results of all runs, in their order; `width` runs step at a time, by the stepping method `method`."""
     count = len(accepted)
     leaves, build_lane = split_by_lane(loop, values, objectives)
-    step_all = jax.vmap(lambda mine, key, carry: method.step(*build_lane(mine), key, carry))
-    renew_all = jax.vmap(lambda mine, carry: method.renew(build_lane(mine)[0], carry))
-    start = jax.vmap(lambda mine, key: method.start(*build_lane(mine), key))
-    finish = jax.vmap(lambda mine, carry: finish_run(*build_lane(mine), carry)[0])
+    step_all = jax.vmap(lambda lane_leaves, key, carry: method.step(*build_lane(lane_leaves), key, carry))
+    renew_all = jax.vmap(lambda lane_leaves, carry: method.renew(build_lane(lane_leaves)[0], carry))
+    start = jax.vmap(lambda lane_leaves, key: method.start(*build_lane(lane_leaves), key))
+    finish = jax.vmap(lambda lane_leaves, carry: finish_run(*build_lane(lane_leaves), carry)[0])
 
     def take_lanes(number: Scalar) -> tuple[PyTree, PyTree, Carry]:
         """Return leaves, keys and carries of these runs at t = 0; beyond the last run a copy that does not step."""
-        mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
-        carry = start(mine, key)
+        lane_leaves, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
+        carry = start(lane_leaves, key)
         status = jnp.where(run & (number < count), carry.status, RunStatus.REFUSED)
-        return mine, key, carry._replace(status=status.astype(carry.status.dtype))
+        return lane_leaves, key, carry._replace(status=status.astype(carry.status.dtype))
 
     def step_and_exchange(slots: _LaneSlots) -> _LaneSlots:
         def step_once(carry: Carry, _: object) -> tuple[Carry, None]:
@@ -173,11 +154,11 @@ def _lanes_ended_early(
     """Return True for each slot whose run ends early; `build_lane` returns the loop and objectives of one run."""
     if enough is None:
         return jnp.zeros_like(slots.carry.running)
-    output = jax.vmap(lambda mine, at: build_lane(mine)[0].plant.output(at.point.state.plant))(
+    output = jax.vmap(lambda lane_leaves, at: build_lane(lane_leaves)[0].plant.output(at.point.state.plant))(
         slots.leaves, slots.carry
     )
-    known = numbers[jnp.minimum(slots.number, len(numbers) - 1)]
-    return jax.vmap(lambda number, output: enough.has_reached(enough.own(number), output))(known, output)
+    lane_numbers = numbers[jnp.minimum(slots.number, len(numbers) - 1)]
+    return jax.vmap(lambda number, output: enough.has_reached(enough.own(number), output))(lane_numbers, output)
 
 
 def _exchange_lanes(
@@ -194,11 +175,11 @@ def _exchange_lanes(
     # The cumulative sum gives free slots consecutive numbers.
     number = jnp.where(free, slots.next + jnp.cumsum(free) - 1, slots.number)
     old = (slots.leaves, slots.keys, slots.carry)
-    mine, key, carry = jax.tree.map(partial(_select_lanes, free), take_lanes(number), old)
-    return _LaneSlots(mine, key, carry, jnp.minimum(number, count), slots.next + jnp.sum(free), ended)
+    lane_leaves, key, carry = jax.tree.map(partial(_select_lanes, free), take_lanes(number), old)
+    return _LaneSlots(lane_leaves, key, carry, jnp.minimum(number, count), slots.next + jnp.sum(free), ended)
 
 
-def _select_lanes(which: Scalar, a: Scalar, b: Scalar) -> PyTree:
+def _select_lanes(free: Scalar, a: Scalar, b: Scalar) -> PyTree:
     if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(_select_lanes(which, jax.random.key_data(a), jax.random.key_data(b)))
-    return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+        return jax.random.wrap_key_data(_select_lanes(free, jax.random.key_data(a), jax.random.key_data(b)))
+    return jnp.where(free.reshape(-1, *[1] * (a.ndim - 1)), a, b)

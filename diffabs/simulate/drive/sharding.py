@@ -29,35 +29,26 @@ TRACED_EXPLICIT_AXES = (
 )
 
 
-def describe_placement(given: PyTree) -> str:
+def describe_placement(data: PyTree) -> str:
     """Return the reason why only XLA can run these arrays where they lie, or "" if a kernel can, too.
 
     A kernel is made for the kind of device that JAX uses by default, and for one device.
-
-    Args:
-        given: Data of the runs, a pytree.
     """
     # JAX moves an array that is not committed to its device.
-    places = [x.sharding.device_set for x in jax.tree.leaves(given) if isinstance(x, jax.Array) and x.committed]
+    places = [x.sharding.device_set for x in jax.tree.leaves(data) if isinstance(x, jax.Array) and x.committed]
     if any(len(devices) > 1 for devices in places):
         return "the runs lie on several devices"
-    others = {device.platform for devices in places for device in devices} - {default_platform()}
-    if others:
-        return f"the runs lie on a device ({', '.join(sorted(others))}) of another kind than JAX's default"
+    foreign = {device.platform for devices in places for device in devices} - {default_platform()}
+    if foreign:
+        return f"the runs lie on a device ({', '.join(sorted(foreign))}) of another kind than JAX's default"
     return ""
 
 
 def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, count: int) -> PyTree:
-    """Return run(columns, numbers of the runs), computed on all cores of this processor.
+    """Return run(columns, numbers of the runs), computed on all cores of this processor, one thread each.
 
-    Each core gets a thread with a share of the runs. All shares have one shape and therefore one program. A share has
-    at least `MIN_RUNS_PER_CORE` runs, so a small batch uses fewer cores. Arrays on several devices, or on another
-    device than a processor, are left to XLA.
-
-    Args:
-        run: Function that returns the results of some runs, a pytree with leaves (runs, ...).
-        columns: Data of the runs, a pytree with leaves (count, ...).
-        count: Number of runs.
+    All shares have one shape, so one program, and at least `MIN_RUNS_PER_CORE` runs: a small batch uses fewer cores.
+    Arrays on several devices, or on another device than a processor, are left to XLA.
     """
     cores = min(core_count(), count // MIN_RUNS_PER_CORE)
     if cores < 2 or default_platform() != "cpu" or describe_placement(columns):
@@ -68,33 +59,26 @@ def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, co
 
     def run_share(numbers: np.ndarray) -> PyTree:
         with default_flags(), jax.enable_x64(wide), jax.default_device(device):
-            mine = jax.tree.map(lambda x: x[numbers], columns)
-            return jax.block_until_ready(run(mine, jnp.asarray(numbers)))
+            share = jax.tree.map(lambda x: x[numbers], columns)
+            return jax.block_until_ready(run(share, jnp.asarray(numbers)))
 
     # Every `cores`-th run: neighbours take about equally long. Copies of the last run fill shares of one shape, so that
     # all shares have one program.
     shares = [np.minimum(np.arange(i, i + each * cores, cores), count - 1) for i in range(cores)]
     with ThreadPoolExecutor(cores) as pool:
-        found = list(pool.map(run_share, shares))
+        results = list(pool.map(run_share, shares))
     order = np.arange(each * cores).reshape(cores, each).T.ravel()[:count]
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *found)
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *results)
 
 
-def run_on_auto_mesh(run: Callable[..., PyTree], given: tuple[PyTree, ...]) -> PyTree:
-    """Return run(*given), with arrays on meshes of Explicit axes moved to Auto axes of the same devices.
+def run_on_auto_mesh(run: Callable[..., PyTree], arguments: tuple[PyTree, ...]) -> PyTree:
+    """Return run(*arguments), with arrays on meshes of Explicit axes moved to Auto axes of the same devices.
 
-    No data move between devices. Results return to the original mesh.
-
-    Args:
-        run: Function to call.
-        given: Positional arguments, pytrees.
-
-    Raises:
-        ValueError: An array on Explicit axes is traced.
+    No data move between devices. Results return to the original mesh. A traced array on Explicit axes is a ValueError.
     """
-    meshes = {_auto_mesh(x.sharding.mesh): x.sharding.mesh for x in jax.tree.leaves(given) if _has_explicit_axes(x)}
+    meshes = {_auto_mesh(x.sharding.mesh): x.sharding.mesh for x in jax.tree.leaves(arguments) if _has_explicit_axes(x)}
     if not meshes:
-        return run(*given)
+        return run(*arguments)
 
     def back(x: Scalar) -> Any:
         mesh = getattr(getattr(x, "sharding", None), "mesh", None)
@@ -103,10 +87,12 @@ def run_on_auto_mesh(run: Callable[..., PyTree], given: tuple[PyTree, ...]) -> P
     # A mesh set around the call must be replaced, too: it would otherwise conflict with the Auto mesh of the arrays.
     meant = jax.sharding.get_abstract_mesh().axis_names
     with jax.set_mesh(next(iter(meshes))) if meant else contextlib.nullcontext():
-        found = run(
-            *jax.tree.map(lambda x: _put_on_mesh(x, _auto_mesh(x.sharding.mesh)) if _has_explicit_axes(x) else x, given)
+        results = run(
+            *jax.tree.map(
+                lambda x: _put_on_mesh(x, _auto_mesh(x.sharding.mesh)) if _has_explicit_axes(x) else x, arguments
+            )
         )
-    return jax.tree.map(back, found)
+    return jax.tree.map(back, results)
 
 
 def _has_explicit_axes(x: Scalar) -> bool:
