@@ -18,11 +18,7 @@ LISTED_FAMILIES = (*PLURALS, "scenarios")
 
 
 def families_like(incomplete: str) -> list[str]:
-    """Return completions of a family's name.
-
-    Args:
-        incomplete: Start of the name.
-    """
+    """Return completions of a family's name."""
     return [name for name in LISTED_FAMILIES if name.startswith(incomplete)]
 
 

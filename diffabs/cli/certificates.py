@@ -74,15 +74,7 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
     """Return the linear systems of a scenario with the gain to certify.
 
     Args:
-        chosen: Scenario.
-        gain: Text `k1,k2,...` of another gain; by default the gain of the controller.
-        weighed: True if the task needs the weights Q and R.
-
-    Raises:
-        ScenarioError: The gain is not one finite number per state. Also raised if the section [design] does not fit the
-            model, or lacks the weights that the task needs.
-        ValueError: The loop has no linear model.
-        ModuleNotFoundError: The extra `design` is not installed.
+        gain: `k1,k2,...`; by default the gain of the controller.
     """
     if weighed and chosen.design.Q is None:
         raise ScenarioError("design.Q and design.R are missing: a design minimises the cost that they weigh")
@@ -162,12 +154,6 @@ def certify_gain(task: ProofTask) -> "Certificate":
     """Return the certificate of the gain, with the largest decay rate that a common Lyapunov matrix proves.
 
     A property without a proof raises no error: the certificate leaves it out.
-
-    Args:
-        task: Linear systems, gain and specification.
-
-    Raises:
-        ModuleNotFoundError: The extra `design` is not installed.
     """
     from diffabs.design import analysis
 
@@ -209,12 +195,7 @@ class FurtherFindings(NamedTuple):
 
 
 def find_further(task: ProofTask, proof: "Certificate") -> FurtherFindings | None:
-    """Return results on a gain without a proved common Lyapunov matrix; None if one is proved, because it implies more.
-
-    Args:
-        task: Linear systems, gain and specification.
-        proof: Certificate of the gain.
-    """
+    """Return results on a gain without a proved common Lyapunov matrix; None with one, because it implies more."""
     from diffabs.design.frozen import analyse_frozen_loops
 
     if proof.quadratically_stable:
@@ -250,11 +231,6 @@ def proof_document(
     """Return the JSON document of a proof, whose parameters have the names of the linear model and SI units.
 
     Args:
-        task: Linear systems, gain and specification.
-        proof: Certificate; None if there is none. Its values are then null.
-        out: File of the certificate, which the document names.
-        reason: Sentence on everything unproved, or on why there is no certificate; None if all is proved.
-        known: Results without a common Lyapunov matrix.
         **numbers: Further values by key: "lower_bound", "gap", "residual" and "trace_cost" of a design.
     """
     summary: JsonObject = proof.summary() if proof else {}
@@ -290,9 +266,6 @@ def slowest_vertex(proof: "Certificate") -> JsonObject:
     It stands in for `worst_vertex` where a proof about all vertices together has no worst vertex of its own. The keys
     are "index", "cell", "corner", "claim" and "margin". The margin is the distance [1/s] of that pole from the
     imaginary axis. For a sampled loop it is 1 - |z|.
-
-    Args:
-        proof: Certificate.
     """
     index = int(np.argmax(proof.frozen))
     margin = (0.0 if proof.period is None else 1.0) - proof.frozen[index]
@@ -302,13 +275,7 @@ def slowest_vertex(proof: "Certificate") -> JsonObject:
 
 
 def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings | None = None) -> str:
-    """Return a sentence on required properties without a proof; empty if all are proved.
-
-    Args:
-        proof: Certificate.
-        spec: Required properties.
-        known: Results without a common Lyapunov matrix.
-    """
+    """Return a sentence on required properties without a proof; empty if all are proved."""
     from diffabs.design.proof.schema import DISPROOF_KINDS
 
     stable, refuted = proof.quadratically_stable, any(proof.proved_data(*DISPROOF_KINDS))
@@ -336,11 +303,7 @@ def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings
 
 
 def describe_frozen_stability(known: FurtherFindings) -> str:
-    """Return a sentence on a gain whose frozen loops are all stable.
-
-    Args:
-        known: Results without a common Lyapunov matrix.
-    """
+    """Return a sentence on a gain whose frozen loops are all stable."""
     loops = known.frozen
     where = ", ".join(f"{name} {value:.6g}" for name, value in loops.at.items())
     said = f"each of {loops.systems} frozen systems is stable by its poles"
@@ -355,12 +318,7 @@ def describe_frozen_stability(known: FurtherFindings) -> str:
 
 @contextlib.contextmanager
 def report_design_errors() -> Iterator[None]:
-    """Turn errors of `diffabs.design` into one line.
-
-    Raises:
-        ScenarioError: A value does not fit.
-        typer.Exit: The extra is missing, or the linear algebra failed.
-    """
+    """Turn errors of `diffabs.design` into one line."""
     try:
         yield
     except ModuleNotFoundError as error:

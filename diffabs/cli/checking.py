@@ -32,13 +32,6 @@ def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
 
     The keys beside it are "solvers", "comparable", "reasons", "ended alike" and "turned". If the runs are not
     comparable, "reasons" says why. "turned" names the metrics that are finite with one step, and not with another.
-
-    Args:
-        chosen: Scenario of the run.
-        key: Random key of its noise.
-
-    Raises:
-        ScenarioError: A quarter of the step takes too many steps.
     """
     solver = chosen.solver
     if FINEST * solver.duration / solver.step > MAX_SOLVER_STEPS:
@@ -80,11 +73,6 @@ def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[S
     The run is made again with `rtol` / 16. A change is reported if it exceeds 100 `rtol` of the metric's new value, or
     of 0.01 if that value is smaller. Such a run chatters, or amplifies its errors. A closer run that diverges has no
     metrics to compare, and the line says so.
-
-    Args:
-        metrics: Metrics of the run by name.
-        solver: Solver of the run.
-        again: Function that makes the run again with another solver.
     """
     closer = dataclasses.replace(solver, rtol=solver.rtol / CLOSER)
     finer, found = again(closer), []
@@ -103,11 +91,7 @@ def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[S
 
 
 def describe_check(found: JsonObject) -> list[str]:
-    """Return the warnings of a check, a line each.
-
-    Args:
-        found: Values of `check_run_accuracy`.
-    """
+    """Return the warnings of a check, a line each."""
     lines = [f"accuracy unknown: {why}" for why in found["reasons"]]
     if found["comparable"] and not found["ended alike"]:
         lines.append("accuracy unknown: with a shorter step the run ends differently")

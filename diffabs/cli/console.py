@@ -48,21 +48,12 @@ EXTRAS = {
 
 # Arguments and options that commands share.
 def scenarios_like(incomplete: str) -> list[str]:
-    """Return completions of a scenario's name; without one the shell completes files.
-
-    Args:
-        incomplete: Start of the name.
-    """
+    """Return completions of a scenario's name; without one the shell completes files."""
     return [name for name in names() if name.startswith(incomplete)]
 
 
 def fields_like(context: typer.Context, incomplete: str) -> list[str]:
-    """Return completions of --set: the fields of the scenario on the line, as `show` writes them.
-
-    Args:
-        context: Context with the words so far.
-        incomplete: Start of the field's path.
-    """
+    """Return completions of --set: the fields of the scenario on the line, as `show` writes them."""
     words = [context.params.get("scenario"), *context.args]  # an unfinished option leaves words unparsed here
     try:
         tables = parse_toml(dump(load(next(filter(None, words)))))
@@ -100,21 +91,13 @@ _begun = time.monotonic()
 
 
 def quieten(wanted: bool) -> None:
-    """Set whether lines other than errors, warnings and interruptions are suppressed.
-
-    Args:
-        wanted: True to suppress them.
-    """
+    """Set whether lines other than errors, warnings and interruptions are suppressed."""
     global _quiet
     _quiet = wanted
 
 
 def note_command(words: Sequence[str]) -> None:
-    """Store the words of the command that begins, and start its clock.
-
-    Args:
-        words: Words after `diffabs`.
-    """
+    """Store the words after `diffabs` of the command that begins, and start its clock."""
     global _given, _begun
     _given, _begun = tuple(words), time.monotonic()
     stopwatch.count_compilations()
@@ -133,9 +116,6 @@ def describe_source(chosen: Scenario) -> JsonObject:
     """Return the entries that documents on a scenario begin with: "scenario", "model" and "made".
 
     They hold its name, the values of `describe_model` and those of `describe_run`.
-
-    Args:
-        chosen: Scenario.
     """
     return {"scenario": chosen.name, "model": describe_model(chosen), "made": describe_run()}
 
@@ -147,11 +127,7 @@ def escape_unencodable_output() -> None:
 
 
 def say(line: str) -> None:
-    """Write a line for a person to stderr; on a terminal it is folded between words.
-
-    Args:
-        line: Line without a line break.
-    """
+    """Write a line for a person to stderr; on a terminal it is folded between words."""
     if _quiet and not line.startswith(LOUD):
         return
     width = _terminal_width()
@@ -161,12 +137,7 @@ def say(line: str) -> None:
 
 
 def say_command(line: str, words: Sequence[str]) -> None:
-    """Write a line that ends in a command; a narrow terminal gets the command on lines of its own, to copy.
-
-    Args:
-        line: Text before the command.
-        words: Words of the command, which are quoted for a shell.
-    """
+    """Write a line that ends in a command; a narrow terminal gets the command on lines of its own, to copy."""
     width, command = _terminal_width(), [shlex.quote(word) for word in words]
     if width is None or len(" ".join([line, *command])) <= width:
         say(" ".join([line, *command]))
@@ -197,15 +168,7 @@ def _terminal_width() -> int | None:
 
 
 def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
-    """End the command with one line on stderr.
-
-    Args:
-        line: Text of the error.
-        status: Exit status.
-
-    Raises:
-        typer.Exit: Always.
-    """
+    """End the command with one line on stderr."""
     say(f"error: {line}")
     raise typer.Exit(status)
 
@@ -215,12 +178,6 @@ def conclude(line: str) -> NoReturn:
 
     The command did its work, so the line does not begin with `error:`. The exit status lets a script stop, as `diff`
     does for files that differ.
-
-    Args:
-        line: Text of the verdict.
-
-    Raises:
-        typer.Exit: Always, with the status `FAILED`.
     """
     say(f"verdict: {line}")
     raise typer.Exit(FAILED)
@@ -237,9 +194,6 @@ def end_on_errors() -> Iterator[None]:
 
     Expected are bad input, an engine that cannot make the runs, and Ctrl-C. So are errors of the system, such as a full
     disk or lack of memory. Parts from outside that raise or exit are expected, too.
-
-    Raises:
-        typer.Exit: One of these errors occurred.
     """
     try:
         yield
@@ -263,14 +217,7 @@ def end_on_errors() -> Iterator[None]:
 
 @contextlib.contextmanager
 def show_before_errors(show: Callable[[], object]) -> Iterator[None]:
-    """Show results before an error of the `with` block, such as of a full disk, ends the command.
-
-    Args:
-        show: Function that writes the results of the work before the block.
-
-    Raises:
-        BaseException: The block raised it.
-    """
+    """Show results before an error of the `with` block, such as of a full disk, ends the command."""
     try:
         yield
     except BaseException:
@@ -321,17 +268,7 @@ def run_with_progress(
     """Return the result of `work`, and show its progress: a spinner on a terminal, else lines on stderr.
 
     The work runs in its own thread, because Ctrl-C cannot interrupt compiled code in the main thread. Its output to
-    stdout goes to stderr.
-
-    Args:
-        work: Function to run.
-        message: Text beside the spinner.
-        detail: Function that returns the progress, for the spinner or for a line every few seconds.
-        ending: Reaction to Ctrl-C; by default the work is interrupted at once.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C interrupted the work.
-        BaseException: The work raised it.
+    stdout goes to stderr. `detail` returns the progress. Without an `ending`, Ctrl-C interrupts the work at once.
     """
     result: list[T] = []
     errors: list[BaseException] = []
@@ -387,14 +324,8 @@ def _wait_for_interrupt(thread: threading.Thread) -> bool:
 def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: bool = True) -> Scenario:
     """Return a scenario, and write its notes and a warning for each value that is allowed but probably a mistake.
 
-    Args:
-        scenario: Name of a packaged scenario, or path of a TOML file.
-        changes: Overrides, as in `load`.
-        integrated: Also check that the step is stable for the loop.
-
-    Raises:
-        ScenarioError: As in `load`. Also raised if the friction of a road has not the sign of the slip, where there are
-            parts from outside.
+    With `integrated` it also checks that the step is stable for the loop. With parts from outside, it raises
+    ScenarioError if the friction of a road has not the sign of the slip.
     """
     chosen = run_with_progress(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
     road = getattr(chosen.loop.plant, "road", None) if outside.registered_modules() else None
@@ -413,9 +344,6 @@ def leave(status: Int) -> NoReturn:
     The interpreter would wait for the thread of such work. This function ends the process at once, after it has removed
     the work's unfinished files and processes.
 
-    Args:
-        status: Exit status. A process that another signal interrupted gets its status in place of `INTERRUPTED`.
-
     Raises:
         SystemExit: No work runs, so the interpreter can end as usual.
     """
@@ -431,36 +359,19 @@ def leave(status: Int) -> NoReturn:
 
 
 def add_option_overrides(changes: Sequence[str] | None, section: str, **fields: Any) -> list[str]:
-    """Return the overrides of --set, followed by those of separate options such as --seed.
-
-    Args:
-        changes: Overrides of --set.
-        section: Section of the fields.
-        **fields: Values by field; None is left out.
-    """
+    """Return the overrides of --set, followed by those of separate options such as --seed; None is left out."""
     return [*(changes or ()), *(f"{section}.{name}={value}" for name, value in fields.items() if value is not None)]
 
 
 def need_extra(extra: str) -> None:
-    """End the command if a module of an optional extra is not installed.
-
-    Args:
-        extra: Key of `EXTRAS`.
-
-    Raises:
-        typer.Exit: A module is missing.
-    """
+    """End the command if a module of an optional extra, a key of `EXTRAS`, is not installed."""
     missing = [name for name in EXTRAS[extra] if importlib.util.find_spec(name) is None]
     if missing:
         fail(f'{" and ".join(missing)} needed: pip install ".[{extra}]" in a clone')
 
 
 def need_matplotlib() -> None:
-    """End the command if Matplotlib is not installed.
-
-    Raises:
-        typer.Exit: Matplotlib is missing.
-    """
+    """End the command if Matplotlib is not installed."""
     os.environ.setdefault("MPLBACKEND", "agg")
     if importlib.util.find_spec("matplotlib") is None:
         fail('figures need matplotlib: pip install ".[plot]" in a clone')

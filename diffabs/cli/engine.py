@@ -22,14 +22,7 @@ XLA_NOTE = "note: runs are made by XLA: {}"
 
 
 def check_engine_name(engine: str) -> None:
-    """Check the name of an engine.
-
-    Args:
-        engine: Value of the option.
-
-    Raises:
-        ScenarioError: The name is unknown, or that in `DIFFABS_ENGINE`.
-    """
+    """Check the name of an engine."""
     try:
         resolve_request(engine)
     except ValueError as error:
@@ -43,10 +36,6 @@ def choose_engine(engine: str, objection: Callable[[], str | None]) -> str:
 
     "auto" becomes "kernel" unless there is an objection. A line on stderr then gives the reason for XLA. The
     environment variable `DIFFABS_ENGINE` replaces "auto".
-
-    Args:
-        engine: Value of the option: "auto", or an engine, which is returned as it is.
-        objection: Function that compiles a kernel, and returns None or the reason why it cannot be used.
     """
     engine = resolve_request(engine)
     if engine != "auto":

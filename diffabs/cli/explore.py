@@ -76,14 +76,7 @@ def _open_socket(port: int | None) -> socket.socket:
 
 
 def load_judge(path: pathlib.Path) -> "Callable[[Session], ProofVerdict]":
-    """Return the function that judges a session by a proof's file.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        typer.Exit: There is no such file, or it is not the certificate of a proof.
-    """
+    """Return the function that judges a session by a proof's file."""
     from diffabs.explore.proved import judge_values, load_proved_box
 
     document = prove.read_proof_file(path)
@@ -100,9 +93,6 @@ def prove_scenario(chosen: Scenario) -> "ProofVerdict":
 
     The word is "certified", "refuted" or "undecided" for quadratic stability. Without any certificate it is "unknown",
     and the sentence gives the reason.
-
-    Args:
-        chosen: Scenario.
     """
     from diffabs.explore.session import CERTIFIED, NOT_PROVED, REFUTED, UNDECIDED, ProofVerdict
 
@@ -115,14 +105,7 @@ def prove_scenario(chosen: Scenario) -> "ProofVerdict":
 
 
 def pose_tuning(chosen: Scenario) -> "TuningTask":
-    """Return runs and constraints of a scenario's [tune].
-
-    Args:
-        chosen: Scenario.
-
-    Raises:
-        ScenarioError: The section does not fit the loop, or an extra is not installed.
-    """
+    """Return runs and constraints of a scenario's [tune]."""
     from diffabs.explore.tuning import TuningTask
 
     try:

@@ -123,11 +123,7 @@ def _draw(chosen: Scenario, nominal: "System", found: "Band | None", picture: pa
 
 
 def margin_numbers(found: "Margins") -> dict[str, float]:
-    """Return the margins by their names in the JSON document, in the units of `MARGIN_UNITS`.
-
-    Args:
-        found: Margins of one loop.
-    """
+    """Return the margins by their names in the JSON document, in the units of `MARGIN_UNITS`."""
     low, high = found.gain
     return {
         **{"gain_up": high, "gain_down": low, "phase": found.phase, "delay": found.delay},

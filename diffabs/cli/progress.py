@@ -47,11 +47,7 @@ Detail = Callable[[], WorkProgress | str]
 
 
 def format_duration(seconds: float) -> str:
-    """Return a length of time in words.
-
-    Args:
-        seconds: Length [s].
-    """
+    """Return a length of time in words."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
@@ -94,11 +90,7 @@ class WorkTiming:
 
 
 def can_redraw(console: Console) -> bool:
-    """Return True if lines can be redrawn: on a terminal that can move its cursor (not TERM=dumb).
-
-    Args:
-        console: Console of stderr.
-    """
+    """Return True if lines can be redrawn: on a terminal that can move its cursor (not TERM=dumb)."""
     return console.is_terminal and not console.is_dumb_terminal
 
 
@@ -129,10 +121,8 @@ def fit_line(words: str, rest: str, times: str, width: int) -> str:
     If the line is too long, it loses the message first. The progress is then cut at its end.
 
     Args:
-        words: Message and progress.
         rest: Progress alone.
         times: Times, which are never cut.
-        width: Columns of the line.
     """
     room = width - len(times)
     if len(words) > room:
@@ -149,7 +139,6 @@ def show_progress(
     It yields a function that the block must call often: without a spinner, each call may write a line that is due.
 
     Args:
-        message: Name of the work.
         detail: Function that returns the progress. Without it, at most one line is written.
         tell: Function that writes a line, if stderr cannot be redrawn.
         timing: Time [s] of the first line, and time [s] between further lines.

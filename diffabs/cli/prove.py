@@ -118,11 +118,7 @@ def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
 
 
 def read_proof_file(file: pathlib.Path) -> JsonObject | None:
-    """Return the content of a file that `prove` wrote, None for any other file.
-
-    Args:
-        file: Path of the file.
-    """
+    """Return the content of a file that `prove` wrote, None for any other file."""
     try:
         document = json.loads(files.read_content(file, MOST_BYTES))
     except (OSError, ValueError, RecursionError):
@@ -134,11 +130,7 @@ def read_proof_file(file: pathlib.Path) -> JsonObject | None:
 def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as_json: bool) -> None:
     """Check a file of `prove` by the checker, show the verdict, and exit with status 1 if it fails.
 
-    Args:
-        file: Path of the file.
-        document: Content of the file.
-        share: Share of the cells to check, in (0, 1].
-        as_json: True for JSON.
+    `share` of its cells are checked, in (0, 1].
     """
     console.need_extra("proof")
     from diffabs.reach import NoRule

@@ -42,17 +42,7 @@ def report(
 
 
 def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, title: str = "") -> None:
-    """Write the report of all documents in folders or files. The file is written whole or not at all.
-
-    Args:
-        sources: Folders or files with documents.
-        target: HTML file.
-        title: Title of the report; by default the title of its only section, or the number of results.
-
-    Raises:
-        ScenarioError: A source has no document.
-        OSError: A file cannot be read or written.
-    """
+    """Write the report of all documents in folders or files. The file is written whole or not at all."""
     from diffabs.report import ReportError, find_documents
     from diffabs.report import build_report as made
 
@@ -65,14 +55,7 @@ def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, tit
 
 
 def check_target(target: pathlib.Path) -> None:
-    """Check that a report may be written to a file.
-
-    Args:
-        target: HTML file.
-
-    Raises:
-        typer.Exit: The file exists and is not a report.
-    """
+    """Check that a report may be written to a file."""
     from diffabs.report import is_report
 
     target = targets.resolve_path(target, "--out")

@@ -36,20 +36,12 @@ COSTS = {
 
 
 def as_json(value: Scalar) -> None:
-    """Print one JSON document to stdout.
-
-    Args:
-        value: Values; a number without a form in JSON becomes null.
-    """
+    """Print one JSON document to stdout; a number without a form in JSON becomes null."""
     typer.echo(json.dumps(replace_infinite(value), indent=2, allow_nan=False))
 
 
 def replace_infinite(value: Scalar) -> Scalar:
-    """Return values with null in place of NaN and infinity, which JSON lacks.
-
-    Args:
-        value: Dictionaries, lists and plain values.
-    """
+    """Return values with null in place of NaN and infinity, which JSON lacks."""
     if isinstance(value, dict):
         return {str(key): replace_infinite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -58,13 +50,7 @@ def replace_infinite(value: Scalar) -> Scalar:
 
 
 def write_csv(trajectory: Trajectory, plant: Part, path: pathlib.Path) -> None:
-    """Write the instants up to the end of the run to a CSV file, with units in its header.
-
-    Args:
-        trajectory: Trajectory of the run.
-        plant: Plant, for the units.
-        path: File to write.
-    """
+    """Write the instants up to the end of the run to a CSV file, with units in its header."""
     columns = {f"{name} [{unit}]": values for name, (unit, values) in run_signals(trajectory.sample, plant).items()}
     rows = int(trajectory.running.sum()) + 1  # after the end the trajectory repeats its last sample
     with path.open("w", encoding="utf-8", newline="\n") as file:
@@ -74,12 +60,7 @@ def write_csv(trajectory: Trajectory, plant: Part, path: pathlib.Path) -> None:
 
 
 def show_run(result: JsonObject, chosen: Scenario) -> None:
-    """Show metrics with their units, and the files written.
-
-    Args:
-        result: JSON document of the run.
-        chosen: Scenario.
-    """
+    """Show metrics with their units, and the files written."""
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
         table.add_row(name, format_metric(value), unit_of(chosen.objectives[name], chosen.loop.plant))
@@ -88,11 +69,7 @@ def show_run(result: JsonObject, chosen: Scenario) -> None:
 
 
 def show_accuracy(found: JsonObject) -> None:
-    """Show the changes of the metrics by shorter steps and by single precision.
-
-    Args:
-        found: Values of `check_run_accuracy`.
-    """
+    """Show the changes of the metrics by shorter steps and by single precision."""
     table = Table("metric", "half step", "relative", "order", "error", "float32")
     for name, row in found["metrics"].items():
         order = "none" if not row["converges"] else "" if math.isnan(row["order"]) else f"{row['order']:.1f}"
@@ -103,12 +80,7 @@ def show_accuracy(found: JsonObject) -> None:
 
 
 def show_family(name: str, members: JsonObject) -> None:
-    """Show the members of a family, field by field; or the scenarios.
-
-    Args:
-        name: Name of the family in the plural, or `scenarios`.
-        members: Values by name of the member.
-    """
+    """Show the members of a family, field by field; or the scenarios."""
     if name == "scenarios":
         table = Table("name", "title", "description")
         for member, header in members.items():
@@ -128,22 +100,13 @@ def show_family(name: str, members: JsonObject) -> None:
 
 
 def show_paper(digest: Digest, folder: pathlib.Path) -> None:
-    """Show the compact result of a paper, and the folder of its files.
-
-    Args:
-        digest: Compact result.
-        folder: Folder of the files.
-    """
+    """Show the compact result of a paper, and the folder of its files."""
     open_console().print(show_digest(digest))
     say(f"{digest.figures} figures, summary.json and report.html: {folder}\n")
 
 
 def show_digest(digest: Digest) -> Group:
-    """Return title, table, number of agreeing values and verdicts of a paper, in 80 columns.
-
-    Args:
-        digest: Compact result.
-    """
+    """Return title, table, number of agreeing values and verdicts of a paper, in 80 columns."""
     table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     for heading, *cells in zip(digest.headings, *digest.lines, strict=True):
         words = heading == digest.headings[0] or any(cell[:1].isalpha() for cell in cells)
@@ -157,14 +120,7 @@ def show_digest(digest: Digest) -> Group:
 
 
 def show_proof(result: JsonObject, title: str, units: Mapping[str, str], verdict: str) -> None:
-    """Show a gain, the proof, and the vertices of its polytope.
-
-    Args:
-        result: JSON document of the proof.
-        title: Title of the first table.
-        units: Units of the parameters by path of the linear model.
-        verdict: Word for the stability.
-    """
+    """Show a gain, the proof, and the vertices of its polytope."""
     gains = Table("state", "gain")
     for state, value in zip(result["states"], result["gain"], strict=True):
         gains.add_row(state, f"{value:.8g}")
@@ -199,11 +155,7 @@ def show_proof(result: JsonObject, title: str, units: Mapping[str, str], verdict
 def show_verification(result: JsonObject, json_wanted: bool) -> None:
     """Show a line for each claim, or the JSON document.
 
-    A claim is "proved", "NOT PROVED", or "not refuted" if only a sample of the cells was proved again.
-
-    Args:
-        result: JSON document of the verification; without the key "complete" it is complete.
-        json_wanted: True for JSON.
+    A claim is "proved", "NOT PROVED", or "not refuted" if only a sample of the cells was proved again (`complete`).
     """
     if json_wanted:
         return as_json(result)
@@ -216,12 +168,7 @@ def show_verification(result: JsonObject, json_wanted: bool) -> None:
 
 
 def show_tuning(result: JsonObject, chosen: Scenario) -> None:
-    """Show parameters, metrics and constraints before and after, and the course of the tuning.
-
-    Args:
-        result: JSON document of the tuning.
-        chosen: Scenario.
-    """
+    """Show parameters, metrics and constraints before and after, and the course of the tuning."""
     free = Table("parameter", "before", "after", "low", "high", "unit")
     for path, row in result["free"].items():
         free.add_row(path, *(format_brief(row[key]) for key in ("before", "after", "low", "high")), row["unit"])
@@ -251,11 +198,7 @@ def show_tuning(result: JsonObject, chosen: Scenario) -> None:
 
 
 def format_shortfall(row: JsonObject) -> str:
-    """Return the amount by which a constraint is not met, in words.
-
-    Args:
-        row: Row of the constraint.
-    """
+    """Return the amount by which a constraint is not met, in words."""
     if row["missed"] is None:
         return "not known"
     part = f" ({100 * row['missed'] / abs(row['bound']):.2g} %)" if row["bound"] else ""
@@ -263,11 +206,7 @@ def format_shortfall(row: JsonObject) -> str:
 
 
 def show_identification(result: JsonObject) -> None:
-    """Show values with standard deviations, residuals and strong correlations.
-
-    Args:
-        result: JSON document of the identification.
-    """
+    """Show values with standard deviations, residuals and strong correlations."""
     values = Table("parameter", "before", "identified", "standard deviation", "unit")
     for name, row in result["values"].items():
         deviation = row["why"] if row["deviation"] is None else f"{row['deviation']:.3g}"
@@ -286,21 +225,13 @@ def show_identification(result: JsonObject) -> None:
 
 
 def show_files(result: JsonObject) -> None:
-    """Write the names of the written files to stderr.
-
-    Args:
-        result: JSON document with the key `files`.
-    """
+    """Write the names of the written files to stderr."""
     for name, path in result["files"].items():
         say(f"{name}: {path}")
 
 
 def format_brief(value: Scalar) -> str:
-    """Return a number with six digits, or the first four entries of a list.
-
-    Args:
-        value: Number, list or text.
-    """
+    """Return a number with six digits, or the first four entries of a list."""
     if isinstance(value, list):
         return f"[{', '.join(map(format_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
     return round_for_table(value) if isinstance(value, float) else str(value)
@@ -310,9 +241,6 @@ def numbers_at_bounds(free: Params) -> Iterator[str]:
     """Yield each tuned number at a bound of its range, with the bound.
 
     A number is at a bound if it is in the outer hundredth of its range (`reached_bound`).
-
-    Args:
-        free: Rows of the free parameters by path.
     """
     for path, row in free.items():
         after, low, high = np.broadcast_arrays(*(np.asarray(row[key], float) for key in ("after", "low", "high")))

@@ -12,12 +12,7 @@ from diffabs.scenario.scenario import Scenario
 
 
 def show_box_proof(result: JsonObject, chosen: Scenario) -> None:
-    """Show the verdict and the proved bounds of a box.
-
-    Args:
-        result: JSON document of the proof.
-        chosen: Scenario.
-    """
+    """Show the verdict and the proved bounds of a box."""
     box = describe_box(result["over"], chosen)
     table = Table("quantity", "proved from", "to", "unit", "worst run found", "looseness")
     for name, row in result["bounds"].items():
@@ -37,8 +32,6 @@ def describe_box(box: Mapping[str, Sequence[float]], chosen: Scenario, digits: i
     """Return a box in words, in SI units.
 
     Args:
-        box: Range (low, high) of each parameter by path.
-        chosen: Scenario with the parameters.
         digits: Significant digits.
     """
     there = parameters_of(chosen.loop)

@@ -17,12 +17,7 @@ if TYPE_CHECKING:
 
 
 def show_sweep(result: JsonObject, chosen: Scenario) -> None:
-    """Show failures, statistics with intervals, sensitivities and the worst samples of a sweep.
-
-    Args:
-        result: JSON document of the sweep.
-        chosen: Scenario.
-    """
+    """Show failures, statistics with intervals, sensitivities and the worst samples of a sweep."""
     percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
     show_titled_table(
         f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", _failures(result["failures"])
@@ -97,12 +92,7 @@ def _statistics(metrics: JsonObject, chosen: Scenario) -> Table:
 
 
 def show_rare_event(result: JsonObject, chosen: Scenario) -> None:
-    """Show a small probability, its levels, and the likeliest failures.
-
-    Args:
-        result: JSON document of the probability.
-        chosen: Scenario.
-    """
+    """Show a small probability, its levels, and the likeliest failures."""
     levels = Table("level", "metric", "share", "coefficient of variation", "accepted", "diverged")
     for i, row in enumerate(result["levels"], 1):
         reached = f"{'>' if row['strict'] else '>='} {row['threshold']:.4g}"
@@ -134,11 +124,7 @@ def _format_probability(probability: float) -> str:
 
 
 def show_comparison(result: JsonObject) -> None:
-    """Show means of two sweeps, and their difference sample by sample.
-
-    Args:
-        result: JSON document of the comparison.
-    """
+    """Show means of two sweeps, and their difference sample by sample."""
     table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")
     for name, row in result["metrics"].items():
         if row["difference"] is None:
@@ -161,21 +147,13 @@ def _estimate(row: JsonObject) -> list[str]:
 
 
 def say_unused_seed(chosen: Scenario) -> None:
-    """Say that the seed of the solver has no effect on a study of samples, if a scenario gives one.
-
-    Args:
-        chosen: Scenario.
-    """
+    """Say that the seed of the solver has no effect on a study of samples, if a scenario gives one."""
     if chosen.seed:
         say(f"note: solver.seed = {chosen.seed} has no effect: sweep.seed decides the noise of a sweep")
 
 
 def warn_of_strays(found: "Results") -> None:
-    """Warn of files among the chunks that are not part of the sweep: other readers would read them too.
-
-    Args:
-        found: Results of the sweep.
-    """
+    """Warn of files among the chunks that are not part of the sweep: other readers would read them too."""
     if found.strays:
         more = f" (and {len(found.strays) - 1} more)" if found.strays[1:] else ""
         say(f"warning: {found.strays[0]}{more} is not a chunk of this sweep; other programs would read it, too")

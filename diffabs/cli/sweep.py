@@ -109,17 +109,7 @@ def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
 
 
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
-    """Return one sample of a sweep as a scenario with the sample's values, and the random key of its noise.
-
-    Args:
-        folder: Folder of the sweep.
-        number: Number of the sample, from 0.
-
-    Raises:
-        SweepError: The folder holds no sweep of a scenario, or its scenario does not match its study.
-        ScenarioError: The sample was refused.
-        typer.Exit: The number is out of range, or the extra is not installed.
-    """
+    """Return one sample of a sweep, from 0, as a scenario with the sample's values, and the random key of its noise."""
     console.need_extra("sweep")
     from diffabs.sweep.store import SweepError, check_owner, describe_differences, read_manifest
 

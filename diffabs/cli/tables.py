@@ -10,12 +10,7 @@ FRAME, PER_COLUMN = 1, 3  # width of the frame; further width of frame and paddi
 
 
 def show_titled_table(title: str, table: Table) -> None:
-    """Print a table to stdout, below its title.
-
-    Args:
-        title: Title; empty for none.
-        table: Table, which is split into several if it is too wide.
-    """
+    """Print a table to stdout, below its title; one that is too wide is split into several."""
     for column in table.columns:
         column.overflow = "fold"  # fold long cells: rich would cut them off
     console = open_console()
@@ -34,10 +29,6 @@ def fit_table(table: Table, width: int) -> list[Table]:
     """Return a table as one or more tables, each at most `width` wide if its longest words allow it.
 
     The first column names the row, so it is repeated in each table.
-
-    Args:
-        table: Table.
-        width: Columns of the terminal.
     """
     groups: list[list[Column]] = []
     first, *others = table.columns

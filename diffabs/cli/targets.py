@@ -20,14 +20,7 @@ INPUTS = {"scenario": "the scenario", "data": "the file of --data", "source": "t
 
 
 def check_distinct(given: Mapping[str, Any]) -> None:
-    """Check that a command writes no file twice, and no file that it reads.
-
-    Args:
-        given: Arguments of the command by name.
-
-    Raises:
-        typer.Exit: Two of the files are the same, or a file cannot be written.
-    """
+    """Check that a command writes no file twice, and no file that it reads."""
     wanted = {f"--{name}": given[name] for name in OUTPUTS if given.get(name)}
     places = {option: resolve_path(path, option) for option, path in wanted.items()}
     for one, other in itertools.combinations(places, 2):
@@ -49,14 +42,7 @@ def _find_inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, str | pathlib.
 
 
 def check_picture(plot: pathlib.Path | None) -> None:
-    """Check the file of a figure.
-
-    Args:
-        plot: File; None for no figure.
-
-    Raises:
-        typer.Exit: The ending is not that of a figure, or Matplotlib is missing.
-    """
+    """Check the file of a figure."""
     if plot:
         if plot.suffix.lower() not in PICTURES:
             fail(f"--plot {plot}: the name must end in {', '.join(PICTURES)}")
@@ -64,14 +50,7 @@ def check_picture(plot: pathlib.Path | None) -> None:
 
 
 def check_mat(mat: pathlib.Path | None) -> None:
-    """Check the file of a MAT export.
-
-    Args:
-        mat: File; None for no export.
-
-    Raises:
-        typer.Exit: MATLAB would not load a file of this name, or SciPy is missing.
-    """
+    """Check that MATLAB loads a file of this name, and that SciPy is there; None for no export."""
     if mat and mat.suffix != ".mat":
         fail(f"--mat {mat}: the name must end in .mat")
     if mat and importlib.util.find_spec("scipy") is None:
@@ -79,28 +58,13 @@ def check_mat(mat: pathlib.Path | None) -> None:
 
 
 def check_scenario_file(out: pathlib.Path | None) -> None:
-    """Check the file of a scenario: `load` finds only files that end in .toml.
-
-    Args:
-        out: File; None for no file.
-
-    Raises:
-        typer.Exit: The name does not end in .toml.
-    """
+    """Check the file of a scenario: `load` finds only files that end in .toml."""
     if out and out.suffix != ".toml":
         fail(f"--out {out}: the name must end in .toml")
 
 
 def resolve_path(path: pathlib.Path, option: str) -> pathlib.Path:
-    """Return a path without symbolic links.
-
-    Args:
-        path: Path.
-        option: Option of the path, for messages.
-
-    Raises:
-        typer.Exit: The links form a loop, or the text is not a path.
-    """
+    """Return a path without symbolic links."""
     try:
         with contextlib.suppress(FileNotFoundError):
             path.stat()  # raises for a loop of links, which `resolve` accepts in some Python versions
@@ -117,13 +81,6 @@ def new_target_file(target: pathlib.Path | None, option: str) -> Iterator[pathli
 
     An error discards the temporary file, and `target` stays unchanged. The block may also delete the temporary file,
     with the same effect.
-
-    Args:
-        target: File to write.
-        option: Option of the file, for messages.
-
-    Raises:
-        typer.Exit: The file cannot be written.
     """
     if target is None:
         yield None
@@ -141,12 +98,6 @@ def new_target_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
 
     An empty folder or an older result (a folder with summary.json that is not a sweep's) is replaced. Any other content
     is left alone.
-
-    Args:
-        target: Folder to write.
-
-    Raises:
-        typer.Exit: The folder cannot be made, or has other content.
     """
     target = resolve_path(target, "--out")
     there = set(os.listdir(target)) if target.is_dir() else set()

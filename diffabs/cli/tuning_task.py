@@ -55,15 +55,7 @@ class Proved(NamedTuple):
 
 
 def build_work(chosen: Scenario) -> Work:
-    """Return the runs and constraints of a tuning.
-
-    Args:
-        chosen: Scenario with a section `[tune]`.
-
-    Raises:
-        ScenarioError: The section does not fit the loop.
-        ModuleNotFoundError: An extra is not installed.
-    """
+    """Return the runs and constraints of a tuning."""
     from diffabs.tune import AtMost, CertifiedDecay, Poles
 
     goal = chosen.tune.check(chosen.loop)
@@ -84,9 +76,6 @@ def certify_result(after: Scenario) -> Proved:
 
     The certificate has the fastest decay rate that is found. If [tune] requires a faster one, it has that one if it can
     be proved. Without a certificate the outcome gives the reason; no error is raised.
-
-    Args:
-        after: Scenario with the tuned loop.
     """
     decay = after.tune.decay
     try:
@@ -110,22 +99,12 @@ def certify_result(after: Scenario) -> Proved:
 
 
 def without_certificate(why: str) -> Proved:
-    """Return the outcome of a proof that gave no certificate.
-
-    Args:
-        why: The reason.
-    """
+    """Return the outcome of a proof that gave no certificate."""
     return Proved({**dict.fromkeys(certificates.FROM_PROOF), "reason": why}, f"no certificate: {why}")
 
 
 def tuning_document(work: Work, found: "Tuned", proved: Proved) -> JsonObject:
-    """Return the whole document, without the written files.
-
-    Args:
-        work: Task of the tuning.
-        found: Result of the tuning.
-        proved: Outcome of the proof.
-    """
+    """Return the whole document, without the written files."""
     chosen, goal = work.chosen, work.chosen.tune
     return {
         **console.describe_source(chosen),

@@ -59,10 +59,8 @@ def add_command(app: typer.Typer, function: Callable[..., PyTree], example: str,
     """Add a function as a command, with its example, --quiet and --parts.
 
     Args:
-        app: Program.
         function: Function of the command. An unknown engine is refused before it is called.
         example: Words after `diffabs`.
-        name: Name of the command; by default the name of the function.
     """
 
     @functools.wraps(function)
