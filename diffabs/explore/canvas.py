@@ -30,9 +30,5 @@ class Canvas:
 
 
 def encode_change(option: JsonObject) -> str:
-    """Return a change as JSON text.
-
-    Args:
-        option: Options of the chart that change.
-    """
+    """Return a change as JSON text."""
     return json.dumps(option, separators=(",", ":"), allow_nan=False)

@@ -25,11 +25,7 @@ TOP, BOTTOM, BETWEEN = 6.0, 7.5, 6.5  # margins and gaps of the panels in percen
 
 
 def run_chart(found: Curves) -> JsonObject:
-    """Return the options of the chart of a run: axes, legends, and all lines, also those without data yet.
-
-    Args:
-        found: Curves of the run.
-    """
+    """Return the options of the chart of a run: axes, legends, and all lines, also those without data yet."""
     shown, given = found.panels, change_curves(found)
     count = len(shown)
     height = (100 - TOP - BOTTOM - BETWEEN * (count - 1)) / count
@@ -59,7 +55,6 @@ def change_curves(found: Curves, which: str = "now") -> JsonObject:
     """Return the change of the chart that shows a run.
 
     Args:
-        found: Curves of the run.
         which: "now" for the current run with all its curves, "before" for the first curve of each panel of a run to
             compare with.
     """
@@ -74,11 +69,7 @@ def change_curves(found: Curves, which: str = "now") -> JsonObject:
 
 
 def change_fan(found: Fan | None) -> JsonObject:
-    """Return the change of the chart that shows a fan.
-
-    Args:
-        found: Quantiles of the fan; None removes the fan.
-    """
+    """Return the change of the chart that shows a fan; None removes it."""
     if found is None:
         return clear_curves("fan")
     source = {"t": round_for_screen(found.t)}
@@ -91,11 +82,7 @@ def change_fan(found: Fan | None) -> JsonObject:
 
 
 def change_time_axis(end: float | None) -> JsonObject:
-    """Return the change of the chart that sets the time axis.
-
-    Args:
-        end: End of the axis [s]; None shows the whole run.
-    """
+    """Return the change of the chart that sets the end of the time axis [s]; None shows the whole run."""
     return {
         "dataZoom": [
             {"start": 0, "end": 100} if end is None else {"startValue": 0, "endValue": round_for_screen([end])[0]}
@@ -104,11 +91,7 @@ def change_time_axis(end: float | None) -> JsonObject:
 
 
 def clear_curves(which: str) -> JsonObject:
-    """Return the change of the chart that removes curves.
-
-    Args:
-        which: "before" or "fan".
-    """
+    """Return the change of the chart that removes curves, "before" or "fan"."""
     return {"dataset": [{"id": which, "source": {"t": []}}]}
 
 
@@ -153,12 +136,9 @@ POLE = (
 
 
 def change_poles(found: Stability | None) -> JsonObject:
-    """Return the change of the map that shows the poles of a loop.
+    """Return the change of the map that shows the poles of a loop; None empties the map.
 
     Poles of a sampled loop are shown as ln(z)/T.
-
-    Args:
-        found: Stability of the loop; None empties the map.
     """
     here = _points(found.poles, found.period) if found else []
     around = _points(found.corners.poles, found.period) if found else []
@@ -182,11 +162,7 @@ def _points(values: np.ndarray, period: float | None) -> list[list[float]]:
 
 
 def round_for_screen(values: PyTree) -> list[float | None]:
-    """Return numbers rounded to `CHART_DIGITS` digits, with None for numbers that are not finite.
-
-    Args:
-        values: Numbers, shape (n,).
-    """
+    """Return numbers rounded to `CHART_DIGITS` digits, with None for numbers that are not finite."""
     numbers = np.asarray(values, float).tolist()
     return [float(f"{x:.{CHART_DIGITS}g}") if math.isfinite(x) else None for x in numbers]
 
@@ -229,11 +205,7 @@ def _y(panel: Panel, i: int) -> JsonObject:
 
 
 def axis_label(panel: Panel) -> str:
-    """Return the label of a panel's vertical axis: quantity and unit.
-
-    Args:
-        panel: Panel of the chart.
-    """
+    """Return the label of a panel's vertical axis: quantity and unit."""
     signals = [line.name for line in panel.lines if line.name not in AIMS]
     words = signals[0] if len(signals) == 1 and signals[0] != "control" else QUANTITIES.get(panel.unit, signals[0])
     return f"{words} [{panel.unit}]"

@@ -37,23 +37,14 @@ MIN_TRANSIENT_SHARE = 0.1  # a fan is drawn while this share of its runs goes on
 def drawing_solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
     """Return the scenario's solver, with `every` set for a run that may stop after a small part of its duration.
 
-    The step of the integration does not change.
-
-    Args:
-        chosen: Scenario.
-        instants: Number of instants to draw; over the whole duration `KEPT_MULTIPLE` times as many are kept.
+    The step of the integration does not change. Over the whole duration, `KEPT_MULTIPLE` times `instants` are stored.
     """
     every = math.ceil(chosen.solver.steps / (KEPT_MULTIPLE * instants))
     return dataclasses.replace(chosen.solver, every=max(1, every))
 
 
 def thin(count: int, instants: int) -> np.ndarray:
-    """Return the places of some instants, the first and the last among them.
-
-    Args:
-        count: Number of instants that there are.
-        instants: Number of intervals between the places, at most.
-    """
+    """Return the places of at most `instants` intervals among `count` instants, the first and the last included."""
     places = np.arange(0, count, max(1, math.ceil((count - 1) / instants)))
     return places if count == 0 or places[-1] == count - 1 else np.append(places, count - 1)
 
@@ -62,9 +53,6 @@ def draft_solver(chosen: Scenario) -> Solver | None:
     """Return a quicker, adaptive solver for the curve during a drag, or None if the scenario's own is to be used.
 
     The own solver stays if it is adaptive or has few steps. It also stays if a clock in the loop needs its grid.
-
-    Args:
-        chosen: Scenario.
     """
     own = chosen.solver
     if chosen.loop.ticks or not isinstance(own, FixedStep) or own.steps <= MIN_DRAFT_STEPS:
@@ -73,12 +61,7 @@ def draft_solver(chosen: Scenario) -> Solver | None:
 
 
 def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
-    """Return the curves of a scenario's run.
-
-    Args:
-        chosen: Scenario.
-        by: Solver of the run; None is the scenario's own.
-    """
+    """Return the curves of a scenario's run by a solver; None is the scenario's own."""
     run: Run = jax.device_get(rollout(chosen.loop, by or drawing_solver(chosen), chosen.objectives, key=chosen.key()))
     assert run.trajectory is not None
     # Samples after the end of the run are no part of the curves.
@@ -99,9 +82,6 @@ def transient_end(found: Curves) -> float:
     It is 1.5 times the settling time of the first signal, and at most the end of the run. Settled means within 5 % of
     the largest distance from the target. Without a target the last value takes its place. A run that does not settle is
     shown whole.
-
-    Args:
-        found: Curves of the run.
     """
     lines = {line.name: line.values for line in found.panels[0].lines}
     signal = found.panels[0].lines[0].values
@@ -120,10 +100,6 @@ def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
     """Return the quantiles of `MEMBERS` runs with different masses and roads, or None if nothing differs.
 
     Refused and diverged runs do not count. The fan ends where too few runs still go on.
-
-    Args:
-        chosen: Scenario.
-        spread: Relative half widths of the spread.
     """
     values, words = fan_members(chosen, spread)
     if not values:
@@ -153,10 +129,6 @@ def fan_members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray]
     Every call uses the same low-discrepancy points, so the fan does not flicker during a drag. Values stay below the
     upper end of the parameter's range. A parameter without spread is left out. The dictionary is empty if no parameter
     remains.
-
-    Args:
-        chosen: Scenario.
-        spread: Relative half widths of the spread.
     """
     there = {path: spec for path, spec, _ in parameters(chosen.loop)}
     wanted = {mass_path(chosen): spread.mass, FACTOR_PATH: spread.road}

@@ -22,9 +22,6 @@ def with_factor(chosen: "Scenario") -> "Scenario":
     """Return the scenario with a friction factor at `plant.road.scale`.
 
     A scenario without a road, or whose road has a factor already, is returned unchanged.
-
-    Args:
-        chosen: Scenario.
     """
     road = getattr(chosen.loop.plant, "road", None)
     if road is None or isinstance(road, Scaled):
@@ -35,12 +32,7 @@ def with_factor(chosen: "Scenario") -> "Scenario":
 
 
 def without_factor(chosen: "Scenario", given: "Scenario") -> "Scenario":
-    """Return the scenario without the factor that `with_factor` added, if the factor is still 1.
-
-    Args:
-        chosen: Scenario with current values.
-        given: Scenario from its file, before `with_factor`.
-    """
+    """Return the scenario without the factor that `with_factor` added, if the factor is still 1."""
     road = getattr(chosen.loop.plant, "road", None)
     had = isinstance(getattr(given.loop.plant, "road", None), Scaled)
     if not isinstance(road, Scaled) or had or float(road.scale) != 1.0:

@@ -9,11 +9,7 @@ if TYPE_CHECKING:
 
 
 def add_header(page: "Page") -> None:
-    """Put the header into the open element.
-
-    Args:
-        page: Page with the run that the buttons act on.
-    """
+    """Put the header into the open element."""
     with ui.element("header"):
         ui.label("diffabs").classes("brand")
         ui.label("explore").classes("brand thin")

@@ -58,11 +58,7 @@ class Knob:
         return self.path if self.place is None else f"{self.path}.{self.place}"
 
     def read(self, given: PyTree) -> float:
-        """Return a typed or dragged value, `given` in the displayed unit, in SI.
-
-        Raises:
-            ScenarioError: The value is not a number in the range; the message names field, value, range and unit.
-        """
+        """Return a typed or dragged value, `given` in the displayed unit, in SI."""
         if isinstance(given, str):
             try:
                 given = read_decimal(given)
@@ -124,11 +120,7 @@ class Knob:
 
 
 def knobs(chosen: Scenario) -> dict[str, Knob]:
-    """Return every number of a scenario's loop by its key.
-
-    Args:
-        chosen: Scenario.
-    """
+    """Return every number of a scenario's loop by its key."""
     found: dict[str, Knob] = {}
     for path, spec, value in parameters(chosen.loop):
         tail = path.rpartition(".")[2]
@@ -153,20 +145,12 @@ def knobs(chosen: Scenario) -> dict[str, Knob]:
 
 
 def is_vehicle(plant: Part) -> bool:
-    """Return whether a plant shows the speed of a wheel; such a plant's speeds are displayed in km/h.
-
-    Args:
-        plant: Plant of a loop.
-    """
+    """Return whether a plant shows the speed of a wheel; such a plant's speeds are displayed in km/h."""
     return "wheel_speed" in plant.shows.units
 
 
 def unit_words(unit: str) -> str:
-    """Return a unit as the page shows it, or "" for plain numbers.
-
-    Args:
-        unit: Unit as in `ParameterSpec`.
-    """
+    """Return a unit as the page shows it, or "" for plain numbers."""
     return "" if unit == "1" else unit.replace("^2", "²")
 
 
@@ -176,10 +160,6 @@ def first_knobs(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
     In order of priority they are mass, speed, friction, tuned parameters, filters, gains, parameters that vary in the
     scenario, and numbers of the start. Gains are left out if the scenario tunes a parameter of the controller. Numbers
     without a slider are left out, too.
-
-    Args:
-        chosen: Scenario.
-        known: Numbers of its loop by key.
     """
     tune, over = chosen.tune, [*chosen.design.over, *chosen.tune.over, *chosen.sweep.over]
     paths = [*filter(None, (mass_path(chosen),)), "initial.speed", FACTOR_PATH, *tune.free]
@@ -199,9 +179,6 @@ def mass_path(chosen: Scenario) -> str | None:
 
     A mass that the scenario varies has priority over the plant's first one. If the loop has no mass, the same rule
     selects a moment of inertia.
-
-    Args:
-        chosen: Scenario.
     """
     over = {*chosen.design.over, *chosen.tune.over, *chosen.sweep.over}
     for unit in ("kg", "kg m^2"):

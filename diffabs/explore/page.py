@@ -346,14 +346,7 @@ def _sentence(error: Exception) -> str:
 
 
 async def show(source: str, tools: Tools, folder: pathlib.Path, thread: str) -> None:
-    """Fill the page of a newly opened tab.
-
-    Args:
-        source: Path or name of the scenario.
-        tools: Functions that need extras.
-        folder: Folder for saved files.
-        thread: Name of the worker threads.
-    """
+    """Fill the page of a newly opened tab."""
     ui.add_css(STYLE)
     ui.add_head_html(f"<script>{SCRIPT}</script>")
     ui.colors(primary=charts.BLUE)

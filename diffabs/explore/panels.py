@@ -76,9 +76,5 @@ class Spread:
 
 
 def format_reading(value: float) -> str:
-    """Return a metric as text, without digits that are rounding errors.
-
-    Args:
-        value: Metric; NaN is shown as "-".
-    """
+    """Return a metric as text, without digits that are rounding errors; NaN is "-"."""
     return NO_VALUE if math.isnan(value) else "0" if abs(value) < DISPLAY_ROUNDING else f"{value:.5g}"

@@ -31,15 +31,7 @@ class ProvedBox(NamedTuple):
 
 
 def load_proved_box(path: pathlib.Path, document: JsonObject) -> ProvedBox:
-    """Return the content of a proof's file.
-
-    Args:
-        path: Path of the file.
-        document: JSON document of the file.
-
-    Raises:
-        ValueError: The document is not the file of a proof, or its scenario cannot be loaded.
-    """
+    """Return the content of a proof's file."""
     content = read_proof(document)
     return ProvedBox(
         str(path), content, loads(str(document.get("scenario")).encode(), path.stem, str(path), integrated=False)
@@ -51,10 +43,6 @@ def judge_values(proved: ProvedBox, session: Session) -> ProofVerdict:
 
     They do if each of the box's parameters lies in its range. The duration and the rest of the loop must be those of
     the file's scenario. The sentence gives the file's bounds, or the value that differs.
-
-    Args:
-        proved: Proof's file.
-        session: Session.
     """
     now = friction.without_factor(session.scenario(), session.given)
     here, there, over = now.loop, proved.chosen.loop, proved.content.over

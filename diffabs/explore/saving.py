@@ -13,15 +13,7 @@ MAX_NAME_LENGTH = 120  # characters, with the suffix
 def save_scenario(chosen: Scenario, folder: pathlib.Path, name: str, *, replacing: bool = False) -> pathlib.Path:
     """Write a scenario to a file atomically, and return its path.
 
-    Args:
-        chosen: Scenario with its current numbers.
-        folder: Folder of the file.
-        name: Name of the file, without folders, with the suffix .toml.
-        replacing: Whether a file of that name may be replaced; else it stays unchanged.
-
-    Raises:
-        ScenarioError: The file exists and must not be replaced, or the name is not valid. Also raised if the command
-            line would refuse the scenario, or the folder cannot be written.
+    It refuses an existing file unless `replacing`, and a scenario that the command line would refuse.
     """
     path = folder / _check_name(name)
     text = dump(chosen).encode()
@@ -43,12 +35,7 @@ def save_scenario(chosen: Scenario, folder: pathlib.Path, name: str, *, replacin
 
 
 def free_name(folder: pathlib.Path, stem: str) -> str:
-    """Return a file name that does not exist in the folder.
-
-    Args:
-        folder: Folder to search.
-        stem: Beginning of the name.
-    """
+    """Return a file name that does not exist in the folder."""
     names = (f"{stem}{'' if i == 1 else f'-{i}'}.toml" for i in range(1, 10_000))
     return next(name for name in names if not (folder / name).exists())
 

@@ -36,20 +36,7 @@ def serve(
     ready: Callable[[str], None] = lambda url: None,
     browser: bool = False,
 ) -> None:
-    """Serve the page of a scenario, with one session for each tab, until the process is interrupted.
-
-    Args:
-        source: Path or name of the scenario.
-        tools: Functions that need extras.
-        folder: Folder for saved files.
-        there: Socket that listens.
-        thread: Name of the worker threads.
-        ready: Callback with the address as soon as the server answers.
-        browser: Whether to open the page in the browser.
-
-    Raises:
-        OSError: The server does not start.
-    """
+    """Serve the page of a scenario, with one session for each tab, until the process is interrupted."""
     port, token = there.getsockname()[1], secrets.token_urlsafe(24)
     url = f"http://{LOOPBACK_ADDRESS}:{port}/?token={token}"
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
@@ -97,10 +84,6 @@ def write_redirect_file(url: str, folder: pathlib.Path) -> pathlib.Path:
 
     Every user of the machine can see the command line that starts a browser. So the browser gets this file in place of
     the address, which contains the token.
-
-    Args:
-        url: Address with the token.
-        folder: Folder of the file.
     """
     path = folder / "explore.html"
     path.touch(mode=0o600, exist_ok=False)

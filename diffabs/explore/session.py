@@ -75,11 +75,7 @@ def load_basis(source: str, parts: Mapping[str, str] = MappingProxyType({})) -> 
     """Return the basis of a session, which may be run unchanged.
 
     Args:
-        source: Path or name of the scenario.
         parts: Name of a part by exchangeable family; a family that is missing, or `AS_GIVEN`, keeps the scenario's own.
-
-    Raises:
-        ScenarioError: The scenario cannot be loaded, or a part does not fit.
     """
     chosen = dict.fromkeys(EXCHANGEABLE_FAMILIES, AS_GIVEN) | dict(parts)
     given = load(source, [f"{family}={part}" for family, part in chosen.items() if part != AS_GIVEN])
@@ -92,11 +88,7 @@ class Session:
     """A scenario with edited numbers."""
 
     def __init__(self, source: str):
-        """Load the scenario from the path or name `source`.
-
-        Raises:
-            ScenarioError: The scenario cannot be loaded.
-        """
+        """Load the scenario from the path or name `source`."""
         self.spread = Spread()
         self._begin(load_basis(source))
 
@@ -104,9 +96,6 @@ class Session:
         """Return this session's scenario with another road or controller, `family`; the session stays unchanged.
 
         `part` is a name, or `AS_GIVEN` for the scenario's own. The new part has its default values.
-
-        Raises:
-            ScenarioError: The part does not fit.
         """
         return load_basis(self.source, {**self.parts, family: part})
 
@@ -135,9 +124,6 @@ class Session:
         """Set the number `key` to `given` in its displayed unit; the loop is not checked.
 
         `check_edit` checks the loop and takes some milliseconds. `accept` or `withdraw` must follow it.
-
-        Raises:
-            ScenarioError: The loop has no such number, or the value is not in its range.
         """
         if key not in self.knobs:
             raise unknown_name_error(f"{key!r} is no number of this loop", key, self.knobs)
@@ -154,11 +140,7 @@ class Session:
         return [key for key, value in before.items() if value != self.value(key)]
 
     def widen(self, name: str, given: PyTree) -> None:
-        """Set the spread of the fan's members in `name` ("mass" or "road") to a value `given` in percent.
-
-        Raises:
-            ScenarioError: The value is not a number from 0 to 90.
-        """
+        """Set the spread of the fan's members in `name` ("mass" or "road") to a value `given` in percent."""
         try:
             value = read_decimal(given) if isinstance(given, str) else float(given)
         except (TypeError, ValueError):
@@ -216,15 +198,7 @@ class Session:
 
 
 def check_edit(knob: Knob, chosen: Scenario) -> None:
-    """Check that a scenario may be run.
-
-    Args:
-        knob: Number edited last, for the message.
-        chosen: Scenario with its current numbers.
-
-    Raises:
-        ScenarioError: The scenario must not be run.
-    """
+    """Check that a scenario may be run."""
     if lines := objections(chosen):
         raise ScenarioError(f"{knob.name} = {knob.words(knob.pick(get(chosen.loop, knob.path)))}: {lines[0]}")
 
@@ -233,9 +207,6 @@ def objections(chosen: Scenario) -> list[str]:
     """Return the reasons why a scenario must not be run, one line each; empty if it may be run.
 
     The command line would give the same lines.
-
-    Args:
-        chosen: Scenario with its current numbers.
     """
     lines = list(find_problems(chosen.loop)) or list(find_mismatches(chosen.loop, chosen.solver))
     return lines or list(find_unstable_step(chosen.loop, chosen.solver))

@@ -61,9 +61,6 @@ def corners_of(chosen: Scenario) -> tuple[PyTree, ...]:
     """Return a key for comparison: it is equal for two scenarios if their corners are equal.
 
     It holds the ranges, and the loop with each ranged parameter at its lower end.
-
-    Args:
-        chosen: Scenario.
     """
     ranges = chosen.design.ranges(chosen.loop)
     # With ranged parameters at fixed values, the key changes only if another parameter changes.
@@ -75,14 +72,8 @@ def corners_of(chosen: Scenario) -> tuple[PyTree, ...]:
 def linearise_corners(chosen: Scenario, known: CornerLoops | None = None) -> CornerLoops:
     """Return poles and worst margins of the linearised loops at the corners of the [design.over] ranges.
 
-    A scenario without ranges, or with more than three, gets a result with zero corners.
-
-    Args:
-        chosen: Scenario.
-        known: Earlier result, which is returned if the corners have not changed.
-
-    Raises:
-        ValueError: The loop has no linear model.
+    A scenario without ranges, or with more than three, gets a result with zero corners. `known` is returned if the
+    corners have not changed. Raises ValueError for a loop without a linear model.
     """
     of = corners_of(chosen)
     if known and known.of == of:
@@ -97,15 +88,7 @@ def linearise_corners(chosen: Scenario, known: CornerLoops | None = None) -> Cor
 
 
 def linear_stability(chosen: Scenario, corners: CornerLoops | None) -> Stability:
-    """Return poles and margins of the linearised loop.
-
-    Args:
-        chosen: Scenario.
-        corners: Corners that are shown with it, or None if there are none yet.
-
-    Raises:
-        ValueError: The loop has no linear model.
-    """
+    """Return poles and margins of the linearised loop. Raises ValueError for a loop without a linear model."""
     here = band(chosen.loop, {}, 0).systems[0]
     return Stability(
         here.loop.period,
@@ -121,9 +104,6 @@ def margin_values(found: Margins) -> dict[str, float]:
     """Return the margins by the names of `MARGIN_KEYS`, in SI; NaN for an unstable loop.
 
     Gain and modulus margins are factors [1], the phase margin is in rad, and the delay margin in s.
-
-    Args:
-        found: Margins of a loop.
     """
     low, high = found.gain
     values = (high, low, found.phase, found.delay, found.modulus)
@@ -131,13 +111,7 @@ def margin_values(found: Margins) -> dict[str, float]:
 
 
 def format_margin(name: str, value: float, stable: bool) -> str:
-    """Return a margin as text with its unit.
-
-    Args:
-        name: Name of the margin.
-        value: Value in SI.
-        stable: Whether the loop is stable.
-    """
+    """Return a margin, in SI, as text with its unit."""
     if math.isnan(value):
         return "undecided" if name == "delay" and stable else "none"
     if value == math.inf:

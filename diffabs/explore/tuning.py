@@ -46,21 +46,13 @@ class TuningFound(NamedTuple):
 
 
 def describe_own_objective(chosen: Scenario) -> str:
-    """Return the objective of [tune] in words, such as "iae + 0.01 overshoot"; empty without any.
-
-    Args:
-        chosen: Scenario.
-    """
+    """Return the objective of [tune] in words, such as "iae + 0.01 overshoot"; empty without any."""
     words = (name if weight == 1 else f"{weight:g} {name}" for name, weight in chosen.tune.objective.items())
     return " + ".join(words)
 
 
 def tunable_parameters(chosen: Scenario) -> list[str]:
-    """Return the paths of the tunable parameters: those of [tune.free], then others of controller and reference.
-
-    Args:
-        chosen: Scenario.
-    """
+    """Return the paths of the tunable parameters: those of [tune.free], then others of controller and reference."""
     there = [
         path
         for path, spec, value in parameters(chosen.loop)
@@ -77,9 +69,6 @@ def default_tuning(chosen: Scenario) -> tuple[list[str], str]:
 
     The parameters are those of the scenario's [tune], else the first tunable parameter of the controller. The objective
     is that of the scenario, `OWN_OBJECTIVE`, else the first metric; "" without any.
-
-    Args:
-        chosen: Scenario.
     """
     paths = (
         list(chosen.tune.free) or [path for path in tunable_parameters(chosen) if path.startswith("controller.")][:1]
@@ -91,14 +80,6 @@ def bounds_on_page(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> di
     """Return the bounds of a free parameter in SI, by the key of each of its numbers.
 
     They are the bounds or the declared range that [tune] gives. Without any they are the ends of the sliders.
-
-    Args:
-        chosen: Scenario.
-        path: Path of the parameter.
-        known: Numbers of the loop by key.
-
-    Raises:
-        ScenarioError: The parameter has no range.
     """
     mine = {key: knob for key, knob in known.items() if knob.path == path}
     given = chosen.tune.free.get(path)
@@ -127,16 +108,8 @@ def scenario_with_goal(
     The objective is the scenario's own, with all its weights, or one metric. The tuning has a single start.
 
     Args:
-        chosen: Scenario; its constraints stay.
-        paths: Paths of the free parameters.
-        metric: Name of the metric, or `OWN_OBJECTIVE`.
-        known: Numbers of the loop by key.
         bounded: Texts of the bounds (low, high) in the displayed unit, by key of a number. A bound without a text, or
             with an unchanged one, is that of `bounds_on_page`.
-
-    Raises:
-        ScenarioError: There is no free parameter, or no such metric. Also raised for a bound that is not in the
-            parameter's range, and for a lower bound that is not below the upper one.
     """
     if not paths:
         raise ScenarioError("tune.free is empty: choose at least one parameter")
@@ -149,13 +122,7 @@ def scenario_with_goal(
 
 
 def at_bounds(chosen: Scenario, after: Scenario, known: Mapping[str, Knob]) -> tuple[str, ...]:
-    """Return a sentence for each free number that the tuning left at a bound of its range.
-
-    Args:
-        chosen: Scenario with free parameters and their ranges.
-        after: Scenario with the tuned values.
-        known: Numbers of the loop by key.
-    """
+    """Return a sentence for each free number that the tuning left at a bound of its range."""
     sentences = []
     for path in chosen.tune.free:
         for key, (low, high) in bounds_on_page(chosen, path, known).items():
@@ -169,9 +136,6 @@ def describe_instability(after: Scenario) -> str:
     """Return what is not stable in the linearised loop, here and at the corners of [design.over].
 
     The text is empty if all is stable, and if the loop has no linear model.
-
-    Args:
-        after: Scenario with the tuned values.
     """
     try:
         found = linear_stability(after, linearise_corners(after))
@@ -192,16 +156,7 @@ def tune_scenario(
 ) -> TuningFound:
     """Return the result of a tuning by a scenario's [tune], from one start: the current values.
 
-    Args:
-        chosen: Scenario.
-        posed: Runs and constraints.
-        known: Numbers of the loop by key.
-        told: Callback with the progress.
-        stopping: Callback that returns True to end the tuning.
-
-    Raises:
-        ValueError: The descent cannot leave its start.
-        ModuleNotFoundError: The extra `tune` is missing.
+    Raises ValueError if the descent cannot leave its start.
     """
     from diffabs.tune import Method, Stopping, build_problem, tune
 
