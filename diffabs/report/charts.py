@@ -15,11 +15,6 @@ def draw_lines(points: Sequence[tuple[float, float]], across: str, up: str) -> s
 
     The vertical axis is logarithmic if all values are positive and differ by more than a factor of 20. Points with a
     missing or infinite coordinate are left out.
-
-    Args:
-        points: Points (x, y).
-        across: Label of the horizontal axis.
-        up: Label of the vertical axis.
     """
     points = [(x, y) for x, y in points if x is not None and y is not None and math.isfinite(x) and math.isfinite(y)]
     if not points:

@@ -141,12 +141,7 @@ def _find_folder(out: pathlib.PurePath, path: pathlib.Path) -> pathlib.Path | No
 
 
 def is_within(path: pathlib.Path, folder: pathlib.Path) -> bool:
-    """Return whether a path is in a folder or below, also by its symbolic links: a document may be of somebody else.
-
-    Args:
-        path: Path that a document names.
-        folder: Folder of the document.
-    """
+    """Return whether a path is in a folder or below, also by its symbolic links: a document may be of somebody else."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):  # a circle of links, a null character

@@ -25,14 +25,7 @@ JUDGED_COLUMNS = {"source": "source", "quantity": "quantity", "unit": "unit", "p
 
 
 def paper_section(document: Document) -> Section:
-    """Return the section of a paper's reproduction.
-
-    Args:
-        document: Document of `reproduce`.
-
-    Raises:
-        KeyError: The paper is unknown, or the document lacks a key.
-    """
+    """Return the section of a paper's reproduction."""
     content = document.content
     name = content["paper"]
     if name not in MODULES:

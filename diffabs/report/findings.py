@@ -25,14 +25,7 @@ NORMAL = 1.959964  # half-width of a 95 % interval, in standard deviations
 
 
 def tuning_section(document: Document) -> Section:
-    """Return the section of a tuning.
-
-    Args:
-        document: Document of `tune`.
-
-    Raises:
-        KeyError: The document lacks a key.
-    """
+    """Return the section of a tuning."""
     content = document.content
     before, after = (format_known(content["objective"][when]) for when in ("before", "after"))
     limits = [row["name"] for row in content["constraints"]]
@@ -101,14 +94,7 @@ def _tuning_tables(content: Table) -> Iterator[ReportTable]:
 
 
 def identification_section(document: Document) -> Section:
-    """Return the section of an identification.
-
-    Args:
-        document: Document of `identify`.
-
-    Raises:
-        KeyError: The document lacks a key.
-    """
+    """Return the section of an identification."""
     content = document.content
     data = content["data"]
     return Section(

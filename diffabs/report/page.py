@@ -99,9 +99,6 @@ def shown_numbers(value: Scalar) -> list[ShownNumber | str]:
     """Return the texts and numbers that a cell shows.
 
     A longer list than `MAX_SHOWN_ENTRIES` shows its first entries and its length. Nested lists are flattened.
-
-    Args:
-        value: Content of the cell.
     """
     if value is None:
         return [""]
@@ -120,10 +117,7 @@ def shown_numbers(value: Scalar) -> list[ShownNumber | str]:
 def embed_image(path: pathlib.Path, folder: pathlib.Path, caption: str = "") -> Figure | None:
     """Return a picture with its bytes as a data URL; None for an unreadable file, other types, and outside of `folder`.
 
-    Args:
-        path: File with the suffix .png or .svg, at most `LARGEST_IMAGE` bytes long.
-        folder: Folder of the document; a link in it may lead out.
-        caption: Caption; by default the name of the file.
+    The file ends in .png or .svg and has at most `LARGEST_IMAGE` bytes.
     """
     kind = IMAGES.get(path.suffix.lower()) if is_within(path, folder) else None
     try:
@@ -140,9 +134,7 @@ def embed_named(folder: pathlib.Path, named: str | None, caption: str) -> Figure
     """Return the picture that a document names if it is in the document's folder, else None.
 
     Args:
-        folder: Folder of the document.
         named: Path of the picture in the document, of which only the name need be right; None without one.
-        caption: Caption.
     """
     if not named:
         return None
@@ -151,23 +143,14 @@ def embed_named(folder: pathlib.Path, named: str | None, caption: str) -> Figure
 
 
 def describe_missing(figures: Sequence[Figure], named: str | None) -> str:
-    """Return the sentence in place of a picture that a document names and that is not among the figures.
-
-    Args:
-        figures: Embedded pictures.
-        named: Path of the picture in the document; None without one.
-    """
+    """Return the sentence in place of a picture that a document names and that is not among the figures."""
     if not named or any(figure.address for figure in figures):
         return ""
     return f"Not shown: {make_printable(named)} is not in the folder of the document."
 
 
 def model_tables(model: Table | None) -> list[ReportTable]:
-    """Return tables of parts, parameters and solver.
-
-    Args:
-        model: Values of `describe_model`; None for no tables.
-    """
+    """Return tables of parts, parameters and solver."""
     if not model:
         return []
     more = {path: format_pairs({**about, "type": None}) for path, about in model["parts"].items()}
@@ -183,21 +166,12 @@ def model_tables(model: Table | None) -> list[ReportTable]:
 
 
 def table_unit(text: str | None) -> str:
-    """Return a unit for a table: "1" for a number without unit, empty for None.
-
-    Args:
-        text: Unit.
-    """
+    """Return a unit for a table: "1" for a number without unit, empty for None."""
     return "" if text is None else "1" if text == "" else text
 
 
 def describe_origin(content: Table, **more: Any) -> list[tuple[str, PyTree]]:
-    """Return the origin of a document as rows of name and value: date, commit, machine and versions.
-
-    Args:
-        content: Values of the document.
-        **more: Further rows by name, such as seeds; None is left out.
-    """
+    """Return the origin of a document as rows of name and value: date, commit, machine, versions and `more`."""
     made = {name: value for name, value in (content.get("made") or {}).items() if name != "command"}
     versions = {f"version of {name}": value for name, value in (content.get("versions") or {}).items()}
     # Papers and manifests keep part of the origin among the versions.
@@ -217,29 +191,16 @@ def describe_origin(content: Table, **more: Any) -> list[tuple[str, PyTree]]:
 
 
 def format_pairs(values: Params) -> str:
-    """Return names with their values on one line; values that are None are left out.
-
-    Args:
-        values: Values by name.
-    """
+    """Return names with their values on one line; values that are None are left out."""
     return ", ".join(f"{name} {value}" for name, value in values.items() if value is not None)
 
 
 def format_known(value: float | None, digits: int = 6) -> str:
-    """Return a number with so many digits, "not known" for None, which stands for NaN and infinity in JSON.
-
-    Args:
-        value: Number, or None.
-        digits: Number of significant digits.
-    """
+    """Return a number with so many digits, "not known" for None, which stands for NaN and infinity in JSON."""
     return "not known" if value is None else f"{value:.{digits}g}"
 
 
 def join_words(words: Iterable[PyTree]) -> str:
-    """Return words joined by commas and "and"; "nothing" without words.
-
-    Args:
-        words: Values to write as words.
-    """
+    """Return words joined by commas and "and"; "nothing" without words."""
     words = list(map(str, words))
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"

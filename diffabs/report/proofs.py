@@ -31,14 +31,7 @@ PROOF_UNITS = {
 
 
 def design_section(document: Document) -> Section:
-    """Return the section of a design, or of the certificate of a given gain.
-
-    Args:
-        document: Document of `design` or `certify`.
-
-    Raises:
-        KeyError: The document lacks a key.
-    """
+    """Return the section of a design, or of the certificate of a given gain."""
     content = document.content
     units = content.get("units") or {}
     ranges = join_words(
@@ -67,9 +60,6 @@ def proof_verdicts(proof: Table) -> list[ReportVerdict]:
     """Return the verdicts of a certificate: proved, disproved or undecided.
 
     Without a certificate, one verdict gives the reason.
-
-    Args:
-        proof: Values of the certificate.
     """
     if proof.get("gain") is None:
         return [ReportVerdict("no certificate", proof.get("reason") or "none is required")]
@@ -103,12 +93,7 @@ def _unit(text: str | None) -> str:
 
 
 def proof_tables(proof: Table, content: Table) -> list[ReportTable]:
-    """Return tables of the numbers of a certificate, and of its vertices with their poles.
-
-    Args:
-        proof: Values of the certificate.
-        content: Values of the document around it, for units.
-    """
+    """Return tables of the numbers of a certificate, and of its vertices with their poles."""
     if proof.get("gain") is None:
         return []
     units = proof.get("units") or content.get("units") or {}
@@ -136,15 +121,7 @@ def _notes(content: Table) -> list[str]:
 
 
 def certificate_section(document: Document) -> Section:
-    """Return the section of a saved certificate, whose claims are proved again.
-
-    Args:
-        document: Certificate in its own file, which is read again.
-
-    Raises:
-        KeyError: The document lacks a key.
-        ValueError: The file is not a certificate that `verify_file` can read in time.
-    """
+    """Return the section of a saved certificate, read again, whose claims are proved again."""
     content = document.content
     proved = verify_file(document.path)
     system = content["system"]
@@ -168,14 +145,7 @@ def certificate_section(document: Document) -> Section:
 
 
 def box_section(document: Document) -> Section:
-    """Return the section of a proof over a box of parameters.
-
-    Args:
-        document: Document of `prove`.
-
-    Raises:
-        KeyError: The document lacks a key.
-    """
+    """Return the section of a proof over a box of parameters."""
     content = document.content
     verdict, claims = content["verdict"], [_describe_claim(claim) for claim in content["claims"]]
     units = {path: row["unit"] for path, row in content["model"]["parameters"].items()}

@@ -38,15 +38,7 @@ INTERVAL = ("value", "low", "high")
 
 
 def sweep_section(document: Document) -> Section:
-    """Return the section of a sweep.
-
-    Args:
-        document: Document of `sweep`; the sweep's manifest lies in its folder.
-
-    Raises:
-        KeyError: The document or the manifest lacks a key.
-        OSError: The manifest cannot be read.
-    """
+    """Return the section of a sweep."""
     content = document.content
     manifest = json.loads(files.read_content(document.folder / MANIFEST, MAX_DOCUMENT_BYTES))
     study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
@@ -171,14 +163,7 @@ def _sample(content: Table, folder: pathlib.Path) -> list[str]:
 
 
 def rare_section(document: Document) -> Section:
-    """Return the section of a small failure probability.
-
-    Args:
-        document: Document of `rare`.
-
-    Raises:
-        KeyError: The document lacks a key.
-    """
+    """Return the section of a small failure probability."""
     content = document.content
     low, high = (format_known(end, 3) for end in content["interval"])
     failure = f"{content['metric']} > {content['bound']:g} {content['unit']}"
