@@ -23,10 +23,7 @@ def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *,
     circle about -1 that L does not enter. Its radius is 1/Ms, the modulus margin.
 
     Args:
-        loop: Open loop whose curves are drawn.
-        found: Margins of this loop.
         band: Loops drawn as a band behind the curves, from the smallest to the largest value at each frequency.
-        title: Title of the figure.
     """
     w = frequencies([loop, *band])
     figure, (magnitude, nyquist, phase, closed) = sheet(2, 2, title=title, size=(5.6, 3.4))

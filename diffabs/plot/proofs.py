@@ -44,11 +44,7 @@ class ProofMap(NamedTuple):
 
 
 def draw_proof(shown: ProofMap) -> Figure:
-    """Return the map of a proof: rectangles over two parameters, or the bounds over one.
-
-    Args:
-        shown: Content of the map.
-    """
+    """Return the map of a proof: rectangles over two parameters, or the bounds over one."""
     figure, (ax,) = sheet(title=shown.title, size=(7.0, 4.8))
     if len(shown.labels) == 2:
         _draw_rectangles(figure, ax, shown)

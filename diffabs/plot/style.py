@@ -160,11 +160,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
 
 
 def curve_style(i: int) -> dict[str, Any]:
-    """Return the colour and the dashes of a curve, as arguments of `plot`; those of the first 49 curves all differ.
-
-    Args:
-        i: Number of the curve in its axes, from 0.
-    """
+    """Return the colour and the dashes of a curve, as arguments of `plot`; those of the first 49 curves all differ."""
     return {"color": COLOURS[i % 7], "linestyle": DASHES[(i + i // 7) % 7]}
 
 
@@ -188,9 +184,5 @@ def signal_label(output: PyTree) -> str:
 
 
 def spaced_name(name: str) -> str:
-    """Return the name of a signal or metric with spaces instead of underscores.
-
-    Args:
-        name: Name of the signal or metric.
-    """
+    """Return the name of a signal or metric with spaces instead of underscores."""
     return name.replace("_", " ")

@@ -130,7 +130,6 @@ def assign_cells(one: AxisVariable, along: int = 2) -> tuple[np.ndarray, np.ndar
     A variable with few different values has one cell around each value. Other cells are equally wide.
 
     Args:
-        one: Variable to divide into cells.
         along: Number of variables of the map, 1 or 2; two variables get fewer cells each.
     """
     levels, n = np.unique(one.values), len(one.values)
@@ -151,7 +150,6 @@ def cell_means(one: AxisVariable, result: np.ndarray) -> np.ndarray:
     of a range. It also shows the influence of a variable with names.
 
     Args:
-        one: Variable to divide into cells.
         result: Result of each run, shape (runs,).
     """
     place = assign_cells(one)[0]

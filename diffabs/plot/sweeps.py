@@ -38,14 +38,7 @@ ABOVE = dict(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False
 
 
 def draw_sweep(found: Results, document: Any, folder: pathlib.Path, units: Mapping[str, str]) -> list[pathlib.Path]:
-    """Write every figure that has content as PNG, and return the paths.
-
-    Args:
-        found: Results of the sweep.
-        document: Summary from `diffabs.sweep.statistics.summary.summarise_sweep`.
-        folder: Folder for the figures.
-        units: Units by the name of a column.
-    """
+    """Write every figure that has content as PNG, and return the paths."""
     figures = {
         "distributions": draw_distributions(found, units),
         "exceedance": draw_exceedance(found, units, document["confidence"]),
@@ -57,12 +50,7 @@ def draw_sweep(found: Results, document: Any, folder: pathlib.Path, units: Mappi
 
 
 def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
-    """Return histograms of each metric with its median and two quantiles, or None if no metric varies.
-
-    Args:
-        found: Results of the sweep.
-        units: Units by the name of a column.
-    """
+    """Return histograms of each metric with its median and two quantiles, or None if no metric varies."""
     view = SweepView(found, units)
     figure, axes = _panels(view.varying, view.title("distributions of", np.sum(view.rows)))
     for ax, name in zip(axes, view.varying, strict=True):
@@ -87,11 +75,6 @@ def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: f
     """Return the share of runs above each value, for each metric, or None if no metric varies.
 
     Pointwise intervals of Clopper and Pearson are drawn unless the design is a grid or corners, which are not random.
-
-    Args:
-        found: Results of the sweep.
-        units: Units by the name of a column.
-        confidence: Confidence level of the intervals.
     """
     view = SweepView(found, units)
     band = f"{100 * confidence:g} % band" + ("" if view.design == "random" else " (as if independent)")
@@ -119,11 +102,6 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
     The metric is the first varying one with a bound of failure, else the first varying one. The variables are the two
     that influence it most, numeric ones first. With one variable, the figure shows the metric over it. The worst runs,
     with the greatest values, are marked with sample number and value.
-
-    Args:
-        found: Results of the sweep.
-        units: Units by the name of a column.
-        count: Number of worst runs that are marked.
     """
     view = SweepView(found, units)
     metric = view.leading
@@ -156,10 +134,6 @@ def draw_sensitivity(found: Results, document: Table) -> Figure | None:
     """Return bars with intervals for each metric, or None if the document has no sensitivities.
 
     The bars are rank correlations, or Sobol' indices for a Saltelli design.
-
-    Args:
-        found: Results of the sweep.
-        document: Summary with `sensitivity` and `confidence`.
     """
     view = SweepView(found)
     sobol = view.design == "saltelli"
@@ -192,10 +166,6 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
     are grey.
 
     The function returns None if no variable varies, and if no run failed and no metric varies.
-
-    Args:
-        found: Results of the sweep.
-        units: Units by the name of a column.
     """
     view = SweepView(found, units)
     failed = found.failed_samples()[every := view.accepted]

@@ -30,11 +30,7 @@ def draw_tuning(
     """Return the figure of `diffabs tune`: convergence above, the runs before and after below.
 
     Args:
-        points: Points of the iteration with `evaluations`, `objective`, `gradient` and `violation`.
-        runs: Trajectories of one run of the batch by name.
-        title: Title of the figure.
         lane: Description of this run, the worst of the batch.
-        unit: Unit of the control.
     """
     figure, (objective, gradient, slip, torque) = sheet(2, 2, title=title, size=(5.8, 3.1))
     _objective(objective, points)
@@ -57,10 +53,6 @@ def draw_pareto(
 
     Args:
         fronts: Points (x, y) by name, each coordinate an array of shape (n,).
-        marks: Single points (x, y) by name.
-        x: Label of the horizontal axis.
-        y: Label of the vertical axis.
-        title: Title of the figure.
     """
     figure, (ax,) = sheet(title=title, size=(6.2, 4.0))
     for i, (name, (across, up)) in enumerate(fronts.items()):
