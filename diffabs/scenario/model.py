@@ -19,9 +19,6 @@ def describe_model(chosen: "Scenario") -> JsonObject:
     """Return a scenario as JSON values.
 
     They are title, description, parts, parameters with units, solver, and units of the metrics.
-
-    Args:
-        chosen: Scenario to describe.
     """
     return {
         "title": chosen.title,
@@ -34,11 +31,7 @@ def describe_model(chosen: "Scenario") -> JsonObject:
 
 
 def describe_parts(chosen: "Scenario") -> dict[str, JsonObject]:
-    """Return every part, objectives included, by its path: its type, and its fields that are not parameters.
-
-    Args:
-        chosen: Scenario to describe.
-    """
+    """Return every part, objectives included, by its path: its type, and its fields that are not parameters."""
     found = dict(registry.part_choices(chosen.loop))
     for name, one in chosen.objectives.items():
         found |= registry.part_choices(one, f"objective.{name}")
@@ -49,9 +42,6 @@ def describe_numbers(chosen: "Scenario") -> dict[str, JsonObject]:
     """Return value (in SI) and unit of every parameter, those of objectives included, by its path.
 
     JSON has no infinity and no NaN: these become texts, which an override accepts.
-
-    Args:
-        chosen: Scenario to describe.
     """
 
     def plain(value: Scalar) -> Any:

@@ -41,14 +41,7 @@ _named: dict[str, ModuleType] = {}
 def register_modules(names: Iterable[str]) -> None:
     """Import modules with parts, which `registered_modules` then returns for the rest of the process.
 
-    The working directory becomes the last entry of the Python path.
-
-    Args:
-        names: Dotted names of the modules.
-
-    Raises:
-        ValueError: A name is not that of a Python module, or the module cannot be imported. Also if no class in it is a
-            complete part, or if the friction of a road is no number.
+    The working directory becomes the last entry of the Python path. Raises ValueError without a complete part.
     """
     for name in names:
         if name.endswith(".py"):
@@ -66,15 +59,7 @@ def register_modules(names: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def lend_modules(folder: pathlib.Path, names: Iterable[str]) -> Iterator[None]:
-    """Return a context in which `registered_modules` also returns modules of a folder.
-
-    Args:
-        folder: Folder of the modules.
-        names: Names of the modules.
-
-    Raises:
-        ValueError: A module cannot be imported.
-    """
+    """Return a context in which `registered_modules` also returns modules of a folder."""
     before = dict(_named)
     sys.path.append(str(folder))
     try:
@@ -88,21 +73,13 @@ def lend_modules(folder: pathlib.Path, names: Iterable[str]) -> Iterator[None]:
 
 @cache
 def installed_modules() -> tuple[ModuleType, ...]:
-    """Return the modules that installed packages register.
-
-    Raises:
-        ValueError: A module cannot be imported.
-    """
+    """Return the modules that installed packages register."""
     points = sorted(importlib.metadata.entry_points(group=ENTRY_POINT_GROUP), key=lambda point: point.name)
     return tuple(_import_module(point.value, f"entry point {point.name} of {ENTRY_POINT_GROUP}") for point in points)
 
 
 def registered_modules() -> tuple[ModuleType, ...]:
-    """Return every module with parts from outside, each once.
-
-    Raises:
-        ValueError: A module of an installed package cannot be imported.
-    """
+    """Return every module with parts from outside, each once."""
     return tuple({module.__name__: module for module in (*installed_modules(), *_named.values())}.values())
 
 
@@ -110,9 +87,6 @@ def exported_parts(module: ModuleType) -> Iterator[tuple[str, PyTree]]:
     """Yield name and item for each part in a module: a class made with `pytree`, or an instance of such a class.
 
     Classes imported from diffabs are left out, but their instances are not.
-
-    Args:
-        module: Module whose `__all__`, or else public names, are searched.
     """
     for name in getattr(module, "__all__", [name for name in vars(module) if not name.startswith("_")]):
         item = getattr(module, name)
@@ -132,7 +106,6 @@ def describe_outside_error(error: BaseException, names: Iterable[str] | None = N
     The line is empty for any other error.
 
     Args:
-        error: Error with its traceback.
         names: Modules whose packages count as outside code; by default all registered modules.
     """
     known = names or [module.__name__ for module in registered_modules()]

@@ -67,24 +67,13 @@ class ParameterEntry:
     scale: float
 
     def single(self, what: str) -> "ParameterEntry":
-        """Return this entry if the parameter is a single number.
-
-        Args:
-            what: Verb for the message, such as "have a range".
-
-        Raises:
-            ScenarioError: The parameter is a list.
-        """
+        """Return this entry if the parameter is a single number."""
         if self.shape:
             raise ScenarioError(f"{self.where} is a list of {self.shape[0]} numbers; only single numbers can {what}")
         return self
 
     def values(self) -> tuple[float, ...]:
-        """Return the given numbers in SI; a single number counts as a list of one.
-
-        Raises:
-            ScenarioError: The list is empty, or an item is no number in the range.
-        """
+        """Return the given numbers in SI; a single number counts as a list of one."""
         if (ends := interval_ends(self.given, self.where)) is not None:
             raise ScenarioError(f"{self.where} is an interval; a list [{format_given(ends[0])}, ...] is needed")
         given = self.given if isinstance(self.given, list) else [self.given]
@@ -99,10 +88,6 @@ class ParameterEntry:
             or_else: Alternative to a range, for messages. A text that is not empty also selects the rules of a free
                 parameter of a tuning. Its ends must then differ, and may be ends that the parameter's own range
                 excludes.
-
-        Raises:
-            ScenarioError: The value is not a pair, an end is outside the parameter's range, or the ends are in the
-                wrong order.
         """
         needed = f"a range {{ low, high }} in {self.spec.interval()}"
         given = interval_ends(self.given, self.where)
@@ -135,15 +120,7 @@ class ParameterEntry:
 
 
 def interval_ends(given: PyTree, where: str) -> list[PyTree] | None:
-    """Return the ends of an interval as given, or None for a value of another form.
-
-    Args:
-        given: Table `{ low, high }`, or text "low:high".
-        where: Place of the value, for messages.
-
-    Raises:
-        ScenarioError: The table has another key or lacks one.
-    """
+    """Return the ends of an interval `{ low, high }` or "low:high" as given, or None for a value of another form."""
     if isinstance(given, str) and given.count(":") == 1:
         ends = [parse_value(text.strip()) for text in given.split(":")]
         return ends if all(isinstance(end, int | float) for end in ends) else None
@@ -155,12 +132,7 @@ def interval_ends(given: PyTree, where: str) -> list[PyTree] | None:
 
 
 def interval_table(low: Scalar, high: Scalar) -> JsonObject:
-    """Return an interval as a TOML value.
-
-    Args:
-        low: Lower end, a number or a tuple.
-        high: Upper end, in the same form.
-    """
+    """Return an interval as a TOML value; its ends are numbers or tuples."""
     return dict(zip(INTERVAL_KEYS, as_plain((low, high)), strict=True))
 
 
@@ -178,12 +150,6 @@ def to_canonical_form(table: JsonObject) -> JsonObject:
     """Return the table of a scenario in canonical form, changed in place.
 
     The road becomes a section of its own, and the tables with parameter keys get dotted paths.
-
-    Args:
-        table: Sections of the scenario.
-
-    Raises:
-        ScenarioError: The road or a path is given twice.
     """
     plant = table.get("plant")
     if isinstance(plant, dict) and "road" in plant:
@@ -209,10 +175,6 @@ def forget_replaced_part(table: JsonObject, replaced: str) -> list[str]:
     """Remove the entries for parameters of a replaced part from the tables with parameter keys, and return their paths.
 
     The new part has other parameters. One with the same name may have another meaning, and another range.
-
-    Args:
-        table: Sections of the scenario, changed in place.
-        replaced: Path of the part.
     """
     removed = []
     for where, inside, name in _find_tables(table):
@@ -227,9 +189,6 @@ def join_path_keys(keys: list[str]) -> list[str]:
 
     For example "tune.free.plant.mass" becomes ["tune", "free", "plant.mass"]. Keys outside of the tables with parameter
     keys are returned as they are.
-
-    Args:
-        keys: Words of the override's path between its dots.
     """
     for table in TABLES:
         if tuple(keys[: (n := len(table))]) == table and keys[n:]:
@@ -241,13 +200,6 @@ def flatten_table(table: Table, section: str) -> JsonObject:
     """Return the values of nested tables by dotted path.
 
     A table with the key `type` or `choices` is a value, and so is a table of `low` and `high` below a dotted path.
-
-    Args:
-        table: Nested tables.
-        section: Name of the table, for messages.
-
-    Raises:
-        ScenarioError: A path is given twice, or nested more than `MAX_DEPTH` deep.
     """
     found: JsonObject = {}
     pending = list(table.items())[::-1]
@@ -267,11 +219,7 @@ def flatten_table(table: Table, section: str) -> JsonObject:
 
 
 def canonical_path(path: str) -> str:
-    """Return a path as messages show it: without quotes, and with the road in a section of its own.
-
-    Args:
-        path: Path as given.
-    """
+    """Return a path as messages show it: without quotes, and with the road in a section of its own."""
     path = path.replace('"', "").replace("'", "")
     return path.removeprefix("plant.") if f"{path}.".startswith("plant.road.") else path
 
@@ -284,13 +232,7 @@ def read_entries(
     A speed may have the suffix `_kmh`.
 
     Args:
-        table: Nested or dotted values by path.
-        section: Name of the table, for messages.
         there: Spec and shape of each allowed parameter by path of the loop.
-        otherwise: End of the message on a path that is not allowed, such as "not a parameter of this loop".
-
-    Raises:
-        ScenarioError: A path is not allowed, or a parameter is given twice.
     """
     known = {canonical_path(path): (path, spec, shape, 1.0) for path, (spec, shape) in there.items()}
     known |= {f"{k}_kmh": (path, in_kmh(spec), n, KMH) for k, (path, spec, n, _) in known.items() if spec.unit == "m/s"}
@@ -308,11 +250,7 @@ def read_entries(
 
 
 def parameters_of(loop: Part) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]]:
-    """Return spec and shape of every parameter by path.
-
-    Args:
-        loop: Loop, or another part with parameters.
-    """
+    """Return spec and shape of every parameter by path."""
     return {path: (spec, np.shape(value)) for path, spec, value in parameters(loop)}
 
 
@@ -327,8 +265,6 @@ def metric_reader(
     """Return the reader (given, path) -> {metric: number} of a table, which raises ScenarioError for a wrong one.
 
     Args:
-        objectives: Objectives by name, whose names are the allowed keys.
-        what: Contents of the table, for messages.
         unit: Function from an objective to the unit of its number.
     """
 

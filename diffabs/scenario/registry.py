@@ -71,12 +71,6 @@ def family_types(family: str) -> Table:
     """Return the parts of a family by name: an instance of each class with its defaults, and the named constants.
 
     Parts from outside are included.
-
-    Args:
-        family: Key of `FAMILIES`.
-
-    Raises:
-        ScenarioError: A module from outside cannot be imported, or uses a name that another part already has.
     """
     try:
         modules = outside.registered_modules()
@@ -156,12 +150,7 @@ def _packaged_parts(family: str) -> Table:
 
 
 def name_of(family: str, part: Part) -> str:
-    """Return the name of a part in scenarios: that of a named constant, else that of the part's class.
-
-    Args:
-        family: Family of the part.
-        part: Instance of the part.
-    """
+    """Return the name of a part in scenarios: that of a named constant, else that of the part's class."""
     named = (name for name, item in family_types(family).items() if item is part)
     return next(named, kebab_case(type(part).__name__))
 
@@ -170,20 +159,12 @@ def family_of(field: str, enclosing: str) -> str:
     """Return the family of the parts in a field.
 
     `road` and `roads` hold roads; any other field, such as `blocks`, holds parts of the enclosing family.
-
-    Args:
-        field: Name of the field.
-        enclosing: Family of the part that has the field.
     """
     return next((name for name in (field, field.removesuffix("s")) if name in FAMILIES), enclosing)
 
 
 def type_name(given: PyTree) -> Scalar:
-    """Return the name of the type in a section: the section itself if it is a bare word, else its `type`, or None.
-
-    Args:
-        given: Value of the section.
-    """
+    """Return the name of the type in a section: the section itself if it is a bare word, else its `type`, or None."""
     return given.get("type") if isinstance(given, dict) else given
 
 
@@ -192,11 +173,6 @@ def describe_missing_inner_parts(family: str, given: PyTree, path: str) -> list[
 
     Such a part would get the default type of the enclosing class, whatever the scenario has there. A named constant
     brings its own parts.
-
-    Args:
-        family: Family of the part.
-        given: Table of the part, or the bare name of its type.
-        path: Place of the part, for messages.
     """
     name, lines = type_name(given), []
     part = family_types(family).get(name) if isinstance(name, str) else None
@@ -218,21 +194,12 @@ def describe_missing_inner_parts(family: str, given: PyTree, path: str) -> list[
 
 
 def part_summary(part: Part) -> str:
-    """Return the first paragraph of a part's docstring, on one line.
-
-    Args:
-        part: Instance of the part.
-    """
+    """Return the first paragraph of a part's docstring, on one line."""
     return " ".join((inspect.getdoc(type(part)) or "").split("\n\n")[0].split())
 
 
 def unit_of(objective: Any, plant: Part = None) -> str:
-    """Return the unit of an objective's value; empty if the objective declares none.
-
-    Args:
-        objective: Objective.
-        plant: Plant whose signals the objective measures; by default the usual plant.
-    """
+    """Return the unit of an objective's value; empty if the objective declares none. Signals are those of the plant."""
     return resolve_unit(getattr(objective, "unit", ""), units_of(plant) or DEFAULT_UNITS)
 
 
@@ -243,14 +210,7 @@ def build_part(family: str, given: PyTree, default: Any, path: str, units: Units
     checked later, by `diffabs.check`.
 
     Args:
-        family: Family of the part.
-        given: Table or name, as read from TOML.
         default: Part with the default fields; None if a type is required.
-        path: Place of the value, for messages.
-        units: Units of the loop's signals, for messages.
-
-    Raises:
-        ScenarioError: The type is missing or unknown, a field is unknown, or a value has the wrong type.
     """
     there = family_types(family)
     table = {"type": given} if isinstance(given, str) else given
@@ -269,18 +229,7 @@ def build_part(family: str, given: PyTree, default: Any, path: str, units: Units
 
 
 def fill_part(template: Any, table: JsonObject, family: str, path: str, units: Units | None = None) -> PyTree:
-    """Return a copy of a part with the fields of a table.
-
-    Args:
-        template: Part with the default fields.
-        table: New values by field; a speed may have the key `<field>_kmh`.
-        family: Family of the part; empty for a whole loop.
-        path: Place of the table, for messages.
-        units: Units of the loop's signals, for messages.
-
-    Raises:
-        ScenarioError: A field is unknown or given twice, a value has the wrong type, or parts are nested too deeply.
-    """
+    """Return a copy of a part with the fields of a table; a speed may have the key `<field>_kmh`."""
     if path.count(".") > MAX_DEPTH:
         raise ScenarioError(f"{format_given(path)}: parts are nested more than {MAX_DEPTH} deep")
     fields = {field.name: field for field in dataclasses.fields(template)}
@@ -322,12 +271,6 @@ def build_loop(sections: JsonObject) -> Loop:
     """Return the loop that the sections of a scenario describe.
 
     A section that is left out gets the plant's usual part.
-
-    Args:
-        sections: Values of the sections by field of the loop.
-
-    Raises:
-        ScenarioError: A section is wrong, or is left out while the plant has no usual part for it.
     """
     plant = fill_part(braking(), {"plant": sections["plant"]}, "", "").plant if "plant" in sections else braking().plant
     own, units = getattr(plant, "usual_parts", dict), units_of(plant)
@@ -351,12 +294,7 @@ OTHER_SECTIONS = ("road", "solver", "objective", "design", "tune", "sweep", "tit
 
 
 def join_path(path: str, key: str) -> str:
-    """Return a dotted path; the road of the plant has the path `road`.
-
-    Args:
-        path: Path of the part.
-        key: Field in it.
-    """
+    """Return a dotted path; the road of the plant has the path `road`."""
     return "road" if (path, key) == ("plant", "road") else dotted_path(path, key)
 
 
@@ -417,11 +355,7 @@ def _parts(
 
 
 def in_kmh(spec: ParameterSpec) -> ParameterSpec:
-    """Return the spec of a speed in km/h.
-
-    Args:
-        spec: Spec of the speed in m/s.
-    """
+    """Return the spec of a speed in km/h."""
     return dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
 
 
@@ -429,10 +363,6 @@ def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
     """Return the fields of a part as plain values by name: "default", "unit", "range", "low" and "high" of each.
 
     A default that is a part is given by its name. An infinite end of a range is None.
-
-    Args:
-        family: Family of the part.
-        part: Instance of the part.
     """
     rows = {}
     for field in dataclasses.fields(part):
@@ -462,7 +392,6 @@ def part_choices(part: Part, path: str = "") -> Iterator[tuple[str, JsonObject]]
     The given part comes first, then every part inside it.
 
     Args:
-        part: Part, or tuple or list of parts.
         path: Path of the part; empty for a whole loop, which itself is not yielded.
     """
     if isinstance(part, tuple | list):

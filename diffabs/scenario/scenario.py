@@ -124,14 +124,7 @@ def names() -> list[str]:
 
 
 def read_header(name_or_path: str | pathlib.Path) -> dict[str, str]:
-    """Return title and description of a scenario, without building it.
-
-    Args:
-        name_or_path: Name of a packaged scenario, or path of a TOML file.
-
-    Raises:
-        ScenarioError: The file cannot be read or is not TOML, or a text is not printable.
-    """
+    """Return title and description of a scenario, without building it."""
     table = _parse(_read(name_or_path)[1], str(name_or_path))
     return {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
 

@@ -101,9 +101,6 @@ class DesignTask:
 
         The dictionary is empty if [design.over] is empty. Otherwise the speed of a brake without a range gets the range
         from the loop's stop to its start.
-
-        Raises:
-            ScenarioError: [design.over] has a range for a parameter of the linear model that `loop` itself lacks.
         """
         over = self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else self.over
         ranges = {path: ends for path, ends in over.items() if ends[0] < ends[1]}
@@ -137,15 +134,7 @@ class _Parameter:
 
 
 def read_design_section(table: PyTree, loop: Loop) -> DesignTask:
-    """Return the task that a section describes.
-
-    Args:
-        table: Values of the section.
-        loop: Loop whose linear model the ranges refer to.
-
-    Raises:
-        ScenarioError: A value is wrong, or only one of Q and R is given. The message is one line.
-    """
+    """Return the task that a section describes."""
     task: DesignTask = read_table(DesignTask, table, "design", over=lambda given, path: _over(given, path, loop))
     for there, missing in (("Q", "R"), ("R", "Q")):
         if getattr(task, there) is not None and getattr(task, missing) is None:

@@ -44,14 +44,7 @@ SECTIONS = {"fixed": _Fixed, "adaptive": _Adaptive}
 
 
 def read_solver_section(given: PyTree) -> tuple[Solver, int]:
-    """Return solver and seed of a section.
-
-    Args:
-        given: Values of the section.
-
-    Raises:
-        ScenarioError: A field is unknown, or a value has the wrong type or is out of range.
-    """
+    """Return solver and seed of a section."""
     if isinstance(given, Mapping):
         fixed = {"step", "kinks"} & given.keys() and "rtol" not in given
         given = {"type": "fixed" if fixed else "adaptive", **given}
@@ -63,12 +56,7 @@ def read_solver_section(given: PyTree) -> tuple[Solver, int]:
 
 
 def write_solver_section(solver: Solver, seed: int) -> JsonObject:
-    """Return the section that `read_solver_section` reads back to the same solver and seed.
-
-    Args:
-        solver: Fixed or adaptive solver.
-        seed: Seed of the noise.
-    """
+    """Return the section that `read_solver_section` reads back to the same solver and seed."""
     kind = next(name for name, one in SOLVER_TYPES.items() if type(solver) is one)
     said = {name: value for name, value in plain_fields(solver).items() if value is not None}
     return {"type": kind, **said, "seed": seed}

@@ -128,15 +128,6 @@ def read_sweep_section(
     """Return the sweep that a section describes.
 
     Files of numbers are read now, so later changes of the files have no effect.
-
-    Args:
-        table: Values of the section.
-        loop: Loop with the parameters that vary.
-        objectives: Objectives of its runs by name.
-        folder: Folder of the files that the section names.
-
-    Raises:
-        ScenarioError: A value is wrong, or a file cannot be read. The message is one line.
     """
     plan: SweepSection = read_table(
         SweepSection,
@@ -235,14 +226,7 @@ def _choice(key: str, given: PyTree, default: Any) -> Choice:
 
 
 def build_study(chosen: Any) -> "Study":
-    """Return the sweep of a scenario.
-
-    Args:
-        chosen: Scenario with a section `[sweep]`.
-
-    Raises:
-        ScenarioError: Nothing varies, or the section does not fit the loop.
-    """
+    """Return the sweep of a scenario."""
     from diffabs.sweep import Study
 
     plan: SweepSection = chosen.sweep

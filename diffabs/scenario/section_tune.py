@@ -107,13 +107,7 @@ class Goal:
         return plain_fields(self) | {"free": free}
 
     def check(self, loop: Loop) -> "Goal":
-        """Return this goal unchanged if `loop` can be tuned with it.
-
-        Raises:
-            ScenarioError: No parameter is free, no metric has a weight, a start is not inside its range, a free
-                parameter is in [tune.over], or there are samples without [tune.over]. Also raised if an initial speed
-                in [tune.over] is not above the speed at which runs stop.
-        """
+        """Return this goal unchanged if `loop` can be tuned with it."""
         interval = '"controller.gain" = { low = -20000.0, high = -80.0 }'
         for name, example in (("free", interval), ("objective", "iae = 1.0")):
             if not getattr(self, name):
@@ -151,16 +145,7 @@ class Goal:
 
 
 def read_tune_section(table: PyTree, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
-    """Return the goal that a section describes.
-
-    Args:
-        table: Values of the section.
-        loop: Loop with the free parameters.
-        objectives: Objectives of its runs by name.
-
-    Raises:
-        ScenarioError: A value is wrong, or there are more than `MOST_LANES` combinations. The message is one line.
-    """
+    """Return the goal that a section describes, of at most `MOST_LANES` combinations."""
     samples = table.get("samples") if isinstance(table, Mapping) else 0
     goal: Goal = read_table(
         Goal,
@@ -185,14 +170,6 @@ def free_ranges(table: JsonObject, loop: Loop, section: str) -> dict[str, Ends |
     """Return the ranges (low, high) of the free parameters by path of the loop, in SI; None for a declared range.
 
     Each end is a number, or a tuple where a list was given for a parameter that is a list.
-
-    Args:
-        table: Ranges as given, by path.
-        loop: Loop with the parameters.
-        section: Name of the table, for messages.
-
-    Raises:
-        ScenarioError: A path is unknown, a range is wrong, or a run does not depend smoothly on the parameter.
     """
     found: dict[str, Ends | None] = {}
     for item in _entries(table, section, loop):
@@ -215,14 +192,6 @@ def check_starts(loop: Loop, free: Mapping[str, Ends | None], section: str) -> N
     """Check that each free parameter starts strictly inside its range.
 
     A parameter that starts at an end of its range could not move: its coordinate in the tuning is infinite there.
-
-    Args:
-        loop: Loop with the values at the start.
-        free: Ranges by path; None for the declared range.
-        section: Name of the table, for messages.
-
-    Raises:
-        ScenarioError: A start is at an end of its range or outside.
     """
     lines = []
     for path, ends in free.items():

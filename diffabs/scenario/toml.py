@@ -20,15 +20,7 @@ KEY_TOKENS = re.compile(
 
 
 def parse_toml(text: str) -> JsonObject:
-    """Return the table that a TOML text describes.
-
-    Args:
-        text: TOML text.
-
-    Raises:
-        ValueError: The text is not TOML.
-        ScenarioError: Keys or values are nested too deeply, or a whole number has more than 64 bits.
-    """
+    """Return the table that a TOML text describes."""
     if _has_long_key(text):
         raise ScenarioError(f"a key is nested more than {MOST_LEVELS} deep")
     try:
@@ -73,12 +65,6 @@ def parse_value(text: str) -> Scalar:
     """Return the value that a text on the command line stands for.
 
     A TOML value is read as such, `1,2` is a list of numbers, and any other text is itself.
-
-    Args:
-        text: Text after the `=` of an override.
-
-    Raises:
-        ScenarioError: Values are nested too deeply, or a whole number has more than 64 bits.
     """
     for candidate in (f"v = {text}", f"v = [{text}]"):
         try:
@@ -94,12 +80,7 @@ def parse_value(text: str) -> Scalar:
 
 
 def write_toml(top: JsonObject, sections: dict[str, JsonObject]) -> str:
-    """Return the text of a TOML file.
-
-    Args:
-        top: Values at the top of the file.
-        sections: Values of each section by its name.
-    """
+    """Return the text of a TOML file."""
     lines = [f"{_write_key(key)} = {_write_value(value)}" for key, value in top.items()]
     for name, values in sections.items():
         lines += ["", f"[{name}]", *(f"{_write_key(key)} = {_write_value(value)}" for key, value in values.items())]
