@@ -37,32 +37,18 @@ class ScenarioError(ValueError):
 
 
 def kebab_case(name: str) -> str:
-    """Return the name in tables: `QuarterCar`, `PID`, `RIG_UNROUNDED` are `quarter-car`, `pid`, `rig-unrounded`.
-
-    Args:
-        name: Name of a class or a constant.
-    """
+    """Return the name in tables: `QuarterCar`, `PID`, `RIG_UNROUNDED` are `quarter-car`, `pid`, `rig-unrounded`."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z]{2})(?=[A-Z][a-z])", "-", name).replace("_", "-").lower()
 
 
 def dotted_path(path: str, key: str) -> str:
-    """Return the path of a key below another path, in a form for messages.
-
-    Args:
-        path: Path of the table, or an empty text.
-        key: Key in the table.
-    """
+    """Return the path of a key below another path, in a form for messages."""
     key = key if re.fullmatch(r"[\w-]{1,60}", key) else format_given(key)
     return f"{path}.{key}" if path else key
 
 
 def format_given(value: Scalar, most: int = 60) -> str:
-    """Return a value from TOML, JSON or the command line for a message: on one line, of bounded length.
-
-    Args:
-        value: Any value.
-        most: Greatest number of characters.
-    """
+    """Return a value from TOML, JSON or the command line for a message: on one line, of bounded length."""
     if isinstance(value, datetime.date | datetime.time):
         return value.isoformat()
     if isinstance(value, float) or (isinstance(value, int) and abs(value) < 10**15):
@@ -75,13 +61,7 @@ def format_given(value: Scalar, most: int = 60) -> str:
 
 
 def unknown_name_error(what: str, name: Any, there: Iterable[str]) -> ScenarioError:
-    """Return the error for an unknown name, with the nearest existing name.
-
-    Args:
-        what: Beginning of the message.
-        name: The unknown name.
-        there: Existing names.
-    """
+    """Return the error for an unknown name, with the nearest existing name."""
     there = list(there)
     near = _find_near_name(str(name), there)
     hint = f"did you mean {near}? There is" if near else "there is"
@@ -107,13 +87,7 @@ def _find_near_name(name: str, there: list[str]) -> str | None:
 
 
 def wrong_kind_error(path: str, value: Scalar, needed: str) -> ScenarioError:
-    """Return the error for a value of the wrong kind.
-
-    Args:
-        path: Path of the value.
-        value: The value.
-        needed: The required kind, in words.
-    """
+    """Return the error for a value of the wrong kind."""
     kinds = ((bool, "a boolean"), (str, "text"), ((int, float), "a number"), (list, "a list"), (dict, "a table"))
     kinds = (*kinds, (datetime.date | datetime.time, "a date or time"), (type(None), "nothing"))
     kind = next((name for of, name in kinds if isinstance(value, of)), f"of type {type(value).__name__}")
@@ -121,16 +95,7 @@ def wrong_kind_error(path: str, value: Scalar, needed: str) -> ScenarioError:
 
 
 def read_number(value: Scalar, spec: ParameterSpec, path: str) -> float:
-    """Return a number as a float, without a check of its range.
-
-    Args:
-        value: Given value.
-        spec: Declared range, which the messages show.
-        path: Path of the value, for messages.
-
-    Raises:
-        ScenarioError: The value is not a number, or too large for a float.
-    """
+    """Return a number as a float, without a check of its range, which the messages show."""
     # bool is a subclass of int, so it is excluded first.
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise wrong_kind_error(path, value, f"a number in {spec.interval()}")
@@ -141,16 +106,7 @@ def read_number(value: Scalar, spec: ParameterSpec, path: str) -> float:
 
 
 def read_number_in_range(value: Scalar, spec: ParameterSpec, path: str) -> float:
-    """Return a number as a float.
-
-    Args:
-        value: Given value.
-        spec: Range.
-        path: Path of the value, for messages.
-
-    Raises:
-        ScenarioError: The value is not a number, or out of range.
-    """
+    """Return a number as a float."""
     found = read_number(value, spec, path)
     if not spec.holds(found):
         raise ScenarioError(f"{path} = {format_given(found)} is outside {spec.interval()}")
@@ -158,17 +114,7 @@ def read_number_in_range(value: Scalar, spec: ParameterSpec, path: str) -> float
 
 
 def read_whole(value: Scalar, low: int, high: int, path: str) -> int:
-    """Return a whole number.
-
-    Args:
-        value: Given value.
-        low: Least value.
-        high: Greatest value.
-        path: Path of the value, for messages.
-
-    Raises:
-        ScenarioError: The value is not a whole number, or out of range.
-    """
+    """Return a whole number."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise wrong_kind_error(path, value, f"a whole number in [{low}, {high}]")
     number = int(value)
@@ -178,30 +124,17 @@ def read_whole(value: Scalar, low: int, high: int, path: str) -> int:
 
 
 def whole_reader(low: int, high: int) -> Reader:
-    """Return the reader of whole numbers in a range.
-
-    Args:
-        low: Least value.
-        high: Greatest value.
-    """
+    """Return the reader of whole numbers in a range."""
     return lambda given, path: read_whole(given, low, high, path)
 
 
 def range_reader(spec: ParameterSpec) -> Reader:
-    """Return the reader of numbers in a range.
-
-    Args:
-        spec: Range.
-    """
+    """Return the reader of numbers in a range."""
     return lambda given, path: read_number_in_range(given, spec, path)
 
 
 def choice_reader(*names: str) -> Reader:
-    """Return the reader of one of several texts.
-
-    Args:
-        names: The allowed texts.
-    """
+    """Return the reader of one of several texts."""
 
     def read(given: PyTree, path: str) -> str:
         if not isinstance(given, str):
@@ -214,11 +147,7 @@ def choice_reader(*names: str) -> Reader:
 
 
 def list_reader(item: Reader) -> Reader:
-    """Return the reader of lists, which it returns as tuples.
-
-    Args:
-        item: Reader of the items.
-    """
+    """Return the reader of lists, which it returns as tuples."""
 
     def read(given: PyTree, path: str) -> tuple[PyTree, ...]:
         if not isinstance(given, list | tuple):
@@ -229,12 +158,7 @@ def list_reader(item: Reader) -> Reader:
 
 
 def table_reader(item: Reader, what: str = "") -> Reader:
-    """Return the reader of tables with any keys.
-
-    Args:
-        item: Reader of the values.
-        what: Kind of the values, for messages.
-    """
+    """Return the reader of tables with any keys."""
 
     def read(given: PyTree, path: str) -> dict[str, PyTree]:
         if not isinstance(given, Mapping):
@@ -245,41 +169,20 @@ def table_reader(item: Reader, what: str = "") -> Reader:
 
 
 def read_as_given(value: Scalar, path: str) -> Scalar:
-    """Return the value unchanged.
-
-    Args:
-        value: Given value.
-        path: Path of the value; not used.
-    """
+    """Return the value unchanged."""
     del path
     return value
 
 
 def read_text(given: PyTree, path: str) -> str:
-    """Return a text.
-
-    Args:
-        given: Given value.
-        path: Path of the value, for messages.
-
-    Raises:
-        ScenarioError: The value is not a text.
-    """
+    """Return a text."""
     if not isinstance(given, str):
         raise wrong_kind_error(path, given, "text")
     return given
 
 
 def read_printable_line(given: PyTree, path: str) -> str:
-    """Return a text that is one printable line.
-
-    Args:
-        given: Given value.
-        path: Path of the value, for messages.
-
-    Raises:
-        ScenarioError: The value is not a text, or not one printable line.
-    """
+    """Return a text that is one printable line."""
     found = read_text(given, path)
     if not found.isprintable():
         raise ScenarioError(f"{path} = {format_given(found)} is outside one line of printable characters")
@@ -287,15 +190,7 @@ def read_printable_line(given: PyTree, path: str) -> str:
 
 
 def read_printable_lines(given: PyTree, path: str) -> str:
-    """Return a text of printable lines.
-
-    Args:
-        given: Given value.
-        path: Path of the value, for messages.
-
-    Raises:
-        ScenarioError: The value is not a text, or a line is not printable.
-    """
+    """Return a text of printable lines."""
     found = read_text(given, path)
     if not all(line.isprintable() for line in found.split("\n")):
         raise ScenarioError(f"{path} = {format_given(found)} is outside lines of printable characters")
@@ -303,39 +198,19 @@ def read_printable_lines(given: PyTree, path: str) -> str:
 
 
 def make_printable(text: str) -> str:
-    """Return a text as one printable line, with a replacement character for each unprintable character.
-
-    Args:
-        text: Text.
-    """
+    """Return a text as one printable line, with a replacement character for each unprintable character."""
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
 def read_switch(given: PyTree, path: str) -> bool:
-    """Return true or false.
-
-    Args:
-        given: Given value.
-        path: Path of the value, for messages.
-
-    Raises:
-        ScenarioError: The value is not a truth value.
-    """
+    """Return true or false."""
     if not isinstance(given, bool):
         raise wrong_kind_error(path, given, "true or false")
     return given
 
 
 def read_any_number(given: PyTree, path: str) -> float:
-    """Return any number, also NaN and infinity, as a float.
-
-    Args:
-        given: Given value.
-        path: Path of the value, for messages.
-
-    Raises:
-        ScenarioError: The value is not a number.
-    """
+    """Return any number, also NaN and infinity, as a float."""
     return read_number(given, FINITE_SPEC, path)
 
 
@@ -356,12 +231,7 @@ READER_BY_TYPE: dict[PyTree, Reader] = {
 
 
 def table_field(read: Reader, default: Any = dataclasses.MISSING) -> Scalar:
-    """Return the field of a dataclass with this reader.
-
-    Args:
-        read: Reader of the field.
-        default: Default value, or a class or function that is called for each new one.
-    """
+    """Return the field of a dataclass with this reader; a default that can be called makes a new value each time."""
     if isinstance(default, type | types.FunctionType):
         return dataclasses.field(default_factory=default, metadata={"read": read})
     return dataclasses.field(default=default, metadata={"read": read})
@@ -371,14 +241,7 @@ def read_table(cls: type, given: PyTree, path: str, kind: str = "", **readers: R
     """Return the instance of a dataclass that a table describes.
 
     Args:
-        cls: Dataclass.
-        given: Given value.
-        path: Path of the table, for messages.
-        kind: Name of the dataclass in messages; empty takes the path.
         readers: Readers by name of a field, in place of the one that the field declares.
-
-    Raises:
-        ScenarioError: The value is not a table, a field is unknown or missing, or a reader refuses a value.
     """
     fields = {field.name: field for field in dataclasses.fields(cls)}
     if not isinstance(given, Mapping):
@@ -401,12 +264,7 @@ def _reader(field: dataclasses.Field[Any]) -> Reader:
 
 
 def find_field_faults(part: Part, name: str) -> Iterator[str]:
-    """Yield an error for each field of a dataclass that its reader refuses.
-
-    Args:
-        part: Instance of a dataclass.
-        name: Name of the part in messages.
-    """
+    """Yield an error for each field of a dataclass that its reader refuses."""
     for field in dataclasses.fields(part):
         try:
             _reader(field)(getattr(part, field.name), f"{name}: {field.name}")
@@ -418,13 +276,7 @@ def read_one(kinds: Mapping[str, type], given: PyTree, path: str, **readers: Rea
     """Return an instance of one of several dataclasses, from a table with a key `type` or from the type's name alone.
 
     Args:
-        kinds: Dataclasses by name.
-        given: Given value.
-        path: Path of the value, for messages.
         readers: Readers by name of a field, in place of the one that the field declares.
-
-    Raises:
-        ScenarioError: The value is neither a table nor a text, the type is missing or unknown, or as in `read_table`.
     """
     table = {"type": given} if isinstance(given, str) else given
     if not isinstance(table, Mapping):
@@ -436,15 +288,7 @@ def read_one(kinds: Mapping[str, type], given: PyTree, path: str, **readers: Rea
 
 
 def check_sound(part: Part, name: str) -> PyTree:
-    """Return the part unchanged if its method `problems(name)` reports no errors.
-
-    Args:
-        part: Object with a method `problems(name)`.
-        name: Name of the part in messages.
-
-    Raises:
-        ScenarioError: The method `problems` reports errors; the message contains all of them.
-    """
+    """Return the part unchanged if its method `problems(name)` reports no errors; the message contains all of them."""
     if lines := list(part.problems(name)):
         raise ScenarioError("; ".join(lines))
     return part
@@ -453,9 +297,7 @@ def check_sound(part: Part, name: str) -> PyTree:
 def as_plain(value: Scalar, *, brief: bool = False) -> PyTree:
     """Return a value as TOML and JSON represent it: parts as tables, their numbers at full precision.
 
-    Args:
-        value: Part, mapping, list, number or text.
-        brief: Whether tables omit fields with their default values.
+    With `brief`, tables omit fields with their default values.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {"type": kebab_case(type(value).__name__), **plain_fields(value, brief=brief)}
@@ -470,7 +312,6 @@ def plain_fields(part: Part, *, brief: bool = False) -> dict[str, PyTree]:
     """Return the fields of a dataclass by name, converted by `as_plain`.
 
     Args:
-        part: Instance of a dataclass.
         brief: Whether to omit fields with their default values. A field whose default comes from a function always
             stays.
     """
@@ -486,11 +327,7 @@ def plain_fields(part: Part, *, brief: bool = False) -> dict[str, PyTree]:
 
 
 def format_table(part: Part) -> str:
-    """Return a dataclass as text for messages: `normal(5.75, 0.3, low = 5)`.
-
-    Args:
-        part: Instance of a dataclass.
-    """
+    """Return a dataclass as text for messages: `normal(5.75, 0.3, low = 5)`."""
     cells = []
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
