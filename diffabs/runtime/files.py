@@ -23,14 +23,7 @@ _unfinished: set[pathlib.Path] = set()
 
 @contextlib.contextmanager
 def open_regular(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Yield a regular file, open for reading.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        OSError: The file cannot be opened, or is a folder, a pipe or a device.
-    """
+    """Yield a regular file, open for reading. Raises OSError for a folder, a pipe or a device."""
     with open(path, "rb", opener=lambda path, flags: os.open(path, flags | NONBLOCKING_FLAG)) as file:
         handle = file.fileno()
         if not stat.S_ISREG(os.fstat(handle).st_mode):
@@ -39,15 +32,7 @@ def open_regular(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def read_content(path: str | os.PathLike[str], most: int = sys.maxsize) -> bytes:
-    """Return the content of a regular file, or only its first bytes.
-
-    Args:
-        path: Path of the file.
-        most: Greatest number of bytes; the function does not return the rest of a longer file.
-
-    Raises:
-        OSError: As in `open_regular`.
-    """
+    """Return the content of a regular file, or only its first bytes."""
     with open_regular(path) as file:
         return file.read(-1 if most == sys.maxsize else most)
 
@@ -56,14 +41,6 @@ def make_room(folder: pathlib.Path, pattern: str, room: int) -> None:
     """Remove half of the matching files, the oldest ones, if all together have more than `room` bytes.
 
     Half refers to the number of files, so the rest may still exceed `room`.
-
-    Args:
-        folder: Folder.
-        pattern: Glob pattern of the files.
-        room: Greatest total size [bytes].
-
-    Raises:
-        OSError: The folder cannot be read.
     """
     found = []
     for path in folder.glob(pattern):
@@ -80,9 +57,6 @@ def temporary_path(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yield the path of a file or folder, and remove it at the end unless it was renamed to its final place.
 
     `remove_unfinished` removes it, too, if the process leaves while a thread still writes.
-
-    Args:
-        path: Path of the file or folder.
     """
     _unfinished.add(path)
     try:
@@ -95,26 +69,14 @@ def temporary_path(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def describe_error(error: OSError) -> str:
-    """Return an error of the system in one line: the file or folder, if it has one, and the reason.
-
-    Args:
-        error: Error to describe.
-    """
+    """Return an error of the system in one line: the file or folder, if it has one, and the reason."""
     reason = error.strerror or str(error)
     return " ".join((reason if error.filename is None else f"{os.fsdecode(error.filename)}: {reason}").split())
 
 
 @contextlib.contextmanager
 def name_in_disk_errors(target: str | os.PathLike[str], temporary: pathlib.Path | None = None) -> Iterator[None]:
-    """Name `target` in an error of the disk in the `with` block that names no file, or one in `temporary`.
-
-    Args:
-        target: File or folder that the block writes.
-        temporary: File or folder that stands for `target` until it is whole.
-
-    Raises:
-        OSError: The block raised it.
-    """
+    """Name `target` in an error of the disk in the `with` block that names no file, or one in `temporary`."""
     try:
         yield
     except OSError as error:
@@ -127,15 +89,7 @@ def name_in_disk_errors(target: str | os.PathLike[str], temporary: pathlib.Path 
 
 @contextlib.contextmanager
 def temporary_folder(prefix: str, parent: pathlib.Path | None = None) -> Iterator[pathlib.Path]:
-    """Yield an empty folder that vanishes at the end. Errors of the disk name it.
-
-    Args:
-        prefix: Beginning of its name.
-        parent: Folder that holds it; None is that of the system (`TMPDIR`).
-
-    Raises:
-        OSError: The folder cannot be created.
-    """
+    """Yield an empty folder that vanishes at the end. Errors of the disk name it. Its parent is by default `TMPDIR`."""
     with tempfile.TemporaryDirectory(prefix=prefix, dir=parent) as name, name_in_disk_errors(name):
         yield pathlib.Path(name)
 
@@ -144,15 +98,8 @@ def temporary_folder(prefix: str, parent: pathlib.Path | None = None) -> Iterato
 def new_file(target: pathlib.Path, suffix: str | None = None) -> Iterator[pathlib.Path]:
     """Yield an empty file beside `target` that replaces `target` at the end, or vanishes after an error.
 
-    Readers see the old file or the whole new one. If the caller removes the file, `target` stays unchanged. A killed
-    process may leave a hidden file `.STEM.*`.
-
-    Args:
-        target: Path of the file to write. The file behind a symbolic link is replaced, and the link stays.
-        suffix: Suffix of the file until then; None is that of `target`.
-
-    Raises:
-        OSError: The file cannot be created, or the target is a folder, a pipe or a device.
+    Readers see the old file or the whole new one. If the caller removes the file, `target` stays unchanged. The file
+    behind a symbolic link is replaced, and the link stays. A killed process may leave a hidden file `.STEM.*`.
     """
     target = pathlib.Path(os.path.realpath(target))
     if target.exists() and not target.is_file():
@@ -166,15 +113,7 @@ def new_file(target: pathlib.Path, suffix: str | None = None) -> Iterator[pathli
 
 
 def write_file(target: pathlib.Path, data: bytes) -> None:
-    """Write a file, whole or not at all.
-
-    Args:
-        target: Path of the file.
-        data: Content.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write a file, whole or not at all."""
     with new_file(target) as temporary:
         temporary.write_bytes(data)
 
@@ -184,13 +123,6 @@ def write_synced(target: pathlib.Path, data: bytes) -> pathlib.Path:
 
     Several processes may write it at once; the content of the last one stays. Unlike `write_durably`, the function does
     not sync the folder, so a power cut may undo the write.
-
-    Args:
-        target: Path of the file.
-        data: Content.
-
-    Raises:
-        OSError: The file cannot be written.
     """
     with new_file(target, ".tmp") as temporary, temporary.open("wb") as file:  # data sets read hidden .parquet files
         file.write(data)
@@ -203,12 +135,6 @@ def others_may_write(folder: pathlib.Path) -> bool:
     """Return whether users other than this one and root may write to a folder; always False on Windows.
 
     The answer is True for a folder that the group or everybody may write to, or that another user owns.
-
-    Args:
-        folder: Folder.
-
-    Raises:
-        OSError: The folder cannot be read.
     """
     if not hasattr(os, "getuid"):
         return False  # Windows: a user's folders are the user's
@@ -220,13 +146,6 @@ def write_durably(target: pathlib.Path, data: bytes) -> pathlib.Path:
     """Write a file that is whole whenever it exists, also after a power cut, and return its path.
 
     Unlike `write_synced`, the function also syncs the folder, so that the new file survives a power cut.
-
-    Args:
-        target: Path of the file.
-        data: Content.
-
-    Raises:
-        OSError: The file cannot be written.
     """
     write_synced(target, data)
     if hasattr(os, "O_DIRECTORY"):
@@ -243,14 +162,9 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yield an empty folder beside `target` that replaces `target` at the end, or vanishes after an error.
 
     Linux exchanges the old and the new folder in one step. Other systems, and some network file systems, take two
-    steps. A process killed between them leaves no `target`, and the old content in `.NAME.*/old` beside it. A killed
-    process may leave a hidden folder `.NAME.*` in any case; remove it when no process writes.
-
-    Args:
-        target: Path of the folder to write. The folder behind a symbolic link is replaced, and the link stays.
-
-    Raises:
-        OSError: The folder cannot be created or put in place, and the old folder is restored. Or the target is a file.
+    steps. A process killed between them leaves no `target`, and the old content in `.NAME.*/old` beside it. The folder
+    behind a symbolic link is replaced, and the link stays. A killed process may leave a hidden folder `.NAME.*` in any
+    case; remove it when no process writes.
     """
     target = pathlib.Path(os.path.realpath(target))
     if target.exists() and not target.is_dir():

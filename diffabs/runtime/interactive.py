@@ -70,8 +70,6 @@ def report_to(
     """Return the user's `progress`, else a function that shows its arguments on a line, else None.
 
     Args:
-        line: Line; without a place to show it, the result is None.
-        progress: Function of the user, or None.
         words: Function that returns the text for the same arguments.
     """
 

@@ -17,28 +17,14 @@ import jax
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Return the versions by name: `diffabs`, `jax`, the given packages, and `python`.
-
-    Args:
-        packages: Names of installed distributions.
-
-    Raises:
-        importlib.metadata.PackageNotFoundError: A distribution is not installed.
-    """
+    """Return the versions by name: `diffabs`, `jax`, the given packages, and `python`."""
     found = {name: importlib.metadata.version(name) for name in ("jax", *packages)}
     own = sys.modules[__name__.partition(".")[0]].__version__  # the distribution's name differs from the package's
     return {"diffabs": own, **found, "python": platform.python_version()}
 
 
 def describe_platform(*packages: str) -> dict[str, str]:
-    """Return `versions`, JAX's `backend`, and the `machine` (x86_64, arm64), since each can change a bit of a result.
-
-    Args:
-        packages: Names of installed distributions.
-
-    Raises:
-        importlib.metadata.PackageNotFoundError: A distribution is not installed.
-    """
+    """Return `versions`, JAX's `backend`, and the `machine` (x86_64, arm64): each can change a bit of a result."""
     return versions(*packages) | {"backend": jax.default_backend(), "machine": platform.machine()}
 
 
@@ -59,9 +45,6 @@ def describe_making(words: Sequence[str]) -> dict[str, str | int]:
     """Return how a computation was made: `command`, `date`, `machine`, `system`, `processors`, `backend`, and `commit`.
 
     The command repeats the computation. The date is UTC. `commit` is absent for an installed package.
-
-    Args:
-        words: Words of the command after `diffabs`.
     """
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     machine = {"machine": platform.machine(), "system": platform.system(), "processors": os.cpu_count() or 1}

@@ -12,15 +12,7 @@ SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
 
 
 def split_rows(text: str, separator: str | None = None) -> tuple[list[list[str]], str]:
-    """Return the cells of each line, and the separator.
-
-    Args:
-        text: Text with the names of the columns in its first line.
-        separator: Character between the cells; None guesses one of `SEPARATORS`.
-
-    Raises:
-        ValueError: Several separators fit, or the text is no CSV.
-    """
+    """Return the cells of each line, names first, and the separator; None guesses one of `SEPARATORS`."""
     lines = text.splitlines()
     separator = separator or guess_separator(lines)
     try:
@@ -33,12 +25,6 @@ def guess_separator(lines: Sequence[str]) -> str:
     """Return the separator that splits the names and the most lines below into equally many cells, more than one.
 
     The comma is the separator of a file with one column, and of one whose first numbers no separator splits alike.
-
-    Args:
-        lines: Lines of the file, with the names of the columns first.
-
-    Raises:
-        ValueError: Several separators fit.
     """
     first = [line for line in lines[:MAX_LOOKED_AT] if line]
 
@@ -60,10 +46,6 @@ def guess_separator(lines: Sequence[str]) -> str:
 
 def read_decimal(cell: str, comma: bool = False) -> float:
     """Return the number in a cell, or in another text of a person.
-
-    Args:
-        cell: Text of the cell.
-        comma: Whether numbers have a decimal comma.
 
     Raises:
         ValueError: The cell is no number. So are digits in groups, such as 1.234,5 and 1_000, and of other scripts.

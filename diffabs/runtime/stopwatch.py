@@ -67,11 +67,8 @@ def count_as_compiling() -> Iterator[None]:
 
 
 def compile_time_since(since: float = 0.0) -> float:
-    """Return the compilation time [s] since an instant, without compilations that have not ended.
+    """Return the compilation time [s] since an instant of `time.monotonic`, without compilations that have not ended.
 
     It covers the compilations of JAX only after `count_compilations`.
-
-    Args:
-        since: Instant of `time.monotonic` [s].
     """
     return _compiling.seconds(since)
