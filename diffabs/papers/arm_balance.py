@@ -92,11 +92,7 @@ SHOWN_QUANTITIES = (
 
 
 def upright_model(plant: Part) -> StateSpace:
-    """Return the linear model (A, B) of a plant about the upright position.
-
-    Args:
-        plant: A two-wheeler.
-    """
+    """Return the linear model (A, B) of a plant about the upright position."""
     return BalanceModel(plant=plant).matrices()
 
 
@@ -104,7 +100,6 @@ def lqr_gain(plant: Part, weights: PyTree = (1.0,) * 6, effort: float = 1.0) -> 
     """Return the LQR gain K of u = K x about the upright position, shape (6,).
 
     Args:
-        plant: A two-wheeler.
         weights: Diagonal of Q, 6 numbers.
         effort: R, > 0.
     """
@@ -115,8 +110,6 @@ def loop(plant: Part, gain: Matrix, start: PyTree = PAPER_START, voltage: float 
     """Return the closed loop from a start.
 
     Args:
-        plant: A two-wheeler.
-        gain: K of u = K x, shape (6,).
         start: Angles theta, psi and phi [rad] at the start; further entries have no effect.
         voltage: Limit of the motor voltage [V].
     """
@@ -152,7 +145,6 @@ def recovered_multiples(one: Loop, rows: Table) -> list[Reach]:
     """Return, for each row, the greatest of `MULTIPLES` up to which every multiple of the paper's start is recovered.
 
     Args:
-        one: Closed loop.
         rows: Values by parameter path, each of shape (rows,); all paths of a row change together.
     """
     direction = {"initial.theta": PAPER_START[0], "initial.phi": PAPER_START[2]}
@@ -160,13 +152,9 @@ def recovered_multiples(one: Loop, rows: Table) -> list[Reach]:
 
 
 def largest_possible_multiples(plant: ArmBalance, riders: Any) -> np.ndarray:
-    """Return an upper bound of the recoverable multiples of the start for each rider, shape (riders,).
+    """Return an upper bound of the recoverable multiples of the start for each rider [kg], shape (riders,).
 
     The bound holds in the linear model for any control of at most 48 V.
-
-    Args:
-        plant: A two-wheeler.
-        riders: Masses of the rider [kg].
     """
     return np.array(
         [
@@ -180,7 +168,6 @@ def heaviest(plant: ArmBalance, gain: np.ndarray) -> float:
     """Return the mass of the heaviest rider [kg], at most 200, that a gain stabilises in the linear model, to 1 g.
 
     Args:
-        plant: A two-wheeler.
         gain: K of u = K x, shape (6,), that is known to stabilise 50 kg.
     """
     low, high = 50.0, 200.0  # kg
@@ -193,11 +180,7 @@ def heaviest(plant: ArmBalance, gain: np.ndarray) -> float:
 
 
 def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
-    """Return the regions of attraction at 48 V by name of the gain.
-
-    Args:
-        progress: Function that receives a sentence before each long computation.
-    """
+    """Return the regions of attraction at 48 V by name of the gain."""
     gains, found = {"LQR": lqr_gain(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": TUNED}, {}
     for name, gain in gains.items():
         progress(f"arm-balance: {BOX.number**2} starts, {name}")
@@ -210,9 +193,6 @@ def robust_gains(progress: Callable[[str], None]) -> JsonObject:
 
     The gains are the LQR of one rider, tuned weights, and the LMI for all riders of 40 to 100 kg. The LMI is left out
     if the extra `design` is not installed.
-
-    Args:
-        progress: Function that receives a sentence before each long computation.
     """
     gains = {"LQR for 50 kg": lqr_gain(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": np.array(TUNED)}
     progress("arm-balance: a gain for 40 to 100 kg")
@@ -233,12 +213,7 @@ def robust_gains(progress: Callable[[str], None]) -> JsonObject:
 
 
 def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[JsonObject]:
-    """Return the rows that compare our numbers with the independent ones.
-
-    Args:
-        seen: Runs by name.
-        basins: Regions of attraction by name.
-    """
+    """Return the rows that compare our numbers with the independent ones."""
     a, b = upright_model(ArmBalance())
     poles = np.sort_complex(np.linalg.eigvals(np.asarray(a)))
     real = poles[np.abs(poles.imag) < 1e-9].real
@@ -291,11 +266,7 @@ def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[JsonObje
 
 
 def compact(summary: Table) -> Digest:
-    """Return the digest: falls, bounds of any control, and recovered starts of the hanging arm.
-
-    Args:
-        summary: Contents of `summary.json`.
-    """
+    """Return the digest: falls, bounds of any control, and recovered starts of the hanging arm."""
     rows = summary["rows"]
     lines = []
     for row in rows:
@@ -311,12 +282,7 @@ def compact(summary: Table) -> Digest:
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObject:
-    """Write figures and `summary.json` into the folder, and return the summary.
-
-    Args:
-        folder: Existing folder.
-        progress: Function that receives a sentence before each long computation.
-    """
+    """Write figures and `summary.json` into the folder, and return the summary."""
     progress("arm-balance: Fig. 3, printed and correct equations")
     seen = runs()
     basins = maps(progress)

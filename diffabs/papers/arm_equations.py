@@ -22,7 +22,6 @@ def potentials(p: ArmBalance, q: AnyArray) -> Scalar:
     In (4) and (6) a term lacks the factor g, so that they add kg m to J.
 
     Args:
-        p: Machine.
         q: Angles (3,) [rad].
     """
     t1, t2, t3 = q
@@ -36,7 +35,6 @@ def printed_equations(p: ArmBalance, q: AnyArray, v: Scalar, a: Scalar) -> Scala
     """Return the left sides of eqs. (8), (9), (10), shape (3,).
 
     Args:
-        p: Machine.
         q: Angles (3,) [rad].
         v: Rates (3,) [rad/s].
         a: Accelerations (3,) [rad/s^2].
@@ -62,20 +60,13 @@ def gravity_stiffness(p: ArmBalance) -> np.ndarray:
     """Return the Jacobian of the left sides of (8)-(10) by the angles, upright and at rest, shape (3, 3) [N m/rad].
 
     A gravity that comes from a potential has a symmetric Jacobian.
-
-    Args:
-        p: Machine.
     """
     zero = jnp.zeros(3)
     return np.asarray(jax.jacfwd(lambda q: printed_equations(p, q, zero, zero))(zero))
 
 
 def judge_equations(p: ArmBalance) -> list[JsonObject]:
-    """Return the rows that judge the printed equations, one for each number.
-
-    Args:
-        p: Machine.
-    """
+    """Return the rows that judge the printed equations, one for each number."""
     upright = np.asarray(potentials(p, jnp.zeros(3)))
     height = p.arm_mass * p.gravity * (p.mount_height + p.arm_length)
     rows = [record.computed_row("eq. (4), everything upright", "potential energy", "J", upright[1], reference=height)]

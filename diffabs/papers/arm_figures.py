@@ -24,13 +24,10 @@ def figures(
     """Return the figures by file name.
 
     Args:
-        seen: Runs by name.
-        basins: Regions of attraction by name.
         riders: Masses of the rider [kg].
         over_riders: Gain and recovered multiples over the riders, by name.
         limit: Largest multiple that any control recovers, for each rider.
         start: Start of the paper's Fig. 3, shape (6,).
-        hanging: Linear model of the hanging arm.
     """
     return {
         "fig3_printed_and_correct": _claim(seen),

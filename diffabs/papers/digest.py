@@ -64,12 +64,7 @@ def digest(
     """Return the digest of a paper from its table and the parts that all papers share.
 
     Args:
-        summary: Contents of `summary.json`.
-        headings: Headings of the table.
-        lines: Lines of the table.
-        claims: Claims of the paper that may be refuted.
         printed: Place of the published numbers in the paper, and their rows.
-        independent: Rows with an independent number.
     """
     return Digest(
         title=summary["title"].split(" (")[0],
@@ -82,41 +77,22 @@ def digest(
 
 
 def our_number(rows: Iterable[Row], name: str, quantity: str) -> float | None:
-    """Return our number in a row of the record; None if there is no such row.
-
-    Args:
-        rows: Rows of the record.
-        name: Name of the row.
-        quantity: Quantity of the row.
-    """
+    """Return our number in a row of the record; None if there is no such row."""
     return next((row["ours"] for row in rows if (row["name"], row["quantity"]) == (name, quantity)), None)
 
 
 def is_reproduced(row: Row) -> bool:
-    """Return whether our number rounds to the printed digits.
-
-    Args:
-        row: Row with a published number; its `matches`, if present, decides.
-    """
+    """Return whether our number rounds to the printed digits; `matches`, if the row has it, decides."""
     return row["matches"] if "matches" in row else rounds_to(row["ours"], row["published"])
 
 
 def rounds_to(number: float | str, given: float) -> bool:
-    """Return whether a number rounds to another number at the other's decimals; a word does not.
-
-    Args:
-        number: Number to round, or a word such as "never".
-        given: Number as printed.
-    """
+    """Return whether a number rounds to another number at the other's decimals; a word such as "never" does not."""
     return not isinstance(number, str) and round(number, decimals(given)) == given
 
 
 def decimals(given: float) -> int:
-    """Return the number of decimals of a number as written.
-
-    Args:
-        given: Number as printed.
-    """
+    """Return the number of decimals of a number as written."""
     exponent = Decimal(repr(given)).normalize().as_tuple().exponent
     return max(0, -int(exponent))
 
@@ -125,9 +101,6 @@ def is_close(row: Row) -> bool:
     """Return whether our number agrees with the independent number.
 
     Rounding counts only if the independent number has decimals; without decimals, 0.4 would agree with 0.
-
-    Args:
-        row: Row with an independent number.
     """
     known, gap = row["reference"], row["difference"]
     if gap is None:  # beside a word, such as "never"
@@ -136,23 +109,14 @@ def is_close(row: Row) -> bool:
 
 
 def count_published(where: str, rows: Sequence[Row]) -> str:
-    """Return a sentence on the share of published numbers that are reproduced, the exceptions, and the rule.
-
-    Args:
-        where: Place of the numbers in the paper.
-        rows: Rows with a published number.
-    """
+    """Return a sentence on the share of published numbers that are reproduced, the exceptions, and the rule."""
     if not rows:
         return f"The paper prints no number to compare with: {where}."
     return _share(rows, is_reproduced, f"published numbers reproduced ({where}: to the printed digit)")
 
 
 def count_computed(rows: Sequence[Row]) -> str:
-    """Return a sentence on the share of independent numbers that are reproduced, and the exceptions.
-
-    Args:
-        rows: Rows with an independent number.
-    """
+    """Return a sentence on the share of independent numbers that are reproduced, and the exceptions."""
     return _share(rows, is_close, "independent numbers reproduced (to 0.1 % or the decimals given)")
 
 
@@ -164,12 +128,7 @@ def _share(rows: Sequence[Row], agrees: Callable[[Row], bool], words: str) -> st
 
 
 def verdict(rows: Sequence[Row], claim: Refuted) -> tuple[str, str] | None:
-    """Return "refuted" or "holds", and a sentence of the claim with its numbers; None if the record lacks a number.
-
-    Args:
-        rows: Rows of the record.
-        claim: Claim of the paper.
-    """
+    """Return "refuted" or "holds", and a sentence of the claim with its numbers; None if the record lacks a number."""
     values = [our_number(rows, *place) for place in claim.evidence]
     if None in values:
         return None

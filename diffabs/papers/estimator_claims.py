@@ -23,14 +23,7 @@ COMPARED_METHODS = ("conventional", "proposed")
 
 
 def run_columns(run: Run) -> dict[str, np.ndarray]:
-    """Return the columns of a trajectory up to its end: time, torque, and the plant's outputs.
-
-    Args:
-        run: Run with a trajectory, as `rollout` returns it.
-
-    Raises:
-        ValueError: The run has no trajectory.
-    """
+    """Return the columns of a trajectory up to its end: time, torque, and the plant's outputs."""
     if run.trajectory is None:
         raise ValueError("a run without a trajectory, as `measure` returns it: use `rollout`")
     sample = run.trajectory.sample
@@ -41,20 +34,12 @@ def run_columns(run: Run) -> dict[str, np.ndarray]:
 
 
 def variation(run: Run) -> float:
-    """Return the total variation of the torque between the stored samples [N m].
-
-    Args:
-        run: Run with a trajectory.
-    """
+    """Return the total variation of the torque between the stored samples [N m]."""
     return float(np.sum(np.abs(np.diff(run_columns(run)["torque"]))))
 
 
 def jerk(run: Run) -> float:
-    """Return the greatest |da/dt| of the vehicle between stored samples from `LATE_TIME` on [m/s^3].
-
-    Args:
-        run: Run with a trajectory.
-    """
+    """Return the greatest |da/dt| of the vehicle between stored samples from `LATE_TIME` on [m/s^3]."""
     one = run_columns(run)
     t = one["t"]
     rates = np.abs(np.diff(one["deceleration"]) / np.diff(t))
@@ -62,22 +47,14 @@ def jerk(run: Run) -> float:
 
 
 def rebounds(run: Run) -> int:
-    """Return the number of sign changes of the wheel's acceleration from 0.3 s to 1 s.
-
-    Args:
-        run: Run with a trajectory.
-    """
+    """Return the number of sign changes of the wheel's acceleration from 0.3 s to 1 s."""
     one = run_columns(run)
     rate = np.diff(one["wheel_speed"])[(one["t"][:-1] >= 0.3) & (one["t"][:-1] < 1.0)]
     return int(np.sum(np.diff(np.sign(rate)) != 0))
 
 
 def slow_deceleration(run: Run) -> float:
-    """Return the mean deceleration over distance [m/s^2], from 20 km/h (`SLOW_SPEED`) to the last sample.
-
-    Args:
-        run: Run with a trajectory.
-    """
+    """Return the mean deceleration over distance [m/s^2], from 20 km/h (`SLOW_SPEED`) to the last sample."""
     one = run_columns(run)
     slow = one["speed"] <= SLOW_SPEED
     v, x = one["speed"][slow], one["distance"][slow]
@@ -88,10 +65,6 @@ def braking_gain(slower: Run, faster: Run) -> tuple[float, float]:
     """Return by how much `faster` stops shorter than `slower` [m], and the part of it below 20 km/h [m].
 
     The distance is the integral of v dv/a(v), so its integrand gives the gain at each speed.
-
-    Args:
-        slower: Run with the longer distance.
-        faster: Run with the shorter distance.
     """
     one, other = run_columns(slower), run_columns(faster)
     v = np.linspace(one["speed"][-1], one["speed"][1], 20_001)  # the first sample has no friction
@@ -105,12 +78,7 @@ def _at(v: np.ndarray, one: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def judge_estimator_claims(runs: Mapping[str, Run], roads: Table) -> list[JsonObject]:
-    """Return the rows that judge the statements, one for each number.
-
-    Args:
-        runs: Runs of Tables 1 and 2 on one car, by name.
-        roads: Friction curves by name.
-    """
+    """Return the rows that judge the statements, one for each number."""
     rows = []
     for name in (f"{method} {controller}" for method in COMPARED_METHODS for controller in CONTROLLERS):
         rows.append(record.computed_row(name, "variation of the torque", "N m", variation(runs[name])))

@@ -84,9 +84,6 @@ def starts_from(brakes: Sequence[tuple[float, float]]) -> tuple[Params, ...]:
     """Return starts of the fit: two pairs of dead times with each brake, a torque [N m] and a rate of its lag [1/s].
 
     A brake that grips a sample earlier shifts a whole cycle, so a far start may end in another minimum.
-
-    Args:
-        brakes: Brakes to start from.
     """
     return tuple(
         {
@@ -170,9 +167,6 @@ def build_rig(coasting: Params) -> LabRig:
     """Return the rig before the fit of experiment 1: the driver's radii, and each bearing's mean over its two curves.
 
     The relay commands 0 or 1 only, so its brake has one torque: `brake_gain` at full command, with `brake_offset` 0.
-
-    Args:
-        coasting: Fits by name of the curve, from `fit_coasting`.
     """
     means = {
         f"{body}_{kind}": float(np.mean([found.values[kind] for name, found in coasting.items() if body in name]))
@@ -192,8 +186,7 @@ def build_rig(coasting: Params) -> LabRig:
 def with_scaled_brake(rig: LabRig) -> LabRig:
     """Return a rig whose brake has the manual's shape b(u) = b1 (u - u0), scaled to its torque at full command.
 
-    Args:
-        rig: Rig whose `brake_gain` is that torque, and whose `brake_offset` is 0.
+    That torque is the `brake_gain` of `rig`, and `brake_offset` is 0.
     """
     slope = rig.brake_gain / (1 - rig.brake_threshold)
     return dataclasses.replace(rig, brake_gain=slope, brake_offset=-rig.brake_threshold * slope)
@@ -203,9 +196,7 @@ def build_run(record: Record, given: bool, rig: LabRig) -> RecordedRun:
     """Return a run of the measured rig from 1,700 rpm.
 
     Args:
-        record: Record of the experiment.
         given: True plays the recorded commands; False lets the loop's relay switch.
-        rig: Plant.
     """
     return RecordedRun(loop=build_record_loop(record, given, rig))
 
@@ -215,11 +206,6 @@ def fit_load(record: Record, rig: LabRig, found: Identified) -> Identified:
 
     A normal force is the moment that presses the wheel on the drum, over a lever. The drum and the wheel feel friction
     times normal force, so a record of both hardly tells a small friction from a small load.
-
-    Args:
-        record: Record that is fitted.
-        rig: Plant before the fit.
-        found: Fit of the same record with free friction.
     """
     friction = float(get(MASK, "road.w4"))
     load = float(rig.weight_torque * found.values[FRICTION] / friction)
@@ -229,13 +215,7 @@ def fit_load(record: Record, rig: LabRig, found: Identified) -> Identified:
 
 
 def judge(record: Record, rig: LabRig, values: Params) -> JsonObject:
-    """Return how far the loop is from a record under given commands and under its own relay, and the measured numbers.
-
-    Args:
-        record: Record of the experiment.
-        rig: Plant before the fit.
-        values: Identified values by path.
-    """
+    """Return how far the loop is from a record under recorded commands and under its own relay, and the readings."""
     given, own = (
         compare_with_record(with_values(build_run(record, mode, rig), values), record) for mode in (True, False)
     )
@@ -260,9 +240,6 @@ def compare_tables(rig: LabRig) -> list[JsonObject]:
     """Return the rms distance of two rigs from the manual's readings of brake torque and friction, Fig. 5.6 b and c.
 
     The brake torque is b(u), 0 below the threshold.
-
-    Args:
-        rig: Identified rig, its brake scaled (`with_scaled_brake`).
 
     Returns:
         For each table its name, its unit, and the rms distance of the `mask` and of the `identified` rig.
@@ -320,9 +297,6 @@ def read_step(command: float) -> StepCurves:
 
     Before the step the drawn rim of the wheel is 1.8 % faster than that of the drum. The radii of the manual are not
     those of the rig. Each curve is therefore divided by its own first reading.
-
-    Args:
-        command: One of `STEP_COMMANDS`.
     """
     (t, wheel), (drum_t, drum) = (read_curves()[f"step-braking {command:g} {one}"].T for one in ("wheel", "drum"))
     return StepCurves(command, float(drum[0]), t, wheel / wheel[0], drum_t, drum / drum[0])
@@ -332,10 +306,6 @@ def build_step(curves: StepCurves, rig: LabRig) -> Loop:
     """Return the loop of a step-braking run: both wheels roll, and the brake receives its command at t = 0.
 
     The drawing does not show the instant of the step, so a dead time has no effect on a comparison and is left out.
-
-    Args:
-        curves: Measured curves.
-        rig: Plant.
     """
     return braking(
         plant=rig, initial=BrakeStart(speed=curves.speed), controller=ConstantTorque(torque=curves.command),
@@ -362,10 +332,6 @@ def match_step(curves: StepCurves, rig: LabRig) -> JsonObject:
     """Return how far a simulated step-braking run is from the measured one.
 
     Both are aligned where the wheel has lost 10 % of its rim speed.
-
-    Args:
-        curves: Measured curves.
-        rig: Plant.
 
     Returns:
         Rms errors of both rim speeds in per cent of the speed before the step, and the `fall_time` in which the wheel's
@@ -394,7 +360,6 @@ def fit_step(curves: StepCurves, rig: LabRig) -> Identified:
     """Return the friction, brake torque, lag and instant of the step with which a rig follows step-braking curves.
 
     Args:
-        curves: Measured curves.
         rig: Identified rig; its brake torque is `brake_gain` times the command, with `brake_offset` 0.
     """
     data = tuple(jnp.asarray(x) for x in (curves.t, curves.wheel, curves.drum_t, curves.drum))
@@ -408,7 +373,6 @@ def compare_steps(rig: LabRig, loaded: LabRig) -> list[JsonObject]:
     """Return how far the mask's and the identified rigs are from the three step-braking curves.
 
     Args:
-        rig: Identified rig; its brake torque is `brake_gain` at full command, with `brake_offset` 0.
         loaded: Rig with the mask's friction and another load, of `fit_load`.
 
     Returns:
@@ -440,12 +404,7 @@ def compare_steps(rig: LabRig, loaded: LabRig) -> list[JsonObject]:
 
 
 def parameter_rows(found: Identified, coasting: Params) -> list[JsonObject]:
-    """Return each identified parameter with the value of the model's mask, unit and standard deviation.
-
-    Args:
-        found: Fit of experiment 1, with some of the parameters of `FREE` and the load.
-        coasting: Fits of the coasting curves by name.
-    """
+    """Return each identified parameter with the value of the model's mask, unit and standard deviation."""
     rows = [
         {"name": f"{name}: {kind}", "value": float(one.values[kind]), "unit": unit, "mask": float(mask),
          "standard_deviation": float(one.uncertainty.deviations[kind]), "what": f"bearing's {kind}, from its curve"}
@@ -471,8 +430,6 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
     """Write figures and `summary.json` into the folder, and return the summary.
 
     Args:
-        folder: Existing folder.
-        progress: Function that receives a sentence before each long computation.
         data: Folder with finer readings of both experiments; None takes the packaged ones.
     """
     first, second = (read_record(one, data) for one in EXPERIMENTS)
@@ -560,14 +517,7 @@ def _step_rows(steps: list[JsonObject]) -> list[JsonObject]:
 
 
 def draw_figures(records: tuple[Record, Record], rig: LabRig, values: Params, coasting: Params) -> JsonObject:
-    """Return the figures by file name: both experiments, and the coasting curves.
-
-    Args:
-        records: Records of both experiments.
-        rig: Plant before the fit.
-        values: Identified values by path.
-        coasting: Fits of the coasting curves by name.
-    """
+    """Return the figures by file name: both experiments, and the coasting curves."""
     titles = ("Experiment 1: relay at slip 0.1 (fitted)", "Experiment 2: relay at slip 0.7 (judged)")
     drawn = {
         f"experiment_{i + 1}": _draw_experiment(one, rig, values, title)
@@ -593,11 +543,7 @@ def _draw_experiment(one: Record, rig: LabRig, values: Params, title: str) -> An
 
 
 def compact(summary: Table) -> Digest:
-    """Return the digest: both experiments measured and simulated, and the identified parameters.
-
-    Args:
-        summary: Contents of `summary.json`.
-    """
+    """Return the digest: both experiments measured and simulated, and the identified parameters."""
     headings = ("experiment", "given [%]", "own [%]", "cycles", "time [s]", "distance [m]")
     lines = []
     for number, key in (("1", "fitted"), ("2", "judged")):

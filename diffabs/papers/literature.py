@@ -64,12 +64,7 @@ def read_rows() -> list[JsonObject]:
 
 
 def load_row_scenario(name: str, overrides: Sequence[str] = ()) -> Scenario:
-    """Return the scenario of a row: a packaged one, or a file of the project's examples with parts of its own.
-
-    Args:
-        name: Name of a packaged scenario, or `examples/NAME.toml`.
-        overrides: Texts `path=value`.
-    """
+    """Return the scenario of a row: a packaged one, or a file of the project's examples with parts of its own."""
     if not name.startswith("examples/"):
         return load(name, overrides, integrated=False)
     here = pathlib.Path(__file__).parent  # an installed package has copies of the examples here
@@ -197,10 +192,6 @@ def bound_of_loop(loop: Loop, row: Table) -> float:
 
     The friction is the greater of its peaks at the first and at the last speed. This is a bound only if the peak is
     monotone in the speed, as it is for the packaged roads.
-
-    Args:
-        loop: Closed loop of a quarter car or a road vehicle.
-        row: Row with a `bound`.
     """
     plant, stop = cast(Any, loop.plant), cast(Any, loop.stop)
     if row["bound"] == "time_between":
@@ -233,25 +224,13 @@ _run_row = jax.jit(run_unchecked, static_argnums=(1, 4))
 
 @functools.cache
 def simulate_row(scenario: str, overrides: tuple[str, ...]) -> Run:
-    """Return the run of a scenario with overrides. Several rows read the same run.
-
-    Args:
-        scenario: Name of a scenario, as in `load_row_scenario`.
-        overrides: Texts `path=value`.
-    """
+    """Return the run of a scenario with overrides. Several rows read the same run."""
     given = load_row_scenario(scenario, overrides)
     return _run_row(given.loop, given.solver, dict(given.objectives), None, given.solver.every)
 
 
 def our_value(row: Table) -> float | None:
-    """Return our number of a row, in its unit; None if nothing can be computed.
-
-    Args:
-        row: Row of `read_rows`.
-
-    Raises:
-        RuntimeError: A run of the row has diverged.
-    """
+    """Return our number of a row, in its unit; None if nothing can be computed."""
     measure = row.get("measure")
     if measure == "saving":
         before, after = row["values"]
@@ -269,11 +248,7 @@ def our_value(row: Table) -> float | None:
 
 
 def judge_row(row: Table) -> JsonObject:
-    """Return a row of the table, with our number, bound and verdict.
-
-    Args:
-        row: Row of `read_rows`.
-    """
+    """Return a row of the table, with our number, bound and verdict."""
     overrides, printed, ours = row.get("set", []), row.get("printed"), our_value(row)
     tolerance = row.get("tolerance", row.get("relative", 0.0) * (printed or 0.0))
     verdict = "undecidable"
@@ -307,12 +282,7 @@ def judge_row(row: Table) -> JsonObject:
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObject:
-    """Write the figure, `table.json` and `summary.json` into the folder, and return the summary.
-
-    Args:
-        folder: Existing folder.
-        progress: Function that receives a sentence before each long computation.
-    """
+    """Write the figure, `table.json` and `summary.json` into the folder, and return the summary."""
     rows = []
     for group in _by_source(read_rows()):
         progress(f"literature: {group[0]['title']}")
@@ -344,11 +314,7 @@ def _by_source(rows: list[JsonObject]) -> Iterator[list[JsonObject]]:
 
 
 def write_json(rows: list[JsonObject]) -> str:
-    """Return the benchmark table as JSON: the scenarios with parameters and units, the sources, and the rows.
-
-    Args:
-        rows: Rows of `judge_row`.
-    """
+    """Return the benchmark table as JSON: the scenarios with parameters and units, the sources, and the rows."""
     names = dict.fromkeys(row["scenario"] for row in rows if row["scenario"])
     content = {
         "scenarios": {name: scenario_parameters(name) for name in names},
@@ -365,11 +331,7 @@ def _round_row(row: JsonObject) -> JsonObject:
 
 
 def scenario_parameters(name: str) -> JsonObject:
-    """Return the parameters of a scenario by path, each with value and unit.
-
-    Args:
-        name: Name of a scenario, as in `load_row_scenario`.
-    """
+    """Return the parameters of a scenario by path, each with value and unit."""
     scenario = load_row_scenario(name)
     units = units_of(scenario.loop.plant)
     found: JsonObject = {
@@ -383,11 +345,7 @@ def scenario_parameters(name: str) -> JsonObject:
 
 
 def draw_rows(rows: list[JsonObject]) -> Any:
-    """Return the figure of all stops: the printed number and ours, each as a multiple of the bound.
-
-    Args:
-        rows: Rows of `judge_row`.
-    """
+    """Return the figure of all stops: the printed number and ours, each as a multiple of the bound."""
     stops = [row for row in rows if row["bound"] and row["printed"] and row["unit"] in ("s", "m")]
     places = np.arange(len(stops))[::-1]
     figure, (axis,) = plot.sheet(size=(9.0, 0.26 * len(stops) + 1.2), title="Stops: printed and ours")
@@ -401,11 +359,7 @@ def draw_rows(rows: list[JsonObject]) -> Any:
 
 
 def compact(summary: Table) -> Digest:
-    """Return the digest: every row of the table, the verdicts counted, and the refuted rows with their causes.
-
-    Args:
-        summary: Contents of `summary.json`.
-    """
+    """Return the digest: every row of the table, the verdicts counted, and the refuted rows with their causes."""
     headings = ("source", "quantity", "unit", "printed", "ours", "bound", "verdict")
     rows = summary["rows"]
     lines = [

@@ -17,11 +17,7 @@ CAR, PERSON, RIG = 1000.0, 60.0, 5.0  # kg
 
 
 def scaled_mass(people: int) -> float:
-    """Return the rig's mass with passengers [kg], where 5 kg stand for a car of 1000 kg.
-
-    Args:
-        people: Number of people of 60 kg.
-    """
+    """Return the rig's mass with passengers [kg], where 5 kg stand for a car of 1000 kg."""
     return RIG + people * PERSON * RIG / CAR
 
 
@@ -41,7 +37,6 @@ def corner(system: Polytope, mass: float, speed: float) -> tuple[np.ndarray, np.
     """Return A, shape (2, 2), and B, shape (2, 1), of the polytope's vertex that is nearest to this mass and speed.
 
     Args:
-        system: Polytope over mass and speed.
         mass: Mass of the vertex [kg].
         speed: Speed of the vertex [m/s].
     """
@@ -54,8 +49,6 @@ def cost(A: np.ndarray, B: np.ndarray, gain: Matrix, weights: tuple[float, float
     """Return the trace of the cost matrix P, eq. (24), with R = 1; infinity if the gain does not stabilise.
 
     Args:
-        A: State matrix (2, 2).
-        B: Input matrix (2, 1).
         gain: K of u = K x, 2 numbers.
         weights: Diagonal of Q.
     """
@@ -70,8 +63,6 @@ def optimum(A: np.ndarray, B: np.ndarray, weights: tuple[float, float]) -> tuple
     """Return the LQ gain K of u = K x with R = 1, eq. (27), shape (2,), and its cost: trace P.
 
     Args:
-        A: State matrix (2, 2).
-        B: Input matrix (2, 1).
         weights: Diagonal of Q.
     """
     P = solve_continuous_are(A, B, np.diag(weights), np.eye(1))
@@ -84,7 +75,6 @@ def holding_mass(system: Polytope, gain: AnyArray) -> float:
     alpha, eq. (17), is affine in the mass, and the closed loop is stable while alpha < beta |k2|.
 
     Args:
-        system: Polytope over mass and speed.
         gain: K of u = K x, 2 numbers.
     """
     low, high = DESIGN_BOX["plant.mass"]
@@ -98,9 +88,6 @@ def nearest_speed(system: Polytope) -> float:
     """Return the speed [m/s] at which the LQ gain for Q = diag(k1^2, 0) and R = 1 is the published gain.
 
     It uses that alpha/beta does not depend on the speed, and that omega_2/beta is proportional to it.
-
-    Args:
-        system: Polytope over mass and speed.
     """
     low = DESIGN_BOX["speed"][0]
     A, B = corner(system, DESIGN_BOX["plant.mass"][0], low)
@@ -110,12 +97,7 @@ def nearest_speed(system: Polytope) -> float:
 
 
 def judge_lmi_claims(system: Polytope, gains: dict[tuple[float, float], np.ndarray]) -> list[JsonObject]:
-    """Return the rows that judge the statements, one for each number.
-
-    Args:
-        system: Polytope over mass and speed.
-        gains: Gains of the matrix inequalities by their weights.
-    """
+    """Return the rows that judge the statements, one for each number."""
     (light, heavy), (slow, fast) = DESIGN_BOX["plant.mass"], DESIGN_BOX["speed"]
     rows = [record.computed_row(f"a car with {n} of 60 kg", "mass of the rig", "kg", scaled_mass(n)) for n in (1, 4)]
     names = ("the rig's lower wheel, 2 J2/r2^2", "weight on the rig's wheels at rest")

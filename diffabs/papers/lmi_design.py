@@ -125,12 +125,7 @@ def _as_printed(system: Polytope) -> Polytope:
 
 
 def table(found: Designed, braked: Mapping[str, Run]) -> list[JsonObject]:
-    """Return the rows of gains, costs, certificates, poles and overshoots.
-
-    Args:
-        found: Results of section 4.
-        braked: Braking runs by name.
-    """
+    """Return the rows of gains, costs, certificates, poles and overshoots."""
     rows = []
     for weights, (gain, trace) in REFERENCE_GAINS.items():
         name = f"LMI, Q = diag({weights[0]:.6g}, {weights[1]:g})"
@@ -172,22 +167,14 @@ def table(found: Designed, braked: Mapping[str, Run]) -> list[JsonObject]:
 
 
 def _truth(proof: Certificate) -> float:
-    """Return 1 for a proved and 0 for a disproved certificate.
-
-    Raises:
-        ValueError: The certificate is undecided.
-    """
+    """Return 1 for a proved and 0 for a disproved certificate."""
     if proof.quadratically_stable is None or not proof.verified_exactly:
         raise ValueError(f"undecided: {proof}")
     return float(proof.quadratically_stable)
 
 
 def stability_threshold(system: Polytope) -> float:
-    """Return the least |k2| [N m] at k1 = -11753 for which a common Lyapunov matrix exists, in closed form.
-
-    Args:
-        system: Polytope over mass and speed.
-    """
+    """Return the least |k2| [N m] at k1 = -11753 for which a common Lyapunov matrix exists, in closed form."""
     omega_beta = 1 / system.B[:, 1, 0]  # omega_2/beta; the closed form needs only this and alpha/beta
     alpha_beta = system.A[:, 1, 1] * omega_beta
     return float(np.max(alpha_beta) + np.sqrt(K1) * np.ptp(np.sqrt(omega_beta)))
@@ -199,7 +186,6 @@ def slowest_pole(system: Polytope, gain: tuple[float, float]) -> tuple[float, fl
     Of the closed loop's two eigenvalues it takes the one with the greater imaginary part.
 
     Args:
-        system: Polytope over mass and speed.
         gain: K of u = K x.
     """
     i = int(np.argmin([corner["plant.mass"] - corner["speed"] for corner in system.corners]))
@@ -209,11 +195,7 @@ def slowest_pole(system: Polytope, gain: tuple[float, float]) -> tuple[float, fl
 
 
 def design_summary(found: Designed) -> JsonObject:
-    """Return the part of `summary.json` on section 4.
-
-    Args:
-        found: Results of section 4.
-    """
+    """Return the part of `summary.json` on section 4."""
 
     def one(answer: Design) -> JsonObject:
         numbers = {name: getattr(answer, name) for name in ("trace_cost", "lower_bound", "gap", "residual")}
@@ -234,12 +216,7 @@ def design_summary(found: Designed) -> JsonObject:
 
 
 def figures(found: Designed, braked: Mapping[str, Run]) -> JsonObject:
-    """Return the figures of the gains that explain the overshoot: poles and damping over speed, and trajectories.
-
-    Args:
-        found: Results of section 4.
-        braked: Braking runs by name.
-    """
+    """Return the figures of the gains that explain the overshoot: poles and damping over speed, and trajectories."""
     gains = {"published": PUBLISHED_GAIN, "LMI, same k1": SAME_INTEGRAL, "K = [-121.8, -158.2]": GENTLE}
     speeds = np.geomspace(*DESIGN_BOX["speed"], 200)
     i = int(np.argmin([corner["plant.mass"] - corner["speed"] for corner in found.system.corners]))

@@ -112,10 +112,6 @@ def run_at_step(loop: Loop, solver: FixedStep) -> Run:
     """Return a run with a trajectory of every step, whose step is not checked.
 
     `FIT_STEP` is not stable below some 0.5 m/s; the comment at its value says how much that changes.
-
-    Args:
-        loop: Closed loop.
-        solver: Solver of the run.
     """
     return run_unchecked(loop, solver, {}, None, solver.every)
 
@@ -178,13 +174,8 @@ def read_record(experiment: Experiment, data: pathlib.Path | None = None) -> Rec
     """Return the record of an experiment at every sample of its computer.
 
     Args:
-        experiment: Experiment.
         data: Folder with finer readings, `relay-slip-0.1.csv` and `relay-slip-0.7.csv`, with the columns time_s,
             wheel_speed_rad_per_s and slip_1, every 10 ms on the axis of the figure. None takes the packaged readings.
-
-    Raises:
-        ScenarioError: A file lacks a column, a number or a sample, begins after the start of the brake, or has fewer
-            than 4 rows that tell the vehicle's speed.
     """
     if data is None:
         curves = read_curves()
@@ -226,9 +217,7 @@ def build_record_loop(record: Record, given: bool, rig: LabRig = MASK) -> Loop:
     """Return the loop of an experiment.
 
     Args:
-        record: Record of the experiment.
         given: True plays the recorded commands; False lets the loop's relay switch.
-        rig: Plant.
     """
     relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
     return braking(
@@ -243,11 +232,7 @@ def build_record_loop(record: Record, given: bool, rig: LabRig = MASK) -> Loop:
 
 
 def solver_for(record: Record) -> FixedStep:
-    """Return the solver of runs that last 1 s longer than a record.
-
-    Args:
-        record: Record of an experiment.
-    """
+    """Return the solver of runs that last 1 s longer than a record."""
     return FixedStep(step=RUN_STEP, duration=round(float(record.t[-1]) + 1.0, 2))
 
 
@@ -265,7 +250,6 @@ class RecordResiduals:
         """Return the residuals, shape (2 n,).
 
         Args:
-            recorded: Loop under the commands of the record, and the counter's lag.
             t: Instants of the record [s], shape (n,).
             wheel: Measured wheel speed [rad/s], shape (n,).
             slip: Measured slip [1], shape (n,).
@@ -283,9 +267,6 @@ def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Vec
     run both are 0: the driver's dead zone hides slower speeds.
 
     Args:
-        run: Run with a trajectory of every step.
-        recorded: Loop of the run, and the counter's lag.
-        solver: Solver of the run.
         t: Instants [s], shape (n,).
     """
     assert run.trajectory is not None
@@ -301,11 +282,7 @@ def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Vec
 
 
 def slip_weight(wheel: np.ndarray) -> np.ndarray:
-    """Return the weights of slips: the wheel speed over 20 rad/s, clipped to 0.1 and 1.
-
-    Args:
-        wheel: Wheel speeds [rad/s], shape (n,).
-    """
+    """Return the weights of slips: the wheel speed over 20 rad/s, clipped to 0.1 and 1, shape (n,)."""
     return np.clip(wheel / HARDLY_TURNS, 0.1, 1.0)
 
 
@@ -322,9 +299,7 @@ def fit_record(
     The standard deviations of the residuals are only relative: the residuals estimate their scale.
 
     Args:
-        recorded: Loop under the commands of the record, and the counter's lag.
         free: Paths of the free parameters, each with a range or None.
-        record: Record of the experiment.
         until: Last instant that counts [s].
         starts: Values by path of each start; without any, the run's own. The best fit is returned.
         tolerance: Relative change of the cost at which a fit ends.
@@ -343,8 +318,6 @@ def compare_with_record(recorded: RecordedRun, record: Record, first: float = 0.
     """Return how far a run of the loop is from a record.
 
     Args:
-        recorded: Loop and the counter's lag.
-        record: Record of the experiment.
         first: First instant that counts for the differences [s].
         last: Last instant that counts for the differences [s].
     """
@@ -405,21 +378,12 @@ def compare_with_maker() -> list[JsonObject]:
 
 
 def describe_record(record: Record) -> RecordMatch:
-    """Return the measured cycles, stopping time and distance, in the form of `compare_with_record`.
-
-    Args:
-        record: Record of an experiment.
-    """
+    """Return the measured cycles, stopping time and distance, in the form of `compare_with_record`."""
     rises = np.diff(record.commands, prepend=0.0) > 0.5
     return RecordMatch(0.0, 0.0, int(np.sum(rises & (record.t < record.stop_time))), record.stop_time,
                       record.stop_distance)  # fmt: skip
 
 
 def with_values(recorded: RecordedRun, values: Params) -> RecordedRun:
-    """Return the run with parameters replaced, by path; a path that it lacks is left out.
-
-    Args:
-        recorded: Loop and the counter's lag.
-        values: Values by path.
-    """
+    """Return the run with parameters replaced, by path; a path that it lacks is left out."""
     return replace(recorded, dict(values))

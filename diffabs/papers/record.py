@@ -20,12 +20,7 @@ from diffabs.simulate.types import FixedStep, Run
 
 
 def lane(run: Run, i: int) -> Run:
-    """Return one run of a batch, as NumPy arrays.
-
-    Args:
-        run: Batch of runs.
-        i: Index of the run.
-    """
+    """Return one run of a batch, as NumPy arrays."""
     return jax.tree.map(lambda x: np.asarray(x[i]), run)
 
 
@@ -35,14 +30,6 @@ def computed_row(
     """Return a row of a table with our number and, if known, the paper's or an independent number.
 
     "difference" is ours less the published number, else ours less the reference; None without either, or beside a word.
-
-    Args:
-        name: Name of the row.
-        quantity: Quantity of the row.
-        unit: Unit of the quantity.
-        ours: Our number, or a word for it from `format_time`.
-        published: Number of the paper.
-        reference: Number of an independent computation, or a word for it.
     """
     ours = ours if isinstance(ours, str) else float(ours)
     expected = reference if published is None else published
@@ -55,11 +42,6 @@ def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float
     """Return the row of `computed_row` with "matches": whether ours and the published number round alike.
 
     Args:
-        name: Name of the row.
-        quantity: Quantity of the row.
-        unit: Unit of the quantity.
-        ours: Our number.
-        published: Number of the paper.
         digits: Decimals of the paper's number, to which both are rounded.
     """
     line = computed_row(name, quantity, unit, ours, published=published)
@@ -67,21 +49,12 @@ def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float
 
 
 def format_time(time: Scalar) -> float | str:
-    """Return a number for a summary, or "never" if it is infinite.
-
-    Args:
-        time: Time [s], or distance [m].
-    """
+    """Return a time [s], or distance [m], for a summary, or "never" if it is infinite."""
     return "never" if math.isinf(float(time)) else float(time)
 
 
 def solver_settings(step: FixedStep, **more: Any) -> JsonObject:
-    """Return the settings of the integration for a summary.
-
-    Args:
-        step: Solver with a fixed step.
-        more: Further entries.
-    """
+    """Return the settings of the integration for a summary."""
     dtype = str(jnp.result_type(float))
     return {"method": "RK4, fixed step", "step": step.step, "duration": step.duration, "dtype": dtype, **more}
 
@@ -92,38 +65,19 @@ def origin_of_numbers() -> dict[str, str]:
 
 
 def write_summary(folder: pathlib.Path, summary: JsonObject, name: str = "summary.json") -> JsonObject:
-    """Write a summary atomically, and return it as it reads back from the file.
-
-    Args:
-        folder: Existing folder.
-        summary: Contents, as for JSON.
-        name: Name of the file.
-
-    Raises:
-        ValueError: A number is not finite.
-    """
+    """Write a summary atomically, and return it as it reads back from the file."""
     text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
     files.write_file(folder / name, f"{text}\n".encode())
     return json.loads(text)
 
 
 def save_figures(figures: Params, folder: pathlib.Path) -> list[str]:
-    """Write figures into a folder, and return the names of their files.
-
-    Args:
-        figures: Figures by file name without suffix.
-        folder: Existing folder.
-    """
+    """Write figures into a folder, and return the names of their files."""
     return [plot.save_figure(figure, folder / f"{name}.png").name for name, figure in figures.items()]
 
 
 def print_rows(title: str, rows: Sequence[Params]) -> None:
-    """Print rows of equal keys as a table, with floats at five significant digits or four decimals.
-
-    Args:
-        title: Title of the table.
-        rows: Rows of equal keys.
-    """
+    """Print rows of equal keys as a table, with floats at five significant digits or four decimals."""
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
         table.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")
@@ -145,9 +99,7 @@ def experiment(config: Any, results: Params, figures: Params) -> JsonObject:
     """Write an experiment's figures and `results.json` with config and versions, and return the contents of this file.
 
     Args:
-        config: Dataclass of the experiment's settings; its field `out` is the folder.
         results: Results, as for JSON; a number that is not finite, such as the mean of no run, becomes None.
-        figures: Figures by file name without suffix.
     """
     results = json.loads(json.dumps(results), parse_constant=lambda _: None)
     folder = pathlib.Path(config.out)

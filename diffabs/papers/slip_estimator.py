@@ -90,23 +90,12 @@ class EstimatorResults(NamedTuple):
 
 
 def loop(car: QuarterCar, reference: Reference, controller: Block) -> Loop:
-    """Return the closed loop of the paper's section 5.
-
-    Args:
-        car: Plant.
-        reference: Reference of the slip.
-        controller: Controller of the slip.
-    """
+    """Return the closed loop of the paper's section 5."""
     return braking(plant=car, reference=reference, controller=controller)
 
 
 def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
-    """Return all nine runs on one car, as NumPy arrays by row of the tables: "no ABS", "proposed PI" and so on.
-
-    Args:
-        car: Plant.
-        solver: Solver.
-    """
+    """Return all nine runs on one car, as NumPy arrays by row of the tables: "no ABS", "proposed PI" and so on."""
     locked = rollout(loop(car, FixedSlip(), ConstantTorque(torque=90.0)), solver, BRAKING)
     runs = {"no ABS": jax.tree.map(np.asarray, locked)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
@@ -127,11 +116,7 @@ def run_literal() -> list[Run]:
 
 
 def run_all(progress: Callable[[str], None]) -> EstimatorResults:
-    """Return every run that the tables and figures need.
-
-    Args:
-        progress: Function that receives a sentence before each long computation.
-    """
+    """Return every run that the tables and figures need."""
     runs = {}
     for name, car in CARS.items():
         progress(f"slip-estimator: nine runs on {name}")
@@ -143,11 +128,7 @@ def run_all(progress: Callable[[str], None]) -> EstimatorResults:
 
 
 def table(runs: Mapping[str, Run]) -> list[JsonObject]:
-    """Return the rows of the twenty numbers of Tables 1 and 2; "no ABS" is in both tables and counts twice.
-
-    Args:
-        runs: Runs on one car, by row of the tables.
-    """
+    """Return the rows of the twenty numbers of Tables 1 and 2; "no ABS" is in both tables and counts twice."""
     rows = []
     for number, method in ((1, "conventional"), (2, "proposed")):
         for name in ("no ABS", *(f"{method} {controller}" for controller in PID_GAINS)):
@@ -162,18 +143,13 @@ def worst_difference(rows: list[JsonObject], quantity: str) -> float:
     """Return the largest absolute difference from a published number, in the unit of the quantity.
 
     Args:
-        rows: Rows of the tables, each with a published number.
         quantity: Quantity of the rows that count.
     """
     return max(abs(row["difference"]) for row in rows if row["quantity"] == quantity)
 
 
 def locked_time(run: Run) -> float:
-    """Return the time from the lock of the wheel to standstill [s].
-
-    Args:
-        run: Run with a trajectory.
-    """
+    """Return the time from the lock of the wheel to standstill [s]."""
     sample = _trajectory(run).sample
     still = np.argmax(sample.output.wheel_speed <= 0)
     return float(run.metrics["stop_time"] - sample.t[still])
@@ -181,10 +157,6 @@ def locked_time(run: Run) -> float:
 
 def shortest_distances(car: QuarterCar, locked: Run) -> dict[str, float]:
     """Return two bounds of the stopping distance [m].
-
-    Args:
-        car: Plant.
-        locked: Run at full torque, with a trajectory.
 
     Returns:
         "unlimited": Distance at the greatest friction from the start. "90 N m": distance with full torque up to the
@@ -200,11 +172,7 @@ def shortest_distances(car: QuarterCar, locked: Run) -> dict[str, float]:
 
 
 def bound_rows(results: EstimatorResults) -> list[JsonObject]:
-    """Return the rows of the Magic Formula, the locked time, the literal estimator and the bounds.
-
-    Args:
-        results: Runs that the rows need.
-    """
+    """Return the rows of the Magic Formula, the locked time, the literal estimator and the bounds."""
     spline, magic = results.runs.values()
     rows = [{**row, "name": f"{row['name']} (Magic Formula)"} for row in table(magic)]
     for quantity, unit in (("stopping time", "s"), ("stopping distance", "m")):
@@ -226,11 +194,7 @@ def bound_rows(results: EstimatorResults) -> list[JsonObject]:
 
 
 def figures(results: EstimatorResults) -> JsonObject:
-    """Return the figures by file name.
-
-    Args:
-        results: Runs that the figures need.
-    """
+    """Return the figures by file name."""
     runs = results.runs["spline B"]
     seen = {name: _trajectory(one) for name, one in runs.items()}
     drawn = {
@@ -259,12 +223,7 @@ def figures(results: EstimatorResults) -> JsonObject:
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObject:
-    """Write figures and `summary.json` into the folder, and return the summary.
-
-    Args:
-        folder: Existing folder.
-        progress: Function that receives a sentence before each long computation.
-    """
+    """Write figures and `summary.json` into the folder, and return the summary."""
     results = run_all(progress)
     progress("slip-estimator: figures")
     names = record.save_figures(figures(results), folder)
@@ -315,11 +274,7 @@ CLAIMS = (
 
 
 def compact(summary: Table) -> Digest:
-    """Return the digest: Tables 1 and 2 with our numbers beside the paper's.
-
-    Args:
-        summary: Contents of `summary.json`.
-    """
+    """Return the digest: Tables 1 and 2 with our numbers beside the paper's."""
     rows, columns = summary["rows"], ("stopping time", "stopping distance")
     printed = [row for row in rows if row["name"].startswith("Table ") and "Magic" not in row["name"]]
     by_place = {(row["name"].partition(": ")[2], row["quantity"]): row for row in printed}

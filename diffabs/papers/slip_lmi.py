@@ -119,12 +119,7 @@ NOTES = [
 
 
 def loop(case: Case, reference: Part = None) -> Loop:
-    """Return the closed loop of section 5.
-
-    Args:
-        case: Settings of the run.
-        reference: Reference of the slip; None is a fixed slip.
-    """
+    """Return the closed loop of section 5."""
     return braking(
         plant=MirroredRig(mass=case.mass, inertia_factor=case.inertia_factor),
         initial=BrakeStart(speed=50 / 3.6, slip=case.slip),
@@ -171,18 +166,13 @@ def convergence_order(errors: list[float], points: slice) -> float:
     """Return the order of convergence: the slope of log error over log step length, by least squares.
 
     Args:
-        errors: Relative error for each step length of `HALVINGS`.
         points: Slice of the step lengths that count.
     """
     return float(np.polyfit(np.log(HALVINGS[points]), np.log(errors[points]), 1)[0])
 
 
 def table(runs: Mapping[str, Run]) -> list[JsonObject]:
-    """Return the rows of the braking runs and of the runs with the car's inertia.
-
-    Args:
-        runs: Runs by name.
-    """
+    """Return the rows of the braking runs and of the runs with the car's inertia."""
     rows = []
     for name, expected in REFERENCE_RUNS.items():
         for quantity, exact in zip(COMPARED_QUANTITIES, expected, strict=True):
@@ -202,12 +192,7 @@ def table(runs: Mapping[str, Run]) -> list[JsonObject]:
 
 
 def reference_and_order_rows(filtered: Run, errors: Errors) -> list[JsonObject]:
-    """Return the rows of the filtered reference, the friction curve and the measured order of convergence.
-
-    Args:
-        filtered: Run with a filtered reference.
-        errors: Relative errors by case and quantity.
-    """
+    """Return the rows of the filtered reference, the friction curve and the measured order of convergence."""
     found = jax.jit(peak)(RIG)
     rows = [
         record.computed_row("reference filter, 35 ms", "overshoot", "1", filtered.metrics["overshoot"], reference=0.0),
@@ -226,13 +211,7 @@ def reference_and_order_rows(filtered: Run, errors: Errors) -> list[JsonObject]:
 
 
 def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> JsonObject:
-    """Return the figures by file name.
-
-    Args:
-        runs: Runs by name.
-        filtered: Run with a filtered reference.
-        errors: Relative errors by case and quantity.
-    """
+    """Return the figures by file name."""
     seen: JsonObject = {name: one.trajectory for name, one in runs.items()}
     drawn = {}
     for case, number in ((CASES[0], 4), (CASES[3], 6)):
@@ -260,12 +239,7 @@ def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> JsonObjec
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObject:
-    """Write figures and `summary.json` into the folder, and return the summary.
-
-    Args:
-        folder: Existing folder.
-        progress: Function that receives a sentence before each long computation.
-    """
+    """Write figures and `summary.json` into the folder, and return the summary."""
     progress(f"slip-lmi: braking {len(CASES)} cases at {STEP_S:g} s")
     runs = run()
     progress("slip-lmi: the same with a filtered reference")
@@ -293,11 +267,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
 
 
 def compact(summary: Table) -> Digest:
-    """Return the digest: the braking runs, and the largest relative difference of each from the independent solution.
-
-    Args:
-        summary: Contents of `summary.json`.
-    """
+    """Return the digest: the braking runs, and the largest relative difference of each from the reference."""
     rows, columns = summary["rows"], ("max_slip", "settling_time", "stop_time", "stop_distance")
     lines = []
     for name in (*REFERENCE_RUNS, *REFERENCE_CAR):
