@@ -212,28 +212,13 @@ def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Itera
 
 
 def check_numbers(part: Part, prefix: str = "") -> None:
-    """Check the parameters of a part before their names and values become code.
-
-    Args:
-        part: Part, or a whole loop.
-        prefix: Text before every name in a message, `"plant."`.
-
-    Raises:
-        NotExported: A parameter is no number, is out of range, breaks a rule between parameters, or has a wrong shape.
-    """
+    """Check the parameters of a part before their names and values become code."""
     if lines := list(find_problems(part, prefix)):
         raise NotExported("; ".join(lines))
 
 
 def with_sampled_controller(loop: Loop) -> Loop:
-    """Return the loop with a `Sampled` controller; a `SampledOnGrid` becomes the `Sampled` with the same times.
-
-    Args:
-        loop: Closed loop.
-
-    Raises:
-        NotExported: The controller is neither of the two, so it runs in continuous time.
-    """
+    """Return the loop with a `Sampled` controller; a `SampledOnGrid` becomes the `Sampled` with the same times."""
     controller: Part = loop.controller
     if isinstance(controller, SampledOnGrid):
         inner, period = controller.controller, controller.sampling_period

@@ -39,15 +39,7 @@ class Lowered:
     """
 
     def __init__(self, found: ComputerProgram):
-        """Trace and lower start, step and move.
-
-        Args:
-            found: The computer's part of a loop.
-
-        Raises:
-            Unsupported: An operation has no lowering rule.
-            NotExported: Two numbers have the same name.
-        """
+        """Trace and lower start, step and move."""
         self.device = found
         graph = Labelled()
         self.inputs = number_leaves(found.input, graph, INPUTS, lambda path: path.removeprefix("measured."))
@@ -99,14 +91,9 @@ def number_leaves(shape: PyTree, graph: Graph, where: str, flat: PyTree) -> dict
     """Return an input node for each number in a pytree's leaves, by name.
 
     Args:
-        shape: Pytree of shapes and types.
-        graph: Graph that receives the nodes.
         where: Origin of the inputs, the first entry of a node's `attr`.
         flat: Function path -> name; a path such as measured.slip or gain.0. A number whose name another one has is
             called by its path.
-
-    Raises:
-        NotExported: Two numbers have the same name even so.
     """
     found: dict[str, Node] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(shape):
@@ -124,7 +111,6 @@ def fill_shapes(shape: PyTree, nodes: dict[str, Node]) -> list[Array]:
     """Return a pytree's leaves as arrays of nodes, filled in order.
 
     Args:
-        shape: Pytree of shapes.
         nodes: Nodes in the order of the leaves' entries, one for each number.
     """
     left, arrays = iter(nodes.values()), []
@@ -140,15 +126,6 @@ def trace_outputs(graph: Labelled, function: Any, shape: PyTree, inputs: list[Ar
     """Return the results of a function as one list of nodes, leaf by leaf and entry by entry.
 
     Arrays that the function closes over become constants.
-
-    Args:
-        graph: Graph that receives the nodes.
-        function: Function of one pytree.
-        shape: Pytree of shapes and types of its argument.
-        inputs: Arrays of nodes for the leaves of the argument.
-
-    Raises:
-        Unsupported: An operation has no lowering rule.
     """
     closed = jax.make_jaxpr(function)(shape)
     graph.labels = {id(eqn): source_label(eqn) for eqn in closed.jaxpr.eqns}

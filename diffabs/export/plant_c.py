@@ -63,15 +63,7 @@ class PlantSource(NamedTuple):
 
 
 def plant_source(loop: Loop) -> PlantSource:
-    """Return the plant of a loop as C, with the loop's initial condition as its default start.
-
-    Args:
-        loop: Closed loop.
-
-    Raises:
-        NotExported: A parameter of plant or start is no number or has a wrong value or shape, an operation has no
-            translation, or a state is not a real number.
-    """
+    """Return the plant of a loop as C, with the loop's initial condition as its default start."""
     check_numbers(loop.plant, "plant.")
     check_numbers(loop.initial, "initial.")
     with jax.enable_x64(True):
