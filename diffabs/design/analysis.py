@@ -157,10 +157,7 @@ class _Analysis:
         return None
 
     def _common(self, rate: float) -> tuple[np.ndarray | None, float, np.ndarray]:
-        """Return P (None without an answer), its margin and the multipliers, in the original coordinates.
-
-        P has trace at most n in the frame and maximises the smallest margin over the vertices.
-        """
+        """Return P with trace at most n in the frame (None without an answer), its least margin and the multipliers."""
         n = self.system.order
         unknowns, scaled = Unknowns(P=n, t=(1, 1)), self.frame.states(self.closed)
         # Unit of time in the frame: one period in discrete time, 1/tau in continuous time.
@@ -211,8 +208,7 @@ class _Analysis:
     def _fastest_decay_claim(self, claim: Claim) -> Claim:
         """Return the claim with the fastest rate that a common P proves, by bisection.
 
-        Each program at a rate between the bounds gives a P and multipliers. The rate of P is a lower bound. The
-        multipliers exclude every rate above an upper bound.
+        P of a program bounds the rate from below, and its multipliers exclude every rate above an upper bound.
         """
         p = np.asarray(claim.data["P"])
         low, high = self._proved_rate(p), self._slowest_mode()

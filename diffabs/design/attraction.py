@@ -139,21 +139,11 @@ def classify_starts(
     """Return the outcome of each run within the solver's duration, shape (runs,).
 
     Args:
-        loop: Closed loop of a balance, which rests upright.
         starts: Values by path in which the runs differ, each of shape (runs,). Paths outside `initial` are allowed.
-        solver: Solver with the duration of the runs.
-        band: None for a proof by the capture ellipsoid. A number replaces it: a run is recovered if |x| <= band at its
-            end. The norm |x| is Euclidean, over three angles [rad] and three rates [rad/s]. The band proves nothing
-            about the time after the run. It serves loops without an ellipsoid (noise, observers, sampled control).
+        band: None for a proof by the capture ellipsoid. With a number a run is recovered if |x| <= band at its end,
+            the norm of three angles [rad] and three rates [rad/s]. It proves nothing about the time after the run,
+            and serves loops without an ellipsoid (noise, observers, sampled control). `unstable` is then False.
         key: Random key of a noisy loop; run i draws from fold_in(key, i).
-        engine: Engine of the runs, as in `run_batch`.
-
-    Returns:
-        Outcomes, each of shape (runs,). `unstable` is False everywhere with a band.
-
-    Raises:
-        ValueError: Columns without a run, or of unlike lengths; a loop that is no balance, or one with a part for
-            which no ellipsoid is known, and no band; or a band outside (0, inf).
     """
     starts, count = _read_columns("starts", starts)
     return _classify_starts(loop, starts, solver, *_find_ellipsoids(loop, starts, count, band), key, engine)
@@ -212,23 +202,11 @@ def region_of_attraction(
     key: PyTree = None,
     engine: str = "auto",
 ) -> Basin:
-    """Return the region of attraction over the cells of two axes, the first axis in rows.
+    """Return the region of attraction of a balance over the cells of two axes, the first axis in rows: shape (n, m).
 
     Args:
-        loop: Closed loop of a balance, which rests upright.
         first: Cells of the first axis, in the unit of its path (rad for the default).
-        second: Cells of the second axis, likewise.
-        solver: Solver with the duration of the runs.
-        paths: Paths of the values on the two axes; all other values are those of `loop`.
         band: Bound on |x| at the end, as for `classify_starts`.
-        key: Random key, as for `classify_starts`.
-        engine: Engine of the runs, as in `run_batch`.
-
-    Returns:
-        Basin with outcomes of shape (n, m) for n and m cells.
-
-    Raises:
-        ValueError: No cells, or a loop or band that `classify_starts` refuses.
     """
     grid = np.meshgrid(first.centres, second.centres, indexing="ij")
     starts = {path: axis.ravel() for path, axis in zip(paths, grid, strict=True)}
@@ -245,25 +223,12 @@ def largest_recovered_multiples(
     *,
     engine: str = "auto",
 ) -> list[Reach]:
-    """Return for each row the largest of `multiples` up to which the loop recovers from all of them.
-
-    It is 0 if the first multiple is not recovered. All runs are one batch.
+    """Return for each row the largest of `multiples` up to which the loop recovers from all of them, 0 for none.
 
     Args:
-        loop: Closed loop of a balance, which rests upright.
-        rows: Values by path, each of shape (rows, ...): one loop for each row; at least one path.
-        direction: Values of the initial state by path. A run starts from the multiple times these values; it does not
-            add them to the loop's own start.
-        multiples: Increasing multiples of `direction` to try, shape (k,).
-        solver: Solver with the duration of the runs.
-        engine: Engine of the runs, as in `run_batch`.
-
-    Returns:
-        One `Reach` for each row.
-
-    Raises:
-        ValueError: A path outside the initial state, a direction of zero, multiples that do not increase from above 0,
-            no rows, or a loop with a part for which no ellipsoid is known.
+        rows: Values by path, each of shape (rows, ...): one loop for each row.
+        direction: Values of the initial state by path; a run starts from a multiple of them, not from the loop's start.
+        multiples: Increasing multiples to try, shape (k,).
     """
     _check_direction(direction)
     multiples = np.array(multiples, float)
@@ -290,24 +255,13 @@ def recoverable_multiple(
     key: PyTree = None,
     engine: str = "auto",
 ) -> Reach:
-    """Return the largest c in [0, most] such that the loop recovers from every tried multiple of `direction` up to c.
+    """Return the largest c in [0, `most`] up to which the loop recovers from every tried multiple of `direction`.
 
-    The search tries 33 multiples in a batch, and then refines the interval up to the first failure. It ends at a
-    relative width of 1e-4.
+    The search tries 33 multiples in a batch, and then refines the interval up to the first failure, to 1e-4 of c.
 
     Args:
-        loop: Closed loop of a balance, which rests upright.
-        direction: Values of the initial state by path, such as {"initial.theta": 1.0}. A run starts from c times these
-            values; other initial values are those of `loop`.
-        solver: Solver with the duration of the runs.
-        most: Upper end of the search.
+        direction: Values of the initial state by path, such as {"initial.theta": 1.0}; a run starts from c times these.
         band: Bound on |x| at the end, as for `classify_starts`.
-        key: Random key, as for `classify_starts`.
-        engine: Engine of the runs, as in `run_batch`.
-
-    Raises:
-        ValueError: A path outside the initial state, a direction of zero, or a loop or band that `classify_starts`
-            refuses. Also `most` that is not positive and finite.
     """
     _check_direction(direction)
     if not 0 < most < np.inf:
@@ -334,8 +288,7 @@ def _find_ellipsoids(
 ) -> tuple[_Ellipsoids, _Ellipsoids | None]:
     """Return the ellipsoids for the verdict, and those that end a run early (None: no run ends early).
 
-    Each distinct system among the runs has one ellipsoid; the start of a run does not change its system. With a band
-    the ball |x| <= band is the ellipsoid of all runs, and no run ends early.
+    With a band the ball |x| <= band is the ellipsoid of all runs, and no run ends early.
     """
     if not hasattr(loop.initial, "theta"):
         raise ValueError(f"plant {type(loop.plant).__name__} is no balance; recovery is defined for a balance only")

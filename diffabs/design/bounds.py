@@ -21,16 +21,9 @@ BOUND_LOOSENINGS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
 def decrease_matrix(p: Matrix, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
-    """Return the symmetric matrix of -dV/dt - 2 rate V, shape (..., n, n), for V = x'P x along dx/dt = C x.
+    """Return the matrix of -dV/dt - 2 rate V (..., n, n) for V = x'P x along dx/dt = C x; it is > 0 if V falls faster.
 
-    In discrete time, x+ = C x, it is the matrix of exp(-2 rate) V - V+. The matrix is positive definite if V falls
-    faster than exp(-2 rate t).
-
-    Args:
-        p: Symmetric P, shape (..., n, n).
-        c: Closed loop C, shape (n, n).
-        rate: Decay rate of |x|, per unit of the loop's time; in discrete time per step.
-        discrete: Whether the system is in discrete time.
+    In discrete time, x+ = C x, it is the matrix of exp(-2 rate) V - V+, with the rate per step.
     """
     if discrete:
         return math.exp(-2 * rate) * p - c.T @ p @ c
@@ -41,10 +34,7 @@ class Bounds:
     """The search for the bounds of one gain: each method returns a proved claim, or None if no proof succeeds."""
 
     def __init__(self, system: Polytope, k: np.ndarray, spec: Spec, frame: Frame):
-        """Prepare the closed loops of gain `k` (m, n) on `system`.
-
-        `spec` is a checked specification and `frame` a frame for quadratic stability.
-        """
+        """Prepare the closed loops of gain `k` (m, n) on `system`; `frame` is one for quadratic stability."""
         self.system, self.k, self.spec, self.frame = system, k, spec, frame
         self.closed, self.discrete = system.closed_loop(k), system.period is not None
 
@@ -69,10 +59,7 @@ class Bounds:
         )
 
     def damping(self) -> Claim | None:
-        """Return the claim that every frozen system has at least the specified damping ratio.
-
-        The ratio is not maximised.
-        """
+        """Return the claim that every frozen system has at least the specified damping ratio, which is not maximised."""
         zeta = self.spec.damping
         # Rounded up: the proof requires cot^2 (1 - zeta^2) >= zeta^2 exactly.
         cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)

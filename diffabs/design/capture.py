@@ -69,15 +69,7 @@ class CaptureEllipsoids(NamedTuple):
 
 
 def capture_ellipsoids(loop: Loop, values: Params) -> CaptureEllipsoids:
-    """Return the capture ellipsoids of loops that differ in the values at these paths.
-
-    Args:
-        loop: Loop of a balance with feedback of the whole state.
-        values: Values by path, each of shape (n, ...).
-
-    Raises:
-        ValueError: A loop with a part for which no ellipsoid is known.
-    """
+    """Return the capture ellipsoids of loops of a balance that differ in `values` by path, each of shape (n, ...)."""
     systems = _build_closed_loops(loop, values)
     found = CaptureEllipsoids(np.full_like(systems.closed, np.inf), np.zeros(len(systems.closed), bool))
     known = np.flatnonzero(np.isfinite(systems.closed).all(axis=(1, 2)))

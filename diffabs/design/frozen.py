@@ -34,17 +34,9 @@ class FrozenLoops(NamedTuple):
 
 
 def analyse_frozen_loops(gain: AnyArray, model: Part, over: Mapping[str, Sequence[float]]) -> FrozenLoops:
-    """Return the stability of A + B K at the points of a grid over a box, corners included.
+    """Return the stability of A + B K at the points of a grid over a box {path: (low, high)}, corners included.
 
     Each parameter has 17 grid points, or fewer so that there are at most 5000 systems, but at least 2.
-
-    Args:
-        gain: Gain K of u = K x, shape (m, n) or (n,).
-        model: Model with `matrices()`, `states` and `period`.
-        over: Box {path: (low, high)}; a parameter with low = high is fixed.
-
-    Raises:
-        ValueError: A gain that does not fit, a box that `check_box_bounds` refuses, or matrices that are not finite.
     """
     low, high = check_box_bounds(model, over)
     free = sum(low[path] < high[path] for path in over)

@@ -18,12 +18,7 @@ BOUNDARY_TOLERANCE = 1e-9  # of the largest singular value of A: below it a sum 
 
 
 def growing_modes(a: np.ndarray, *, discrete: bool) -> Iterator[dict[str, float | np.ndarray]]:
-    """Yield data of claims `unstable`, the most promising first; nothing if no mode grows or stays. None is proved yet.
-
-    Args:
-        a: Matrix A, shape (n, n).
-        discrete: Whether the system is in discrete time.
-    """
+    """Yield data of claims `unstable` of A (n, n): modes that grow or stay, none proved yet, the most promising first."""
     from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
 
     balanced, (units, _) = matrix_balance(a, permute=False, separate=True)

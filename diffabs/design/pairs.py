@@ -74,10 +74,6 @@ def unstable_pairs(flows: np.ndarray, inverses: np.ndarray) -> Iterator[Pair]:
     """Yield the ranges of k on which the determinant proves M(k) unstable, for every pair of vertices.
 
     A range lies between two neighbouring values of `singular_factors`.
-
-    Args:
-        flows: Closed loops C, shape (vertices, n, n).
-        inverses: Their inverses, shape (vertices, n, n).
     """
     sign = (-1.0) ** flows.shape[-1]  # of the determinant of a stable matrix
     for inverse, others, products in ((False, flows, inverses), (True, inverses, flows)):
@@ -95,9 +91,6 @@ def singular_factors(product: np.ndarray) -> list[float]:
 
     The list also has one value a factor of 1000 below the smallest and one as far above the largest. It is empty
     without such an eigenvalue.
-
-    Args:
-        product: Product of two closed loops, shape (n, n).
     """
     modes = np.linalg.eigvals(product)
     k = np.sort(-np.real(modes[(np.real(modes) < 0) & (np.abs(np.imag(modes)) <= 1e-12 * np.abs(modes))]))
@@ -108,11 +101,6 @@ def multipliers(pair: Pair, flows: np.ndarray, inverses: np.ndarray) -> np.ndarr
     """Return the multipliers W of a pair, shape (vertices, n, n).
 
     Each other vertex gets the share OTHERS_SHARE of W_i + W_j, or as much of it as the inequality bears.
-
-    Args:
-        pair: Two vertices and a range of k.
-        flows: Closed loops C, shape (vertices, n, n).
-        inverses: Their inverses, shape (vertices, n, n).
     """
     C, D = flows[pair.i], (inverses if pair.inverse else flows)[pair.j]
     k = pair.low * (pair.high / pair.low) ** ((np.arange(RANGE_POINTS) + 0.5) / RANGE_POINTS)
@@ -134,12 +122,7 @@ def multipliers(pair: Pair, flows: np.ndarray, inverses: np.ndarray) -> np.ndarr
 
 
 def least_dominating_factor(strength: np.ndarray, taken: np.ndarray) -> float:
-    """Return the smallest c for which c strength + taken is positive semidefinite.
-
-    Args:
-        strength: Symmetric matrix, shape (n, n). The result is inf if it is not positive definite.
-        taken: Symmetric matrix, shape (n, n).
-    """
+    """Return the smallest c for which c strength + taken >= 0; inf if `strength` is not positive definite."""
     try:
         root = np.linalg.inv(np.linalg.cholesky(strength))
     except np.linalg.LinAlgError:

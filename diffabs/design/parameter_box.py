@@ -105,20 +105,12 @@ def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9,
 def schedule(
     model: Part, over: Mapping[str, Sequence[float]], along: str, nodes: int | Sequence[float], **options: Any
 ) -> Schedule:
-    """Return a chain of polytopes: the box, cut along one of its parameters at `nodes`.
+    """Return a chain of polytopes: the box {path: (low, high)}, cut along one of its parameters at `nodes`.
 
     Args:
-        model: Model with `matrices()`, `states` and `period`.
-        over: Box {path: (low, high)} of parameters of the model, `along` among them.
-        along: Path of the parameter to cut along.
         nodes: Increasing nodes from the low to the high end, or the number N of cells, an int >= 1. N cells have N + 1
             nodes in geometric progression, or evenly spaced if the low end is not positive.
         options: Options of `polytope`.
-
-    Raises:
-        ValueError: A parameter outside the box, nodes that do not increase from its low to its high end, or a box that
-            `polytope` refuses.
-        ModuleNotFoundError: SciPy is not installed.
     """
     if along not in over:
         raise ValueError(f"along = '{along}' is not a parameter of the box; there is {', '.join(over) or 'nothing'}")
@@ -147,16 +139,7 @@ def _require_scipy() -> None:
 
 
 def check_box_bounds(model: Part, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the low and the high end of every interval by path, after a check of each.
-
-    Args:
-        model: Model whose parameters the paths name.
-        over: Box {path: (low, high)}.
-
-    Raises:
-        ValueError: A path that is no scalar parameter, ends that are no interval, a value out of range, or a period
-            that varies.
-    """
+    """Return the low and the high end of every interval by path, after a check of each."""
     known = {path: value for path, _, value in parameters(model)}
     for path, ends in over.items():
         if path not in known:
@@ -181,16 +164,7 @@ def _batch(model: Part, free: tuple[str, ...], points: PyTree) -> AnyArray:
 
 
 def evaluate_systems(model: Part, free: tuple[str, ...], points: np.ndarray) -> _SystemRows:
-    """Return the systems at points of the box, in float64; A and B are the property `matrices` of the result.
-
-    Args:
-        model: Model with `matrices()`.
-        free: Paths of the varied parameters.
-        points: Values of these parameters, shape (N, k).
-
-    Raises:
-        ValueError: Matrices that are not finite.
-    """
+    """Return the systems at points (N, k) of the free parameters, in float64; A and B are its property `matrices`."""
     parts, n, m = [], 0, 0
     # Rounding of float32 would exceed the tolerance of the gauge.
     with jax.enable_x64(True):
@@ -210,17 +184,9 @@ def evaluate_systems(model: Part, free: tuple[str, ...], points: np.ndarray) -> 
 def evaluate_grid(
     model: Part, over: Mapping[str, Sequence[float]], points: int
 ) -> tuple[_SystemRows, tuple[dict[str, float], ...], Part]:
-    """Return the systems on a grid over a box, the parameters by path of each, and the model at the box's low ends.
+    """Return the systems on a grid over a box, ends included, their parameters by path, and the model at the low ends.
 
-    The grid includes the ends. The returned model has the fixed parameters of all systems, and their period.
-
-    Args:
-        model: Model with `matrices()`.
-        over: Box {path: (low, high)}; a parameter with low = high is fixed. The last one runs first.
-        points: Number of values of each parameter, >= 2.
-
-    Raises:
-        ValueError: A box that `check_box_bounds` refuses, or matrices that are not finite.
+    The model has the fixed parameters of all systems, and their period. The last parameter of the box runs first.
     """
     low, high = check_box_bounds(model, over)
     free = tuple(path for path in over if low[path] < high[path])
@@ -371,10 +337,7 @@ def _extreme_points(v: np.ndarray) -> list[int]:
 
 
 def _facets(v: np.ndarray) -> Matrix:
-    """Return the hull of v (V, d) with its facets, or None.
-
-    None stands for too many facets, or for facets that merge by rounding (64 points in 6-d).
-    """
+    """Return the hull of v (V, d), or None for too many facets or facets that merge by rounding (64 points in 6-d)."""
     from scipy.spatial import ConvexHull, QhullError
 
     if v.shape[1] > FACETS[0] or len(v) > FACETS[1]:

@@ -16,19 +16,7 @@ from diffabs.design.polytopes import MAX_VERTICES, Polytope
 
 
 def grid_polytope(model: Part, over: Mapping[str, Sequence[float]], points: int = 3) -> Polytope:
-    """Return the polytope whose vertices are the systems of `model` on a grid over a box, its ends included.
-
-    All grid systems are vertices. `corners` has the parameters of each, and `coverage` is None.
-
-    Args:
-        model: Model with `matrices()`, `states` and `period`.
-        over: Box {path: (low, high)} of parameters of the model; a parameter with low = high is fixed.
-        points: Number of values of each parameter, >= 2.
-
-    Raises:
-        ValueError: A box that `check_box_bounds` refuses, fewer than two points, more than 2^12 systems, or matrices
-            that are not finite.
-    """
+    """Return the polytope whose vertices are the systems on a grid over a box; `corners` has the parameters of each."""
     if not isinstance(points, numbers.Integral) or points < 2:
         raise ValueError(f"points = {points} is no whole number in [2, inf): a grid has the ends of the box")
     low, high = check_box_bounds(model, over)

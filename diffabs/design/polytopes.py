@@ -136,15 +136,7 @@ class Schedule:
 
 
 def as_gain_matrix(gain: AnyArray, shape: tuple[int, int]) -> np.ndarray:
-    """Return a gain as a matrix of floats, shape (m, n); a gain of shape (n,) is one row.
-
-    Args:
-        gain: Gain, shape (m, n) or (n,).
-        shape: Required shape (m, n).
-
-    Raises:
-        ValueError: Another shape, or numbers that are not finite.
-    """
+    """Return a gain (m, n) or (n,) as a matrix of floats of this shape."""
     if objection := find_value_objection(gain):
         raise ValueError(f"gain = {format_value(gain)} {objection}")
     k = np.atleast_2d(np.array(gain, float))

@@ -31,21 +31,14 @@ SCHEDULE_DECAY_TOLERANCE = 0.01  # relative width at which the search for the fa
 
 
 def certify_schedule(gain: AnyArray, system: Schedule, spec: Spec, *, fastest: bool = False) -> Certificate:
-    """Return the proved properties of a gain on a schedule, with a parameter-dependent P(p).
+    """Return the proved properties, of decay and cost only, of a gain on a schedule, with a parameter-dependent P(p).
 
     One claim proves `spec.decay` (0 for stability alone). With Q and R another one, with its own P(p), proves the cost.
     A proof of the cost is also one of stability, and then the only claim for a decay of 0. A claim without a proof is
-    left out. The search for the fastest decay needs a proof of `spec.decay`.
+    left out. The search for the fastest decay, to 1 %, needs a proof of `spec.decay`.
 
     Args:
         gain: Gain K, constant of shape (m, n) or (n,), or linear between the nodes, shape (N + 1, m, n) for N cells.
-        system: A schedule in continuous time.
-        spec: Specification with `rates`; only decay and cost have a proof here.
-        fastest: Whether to add a claim with the fastest decay that a P(p) proves, to 1 %.
-
-    Raises:
-        ValueError: Shapes that do not fit, missing rates, discrete time, or a specification other than decay and cost.
-        ModuleNotFoundError: cvxpy is not installed.
     """
     cell = system.cells[0]
     spec = spec.check(cell.order, cell.inputs, cell.period, scheduled=True)
@@ -72,15 +65,7 @@ def _fastest_decay_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Cla
 
 
 def gains_at_nodes(gain: AnyArray, system: Schedule) -> np.ndarray:
-    """Return the gains at the nodes, shape (N + 1, m, n).
-
-    Args:
-        gain: Gains at the nodes, shape (N + 1, m, n), or a constant gain, shape (m, n) or (n,).
-        system: Schedule with N + 1 nodes.
-
-    Raises:
-        ValueError: Other shapes.
-    """
+    """Return the gains at the nodes, shape (N + 1, m, n); a constant gain has shape (m, n) or (n,)."""
     shape = (system.cells[0].inputs, system.cells[0].order)
     if np.ndim(gain) < 3:
         return np.repeat(as_gain_matrix(gain, shape)[None], len(system.nodes), axis=0)

@@ -55,18 +55,7 @@ class SpeedScaled:
 
 
 def greatest_speed_fall(deceleration: float, speed: float, period: float) -> float:
-    """Return v/v+ - 1 [1] for a speed v that falls at a constant deceleration over one period.
-
-    The lower the speed, the larger the result.
-
-    Args:
-        deceleration: Greatest deceleration [m/s^2].
-        speed: Lowest speed v at the start of a period [m/s].
-        period: Sampling period [s].
-
-    Raises:
-        ValueError: The speed falls to 0 within the period.
-    """
+    """Return v/v+ - 1 [1] at a constant deceleration [m/s^2] over a period [s], for the lowest speed v [m/s]."""
     if not deceleration * period < speed:
         needed = f"a speed above {deceleration * period:g} m/s is needed"
         raise ValueError(f"speed = {speed:g} m/s ends in a period of {period:g} s at {deceleration:g} m/s^2: {needed}")

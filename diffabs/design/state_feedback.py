@@ -61,13 +61,7 @@ class ReducedLoop(NamedTuple):
 def reduce_loop(loop: Loop) -> ReducedLoop:
     """Return the loop as state feedback, linearised at its initial speed and its setpoint at t = 0.
 
-    Args:
-        loop: Closed loop with a linear controller; the actuator may have limits, one lag and a delay. A loop of a
-            balance, or around a plant that is no brake, is linearised at rest.
-
-    Raises:
-        ValueError: A controller or an actuator that is not linear, or several lags. Also a parameter out of its range,
-            a setpoint of 1, or a loop that does not come to rest.
+    The actuator may have limits, one lag and a delay. A balance, or a plant that is no brake, is linearised at rest.
     """
     check_part(loop)
     if isinstance(inner_controller(loop.controller), BalanceFeedback):
@@ -102,13 +96,6 @@ def reduce_balance_loop(loop: Loop) -> ReducedLoop:
     """Return a balance's loop as state feedback on its linear model about upright.
 
     It is exact if the sensor passes the output unchanged. A voltage limit is neglected but does not count against it.
-
-    Args:
-        loop: Closed loop of a balance.
-
-    Raises:
-        ValueError: A controller other than feedback of the whole state, an actuator other than none or a voltage limit,
-            or a parameter out of its range.
     """
     controller = inner_controller(loop.controller)
     if not isinstance(controller, BalanceFeedback):
@@ -135,17 +122,9 @@ def _read_sampling(controller: Part) -> Sampling | Continuous:
 
 
 def feedback_gain(loop: Loop, states: Sequence[str]) -> AnyArray:
-    """Return K (n,) of a loop's controller on the named states, with 0 for unused states.
+    """Return K (n,) of a loop's controller on the named states, differentiable in its parameters; 0 for unused states.
 
-    K is differentiable in the controller's parameters. The K of a `ProportionalFeedback` holds at its reference speed.
-
-    Args:
-        loop: Closed loop with a linear controller.
-        states: Names of the states of a linear model such as `SlipModel`; not used for a `BalanceFeedback`, whose gain
-            is returned whole.
-
-    Raises:
-        ValueError: A controller that is not linear.
+    K of a `ProportionalFeedback` holds at its reference speed. A `BalanceFeedback` has K whole, whatever the names.
     """
     controller = inner_controller(loop.controller)
     if isinstance(controller, BalanceFeedback):

@@ -120,11 +120,7 @@ def design(system: Polytope | Schedule, spec: Spec) -> Design:
 
 
 def pool_vertices(system: Polytope | Schedule) -> Polytope:
-    """Return all vertices of a schedule as one polytope; a polytope is returned unchanged.
-
-    Args:
-        system: A polytope or a schedule.
-    """
+    """Return all vertices of a schedule as one polytope; a polytope is returned unchanged."""
     if isinstance(system, Polytope):
         return system
     a, b = (np.concatenate([getattr(cell, name) for cell in system.cells]) for name in "AB")

@@ -102,17 +102,9 @@ class StoredCertificate(NamedTuple):
 
 
 def verify_file(path: str | os.PathLike[str], seconds: float = MAX_SECONDS) -> list[ClaimVerdict]:
-    """Return a verdict for each claim of a certificate file, in its order.
+    """Return a verdict for each claim of a certificate file, in its order; one that is not proved has the reason.
 
-    A claim that is false, or not proved, raises no error: its verdict has the reason.
-
-    Args:
-        path: Path of the file.
-        seconds: Time [s] after which an undecided file is refused.
-
-    Raises:
-        ValueError: A file that is not readable, not of the format, or not decided in time; or a claim that does not fit
-            its system or is out of range. The message is one line that names the field.
+    A file that is not decided within `seconds` is refused with ValueError.
     """
     # A context variable carries the deadline through the recursion, and keeps calls in other threads apart.
     given = _deadline.set((time.monotonic() + seconds, seconds))
@@ -276,11 +268,7 @@ def _read_tensor(value: Any, letters: str, sizes: dict[str, int], where: str) ->
 
 
 def multiply_matrices(*factors: Matrix) -> Matrix:
-    """Return the product of matrices, each product in integers over a common denominator.
-
-    Args:
-        factors: Matrices in the order of the product.
-    """
+    """Return the product of matrices, each product in integers over a common denominator."""
     a, *rest = factors
     for b in rest:
         (rows, below), (columns, under) = _integers(a), _integers(transpose_matrix(b))
@@ -300,50 +288,28 @@ def _quotient(terms: Iterable[int], below: int) -> Fraction:
 
 
 def transpose_matrix(a: Matrix) -> Matrix:
-    """Return A'.
-
-    Args:
-        a: Matrix.
-    """
+    """Return A'."""
     return [list(row) for row in zip(*a, strict=True)]
 
 
 def weighted_sum(*terms: tuple[Any, Matrix]) -> Matrix:
-    """Return the sum of number times matrix.
-
-    Args:
-        terms: Pairs of a number and a matrix.
-    """
+    """Return the sum of number times matrix over pairs of them."""
     first = terms[0][1]
     return [[sum((k * m[i][j] for k, m in terms), Fraction(0)) for j in range(len(row))] for i, row in enumerate(first)]
 
 
 def he(a: Matrix) -> Matrix:
-    """Return A + A'.
-
-    Args:
-        a: Square matrix.
-    """
+    """Return A + A'."""
     return weighted_sum((1, a), (1, transpose_matrix(a)))
 
 
 def identity_matrix(n: int) -> Matrix:
-    """Return the unit matrix I.
-
-    Args:
-        n: Size.
-    """
+    """Return the unit matrix I of size n."""
     return [[Fraction(int(i == j)) for j in range(n)] for i in range(n)]
 
 
 def bordered_matrix(a: Matrix, b: Matrix, d: Matrix) -> Matrix:
-    """Return [[A, B], [B', D]].
-
-    Args:
-        a: Block A.
-        b: Block B.
-        d: Block D.
-    """
+    """Return [[A, B], [B', D]]."""
     return [[*x, *y] for x, y in zip(a, b, strict=True)] + [
         [*x, *y] for x, y in zip(transpose_matrix(b), d, strict=True)
     ]
@@ -353,11 +319,8 @@ def is_positive_definite(m: Matrix, semi: bool = False) -> bool:
     """Return whether M is symmetric and positive definite: all its pivots are positive.
 
     The method is elimination in integers (Bareiss, 1968) on the upper triangle. Every entry is a minor of M times the
-    common denominator. Divisions therefore leave no remainder, and no number grows beyond a minor.
-
-    Args:
-        m: Square matrix.
-        semi: Whether semidefiniteness is enough: a zero pivot then needs a zero row.
+    common denominator. Divisions therefore leave no remainder, and no number grows beyond a minor. With `semi` a zero
+    pivot needs a zero row.
     """
     if m != transpose_matrix(m):
         return False

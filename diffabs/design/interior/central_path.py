@@ -84,13 +84,7 @@ class LocalProblem(NamedTuple):
 
 
 def start_path(T: Matrix, K: Matrix, mu: Scalar) -> CentralPathState:
-    """Return the initial state of the path; `follow_path` sets its shift.
-
-    Args:
-        T: T with T T' = X, shape (n, n).
-        K: Gain, shape (m, n).
-        mu: Initial weight of the barrier.
-    """
+    """Return the initial state, with T T' = X and gain K (m, n); `follow_path` sets its shift."""
     zero = jnp.zeros((), T.dtype)
     return CentralPathState(0, PathPoint(T, K), zero - 1, zero + mu, zero, 0, zero > 0)
 
@@ -98,15 +92,10 @@ def start_path(T: Matrix, K: Matrix, mu: Scalar) -> CentralPathState:
 def follow_path(
     problem: GuaranteedCostProblem, path: CentralPathState, onwards: Callable, *, discrete: bool
 ) -> CentralPathState:
-    """Return the state at the end of the path: at the last centre, or `stuck` if there is no such centre.
-
-    The path also ends at an invalid number, and after MAX_PATH_STEPS steps.
+    """Return the state at the last centre, or `stuck`; also at an invalid number, and after MAX_PATH_STEPS steps.
 
     Args:
-        problem: Vertices and weights.
-        path: Initial state.
         onwards: Function (path, smallest shift, trace P) that returns the state with the next shift and mu.
-        discrete: Whether the system is in discrete time.
     """
     here = localise_problem(problem, path.point)
     first = least_shift(here, discrete=discrete)
@@ -137,40 +126,21 @@ def follow_path(
 
 
 def localise_problem(problem: GuaranteedCostProblem, point: PathPoint) -> LocalProblem:
-    """Return the problem in a point's coordinates.
-
-    Args:
-        problem: Vertices and weights.
-        point: Point of the path.
-    """
+    """Return the problem in a point's coordinates."""
     t, inverse = point.T, jnp.linalg.inv(point.T)
     closed = inverse @ (problem.A + problem.B @ point.K) @ t
     return LocalProblem(closed, inverse @ problem.B, point.K @ t, t.T @ problem.Q @ t, problem.R, inverse @ inverse.T)
 
 
 def least_shift(here: LocalProblem, *, discrete: bool) -> Matrix:
-    """Return the smallest s, a scalar, for which no S_i has a negative eigenvalue at the point itself.
-
-    It is at most 0 if the point satisfies all inequalities.
-
-    Args:
-        here: Problem in the coordinates of the point.
-        discrete: Whether the system is in discrete time.
-    """
+    """Return the smallest s, a scalar, for which no S_i has a negative eigenvalue; <= 0 where all inequalities hold."""
     # At X = I the Schur complement of the discrete block matrix is (1 + s) I - Q - K'RK - C'C.
     flow = _t(here.c) @ here.c - jnp.eye(len(here.q)) if discrete else he(here.c)
     return jnp.max(jnp.linalg.eigvalsh(flow + here.q + here.k.T @ here.r @ here.k))
 
 
 def gradient_and_hessian(here: LocalProblem, shift: Scalar, mu: Scalar, *, discrete: bool) -> tuple[PyTree, PyTree]:
-    """Return gradient (d,) and Hessian (d, d) of phi in (X, F) at the point itself, in the basis of `directions`.
-
-    Args:
-        here: Problem in the coordinates of the point.
-        shift: Shift s.
-        mu: Weight of the barrier.
-        discrete: Whether the system is in discrete time.
-    """
+    """Return gradient (d,) and Hessian (d, d) of phi in (X, F) at the point itself, in the basis of `directions`."""
     n = len(here.q)
     y, g = directions(n, len(here.k))
     f = here.k @ y + g
@@ -189,11 +159,7 @@ def gradient_and_hessian(here: LocalProblem, shift: Scalar, mu: Scalar, *, discr
 def directions(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a basis of the changes (Y, G), shapes (d, n, n) and (d, m, n), with d = n(n + 1)/2 + m n.
 
-    The changed point is X = I + Y and F = K + K Y + G.
-
-    Args:
-        n: Number of states.
-        m: Number of inputs.
+    The changed point is X = I + Y and F = K + K Y + G, for n states and m inputs.
     """
     pairs = [(i, j) for i in range(n) for j in range(i + 1)]
     y, g = np.zeros((len(pairs) + m * n, n, n)), np.zeros((len(pairs) + m * n, m, n))
@@ -204,12 +170,7 @@ def directions(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def solve_newton_system(hessian: Matrix, right: Any) -> Matrix:
-    """Return H^-1 b for a positive definite H, which is first scaled to a unit diagonal.
-
-    Args:
-        hessian: H, shape (d, d).
-        right: b, shape (d,).
-    """
+    """Return H^-1 b for a positive definite H (d, d), which is first scaled to a unit diagonal."""
     # Scaling the diagonal to 1 lowers the condition number: directions of X and F differ by many decades.
     unit = 1 / jnp.sqrt(jnp.diagonal(hessian))
     return unit * jnp.linalg.solve(hessian * unit * unit[:, None], unit * right)
@@ -268,11 +229,7 @@ def _t(x: Scalar) -> Matrix:
 
 
 def he(x: Scalar) -> Matrix:
-    """Return He[M] = M + M'.
-
-    Args:
-        x: Square matrices, shape (..., n, n).
-    """
+    """Return He[M] = M + M'."""
     return x + _t(x)
 
 
@@ -281,9 +238,5 @@ def _trace(x: Scalar) -> Matrix:
 
 
 def logdet(x: Scalar) -> Matrix:
-    """Return log det of positive definite matrices; NaN for other matrices.
-
-    Args:
-        x: Symmetric matrices, shape (..., n, n).
-    """
+    """Return log det of positive definite matrices (..., n, n); NaN for other matrices."""
     return 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(x), axis1=-2, axis2=-1)), -1)

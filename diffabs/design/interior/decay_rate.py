@@ -68,9 +68,9 @@ def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -
 
         He[P C_i] + 2 rate P <= 0,   C_i'P C_i <= exp(-2 rate period) P,      C_i = A_i + B_i K
 
-    The first inequality is for continuous time, the second for discrete time. The rate also holds while the system
-    varies. It is negative if no common P proves stability. It is below the largest rate by at most 1e-8 of itself, up
-    to rounding. This accuracy and the derivative need float64.
+    The first inequality is for continuous time (period None), the second for discrete time. The rate also holds while
+    the system varies. It is negative if no common P proves stability. It is below the largest rate by at most 1e-8 of
+    itself, up to rounding. This accuracy and the derivative need float64.
 
     The function works under jit, vmap and both modes of differentiation, to first order only. The derivative uses the
     multipliers W_i of the optimum: sum <W_i, d left side> = 0.
@@ -78,15 +78,6 @@ def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -
     If the optimum is not unique (two modes equally slow), the derivative is one of the possible ones. A double pole, or
     a deadbeat loop (whose largest rate is infinite), does not attain the optimum. The rate is then one that some P
     proves. It is below the largest, and the derivative is NaN. The rate is NaN for input that is not finite.
-
-    Args:
-        gain: Gain K of u = K x, shape (m, n) or (n,).
-        A: State matrices of the vertices, shape (V, n, n).
-        B: Input matrices of the vertices, shape (V, n, m).
-        period: Sampling period [s] in discrete time; None for continuous time.
-
-    Raises:
-        ValueError: A without an axis for the vertices, or a period that is not positive and finite.
     """
     A, B, K = as_float_arrays(A, B, jnp.atleast_2d(jnp.asarray(gain)))
     if A.ndim != 3:
@@ -161,10 +152,7 @@ def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree
 
 
 def _step(c: Scalar, path: _DecayPathState, m: Scalar, discrete: bool) -> tuple[PyTree, PyTree, PyTree]:
-    """Return T and s after a step, and the decrement before it; NaN for the decrement if no step is possible.
-
-    `c` and `m` = M/trace M are in the coordinates of the point.
-    """
+    """Return T and s after a step, and the decrement before it, NaN if no step is possible; m = M/trace M."""
     vertices, n, _ = c.shape
     degree = (vertices + 1) * n
     one, basis, s = jnp.eye(n, dtype=c.dtype), directions(n, 0)[0], path.s

@@ -40,15 +40,7 @@ class RobustFeedback(NamedTuple):
 
 
 def robust_gain(system: Polytope, Q: AnyArray, R: AnyArray) -> AnyArray:
-    """Return the gain with the smallest guaranteed cost over a polytope, shape (m, n).
-
-    It is NaN if no such gain exists; see `robust_design`.
-
-    Args:
-        system: Polytope.
-        Q: State weight, shape (n, n).
-        R: Input weight, shape (m, m), R > 0.
-    """
+    """Return the gain (m, n) with the smallest guaranteed cost, NaN if there is none: see `robust_design`."""
     return robust_design(system.A, system.B, Q, R, discrete=system.period is not None).gain
 
 
@@ -56,7 +48,7 @@ def robust_design(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, *, discret
     """Return the gain that minimises trace P over the vertices, and P: eqs. (29)-(32) of Maeda and Sugiura.
 
     The function works under jit, vmap and both modes of differentiation, in all arguments. Only the symmetric parts of
-    Q and R count.
+    Q and R count. The vertices are A (V, n, n) and B (V, n, m).
 
     The result is the point of the central path at FINAL_MU. Its cost exceeds the optimum by less than a millionth, and
     it satisfies the inequalities strictly. Errors of the derivative, measured on the rig as d ln K/d ln weight, are
@@ -66,21 +58,8 @@ def robust_design(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, *, discret
     The optimal gain has a kink where an inequality becomes active or inactive (strict complementarity fails). There is
     no derivative there: the function returns that of the central path, which rounds off the kink.
 
-    The result is NaN without a solution or with invalid input:
-
-    - A vertex has no stabilising Riccati solution, or no gain has a common P.
-    - Q does not see every mode, or R is not positive definite.
-    - Input is not finite.
-
-    Args:
-        A: State matrices of the vertices, shape (V, n, n).
-        B: Input matrices of the vertices, shape (V, n, m).
-        Q: State weight, shape (n, n).
-        R: Input weight, shape (m, m).
-        discrete: Whether the system is in discrete time.
-
-    Raises:
-        ValueError: Shapes that do not fit.
+    The result is NaN without a solution (no stabilising Riccati solution of a vertex, no common P) or with invalid
+    input: Q does not see every mode, R is not positive definite, or an entry is not finite.
     """
     A, B, Q, R = as_float_arrays(A, B, Q, R)
     n, m = B.shape[-2:]
@@ -125,10 +104,7 @@ def _solve_central_path_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -
 
 
 def _start_from_riccati(problem: GuaranteedCostProblem, discrete: bool) -> CentralPathState:
-    """Return the path's start: the Riccati solution of the vertex with the smallest shift over all vertices.
-
-    It is NaN if one vertex has no solution.
-    """
+    """Return the path's start: the Riccati solution of the vertex with the smallest shift; NaN if one vertex has none."""
     A, B, Q, R = problem
 
     def alone(a: Scalar, b: Scalar) -> tuple[PyTree, PathPoint, PyTree]:

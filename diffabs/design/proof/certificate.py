@@ -300,22 +300,14 @@ class Certificate:
 
 
 def as_read_only_array(value: Scalar) -> np.ndarray:
-    """Return a copy as floats that cannot be written to.
-
-    Args:
-        value: Number or array.
-    """
+    """Return a copy as floats that cannot be written to."""
     array = np.array(value, float)
     array.setflags(write=False)
     return array
 
 
 def as_read_only_system(system: Polytope | Schedule) -> Matrix:
-    """Return a copy whose arrays cannot be written to.
-
-    Args:
-        system: A polytope or a schedule.
-    """
+    """Return a copy whose arrays cannot be written to."""
     if isinstance(system, Schedule):
         copy = dataclasses.replace(system, cells=tuple(map(as_read_only_system, system.cells)))
         copy.nodes.setflags(write=False)
@@ -327,10 +319,6 @@ def as_read_only_system(system: Polytope | Schedule) -> Matrix:
 
 
 def round_up(value: Scalar) -> float:
-    """Return the smallest float that is not below a rational number.
-
-    Args:
-        value: Rational number.
-    """
+    """Return the smallest float that is not below a rational number."""
     near = float(value)
     return near if Fraction(near) >= value else math.nextafter(near, math.inf)

@@ -87,14 +87,7 @@ class Dyadic:
 
 
 def as_dyadic(value: Scalar) -> Dyadic:
-    """Return the numbers of `value` as integers times a power of two, without error.
-
-    Args:
-        value: Float, int or array of floats; a Dyadic is returned unchanged.
-
-    Raises:
-        ValueError: A number that is not finite.
-    """
+    """Return the numbers of an int, finite floats or a Dyadic as integers times a power of two, without error."""
     if isinstance(value, Dyadic):
         return value
     if isinstance(value, int):
@@ -112,25 +105,17 @@ def as_dyadic(value: Scalar) -> Dyadic:
 
 
 def as_uncertain_dyadic(value: Scalar) -> Dyadic:
-    """Return the numbers of `value` with a relative error of at most 2^-RELATIVE_ERROR_BITS each.
-
-    Args:
-        value: Float, int or array of floats.
-    """
+    """Return the numbers of `value` with a relative error of at most 2^-RELATIVE_ERROR_BITS each."""
     ints = as_dyadic(value)
     # At a scale finer by 2^40, an error of |ints| units is a relative error of 2^-40.
     return Dyadic(ints.ints * (1 << RELATIVE_ERROR_BITS), ints.bits + RELATIVE_ERROR_BITS, abs(ints.ints))
 
 
 def is_positive_definite(matrix: list[list[int]], strict: bool = True) -> bool:
-    """Return whether a symmetric matrix of integers is positive definite, or semidefinite if not `strict`.
+    """Return whether a symmetric matrix of Python integers is positive definite, or semidefinite if not `strict`.
 
     The method is Bareiss's elimination: the pivots are the leading minors, and every division leaves no remainder. A
-    zero pivot of a semidefinite matrix has a zero row, which is skipped. It works in place, in the lower triangle.
-
-    Args:
-        matrix: Symmetric matrix of Python integers; its lower triangle is overwritten.
-        strict: Whether to require definiteness; False also accepts a semidefinite matrix.
+    zero pivot of a semidefinite matrix has a zero row, which is skipped. It overwrites the lower triangle.
     """
     n, last = len(matrix), 1
     for k in range(n):

@@ -51,20 +51,12 @@ class ClosedLoop(NamedTuple):
 
 
 def he(M: Matrix) -> Matrix:
-    """Return M + M'.
-
-    Args:
-        M: Square matrices, shape (..., n, n).
-    """
+    """Return M + M'."""
     return M + M.mT
 
 
 def block_matrix(rows: list[list[Matrix]]) -> Matrix:
-    """Return the block matrix of the rows; blocks without leading axes are the same for every vertex.
-
-    Args:
-        rows: Rows of blocks, each of shape (..., r, c).
-    """
+    """Return the block matrix of the rows; blocks without leading axes are the same for every vertex."""
     flat = [each for row in rows for each in row]
     lead = np.broadcast_shapes(*(each.shape[:-2] for each in flat))
 
@@ -85,13 +77,7 @@ def block_matrix(rows: list[list[Matrix]]) -> Matrix:
 
 
 def decrease_terms(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> tuple[Matrix, ...]:
-    """Return the terms of -He(P C) - 2 rate P, or in discrete time of factor^2 P - C' P C.
-
-    Args:
-        loop: Closed loops of the vertices.
-        P: Lyapunov matrix, shape (n, n).
-        data: Data of the claim, with `rate` [1/s] or `factor` if they are not 0 or 1.
-    """
+    """Return the terms of -He(P C) - 2 rate P, or in discrete time of factor^2 P - C' P C."""
     if loop.discrete:
         factor = data.get("factor", 1)
         return factor * factor * P, -(loop.C.mT @ P @ loop.C)
@@ -99,12 +85,7 @@ def decrease_terms(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> t
 
 
 def decay_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
-    """Yield the conditions that V = x' P x falls at least like exp(-2 rate t), or by factor^2 a period.
-
-    Args:
-        loop: Closed loops of the vertices.
-        data: Data of the claim.
-    """
+    """Yield the conditions that V = x' P x falls at least like exp(-2 rate t), or by factor^2 a period."""
     yield Inequality((data["P"],))
     yield Inequality(decrease_terms(loop, data["P"], data), 0)
 
@@ -114,10 +95,6 @@ def cost_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[In
 
     The integral (sum) of x' (Q + K' R K) x from x0 is then at most x0' P x0. A further condition is that V falls,
     without Q and R. V therefore goes to 0, and the bound needs no sign of Q, which may have rounding errors.
-
-    Args:
-        loop: Closed loops of the vertices.
-        data: Data of the claim.
     """
     terms = decrease_terms(loop, data["P"], {})
     yield Inequality((data["P"],))
@@ -132,10 +109,6 @@ def damping_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator
         -[[He(M), cot (M - M')], [cot (M' - M), He(M)]] > 0
 
     Eigenvalues of every fixed system of the hull then lie in |Im| < |Re| / cot, left of 0 (Chilali and Gahinet 1996).
-
-    Args:
-        loop: Closed loops of the vertices.
-        data: Data of the claim.
     """
     M, cot, zeta = data["P"] @ loop.C, data["cot"], data["zeta"]
     skew = cot * (M - M.mT)
@@ -147,12 +120,8 @@ def damping_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator
 def l2_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """Yield the conditions for V' + |z|^2 - gamma^2 |w|^2 < 0: the gain from w to z is below gamma.
 
-    Here x' = C x + Bw w and z = (C + D K) x with C and D of the claim. The method is the bounded real lemma. In
-    discrete time V' is the difference V(x+) - V(x).
-
-    Args:
-        loop: Closed loops of the vertices.
-        data: Data of the claim.
+    This is the bounded real lemma, x' = C x + Bw w and z = (C + D K) x with C and D of the claim. In discrete time V'
+    is the difference V(x+) - V(x).
     """
     P, Bw, Z = data["P"], data["Bw"], data["C"] + data["D"] @ loop.K
     none, supply = np.zeros((P.shape[-1], Bw.shape[-1])), data["gamma"] * data["gamma"] * np.eye(Bw.shape[-1])
@@ -171,10 +140,6 @@ def input_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[I
 
     The points lie in {x' P x <= 1}, which no trajectory leaves. There (K_j x)^2 <= K_j P^-1 K_j' < limit_j^2, by [[P,
     K_j'], [K_j, limit_j^2]] > 0.
-
-    Args:
-        loop: Closed loops of the vertices.
-        data: Data of the claim.
     """
     P, limit, points = data["P"], data["limit"], data["points"]
     yield Inequality((P,))
@@ -192,10 +157,6 @@ def infeasibility_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> It
     They are W_i >= 0 and S = sum_i He((C_i + rate I) W_i) > 0. Such a P gives the contradiction 0 >= sum_i tr(W_i He(P
     (C_i + rate I))) = tr(P S) > 0. In discrete time C_i' P C_i <= factor^2 P and S = sum_i (C_i W_i C_i' - factor^2
     W_i).
-
-    Args:
-        loop: Closed loops of the vertices.
-        data: Data of the claim.
     """
     W, factor = data["W"], data.get("factor", 1)
     yield Inequality((W,), strict=False)
@@ -210,11 +171,6 @@ def instability_conditions(loop: ClosedLoop, data: Mapping[str, Matrix], vertex:
 
     They are He(P C) + 2 rate P <= 0 and x'P x < 0. From x on, V = x'P x is at most V(0) exp(-2 rate t), so it stays
     negative, and |x| does not fall faster (Lyapunov's theorem of instability, for a rate of at most 0).
-
-    Args:
-        loop: Closed loops of the vertices.
-        data: Data of the claim.
-        vertex: Number of the vertex.
     """
     x = data["x"]
     row = block_matrix([[x[i : i + 1] * np.eye(1) for i in range(x.shape[0])]])
@@ -227,8 +183,9 @@ def schedule_conditions(
 ) -> Iterator[Inequality]:
     """Yield the conditions for V = x' P(p) x with V' <= -2 rate V - x' (Q + K' R K) x.
 
-    P and K are linear in the parameter p between nodes. In a cell, p = a + l (b - a). V' + ... is x' G(l) x with G
-    quadratic in l, and affine in (A, B) and in p', which lies in `rates`.
+    `cells` has A and B of the vertices. P and K are linear in the parameter p between nodes. In a cell,
+    p = a + l (b - a). V' + ... is x' G(l) x with G quadratic in l, and affine in (A, B) and in p', which lies in
+    `rates`.
 
     G(l) is (1-l)^2 G_aa + 2 l (1-l) G_ab + l^2 G_bb. Its Bernstein coefficients for a product X Y of linear functions
     are X_a Y_a, (X_a Y_b + X_b Y_a)/2 and X_b Y_b. The weights are not negative, so negative definite coefficients make
@@ -236,12 +193,6 @@ def schedule_conditions(
 
     Vertices and ends of `rates` suffice because G is affine in (A, B) and p'. Both may depend on l: in a cell they are
     anywhere in its hull. V is continuous, so its kinks at nodes do no harm. The inequality is stated as -(b - a) G > 0.
-
-    Args:
-        cells: A and B of the vertices of each cell.
-        nodes: Nodes of the parameter, N of them.
-        gain: Gain, shape (m, n), or one for each node, shape (N, m, n).
-        data: Data of the claim.
     """
     P, vertex = data["P"], 0
     yield Inequality((P,))
@@ -272,18 +223,7 @@ CLAIM_CONDITIONS = {
 
 
 def conditions(kind: str, system: Polytope | Schedule, gain: Matrix, data: Params, proof: bool) -> Iterator[Inequality]:
-    """Yield the inequalities of a claim.
-
-    Args:
-        kind: Kind of the claim.
-        system: A polytope or a schedule.
-        gain: Gain of the certificate.
-        data: Data of the claim.
-        proof: True for exact numbers with errors of the vertices, False for floats.
-
-    Raises:
-        ValueError: Data that do not fit.
-    """
+    """Yield the inequalities of a claim, with `proof` in exact numbers with errors of the vertices, else in floats."""
     check_claim(kind, system, gain, data)
     # The gain, P and the bounds are exact as stored; only the system's matrices come from a computation with rounding.
     known, vertex = (as_dyadic, as_uncertain_dyadic) if proof else (np.asarray, np.asarray)
@@ -299,11 +239,7 @@ def conditions(kind: str, system: Polytope | Schedule, gain: Matrix, data: Param
 
 
 def is_satisfied(inequality: Inequality) -> bool:
-    """Return whether an inequality over Dyadic matrices holds, errors included; False without symmetry.
-
-    Args:
-        inequality: Inequality with Dyadic terms.
-    """
+    """Return whether an inequality over Dyadic matrices holds, errors included; False without symmetry."""
     total = functools.reduce(operator.add, inequality.terms)
     k = total.shape[-1]
     matrices = total.ints.reshape(-1, k, k)
@@ -320,12 +256,7 @@ def is_robustly_positive(matrix: np.ndarray, error: np.ndarray, bits: int) -> bo
 
     Both sides are multiplied by 1 / s and by a power of 2 that leaves integers. So rows of unlike size lose equally.
     The propagated bound of C' P C is not symmetric. The error itself is symmetric, so either of error_ij and error_ji
-    bounds it.
-
-    Args:
-        matrix: Symmetric matrix of Python integers, shape (n, n).
-        error: Bounds of its errors in the same units, shape (n, n).
-        bits: Scale of both: one unit is 2^-bits.
+    bounds it. One unit of both integer matrices is 2^-bits.
     """
     # bit_length needs positive numbers, and no definite matrix has another diagonal.
     diagonal = np.diagonal(matrix)
@@ -341,17 +272,7 @@ def is_robustly_positive(matrix: np.ndarray, error: np.ndarray, bits: int) -> bo
 
 
 def is_proved(kind: str, system: Polytope | Schedule, gain: Matrix, data: Params) -> bool:
-    """Return whether a claim is proved, exactly and rounded outward.
-
-    Args:
-        kind: Kind of the claim.
-        system: A polytope or a schedule.
-        gain: Gain of the certificate.
-        data: Data of the claim.
-
-    Raises:
-        ValueError: Data that do not fit (`schema.FIELD_SHAPES`).
-    """
+    """Return whether a claim is proved, exactly and rounded outward."""
     return all(map(is_satisfied, conditions(kind, system, gain, data, proof=True)))
 
 
@@ -359,15 +280,6 @@ def vertex_margins(kind: str, system: Polytope | Schedule, gain: Matrix, data: P
     """Return for each vertex the smallest eigenvalue of a claim's inequality relative to its largest term, in floats.
 
     The margin of an inequality about all vertices together has the key ALL_VERTICES. Side conditions are left out.
-
-    Args:
-        kind: Kind of the claim.
-        system: A polytope or a schedule.
-        gain: Gain of the certificate.
-        data: Data of the claim.
-
-    Raises:
-        ValueError: Data that do not fit.
     """
     left: dict[int, float] = {}
     for each in conditions(kind, system, gain, data, proof=False):

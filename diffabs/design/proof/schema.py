@@ -34,17 +34,7 @@ DISPROOF_RANGES = {"factor": ("be positive", FIELD_RANGES["gamma"][1])}
 
 
 def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Params) -> None:
-    """Check that a claim fits the system and the gain.
-
-    Args:
-        kind: Kind of the claim.
-        system: A polytope or a schedule.
-        gain: Gain, shape (m, n), or (N, m, n) for a schedule of N nodes.
-        data: Data of the claim.
-
-    Raises:
-        ValueError: A claim that does not fit; the message is one line that names the field.
-    """
+    """Check that a claim fits the system and the gain."""
     cell = system.cells[0] if isinstance(system, Schedule) else system
     if (kind == "scheduled") != isinstance(system, Schedule) or kind not in FIELD_SHAPES:
         raise ValueError(
@@ -76,15 +66,7 @@ def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: 
 
 
 def check_gain(system: Polytope | Schedule, gain: np.ndarray) -> dict[str, int]:
-    """Return sizes by letter (`FIELD_SHAPES`) after a check of the gain.
-
-    Args:
-        system: A polytope or a schedule.
-        gain: Gain, shape (m, n), or (N, m, n) for a schedule of N nodes.
-
-    Raises:
-        ValueError: A gain of another shape, or not finite.
-    """
+    """Return sizes by letter (`FIELD_SHAPES`) after a check of the gain, (N, m, n) for N nodes, else (m, n)."""
     cell = system.cells[0] if isinstance(system, Schedule) else system
     sizes = {"n": cell.order, "m": cell.inputs, "2": 2}
     sizes |= {"N": len(system.nodes)} if isinstance(system, Schedule) else {"V": system.vertices}
@@ -95,13 +77,7 @@ def check_gain(system: Polytope | Schedule, gain: np.ndarray) -> dict[str, int]:
 
 
 def matches_shape(value: Scalar, letters: str, sizes: dict[str, int]) -> bool:
-    """Return whether the axes of `value` have the sizes of the letters.
-
-    Args:
-        value: Number or array.
-        letters: One letter for each axis.
-        sizes: Sizes by letter; the function adds a new letter with its size.
-    """
+    """Return whether the axes of `value` have the sizes of the letters; a new letter is added to `sizes`."""
     shape = np.shape(value)
     return len(shape) == len(letters) and all(
         0 < size == sizes.setdefault(letter, size) for letter, size in zip(letters, shape, strict=True)

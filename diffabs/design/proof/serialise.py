@@ -17,11 +17,7 @@ MAX_CERTIFICATE_BYTES, MAX_STATES_OR_INPUTS, MAX_LIST_ENTRIES = 2**24, 64, 2**12
 
 
 def describe_system(system: Polytope | Schedule) -> dict[str, PyTree]:
-    """Return a system for JSON, without `coverage`, which no claim needs.
-
-    Args:
-        system: A polytope or a schedule.
-    """
+    """Return a system for JSON, without `coverage`, which no claim needs."""
     if isinstance(system, Schedule):
         cells = [describe_system(cell) for cell in system.cells]
         return {"parameter": system.parameter, "nodes": system.nodes.tolist(), "cells": cells}
@@ -31,14 +27,7 @@ def describe_system(system: Polytope | Schedule) -> dict[str, PyTree]:
 
 
 def reject_duplicate_names(pairs: list[tuple[str, PyTree]]) -> dict[str, PyTree]:
-    """Return a JSON object from its members, if their names differ.
-
-    Args:
-        pairs: Names and values of the members.
-
-    Raises:
-        ValueError: A name that occurs twice: two readers may take different values.
-    """
+    """Return a JSON object from its members; two readers may take different values of a name that occurs twice."""
     found = dict(pairs)
     if len(found) != len(pairs):
         raise ValueError(f"a name comes twice among {', '.join(name for name, _ in pairs)}")
@@ -46,16 +35,7 @@ def reject_duplicate_names(pairs: list[tuple[str, PyTree]]) -> dict[str, PyTree]
 
 
 def read_members(value: Scalar, where: str, *names: str) -> list[PyTree]:
-    """Return the values of an object with exactly these members, in the order of `names`.
-
-    Args:
-        value: JSON value.
-        where: Name of the value for messages.
-        names: Names of the members.
-
-    Raises:
-        ValueError: Not an object, or other members.
-    """
+    """Return the values of an object with exactly these members, in the order of `names`."""
     if not isinstance(value, dict) or set(value) != set(names):
         has = ", ".join(value) if isinstance(value, dict) else type(value).__name__
         raise ValueError(f"{where} must have the members {', '.join(names)} and no other; has {has}")
@@ -63,31 +43,14 @@ def read_members(value: Scalar, where: str, *names: str) -> list[PyTree]:
 
 
 def read_list(value: Scalar, where: str, kind: type = dict) -> list[PyTree]:
-    """Return a list of JSON values of one type, after a check.
-
-    Args:
-        value: JSON value.
-        where: Name of the value for messages.
-        kind: Type of the entries.
-
-    Raises:
-        ValueError: Not a list, or an entry of another type.
-    """
+    """Return a list of JSON values of one type, after a check."""
     if not isinstance(value, list) or not all(type(each) is kind for each in value):
         raise ValueError(f"{where} must be a list of {kind.__name__}")
     return value
 
 
 def read_numbers(value: Scalar, where: str = "a number") -> Matrix:
-    """Return a finite number, or lists of them of equal lengths, as an array.
-
-    Args:
-        value: JSON value whose numbers are all floats, integers included.
-        where: Name of the value for messages.
-
-    Raises:
-        ValueError: A value that is not finite or no number, or lists of different lengths.
-    """
+    """Return a finite number, or lists of them of equal lengths, as an array; integers are read as floats."""
     array = np.array(value, object)
     if not all(type(each) is float and math.isfinite(each) for each in array.flat):
         raise ValueError(f"{where} must be finite numbers, in lists of equal lengths")
@@ -95,16 +58,7 @@ def read_numbers(value: Scalar, where: str = "a number") -> Matrix:
 
 
 def format_certificate(system: Polytope | Schedule, gain: np.ndarray, claims: Iterable[tuple[str, Params]]) -> str:
-    """Return the content of a certificate's file.
-
-    Args:
-        system: A polytope or a schedule.
-        gain: Gain of the certificate.
-        claims: Kind and data of each claim.
-
-    Raises:
-        ValueError: A certificate that is too large for its readers.
-    """
+    """Return the content of a certificate's file."""
     check_cell_size(system.cells[0] if isinstance(system, Schedule) else system, "system")
     arrays = [(kind, {name: np.asarray(value) for name, value in data.items()}) for kind, data in claims]
     nodes = len(system.nodes) if isinstance(system, Schedule) else 0
@@ -127,15 +81,7 @@ def format_certificate(system: Polytope | Schedule, gain: np.ndarray, claims: It
 def read_certificate(
     path: str | os.PathLike[str],
 ) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, PyTree]]]]:
-    """Return system, gain, and (kind, data) of the claims in a file.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        OSError: The file cannot be read.
-        ValueError: A file that is no certificate; the message names the field.
-    """
+    """Return system, gain, and (kind, data) of the claims in a file."""
     raw = files.read_content(path, MAX_CERTIFICATE_BYTES + 1)
     if len(raw) > MAX_CERTIFICATE_BYTES:
         raise ValueError(f"the file is larger than {MAX_CERTIFICATE_BYTES} bytes")
@@ -147,14 +93,7 @@ def read_certificate(
 
 
 def certificate_from_json(value: Scalar) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, PyTree]]]]:
-    """Return system, gain, and (kind, data) of the claims in a JSON value.
-
-    Args:
-        value: JSON value.
-
-    Raises:
-        ValueError: A value that is no certificate; the message names the field.
-    """
+    """Return system, gain, and (kind, data) of the claims in a JSON value."""
     kind, version, system, gain, claims = read_members(
         value, "the file", "format", "version", "system", "gain", "claims"
     )
@@ -174,14 +113,7 @@ def certificate_from_json(value: Scalar) -> tuple[Polytope | Schedule, np.ndarra
 
 
 def read_system(value: Scalar) -> Polytope | Schedule:
-    """Return a polytope or a schedule from a JSON value.
-
-    Args:
-        value: JSON value.
-
-    Raises:
-        ValueError: A value that is no system; the message names the field.
-    """
+    """Return a polytope or a schedule from a JSON value."""
     if isinstance(value, dict) and "cells" in value:
         parameter, nodes, cells = read_members(value, "system", "parameter", "nodes", "cells")
         if not isinstance(parameter, str):
@@ -194,17 +126,7 @@ def read_system(value: Scalar) -> Polytope | Schedule:
 
 
 def read_polytope(value: Scalar, where: str) -> Polytope:
-    """Return a polytope from a JSON value, whose corners are not read.
-
-    Nothing ties these labels of a file to its matrices, so no output shows them beside a proof.
-
-    Args:
-        value: JSON value.
-        where: Name of the value for messages.
-
-    Raises:
-        ValueError: A value that is no polytope; the message names the field.
-    """
+    """Return a polytope from a JSON value, without corners: nothing ties such labels of a file to its matrices."""
     A, B, period, states, _ = read_members(value, where, "A", "B", "period", "states", "corners")
     if period is not None and not (isinstance(period, float) and 0 < period < math.inf):
         raise ValueError(f"{where}.period must be null or positive [s]")
@@ -219,11 +141,6 @@ def read_polytope(value: Scalar, where: str) -> Polytope:
 
 
 def check_cell_size(cell: Polytope, where: str) -> None:
-    """Raise ValueError for a polytope that is too large for a certificate's file.
-
-    Args:
-        cell: Polytope.
-        where: Name of the polytope for messages.
-    """
+    """Raise ValueError for a polytope that is too large for a certificate's file."""
     if max(cell.order, cell.inputs) > MAX_STATES_OR_INPUTS:
         raise ValueError(f"{where} has more than {MAX_STATES_OR_INPUTS} states or inputs")

@@ -78,10 +78,7 @@ class DesignProgram:
         self.common = list(self._common())
 
     def objective(self) -> np.ndarray:
-        """Return the coefficients c (unknowns,) of the objective c'y.
-
-        With Q and R, the mean of trace Z in the original coordinates is `scale` c'y.
-        """
+        """Return c (unknowns,) of the objective c'y: with Q and R, `scale` c'y is the mean of trace Z."""
         trace = self.unknowns.row(
             lambda v: sum(np.einsum("ij,dji->d", self.weight, v[f"Z{i}"]) for i in range(self.nodes)) / self.nodes
         )
@@ -214,12 +211,7 @@ class DesignProgram:
 
 
 def damping_matrix(flow: np.ndarray, cot: float) -> np.ndarray:
-    """Return the matrix of the pole region |Im s| <= -Re s/cot, which has the damping cot/sqrt(1 + cot^2).
-
-    Args:
-        flow: A X + B F, or P C of an analysis, shape (..., n, n).
-        cot: Cotangent of the half-angle of the cone about the negative real axis.
-    """
+    """Return the matrix of the pole region |Im s| <= -Re s/cot, whose damping is cot/sqrt(1 + cot^2)."""
     skew = cot * (flow - np.swapaxes(flow, -1, -2))
     return -symmetric_from_blocks([[he(flow)], [-skew, he(flow)]])
 

@@ -55,9 +55,6 @@ def whitening_matrix(weight: np.ndarray) -> np.ndarray:
 
     A slow closed loop beside a fast one has a small cost per unit of time. If M >= 0 is an inequality, the congruence
     D' M D makes a solver's tolerance relative. In a direction without weight it would only magnify rounding.
-
-    Args:
-        weight: Symmetric positive semidefinite matrix, shape (n, n).
     """
     values, vectors = np.linalg.eigh(weight)
     return vectors / np.sqrt(np.maximum(values, 1e-6 * (values[-1] or 1.0)))
@@ -66,25 +63,13 @@ def whitening_matrix(weight: np.ndarray) -> np.ndarray:
 def definite_weight(q: np.ndarray, share: float) -> np.ndarray:
     """Return Q plus `share` of its diagonal, which gives every state a weight in its own unit unless Q = 0.
 
-    Args:
-        q: Symmetric positive semidefinite Q, shape (n, n). A diagonal entry below 1e-6 of their mean counts as that.
-        share: Added part [1] of the diagonal.
+    A diagonal entry below 1e-6 of their mean counts as that.
     """
     return q + share * np.diag(np.maximum(np.diag(q), 1e-6 * np.trace(q) / len(q)))
 
 
 def lyapunov_frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: bool) -> Frame:
-    """Return the frame in which P and R are unit matrices and the closed loops have norms of about 1.
-
-    Args:
-        p: P, shape (n, n).
-        a: Closed loops, shape (V, n, n).
-        r: Input weight R, shape (m, m).
-        discrete: Whether the system is in discrete time.
-
-    Raises:
-        LinAlgError: P or R is not positive definite.
-    """
+    """Return the frame in which P and R are unit matrices and the closed loops `a` (V, n, n) have norms of about 1."""
     lower = np.linalg.cholesky((p + p.T) / 2)
     inverse = lower.T
     t = np.linalg.inv(inverse)
@@ -95,17 +80,9 @@ def lyapunov_frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: boo
 
 
 def design_frames(system: Polytope, q: np.ndarray, r: np.ndarray) -> Iterator[tuple[Frame, float]]:
-    """Yield frames for a design from the vertices' Riccati solutions P, in decreasing order of trace P.
+    """Yield frames for a design from the vertices' Riccati solutions P, with trace P, in decreasing order of it.
 
-    Each frame comes with its trace. No gain has a guaranteed cost below any of these traces.
-
-    Args:
-        system: Polytope.
-        q: State weight Q, shape (n, n).
-        r: Input weight R, shape (m, m).
-
-    Raises:
-        ValueError: A vertex without a stabilising Riccati solution.
+    No gain has a guaranteed cost below any of these traces.
     """
     # A small weight on every state keeps P definite. It is relative, and too small to change the result.
     q = definite_weight(q, 1e-12)
@@ -170,12 +147,8 @@ def _solve_by_hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.nda
 def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | None = None) -> Frame:
     """Return a frame for the analysis of closed loops from the mean of their Lyapunov solutions.
 
-    For an unstable loop the Lyapunov equation is shifted. All equations are in balanced units.
-
-    Args:
-        closed: Closed loops, shape (V, n, n).
-        discrete: Whether the system is in discrete time.
-        weight: Cost rate on the right side of the Lyapunov equations, shape (n, n); None for the unit matrix.
+    For an unstable loop the Lyapunov equation is shifted. All equations are in balanced units. `weight` (n, n) is the
+    cost rate on their right side, by default the unit matrix.
     """
     from scipy.linalg import matrix_balance
 
@@ -190,17 +163,7 @@ def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | N
 def _mean_lyapunov_solution(
     closed: np.ndarray, units: np.ndarray, *, discrete: bool, weight: np.ndarray | None
 ) -> np.ndarray:
-    """Return the mean of the Lyapunov solutions of closed loops, each shifted until it is stable.
-
-    Args:
-        closed: Closed loops, shape (V, n, n).
-        units: Units of the states in which the equations are solved, shape (n,).
-        discrete: Whether the system is in discrete time.
-        weight: As in `analysis_frame`.
-
-    Raises:
-        LinAlgError: An equation is singular in floating point.
-    """
+    """Return the mean of the Lyapunov solutions, each loop shifted until it is stable; `units` (n,) are the states'."""
     from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
     n = closed.shape[1]

@@ -45,10 +45,7 @@ class Answer(NamedTuple):
         return max(0.0, *(-float(np.linalg.eigvalsh(value).min()) for value in values))
 
     def gap(self, c: np.ndarray, blocks: list[SdpBlock]) -> float:
-        """Return a bound on c'y - optimum: the duality gap plus the multipliers' residual times the unknowns.
-
-        `c` and `blocks` are those of the program.
-        """
+        """Return a bound on c'y - optimum: the duality gap plus the multipliers' residual times the unknowns."""
         # Weak duality with multipliers W >= 0 that satisfy the dual equation only approximately: |c - found| |y| covers
         # the rest.
         bound = -sum(float(np.sum(b.h * w)) for b, w in zip(blocks, self.multipliers, strict=True))
@@ -106,11 +103,7 @@ def _units(shape: tuple[int, int] | int) -> np.ndarray:
 
 
 def symmetric_from_blocks(rows: list[list[PyTree]]) -> np.ndarray:
-    """Return a symmetric matrix, or a stack of them, from the blocks on and below its diagonal.
-
-    Args:
-        rows: Rows of blocks; None stands for zero.
-    """
+    """Return a symmetric matrix, or a stack of them, from the blocks on and below its diagonal; None stands for zero."""
     stack = np.broadcast_shapes(*(np.shape(x)[:-2] for row in rows for x in row if x is not None))
     sizes = [np.shape(row[-1])[-1] for row in rows]
     ends = np.cumsum([0, *sizes])
@@ -125,11 +118,7 @@ def symmetric_from_blocks(rows: list[list[PyTree]]) -> np.ndarray:
 
 
 def group_blocks(blocks: Iterable[SdpBlock]) -> list[SdpBlock]:
-    """Return groups of blocks of equal size, each block scaled to a largest coefficient of 1.
-
-    Args:
-        blocks: Blocks of any sizes.
-    """
+    """Return groups of blocks of equal size, each block scaled to a largest coefficient of 1."""
     groups: dict[int, list[SdpBlock]] = {}
     for block in blocks:
         size = max(float(np.abs(block.G).max()), float(np.abs(block.h).max()))
@@ -138,21 +127,13 @@ def group_blocks(blocks: Iterable[SdpBlock]) -> list[SdpBlock]:
 
 
 def stack_blocks(blocks: list[SdpBlock]) -> SdpBlock:
-    """Return blocks of one size as one group.
-
-    Args:
-        blocks: Blocks of one size.
-    """
+    """Return blocks of one size as one group."""
     return SdpBlock(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
 @functools.cache
 def solvers() -> tuple[str, ...]:
-    """Return the installed solvers among `SOLVERS`, in that order.
-
-    Raises:
-        ModuleNotFoundError: cvxpy or every solver is missing.
-    """
+    """Return the installed solvers among `SOLVERS`, in that order."""
     try:
         import cvxpy
     except ModuleNotFoundError as error:
@@ -165,13 +146,7 @@ def solvers() -> tuple[str, ...]:
 
 
 def solve_sdp(c: np.ndarray, blocks: list[SdpBlock], solver: str = "CLARABEL") -> Answer:
-    """Minimise c'y under grouped blocks and return the answer; NaN in y stands for a failure.
-
-    Args:
-        c: Coefficients of the objective, shape (unknowns,).
-        blocks: Groups of blocks.
-        solver: Name of the solver.
-    """
+    """Minimise c'y under grouped blocks and return the answer; NaN in y stands for a failure."""
     shapes = tuple(b.h.shape[:2] for b in blocks)
     with SOLVER_LOCK:
         program = _program(len(c), shapes)
@@ -202,10 +177,7 @@ class _Program(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def _program(unknowns: int, shapes: tuple[tuple[int, int], ...]) -> _Program:
-    """Return the parametrised program for groups of (count, size) blocks.
-
-    It follows the rules for disciplined parametrised programs, so cvxpy compiles it once.
-    """
+    """Return the parametrised program for groups of (count, size) blocks; by the rules (DPP), cvxpy compiles it once."""
     import cvxpy as cp
 
     y, cost = cp.Variable(unknowns), cp.Parameter(unknowns)
