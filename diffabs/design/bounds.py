@@ -59,7 +59,7 @@ class Bounds:
         )
 
     def damping(self) -> Claim | None:
-        """Return the claim that every frozen system has at least the specified damping ratio, which is not maximised."""
+        """Return the claim that every frozen system has at least the specified damping ratio; it is not maximised."""
         zeta = self.spec.damping
         # Rounded up: the proof requires cot^2 (1 - zeta^2) >= zeta^2 exactly.
         cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)

@@ -65,11 +65,9 @@ class DelayedLoop:
     """The response of a sampled open loop as a function of its delay."""
 
     def __init__(self, loop: OpenLoop, w: np.ndarray):
-        """Prepare the loop for all delays. `largest` is then the largest |L| over all frequencies and delays.
+        """Prepare the loop for all delays, from a grid of frequencies `w` (k,) [rad/s] that is refined.
 
-        Args:
-            loop: Open loop with a sampled controller.
-            w: Frequencies to begin with (k,) [rad/s]; the grid is refined.
+        `largest` is then the largest |L| over all frequencies and delays.
         """
         self.loop, self.period = loop, float(loop.period or 0.0)
         self._plant = sample_plant(loop.plant, self.period, 0.0)
@@ -79,10 +77,9 @@ class DelayedLoop:
         self._curve, self._reaching, self.largest = self._trace(self._refine(w))
 
     def step(self, delay: float) -> DelayStep:
-        """Return a step that keeps the number of unstable poles, unless L is within `LEAST_DISTANCE` of -1.
+        """Return a step from a whole delay [s] that keeps the number of unstable poles.
 
-        Args:
-            delay: Whole delay of the loop before the step [s].
+        It is no such step if L is within `LEAST_DISTANCE` of -1.
         """
         if delay > self._longest:
             self._longest = 2 * delay

@@ -78,15 +78,8 @@ def tracking_dynamics(
         xi = F(x) = (h(x), remaining, w(x)),  xi' = DF(x) f(x, u) =: G(x, u),  A = (dG/dx) DF^-1,  B = dG/du
 
     h are the tracked outputs and w the frozen ones. A and B contain the rows and columns of (h, remaining). The
-    remaining states are the components of the state on which neither h nor w depends. The result is exact at any point:
-    where f is not zero, dG/dx contains the second derivative of F times f.
-
-    Args:
-        plant: Plant x' = f(x, u).
-        state: State of the plant; it need not be an equilibrium.
-        control: Control at this point.
-        tracked: Names of the outputs h.
-        frozen: Names of the outputs w.
+    remaining states are the components of the state on which neither h nor w depends. The result is exact at any point,
+    which need not be an equilibrium: where f is not zero, dG/dx contains the second derivative of F times f.
 
     Raises:
         ValueError: F is not a change of coordinates: its components are more or fewer than the states, or dependent. Or
@@ -105,18 +98,7 @@ def track_outputs(
     tracked: Sequence[str] = ("slip",),
     frozen: Sequence[str] = FROZEN_OUTPUTS,
 ) -> tuple[StateSpace, Bool]:
-    """Return the model of `tracking_dynamics`, and whether it is at a kink; there it is the model of one side.
-
-    Args:
-        plant: Plant x' = f(x, u).
-        state: State of the plant; it need not be an equilibrium.
-        control: Control at this point.
-        tracked: Names of the outputs h.
-        frozen: Names of the outputs w.
-
-    Raises:
-        ValueError: F is not a change of coordinates.
-    """
+    """Return the model of `tracking_dynamics`, and whether it is at a kink; there it is the model of one side."""
     plant, state, control = canonical_dtypes((plant, state, control))
     flow, x, u = as_vectors(plant, state, control)
     unravel = ravel_pytree(state)[1]
@@ -143,13 +125,8 @@ def track_outputs(
 def is_kinked(function: Callable[..., AnyArray], moves: AnyArray, x: AnyArray, u: AnyArray) -> Bool:
     """Return whether a function or its slope jumps at a point, along some moves of x or along a component of u.
 
-    In single precision the result is False: differences are too inexact.
-
-    Args:
-        function: Function of two vectors that returns a vector.
-        moves: Moves of x, shape (m, len(x)); each is as large as what it moves.
-        x: First vector of the point.
-        u: Second vector of the point.
+    In single precision the result is False: differences are too inexact. Each move of x, shape (m, len(x)), is as large
+    as what it moves.
     """
     point, unravel = ravel_pytree((x, u))
     by_u = (1 + jnp.abs(u))[:, None] * jnp.eye(len(u), dtype=point.dtype)
@@ -171,44 +148,23 @@ def is_kinked(function: Callable[..., AnyArray], moves: AnyArray, x: AnyArray, u
 
 
 def check_kink(what: str, kinked: Bool) -> None:
-    """Raise ValueError if a flag of a kink is true; accept a traced flag.
-
-    Args:
-        what: What has no linear model, for the message.
-        kinked: Result of `is_kinked`.
-    """
+    """Raise ValueError if a flag of a kink is true; accept a traced flag."""
     if not isinstance(kinked, Tracer) and kinked:
         raise ValueError(f"{what}: a slope jumps here, at a kink: no linear model")
 
 
 def nan_at_kink(found: PyTree, kinked: Bool) -> PyTree:
-    """Return a model, or NaN in its place at a kink.
-
-    Args:
-        found: Model.
-        kinked: Result of `is_kinked`.
-    """
+    """Return a model, or NaN in its place at a kink."""
     return jax.tree.map(lambda x: jnp.where(kinked, jnp.nan, x), found)
 
 
 def coordinate_moves(by_x: AnyArray, at: AnyArray) -> AnyArray:
-    """Return the moves of x, one a row, that change one coordinate by 1 plus its size and no other.
-
-    Args:
-        by_x: Derivatives of the coordinates by x, shape (n, n).
-        at: Coordinates of the point, shape (n,).
-    """
+    """Return the moves of x, one a row, that change one coordinate by 1 plus its size and no other."""
     return (jnp.linalg.inv(by_x) * (1 + jnp.abs(at))).T
 
 
 def as_vectors(plant: Plant, state: PyTree, control: Scalar) -> Matrix:
-    """Return (flow, x, u): f(x, u) as a function of two vectors, the state as vector x, and the control as vector u.
-
-    Args:
-        plant: Plant whose `derivative` is f.
-        state: State to flatten into x.
-        control: Control to flatten into u.
-    """
+    """Return (flow, x, u): f(x, u) as a function of two vectors, the state as vector x, and the control as vector u."""
     plant, state, control = canonical_dtypes((plant, state, control))
     (x, unravel), (u, unravel_control) = ravel_pytree(state), ravel_pytree(control)
 
@@ -232,13 +188,7 @@ def _check_chart(by_x: Any, outputs: Sequence[str]) -> None:
 
 
 def independent_components(plant: Plant, state: PyTree, outputs: Sequence[str]) -> np.ndarray:
-    """Return the indices in the flattened state of the components on which none of the outputs depends.
-
-    Args:
-        plant: Plant with an `output`.
-        state: State of the plant.
-        outputs: Names of outputs.
-    """
+    """Return the indices in the flattened state of the components on which none of the outputs depends."""
     used = used_leaves(plant, state, outputs)
     sizes = [np.size(leaf) for leaf in jax.tree.leaves(state)]
     return np.flatnonzero(np.repeat([not u for u in used], sizes))
@@ -249,11 +199,6 @@ def used_leaves(plant: Plant, state: PyTree, outputs: Sequence[str]) -> list[boo
 
     Dependence is read from the traced computation, not from values. A leaf counts even if its coefficient is zero, and
     the parameters may be tracers.
-
-    Args:
-        plant: Plant with an `output`.
-        state: State of the plant.
-        outputs: Names of outputs.
     """
     leaves, tree = jax.tree.flatten(state)
 

@@ -84,11 +84,9 @@ def as_float_arrays(*given: PyTree) -> tuple[PyTree, ...]:
 
 
 def relative_residual(left: jax.Array, *terms: jax.Array) -> jax.Array:
-    """Return the norm of a sum over the sum of the norms of its terms; 0 where all terms are 0. Its derivative is zero.
+    """Return the norm of the sum of the terms over the sum of their norms; 0 where all terms are 0.
 
-    Args:
-        left: Sum of the terms.
-        terms: Terms of the sum.
+    Its derivative is zero.
     """
     left, terms = lax.stop_gradient((left, terms))
     axes = (0, 1)
@@ -101,21 +99,12 @@ def relative_residual(left: jax.Array, *terms: jax.Array) -> jax.Array:
 
 
 def frobenius_norm(X: jax.Array, axes: Any = (0, 1)) -> jax.Array:
-    """Return the Frobenius norm of each matrix.
-
-    Args:
-        X: Matrices, shape (rows, columns, batch).
-        axes: Axes of rows and columns.
-    """
+    """Return the Frobenius norm of each matrix; `axes` are those of rows and columns."""
     return jnp.sqrt(jnp.sum(X * X, axes))
 
 
 def transpose(X: jax.Array) -> jax.Array:
-    """Return the transpose of each matrix.
-
-    Args:
-        X: Matrices, shape (rows, columns, batch).
-    """
+    """Return the transpose of each matrix, shape (rows, columns, batch)."""
     return jnp.swapaxes(X, 0, 1)
 
 
@@ -128,22 +117,12 @@ def times(*factors: jax.Array) -> jax.Array:
 
 
 def eye(n: int, like: jax.Array) -> jax.Array:
-    """Return an identity matrix for each matrix of `like`.
-
-    Args:
-        n: Number of rows.
-        like: Array whose last axis is the batch; it also sets the data type.
-    """
+    """Return an identity matrix (n, n, batch) for each matrix of `like`, of its data type."""
     return jnp.broadcast_to(jnp.eye(n, dtype=like.dtype)[..., None], (n, n, like.shape[-1]))
 
 
 def gauss_jordan_solve(M: jax.Array, W: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return M^-1 W and log abs det M of each matrix, by Gauss-Jordan elimination with partial pivoting.
-
-    Args:
-        M: Matrices, shape (n, n, batch).
-        W: Right sides, shape (n, columns, batch).
-    """
+    """Return M^-1 W and log abs det M for each M (n, n, batch), by elimination with partial pivoting."""
     rows = jnp.arange(len(M))[:, None]
 
     def step(k: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -163,11 +142,7 @@ def gauss_jordan_solve(M: jax.Array, W: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 def cholesky(R: jax.Array) -> jax.Array:
-    """Return the lower triangular L with L L' = R of each matrix; not finite where R is not positive definite.
-
-    Args:
-        R: Symmetric matrices, shape (n, n, batch).
-    """
+    """Return the lower triangular L (n, n, batch) with L L' = R; not finite where R is not positive definite."""
     L = jnp.zeros_like(R)
     for k in range(len(R)):
         column = R[:, k] - jnp.sum(L * L[k], 1)
@@ -177,13 +152,9 @@ def cholesky(R: jax.Array) -> jax.Array:
 
 
 def solve_stein(C: jax.Array, *right: jax.Array) -> tuple[jax.Array, ...]:
-    """Return X of C' X C - X + W = 0 for each W of `right`; NaN where C is not stable.
+    """Return X of C' X C - X + W = 0 for each W of `right`, all (n, n, batch); NaN where C is not stable.
 
     Smith's squared method: X <- X + C' X C, C <- C^2. C is not stable where its powers do not vanish.
-
-    Args:
-        C: Matrices, shape (n, n, batch).
-        right: One or more W, each of shape (n, n, batch).
     """
 
     def goes_on(carry: tuple[PyTree, ...]) -> jax.Array:

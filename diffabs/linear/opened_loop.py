@@ -113,15 +113,7 @@ def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
 
 
 def linear_controller(loop: Loop, target: Scalar = None) -> Transfer:
-    """Return the controller of `open_loop`; the parts around it may be at a kink.
-
-    Args:
-        loop: Loop with the controller.
-        target: Setpoint, as in `open_loop`.
-
-    Raises:
-        ValueError: The other cases of `open_loop`.
-    """
+    """Return the controller of `open_loop`; the parts around it may be at a kink."""
     return _open(loop, target, plant=False).controller
 
 
@@ -308,10 +300,9 @@ class _Surroundings:
 
 
 def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: Scalar) -> Matrix:
-    """Return three things of the controller, at rest with the command that holds the plant.
+    """Return the controller at rest with the command that holds the plant: (A, B, C, D), a function, and its memory.
 
-    They are (A, B, C, D) from its signal to its command, a function, and the memory at rest. The function maps (signal,
-    memory) to (rate or next memory, command).
+    The system is from its signal to its command. The function maps (signal, memory) to (rate or next memory, command).
     """
     controller, memory = loop.controller, loop.start().controller
     sampled = isinstance(controller, Sampled)
@@ -333,9 +324,7 @@ def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: S
         return jnp.append(after - c if sampled else after, output - command)
 
     def find_rest(offset: Scalar) -> Matrix:
-        """Return the memory at rest, and the size of the remaining residual. `offset` moves the target for the first
-        step.
-        """
+        """Return the memory at rest and the size of the residual; `offset` moves the target for the first step."""
         # At the setpoint itself the command may be at the edge of a limit, where its slope is zero. The first step
         # therefore uses the slopes at a nearby target.
         size = jnp.where(signal[0] == 0, 1.0, jnp.abs(signal[0]))
@@ -352,9 +341,7 @@ def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: S
 
 
 def _series(first: Transfer, second: Transfer) -> Transfer:
-    """Return minus the second system behind the first; the first has no direct path. The sign is that of negative
-    feedback.
-    """
+    """Return minus the second system behind the first (negative feedback); the first has no direct path."""
     n, m = len(first.A), len(second.A)
     a = np.block([[first.A, np.zeros((n, m))], [second.B @ first.C, second.A]])
     b = np.concatenate([first.B, np.zeros((m, np.shape(first.B)[1]))])
@@ -363,12 +350,9 @@ def _series(first: Transfer, second: Transfer) -> Transfer:
 
 
 def sample_plant(plant: Transfer, period: float, delay: float) -> Transfer:
-    """Return the plant sampled with `period`, for an input that is held and changes `delay` after each instant.
+    """Return the sampled plant for an input that is held and changes `delay`, 0 to `period`, after each instant.
 
-    Args:
-        plant: System in continuous time without a direct path.
-        period: Sampling period [s].
-        delay: Time from an instant to the change of the input [s], 0 to `period`.
+    The plant has no direct path.
     """
     n, m = np.shape(plant.B)
     (a, _, after), (whole, late, early) = hold_input(plant.A, plant.B, np.array([period, delay, period - delay]))

@@ -75,36 +75,26 @@ class OperatingPoint:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of the states; a state of the sensor, controller or actuator begins with that word, as in
-        `controller.integral`.
-        """
+        """Names of the states; those of a part begin with it, as in `controller.integral`."""
         names = _names(self.loop)
         return tuple(names[i] for i in self.kept)
 
     def matrices(self) -> StateSpace:
         """Return A (n, n) and B (n, 1), differentiable in every parameter; they compile once for each kind of loop.
 
-        Raises:
-            ValueError: A slope jumps at the setpoint, at a kink. Inside jit A and B are NaN there.
+        At a kink, where a slope jumps, this raises ValueError. Inside jit A and B are NaN there.
         """
         found, kept = _smooth_model(self), np.array(self.kept, int)
         return StateSpace(found.A[kept][:, kept], found.B[kept])
 
     def gain(self) -> AnyArray:
-        """Return K (n,) of the loop's own controller.
-
-        Raises:
-            ValueError: A slope jumps at the setpoint, at a kink. Inside jit K is NaN there.
-        """
+        """Return K (n,) of the loop's own controller; at a kink ValueError, inside jit NaN."""
         return _smooth_model(self).K[np.array(self.kept, int)]
 
 
 @default_flags()
 def operating_point(loop: Loop) -> OperatingPoint:
     """Return the linear model of a loop at rest on its setpoint, in continuous time.
-
-    Args:
-        loop: Loop to linearise.
 
     Raises:
         ValueError: A block acts at instants (sampled, delayed, a relay); or the plant does not come to rest at the
@@ -135,12 +125,7 @@ def operating_point(loop: Loop) -> OperatingPoint:
 def loop_gain(loop: Loop, states: tuple[str, ...]) -> AnyArray:
     """Return K (n,) of a loop's controller on the named states, differentiable in the loop's parameters.
 
-    Args:
-        loop: Loop with the controller.
-        states: Names of the states, as in `OperatingPoint.states`.
-
-    Raises:
-        ValueError: A slope jumps at the setpoint, at a kink. Inside jit K is NaN there.
+    At a kink this raises ValueError; inside jit K is NaN there.
     """
     names = _names(loop)
     return _smooth_model(_drop_stop(loop)).K[np.array([names.index(name) for name in states])]
@@ -227,9 +212,7 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     z = z.at[~inside].set(free[:-1])
 
     def rest_residual(memory: PyTree, z: Matrix = z) -> Matrix:
-        """Return the rates of the controller's memory, and its command minus the command that holds the plant; zero at
-        rest.
-        """
+        """Return the rates of the controller's memory, and its command minus that which holds the plant."""
         moved = z.at[inside].set(memory)
         return jnp.append(one.flow(moved, free[-1])[inside], one.command(moved) - free[-1])
 
@@ -250,14 +233,9 @@ def _smooth_model(model: OperatingPoint) -> LinearLoop:
 
 
 def find_root(function: Any, x: Scalar) -> AnyArray:
-    """Return a root of a vector function, shape (n,), by the Gauss-Newton method.
+    """Return a root (n,) of a vector function by the Gauss-Newton method, without one the least-squares minimiser.
 
-    Without a root, the result is the least-squares minimiser. The result is differentiable twice in the parameters of
-    the function.
-
-    Args:
-        function: Function of a vector that returns a vector.
-        x: Starting point, shape (n,).
+    The result is differentiable twice in the parameters of the function.
     """
 
     def step(x: Scalar, function: Any = function) -> AnyArray:

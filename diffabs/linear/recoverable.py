@@ -45,20 +45,13 @@ def recoverable_bound(A: AnyArray, B: AnyArray, start: PyTree, limit: Scalar) ->
 
 
 def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[float, float]:
-    """Return {pole: multiple} over the unstable real poles [1/s], the largest recoverable multiple of `start` for each
-    mode.
+    """Return {pole: multiple} over the unstable real poles [1/s], the largest recoverable multiple of `start` for each.
 
     Some |u| <= limit returns the mode from every smaller multiple, and none from a larger one. Each mode is taken
     alone, so no control returns the whole system from more than the least of the multiples. If only one pole is
     unstable, some control returns from every smaller multiple. A multiple is infinite where `start` does not excite the
     mode. Modes with equal poles have one entry, the least multiple of all their left eigenvectors. Complex pairs are
     left out.
-
-    Args:
-        A: State matrix, shape (n, n).
-        B: Input matrix, shape (n, 1).
-        start: Initial deviation, shape (n,).
-        limit: Largest |u|.
     """
     a, b, d = np.asarray(A, float), np.asarray(B, float).reshape(-1), np.asarray(start, float)
     poles, left = np.linalg.eig(a.T)
@@ -93,14 +86,6 @@ def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
         (I - B (c'A^(r-1)B)^-1 c'A^(r-1)) A
 
     The result is empty if u does not influence y.
-
-    Args:
-        A: State matrix, shape (n, n).
-        B: Input matrix, shape (n, 1).
-        output: Output row c', shape (n,).
-
-    Raises:
-        ValueError: An entry is not finite.
     """
     a, b, rows = np.asarray(A, float), np.asarray(B, float).reshape(-1), np.asarray(output, float).reshape(1, -1)
     if not all(np.isfinite(x).all() for x in (a, b, rows)):

@@ -104,11 +104,7 @@ def dare(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
 
 
 def symmetric_part(X: AnyArray) -> AnyArray:
-    """Return (X + X')/2: the part of a weight that counts in x'X x.
-
-    Args:
-        X: Matrix, shape (n, n).
-    """
+    """Return (X + X')/2: the part of a weight that counts in x'X x."""
     return (X + X.T) / 2
 
 

@@ -37,20 +37,13 @@ MAX_RELATIVE_RESIDUAL = 1e-9  # largest admitted relative residual in the given 
 
 @partial(jax.jit, static_argnums=0)
 def solve_one(solver: Callable, data: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
-    """Return (P, residual) of one equation, shapes (n, n) and ().
-
-    Args:
-        solver: `solve_care` or `solve_dare`.
-        data: Matrices A, B, Q, R, S of the equation.
-    """
+    """Return (P, residual) of one equation (A, B, Q, R, S), shapes (n, n) and ()."""
     P, residual = solver(*(x[None] for x in data))
     return P[0], residual[0]
 
 
 def _batch_over_matrices(solver: Callable) -> Callable:
-    """Return `solver` for arrays (batch, rows, columns): it runs in chunks of CHUNK_MATRICES, and vmap enlarges the
-    batch.
-    """
+    """Return `solver` for arrays (batch, rows, columns), in chunks of CHUNK_MATRICES; vmap enlarges the batch."""
 
     @custom_vmap
     def many(*data: jax.Array) -> Matrix:
@@ -78,12 +71,7 @@ def _batch_over_matrices(solver: Callable) -> Callable:
 def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Matrix:
     """Return (P, residual) of continuous equations, shapes (batch, n, n) and (batch,); P is NaN where it is not proven.
 
-    Args:
-        A: State matrices, shape (batch, n, n).
-        B: Input matrices, shape (batch, n, m).
-        Q: Weights of the states, shape (batch, n, n), symmetric.
-        R: Weights of the inputs, shape (batch, m, m), symmetric positive definite.
-        S: Cross weights, shape (batch, n, m).
+    R is symmetric positive definite.
     """
     B, S, a, b, q, d = _reduce_and_balance(A, B, Q, R, S)
     G = times(b, transpose(b))
@@ -101,12 +89,7 @@ def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
 def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Matrix:
     """Return (P, residual) of discrete equations, shapes (batch, n, n) and (batch,); P is NaN where it is not proven.
 
-    Args:
-        A: State matrices, shape (batch, n, n).
-        B: Input matrices, shape (batch, n, m).
-        Q: Weights of the states, shape (batch, n, n), symmetric.
-        R: Weights of the inputs, shape (batch, m, m), symmetric positive semidefinite; singular only if R + B' P B > 0.
-        S: Cross weights, shape (batch, n, m).
+    R is symmetric positive semidefinite, and singular only if R + B' P B > 0.
     """
     pivots, diagonal = (jnp.sum(x * eye(len(R), R), 1) for x in (cholesky(R), R))
     definite = jnp.all(pivots**2 > PIVOT_ROUNDING * diagonal, 0)
@@ -261,11 +244,7 @@ def _solution_from_sign(Z: jax.Array) -> jax.Array:
 
 
 def _refine_and_prove(newton: Callable, P: jax.Array, shift: Scalar = 0.0) -> jax.Array:
-    """Return P after Newton-Kleinman steps until it moves by less than 1e-7, or NaN where the last step proves no
-    solution.
-
-    Errors are relative to P + shift.
-    """
+    """Return P after Newton-Kleinman steps until it moves by less than 1e-7 of P + shift, or NaN without a proof."""
 
     def goes_on(carry: PyTree) -> jax.Array:
         return ~carry[0]
@@ -332,9 +311,7 @@ def _kleinman(A: Matrix, B: Matrix, Q: Matrix, scale: Scalar, P: Matrix, *extra:
 def _hewer(A: Matrix, B: Matrix, Q: Matrix, P: Matrix, *extra: Scalar) -> tuple[PyTree, ...]:
     """Return the size of the terms, the Newton step D, and one X for each E of `extra`, in discrete time.
 
-        Ac' D Ac - D + (left side at P) = 0,     Ac' X Ac - X + E = 0
-
-    Ac is the closed loop at P.
+    Ac' D Ac - D + (left side at P) = 0,     Ac' X Ac - X + E = 0
     """
     terms, PB = _discrete_terms(A, B, Q, jnp.zeros_like(B), P), times(P, B)
     gain = gauss_jordan_solve(eye(B.shape[1], B) + times(transpose(B), PB), times(transpose(PB), A))[0]

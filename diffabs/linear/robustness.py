@@ -109,10 +109,6 @@ def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:
 
     Coordinate i of point k is 1/2 + k/x^i modulo 1, both counted from 1. Here x is the root of x^(d+1) = x + 1
     (Roberts, 2018). In one dimension the root is the golden ratio.
-
-    Args:
-        count: Number of points.
-        dimensions: Number of dimensions d.
     """
     root = 2.0
     for _ in range(64):
@@ -122,14 +118,9 @@ def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:
 
 
 def frequencies(systems: Sequence[OpenLoop], decades: float = 1.5, count: int = 400) -> np.ndarray:
-    """Return logarithmically spaced frequencies (count,) [rad/s] for a plot of these loops, around their crossovers.
+    """Return logarithmically spaced frequencies (count,) [rad/s], `decades` beyond the crossovers of these loops.
 
     They end at half the lowest sampling rate at most. Without any crossover they surround 1 rad/s.
-
-    Args:
-        systems: Open loops.
-        decades: Decades below the lowest and above the highest crossover.
-        count: Number of frequencies.
     """
     found = [m.crossover for m in map(margins, systems) if math.isfinite(m.crossover)] or [1.0]
     low, high = min(found) * 10**-decades, max(found) * 10**decades

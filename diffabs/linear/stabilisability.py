@@ -28,11 +28,6 @@ def unstabilisable_mode(A: AnyArray, B: AnyArray, *, discrete: bool = False) -> 
     """Return an eigenvalue of A that is not stable and that the input cannot move, or None.
 
     Eigenvalues on the stability boundary, but for rounding, count as not stable.
-
-    Args:
-        A: State matrix, shape (n, n).
-        B: Input matrix, shape (n, m).
-        discrete: Whether the system is x+ = A x + B u.
     """
     a, b = np.asarray(A, float), np.asarray(B, float)
     reached = (b != 0).any(axis=1)
@@ -106,12 +101,10 @@ def _row_scales(a: np.ndarray, b: np.ndarray, rate: float) -> np.ndarray:
 
 
 def _scale_to_unit_entries(sizes: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return scales of rows (n,) and columns (k,) with which n entries, in different rows and columns, are 1 and no
-    entry is larger. None if every choice of n such entries has a zero.
+    """Return scales of rows (n,) and columns (k,) with which n entries are 1 and no entry is larger.
 
-    Args:
-        sizes: Sizes of the entries (n, k), k >= n.
-        rows: Logarithms of the row scales to begin with (n,). They only become smaller.
+    The n entries are in different rows and columns of `sizes` (n, k), k >= n. None if every such choice has a zero. The
+    logarithms of the row scales begin with `rows` (n,) and only become smaller.
     """
     from scipy.optimize import linear_sum_assignment
 

@@ -147,12 +147,7 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
 
 
 def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers:
-    """Return the frequencies at which |L| = 1, and at which L is real and negative.
-
-    Args:
-        system: Open loop with one input and one output.
-        w: Grid of frequencies [rad/s]; by default `frequency_grid(system)`.
-    """
+    """Return the frequencies [rad/s] at which |L| = 1, and at which L is real and negative, from a grid `w`."""
     w = frequency_grid(system) if w is None else w
     gain_at, falls = _roots(lambda w: np.log(np.abs(_response(system, w))), w)
     phases = np.angle(-_response(system, gain_at))
@@ -188,16 +183,7 @@ def _touch_unit_circle(system: Transfer, w: np.ndarray, found: Crossovers) -> Cr
 
 
 def is_stable(system: Transfer) -> bool:
-    """Return whether the closed loop is stable: all poles in the left half-plane, or in the unit circle if sampled.
-
-    The pure delay is included, without an approximation.
-
-    Args:
-        system: Open loop with one input and one output.
-
-    Raises:
-        ValueError: The delay is negative, or no whole number of periods if sampled.
-    """
+    """Return whether the closed loop is stable; its pure delay is included, without an approximation."""
     system = check_transfer(system)
     whole = 0 if system.period is None else system.count_periods()
     if not system.delay or 0 < whole <= MAX_SHIFTS:
@@ -225,12 +211,9 @@ def _poles_gained(system: Transfer, delays: np.ndarray) -> np.ndarray:
 
 
 def unstable_poles(system: Transfer) -> int:
-    """Return the number of unstable poles of the closed loop, those on the stability boundary included.
+    """Return the number of unstable poles of a closed loop without delay, those on the stability boundary included.
 
     If 1 + D = 0 the closed loop is not well-posed. The result is then the number of states plus 1.
-
-    Args:
-        system: Open loop with one input, one output and no delay.
     """
     if not 1 + system.D[0, 0]:
         return len(system.A) + 1
@@ -242,9 +225,6 @@ def closed_loop_poles(system: Transfer) -> np.ndarray:
     """Return the poles (order,) of the closed loop: in z if it is sampled, else in s.
 
     A delay in continuous time is left out, because it makes infinitely many poles.
-
-    Args:
-        system: Open loop with one input and one output.
     """
     system = system._replace(delay=0.0) if system.period is None else system.without_delay()
     return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))
@@ -255,9 +235,6 @@ def frequency_grid(system: Transfer) -> np.ndarray:
 
     They begin well below the slowest pole and the lowest crossover. They end well above the fastest pole and the
     highest crossover, or at half the sampling rate.
-
-    Args:
-        system: Open loop with one input and one output.
     """
     poles, closed = system.poles, closed_loop_poles(system._replace(delay=0.0))
     if system.period is not None:
@@ -356,8 +333,9 @@ def _complementary_sensitivity(values: np.ndarray) -> np.ndarray:
 
 
 def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places where a function changes its sign between neighbours of a grid, and whether it falls there.
-    Places are bisected to rounding. Zero counts as negative.
+    """Return where a function changes its sign between neighbours of a grid, and whether it falls there.
+
+    The places are bisected to rounding. Zero counts as negative.
     """
 
     def sign(w: np.ndarray) -> np.ndarray:

@@ -87,15 +87,7 @@ class Transfer(NamedTuple):
 
 
 def check_transfer(system: Transfer) -> Transfer:
-    """Return a system with its matrices as arrays if its fields fit each other.
-
-    Args:
-        system: System with any number of inputs and outputs.
-
-    Raises:
-        ValueError: A matrix is not finite or does not fit the others, the period is not positive, or the delay is
-            negative.
-    """
+    """Return a system with its matrices as arrays if its fields fit each other."""
     matrices = {name: _as_matrix(name, getattr(system, name)) for name in "ABCD"}
     n, (p, m) = len(matrices["A"]), matrices["D"].shape
     for name, shape in {"A": (n, n), "B": (n, m), "C": (p, n)}.items():

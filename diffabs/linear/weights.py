@@ -8,13 +8,7 @@ SYMMETRY_TOLERANCE = 1e-12  # difference of X[i, j] and X[j, i] that is rounding
 
 
 def is_symmetric(X: np.ndarray) -> bool:
-    """Return whether a matrix is finite, and symmetric up to rounding.
-
-    The size of an entry, for rounding, is |X[i, j]| or sqrt|X[i, i] X[j, j]|, the larger one.
-
-    Args:
-        X: Matrix, shape (n, n).
-    """
+    """Return whether a matrix is finite, and symmetric up to rounding of |X[i, j]| or sqrt|X[i, i] X[j, j]|."""
     if not np.isfinite(X).all():
         return False
     scale = np.sqrt(np.abs(np.diag(X)))
@@ -23,13 +17,7 @@ def is_symmetric(X: np.ndarray) -> bool:
 
 
 def check_symmetric(name: str, value: Scalar, size: int) -> None:
-    """Raise ValueError for a matrix that is not symmetric up to rounding, or not finite.
-
-    Args:
-        name: Name of the matrix, for messages.
-        value: Matrix, shape (size, size); another shape is refused.
-        size: Number of rows.
-    """
+    """Raise ValueError for a matrix that is not finite and symmetric up to rounding, of shape (size, size)."""
     array = np.asarray(value, float)
     if array.shape != (size, size):
         raise ValueError(f"{name} has shape {array.shape}; ({size}, {size}) is needed")
@@ -38,17 +26,10 @@ def check_symmetric(name: str, value: Scalar, size: int) -> None:
 
 
 def as_weight_matrix(name: str, value: Scalar, size: int, *, definite: bool) -> np.ndarray:
-    """Return a weight as a symmetric matrix (size, size).
+    """Return a weight, a matrix, diagonal or (for size 1) number, as a symmetric (size, size) matrix.
 
     Args:
-        name: Name of the weight, for messages.
-        value: Matrix, diagonal, or a number for size 1.
-        size: Number of rows.
         definite: Whether the matrix must be positive definite; else semidefinite.
-
-    Raises:
-        ValueError: The shape is wrong, an entry is not finite, the matrix is not symmetric, or an eigenvalue is
-            negative (zero, if `definite`).
     """
     array = np.array(value, float)
     if array.ndim < 2:

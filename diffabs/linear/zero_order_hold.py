@@ -15,14 +15,9 @@ TERMS, EXPONENTIAL_SQUARINGS = 14, 16  # terms of the Taylor series and largest 
 def discretise_held_input(system: StateSpace, period: Scalar, delay: Scalar) -> StateSpace:
     """Return the discrete system over one period, for the state (x, u_old): A (n + m, n + m), B (n + m, m).
 
-    The previous input u_old acts until `delay` d, then the new one until the period T ends.
+    The previous input u_old acts until `delay` d [s], then the new one until the period T ends, 0 <= d <= T.
 
         x(T) = e^(A T) x + e^(A (T - d)) G(d) u_old + G(T - d) u,  G(s) = integral of e^(A r) B over r in [0, s]
-
-    Args:
-        system: System in continuous time, A (n, n), B (n, m).
-        period: Sampling period T [s].
-        delay: Computing delay d [s], 0 to T.
     """
     (a, b), n, m = system, *system.B.shape
     with_input = jnp.zeros((n + m, n + m), a.dtype).at[:n, :n].set(a).at[:n, n:].set(b)
@@ -34,12 +29,7 @@ def discretise_held_input(system: StateSpace, period: Scalar, delay: Scalar) -> 
 def hold_input(a: np.ndarray, b: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return e^(A t) (k, n, n) and the response of the state to a held input, G(t) (k, n, m), in NumPy and float64.
 
-        G(t) = integral of e^(A r) B over r in [0, t]
-
-    Args:
-        a: State matrix A (n, n).
-        b: Input matrix B (n, m).
-        times: Times t (k,) [s], at least 0.
+    G(t) = integral of e^(A r) B over r in [0, t], t >= 0
     """
     (n, m), times = np.shape(b), np.asarray(times, float)
     rates = np.zeros((n + m, n + m))
@@ -56,11 +46,11 @@ def hold_input(a: np.ndarray, b: np.ndarray, times: np.ndarray) -> tuple[np.ndar
 
 
 def _exponential(a: Scalar) -> AnyArray:
-    """Return e^a by scaling and squaring of its Taylor series, to about rounding for norms up to
-    2^(EXPONENTIAL_SQUARINGS - 1).
+    """Return e^a by scaling and squaring of its Taylor series.
 
-    `jax.scipy.linalg.expm` hangs for 20,000 models of the lab rig at once (JAX 0.10.2, two cores). JAX has no known
-    issue of exactly this; github.com/jax-ml/jax/issues/20428 is similar.
+    It is exact to about rounding for norms up to 2^(EXPONENTIAL_SQUARINGS - 1). `jax.scipy.linalg.expm` hangs for
+    20,000 models of the lab rig at once (JAX 0.10.2, two cores). JAX has no known issue of exactly this;
+    github.com/jax-ml/jax/issues/20428 is similar.
     """
     # The number of halvings is piecewise constant, so its gradient is cut. A fixed number of squarings, masked by
     # `where`, has a reverse-mode derivative and works under vmap.

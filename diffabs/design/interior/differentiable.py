@@ -104,7 +104,7 @@ def _solve_central_path_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -
 
 
 def _start_from_riccati(problem: GuaranteedCostProblem, discrete: bool) -> CentralPathState:
-    """Return the path's start: the Riccati solution of the vertex with the smallest shift; NaN if one vertex has none."""
+    """Return the Riccati solution of the vertex with the smallest shift; NaN if one vertex has no solution."""
     A, B, Q, R = problem
 
     def alone(a: Scalar, b: Scalar) -> tuple[PyTree, PathPoint, PyTree]:

@@ -103,7 +103,7 @@ def _units(shape: tuple[int, int] | int) -> np.ndarray:
 
 
 def symmetric_from_blocks(rows: list[list[PyTree]]) -> np.ndarray:
-    """Return a symmetric matrix, or a stack of them, from the blocks on and below its diagonal; None stands for zero."""
+    """Return symmetric matrices from the blocks on and below the diagonal; None stands for zero."""
     stack = np.broadcast_shapes(*(np.shape(x)[:-2] for row in rows for x in row if x is not None))
     sizes = [np.shape(row[-1])[-1] for row in rows]
     ends = np.cumsum([0, *sizes])
@@ -177,7 +177,10 @@ class _Program(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def _program(unknowns: int, shapes: tuple[tuple[int, int], ...]) -> _Program:
-    """Return the parametrised program for groups of (count, size) blocks; by the rules (DPP), cvxpy compiles it once."""
+    """Return the parametrised program for groups of (count, size) blocks.
+
+    It follows the rules for disciplined parametrised programs, so cvxpy compiles it once.
+    """
     import cvxpy as cp
 
     y, cost = cp.Variable(unknowns), cp.Parameter(unknowns)
