@@ -15,11 +15,7 @@ SLACK = 1e-3  # of a bound, which the file adds: the checker has other steps, an
 def proved_ends(quantity: str) -> tuple[bool, bool]:
     """Return whether a file states a low and a high end of a quantity: the ends that the checker can prove.
 
-    Args:
-        quantity: `greatest NAME` or `least NAME` of a signal, `stop_time` or `stop_distance`.
-
-    Raises:
-        ValueError: No proof bounds such a quantity.
+    The quantities are `greatest NAME` and `least NAME` of a signal, `stop_time` and `stop_distance`.
     """
     word, _, name = quantity.partition(" ")
     if name and word in ("greatest", "least"):
@@ -55,11 +51,7 @@ def certificate_document(
 
 
 def tail_document(tail: RunTail) -> JsonObject:
-    """Return the JSON object of a tail.
-
-    Args:
-        tail: Settled states in which cells may end.
-    """
+    """Return the JSON object of a tail, the settled states in which cells may end."""
     return {**tail._asdict(), "pieces": [piece._asdict() for piece in tail.pieces]}
 
 

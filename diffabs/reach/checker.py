@@ -285,8 +285,6 @@ class _Series:
         """Make the series of one set.
 
         Args:
-            program: Operations.
-            parameters: Values of the parameters.
             states: Values of the states at the start.
             halves: Derivative of each parameter along the direction of its number; None: 0.
             tangents: Derivatives of each state along the directions.
@@ -803,9 +801,6 @@ class _Check:
 
         They balance the Jacobian of the loop without limits at the centre, for a sampled loop that of a whole period.
         They follow it slowly.
-
-        Args:
-            period: Time between two ticks [s]; not used for a continuous loop.
         """
         p, n = self.program, self.n
         tangents = [_along(i, ONE) for i in range(n)]
@@ -1316,11 +1311,9 @@ def check_cell(
     tail: RunTail | None = None,
     latest: float | None = None,
 ) -> CheckedBounds:
-    """Prove bounds of every run of a cell of parameters.
+    """Prove bounds of every run of a cell of parameters: of its end, and of the signals until the last run ends.
 
     Args:
-        equations: Equations of the loop.
-        signals: Names of the signals to bound.
         cell: Low and high end of each parameter, shape (parameters, 2), in the parameters' units; taken as exact.
         steps: Lengths of the steps in time [s], or in eta [s^2/m] for paced equations; the last one repeats. For a
             sampled loop, the number of steps between two ticks.
@@ -1328,9 +1321,6 @@ def check_cell(
         order: Order of the Taylor polynomials.
         tail: Pieces in which the proof may end; they are taken as true.
         latest: Time by which runs in the tail must stop [s]; None for the horizon.
-
-    Returns:
-        Bounds of the end of all runs, and of the signals from the start until the last run ends.
 
     Raises:
         NotProved: The checker found no proof. The bounds may hold nevertheless.

@@ -321,9 +321,7 @@ def _find_violation(
 def name_contradiction(bounds: Mapping[str, tuple[float, float]], known: Mapping[str, tuple[float, float]]) -> str:
     """Return in words the first bound that a run violates by more than the errors of runs, empty without any.
 
-    Args:
-        bounds: Bounds (low, high) of quantities.
-        known: Least and greatest value of quantities in simulated runs.
+    `known` has the least and greatest value of quantities in simulated runs.
     """
     for name, (least, greatest) in known.items():
         low, high = bounds.get(name, (-math.inf, math.inf))
@@ -334,10 +332,9 @@ def name_contradiction(bounds: Mapping[str, tuple[float, float]], known: Mapping
 
 
 def _measure_influence(prover: Prover, box: np.ndarray, point: np.ndarray, threads: int | None) -> np.ndarray:
-    """Return how much a unit of each parameter moves the slip in the runs near a point of the box.
+    """Return how much a unit of each parameter moves the slip, else state 0, in the runs near a point of the box.
 
-    Without a slip it is state 0. A cell that is not proved is halved along the side that moves it most. A wrong choice
-    costs time, and no more.
+    A cell that is not proved is halved along the side that moves it most. A wrong choice costs time, and no more.
     """
     sides = box[:, 1] - box[:, 0]
     for share in PROBE_SIZES:
@@ -409,14 +406,7 @@ def _cut_to_size(
 
 
 def check_box(over: Mapping[str, tuple[float, float]]) -> None:
-    """Check that a box has a parameter, and that the ends of each are below `LARGEST_INPUT` and in order.
-
-    Args:
-        over: Range (low, high) of each parameter of the box, by path, in SI units.
-
-    Raises:
-        ValueError: The box is empty, or the ends of a parameter, which is named, are too large or not in order.
-    """
+    """Check that a box has a parameter, and that the ends of each are below `LARGEST_INPUT` and in order."""
     if not over:
         raise ValueError("over: the box has no parameter")
     for path, (low, high) in over.items():
@@ -431,10 +421,6 @@ def comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[PyTree]) 
     """Return whether the cells are the leaves of a tree of halvings of the box.
 
     Then they cover it. A leaf is exactly its part of the box, and the parts of a halving have the whole as their union.
-
-    Args:
-        box: Ends of each parameter, shape (parameters, 2).
-        cells: Ends of each parameter, shape (cells, parameters, 2).
     """
     parts = [(list(map(list, box)), cells)]
     while parts:

@@ -82,11 +82,7 @@ class _Task(ctypes.Structure):
 
 
 def decimal_ends(value: float) -> tuple[float, float]:
-    """Return an interval that contains a double and the decimal number that its shortest text shows.
-
-    Args:
-        value: Finite number.
-    """
+    """Return an interval that contains a double and the decimal number that its shortest text shows."""
     if Fraction(repr(float(value))) == Fraction(float(value)):
         return float(value), float(value)
     return float(np.nextafter(value, -np.inf)), float(np.nextafter(value, np.inf))
@@ -94,11 +90,7 @@ def decimal_ends(value: float) -> tuple[float, float]:
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """Return the compiled prover, after a test that its compiler keeps the rounding mode.
-
-    Raises:
-        NoCompiler: No C++ compiler of this machine works, or it ignores the rounding mode.
-    """
+    """Return the compiled prover, after a test that its compiler keeps the rounding mode."""
     sources = [(PROVER_FOLDER / name).read_text() for name in ("interval.h", "set.h", "series.h", "prove.cpp")]
     text = "\n".join(re.sub(r'#include "[a-z.]*"|#pragma once', "", source) for source in sources)
     try:
@@ -116,8 +108,6 @@ def apply_operation(name: str, a: np.ndarray, b: np.ndarray | None = None) -> np
 
     Args:
         name: add, sub, mul, inv, exp, log, sin, cos, atan or power.
-        a: First operands, shape (count, 2).
-        b: Second operands, shape (count, 2); the exponents of power.
     """
     a = np.ascontiguousarray(a, float)
     b = np.ascontiguousarray(a if b is None else b, float)
@@ -187,8 +177,6 @@ class Prover:
         """Arrange the equations.
 
         Args:
-            equations: Equations of the loop.
-            signals: Names of the signals whose range is wanted.
             horizon: Duration after which a run is no longer followed [s].
             tolerance: Greatest remainder of a step, relative to the state.
             slowest: Least speed [m/s].
@@ -234,9 +222,7 @@ class Prover:
     def use_tail(self, tail: RunTail | None, latest: float | None = None) -> None:
         """End a cell once its runs are in a tail, which must be proved for all parameters of the cells.
 
-        Args:
-            tail: Proved tail, or None to follow every cell to its stop.
-            latest: Time by which runs in the tail must stop [s]; None for the horizon.
+        None follows every cell to its stop. Runs in the tail must stop by `latest` [s], by default the horizon.
         """
         if tail is None or not tail.pieces:
             self.task.pieces = 0
@@ -278,12 +264,7 @@ class Prover:
         return 6 + 4 * len(self.signals) + 3 * len(self.equations.params)
 
     def prove(self, cells: np.ndarray, threads: int | None = None) -> CellBounds:
-        """Return the bounds of cells.
-
-        Args:
-            cells: Ends of each parameter in SI units, shape (cells, parameters, 2).
-            threads: Number of threads; None for one for each core.
-        """
+        """Return the bounds of cells, whose ends have shape (cells, parameters, 2), in SI units."""
         cells, lanes = np.ascontiguousarray(cells, float), library().lanes()
         out = np.zeros((len(cells), self._width))
         groups = [slice(first, first + lanes) for first in range(0, len(cells), lanes)]
@@ -297,15 +278,7 @@ class Prover:
         )
 
     def follow(self, cell: np.ndarray, steps: int = 100_000) -> CellTube:
-        """Return the bounds of one cell at every step: a tube that all its runs stay in.
-
-        Args:
-            cell: Ends of each parameter in SI units, shape (parameters, 2).
-            steps: Greatest number of steps.
-
-        Raises:
-            ValueError: The cell is not proved, or has more steps.
-        """
+        """Return the bounds of one cell (parameters, 2) at every step: a tube that all its runs stay in."""
         n, lanes = len(self.signals), library().lanes()
         trail = np.full((steps, lanes, 2 + 2 * n), np.nan)
         out = np.zeros((1, self._width))
@@ -336,11 +309,7 @@ class Prover:
         return _run_in_threads([lambda group=group: prove_group(*group) for group in groups], threads, stop)
 
     def scout(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return speeds [m/s] (or times [s]), kept states and absolute Jacobians of the periods of one run.
-
-        Args:
-            point: Parameters of the run, shape (parameters,).
-        """
+        """Return speeds [m/s] (or times [s]), kept states and absolute Jacobians of the periods of one run."""
         n = len(self.kept)
         found = np.zeros((SCOUTED, 1 + n + n * n))
         cell = np.repeat(np.asarray(point, float)[None, :, None], 2, 2)
@@ -349,31 +318,20 @@ class Prover:
         return found[:, 0], found[:, 1 : 1 + n], np.abs(found[:, 1 + n :]).reshape(len(found), n, n)
 
     def share_weights(self, other: "Prover") -> None:
-        """Take the units of the axes from another prover of the same states.
-
-        Args:
-            other: Prover whose weights were chosen.
-        """
+        """Take the units of the axes from another prover of the same states, whose weights were chosen."""
         self.weights[:] = other.weights
         self.task.keys_low, self.task.keys_high = other.task.keys_low, other.task.keys_high
 
     def weights_at(self, speed: float) -> np.ndarray:
-        """Return the units of the axes at a speed [m/s], shape (kept states,).
-
-        Args:
-            speed: Speed.
-        """
+        """Return the units of the axes at a speed [m/s], shape (kept states,)."""
         low, high = self.task.keys_low, self.task.keys_high
         place = (np.log(max(speed, 1e-3)) - low) / max(high - low, 1e-9) * WEIGHT_TABLES
         return self.weights[int(np.clip(place, 0, WEIGHT_TABLES - 1))]
 
     def choose_weights(self, point: np.ndarray) -> None:
-        """Choose the units of Lohner's step from the Jacobians along one run.
+        """Choose the units of Lohner's step from the Jacobians along the run of one point.
 
         Without them a contracting map wraps the set and lets it grow.
-
-        Args:
-            point: Parameters of the run, shape (parameters,).
         """
         if not self.kept:
             return
@@ -446,12 +404,7 @@ def _tape_arrays(e: Equations, place: dict[int, int]) -> dict[str, np.ndarray]:
 
 
 def clockwork_states(e: Equations, states: list[int]) -> list[int]:
-    """Return the states that only such states move: they are the same in all runs.
-
-    Args:
-        e: Equations of the loop.
-        states: States among which to look.
-    """
+    """Return those of `states` that only such states move: they are the same in all runs."""
     alone = set(states)
     while True:
         read = {i: read_by(e, [e.start[i], e.flow[i], *([e.tick[i]] if e.tick else [])]) for i in alone}
@@ -462,12 +415,7 @@ def clockwork_states(e: Equations, states: list[int]) -> list[int]:
 
 
 def read_by(e: Equations, roots: Sequence[int]) -> tuple[set[int], set[int]]:
-    """Return the states and the parameters that operations read, through their operands.
-
-    Args:
-        e: Equations of the loop.
-        roots: Operations.
-    """
+    """Return the states and the parameters that operations read, through their operands."""
     states, params, left, seen = set(), set(), list(roots), set()
     while left:
         i = left.pop()
@@ -486,9 +434,6 @@ def balance_weights(matrix: np.ndarray) -> np.ndarray:
     """Return powers of two w with which diag(w) |matrix| diag(1/w) has rows and columns of equal norms.
 
     The diagonal counts for nothing. This is Osborne's balancing, row by row.
-
-    Args:
-        matrix: Square matrix.
     """
     w, a = np.ones(len(matrix)), np.abs(np.asarray(matrix, float))
     np.fill_diagonal(a, 0.0)
@@ -506,14 +451,8 @@ def balance_weights(matrix: np.ndarray) -> np.ndarray:
 def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], list[int], list[int]]:
     """Return the states that a proof needs: kept over a tick, set by a tick, and quadratures.
 
-    A quadrature is a state that nothing reads, such as the distance.
-
-    Args:
-        e: Equations of the loop.
-        signals: Names of the signals whose range is wanted.
-
-    Raises:
-        NoRule: A tick changes a state that the stop reads.
+    A quadrature is a state that nothing reads, such as the distance. There is no rule for a tick that changes a state
+    that the stop reads.
     """
     asked = read_by(e, [e.margin])[0]
     integrals = [i for i in (e.travelled, e.clock if e.paced else -1) if i >= 0]

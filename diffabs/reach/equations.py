@@ -123,11 +123,7 @@ class RealGraph(Graph):
         self._sizes: dict[int, float] = {}
 
     def has_value(self, node: Node) -> bool:
-        """Return whether a number is finite, in doubles, for all values of the inputs; False if that is unknown.
-
-        Args:
-            node: Number.
-        """
+        """Return whether a number is finite, in doubles, for all values of the inputs; False if that is unknown."""
         return self._size(node) < LARGEST_NUMBER
 
     def _size(self, node: Node) -> float:
@@ -180,11 +176,7 @@ class RealGraph(Graph):
         raise Unsupported("lt_to", "a proof has no rule for a search in a table, as of jnp.interp or jnp.searchsorted")
 
     def any(self, which: Node) -> Node:
-        """Return the condition itself: a result of a branch that no lane takes is a placeholder only in a kernel.
-
-        Args:
-            which: Condition.
-        """
+        """Return the condition itself: a result of a branch that no lane takes is a placeholder only in a kernel."""
         return which
 
 
@@ -229,14 +221,7 @@ def _simplify(graph: RealGraph, name: str, args: tuple[Node, ...]) -> Node | Non
 
 
 def tick_clock(own: float, t: Scalar, h: Scalar, k: Scalar) -> Clock:
-    """Return the clock at a tick of every block, whose number is k; a block of another period has no rule.
-
-    Args:
-        own: Period of the loop's clock [s].
-        t: Time [s].
-        h: Step of the integration grid, traced [s].
-        k: Number of the tick, traced.
-    """
+    """Return the clock at a tick of every block, whose number is k; a block of another period has no rule."""
 
     class Tick(Clock):
         def ticks(self, period: PyTree = None) -> tuple[PyTree, PyTree]:
@@ -254,10 +239,6 @@ def tick_clock(own: float, t: Scalar, h: Scalar, k: Scalar) -> Clock:
 
 def derive_equations(loop: Loop, over: Iterable[str]) -> Equations:
     """Return the equations of a loop, with the parameters at the paths `over` as variables.
-
-    Args:
-        loop: Closed loop with concrete parameters.
-        over: Paths of the parameters of the box.
 
     Raises:
         ValueError: A parameter is out of range, or an output of the plant has the name of another signal.
@@ -437,11 +418,6 @@ class _Derivation:
 
         The graph of the speeds v and w in the plant's output is differentiated here. A derivative that a part declares
         need not be that of its values.
-
-        Args:
-            own: States of the plant, in its own order.
-            rates: Their rates.
-            chart: Nodes of slip, speed and distance.
         """
         graph, made = self.graph, jax.tree.structure(self.loop.start().plant)
         inputs = [graph.input(np.float64, UpdateLevel.STEP, (OWN, i)) for i in range(len(own))]
@@ -754,11 +730,7 @@ def _is_traced(path: PyTree, leaf: np.ndarray) -> bool:
 
 
 def _tangent(graph: Graph, root: Node, tangents: dict[int, Node]) -> Node:
-    """Return the derivative of a node along the given derivatives of other nodes, by their number.
-
-    Raises:
-        NoRule: An operation has no rule.
-    """
+    """Return the derivative of a node along the given derivatives of other nodes, by their number."""
     zero, op, found = graph.const(0.0), graph.op, dict(tangents)
 
     def of(node: Node) -> Node:
@@ -818,13 +790,6 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
 
     A wrong rational function agrees at a random point with a probability of nearly 0. A function with branches, such as
     max(v, 0.01), is wrong between two thresholds. It passes only if no point lies between them.
-
-    Args:
-        loop: Closed loop of a braked wheel.
-        over: Paths of the parameters of the box.
-
-    Raises:
-        NoRule: They differ.
     """
     graph, paths = RealGraph(), [path for path in over if path.startswith("plant.")]
     inputs = [graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(3 + len(paths))]

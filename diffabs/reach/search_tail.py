@@ -80,12 +80,9 @@ def find_tail(
     There is none for a loop without slip, or without a speed at which it stops.
 
     Args:
-        prover: Prover of the loop, with weights.
-        over: Range of each parameter of the box.
         width: Greatest half width of the pieces in the slip [1].
         greatest: Bound of the slip, which limits the width too [1].
         until: Time of `time.monotonic` at which the search ends [s].
-        threads: Number of threads; None for one for each core.
     """
     e = prover.equations
     end = stop_speed(e)

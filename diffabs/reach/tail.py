@@ -68,22 +68,13 @@ class RunTail(NamedTuple):
     pieces: tuple[TailPiece, ...]
 
     def without_signals(self, count: int, signals: Iterable[str]) -> "RunTail":
-        """Return the first pieces without ranges of signals. The bounds of a run then end with its entry.
-
-        Args:
-            count: Number of pieces.
-            signals: Names of the signals.
-        """
+        """Return the first pieces without ranges of signals: the bounds of a run then end with its entry."""
         nothing = dict.fromkeys(signals, (math.inf, -math.inf))
         return self._replace(pieces=tuple(x._replace(later_signals=nothing) for x in self.pieces[:count]))
 
 
 def stop_speed(e: Equations) -> float | None:
-    """Return the speed at which the runs end [m/s], or None if the margin is not the speed minus a constant.
-
-    Args:
-        e: Equations of the loop.
-    """
+    """Return the speed at which the runs end [m/s], or None if the margin is not the speed minus a constant."""
     margin = e.operations[e.margin]
     if e.speed < 0 or margin.name != "sub" or e.operations[margin.args[0]] != RealOperation("state", (), e.speed):
         return None
@@ -92,16 +83,10 @@ def stop_speed(e: Equations) -> float | None:
 
 
 def equations_from(e: Equations, tail: RunTail, piece: TailPiece, shown: Iterable[str] = ()) -> Equations:
-    """Return the equations of all runs that start in a piece.
+    """Return the equations of all runs that start in a piece; only `states` and `middle` of the tail are read.
 
     Further parameters are the speed and, for each settled state, its place in [-1, 1] across the piece. The other
-    states start as in the loop.
-
-    Args:
-        e: Equations of the loop.
-        tail: Tail, of which only `states` and `middle` are read.
-        piece: Piece.
-        shown: Names of states that become signals too, of the same name.
+    states start as in the loop. States in `shown` become signals of the same name.
     """
     operations = list(e.operations)
 

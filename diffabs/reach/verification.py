@@ -102,14 +102,7 @@ class ProofFile(NamedTuple):
 
 
 def read_proof(document: JsonObject) -> ProofFile:
-    """Return the content of a proof's file; every number is finite, and every quantity is one that a proof bounds.
-
-    Args:
-        document: JSON document of the file, from `certificate_document`.
-
-    Raises:
-        ValueError: The document is not the file of a proof.
-    """
+    """Return the content of a proof's file; every number is finite, and every quantity is one that a proof bounds."""
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ValueError(f'not a proof\'s file: its "format" is not {FORMAT!r}')
     if document.get("verdict") != "proved":
@@ -141,15 +134,7 @@ def read_proof(document: JsonObject) -> ProofFile:
 
 
 def _read_tail(document: JsonObject, params: int) -> RunTail:
-    """Return the tail of a proof's file.
-
-    Args:
-        document: JSON document of the file.
-        params: Number of parameters of the box.
-
-    Raises:
-        ValueError: The tail is wrong.
-    """
+    """Return the tail of a proof's file, for a box of so many parameters."""
     given = document["tail"]
     if not isinstance(given, dict):
         raise ValueError(f"tail = {format_given(given)} is not a table")
@@ -199,14 +184,9 @@ def _read_entries(
     """Return each entry of a member as `read` returns it, by its key or index.
 
     Args:
-        document: JSON document of the file.
-        name: Name of the member.
         kind: Type of the member, dict or list.
         read: Function that returns the value of an entry, or raises an error if the entry is wrong.
         needed: What an entry has to be, in words.
-
-    Raises:
-        ValueError: The member is missing or of another type, or an entry is wrong.
     """
     given = document.get(name)
     if not isinstance(given, kind):
@@ -257,9 +237,7 @@ def verify_box(
     share of 1 proves the whole file.
 
     Args:
-        loop: Closed loop of the file's scenario.
         horizon: Duration of the file's scenario [s].
-        document: Content of the file, from `certificate_document`.
         share: Share of the cells to check, in (0, 1]; at least one is checked.
         suspects: Points of the box whose runs may violate a bound, shape (points, parameters), in SI units.
         known: Least and greatest value of a quantity in simulated runs. A bound that such a run violates by more than
@@ -267,11 +245,6 @@ def verify_box(
         progress: Called with a line about how far the check is.
         processes: Number of processes that check cells at the same time. Several need a main module that can be
             imported, as always with `multiprocessing`.
-
-    Raises:
-        ModuleNotFoundError: The extra `proof` is not installed.
-        NoRule: A part of the loop has no sound rule.
-        ValueError: The document is not a proof's file, or the share is outside (0, 1].
     """
     if not 0 < share <= 1:
         raise ValueError(f"share = {share:g} is outside (0, 1]")
@@ -361,10 +334,7 @@ def _choose_cells(cells: Sequence[Any], share: float, suspects: Sequence[Sequenc
 def _map_cells(
     check: Callable[[PlacedCell], str], cells: Sequence[PlacedCell], processes: int
 ) -> Iterator[tuple[PlacedCell, str]]:
-    """Yield each of the cells and the result of its check, in the given order, from at most `processes` processes.
-
-    A cell whose process ends before it answers is not proved.
-    """
+    """Yield each cell and the result of its check, in order; a cell whose process dies is not proved."""
     if min(processes, len(cells)) <= 1:
         yield from ((cell, check(cell)) for cell in cells)
         return
