@@ -237,13 +237,7 @@ class _InEvents(Delay):
 
 
 def find_wrong_capacity(capacity: Int, least: int, unit: str) -> Iterator[str]:
-    """Yield a message if the capacity of an actuator's memory is no integer, or smaller than the least one.
-
-    Args:
-        capacity: The capacity.
-        least: Least capacity.
-        unit: What it counts, in the plural.
-    """
+    """Yield a message if the capacity of an actuator's memory, in `unit` (plural), is no integer >= `least`."""
     if not isinstance(capacity, int | np.integer) or isinstance(capacity, bool):
         yield f"capacity = {format_value(capacity)} is no integer; one in [{least}, inf) {unit} is needed"
     elif capacity < least:

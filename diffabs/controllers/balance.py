@@ -25,11 +25,7 @@ DEFAULT_BALANCE_GAIN = (24208.064, 2293.1921, 7667.1, 8683.2995, 889.36867, 2860
 
 
 def state_of(output: BalanceOutput) -> PyTree:
-    """Return the state x = (theta, psi, phi, theta', psi', phi') from a plant output, shape (6,).
-
-    Args:
-        output: Output of the plant, angles in rad and rates in rad/s.
-    """
+    """Return the state x = (theta, psi, phi, theta', psi', phi') [rad, rad/s] from a plant output, shape (6,)."""
     return jnp.stack([getattr(output, name) for name in STATE_NAMES])
 
 

@@ -175,9 +175,7 @@ class Sampled:
         return Memory(held=m._replace(applied=applied, waits=waits))
 
     def _update_memory(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """Return the inner controller's memory after its tick and after the events that it can only detect at a
-        sampling instant.
-        """
+        """Return the inner controller's memory after its tick and the events that it detects only at a sample."""
         inner: Part = self.controller
         if offers(inner, "margins"):
             late = tuple(margin < 0 for margin in inner.margins(clock.t, memory, signal, _refuse_rate))
@@ -205,11 +203,7 @@ def _refuse_rate() -> PyTree:
 
 
 def replace_nan(signal: PyTree) -> PyTree:
-    """Return a signal with 0 in place of NaN, so that a memory that starts from it is finite.
-
-    Args:
-        signal: Pytree of arrays.
-    """
+    """Return a signal with 0 in place of NaN, so that a memory that starts from it is finite."""
     return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), 0.0, x), signal)
 
 
@@ -227,23 +221,12 @@ class _AlwaysWaits(Sampled):
 
 
 def inner_controller(controller: Part) -> PyTree:
-    """Return the controller inside a `Sampled`; any other controller, also `SampledOnGrid`, is returned unchanged.
-
-    Args:
-        controller: Any controller.
-    """
+    """Return the controller inside a `Sampled`; any other controller, also `SampledOnGrid`, is returned unchanged."""
     return controller.controller if isinstance(controller, Sampled) else controller
 
 
 def sampling_rules(controller: Part, delay: Scalar, period: Scalar, name: str = "controller") -> Iterator[Rule]:
-    """Yield the rule delay <= period, and the rules that the controller's own clock and its Euler steps fit the period.
-
-    Args:
-        controller: Inner controller, or None.
-        delay: Computing time [s].
-        period: Sampling period [s].
-        name: Path of the inner controller, for messages.
-    """
+    """Yield the rules that delay, the controller's own clock and its Euler steps fit the period."""
     if isinstance(controller, Cascade):
         for one in CASCADED:
             yield from sampling_rules(getattr(controller, one), delay, period, f"{name}.{one}")

@@ -126,11 +126,7 @@ class PeakVoltage(HeldValue):
 
 
 def motor_torque(sample: Sample) -> Scalar:
-    """Return the motor's torque without its friction [N m].
-
-    Args:
-        sample: Sample of a run whose plant shows a `BalanceOutput`; its control is the voltage [V].
-    """
+    """Return the motor's torque without its friction [N m]; the control is its voltage [V]."""
     y = sample.output
     return y.constant * clamp((sample.control - y.emf) / y.resistance, -y.current_max, y.current_max)
 

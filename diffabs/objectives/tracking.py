@@ -68,20 +68,14 @@ class HeldValue(FinalValue):
 
 
 def tracking_error(sample: Sample) -> Scalar:
-    """Return the first signal minus its setpoint.
-
-    Args:
-        sample: A sample of the run, or another tuple with `output` and `setpoint`.
-    """
+    """Return the first signal minus its setpoint."""
     return sample.output[0] - sample.setpoint
 
 
 def absolute_integral(cubic: Cubic, integral: Callable[[PyTree], PyTree]) -> Scalar:
-    """Return the integral of |p|, or of |p| times a positive weight, over [0, 1]. The cubic p changes its sign at most
-    once.
+    """Return the integral of |p|, or of |p| times a positive weight, over [0, 1], for p of one change of sign at most.
 
     Args:
-        cubic: The cubic p; its sign changes if p(0) and p(1) differ in sign.
         integral: Function of x that returns the integral from 0 to x of p, or of p times the weight.
     """
     whole = integral(1.0)

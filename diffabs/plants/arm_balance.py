@@ -78,24 +78,14 @@ class BalanceStart:
 
 
 def usual_parts(self: Part) -> dict[str, PyTree]:
-    """Return the default parts of a loop around a two-wheeler: feedback that holds it upright until it falls.
-
-    The keys are `initial`, `reference`, `controller`, `actuator` and `stop`.
-
-    Args:
-        self: The plant; it has no effect.
-    """
+    """Return the default parts of a loop by field: feedback that holds the vehicle upright until it falls."""
     del self
     around = {"reference": Upright(), "controller": BalanceFeedback(), "actuator": VoltageLimit(), "stop": Fallen()}
     return {"initial": BalanceStart(), **around}
 
 
 def usual_objectives(self: Part) -> dict[str, PyTree]:
-    """Return the default objectives of a two-wheeler, by name.
-
-    Args:
-        self: The plant; it has no effect.
-    """
+    """Return the default objectives of a two-wheeler, by name."""
     del self
     return dict(BALANCE)
 

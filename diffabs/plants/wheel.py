@@ -34,11 +34,6 @@ def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Scalar:
     """Return the slip (v - w)/max(v, w, crawl) [1], in [-1, 1]: positive in braking, negative in driving, 0 at rest.
 
     The slip is C1 at v = w. Below the crawl speed it goes to zero with v - w, so there is no division by zero.
-
-    Args:
-        speed: Vehicle speed v [m/s], >= 0.
-        wheel_speed: Speed of the wheel's rim w [m/s], >= 0.
-        crawl: Least denominator [m/s], > 0.
     """
     return quotient(speed - wheel_speed, larger(larger(speed, wheel_speed), crawl))
 
@@ -47,20 +42,12 @@ def halt_at_zero(speed: Scalar, rate: Scalar) -> Scalar:
     """Return the rate of a speed that cannot become negative: at standstill a negative rate becomes 0.
 
     Brake friction balances a negative rate at standstill, as dry friction does.
-
-    Args:
-        speed: Speed or angular speed.
-        rate: Its rate without the constraint.
     """
     return jnp.where(jnp.greater(speed, 0), rate, larger(rate, 0.0))
 
 
 def forward_speed(speed: Scalar) -> Scalar:
-    """Return the speed, or 0 where a step ended at standstill or beyond it.
-
-    Args:
-        speed: Speed or angular speed after a step.
-    """
+    """Return the speed, or 0 where a step ended at standstill or beyond it."""
     return jnp.where(jnp.greater(speed, STANDSTILL_SPEED), speed, 0.0)
 
 

@@ -21,9 +21,6 @@ def opposes(friction: Partial) -> Rule:
     """Return the rule that mu(s) >= 0 at 20 slips from 0.05 to 1: negative friction would accelerate the car.
 
     A violation raises nothing here: the check of the loop's rules reports it.
-
-    Args:
-        friction: Friction curve, mu as a function of slip alone.
     """
     mu = _at_slips(friction)
 
@@ -35,14 +32,7 @@ def opposes(friction: Partial) -> Rule:
 
 
 def stays_below(friction: Partial, limit: Scalar, name: str, then: str) -> Rule:
-    """Return the rule that mu(s) < limit at 20 slips from 0.05 to 1.
-
-    Args:
-        friction: Friction curve, mu as a function of slip alone.
-        limit: Upper limit of mu [1].
-        name: Name of the limit in messages.
-        then: Consequence of a violation in messages.
-    """
+    """Return the rule that mu(s) < limit at 20 slips from 0.05 to 1; `then` names the consequence in its message."""
     mu = _at_slips(friction)
 
     def says() -> str:
@@ -56,9 +46,6 @@ def find_wrong_sign(road: Part) -> str:
     """Return a line about the first slip at which friction has the opposite sign or is NaN; empty without such a slip.
 
     20 slips from 0.05 to 1, their negatives and 0 are checked, at 10 m/s and distance 0.
-
-    Args:
-        road: Road, with concrete parameters.
     """
     slips = np.concatenate([SLIPS, -SLIPS, [0.0]])
     mu = np.asarray(_along(Partial(_friction_of, road), slips.astype(jnp.result_type(float))))

@@ -109,17 +109,10 @@ class PiecewiseCubic:
 
 
 def slopes(x: Scalar, y: Scalar) -> Scalar:
-    """Return the slopes dy/dx at the knots, shape (n,): inside, the weighted harmonic mean of the two neighbouring
-    secants.
+    """Return the slopes dy/dx (n,) at n >= 3 knots: inside, the weighted harmonic mean of the two neighbouring secants.
 
-    The slope is 0 where these secants differ in sign. At both ends it is a limited three-point slope.
-
-    The result is differentiable in x and y. At a local extremum the slope stays 0, so the derivative with respect to
-    the knot's value is one-sided.
-
-    Args:
-        x: Knots, increasing, shape (n,), n >= 3.
-        y: Values at the knots, shape (n,).
+    The slope is 0 where these secants differ in sign. At both ends it is a limited three-point slope. At a local
+    extremum the slope stays 0, so the derivative with respect to the knot's value is one-sided.
     """
     h = jnp.diff(x)
     m = jnp.diff(y) / h

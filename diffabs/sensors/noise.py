@@ -142,15 +142,7 @@ def draw_noise(deviation: Scalar, key: Key, number: Scalar) -> PyTree:
     """Return deviation * z as a scalar, with z standard normal; a draw happens only if necessary.
 
     A deviation of 0 without a tangent draws nothing and returns 0. The tangent is z times the deviation's tangent, also
-    at deviation 0.
-
-    Args:
-        deviation: Standard deviation, shape ().
-        key: Random key of the run.
-        number: Number of the draw, folded into the key: equal key and number give equal z.
-
-    Raises:
-        ValueError: The run has no random key.
+    at deviation 0. The key of the run and the number of the draw, folded into it, determine z.
     """
     if key is None:
         raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
