@@ -72,7 +72,7 @@ class Graph:
     def __init__(self) -> None:
         """Create an empty graph."""
         self.nodes: list[Node] = []
-        self._known: dict[PyTree, Node] = {}
+        self._by_key: dict[PyTree, Node] = {}
         self._gates = 0
 
     def begin_equation(self, eqn: JaxprEqn) -> None:
@@ -87,21 +87,21 @@ class Graph:
         """
         dtype = np.dtype(dtype)
         key = (op, tuple(arg.id for arg in args), dtype, attr)
-        if key not in self._known:
-            most = max((UpdateLevel.UNIFORM, *(arg.level for arg in args))) if level is None else level
-            self.nodes.append(Node(len(self.nodes), op, args, dtype, attr, most))
-            self._known[key] = self.nodes[-1]
-        return self._known[key]
+        if key not in self._by_key:
+            node_level = max((UpdateLevel.UNIFORM, *(arg.level for arg in args))) if level is None else level
+            self.nodes.append(Node(len(self.nodes), op, args, dtype, attr, node_level))
+            self._by_key[key] = self.nodes[-1]
+        return self._by_key[key]
 
     def const(self, value: Scalar, dtype: DTypeLike | None = None) -> Node:
         """Return the constant `value` of type `dtype`."""
         x = np.asarray(value, dtype)[()]
         # The key has the bytes, because 0 == -0 and NaN != NaN.
         key = ("const", x.dtype, x.tobytes())
-        if key not in self._known:
+        if key not in self._by_key:
             self.nodes.append(Node(len(self.nodes), "const", (), x.dtype, x, UpdateLevel.KNOWN))
-            self._known[key] = self.nodes[-1]
-        return self._known[key]
+            self._by_key[key] = self.nodes[-1]
+        return self._by_key[key]
 
     def input(self, dtype: DTypeLike, level: UpdateLevel, place: Scalar) -> Node:
         """Return the input node of type `dtype` and level `level`; `place` (hashable) says where its value is from."""
@@ -120,66 +120,66 @@ class Graph:
         if operation.fold and all(arg.op == "const" for arg in args):
             with np.errstate(all="ignore"):
                 return self.const(operation.fold(*(arg.attr for arg in args)), dtype)
-        found = _SIMPLIFICATIONS[name](self, *args) if name in _SIMPLIFICATIONS else None
-        if found is not None:
-            return found
+        simpler = _SIMPLIFICATIONS[name](self, *args) if name in _SIMPLIFICATIONS else None
+        if simpler is not None:
+            return simpler
         # One order of operands for commutative operations, so that x + y and y + x are one node.
         if operation.symmetric and args[0].id > args[1].id:
             args = args[::-1]
         return self._make(name, args, dtype)
 
-    def select(self, which: Node, no: Node, yes: Node) -> Node:
-        """Return `yes` where `which` is true, else `no`."""
-        if which.op == "const" or no is yes:
-            return yes if no is yes or which.attr else no
-        if which.op == "not":
-            return self.select(which.args[0], yes, no)
+    def select(self, condition: Node, no: Node, yes: Node) -> Node:
+        """Return `yes` where `condition` is true, else `no`."""
+        if condition.op == "const" or no is yes:
+            return yes if no is yes or condition.attr else no
+        if condition.op == "not":
+            return self.select(condition.args[0], yes, no)
         if no.dtype == bool:
-            return self._select_boolean(which, no, yes)
+            return self._select_boolean(condition, no, yes)
         # A nested selection on the same truth has only one reachable branch.
-        yes = yes.args[2] if yes.op == "select" and yes.args[0] is which else yes
-        no = no.args[1] if no.op == "select" and no.args[0] is which else no
+        yes = yes.args[2] if yes.op == "select" and yes.args[0] is condition else yes
+        no = no.args[1] if no.op == "select" and no.args[0] is condition else no
         if no is yes:
             return yes
         # `lower` and `higher` are the processor's min and max. They return the second operand for NaN, as here.
-        if which.op == "lt" and {yes, no} == set(which.args):
-            return self._make("lower" if yes is which.args[0] else "higher", (yes, no), yes.dtype)
-        return self._make("select", (which, no, yes), yes.dtype)
+        if condition.op == "lt" and {yes, no} == set(condition.args):
+            return self._make("lower" if yes is condition.args[0] else "higher", (yes, no), yes.dtype)
+        return self._make("select", (condition, no, yes), yes.dtype)
 
-    def _select_boolean(self, which: Node, no: Node, yes: Node) -> Node:
+    def _select_boolean(self, condition: Node, no: Node, yes: Node) -> Node:
         """Return a selection between two booleans, as logical operations."""
         if yes.op == "const":
-            return self.op("or", which, no) if yes.attr else self.op("and", self.op("not", which), no)
+            return self.op("or", condition, no) if yes.attr else self.op("and", self.op("not", condition), no)
         if no.op == "const":
-            return self.op("or", self.op("not", which), yes) if no.attr else self.op("and", which, yes)
-        return self.op("or", self.op("and", which, yes), self.op("and", self.op("not", which), no))
+            return self.op("or", self.op("not", condition), yes) if no.attr else self.op("and", condition, yes)
+        return self.op("or", self.op("and", condition, yes), self.op("and", self.op("not", condition), no))
 
-    def gate(self, which: Node, no: Iterable[Node], yes: Iterable[Node]) -> list[Node]:
+    def gate(self, condition: Node, no: Iterable[Node], yes: Iterable[Node]) -> list[Node]:
         """Return the results of a conditional: nodes "gate", which a back end may compute with a jump.
 
-        `no` and `yes` are the results of the false and of the true branch, in one order. `which` is a boolean of a
+        `no` and `yes` are the results of the false and of the true branch, in one order. `condition` is a boolean of a
         lane, or the marker that `any` returns for one.
         """
         pairs = list(zip(no, yes, strict=True))
-        asked = which.args[0] if which.op == "any" else which
-        if asked.op == "const":
-            return [b if asked.attr else a for a, b in pairs]
-        gate, self._gates = Gate(self._gates, which.op == "any"), self._gates + 1
-        return [b if a is b else self._gate(gate, asked, a, b) for a, b in pairs]
+        truth = condition.args[0] if condition.op == "any" else condition
+        if truth.op == "const":
+            return [b if truth.attr else a for a, b in pairs]
+        gate, self._gates = Gate(self._gates, condition.op == "any"), self._gates + 1
+        return [b if a is b else self._gate(gate, truth, a, b) for a, b in pairs]
 
-    def _gate(self, gate: Gate, which: Node, no: Node, yes: Node) -> Node:
+    def _gate(self, gate: Gate, condition: Node, no: Node, yes: Node) -> Node:
         """Return one result of the conditional `gate`, whose condition is not constant."""
-        # A constant in the other branch is a placeholder: only lanes with a true `which` use the result.
+        # A constant in the other branch is a placeholder: only lanes with a true `condition` use the result.
         if gate.any and no.op == "const":
             return yes
-        return self._make("gate", (which, no, yes), yes.dtype, gate)
+        return self._make("gate", (condition, no, yes), yes.dtype, gate)
 
-    def any(self, which: Node) -> Node:
-        """Return a node for `which` that `gate` takes as the condition "`which` is true in some lane".
+    def any(self, condition: Node) -> Node:
+        """Return a node for `condition` that `gate` takes as the condition "`condition` is true in some lane".
 
-        Its value in a lane is `which` itself.
+        Its value in a lane is `condition` itself.
         """
-        return which if which.op in ("const", "any") else self._make("any", (which,), bool)
+        return condition if condition.op in ("const", "any") else self._make("any", (condition,), bool)
 
     def convert(self, x: Node, dtype: DTypeLike) -> Node:
         """Return the number `x` converted to `dtype`; as a boolean, x != 0."""
@@ -206,10 +206,10 @@ class Graph:
         if len(column) > 2 and all(x.level < UpdateLevel.LANE for x in column):
             return self._make("table", (index, *column), column[0].dtype)
         entries = list(column)
-        found = entries.pop()  # needs no comparison, because the index is in range
+        entry = entries.pop()  # needs no comparison, because the index is in range
         for i, x in reversed([*enumerate(entries)]):
-            found = self.select(self.op("eq", index, self.const(i, index.dtype)), found, x)
-        return found
+            entry = self.select(self.op("eq", index, self.const(i, index.dtype)), entry, x)
+        return entry
 
     def again(self, node: Node, args: list[Node]) -> Node:
         """Return the operation of `node`, which may belong to another graph, on the operands `args` of this graph."""
@@ -230,29 +230,21 @@ class Graph:
 
 
 def is_real(dtype: DTypeLike) -> bool:
-    """Return whether a type is real (floating point).
-
-    Args:
-        dtype: NumPy type.
-    """
+    """Return whether a type is real (floating point)."""
     return np.issubdtype(dtype, np.floating)
 
 
 def live_nodes(roots: Sequence[Node]) -> list[Node]:
-    """Return the roots and all nodes that they depend on, without duplicates, operands first.
-
-    Args:
-        roots: Nodes.
-    """
-    found: dict[int, Node] = {}
-    left = list(roots)
-    while left:
-        node = left.pop()
-        if node.id not in found:
-            found[node.id] = node
-            left.extend(node.args)
+    """Return the roots and all nodes that they depend on, without duplicates, operands first."""
+    nodes: dict[int, Node] = {}
+    pending = list(roots)
+    while pending:
+        node = pending.pop()
+        if node.id not in nodes:
+            nodes[node.id] = node
+            pending.extend(node.args)
     # Node ids grow from operands to results, so sorting is a topological order.
-    return [found[i] for i in sorted(found)]
+    return [nodes[i] for i in sorted(nodes)]
 
 
 # Each of these returns a simpler node for an operation, or None if the operation stays as it is.
@@ -276,9 +268,9 @@ def _mul(graph: Graph, x: Node, y: Node) -> Node | None:
             return graph.op("neg", b)
         # Two factors that are constant over the steps become one: fewer operations, with another rounding.
         if is_real(x.dtype) and a.level < UpdateLevel.STEP and b.op == "mul" and b.level == UpdateLevel.STEP:
-            for c, rest in (b.args, b.args[::-1]):
+            for c, factor in (b.args, b.args[::-1]):
                 if c.level < UpdateLevel.STEP and _is_factor(product := graph.op("mul", a, c)):
-                    return graph.op("mul", product, rest)
+                    return graph.op("mul", product, factor)
     return None
 
 
@@ -344,8 +336,8 @@ def _ne(graph: Graph, x: Node, y: Node) -> Node | None:
 
 
 def _eq(graph: Graph, x: Node, y: Node) -> Node | None:
-    found = _ne(graph, x, y)
-    return None if found is None else graph.op("not", found)
+    unequal = _ne(graph, x, y)
+    return None if unequal is None else graph.op("not", unequal)
 
 
 def _bounded_integer(value: float, dtype: np.dtype) -> int:

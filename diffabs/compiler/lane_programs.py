@@ -25,7 +25,7 @@ class LanePrograms:
     Attributes:
         functions: The traced functions of one lane.
         launch: Function (program, arrays before the carry, carry) -> carry that builds and runs a program.
-        wanted: Indices of the carry's arrays whose tangents matter at the end, None for all.
+        tangents_read: Indices of the carry's arrays whose tangents matter at the end, None for all.
         read: Indices of the carry's arrays whose values matter at the end, None for all.
     """
 
@@ -33,21 +33,11 @@ class LanePrograms:
         self,
         functions: TracedFunctions,
         launch: Callable[[ScalarProgram, list[PyTree], list[PyTree]], list[PyTree]],
-        wanted: tuple[int, ...] | None = None,
+        tangents_read: tuple[int, ...] | None = None,
         read: tuple[int, ...] | None = None,
     ):
-        """Store the functions and lower them to the program without tangents, so that an error appears at once.
-
-        Args:
-            functions: The traced functions of one lane.
-            launch: Function (program, arrays before the carry, carry) -> carry that builds and runs a program.
-            wanted: Indices of the carry's arrays whose tangents matter at the end, None for all.
-            read: Indices of the carry's arrays whose values matter at the end, None for all.
-
-        Raises:
-            Unsupported: As in `lower_functions`.
-        """
-        self.functions, self.launch, self.wanted, self.read = functions, launch, wanted, read
+        """Store the functions and lower them to the program without tangents, so that an error appears at once."""
+        self.functions, self.launch, self.tangents_read, self.read = functions, launch, tangents_read, read
         self._derivatives: dict[PyTree, PyTree] = {}
         self.derivative(None)
 
@@ -56,16 +46,13 @@ class LanePrograms:
 
         `seeds` lists as (level, index) the arrays whose initial tangents are given; all other initial tangents are 0.
         The result is kept for the next call.
-
-        Raises:
-            Unsupported: As in `lower_functions`, for the derivative.
         """
         if seeds not in self._derivatives:
-            moving = {level: tuple(i for one, i in seeds or () if one == level) for level in INPUT_LEVELS}
+            moving = {level: tuple(i for seed_level, i in seeds or () if seed_level == level) for level in INPUT_LEVELS}
             self._derivatives[seeds] = (
                 DerivativeProgram(lower_functions(self.functions), moving, moving)
                 if seeds is None
-                else differentiate_functions(self.functions, moving, self.wanted)
+                else differentiate_functions(self.functions, moving, self.tangents_read)
             )
         return self._derivatives[seeds]
 
@@ -74,17 +61,14 @@ class LanePrograms:
 
         `seeds` is as in `derivative`. `as_lanes` holds the indices of the uniform arrays that vmap has given a value
         per lane.
-
-        Raises:
-            Unsupported: As in `lower_functions`.
         """
-        one = self.derivative(seeds)
-        whole = one.program
+        derivative = self.derivative(seeds)
+        whole = derivative.program
         if seeds is not None or as_lanes:
-            whole = replicate_tangents(self.functions, one, many, as_lanes)
+            whole = replicate_tangents(self.functions, derivative, many, as_lanes)
         if self.read is None:
             return whole
-        order = arrange_arrays(self.functions, one.moved_arrays, as_lanes)[UpdateLevel.STEP]
+        order = arrange_arrays(self.functions, derivative.moved_arrays, as_lanes)[UpdateLevel.STEP]
         return keep_read(whole, [i for i, key in enumerate(order) if key.tangent or key.number in self.read])
 
     @functools.cached_property

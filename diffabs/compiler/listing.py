@@ -24,10 +24,6 @@ def list_program(program: ScalarProgram, paths: ArrayPaths) -> str:
     """Return the text of a program: its inputs, then its functions with the operations that they need, operands first.
 
     An operation that several functions need stands in the first of them.
-
-    Args:
-        program: Operations and results.
-        paths: Names of the arrays.
     """
     names = _name_nodes(program)
     lines, listed = _inputs(program, paths, names), set[int]()
@@ -44,10 +40,6 @@ def list_schedule(program: ScalarProgram, paths: ArrayPaths) -> str:
     """Return the text of the operations of level step in their order, inside the conditionals that need them.
 
     Operations of the other levels have no line, but keep their names.
-
-    Args:
-        program: Operations and results.
-        paths: Names of the arrays.
     """
     names = _name_nodes(program)
     lines = _inputs(program, paths, names)
@@ -59,11 +51,7 @@ def list_schedule(program: ScalarProgram, paths: ArrayPaths) -> str:
 
 
 def count_by_level(program: ScalarProgram) -> dict[str, int]:
-    """Return the number of operations by how often they are computed: "uniform", "lane", "step".
-
-    Args:
-        program: Operations and results.
-    """
+    """Return the number of operations by how often they are computed: "uniform", "lane", "step"."""
     nodes = live_nodes([node for results in program.results.values() for node in results])
     return {
         name: sum(node.level == level and node.op not in ("const", "input") for node in nodes)
@@ -123,7 +111,7 @@ def _block(block: ScheduleBlock, names: dict[int, str], indent: str) -> list[str
         if not isinstance(item, Branch):
             lines.append(indent[2:] + _operation(item, names))
             continue
-        lines.append(f"{indent}if {names[item.which.id]}:")
+        lines.append(f"{indent}if {names[item.condition.id]}:")
         lines += _block(item.yes, names, indent + "  ")
         if item.no.items:
             lines.append(f"{indent}else:")

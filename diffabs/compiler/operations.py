@@ -46,8 +46,8 @@ def _function(name: str, st: str | None = None, *, arity: int = 1, fold: PyTree 
 
     ... in `st` stands for the operands. Without `fold`, constants are left to the back end.
     """
-    given = ", ".join(f"{{{i}}}" for i in range(arity))
-    return Operation(fold, f"k_{name}({given})", f"{name}{{f}}({given})", st and st.replace("...", given))
+    operands = ", ".join(f"{{{i}}}" for i in range(arity))
+    return Operation(fold, f"k_{name}({operands})", f"{name}{{f}}({operands})", st and st.replace("...", operands))
 
 
 # a != a detects NaN in a. For NaN in b the comparison is false, so b is returned: the result is NaN either way.
@@ -56,9 +56,9 @@ _C_MAX, _ST_MAX = "{0} != {0} || {0} > {1} ? {0} : {1}", "SEL(({0} <> {0}) OR ({
 # The conversion of IEC 61131-3 rounds to the nearest integer, half to even.
 _ST_RINT = "LINT_TO_{real}({real}_TO_LINT({0}))"
 # Near 0 the differences of exponentials cancel: Lambert's continued fraction and the power series do not.
-_ST_TANH = "{0} / " + functools.reduce(lambda rest, k: f"({k}.0 + {{0}} * {{0}} / {rest})", range(11, 0, -2), "13.0")
+_ST_TANH = "{0} / " + functools.reduce(lambda tail, k: f"({k}.0 + {{0}} * {{0}} / {tail})", range(11, 0, -2), "13.0")
 _ST_SINH = "{0}" + functools.reduce(
-    lambda rest, k: f" * (1.0 + {{0}} * {{0}} / {k * (k + 1)}.0{rest})", range(12, 0, -2), ""
+    lambda tail, k: f" * (1.0 + {{0}} * {{0}} / {k * (k + 1)}.0{tail})", range(12, 0, -2), ""
 )
 # (e^x + e^-x)/2 and (e^x - e^-x)/2. Far from 0 the product of two roots does not overflow before its half does.
 _ST_EXPONENTIALS = {

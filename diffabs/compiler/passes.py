@@ -38,8 +38,8 @@ class LaneCall(NamedTuple):
 
     def paths(self) -> ArrayPaths:
         """Return the names of the launched program's arrays; a tangent has the name of its array after "d "."""
-        functions, one = self.lanes.functions, self.lanes.derivative(self.seeds)
-        keys = arrange_arrays(functions, one.moved_arrays, self.as_lanes)
+        functions, derivative = self.lanes.functions, self.lanes.derivative(self.seeds)
+        keys = arrange_arrays(functions, derivative.moved_arrays, self.as_lanes)
         return {level: [_path(functions, *key) for key in some] for level, some in keys.items()}
 
 
@@ -49,11 +49,7 @@ def _path(functions: TracedFunctions, level: UpdateLevel, number: int, tangent: 
 
 
 def find_lane_calls(jaxpr: Any) -> Iterator[LaneCall]:
-    """Yield the calls of `run_lanes` in a jaxpr and in the jaxprs of its equations, except branches of conditionals.
-
-    Args:
-        jaxpr: Jaxpr, closed or not.
-    """
+    """Yield the calls of `run_lanes` in a jaxpr and in the jaxprs of its equations, except branches of conditionals."""
     for eqn in getattr(jaxpr, "jaxpr", jaxpr).eqns:
         if eqn.primitive is run_lanes_primitive:
             yield LaneCall(**eqn.params)
@@ -73,28 +69,21 @@ def list_pass(call: LaneCall, name: str) -> str:
         c          its C++
 
     A call without tangents has no pass "jvp", and its pass "eliminate" only leaves out updates that nothing reads.
-
-    Args:
-        call: Call of the primitive.
-        name: Name of the pass, from `PASSES`.
-
-    Raises:
-        ValueError: The pass "jvp" of a call without tangents.
     """
     match name:
         case "trace":
-            return "".join(f"{key}:\n{one.jaxpr}\n" for key, one in call.lanes.functions.each.items())
+            return "".join(f"{key}:\n{function.jaxpr}\n" for key, function in call.lanes.functions.each.items())
         case "lower":
             return list_program(call.lanes.derivative(None).program, call.lanes.functions.names)
         case "jvp":
             if call.seeds is None:
                 raise ValueError("a program without tangents has no pass jvp")
-            one, functions = call.lanes.derivative(call.seeds), call.lanes.functions
+            derivative, functions = call.lanes.derivative(call.seeds), call.lanes.functions
             paths = {
-                level: names + [f"d {names[i]}" for i in one.differentiable[level]]
+                level: names + [f"d {names[i]}" for i in derivative.differentiable[level]]
                 for level, names in functions.names.items()
             }
-            return list_program(one.program, paths)
+            return list_program(derivative.program, paths)
         case "eliminate":
             return list_program(call.program(), call.paths())
         case "schedule":

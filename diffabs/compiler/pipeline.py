@@ -50,7 +50,7 @@ def run_lanes(
     steps: int,
     rounds: int,
     read: PyTree = None,
-    wanted: PyTree = None,
+    tangents_read: PyTree = None,
 ) -> PyTree:
     """Return the carry of n lanes after all have ended (pytree, leading axis n), with the structure of `carry`.
 
@@ -72,7 +72,7 @@ def run_lanes(
         rounds: Rounds between two calls of `running`.
         read: Pytree of booleans like `carry`: arrays whose values matter afterwards, None for all. An array that
             influences none of these, nor `running`, may be returned with its initial values.
-        wanted: Pytree of booleans like `carry`: arrays whose derivatives matter afterwards, None for all. The
+        tangents_read: Pytree of booleans like `carry`: arrays whose derivatives matter afterwards, None for all. The
             derivatives of an array that influences none of these may be returned as zero.
 
     Raises:
@@ -89,30 +89,32 @@ def run_lanes(
         jax.tree.map(_lane_type, carry),
     )
     leaves, tree = jax.tree.flatten(carry)
-    given = [unwrap_key(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
+    arguments = [unwrap_key(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
     launch = functools.partial(_launch_lanes, shape=LaunchShape(VECTORS_PER_BLOCK, steps, rounds))
 
-    def true_leaves(which: PyTree) -> tuple[int, ...] | None:
-        return None if which is None else tuple(i for i, on in enumerate(jax.tree.leaves(which)) if on)
+    def true_leaves(mask: PyTree) -> tuple[int, ...] | None:
+        return None if mask is None else tuple(i for i, on in enumerate(jax.tree.leaves(mask)) if on)
 
     # Drop the traced arrays: this object outlives the trace, and a tracer must not leak. They are arguments instead.
-    lanes = LanePrograms(functions._replace(uniform=[]), launch, true_leaves(wanted), true_leaves(read))
-    found = bind_lanes(lanes, given)
+    lanes = LanePrograms(functions._replace(uniform=[]), launch, true_leaves(tangents_read), true_leaves(read))
+    results = bind_lanes(lanes, arguments)
     return tree.unflatten(
-        [jax.random.wrap_key_data(x) if is_key(leaf) else x for x, leaf in zip(found, leaves, strict=True)]
+        [jax.random.wrap_key_data(x) if is_key(leaf) else x for x, leaf in zip(results, leaves, strict=True)]
     )
 
 
-def _launch_lanes(made: ScalarProgram, before: list[PyTree], carry: list[PyTree], shape: LaunchShape) -> list[PyTree]:
+def _launch_lanes(
+    program: ScalarProgram, before: list[PyTree], carry: list[PyTree], shape: LaunchShape
+) -> list[PyTree]:
     """Build a program and return the carry after all lanes have ended, as an operation of XLA.
 
     `before` holds the uniform arrays and then the arrays of the lanes.
     """
     first, results = len(before), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
     if gpu.find_gpu():
-        return gpu.call_kernel(made, shape, [*before, *carry], results)
+        return gpu.call_kernel(program, shape, [*before, *carry], results)
     call = jax.ffi.ffi_call(
-        cpu.build_target(made, shape),
+        cpu.build_target(program, shape),
         results,
         # The carry is updated in place, because result i shares its buffer with the argument.
         input_output_aliases={first + i: i for i in range(len(carry))},
@@ -124,9 +126,6 @@ def describe_kernel_build() -> dict[str, str]:
     """Return a dictionary with "compiler", "flags" and "processor" of the back end for JAX's default device.
 
     With a program's text, they determine a kernel's numbers to the last bit.
-
-    Raises:
-        NoCompiler: There is no compiler for the processor or GPU.
     """
     device = gpu.find_gpu()
     return device.describe() if device else toolchain.describe_compiler()
@@ -138,20 +137,12 @@ def _lane_type(x: Scalar) -> jax.ShapeDtypeStruct:
 
 
 def unwrap_key(x: Scalar) -> Scalar:
-    """Return random keys as their words (uint32, one more axis), and anything else as a JAX array.
-
-    Args:
-        x: Array or random keys.
-    """
+    """Return random keys as their words (uint32, one more axis), and anything else as a JAX array."""
     if is_key(x):
         return jax.random.key_data(x)
     return x if isinstance(x, jax.Array) else jnp.asarray(x)
 
 
 def is_key(x: Scalar) -> bool:
-    """Return whether an array holds random keys.
-
-    Args:
-        x: Array or random keys.
-    """
+    """Return whether an array holds random keys."""
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

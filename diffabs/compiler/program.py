@@ -56,9 +56,6 @@ class ScalarProgram:
 def lower_functions(functions: TracedFunctions) -> ScalarProgram:
     """Return the program of single numbers of traced functions.
 
-    Args:
-        functions: Traced functions.
-
     Raises:
         Unsupported: A function uses an operation without a lowering rule, or a type outside `LOWERED_TYPES`. There are
             too many operations, or the carry's real numbers do not share one type, float32 or float64.
@@ -76,29 +73,21 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
         sizes[level].append(out.size)
         return out
 
-    given = {level: [take_inputs(aval, level) for aval in avals] for level, avals in functions.types.items()}
+    input_nodes = {level: [take_inputs(aval, level) for aval in avals] for level, avals in functions.types.items()}
     results: dict[str, list[Node]] = {}
     for name, (jaxpr, closed, constants) in functions.each.items():
-        shared = [given[UpdateLevel.UNIFORM][i] for i in closed] + [constant_array(graph, x) for x in constants]
-        outs = lower_jaxpr(graph, jaxpr, shared, [*given[UpdateLevel.LANE], *given[UpdateLevel.STEP]])
+        shared = [input_nodes[UpdateLevel.UNIFORM][i] for i in closed] + [constant_array(graph, x) for x in constants]
+        outs = lower_jaxpr(graph, jaxpr, shared, [*input_nodes[UpdateLevel.LANE], *input_nodes[UpdateLevel.STEP]])
         results[name] = [node for array in outs for node in array.flat]
     for node in live_nodes([node for nodes in results.values() for node in nodes]):
         if node.dtype.name not in LOWERED_TYPES:
             raise Unsupported(node.op, f"on numbers of the type {node.dtype}")
-    found = ScalarProgram(inputs, results, sizes, _real_type(inputs))
-    return check_size(found, len(graph.nodes))
+    program = ScalarProgram(inputs, results, sizes, _real_type(inputs))
+    return check_size(program, len(graph.nodes))
 
 
 def check_size(program: ScalarProgram, operations: int) -> ScalarProgram:
-    """Return the program unchanged, or raise if it is too large.
-
-    Args:
-        program: Program to return.
-        operations: Number of nodes in its graph, inputs and constants included.
-
-    Raises:
-        Unsupported: `operations` is greater than MAX_OPERATIONS.
-    """
+    """Return the program unchanged, or raise Unsupported if its graph has more than MAX_OPERATIONS nodes."""
     if operations > MAX_OPERATIONS:
         raise Unsupported("step", f"of {operations} operations; {MAX_OPERATIONS} are the most")
     return program
@@ -108,26 +97,22 @@ def keep_read(program: ScalarProgram, arrays: Iterable[int]) -> ScalarProgram:
     """Return the program without updates of the carry that never influence `running` or the given arrays.
 
     The result of such an update becomes its input, so the number keeps its initial value.
-
-    Args:
-        program: Program of functions that update the carry, and `running`.
-        arrays: Indices of the carry's arrays whose values matter at the end.
     """
     updates = [nodes for name, nodes in program.results.items() if name != RUNNING_FUNCTION]
-    carried, chosen = program.carry_inputs(), set(arrays)
+    carried, final_arrays = program.carry_inputs(), set(arrays)
     number = {node.id: i for i, node in enumerate(carried)}
-    read = {number[node.id] for node in carried if node.attr.array in chosen}
-    left = [*program.results[RUNNING_FUNCTION], *(nodes[i] for nodes in updates for i in read)]
-    seen: set[int] = set()
-    while left:
-        node = left.pop()
-        if node.id not in seen:
-            seen.add(node.id)
-            left += node.args
+    read = {number[node.id] for node in carried if node.attr.array in final_arrays}
+    pending = [*program.results[RUNNING_FUNCTION], *(nodes[i] for nodes in updates for i in read)]
+    visited: set[int] = set()
+    while pending:
+        node = pending.pop()
+        if node.id not in visited:
+            visited.add(node.id)
+            pending += node.args
             # A number that some result reads is a result itself, since the next step reads it.
             if (i := number.get(node.id)) is not None and i not in read:
                 read.add(i)
-                left += [nodes[i] for nodes in updates]
+                pending += [nodes[i] for nodes in updates]
     results = {
         name: nodes if name == RUNNING_FUNCTION else [node if i in read else carried[i] for i, node in enumerate(nodes)]
         for name, nodes in program.results.items()

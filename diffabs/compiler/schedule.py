@@ -12,13 +12,13 @@ class Branch:
         gates: Nodes "gate" of the conditional's results; they lie outside of both branches.
         yes: Operations that only the true branch needs.
         no: Operations that only the false branch needs.
-        which: Boolean node of the condition.
+        condition: Boolean node.
     """
 
     def __init__(self, gates: list[Node], yes: "ScheduleBlock", no: "ScheduleBlock"):
         """Create the conditional of `gates`, which share one number, with the blocks `yes` and `no`."""
         self.gates, self.yes, self.no = gates, yes, no
-        self.which = gates[0].args[0]
+        self.condition = gates[0].args[0]
 
     @property
     def size(self) -> int:
@@ -33,7 +33,7 @@ class ScheduleBlock:
     """
 
     def __init__(self, outer: "ScheduleBlock | None" = None):
-        """Create an empty block inside the block `outer`, or an outermost block."""
+        """Create an empty block inside `outer`, or an outermost block."""
         self.outer, self.depth = outer, (outer.depth + 1 if outer else 0)
         self.items: dict[int, Node | Branch] = {}
 
@@ -57,12 +57,7 @@ class ScheduleBlock:
 
 
 def schedule_nodes(roots: Sequence[Node], level: UpdateLevel) -> ScheduleBlock:
-    """Return the operations of one level that the roots need, nested in the branches of conditionals.
-
-    Args:
-        roots: Nodes to compute.
-        level: Level of the operations.
-    """
+    """Return the operations of one level that the roots need, nested in the branches of conditionals."""
     nodes = [node for node in live_nodes(roots) if node.level == level and node.op not in ("input", "const")]
     gates: dict[int, list[Node]] = {}
     for node in nodes:
@@ -89,7 +84,7 @@ def schedule_nodes(roots: Sequence[Node], level: UpdateLevel) -> ScheduleBlock:
                 block = _common(block, used[gate.id])
             branch = Branch(group, ScheduleBlock(block), ScheduleBlock(block))
             block.items[group[0].id] = branch
-            use(branch.which, block)
+            use(branch.condition, block)
             for gate in group:
                 use(gate.args[1], branch.no)
                 use(gate.args[2], branch.yes)

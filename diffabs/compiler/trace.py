@@ -47,10 +47,7 @@ def trace_functions(
 ) -> TracedFunctions:
     """Return functions of (lane, carry) as jaxprs, with the arrays that they close over.
 
-    Args:
-        functions: Functions by name.
-        lane: Pytree with shapes and types of a lane's constants, without the axis of lanes.
-        carry: Pytree with shapes and types of a lane's carry, without the axis of lanes.
+    `lane` and `carry` have the shapes and types of one lane's arrays, without the axis of lanes.
     """
     uniform: list[PyTree] = []
     numbers: dict[int, int] = {}

@@ -158,7 +158,7 @@ class TestObjections:
         assert native.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) is None
 
     @pytest.mark.slow
-    @killed_by("compiler/runtime/toolchain.py", "if said is not None and not said.strip():", "if False:")
+    @killed_by("compiler/runtime/toolchain.py", "if configured is not None and not configured.strip():", "if False:")
     @killed_by("simulate/drive/engine.py", "    log_xla_reason(why_not)\n", "")
     @killed_by("simulate/drive/engine.py", "    _refused[structure] = why_not\n", "")
     def test_without_a_compiler(self, users_engine, monkeypatch, caplog):
@@ -249,7 +249,7 @@ class TestObjections:
         with pytest.raises(Unsupported, match="scan: its parameter ft_in is not known"):
             lower_jaxpr(Graph(), new, [], [constant_array(Graph(), 1.0)])
 
-    @killed_by("compiler/lower/rules.py", "sorted(set(eqn.params) - LOWERING_RULES[name].known)", "[]")
+    @killed_by("compiler/lower/rules.py", "sorted(set(eqn.params) - LOWERING_RULES[name].parameters)", "[]")
     def test_of_a_parameter_that_is_not_known(self):
         """A later JAX may say something with it."""
         jaxpr = jax.make_jaxpr(lambda x: jnp.exp(x))(1.0).jaxpr
@@ -398,7 +398,7 @@ class TestCarry:
         return jax.device_get((jax.jit(native)(levels, carry), jax.jit(jax.vmap(known))(levels, carry)))
 
     @pytest.mark.slow
-    @killed_by("compiler/program.py", "left += [nodes[i] for nodes in updates]", "pass")
+    @killed_by("compiler/program.py", "pending += [nodes[i] for nodes in updates]", "pass")
     @killed_by("compiler/program.py", "i in read else carried[i]", "True else carried[i]")
     def test_what_nothing_reads_stays_as_it_was(self):
         """The last number of these leads to none that is read; those before it lead to the fourth, one by one."""
@@ -516,7 +516,7 @@ class TestLibrary:
         fifth = toolchain.build_library("fifth")
         assert set(tmp_path.glob("*.so")) == {first, fourth, fifth}
 
-    @killed_by("compiler/runtime/toolchain.py", "repr((made, CPP_FLAGS, _processor()))", "repr(made)")
+    @killed_by("compiler/runtime/toolchain.py", "repr((compiler, CPP_FLAGS, _processor()))", "repr(compiler)")
     @pytest.mark.parametrize("changed", ["CPP_FLAGS", "_processor"])
     def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
         toolchain.find_compiler()

@@ -254,7 +254,7 @@ class TestDriver:
     )
     @killed_by(
         "compiler/runtime/gpu.py",
-        "min(one.blocks, -(-count // cuda.THREADS_PER_BLOCK))",
+        "min(loaded.blocks, -(-count // cuda.THREADS_PER_BLOCK))",
         "-(-count // cuda.THREADS_PER_BLOCK)",
     )
     def test_is_told_of_arrays_threads_and_lanes(self, monkeypatch, tmp_path):

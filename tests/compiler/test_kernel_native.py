@@ -237,7 +237,7 @@ def _long(x):
 
 
 @pytest.mark.slow
-@killed_by("compiler/emit/cpp.py", "and x is not branch.which and", "and")
+@killed_by("compiler/emit/cpp.py", "and x is not branch.condition\n", "\n")
 @killed_by("compiler/emit/cpp.py", "self.rare = program, shape, RareNumbers({}, {})", "_ = program, shape, 0")
 def test_a_conditional_may_ask_a_parameter_or_a_carried_truth():
     """The condition is known before a run, or the step reads it for nothing else."""

@@ -75,7 +75,7 @@ def chain(gain, rates, engine="kernel", wanted=None):
     carry = (jnp.zeros(len(rates), int), ones, ones, ones, ones)
     if engine == "kernel":
         carry = run_lanes(
-            lambda _, c: c, step, lambda _, c: c[0] < STEPS, rates, carry, steps=2, rounds=1, wanted=wanted
+            lambda _, c: c, step, lambda _, c: c[0] < STEPS, rates, carry, steps=2, rounds=1, tangents_read=wanted
         )
     else:
         for _ in range(STEPS):

@@ -821,8 +821,10 @@ def test_hyperbolic_functions_are_right_near_zero_and_up_to_their_overflow(name,
     np.testing.assert_allclose([float(block(slip=x)) for x in slips], wanted, rtol=4 * np.finfo(dtype).eps)
 
 
-@killed_by("compiler/emit/c99_words.py", 'taken |= {new, f"{new}_table"}', "taken.add(new)", case="table first")
-@killed_by("compiler/emit/c99_words.py", 'taken & {new, f"{new}_table"}', "new in taken", case="table last")
+@killed_by(
+    "compiler/emit/c99_words.py", 'used_names |= {new, f"{new}_table"}', "used_names.add(new)", case="table first"
+)
+@killed_by("compiler/emit/c99_words.py", 'used_names & {new, f"{new}_table"}', "new in used_names", case="table last")
 @killed_by(
     "export/structured_text.py", "taken & (both := {", "fresh.lower() in taken or not (both := {", case="table last"
 )

@@ -56,12 +56,8 @@ def differentiate_functions(
     """Return the program of the functions' values and one tangent direction.
 
     Args:
-        functions: Traced functions.
         seeded: Indices of the arrays whose initial tangents can be nonzero, by level.
         outputs_needed: Indices of the carry's arrays whose tangents matter at the end, None for all.
-
-    Raises:
-        Unsupported: As in `lower_functions`, for the derivative.
     """
     differentiable = seeded | {
         UpdateLevel.STEP: tuple(i for i, x in enumerate(functions.types[UpdateLevel.STEP]) if is_real(x.dtype))
@@ -83,42 +79,35 @@ def arrange_arrays(
     A uniform array that vmap has given a value per lane belongs to the level LANE, and so do its tangents.
 
     Args:
-        functions: Traced functions.
-        moved_arrays: Indices of the arrays whose tangents the program has, by level.
         per_lane_uniforms: Indices of the uniform arrays that vmap has given a value per lane.
     """
-    found: dict[UpdateLevel, list[ArrayKey]] = {level: [] for level in INPUT_LEVELS}
+    keys_by_level: dict[UpdateLevel, list[ArrayKey]] = {level: [] for level in INPUT_LEVELS}
     for tangent in (False, True):
         for level in INPUT_LEVELS:
             for i in moved_arrays[level] if tangent else range(len(functions.types[level])):
                 moved = level == UpdateLevel.UNIFORM and i in per_lane_uniforms
-                found[UpdateLevel.LANE if moved else level].append(ArrayKey(level, i, tangent))
-    return found
+                keys_by_level[UpdateLevel.LANE if moved else level].append(ArrayKey(level, i, tangent))
+    return keys_by_level
 
 
 def replicate_tangents(
-    functions: TracedFunctions, one: DerivativeProgram, many: int, per_lane_uniforms: frozenset[int] = frozenset()
+    functions: TracedFunctions,
+    derivative: DerivativeProgram,
+    many: int,
+    per_lane_uniforms: frozenset[int] = frozenset(),
 ) -> ScalarProgram:
     """Return the program with `many` tangent directions; the tangents of an array have the shape (many, ...).
 
-    `replicate_nodes` eliminates tangents, so that the program has few operations.
-
-    Args:
-        functions: Traced functions.
-        one: Program with one tangent direction, or with none.
-        many: Number of tangent directions.
-        per_lane_uniforms: Indices of the uniform arrays that vmap has given a value per lane.
-
-    Raises:
-        Unsupported: There are too many operations.
+    `replicate_nodes` eliminates tangents, so that the program has few operations. `per_lane_uniforms` is as in
+    `arrange_arrays`.
     """
-    graph, old = Graph(), one.program
+    graph, old = Graph(), derivative.program
     inputs: dict[InputPlace, Node] = {}
-    given: dict[int, list[Node]] = {}
+    input_copies: dict[int, list[Node]] = {}
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in INPUT_LEVELS}
-    for level, keys in arrange_arrays(functions, one.moved_arrays, per_lane_uniforms).items():
+    for level, keys in arrange_arrays(functions, derivative.moved_arrays, per_lane_uniforms).items():
         for array, key in enumerate(keys):
-            number = _array_index(functions, one.differentiable, key)
+            number = _array_index(functions, derivative.differentiable, key)
             size, copies = old.sizes[key.level][number], many if key.tangent else 1
             for k in range(copies):
                 for entry in range(size):
@@ -128,7 +117,7 @@ def replicate_tangents(
                     )
                     # A uniform array that is now an array of lanes changes its level here, not the functions.
                     inputs[place] = graph.input(node.dtype, level, place)
-                    given.setdefault(node.id, []).append(inputs[place])
+                    input_copies.setdefault(node.id, []).append(inputs[place])
             sizes[level].append(size * copies)
     # In each level the tangents follow the values, so their array numbers start at the number of values.
     slopes = {node.id for place, node in old.inputs.items() if place.array >= len(functions.types[place.level])}
@@ -140,13 +129,13 @@ def replicate_tangents(
             continue
         arrays = _results_by_array(old, name)
         moving = [
-            _array_index(functions, one.differentiable, ArrayKey(UpdateLevel.STEP, i, True))
-            for i in one.moved_arrays[UpdateLevel.STEP]
+            _array_index(functions, derivative.differentiable, ArrayKey(UpdateLevel.STEP, i, True))
+            for i in derivative.moved_arrays[UpdateLevel.STEP]
         ]
         values = arrays[: len(functions.types[UpdateLevel.STEP])]
         ends[name] = [(x, False) for x in values] + [(arrays[i], True) for i in moving]
     roots = [node for arrays in ends.values() for nodes, _ in arrays for node in nodes]
-    new = replicate_nodes(graph, roots, given, slopes, (many, old.dtype))
+    new = replicate_nodes(graph, roots, input_copies, slopes, (many, old.dtype))
     results = {
         name: [
             tangent_copy(new[x.id], k) for nodes, moves in arrays for k in range(many if moves else 1) for x in nodes
@@ -164,8 +153,8 @@ def _array_index(functions: TracedFunctions, differentiable: TangentArrays, key:
 
 def _results_by_array(program: ScalarProgram, name: str) -> list[list[Node]]:
     """Return the results of `renew` or `step` (`name`), grouped by array of the carry."""
-    rest = iter(program.results[name])
-    return [[next(rest) for _ in range(size)] for size in program.sizes[UpdateLevel.STEP]]
+    nodes = iter(program.results[name])
+    return [[next(nodes) for _ in range(size)] for size in program.sizes[UpdateLevel.STEP]]
 
 
 def _reached_arrays(
@@ -182,9 +171,9 @@ def _reached_arrays(
             for level in INPUT_LEVELS
             for i in moved_arrays[level]
         }
-        found = dependents(nodes, {node.id for p, node in program.inputs.items() if (p.level, p.array) in starts})
+        moving = dependents(nodes, {node.id for p, node in program.inputs.items() if (p.level, p.array) in starts})
         reached = tuple(
-            i for i, nodes in ends.items() if i in moved_arrays[UpdateLevel.STEP] or any(x.id in found for x in nodes)
+            i for i, nodes in ends.items() if i in moved_arrays[UpdateLevel.STEP] or any(x.id in moving for x in nodes)
         )
         if reached == moved_arrays[UpdateLevel.STEP]:
             return reached
@@ -195,16 +184,16 @@ def _needed_arrays(
     program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays, outputs_needed: set[int]
 ) -> set[int]:
     """Return the indices of the carry's arrays whose tangents influence one of `outputs_needed` in any later step."""
-    ends, found = _tangent_results(program, functions, differentiable), set(outputs_needed)
+    ends, needed = _tangent_results(program, functions, differentiable), set(outputs_needed)
     first = len(functions.types[UpdateLevel.STEP])
     numbers = {first + at: i for at, i in enumerate(differentiable[UpdateLevel.STEP])}
-    left = [i for i in outputs_needed if i in ends]
-    while left:
-        read = [n.attr for n in live_nodes(ends[left.pop()]) if n.op == "input" and n.attr.level == UpdateLevel.STEP]
-        new = {numbers[place.array] for place in read if place.array >= first} - found
-        found |= new
-        left += new
-    return found
+    pending = [i for i in outputs_needed if i in ends]
+    while pending:
+        read = [n.attr for n in live_nodes(ends[pending.pop()]) if n.op == "input" and n.attr.level == UpdateLevel.STEP]
+        new = {numbers[place.array] for place in read if place.array >= first} - needed
+        needed |= new
+        pending += new
+    return needed
 
 
 def _tangent_results(
@@ -228,9 +217,9 @@ def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) ->
     for name, function in functions.each.items():
         derivative = _jvp_function(functions, function, differentiable, name != RUNNING_FUNCTION)
         closed = jax.make_jaxpr(derivative)(*(x for level in INPUT_LEVELS for x in types[level]))
-        shared, rest = closed.jaxpr.invars[:uniform], closed.jaxpr.invars[uniform:]
+        shared, lane_and_carry = closed.jaxpr.invars[:uniform], closed.jaxpr.invars[uniform:]
         # The uniform inputs become constvars, as in a traced function: `lower_functions` passes them by number.
-        jaxpr = closed.jaxpr.replace(constvars=[*shared, *closed.jaxpr.constvars], invars=rest)
+        jaxpr = closed.jaxpr.replace(constvars=[*shared, *closed.jaxpr.constvars], invars=lane_and_carry)
         each[name] = TracedFunction(jaxpr, tuple(range(uniform)), tuple(closed.consts))
     return TracedFunctions(each, types, functions.uniform, functions.names)
 
@@ -248,11 +237,11 @@ def _jvp_function(
         closed = jex.ClosedJaxpr(function.jaxpr, shared)
         return jex.jaxpr_as_fun(closed)(*arrays[UpdateLevel.LANE], *arrays[UpdateLevel.STEP])
 
-    def compute(*given: PyTree) -> list[PyTree]:
-        rest, arrays, slopes = iter(given), {}, {}
+    def compute(*arguments: PyTree) -> list[PyTree]:
+        remaining, arrays, slopes = iter(arguments), {}, {}
         for level in INPUT_LEVELS:
-            arrays[level] = [next(rest) for _ in functions.types[level]]
-            slopes[level] = [next(rest) for _ in differentiable[level]]
+            arrays[level] = [next(remaining) for _ in functions.types[level]]
+            slopes[level] = [next(remaining) for _ in differentiable[level]]
         if not with_tangents:
             return evaluate(arrays)
 

@@ -33,28 +33,23 @@ class Vertex:
     """A tangent: a sum of other tangents, a selection between two sums, or a nonlinear operation.
 
     Attributes:
-        sum: The linear combination; in a selection, the one where `which` is false.
-        which: Boolean node of the factor graph that selects; None without a selection.
-        others: The sum where `which` is true.
+        sum: The linear combination; in a selection, the one where `condition` is false.
+        condition: Boolean node of the factor graph that selects; None without a selection.
+        true_sum: The sum where `condition` is true.
         reads: Ids of the tangents that a nonlinear operation reads; empty for a sum or a selection.
     """
 
-    __slots__ = ("others", "reads", "sum", "which")
+    __slots__ = ("condition", "reads", "sum", "true_sum")
 
-    def __init__(self, sum: Sum, which: Node | None = None, others: Sum | None = None, reads: tuple[int, ...] = ()):
-        """Store a tangent.
-
-        Args:
-            sum: The linear combination; in a selection, the one where `which` is false.
-            which: Boolean node that selects; None without a selection.
-            others: The sum where `which` is true.
-            reads: Ids of the tangents that a nonlinear operation reads.
-        """
-        self.sum, self.which, self.others, self.reads = sum, which, others or {}, reads
+    def __init__(
+        self, sum: Sum, condition: Node | None = None, true_sum: Sum | None = None, reads: tuple[int, ...] = ()
+    ):
+        """Store a tangent; the arguments are the attributes."""
+        self.sum, self.condition, self.true_sum, self.reads = sum, condition, true_sum or {}, reads
 
     def sums(self) -> tuple[Sum, ...]:
         """Return the sum, or both sums of a selection."""
-        return (self.sum,) if self.which is None else (self.sum, self.others)
+        return (self.sum,) if self.condition is None else (self.sum, self.true_sum)
 
 
 class Algebra:
@@ -66,23 +61,14 @@ class Algebra:
     """
 
     def __init__(self, graph: Graph, dtype: np.dtype):
-        """Store the graph, which grows with new factors.
-
-        Args:
-            graph: Graph that the factors are nodes of.
-            dtype: Type of the factors.
-        """
+        """Store the graph, which grows with new factors."""
         self.graph, self.dtype = graph, dtype
 
     def vertex(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> Vertex:
         """Return the vertex of an operation on tangents: a sum, a selection between two sums, or a nonlinear one.
 
-        A `gate` is nonlinear here, so that it stays a conditional.
-
-        Args:
-            node: Operation in the graph of one tangent.
-            moves: Function that returns True for a tangent that can be nonzero.
-            value: Function that returns the factor graph's node for any other node.
+        A `gate` is nonlinear here, so that it stays a conditional. `moves` and `value` are as in
+        `Elimination.add_operation`.
         """
         on, args = [moves(x) for x in node.args], node.args
 
@@ -113,7 +99,6 @@ class Algebra:
         return self.graph.const(1, self.dtype) if factor.number is None else factor.number
 
     def _times(self, x: Factor, y: Factor) -> Factor:
-        """Return the product of two factors."""
         negative = x.negative != y.negative
         if x.number is None or y.number is None:
             return Factor(negative, x.number or y.number)
@@ -125,43 +110,43 @@ class Algebra:
 
     def _plus(self, sum: Sum, more: Sum) -> Sum:
         """Return the sum of two sums."""
-        found = dict(sum)
+        merged = dict(sum)
         for key, new in more.items():
-            old = found.pop(key, None)
+            old = merged.pop(key, None)
             if old is None:
-                found[key] = new
+                merged[key] = new
             elif old.negative == new.negative:
-                found[key] = Factor(old.negative, self.graph.op("add", self._as_node(old), self._as_node(new)))
+                merged[key] = Factor(old.negative, self.graph.op("add", self._as_node(old), self._as_node(new)))
             # Equal terms of opposite sign cancel: the tangent leaves the sum.
             elif old.number is not new.number:
                 first, second = (new, old) if old.negative else (old, new)
-                found[key] = Factor(False, self.graph.op("sub", self._as_node(first), self._as_node(second)))
-        return found
+                merged[key] = Factor(False, self.graph.op("sub", self._as_node(first), self._as_node(second)))
+        return merged
 
     def substitute(self, sum: Sum, key: int, inner: Sum) -> Sum:
         """Return `sum` with the sum `inner` in place of the tangent `key`, times the factor of `key`."""
         factor = sum[key]
-        more = {x: self._times(factor, one) for x, one in inner.items()}
-        return self._plus({x: one for x, one in sum.items() if x != key}, more)
+        more = {x: self._times(factor, term) for x, term in inner.items()}
+        return self._plus({x: term for x, term in sum.items() if x != key}, more)
 
     def select_factors(self, vertex: Vertex) -> Sum:
         """Return the selection of `vertex` between two sums as one sum, whose factors are selections."""
-        assert vertex.which is not None
-        found = {}
-        for x in [*vertex.sum, *(x for x in vertex.others if x not in vertex.sum)]:
-            no, yes = vertex.sum.get(x), vertex.others.get(x)
+        assert vertex.condition is not None
+        factors = {}
+        for x in [*vertex.sum, *(x for x in vertex.true_sum if x not in vertex.sum)]:
+            no, yes = vertex.sum.get(x), vertex.true_sum.get(x)
             if no == yes:
-                found[x] = no
+                factors[x] = no
                 continue
             # A sign that both branches share stays outside of the selection.
-            signs = {one.negative for one in (no, yes) if one is not None}
+            signs = {side.negative for side in (no, yes) if side is not None}
             sides = []
-            for one in (no, yes):
-                number = self.graph.const(0, self.dtype) if one is None else self._as_node(one)
-                turned = one is not None and len(signs) > 1 and one.negative
+            for side in (no, yes):
+                number = self.graph.const(0, self.dtype) if side is None else self._as_node(side)
+                turned = side is not None and len(signs) > 1 and side.negative
                 sides.append(self.graph.op("neg", number) if turned else number)
-            found[x] = Factor(len(signs) == 1 and signs.pop(), self.graph.select(vertex.which, *sides))
-        return found
+            factors[x] = Factor(len(signs) == 1 and signs.pop(), self.graph.select(vertex.condition, *sides))
+        return factors
 
 
 def _as_factor(node: Node) -> Factor:
@@ -179,11 +164,7 @@ def _is_zero_tangent(node: Node) -> bool:
 
 
 def changes_in_step(factor: Factor) -> bool:
-    """Return whether a factor changes with each step.
-
-    Args:
-        factor: Factor of a tangent.
-    """
+    """Return whether a factor changes with each step."""
     return factor.number is not None and factor.number.level == UpdateLevel.STEP
 
 
@@ -191,9 +172,6 @@ def sum_cost(sum: Sum) -> int:
     """Return the number of operations that a sum needs in each tangent direction.
 
     A product and the addition of it count as one (FMA). A copy or an empty sum counts as 0.
-
-    Args:
-        sum: Sum of tangents.
     """
     alone = len(sum) == 1 and next(iter(sum.values())) == FACTOR_ONE
-    return 0 if alone or not sum else max(1, len(sum) - any(one == FACTOR_ONE for one in sum.values()))
+    return 0 if alone or not sum else max(1, len(sum) - any(factor == FACTOR_ONE for factor in sum.values()))

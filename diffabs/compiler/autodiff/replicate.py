@@ -10,31 +10,21 @@ from diffabs.compiler.ir import Graph, Node, live_nodes
 
 
 def dependents(nodes: Iterable[Node], first: set[int]) -> set[int]:
-    """Return the ids in `first`, and the ids of all nodes that depend on them.
-
-    Args:
-        nodes: Nodes, operands first.
-        first: Ids to start from.
-    """
-    found = set(first)
-    found.update(node.id for node in nodes if any(x.id in found for x in node.args))
-    return found
+    """Return the ids in `first`, and the ids of all nodes that depend on them; `nodes` come operands first."""
+    reached = set(first)
+    reached.update(node.id for node in nodes if any(x.id in reached for x in node.args))
+    return reached
 
 
 def tangent_copy(nodes: list[Node], k: int) -> Node:
-    """Return the node for tangent direction k, or the only node of a number that is the same in all directions.
-
-    Args:
-        nodes: One node, or one for each tangent direction.
-        k: Index of the direction.
-    """
+    """Return the node for tangent direction k, or the only node of a number that is the same in all directions."""
     return nodes[k if len(nodes) > 1 else 0]
 
 
 def replicate_nodes(
     graph: Graph,
     roots: list[Node],
-    given: dict[int, list[Node]],
+    inputs: dict[int, list[Node]],
     slopes: set[int],
     size: tuple[int, np.dtype],
 ) -> dict[int, list[Node]]:
@@ -44,14 +34,11 @@ def replicate_nodes(
     tangent that the elimination has removed has no entry.
 
     Args:
-        graph: Graph that receives the nodes.
-        roots: Results of the program with one tangent direction.
-        given: Inputs of the new program, by the id of the old input.
-        slopes: Ids of the old inputs that are tangents; one without an entry in `given` is zero.
-        size: Number of tangent directions, and the type of the tangents.
+        inputs: Inputs of the new program, by the id of the old input.
+        slopes: Ids of the old inputs that are tangents; one without an entry in `inputs` is zero.
     """
     nodes = live_nodes(roots)
-    moving = dependents(nodes, {i for i in slopes if i in given})
+    moving = dependents(nodes, {i for i in slopes if i in inputs})
     # A node that depends on tangents, but only on zero ones, is in `slopes` and not in `moving`: it is zero.
     slopes = dependents(nodes, slopes)
     factors = Graph()
@@ -63,8 +50,8 @@ def replicate_nodes(
         if node.id in slopes:
             values[node.id] = factors.const(0, node.dtype)
         elif node.op == "input":
-            (one,) = given[node.id]
-            values[node.id] = factors.input(one.dtype, one.level, one.attr)
+            (new_input,) = inputs[node.id]
+            values[node.id] = factors.input(new_input.dtype, new_input.level, new_input.attr)
         else:
             values[node.id] = factors.again(node, [values[x.id] for x in node.args])
     plan = Elimination(factors, *size)
@@ -72,11 +59,11 @@ def replicate_nodes(
         if node.id not in moving:
             continue
         if node.op == "input":
-            plan.add_input(node.id, given[node.id][0].level)
+            plan.add_input(node.id, inputs[node.id][0].level)
         else:
             plan.add_operation(node, lambda x: x.id in moving, lambda x: values[x.id])
     plan.reduce({node.id for node in roots if node.id in plan.vertices})
-    return _ReplicaWriter(graph, plan, values, given).write(nodes)
+    return _ReplicaWriter(graph, plan, values, inputs).write(nodes)
 
 
 class _ReplicaWriter:
@@ -90,35 +77,35 @@ class _ReplicaWriter:
         tangents: Nodes of the new graph for each direction, by the id of the old node.
     """
 
-    def __init__(self, graph: Graph, plan: Elimination, values: dict[int, Node], given: dict[int, list[Node]]):
+    def __init__(self, graph: Graph, plan: Elimination, values: dict[int, Node], inputs: dict[int, list[Node]]):
         self.graph, self.plan, self.values = graph, plan, values
         self.numbers: dict[int, Node] = {}
-        self.tangents = {i: nodes for i, nodes in given.items() if i in plan.readers}
+        self.tangents = {i: nodes for i, nodes in inputs.items() if i in plan.readers}
 
     def write(self, nodes: list[Node]) -> dict[int, list[Node]]:
         """Write the values and tangents of the old `nodes`; return their new nodes by the id of the old node."""
-        found: dict[int, list[Node]] = {}
+        new_nodes: dict[int, list[Node]] = {}
         for node in nodes:
             if node.id in self.values:
-                found[node.id] = [self._write_value(self.values[node.id])]
+                new_nodes[node.id] = [self._write_value(self.values[node.id])]
             elif node.id in self.plan.vertices:
                 self.tangents[node.id] = self._write_tangent(node, self.plan.vertices[node.id])
-        return found | self.tangents
+        return new_nodes | self.tangents
 
     def _write_value(self, node: Node) -> Node:
         """Write a node of the factor graph and its operands; return its node of the new graph."""
         # A stack instead of recursion: a chain of operations may be longer than Python's limit.
-        left = [node]
-        while left:
-            one = left[-1]
-            lacking = [x for x in one.args if x.id not in self.numbers]
-            left += lacking
+        stack = [node]
+        while stack:
+            top = stack[-1]
+            lacking = [x for x in top.args if x.id not in self.numbers]
+            stack += lacking
             if not lacking:
-                left.pop()
-                args = [self.numbers[x.id] for x in one.args]
-                same = one.op == "input"
-                self.numbers[one.id] = (
-                    self.graph.input(one.dtype, one.level, one.attr) if same else self.graph.again(one, args)
+                stack.pop()
+                args = [self.numbers[x.id] for x in top.args]
+                is_input = top.op == "input"
+                self.numbers[top.id] = (
+                    self.graph.input(top.dtype, top.level, top.attr) if is_input else self.graph.again(top, args)
                 )
         return self.numbers[node.id]
 
@@ -131,10 +118,10 @@ class _ReplicaWriter:
             ]
             return [self.graph.again(node, [tangent_copy(x, k) for x in args]) for k in range(self.plan.many)]
         sums = [self._write_sum(sum, node) for sum in vertex.sums()]
-        if vertex.which is None:
+        if vertex.condition is None:
             return sums[0]
-        which = self._write_value(vertex.which)
-        return [self.graph.select(which, *(tangent_copy(x, k) for x in sums)) for k in range(self.plan.many)]
+        condition = self._write_value(vertex.condition)
+        return [self.graph.select(condition, *(tangent_copy(x, k) for x in sums)) for k in range(self.plan.many)]
 
     def _write_sum(self, sum: Sum, node: Node) -> list[Node]:
         """Write a sum; return a node for each direction, or one constant 0.
@@ -145,16 +132,16 @@ class _ReplicaWriter:
             return [self.graph.const(0, node.dtype)]
         # The first term needs no addition. A positive one saves the negation.
         ordered = sorted(sum, key=lambda x: (sum[x].number is not None, sum[x].negative))
-        found: list[Node] = []
+        total: list[Node] = []
         for i, x in enumerate(ordered):
             factor, slopes = sum[x], self.tangents[x]
             number = None if factor.number is None else self._write_value(factor.number)
             terms = [slope if number is None else self.graph.op("mul", slope, number) for slope in slopes]
             if not i:
-                found = [self.graph.op("neg", term) for term in terms] if factor.negative else terms
+                total = [self.graph.op("neg", term) for term in terms] if factor.negative else terms
             else:
                 name = "sub" if factor.negative else "add"
-                found = [
-                    self.graph.op(name, tangent_copy(found, k), tangent_copy(terms, k)) for k in range(self.plan.many)
+                total = [
+                    self.graph.op(name, tangent_copy(total, k), tangent_copy(terms, k)) for k in range(self.plan.many)
                 ]
-        return found
+        return total

@@ -26,7 +26,7 @@ C_KEYWORDS = set(C_KEYWORDS_TEXT.split())
 # Macros of the headers that the texts include, which replace also a struct's field: NAN, EOF, INT64_MAX.
 C_MACRO = re.compile(r"[A-Z][A-Z0-9_]{2,}|L_tmpnam|math_errhandling|std(in|out|err)")
 C_FUNCTIONS = {name for row in OPERATIONS.values() for name in FUNCTION.findall(row.c99 or "")}
-TAKEN = {*C_FUNCTIONS, "s", "p", "in", "i", "m", "t", "h"}  # names that a variable must not hide
+RESERVED_NAMES = {*C_FUNCTIONS, "s", "p", "in", "i", "m", "t", "h"}  # names that a variable must not hide
 
 
 class Words:
@@ -39,25 +39,13 @@ class Words:
     """
 
     def __init__(self, real: str, place: Callable[[str, str], str], single: bool = False):
-        """Create a writer without variables.
-
-        Args:
-            real: C type of the real numbers.
-            place: Function (where, path) -> C expression of an input of the graph.
-            single: Whether real numbers have single precision.
-        """
+        """Create a writer without variables; `place` maps (where, path) to the C expression of an input."""
         self.real, self.place, self.single = real, place, single
         self._names: dict[int, str] = {}
-        self._taken = {*TAKEN, real}
+        self._used_names = {*RESERVED_NAMES, real}
 
     def operations(self, nodes: Sequence[Node], indent: str) -> Iterator[str]:
-        """Yield a C declaration for each of the `nodes`, which come operands first; every line begins with `indent`.
-
-        Constants and inputs need none.
-
-        Raises:
-            Unsupported: An operation has no translation to C.
-        """
+        """Yield a C declaration for each node, operands first; constants and inputs need none."""
         for node in nodes:
             if node.op in ("const", "input"):
                 continue
@@ -67,24 +55,22 @@ class Words:
             yield f"{indent}const {self.type(node)} {self.name(node)} = {self._expression(node)};"
 
     def type(self, node: Node) -> str:
-        """Return the C type of the number `node`."""
         return self.real if is_real(node.dtype) else C_TYPES[node.dtype.name]
 
     def name(self, node: Node) -> str:
-        """Return the C expression of `node`: a literal, a variable, or the place of an input.
+        """Return the C expression of a node: a literal, a variable, or the place of an input.
 
-        A variable has the label of its node, or the name of its operation, with a number if that name is taken.
+        A variable has the label of its node, or the name of its operation, with a number if that name is in use.
         """
         if node.op == "const":
             return self._literal(node)
         if node.op == "input":
             return self.place(*node.attr)
         if node.id not in self._names:
-            self._names[node.id] = fresh_name(identifier(node.label) or node.op, self._taken)
+            self._names[node.id] = fresh_name(identifier(node.label) or node.op, self._used_names)
         return self._names[node.id]
 
     def _literal(self, node: Node) -> str:
-        """Return the C literal of a constant."""
         x = node.attr
         if node.dtype.kind == "b":
             return "true" if x else "false"
@@ -103,7 +89,6 @@ class Words:
         return f"({text})" if np.signbit(x) else text
 
     def _expression(self, node: Node) -> str:
-        """Return the C expression of an operation. Raises Unsupported."""
         args, real = [self.name(x) for x in node.args], is_real(node.dtype)
         template = OPERATIONS[node.op].c99 if node.op in OPERATIONS else None
         match node.op:
@@ -128,56 +113,36 @@ class Words:
 
 
 def is_name(name: str) -> bool:
-    """Return whether a text can name an exported C function: an ASCII letter, then letters, digits and _; no keyword.
-
-    Args:
-        name: Text to test.
-    """
+    """Return whether a text can name an exported C function: an ASCII letter, then letters, digits, _; no keyword."""
     return bool(re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII)) and name not in C_KEYWORDS
 
 
 def identifier(path: str) -> str:
-    """Return a path as an identifier of C; empty if the path has no ASCII letter or digit.
-
-    Args:
-        path: Text such as a path in a pytree.
-    """
+    """Return a path as an identifier of C; empty if the path has no ASCII letter or digit."""
     name = re.sub(r"\W+", "_", path, flags=re.ASCII).strip("_")
     name = f"x{name}" if name[:1].isdigit() else name
     return f"{name}_" if name in C_KEYWORDS or C_MACRO.fullmatch(name) else name
 
 
 def identifiers(paths: Iterable[str]) -> dict[str, str]:
-    """Return a dictionary from each path to an identifier of C; all identifiers differ.
-
-    Args:
-        paths: Texts such as paths in a pytree.
-    """
-    taken: set[str] = set()
-    return {path: fresh_name(identifier(path) or "x", taken) for path in paths}
+    """Return a dictionary from each path to an identifier of C; all identifiers differ."""
+    used_names: set[str] = set()
+    return {path: fresh_name(identifier(path) or "x", used_names) for path in paths}
 
 
-def fresh_name(name: str, taken: set[str]) -> str:
-    """Return `name`, or `name` with a number such as name_2 if it is in `taken`, and add the result to `taken`.
+def fresh_name(name: str, used_names: set[str]) -> str:
+    """Return `name`, or `name` with a number such as name_2 if it is in use, and add the result to `used_names`.
 
     The name of its table, `name_table`, is reserved as well.
-
-    Args:
-        name: Preferred name.
-        taken: Names in use; the function adds the new names.
     """
     number, new = 2, name
-    while taken & {new, f"{new}_table"}:
+    while used_names & {new, f"{new}_table"}:
         number, new = number + 1, f"{name}_{number}"
-    taken |= {new, f"{new}_table"}
+    used_names |= {new, f"{new}_table"}
     return new
 
 
 def comment_text(text: str) -> str:
-    """Return a text that is safe in a comment of any language: one line, with `_` for each unsafe character.
-
-    Args:
-        text: Text of a comment.
-    """
+    """Return a text that is safe in a comment of any language: one line, with `_` for each unsafe character."""
     # The alphabet lacks * and the backslash: no block comment can begin or end, and no line can continue.
     return re.sub(r"[^A-Za-z0-9 .,:;=+_/()\[\]<>'^%&|-]", "_", " ".join(text.split()))

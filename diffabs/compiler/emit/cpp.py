@@ -38,20 +38,12 @@ def emit_cpp(program: ScalarProgram, shape: LaunchShape) -> str:
     """Return the C++ text of a program, complete with the loops over lanes and the entry point for XLA.
 
     It contains the functions `renew` and `step` (carry to carry) and `running` (carry to boolean).
-
-    Args:
-        program: Operations and results.
-        shape: Loop structure of the launch.
     """
     return "\n".join(Text(program, shape).parts()) + "\n"
 
 
 def operands_by_name(node: Node) -> tuple[Node, ...]:
-    """Return the operands that an expression refers to by variable name; a table's entries lie in a column instead.
-
-    Args:
-        node: Operation.
-    """
+    """Return the operands that an expression refers to by variable name; a table's entries lie in a column instead."""
     return node.args[:1] if node.op == "table" else node.args
 
 
@@ -73,11 +65,9 @@ def find_rare_numbers(block: ScheduleBlock, nodes: Sequence[Node], changed: Sequ
     """Return the numbers that only the true branch of one outermost conditional with a jump reads or changes.
 
     Args:
-        block: Operations of a function.
-        nodes: All nodes that the function needs.
         changed: Numbers of the carry that the function changes, each with its result.
     """
-    found = RareNumbers({}, {})
+    rare = RareNumbers({}, {})
     readers: dict[int, set[int]] = {node.id: set() for node in nodes}
     for node in nodes:
         for x in node.args:
@@ -92,21 +82,20 @@ def find_rare_numbers(block: ScheduleBlock, nodes: Sequence[Node], changed: Sequ
         }
         inside = {*stored, *(node.id for node in branch.yes.nodes())}
         read = {x.id: x for node in nodes if node.id in inside for x in node.args if x.op == "input"}
-        found.loaded[branch.gates[0].id] = [
+        rare.loaded[branch.gates[0].id] = [
             x
             for x in read.values()
-            if x.level == UpdateLevel.STEP and readers[x.id] <= inside and x is not branch.which and x.id not in results
+            if x.level == UpdateLevel.STEP
+            and readers[x.id] <= inside
+            and x is not branch.condition
+            and x.id not in results
         ]
-        found.stored.update(stored)
-    return found
+        rare.stored.update(stored)
+    return rare
 
 
 def branch_jumps(branch: Branch) -> bool:
-    """Return whether a conditional becomes a jump: both branches together have at least MIN_BRANCH_OPERATIONS.
-
-    Args:
-        branch: Conditional.
-    """
+    """Return whether a conditional becomes a jump: both branches together have at least MIN_BRANCH_OPERATIONS."""
     # `size` includes the gates, which execute with or without a jump.
     return branch.size >= MIN_BRANCH_OPERATIONS + len(branch.gates)
 
@@ -124,10 +113,6 @@ class Text:
         """Find the values that are computed before the steps: `shared` once a launch, `lanes` once a lane.
 
         `columns` has the name and a node of each table. The other operations are computed in every step.
-
-        Args:
-            program: Operations and results.
-            shape: Loop structure of the launch.
         """
         self.program, self.shape, self.rare = program, shape, RareNumbers({}, {})
         self.roots = [node for nodes in program.results.values() for node in nodes]
@@ -189,8 +174,8 @@ class Text:
         yield "struct Shared { " + " ".join([*shared, *tables]) + " int none; };"
         carried = [f"{vector_type(n.dtype)} c{n.id}[VECTORS];" for _, n in self._given_inputs(UpdateLevel.STEP)]
         lanes = {n.id: n for n in [*(n for _, n in self._given_inputs(UpdateLevel.LANE)), *self.lanes]}
-        own = [f"{vector_type(n.dtype)} l{n.id}[VECTORS];" for n in lanes.values() if n.op != "const"]
-        yield "struct Block { " + " ".join([*carried, *own]) + " int none; };"
+        lane_values = [f"{vector_type(n.dtype)} l{n.id}[VECTORS];" for n in lanes.values() if n.op != "const"]
+        yield "struct Block { " + " ".join([*carried, *lane_values]) + " int none; };"
 
     def _prepare(self) -> Iterator[str]:
         """Yield static void prepare(Shared&, arrays), which computes the values that all lanes share."""
@@ -199,8 +184,8 @@ class Text:
             value = f"((const {scalar_type(node.dtype)}*)uniform[{place.array}].data)[{place.entry}]"
             yield "  " + _declare_uniform(node, value)
         columns = [x for _, node in self.columns.values() for x in node.args[1:]]
-        wanted = [node for node in [*self.shared, *columns] if node.level == UpdateLevel.UNIFORM]
-        yield from self._lines(schedule_nodes(wanted, UpdateLevel.UNIFORM), ONE_VECTOR, "  ")
+        uniforms = [node for node in [*self.shared, *columns] if node.level == UpdateLevel.UNIFORM]
+        yield from self._lines(schedule_nodes(uniforms, UpdateLevel.UNIFORM), ONE_VECTOR, "  ")
         for node in self.shared:
             yield f"  s.v{node.id} = first(v{node.id});"
         for _, node in self.columns.values():
@@ -246,14 +231,14 @@ class Text:
         nodes, block = live_nodes(roots), schedule_nodes(roots, UpdateLevel.STEP)
         self.rare = find_rare_numbers(block, nodes, changed)
         loaded_later = {node.id for numbers in self.rare.loaded.values() for node in numbers}
-        own = {node.id for node in nodes}
+        needed = {node.id for node in nodes}
         steps = [node for node in nodes if node.level == UpdateLevel.STEP]
         yield from self._load_uniforms([*steps, *roots])
         read = [*roots, *(x for node in steps for x in operands_by_name(node))]
         lanes = {x.id: x for x in read if x.level == UpdateLevel.LANE}
         for q in range(self.shape.vectors):
             for node in self.program.carry_inputs():
-                if node.id in own - loaded_later:
+                if node.id in needed - loaded_later:
                     yield self._load(node, q, "  ")
             for node in lanes.values():
                 yield f"  const {vector_type(node.dtype)} v{node.id}_{q} = b.l{node.id}[{q}];"
@@ -324,7 +309,7 @@ class Text:
             names = ", ".join(f"{self._name(gate, q)} = {self._name(gate.args[1], q)}" for q in vectors)
             yield f"{indent}{vector_type(gate.dtype)} {names};"
         for q in vectors:
-            yield f"{indent}if (any({self._name(branch.which, q)})) {{"
+            yield f"{indent}if (any({self._name(branch.condition, q)})) {{"
             for node in self.rare.loaded.get(branch.gates[0].id, ()):
                 yield self._load(node, q, indent + "  ")
             yield from self._lines(branch.yes, range(q, q + 1), indent + "  ")
@@ -335,12 +320,12 @@ class Text:
         """Yield the selections of a conditional's results; `declared` says that their variables exist."""
         for gate in branch.gates:
             for q in vectors:
-                which, no, yes = (self._name(x, q) for x in gate.args)
+                condition, no, yes = (self._name(x, q) for x in gate.args)
                 if gate.id in self.rare.stored:
-                    left = f"b.c{self.rare.stored[gate.id].id}[{q}]"
+                    target = f"b.c{self.rare.stored[gate.id].id}[{q}]"
                 else:
-                    left = self._name(gate, q) if declared else f"{vector_type(gate.dtype)} {self._name(gate, q)}"
-                yield f"{indent}{left} = sel({which}, {yes}, {no});"
+                    target = self._name(gate, q) if declared else f"{vector_type(gate.dtype)} {self._name(gate, q)}"
+                yield f"{indent}{target} = sel({condition}, {yes}, {no});"
 
     def _name(self, node: Node, q: int) -> str:
         """Return the C++ variable of a node for vector q, or the literal of a constant."""

@@ -10,29 +10,17 @@ CPP_TYPES = {
 
 
 def scalar_type(dtype: np.dtype) -> str:
-    """Return the C++ type of one number, such as f64; a boolean is a byte, u8.
-
-    Args:
-        dtype: NumPy type.
-    """
+    """Return the C++ type of one number, such as f64; a boolean is a byte, u8."""
     return "u8" if dtype.kind == "b" else CPP_TYPES[dtype.name]
 
 
 def vector_type(dtype: np.dtype) -> str:
-    """Return the C++ type of a vector with one number for each lane, such as vf64; for booleans, mask.
-
-    Args:
-        dtype: NumPy type.
-    """
+    """Return the C++ type of a vector with one number for each lane, such as vf64; for booleans, mask."""
     return "mask" if dtype.kind == "b" else "v" + CPP_TYPES[dtype.name]
 
 
 def literal(node: Node) -> str:
-    """Return the C++ expression of a vector with a constant in every lane.
-
-    Args:
-        node: Constant.
-    """
+    """Return the C++ expression of a vector with a constant in every lane."""
     x = node.attr
     if node.dtype == bool:
         return f"all({'true' if x else 'false'})"

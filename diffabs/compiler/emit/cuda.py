@@ -29,16 +29,13 @@ class CudaSource(NamedTuple):
 def emit_cuda(program: ScalarProgram, shape: LaunchShape) -> CudaSource:
     """Return the CUDA C++ of a program, with the kernels to launch, and their need of memory.
 
-    The text contains the functions `renew` and `step` (carry to carry) and `running` (carry to boolean).
-
-    Args:
-        program: Operations and results.
-        shape: Loop structure of the launch; a thread has one lane at a time, so `vectors` has no effect.
+    It contains the functions `renew` and `step` (carry to carry) and `running` (carry to boolean). A thread has one
+    lane at a time, so `shape.vectors` has no effect.
     """
-    made = _Text(program, shape._replace(vectors=1))
-    columns = sum(len(node.args) for _, node in made.columns.values())
+    writer = _Text(program, shape._replace(vectors=1))
+    columns = sum(len(node.args) for _, node in writer.columns.values())
     # The device struct `Shared` holds at most 8 bytes for each entry, and one pad.
-    return CudaSource("\n".join(made.parts()) + "\n", COUNTER + 8 * (len(made.shared) + columns + 1))
+    return CudaSource("\n".join(writer.parts()) + "\n", COUNTER + 8 * (len(writer.shared) + columns + 1))
 
 
 class _Text(Text):

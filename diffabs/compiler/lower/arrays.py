@@ -159,14 +159,14 @@ def _first_extreme(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]
 
 @lowering_rule("dot_general", "dimension_numbers precision preferred_element_type out_sharding")
 def _dot(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
-    (left, right), batch = eqn.params["dimension_numbers"]
+    (left_axes, right_axes), batch = eqn.params["dimension_numbers"]
     if any(batch):
         raise Unsupported("dot_general", "of stacked arrays")
     if len({x.aval.dtype for x in (*eqn.invars, *eqn.outvars)}) > 1 or not ins[0].size:
         raise Unsupported("dot_general", "of nothing, or of two types")
-    count = math.prod(ins[0].shape[i] for i in left)
-    a = np.moveaxis(ins[0], left, range(len(left))).reshape(count, -1)
-    b = np.moveaxis(ins[1], right, range(len(right))).reshape(count, -1)
+    count = math.prod(ins[0].shape[i] for i in left_axes)
+    a = np.moveaxis(ins[0], left_axes, range(len(left_axes))).reshape(count, -1)
+    b = np.moveaxis(ins[1], right_axes, range(len(right_axes))).reshape(count, -1)
     out: Any = np.empty((a.shape[1], b.shape[1]), object)
     # Sequential sum: every product can fuse with its addition (FMA). A sum by pairs allows that at its leaves only.
     for i, j in np.ndindex(out.shape):

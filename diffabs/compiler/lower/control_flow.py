@@ -45,31 +45,31 @@ def _custom_vmap_any(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Arra
 
 def _is_any_rule(eqn: Equation) -> bool:
     """Return whether a custom rule for vmap computes `any` over the batch, by a test on three batches of two values."""
-    told = jex.DebugInfo("kernel", "any", None, None)
-    body = jex.Jaxpr((), list(eqn.invars), list(eqn.outvars), [eqn], eqn.effects, told)
-    found = jax.vmap(lambda x: jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))(x)[0])
+    debug_info = jex.DebugInfo("kernel", "any", None, None)
+    body = jex.Jaxpr((), list(eqn.invars), list(eqn.outvars), [eqn], eqn.effects, debug_info)
+    batched = jax.vmap(lambda x: jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))(x)[0])
     # The lowering may itself run under a trace. The test needs numbers.
     with jax.ensure_compile_time_eval():
-        return all(bool(found(np.array(x)).all()) == any(x) for x in ([False, False], [False, True], [True, True]))
+        return all(bool(batched(np.array(x)).all()) == any(x) for x in ([False, False], [False, True], [True, True]))
 
 
 @lowering_rule("cond", "branches")
 def _cond(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
-    which, rest, branches = ins[0].item(), ins[1:], eqn.params["branches"]
-    if which.op == "const":
+    index, operands, branches = ins[0].item(), ins[1:], eqn.params["branches"]
+    if index.op == "const":
         # XLA clamps an index that is out of range.
-        return inline_program(graph, branches[int(np.clip(which.attr, 0, len(branches) - 1))], rest)
+        return inline_program(graph, branches[int(np.clip(index.attr, 0, len(branches) - 1))], operands)
     # A chain of conditionals: branch i replaces the result so far where the index is at least i.
-    taken = inline_program(graph, branches[0], rest)
+    outputs = inline_program(graph, branches[0], operands)
     for i, branch in enumerate(branches[1:], 1):
-        asked = graph.convert(which, bool)
+        condition = graph.convert(index, bool)
         if len(branches) > 2:
-            asked = graph.op("ge", which, graph.const(i, which.dtype))
-        other = inline_program(graph, branch, rest)
-        flat = [[node for array in arrays for node in array.flat] for arrays in (taken, other)]
-        gated = iter(graph.gate(asked, *flat))
-        taken = [map_entries(lambda _: next(gated), array) for array in taken]  # noqa: B023  used at once
-    return taken
+            condition = graph.op("ge", index, graph.const(i, index.dtype))
+        branch_outputs = inline_program(graph, branch, operands)
+        flat = [[node for array in arrays for node in array.flat] for arrays in (outputs, branch_outputs)]
+        gated = iter(graph.gate(condition, *flat))
+        outputs = [map_entries(lambda _: next(gated), array) for array in outputs]  # noqa: B023  used at once
+    return outputs
 
 
 @lowering_rule("scan", "length reverse jaxpr num_consts num_carry linear unroll _split_transpose ft_in ft_out")
@@ -85,9 +85,9 @@ def _scan(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     if not p["length"] and len(eqn.outvars) > many:
         raise Unsupported("scan", "of no steps with outputs")
     order = range(p["length"])[:: -1 if p["reverse"] else 1]
-    seen: dict[int, list[Array]] = {}
+    outputs: dict[int, list[Array]] = {}
     for i in order:
         outs = inline_program(graph, p["jaxpr"], [*fixed, *carry, *(as_node_array(row[i]) for row in rows)])
-        carry, seen[i] = outs[:many], outs[many:]
+        carry, outputs[i] = outs[:many], outs[many:]
     # A reversed scan fills its outputs from the end, so they are sorted by index.
-    return [*carry, *(np.stack(column) for column in zip(*(seen[i] for i in sorted(seen)), strict=True))]
+    return [*carry, *(np.stack(column) for column in zip(*(outputs[i] for i in sorted(outputs)), strict=True))]

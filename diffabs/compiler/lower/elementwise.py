@@ -47,15 +47,15 @@ def _integer_quotient(graph: Graph, x: Node, y: Node) -> Node:
 
     As in XLA, x/0 has all bits set, and the least integer divided by -1 is itself.
     """
-    zero, one = graph.const(0, y.dtype), graph.const(1, y.dtype)
+    zero, unit = graph.const(0, y.dtype), graph.const(1, y.dtype)
     by_zero, by_minus_one = graph.op("eq", y, zero), graph.const(False)
     if y.dtype.kind == "i":
         # The least integer divided by -1 overflows, which stops the process on x86. A negation wraps instead.
         by_minus_one = graph.op("eq", y, graph.const(-1, y.dtype))
     # The divisor is made valid first: both sides of a selection are computed in every lane.
-    found = graph.op("quotient", x, graph.select(graph.op("or", by_zero, by_minus_one), y, one))
-    found = graph.select(by_minus_one, found, graph.op("neg", x) if y.dtype.kind == "i" else x)
-    return graph.select(by_zero, found, graph.op("not", zero))
+    quotient = graph.op("quotient", x, graph.select(graph.op("or", by_zero, by_minus_one), y, unit))
+    quotient = graph.select(by_minus_one, quotient, graph.op("neg", x) if y.dtype.kind == "i" else x)
+    return graph.select(by_zero, quotient, graph.op("not", zero))
 
 
 @lowering_rule("stop_gradient copy copy_p optimization_barrier pvary")
@@ -74,8 +74,6 @@ def max_or_min(graph: Graph, name: str, x: Node, y: Node) -> Node:
     """Return the larger or smaller of two numbers; NaN if either is NaN.
 
     Args:
-        graph: Graph of the result.
-        name: "max" or "min".
         x, y: Numbers of one type, or booleans: the larger is their "or".
     """
     if x is y:
@@ -90,10 +88,10 @@ def _sign(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     """Return the sign; NaN, 0 and -0 stay themselves."""
 
     def sign(x: Node) -> Node:
-        zero, one, less = (graph.const(value, x.dtype) for value in (0, 1, -1 if x.dtype.kind != "u" else 0))
+        zero, unit, less = (graph.const(value, x.dtype) for value in (0, 1, -1 if x.dtype.kind != "u" else 0))
         low = graph.select(graph.op("lt", x, zero), x, less)
         # Both comparisons are false for NaN, 0 and -0, so x remains.
-        return graph.select(graph.op("gt", x, zero), low, one)
+        return graph.select(graph.op("gt", x, zero), low, unit)
 
     return [map_entries(sign, *ins)]
 
@@ -113,8 +111,8 @@ def _integer_pow(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
                 result = x if result is None else graph.op("mul", result, x)
             n >>= 1
             x = graph.op("mul", x, x) if n else x
-        one = graph.const(1, x.dtype)
-        return (result or one) if eqn.params["y"] >= 0 else graph.op("div", one, result or one)
+        unit = graph.const(1, x.dtype)
+        return (result or unit) if eqn.params["y"] >= 0 else graph.op("div", unit, result or unit)
 
     return [map_entries(power, *ins)]
 
@@ -125,10 +123,10 @@ def _rsqrt_or_logistic(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Ar
         raise Unsupported(eqn.primitive.name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
 
     def inverse(x: Node) -> Node:
-        one = graph.const(1, x.dtype)
+        unit = graph.const(1, x.dtype)
         if eqn.primitive.name == "rsqrt":
-            return graph.op("div", one, graph.op("sqrt", x))
-        return graph.op("div", one, graph.op("add", one, graph.op("exp", graph.op("neg", x))))
+            return graph.op("div", unit, graph.op("sqrt", x))
+        return graph.op("div", unit, graph.op("add", unit, graph.op("exp", graph.op("neg", x))))
 
     return [map_entries(inverse, *ins)]
 
@@ -174,10 +172,10 @@ def _round(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("select_n")
 def _select(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
-    which, *cases = ins
+    condition, *cases = ins
     if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
         raise Unsupported("select_n", f"between {len(cases)} cases")
-    return [map_entries(graph.select, which, *cases)]
+    return [map_entries(graph.select, condition, *cases)]
 
 
 @lowering_rule("clamp")

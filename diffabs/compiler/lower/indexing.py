@@ -15,10 +15,10 @@ from diffabs.core.types import PyTree
 MAX_COMPARED_ENTRIES = 64  # possible indices of one read or write by comparison
 
 
-def _clamp_index(graph: Graph, index: Node, most: int) -> Node:
+def _clamp_index(graph: Graph, index: Node, last: int) -> Node:
     """Return an index clamped to [0, most]."""
     low = max_or_min(graph, "max", index, graph.const(0, index.dtype))
-    return max_or_min(graph, "min", low, graph.const(most, index.dtype))
+    return max_or_min(graph, "min", low, graph.const(last, index.dtype))
 
 
 @lowering_rule("dynamic_slice", "slice_sizes")
@@ -31,16 +31,16 @@ def _dynamic_slice(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]
 
 def _part(graph: Graph, x: Array, axis: int, place: Node, size: int) -> Array:
     """Return `size` entries along an axis from index `place`, which is clamped so that they lie inside."""
-    most = x.shape[axis] - size
-    if most == 0:
+    last = x.shape[axis] - size
+    if last == 0:
         return x
     rows = np.moveaxis(x, axis, 0)
     if place.op == "const":
-        start = int(np.clip(place.attr, 0, most))
+        start = int(np.clip(place.attr, 0, last))
         return np.moveaxis(rows[start : start + size], 0, axis)
-    place = _clamp_index(graph, place, most)
-    taken: PyTree = [map_entries(lambda *x: _entry(graph, place, x), *rows[i : i + most + 1]) for i in range(size)]
-    return np.moveaxis(np.stack(taken), 0, axis)
+    place = _clamp_index(graph, place, last)
+    entries: PyTree = [map_entries(lambda *x: _entry(graph, place, x), *rows[i : i + last + 1]) for i in range(size)]
+    return np.moveaxis(np.stack(entries), 0, axis)
 
 
 def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
@@ -78,14 +78,14 @@ def _dynamic_update(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array
     for axis, place in enumerate(places):
         _check_writable(eqn, x.shape[axis] if new.shape[axis] != x.shape[axis] and place.op != "const" else 0)
     room = [a - b for a, b in zip(x.shape, new.shape, strict=True)]
-    starts = [_clamp_index(graph, place, most) for place, most in zip(places, room, strict=True)]
+    starts = [_clamp_index(graph, place, last) for place, last in zip(places, room, strict=True)]
     out = x.copy()
     # One pass for each possible position: the block is written where all clamped indices match.
-    for start in np.ndindex(*(most + 1 for most in room)):
+    for start in np.ndindex(*(last + 1 for last in room)):
         hits = [graph.op("eq", s, graph.const(o, s.dtype)) for s, o in zip(starts, start, strict=True)]
         hit = graph.const(True)
-        for one in hits:
-            hit = graph.op("and", hit, one)
+        for axis_hit in hits:
+            hit = graph.op("and", hit, axis_hit)
         inside = tuple(slice(o, o + size) for o, size in zip(start, new.shape, strict=True))
         out[inside] = map_entries(lambda a, b, hit=hit: graph.select(hit, a, b), out[inside], new)
     return [out]

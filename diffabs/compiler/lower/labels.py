@@ -51,11 +51,7 @@ class Labelled(Graph):
 
 
 def source_label(eqn: JaxprEqn) -> str:
-    """Return the variable's or function's name that the source gives to an operation's result; empty if unknown.
-
-    Args:
-        eqn: Equation of a jaxpr.
-    """
+    """Return the variable's or function's name that the source gives to an operation's result; empty if unknown."""
     traceback = getattr(getattr(eqn, "source_info", None), "traceback", None)
     for frame in getattr(traceback, "frames", ()):
         place = pathlib.Path(frame.file_name)
@@ -73,9 +69,9 @@ def _assigned_variables(file: str) -> dict[int, str]:
         tree = ast.parse(pathlib.Path(file).read_bytes())
     except (OSError, SyntaxError, ValueError):
         return {}
-    found = {}
+    variables = {}
     for node in ast.walk(tree):
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         if isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign) and isinstance(targets[0], ast.Name):
-            found |= dict.fromkeys(range(node.lineno, (node.end_lineno or node.lineno) + 1), targets[0].id)
-    return found
+            variables |= dict.fromkeys(range(node.lineno, (node.end_lineno or node.lineno) + 1), targets[0].id)
+    return variables

@@ -21,14 +21,7 @@ THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # bits by which a roun
 
 
 def key_shape(aval: Any) -> tuple[tuple[int, ...], np.dtype]:
-    """Return shape and type of an array; for a random key, shape and type of its words.
-
-    Args:
-        aval: Abstract value of an array or of keys.
-
-    Raises:
-        Unsupported: The key belongs to another generator than Threefry.
-    """
+    """Return shape and type of an array; for a random key, shape and type of its words."""
     if not jnp.issubdtype(aval.dtype, jax.dtypes.prng_key):
         return aval.shape, np.dtype(aval.dtype)
     if str(aval.dtype) != "key<fry>":
@@ -48,7 +41,7 @@ def _fold_in(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     if key_shape(eqn.invars[0].aval)[0] != (2,) or ins[1].ndim:
         raise Unsupported("random_fold_in", "of several keys")
     fold = jer.threefry_prng_impl.fold_in
-    program = jax.make_jaxpr(fold)(*(jax.ShapeDtypeStruct(*one) for one in (((2,), np.uint32), ((), np.uint32))))
+    program = jax.make_jaxpr(fold)(*(jax.ShapeDtypeStruct(*spec) for spec in (((2,), np.uint32), ((), np.uint32))))
     return inline_program(graph, program, [ins[0], map_entries(lambda x: graph.convert(x, np.uint32), ins[1])])
 
 
@@ -79,13 +72,7 @@ def _threefry(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 def threefry(graph: Graph, k0: Node, k1: Node, x0: Node, x1: Node) -> tuple[Node, Node]:
-    """Return the two words that Threefry-2x32 with 20 rounds makes from the counter (x0, x1) and the key (k0, k1).
-
-    Args:
-        graph: Graph of the result.
-        k0, k1: Words of the key (uint32).
-        x0, x1: Words of the counter (uint32).
-    """
+    """Return the two words (uint32) of Threefry-2x32 with 20 rounds for the counter (x0, x1) and the key (k0, k1)."""
 
     def word(value: int) -> Node:
         return graph.const(value, np.uint32)
@@ -147,20 +134,16 @@ def _erf_inv(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 def erf_inv(graph: Graph, x: Node) -> Node:
     """Return y with erf(y) = x: infinite at x = 1 and x = -1, NaN outside [-1, 1].
 
-    Args:
-        graph: Graph of the result.
-        x: Real number.
-
     Source: M. Giles, Approximating the erfinv function (2012), with XLA's coefficients.
     """
     w = graph.op("neg", graph.op("log1p", graph.op("neg", graph.op("mul", x, x))))
-    found: Node | None = None
-    for most, shifted, powers in reversed(ERF_INV_SINGLE if x.dtype == np.float32 else ERF_INV_DOUBLE):
+    root: Node | None = None
+    for upper, shifted, powers in reversed(ERF_INV_SINGLE if x.dtype == np.float32 else ERF_INV_DOUBLE):
         at, y = shifted(graph, w), graph.const(powers[0], x.dtype)
         for power in powers[1:]:
             y = graph.op("add", graph.op("mul", y, at), graph.const(power, x.dtype))
-        found = y if found is None else graph.select(graph.op("lt", w, graph.const(most, x.dtype)), found, y)
-    assert found is not None
+        root = y if root is None else graph.select(graph.op("lt", w, graph.const(upper, x.dtype)), root, y)
+    assert root is not None
     # At x = 1 and x = -1, w is infinite and the leading coefficient, not x, would decide the sign of the result.
     ends = graph.op("eq", graph.op("abs", x), graph.const(1, x.dtype))
-    return graph.select(ends, graph.op("mul", found, x), graph.op("mul", x, graph.const(np.inf, x.dtype)))
+    return graph.select(ends, graph.op("mul", root, x), graph.op("mul", x, graph.const(np.inf, x.dtype)))

@@ -46,43 +46,33 @@ class LoweringRule(NamedTuple):
 
     Attributes:
         apply: Function (graph, eqn, inputs) -> outputs.
-        known: Names of the parameters that the primitive may have; another one is refused.
+        parameters: Names of the parameters that the primitive may have; another one is refused.
     """
 
     apply: Callable[[Graph, PyTree, list[Array]], Sequence[Array]]
-    known: frozenset[str]
+    parameters: frozenset[str]
 
 
 LOWERING_RULES: dict[str, LoweringRule] = {}
 
 
-def lowering_rule(names: str, known: str = "") -> Callable[[PyTree], PyTree]:
+def lowering_rule(names: str, parameters: str = "") -> Callable[[PyTree], PyTree]:
     """Return a decorator that registers a function (graph, eqn, inputs) -> outputs as the rule of some primitives.
 
     Args:
         names: Names of the primitives, separated by blanks.
-        known: Names of the parameters that the primitives may have, separated by blanks.
+        parameters: Names of the parameters that the primitives may have, separated by blanks.
     """
 
     def decorate(apply: Any) -> Any:
-        LOWERING_RULES.update({name: LoweringRule(apply, frozenset(known.split())) for name in names.split()})
+        LOWERING_RULES.update({name: LoweringRule(apply, frozenset(parameters.split())) for name in names.split()})
         return apply
 
     return decorate
 
 
 def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Sequence[Array]) -> list[Array]:
-    """Lower a jaxpr to a graph and return its outputs as arrays of nodes.
-
-    Args:
-        graph: Graph that receives the nodes.
-        jaxpr: Program to lower.
-        constants: Arrays of nodes for its constants.
-        inputs: Arrays of nodes for its inputs.
-
-    Raises:
-        Unsupported: A primitive has no rule, or its rule does not handle a parameter, a type or a shape.
-    """
+    """Lower a jaxpr to a graph and return its outputs as arrays of nodes."""
     arrays = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
     def read(atom: PyTree) -> Array:
@@ -97,7 +87,7 @@ def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Se
             if name not in LOWERING_RULES:
                 raise Unsupported(name, "there is no rule for it")
             # An unknown parameter may change the meaning of the primitive.
-            if new := sorted(set(eqn.params) - LOWERING_RULES[name].known):
+            if new := sorted(set(eqn.params) - LOWERING_RULES[name].parameters):
                 raise Unsupported(name, f"its parameter {new[0]} is not known")
             outs = LOWERING_RULES[name].apply(graph, eqn, ins)
         except Unsupported as error:
@@ -109,10 +99,7 @@ def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Se
 
 
 def _calling_method(eqn: JaxprEqn) -> str:
-    """Return the name of the innermost method that made the equation, without those of JAX and of this package's core.
-
-    It is empty if there is none.
-    """
+    """Return the innermost method that made the equation, outside JAX and this package's core; else ""."""
     traceback = getattr(getattr(eqn, "source_info", None), "traceback", None)
     for frame in getattr(traceback, "frames", ()):
         place = pathlib.Path(frame.file_name)
@@ -123,35 +110,20 @@ def _calling_method(eqn: JaxprEqn) -> str:
 
 
 def constant_array(graph: Graph, x: Scalar, dtype: DTypeLike | None = None) -> Array:
-    """Return an array of constant nodes.
-
-    Args:
-        graph: Graph that receives the nodes.
-        x: Numbers, any shape.
-        dtype: Type, None for the type of `x`.
-    """
+    """Return an array of constant nodes."""
     x = np.asarray(x, dtype)
     return map_entries(lambda i: graph.const(x.reshape(-1)[i]), np.arange(x.size).reshape(x.shape))
 
 
 def scalar_array(node: Node) -> Array:
-    """Return a node as an array of shape ().
-
-    Args:
-        node: Number.
-    """
+    """Return a node as an array of shape ()."""
     out = np.empty((), object)
     out[()] = node
     return out
 
 
 def map_entries(function: Callable[..., Node], *arrays: PyTree) -> Array:
-    """Apply a function entry by entry, with broadcasting, and return the array of its results.
-
-    Args:
-        function: Function of nodes.
-        arrays: Arrays of nodes.
-    """
+    """Apply a function entry by entry, with broadcasting, and return the array of its results."""
     arrays = np.broadcast_arrays(*arrays) if len(arrays) > 1 else arrays
     out = np.empty(arrays[0].shape, object)
     for i in np.ndindex(out.shape):
@@ -160,24 +132,11 @@ def map_entries(function: Callable[..., Node], *arrays: PyTree) -> Array:
 
 
 def inline_program(graph: Graph, program: Any, inputs: Sequence[Array]) -> list[Array]:
-    """Lower a program (jaxpr, closed or not) that another one calls, and return its outputs as arrays of nodes.
-
-    Args:
-        graph: Graph that receives the nodes.
-        program: Program to lower.
-        inputs: Arrays of nodes for its inputs.
-
-    Raises:
-        Unsupported: As in `lower_jaxpr`.
-    """
+    """Lower a program (jaxpr, closed or not) that another one calls, and return its outputs as arrays of nodes."""
     jaxpr, constants = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, ())
     return lower_jaxpr(graph, jaxpr, [constant_array(graph, x) for x in constants], inputs)
 
 
 def as_node_array(x: Scalar) -> Array:
-    """Return `x` itself if it is an array, or a single node as an array of shape ().
-
-    Args:
-        x: Array of nodes, or a node, as indexing an array gives it.
-    """
+    """Return `x` itself if it is an array, or a single node as an array of shape ()."""
     return x if isinstance(x, np.ndarray) else scalar_array(x)

@@ -19,32 +19,20 @@ _lock = threading.Lock()
 _loaded: dict[str, PyTree] = {}
 
 
-def build_target(made: ScalarProgram, shape: cpp.LaunchShape) -> str:
+def build_target(program: ScalarProgram, shape: cpp.LaunchShape) -> str:
     """Return the name of a program's FFI target of XLA; compile and register the program if necessary.
 
-    Args:
-        made: Operations and results.
-        shape: Loop structure of the launch; a large program or one with tangents gets fewer `vectors`.
-
-    Raises:
-        NoCompiler: No compiler works, or the library does not load.
+    A large program, or one with tangents, gets fewer vectors than `shape` says.
     """
     # Tangents are independent of each other too and hide latency, so they replace vectors of the block.
-    vectors = shape.vectors // max(1, made.tangents)
-    operations = count_by_level(made)["step"]
+    vectors = shape.vectors // max(1, program.tangents)
+    operations = count_by_level(program)["step"]
     shape = shape._replace(vectors=max(1, min(vectors, MAX_STEP_LINES // max(1, operations))))
-    return register_library(toolchain.build_library(cpp.emit_cpp(made, shape)))
+    return register_library(toolchain.build_library(cpp.emit_cpp(program, shape)))
 
 
 def register_library(path: pathlib.Path) -> str:
-    """Return the name of a library's FFI target of XLA; load and register it if this process has not.
-
-    Args:
-        path: File of the library.
-
-    Raises:
-        NoCompiler: The library does not load.
-    """
+    """Return the name of a library's FFI target of XLA; load and register it if this process has not."""
     name = f"{LIBRARY_NAME_PREFIX}{path.stem[:32]}"
     with _lock:
         if name not in _loaded:

@@ -28,11 +28,7 @@ _lock = threading.Lock()
 
 
 def find_gpu() -> "CudaDevice | None":
-    """Return the GPU that JAX runs on by default, or None if JAX runs on a CPU by default.
-
-    Raises:
-        NoCompiler: JAX runs on an accelerator that is not an NVIDIA GPU.
-    """
+    """Return the GPU that JAX runs on by default, or None if JAX runs on a CPU by default."""
     home = default_devices()[0]
     if home.platform == "cpu":
         return None
@@ -42,42 +38,39 @@ def find_gpu() -> "CudaDevice | None":
     return _cuda_device(f"sm_{capability.replace('.', '')}")
 
 
-def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[PyTree], results: list[PyTree]) -> list[PyTree]:
+def call_kernel(
+    program: ScalarProgram, shape: LaunchShape, arguments: list[PyTree], results: list[PyTree]
+) -> list[PyTree]:
     """Compile a program and return the carry's arrays after all lanes have ended, as an operation of XLA on the GPU.
 
-    Args:
-        program: Operations and results.
-        shape: Loop structure of the launch.
-        given: Uniform arrays, arrays of the lanes and arrays of the carry; the last two have a leading axis of lanes.
-        results: Shapes and types of the carry.
-
-    Raises:
-        NoCompiler: The program does not compile, or there is no compiler.
+    `arguments` are uniform arrays, arrays of the lanes and arrays of the carry; the last two have an axis of lanes.
     """
     on = find_gpu()
     assert on is not None
     source = cuda.emit_cuda(program, shape)
     code = on.compile(source.text)
     sizes = [len(program.sizes[level]) for level in (UpdateLevel.UNIFORM, UpdateLevel.LANE, UpdateLevel.STEP)]
-    count = given[-1].shape[0]
+    count = arguments[-1].shape[0]
 
     def start(context: PyTree, outs: Any, *ins: Any) -> None:
-        *found, room = [on.address(buffer) for buffer in outs]
+        *addresses, room = [on.address(buffer) for buffer in outs]
         if count:
-            on.start(code, _pack_addresses([*map(on.address, ins), *found], [*sizes, sizes[-1]]), room, count, context)
+            on.start(
+                code, _pack_addresses([*map(on.address, ins), *addresses], [*sizes, sizes[-1]]), room, count, context
+            )
 
     # XLA allocates the kernels' own memory as one more result, which is dropped.
     whole = [*results, jax.ShapeDtypeStruct((source.room,), np.uint8)]
-    return buffer_callback(start, whole)(*given)[:-1]
+    return buffer_callback(start, whole)(*arguments)[:-1]
 
 
 def _pack_addresses(addresses: list[int], sizes: list[int]) -> PyTree:
     """Return the struct `Arrays` of `threads.h`: groups of `sizes` addresses, each with one null pointer at its end."""
-    rest, found = iter(addresses), []
+    remaining, pointers = iter(addresses), []
     for size in sizes:
         # C++ has no arrays of length 0, so every group has one more entry.
-        found += [*(next(rest) for _ in range(size)), 0]
-    return (ctypes.c_void_p * len(found))(*found)
+        pointers += [*(next(remaining) for _ in range(size)), 0]
+    return (ctypes.c_void_p * len(pointers))(*pointers)
 
 
 # CUDA -----------------------------------------------------------------------------------------------------------------
@@ -114,11 +107,7 @@ class CudaDevice:
         self._loaded: dict[tuple[pathlib.Path, int], _LoadedCode] = {}
 
     def describe(self) -> dict[str, str]:
-        """Return "compiler", "flags" and "processor": with a program's text they determine its numbers to the last bit.
-
-        Raises:
-            NoCompiler: There is no compiler.
-        """
+        """Return "compiler", "flags", "processor": with a program's text they determine its numbers to the last bit."""
         major, minor = nvrtc.nvrtc_version()
         return {
             "compiler": f"NVRTC {major}.{minor}",
@@ -127,11 +116,7 @@ class CudaDevice:
         }
 
     def compile(self, text: str) -> pathlib.Path:
-        """Return the file with the machine code of a CUDA C++ `text`.
-
-        Raises:
-            NoCompiler: The text does not compile, or there is no compiler.
-        """
+        """Return the file with the machine code of a CUDA C++ `text`."""
         return nvrtc.build_cubin(text, self.architecture)
 
     def address(self, buffer: Any) -> int:
@@ -142,11 +127,7 @@ class CudaDevice:
         """Start the kernels `begin_all` and then `run_all` of a program, on the device that holds `room`.
 
         Args:
-            code: File with the machine code.
-            arrays: The struct `Arrays` of `threads.h`.
             room: Device address of the memory for the counter and the shared values.
-            count: Number of lanes.
-            context: XLA's execution context, which has the stream.
         """
         ordinal = ctypes.c_int()
         # Several devices may run this program: the memory tells which one to use.
@@ -155,15 +136,15 @@ class CudaDevice:
         with _lock:
             if at not in self._loaded:
                 self._loaded[at] = _load(*at)
-            one = self._loaded[at]
-        _call_driver("cuCtxPushCurrent_v2", one.context)
+            loaded = self._loaded[at]
+        _call_driver("cuCtxPushCurrent_v2", loaded.context)
         try:
             # At most as many blocks as run at a time: each thread takes further lanes from the counter.
-            blocks = min(one.blocks, -(-count // cuda.THREADS_PER_BLOCK))
+            blocks = min(loaded.blocks, -(-count // cuda.THREADS_PER_BLOCK))
             shared, counter = ctypes.c_uint64(room + cuda.COUNTER), ctypes.c_uint64(room)
             threads, lanes = ctypes.c_int64(blocks * cuda.THREADS_PER_BLOCK), ctypes.c_int64(count)
-            _launch(one.begin, 1, 1, context.stream, arrays, shared, counter, threads)
-            _launch(one.run, blocks, cuda.THREADS_PER_BLOCK, context.stream, arrays, shared, counter, lanes)
+            _launch(loaded.begin, 1, 1, context.stream, arrays, shared, counter, threads)
+            _launch(loaded.run, blocks, cuda.THREADS_PER_BLOCK, context.stream, arrays, shared, counter, lanes)
         finally:
             _call_driver("cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
 
@@ -195,17 +176,17 @@ def _load(code: pathlib.Path, ordinal: int) -> _LoadedCode:
 def _launch(kernel: Any, blocks: int, threads: int, stream: int, *args: PyTree) -> None:
     """Start a kernel on a stream with `blocks` blocks of `threads` threads; `args` are values of ctypes."""
     # cuLaunchKernel takes an array with the address of each argument.
-    given = (ctypes.c_void_p * len(args))(*(ctypes.addressof(x) for x in args))
+    pointers = (ctypes.c_void_p * len(args))(*(ctypes.addressof(x) for x in args))
     nothing = ctypes.c_void_p()
-    _call_driver("cuLaunchKernel", kernel, blocks, 1, 1, threads, 1, 1, 0, ctypes.c_void_p(stream), given, nothing)
+    _call_driver("cuLaunchKernel", kernel, blocks, 1, 1, threads, 1, 1, 0, ctypes.c_void_p(stream), pointers, nothing)
 
 
 def _call_driver(name: str, *args: PyTree) -> None:
     """Call a function of the driver; raise RuntimeError with the name of the error it returns."""
     if failed := getattr(_load_driver(), name)(*args):
-        said = ctypes.c_char_p()
-        _load_driver().cuGetErrorName(failed, ctypes.byref(said))
-        raise RuntimeError(f"{name}: {(said.value or b'error').decode()} ({failed})")
+        message = ctypes.c_char_p()
+        _load_driver().cuGetErrorName(failed, ctypes.byref(message))
+        raise RuntimeError(f"{name}: {(message.value or b'error').decode()} ({failed})")
 
 
 @functools.cache

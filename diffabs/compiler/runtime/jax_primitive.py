@@ -38,9 +38,7 @@ run_lanes_primitive.multiple_results = True
 def bind_lanes(lanes: LanePrograms, arrays: Sequence[PyTree]) -> list[PyTree]:
     """Call the primitive without tangents; return the carry's arrays after all lanes have ended, in leaf order.
 
-    Args:
-        lanes: The functions and their programs.
-        arrays: Uniform arrays, then arrays of the lanes, then the carry; random keys as their words (uint32).
+    The arrays are the uniform ones, then those of the lanes, then the carry; random keys as their words (uint32).
     """
     return run_lanes_primitive.bind(*arrays, lanes=lanes, seeds=None, many=0, as_lanes=frozenset())
 
@@ -75,9 +73,9 @@ def _launch_in_parts(
     launches = max(1, math.ceil(many / MAX_TANGENTS_PER_LAUNCH))
     # Groups of one size share one compiled program. The padding tangents are zero and are cut off at the end.
     each = math.ceil(many / launches)
-    given = dict(zip(keys, arrays, strict=True))
+    arrays_by_key = dict(zip(keys, arrays, strict=True))
     if not many:
-        return _launch_once(lanes, seeds, 0, as_lanes, given)
+        return _launch_once(lanes, seeds, 0, as_lanes, arrays_by_key)
 
     def part(first: int) -> list[PyTree]:
         """Return the results of the launch for `each` directions from `first` on."""
@@ -89,12 +87,12 @@ def _launch_in_parts(
             wide = [(0, lacking if i == axis else 0) for i in range(x.ndim)]
             return jax.lax.slice_in_dim(jnp.pad(x, wide), first, first + each, axis=axis)
 
-        some = {key: cut(key, x) if key.tangent else x for key, x in given.items()}
+        some = {key: cut(key, x) if key.tangent else x for key, x in arrays_by_key.items()}
         return _launch_once(lanes, seeds, each, as_lanes, some)
 
     parts = [part(first) for first in range(0, each * launches, each)]
     return [
-        jnp.concatenate([one[i] for one in parts], 1)[:, :many] if key.tangent else parts[0][i]
+        jnp.concatenate([outs[i] for outs in parts], 1)[:, :many] if key.tangent else parts[0][i]
         for i, key in enumerate(lanes.result_keys(seeds))
     ]
 
@@ -103,15 +101,7 @@ mlir.register_lowering(run_lanes_primitive, mlir.lower_fun(_launch_in_parts, mul
 
 
 def build_launches(program: Any) -> None:
-    """Build the kernels that a jaxpr calls, so that an error appears before XLA compiles it.
-
-    Args:
-        program: Jaxpr.
-
-    Raises:
-        Unsupported: A derivative has an operation without a lowering rule.
-        NoCompiler: There is no compiler, or it does not compile a kernel.
-    """
+    """Build the kernels that a jaxpr calls, so that an error appears before XLA compiles it."""
     for equation in program.eqns:
         if equation.primitive is run_lanes_primitive:
             types = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
@@ -121,14 +111,14 @@ def build_launches(program: Any) -> None:
 
 
 def _launch_once(
-    lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: frozenset[int], given: dict[ArrayKey, PyTree]
+    lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: frozenset[int], arrays_by_key: dict[ArrayKey, PyTree]
 ) -> list[PyTree]:
-    """Return the results of one launch; initial tangents of the carry that are not in `given` are zero."""
+    """Return the results of one launch; initial tangents of the carry that are not in `arrays_by_key` are zero."""
 
     def array(key: ArrayKey) -> PyTree:
-        if key in given:
-            return given[key]
-        x = given[key._replace(tangent=False)]
+        if key in arrays_by_key:
+            return arrays_by_key[key]
+        x = arrays_by_key[key._replace(tangent=False)]
         return jnp.zeros((x.shape[0], many, *x.shape[1:]), x.dtype)
 
     order = arrange_arrays(lanes.functions, lanes.derivative(seeds).moved_arrays, as_lanes)
@@ -147,8 +137,8 @@ def _jvp_rule(
     moving = [type(x) is not ad.Zero and is_real(jax.typeof(x).dtype) for x in slopes]
     seeds = tuple((key.level, key.number) for key, on in zip(lanes.value_keys, moving, strict=True) if on)
     if not seeds:
-        found = run_lanes_primitive.bind(*arrays, lanes=lanes, seeds=None, many=0, as_lanes=as_lanes)
-        return found, [_zero_tangent(x) for x in found]
+        outs = run_lanes_primitive.bind(*arrays, lanes=lanes, seeds=None, many=0, as_lanes=as_lanes)
+        return outs, [_zero_tangent(x) for x in outs]
 
     # Build the derivative here: JAX 0.12 forbids tracing inside the abstract evaluation, where `result_keys` needs it.
     lanes.derivative(seeds)
@@ -156,11 +146,13 @@ def _jvp_rule(
     def add_direction_axis(key: ArrayKey, x: Scalar) -> PyTree:
         return jnp.expand_dims(x, 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1)
 
-    given = [add_direction_axis(key, x) for key, x, on in zip(lanes.value_keys, slopes, moving, strict=True) if on]
-    found = run_lanes_primitive.bind(*arrays, *given, lanes=lanes, seeds=seeds, many=1, as_lanes=as_lanes)
-    values = found[: len(lanes.functions.types[UpdateLevel.STEP])]
+    seed_tangents = [
+        add_direction_axis(key, x) for key, x, on in zip(lanes.value_keys, slopes, moving, strict=True) if on
+    ]
+    outs = run_lanes_primitive.bind(*arrays, *seed_tangents, lanes=lanes, seeds=seeds, many=1, as_lanes=as_lanes)
+    values = outs[: len(lanes.functions.types[UpdateLevel.STEP])]
     results = [_zero_tangent(x) for x in values]
-    for key, x in zip(lanes.result_keys(seeds)[len(values) :], found[len(values) :], strict=True):
+    for key, x in zip(lanes.result_keys(seeds)[len(values) :], outs[len(values) :], strict=True):
         results[key.number] = x[:, 0]
     return values, results
 
@@ -192,30 +184,32 @@ def _batching_rule(
             x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
             x = jnp.moveaxis(x, 0, at)
             more.append(x.reshape(*x.shape[:at], size * many, *x.shape[at + 2 :]))
-        found = run_lanes_primitive.bind(*arrays[:values], *more, **how, many=size * many, as_lanes=as_lanes)
+        outs = run_lanes_primitive.bind(*arrays[:values], *more, **how, many=size * many, as_lanes=as_lanes)
         results = [
             x.reshape(x.shape[0], size, many, *x.shape[2:]) if key.tangent else x
-            for key, x in zip(lanes.result_keys(seeds), found, strict=True)
+            for key, x in zip(lanes.result_keys(seeds), outs, strict=True)
         ]
         return results, [1 if key.tangent else None for key in lanes.result_keys(seeds)]
 
     keys = [*lanes.value_keys, *lanes.seed_keys(seeds)]
-    own = {k.number for k, axis in zip(keys, axes, strict=True) if k.level == UpdateLevel.UNIFORM and axis is not None}
+    batched_uniforms = {
+        k.number for k, axis in zip(keys, axes, strict=True) if k.level == UpdateLevel.UNIFORM and axis is not None
+    }
     # The last of the values is an array of the carry, so it always has a lane axis.
     count = arrays[values - 1].shape[1 if axes[values - 1] == 0 else 0]
-    given = []
+    arguments = []
     # Merge the batch axis in front of the lane axis.
     for key, x, axis in zip(keys, arrays, axes, strict=True):
         shared = key.level == UpdateLevel.UNIFORM and key.number not in as_lanes
         # A uniform array that is not batched stays as given. A batched one is repeated for every lane.
-        if not shared or key.number in own:
+        if not shared or key.number in batched_uniforms:
             x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
             if shared:
                 x = jnp.broadcast_to(x[:, None], (size, count, *x.shape[1:]))
             x = x.reshape(size * count, *x.shape[2:])  # not -1: an array may be empty
-        given.append(x)
-    found = run_lanes_primitive.bind(*given, **how, many=many, as_lanes=as_lanes | own)
-    return [x.reshape(size, count, *x.shape[1:]) for x in found], [0] * len(found)
+        arguments.append(x)
+    outs = run_lanes_primitive.bind(*arguments, **how, many=many, as_lanes=as_lanes | batched_uniforms)
+    return [x.reshape(size, count, *x.shape[1:]) for x in outs], [0] * len(outs)
 
 
 batching.primitive_batchers[run_lanes_primitive] = _batching_rule

@@ -23,21 +23,15 @@ log = logging.getLogger("diffabs")
 
 
 def cache_folder() -> pathlib.Path:
-    """Return the folder of the compiled libraries, which need not exist.
-
-    This is $DIFFABS_KERNEL_CACHE, or the subfolder diffabs/kernel of the user's cache folder.
-
-    Raises:
-        OSError: The user has no home folder.
-    """
-    if said := os.environ.get(CACHE):
-        return pathlib.Path(said)
+    """Return the folder of compiled libraries: $DIFFABS_KERNEL_CACHE, or diffabs/kernel in the user's cache folder."""
+    if folder := os.environ.get(CACHE):
+        return pathlib.Path(folder)
     try:
         caches = pathlib.Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
     except RuntimeError:
         raise OSError(errno.ENOENT, f"the user has no home folder; name a folder in {CACHE}") from None
-    if sys.platform != "darwin" and (said := os.environ.get("XDG_CACHE_HOME")):
-        caches = pathlib.Path(said)
+    if sys.platform != "darwin" and (folder := os.environ.get("XDG_CACHE_HOME")):
+        caches = pathlib.Path(folder)
     return caches / "diffabs" / "kernel"
 
 
@@ -55,16 +49,9 @@ def make_cache_folder() -> pathlib.Path:
 
 
 def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
-    """Return the file of a library, or None if the cache does not hold it.
+    """Return the file of a library by the digest of its compilation's inputs, or None if the cache does not hold it.
 
     The content of the file is checked. A damaged file is removed, with one line in the log.
-
-    Args:
-        made_of: Digest of every input of the compilation.
-        suffix: End of the file's name, such as ".so".
-
-    Raises:
-        OSError: A file cannot be read, or `make_cache_folder` fails.
     """
     for path in sorted(make_cache_folder().glob(f"{made_of}-*{suffix}")):
         try:
@@ -86,14 +73,6 @@ def write_library(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
 
     The write is atomic: a file with a library's name is always complete. If the files with this suffix have more than
     MAX_CACHE_BYTES, the less recently used half of them is removed first.
-
-    Args:
-        made_of: Digest of every input of the compilation.
-        suffix: End of the file's name, such as ".so".
-        content: Bytes of the library.
-
-    Raises:
-        OSError: The folder or the file cannot be written, or `make_cache_folder` fails.
     """
     folder = make_cache_folder()
     files.make_room(folder, f"*{suffix}", MAX_CACHE_BYTES)

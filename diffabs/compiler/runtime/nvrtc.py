@@ -28,17 +28,10 @@ def build_cubin(text: str, architecture: str) -> pathlib.Path:
     """Return the file with the machine code (cubin) of a CUDA C++ text; compile it unless the cache holds it.
 
     A file `.log` beside it holds the assembler's messages on register usage.
-
-    Args:
-        text: CUDA C++.
-        architecture: Name such as sm_90.
-
-    Raises:
-        NoCompiler: There is no NVRTC, the text does not compile, or the cache folder is not usable.
     """
     headers = [(NATIVE_FOLDER / name).read_bytes() for name in HEADERS]
-    said = [text.encode(), *headers, repr((NVRTC_FLAGS, nvrtc_version(), architecture)).encode()]
-    digest = hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in said)).hexdigest()
+    sources = [text.encode(), *headers, repr((NVRTC_FLAGS, nvrtc_version(), architecture)).encode()]
+    digest = hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in sources)).hexdigest()
     try:
         if path := library_cache.find_library(digest, ".cubin"):
             return path
@@ -51,29 +44,19 @@ def build_cubin(text: str, architecture: str) -> pathlib.Path:
 
 
 def parse_register_usage(log: str) -> dict[str, dict[str, int]]:
-    """Return, by kernel name, the registers of a thread ("registers") and its spilled bytes ("spilled").
-
-    The spilled bytes are those of stores and loads together.
-
-    Args:
-        log: Messages of the assembler.
-    """
-    found = {}
+    """Return, by kernel name, a thread's "registers" and its "spilled" bytes, of stores and loads together."""
+    usage = {}
     for part in re.split(r"Compiling entry function", log)[1:]:
         name = re.search(r"'(\w+)'", part)
         used, spilled = re.search(r"Used (\d+) registers", part), re.findall(r"(\d+) bytes spill", part)
         if name and used:
-            found[name[1]] = {"registers": int(used[1]), "spilled": sum(map(int, spilled))}
-    return found
+            usage[name[1]] = {"registers": int(used[1]), "spilled": sum(map(int, spilled))}
+    return usage
 
 
 @functools.cache
 def nvrtc_version() -> tuple[int, int]:
-    """Return NVRTC's major and minor version.
-
-    Raises:
-        NoCompiler: There is no NVRTC.
-    """
+    """Return NVRTC's major and minor version."""
     major, minor = ctypes.c_int(), ctypes.c_int()
     _load_nvrtc().nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
     return major.value, minor.value
@@ -82,8 +65,8 @@ def nvrtc_version() -> tuple[int, int]:
 @functools.cache
 def _load_nvrtc() -> ctypes.CDLL:
     """Return NVRTC of the package nvidia-cuda-nvrtc (CUDA 13) or nvidia-cuda-nvrtc-cu12, or of the system."""
-    found = importlib.util.find_spec("nvidia")
-    folders = [*(found.submodule_search_locations or ())] if found else []
+    nvidia = importlib.util.find_spec("nvidia")
+    folders = [*(nvidia.submodule_search_locations or ())] if nvidia else []
     paths = [
         str(p) for folder in folders for p in sorted(pathlib.Path(folder).glob("*/lib/libnvrtc.so.*"), reverse=True)
     ]

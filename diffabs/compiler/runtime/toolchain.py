@@ -56,15 +56,15 @@ def _probe_compiler(command: tuple[str, ...]) -> Compiler | str:
     """
     try:
         version = _run_command([*command, "--version"], PROBE_TIMEOUT_S)
-        made = Compiler(command, version.stdout.partition("\n")[0].strip())
-        note = cache_folder() / f".{_digest('works', made)[:32]}"
+        compiler = Compiler(command, version.stdout.partition("\n")[0].strip())
+        note = cache_folder() / f".{_digest('works', compiler)[:32]}"
         if not note.is_file():
             _check_loads(command)
             with contextlib.suppress(OSError):
                 (make_cache_folder() / note.name).touch()
     except (OSError, NoCompiler) as error:
         return f"{' '.join(command)}: {error}"
-    return made
+    return compiler
 
 
 def _check_loads(command: tuple[str, ...]) -> None:
@@ -82,15 +82,14 @@ def find_compiler() -> Compiler:
     ziglang.
 
     $DIFFABS_KERNEL_COMPILER replaces this list by one command; if it is set but empty, no compiler is used.
-
-    Raises:
-        NoCompiler: No command works; the message gives a reason for each.
     """
-    said = os.environ.get(COMPILER)
-    if said is not None and not said.strip():
+    configured = os.environ.get(COMPILER)
+    if configured is not None and not configured.strip():
         raise NoCompiler(f"{COMPILER} is empty")
-    commands = [shlex.split(said)] if said else [command for command in CANDIDATES if shutil.which(command[0])]
-    if not said and importlib.util.find_spec("ziglang"):
+    commands = (
+        [shlex.split(configured)] if configured else [command for command in CANDIDATES if shutil.which(command[0])]
+    )
+    if not configured and importlib.util.find_spec("ziglang"):
         commands.append([sys.executable, "-m", "ziglang", "cc", "-x", "c++"])
     reasons = []
     for command in commands:
@@ -104,26 +103,21 @@ def find_compiler() -> Compiler:
 def build_library(text: str, flags: tuple[str, ...] = ()) -> pathlib.Path:
     """Compile a C++ text, unless the cache holds its library, and return the library's file.
 
-    Args:
-        text: C++ source.
-        flags: Flags of the compiler in place of `CPP_FLAGS`, unless empty.
-
-    Raises:
-        NoCompiler: No compiler works, compilation fails, or the cache folder is unusable: not writable, or writable for
-            other users.
+    `flags` replaces `CPP_FLAGS` unless empty. An unusable cache folder (not writable, or writable for other users)
+    raises NoCompiler.
     """
-    made = find_compiler()
-    given = (flags,) if flags else ()
-    digest = _digest(text, made, *given)
+    compiler = find_compiler()
+    own_flags = (flags,) if flags else ()
+    digest = _digest(text, compiler, *own_flags)
     try:
         if path := find_library(digest, ".so"):
             return path
         # Compile inside the cache folder, which only this user can write to.
-        with files.temporary_folder(f".{digest[:16]}-", make_cache_folder()) as own:
-            source, result = own / "kernel.cpp", own / "kernel.so"
+        with files.temporary_folder(f".{digest[:16]}-", make_cache_folder()) as folder:
+            source, result = folder / "kernel.cpp", folder / "kernel.so"
             source.write_text(text)
             with stopwatch.count_as_compiling():
-                _compile(made.command, source, result, COMPILE_TIMEOUT_S, *given)
+                _compile(compiler.command, source, result, COMPILE_TIMEOUT_S, *own_flags)
             return write_library(digest, ".so", result.read_bytes())
     except OSError as error:
         raise NoCompiler(f"no kernel in {cache_folder()}: {error.strerror or error}") from None
@@ -133,9 +127,6 @@ def describe_compiler() -> dict[str, str]:
     """Return a dictionary with "compiler", "flags" and "processor" of the C++ back end.
 
     With a program's text, they determine a kernel's numbers to the last bit.
-
-    Raises:
-        NoCompiler: No compiler works on this machine.
     """
     return {"compiler": find_compiler().version, "flags": " ".join(CPP_FLAGS), "processor": _processor()}
 
@@ -145,20 +136,17 @@ def _compile(
 ) -> None:
     """Compile a C++ file to the library `result` in at most `longest` seconds; raise NoCompiler if that fails."""
     include = [f"-I{NATIVE_FOLDER}", f"-I{jax.ffi.include_dir()}"]
-    done = _run_command([*command, *(flags or CPP_FLAGS), *include, "-o", str(result), str(source), "-lm"], longest)
-    if done.returncode or not result.is_file():
-        lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"exit status {done.returncode}"]
+    process = _run_command([*command, *(flags or CPP_FLAGS), *include, "-o", str(result), str(source), "-lm"], longest)
+    if process.returncode or not result.is_file():
+        lines = [line for line in process.stderr.splitlines() if line.strip()] or [f"exit status {process.returncode}"]
         errors = [line for line in lines if "error" in line]
         raise NoCompiler(f"{' '.join(command)}: {(errors or lines)[0][:300]}")
 
 
 def _run_command(words: list[str], longest: float) -> subprocess.CompletedProcess[str]:
-    """Run a command for at most `longest` seconds and return its exit status and output.
-
-    Raises NoCompiler on timeout, OSError if there is no such command.
-    """
-    told = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(words, **told, start_new_session=True) as process:
+    """Run a command for at most `longest` seconds; raise NoCompiler on timeout, OSError if there is no such command."""
+    options = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, **options, start_new_session=True) as process:
         try:
             out, errors = process.communicate(timeout=longest)
         except BaseException as error:
@@ -171,20 +159,22 @@ def _run_command(words: list[str], longest: float) -> subprocess.CompletedProces
         return subprocess.CompletedProcess(words, process.returncode, out, errors)
 
 
-def _digest(text: str, made: Compiler, flags: tuple[str, ...] = ()) -> str:
+def _digest(text: str, compiler: Compiler, flags: tuple[str, ...] = ()) -> str:
     """Return the digest of every input of the compilation of `text` (64 hexadecimal digits)."""
     # The FFI header belongs to the digest: a new jaxlib may change the layout of the call frame.
     interface = pathlib.Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     headers = [path.read_bytes() for path in (*sorted(NATIVE_FOLDER.glob("*.h")), interface)]
-    said = [text.encode(), *headers, repr((made, CPP_FLAGS, _processor())).encode()]
-    said += [repr(flags).encode()] if flags else []
-    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in said)).hexdigest()
+    sources = [text.encode(), *headers, repr((compiler, CPP_FLAGS, _processor())).encode()]
+    sources += [repr(flags).encode()] if flags else []
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in sources)).hexdigest()
 
 
 @functools.cache
 def _processor() -> str:
     """Return a name for the processor with a digest of its features, because -march=native depends on them."""
     lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines() if os.path.exists("/proc/cpuinfo") else []
-    wanted = [line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "flags", "Features"))]
-    features = hashlib.sha256("\n".join(sorted(set(wanted))).encode()).hexdigest()[:12] if wanted else ""
-    return f"{platform.machine()} {platform.processor() or next(iter(wanted), '')} {features}".strip()
+    features_text = [
+        line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "flags", "Features"))
+    ]
+    features = hashlib.sha256("\n".join(sorted(set(features_text))).encode()).hexdigest()[:12] if features_text else ""
+    return f"{platform.machine()} {platform.processor() or next(iter(features_text), '')} {features}".strip()

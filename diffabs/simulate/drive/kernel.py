@@ -159,7 +159,7 @@ def _run(
         steps=STEPS_PER_BLOCK,
         rounds=1 if enough is None else STEPS_PER_EXCHANGE // STEPS_PER_BLOCK,
         read=read_leaves(judge, leaves, begins),
-        wanted=read_leaves(judge, leaves, begins, differentiably=True),
+        tangents_read=read_leaves(judge, leaves, begins, differentiably=True),
     )
     return jax.vmap(judge)(leaves, carry)
 
