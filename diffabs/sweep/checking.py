@@ -24,7 +24,7 @@ NEGLIGIBLE_CHANGE = 1e-9  # smaller changes, or changes below solver.rtol, give 
 MAX_RELATIVE_CHANGE = 0.01  # largest relative change by a half step without a warning
 
 
-def check_accuracy(study: Study, found: "Results", count: int) -> JsonObject:
+def check_accuracy(study: Study, results: "Results", count: int) -> JsonObject:
     """Return how much a half step changes each metric, for at most `count` runs that did not diverge.
 
     The seed chooses the runs. The result has these entries:
@@ -39,44 +39,35 @@ def check_accuracy(study: Study, found: "Results", count: int) -> JsonObject:
 
     A change is relative to the metric's absolute value, or to the median of these if that is larger. A metric without
     finite values is left out of `metrics`.
-
-    Args:
-        study: Study of the sweep.
-        found: Results of the sweep.
-        count: Largest number of runs to repeat.
     """
-    samples = _choose_samples(study, found, count)
-    rows = np.searchsorted(found.column("sample"), samples)  # missing chunks have no rows
-    stopped = found.column("stopped")[rows]
+    samples = _choose_samples(study, results, count)
+    rows = np.searchsorted(results.column("sample"), samples)  # missing chunks have no rows
+    stopped = results.column("stopped")[rows]
     if len(samples):
         half = _run_finer(study, samples)
         alike = ~half["diverged"] & (half["stopped"] == stopped)
-        fine = _draw_same_noise(study, samples)
+        same_noise = _draw_same_noise(study, samples)
     else:
-        half = {name: np.zeros(0) for name in found.metrics}
-        alike = fine = np.zeros(0, bool)
-    same = fine & alike
-    compared, rows = samples[same], rows[same]
-    pairs = {name: (found.column(name)[rows], half[name][same]) for name in found.metrics}
+        half = {name: np.zeros(0) for name in results.metrics}
+        alike = same_noise = np.zeros(0, bool)
+    comparable = same_noise & alike
+    compared, rows = samples[comparable], rows[comparable]
+    pairs = {name: (results.column(name)[rows], half[name][comparable]) for name in results.metrics}
     turned = {name: compared[differs_in_kind(*pair)].tolist() for name, pair in pairs.items()}
     changes = {name: _summarise_changes(*pair, compared) for name, pair in pairs.items()}
     return {
         "samples": compared.tolist(),
         "step": study.solver.step / 2,
         "solver": describe_solver(study.solver),
-        "ended otherwise": int((fine & ~alike).sum()),
-        "not comparable": int((~fine).sum()),
-        "turned": {name: {"count": len(one), "samples": one} for name, one in turned.items() if one},
+        "ended otherwise": int((same_noise & ~alike).sum()),
+        "not comparable": int((~same_noise).sum()),
+        "turned": {name: {"count": len(numbers), "samples": numbers} for name, numbers in turned.items() if numbers},
         "metrics": {name: row for name, row in changes.items() if row},
     }
 
 
 def accuracy_warnings(result: JsonObject) -> list[str]:
-    """Return warnings for a reader of the statistics, one line each.
-
-    Args:
-        result: Result of `check_accuracy`.
-    """
+    """Return warnings for a reader of the statistics, one line each."""
     lines = []
     rows = result["metrics"].items()
     nothing = max(NEGLIGIBLE_CHANGE, result.get("solver", {}).get("rtol", 0.0))
@@ -94,19 +85,15 @@ def accuracy_warnings(result: JsonObject) -> list[str]:
 
 
 def describe_turned_metrics(result: JsonObject) -> Iterator[str]:
-    """Yield a line for each metric that the half step turns from a number into never, or back.
-
-    Args:
-        result: Result of `check_accuracy`; older versions wrote none of these metrics.
-    """
+    """Yield a line for each metric that the half step turns from a number into never, or back; old results lack it."""
     for name, row in result.get("turned", {}).items():
         where = f"{row['count']} of {len(result['samples'])} runs, the first sample {row['samples'][0]}"
         yield f"{name} is finite with one step and never with the other in {where}: its statistics cannot be trusted"
 
 
-def _choose_samples(study: Study, found: "Results", count: int) -> np.ndarray:
+def _choose_samples(study: Study, results: "Results", count: int) -> np.ndarray:
     """Return the numbers of at most `count` samples with metrics, in ascending order."""
-    good = found.column("sample")[is_accepted(found.column("refused")) & ~found.column("diverged")]
+    good = results.column("sample")[is_accepted(results.column("refused")) & ~results.column("diverged")]
     random = np.random.default_rng([study.seed, ACCURACY_STREAM])
     return np.sort(random.choice(good, min(count, len(good)), replace=False))
 
@@ -121,7 +108,7 @@ def _run_finer(study: Study, samples: np.ndarray) -> Columns:
 
 def _draw_same_noise(study: Study, samples: np.ndarray) -> np.ndarray:
     """Return for each sample whether a half step draws the same noise, and blocks compute at the same instants."""
-    same = np.zeros(len(samples), bool)
+    mask = np.zeros(len(samples), bool)
     loops, keys = zip(*map(study.lane, samples.tolist()), strict=True)
     for places in group_by_structure(loops):  # loops of one structure share a program
         loop, batch = stack_loops([loops[i] for i in places])
@@ -132,13 +119,13 @@ def _draw_same_noise(study: Study, samples: np.ndarray) -> np.ndarray:
             return is_comparable(loop, study.solver, key, (2,))
 
         with precision(study.dtype):
-            same[places] = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, compare))(*lanes)
-    return same
+            mask[places] = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, compare))(*lanes)
+    return mask
 
 
 def _summarise_changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> JsonObject:
-    known = np.isfinite(values) & np.isfinite(half)  # a run that never settles has an infinite settling time
-    values, half, samples = values[known], half[known], samples[known]
+    finite = np.isfinite(values) & np.isfinite(half)  # a run that never settles has an infinite settling time
+    values, half, samples = values[finite], half[finite], samples[finite]
     if not len(values):
         return {}
     # A value near zero would have a huge relative change, so the median bounds the reference from below.

@@ -54,11 +54,7 @@ class Dask:
     """
 
     def __init__(self, scheduler: str | None = None, workers: int | None = None):
-        """Set the cluster: `scheduler`, or else `workers` processes here, by default one for each core.
-
-        Raises:
-            ScenarioError: `workers` is not a positive number.
-        """
+        """Set the cluster: `scheduler`, or else `workers` processes here, by default one for each core."""
         self.scheduler = scheduler
         self.workers = core_count() if workers is None else read_whole(workers, 1, MAX_WORKERS, "workers")
 
@@ -113,11 +109,7 @@ def _silence_dask_logs() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _start_workers(workers: int) -> Iterator[PyTree]:
-    """Start workers on this machine, with all pages and ports on the loopback interface.
-
-    Raises:
-        SweepError: The workers do not start.
-    """
+    """Start workers on this machine, with all pages and ports on the loopback interface."""
     with contextlib.ExitStack() as opened:
         scratch = pathlib.Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="diffabs-dask-")))
         opened.enter_context(files.temporary_path(scratch))
@@ -142,9 +134,6 @@ def dask_setup(_: object) -> None:
     """Ignore Ctrl-C in a worker, so that only the process in the terminal handles it.
 
     Dask calls this in each new worker.
-
-    Args:
-        _: Worker, not used.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -153,9 +142,6 @@ def _probe_scheduler(scheduler: str) -> None:
     """Connect to a scheduler and disconnect.
 
     A client that does not reach its scheduler would leave a thread behind, which can block the next client.
-
-    Raises:
-        OSError, TypeError, ValueError: The scheduler cannot be reached. TimeoutError if another program listens there.
     """
 
     async def call() -> None:
@@ -174,17 +160,17 @@ def _check_workers(client: Client, engine: str) -> None:
         client.wait_for_workers(1, timeout=TIMEOUT_SECONDS)
     except TimeoutError:
         raise SweepError(f"the scheduler has no worker within {TIMEOUT_SECONDS:g} s") from None
-    here = _result_versions(engine)
+    own_versions = _result_versions(engine)
     try:
         answers: Any = client.run(_result_versions, engine)
     except Exception as error:  # Dask raises any type for a worker without diffabs
         raise SweepError(f"a worker cannot say its versions: {(str(error) or repr(error)).splitlines()[0]}") from None
-    for worker, there in answers.items():
-        _check_worker(worker, there, here)
+    for worker, worker_versions in answers.items():
+        _check_worker(worker, worker_versions, own_versions)
 
 
-def _check_worker(worker: str, there: JsonObject, here: JsonObject) -> None:
-    for line in describe_differences(there, here):
+def _check_worker(worker: str, worker_versions: JsonObject, own_versions: JsonObject) -> None:
+    for line in describe_differences(worker_versions, own_versions):
         raise SweepError(f"worker {worker}: {line}; results would not be those of one run")
 
 
@@ -199,7 +185,7 @@ def _compute_chunks(
     client: Client, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
 ) -> Iterator[ComputedChunk]:
     """Yield chunks as they finish, with at most CHUNKS_PER_THREAD chunks for each worker thread in progress."""
-    rest, deaths, finished = iter(chunks), dict.fromkeys(chunks, 0), as_completed()
+    pending, deaths, finished = iter(chunks), dict.fromkeys(chunks, 0), as_completed()
     seals, versions = Seals(describe_owner(study)), _result_versions(study.engine)
     inside: dict[PyTree, int] = {}
 
@@ -212,7 +198,7 @@ def _compute_chunks(
     def fill() -> None:
         threads: Any = client.nthreads()
         free_slots = CHUNKS_PER_THREAD * max(1, sum(threads.values())) - len(inside)
-        for chunk in [c for _, c in zip(range(free_slots), rest, strict=False)]:
+        for chunk in [c for _, c in zip(range(free_slots), pending, strict=False)]:
             give(chunk)
 
     fill()
@@ -252,21 +238,12 @@ def _convert_to_numpy(study: Study) -> Study:
         return np.asarray(x) if isinstance(x, jax.Array) else x
 
     # One by one: `tree.map` over the dictionaries would sort their keys, and so change the order of the columns.
-    objectives = {name: jax.tree.map(plain, one) for name, one in study.objectives.items()}
-    parts = {path: {name: jax.tree.map(plain, one) for name, one in by.items()} for path, by in study.parts.items()}
+    objectives = {name: jax.tree.map(plain, part) for name, part in study.objectives.items()}
+    parts = {path: {name: jax.tree.map(plain, part) for name, part in by.items()} for path, by in study.parts.items()}
     return dataclasses.replace(study, loop=jax.tree.map(plain, study.loop), parts=parts, objectives=objectives)
 
 
 def compute_chunk(study: Study, seal: Seal, versions: JsonObject) -> ComputedChunk:
-    """Return one chunk, computed on a worker.
-
-    Args:
-        study: Study of the sweep.
-        seal: Seal of the chunk.
-        versions: Versions of the sweep's process that can change a bit of the results.
-
-    Raises:
-        SweepError: This worker, which may have joined later than the others, has other versions.
-    """
+    """Return one chunk, computed on a worker, after a check of its versions: it may have joined later than others."""
     _check_worker(get_worker().address, _result_versions(study.engine), versions)
     return encode_computed_chunk(study, seal, Runner(study, default_devices()[:1]).run([seal.chunk])[0])

@@ -35,11 +35,7 @@ def _weight_problems(weights: Sequence[float] | None, count: int, name: str, eac
 
 
 def is_numeric(column: ArrayLike) -> bool:
-    """Return whether values have a type of numbers; objects and booleans have not.
-
-    Args:
-        column: Values, any shape.
-    """
+    """Return whether values have a type of numbers; objects and booleans have not."""
     return np.asarray(column).dtype.kind in "fiu"
 
 
@@ -157,10 +153,10 @@ class Empirical(_Discrete):
             yield f"{name}: values = {reprlib.repr(list(self.values))} are not all in {FINITE_SPEC.interval()}"
 
 
-def _read_columns(given: PyTree, where: str) -> dict[str, np.ndarray]:
+def _read_columns(table: PyTree, where: str) -> dict[str, np.ndarray]:
     return {
         path: np.array(column)
-        for path, column in table_reader(list_reader(read_as_given), "lists")(given, where).items()
+        for path, column in table_reader(list_reader(read_as_given), "lists")(table, where).items()
     }
 
 
@@ -193,8 +189,8 @@ class Rows(_Weighted):
         lengths = {path: np.shape(column) for path, column in self.columns.items()}
         shapes = set(lengths.values())
         if len(shapes) != 1 or len(next(iter(shapes))) != 1 or (0,) in shapes:
-            found = ", ".join(f"{path} {shape}" for path, shape in lengths.items()) or "none"
-            yield f"{name}: columns need one shape (n,); there is {found}"
+            described = ", ".join(f"{path} {shape}" for path, shape in lengths.items()) or "none"
+            yield f"{name}: columns need one shape (n,); there is {described}"
             return
         for path, column in self.columns.items():
             if is_numeric(column):

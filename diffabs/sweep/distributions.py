@@ -209,28 +209,13 @@ DISTRIBUTION_TYPES = {
 }
 
 
-def read_distribution(given: PyTree, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Scalar:
-    """Return the distribution that a table describes.
-
-    Args:
-        given: Table with `type` and fields.
-        where: Path of the table, for messages.
-        kinds: Class of each type, by name.
-
-    Raises:
-        ScenarioError: The type is unknown, a field is missing or unknown, a value is not a number, or the distribution
-            refuses its fields. The message is one line.
-    """
-    return check_sound(read_one(kinds, given, where), where)
+def read_distribution(table: PyTree, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Scalar:
+    """Return the distribution that a table describes."""
+    return check_sound(read_one(kinds, table, where), where)
 
 
 def convert_distribution_to_si(distribution: Any, scale: float) -> Scalar:
-    """Return the distribution of a parameter in SI units: its fields with a unit are divided by `scale`.
-
-    Args:
-        distribution: Distribution in another unit.
-        scale: Number of these units in one SI unit, for example 3.6 for km/h.
-    """
+    """Return the distribution of a parameter in SI units: fields with a unit are divided by `scale`, 3.6 for km/h."""
 
     def divide(value: Scalar) -> Any:
         return tuple(x / scale for x in value) if isinstance(value, tuple) else value / scale
@@ -239,30 +224,20 @@ def convert_distribution_to_si(distribution: Any, scale: float) -> Scalar:
 
 
 def support_interval(distribution: Distribution) -> ParameterSpec:
-    """Return the support as a `ParameterSpec` with unit "1"; infinite ends, and 0 of a `LogNormal`, are open.
-
-    Args:
-        distribution: Distribution of a parameter.
-    """
+    """Return the support as a `ParameterSpec` with unit "1"; infinite ends, and 0 of a `LogNormal`, are open."""
     low, high = distribution.support()
     open_low = low == -math.inf or (isinstance(distribution, LogNormal) and low == 0)
     return ParameterSpec("1", low, high, open_low, high == math.inf)
 
 
 def describe_out_of_range(distribution: Distribution, spec: ParameterSpec, name: str) -> str | None:
-    """Return a line if a parameter with this distribution can leave its range, else None.
-
-    Args:
-        distribution: Distribution of the parameter.
-        spec: Range of the parameter.
-        name: Name of the parameter.
-    """
+    """Return a line if a parameter with this distribution can leave its range, else None."""
     if isinstance(distribution, Categorical) and distribution.textual():
         return f"{name} = {format_table(distribution)} is text; a number in {spec.interval()} is needed"
-    own = support_interval(distribution)
-    below = own.low < spec.low or (own.low == spec.low and spec.open_low and not own.open_low)
-    above = own.high > spec.high or (own.high == spec.high and spec.open_high and not own.open_high)
+    support = support_interval(distribution)
+    below = support.low < spec.low or (support.low == spec.low and spec.open_low and not support.open_low)
+    above = support.high > spec.high or (support.high == spec.high and spec.open_high and not support.open_high)
     if not (below or above):
         return None
     hint = "; truncate it with low and high" if isinstance(distribution, Normal | LogNormal) else ""
-    return f"{name} = {format_table(distribution)} reaches {own.interval()}, outside {spec.interval()}{hint}"
+    return f"{name} = {format_table(distribution)} reaches {support.interval()}, outside {spec.interval()}{hint}"

@@ -81,26 +81,20 @@ class Local:
         """
         places = self.places(study)
         runner, seals = Runner(study, places), Seals(describe_owner(study))
-        rest = iter([chunks[k : k + len(places)] for k in range(0, len(chunks), len(places))])
+        groups = iter([chunks[k : k + len(places)] for k in range(0, len(chunks), len(places))])
         with ThreadPoolExecutor(1) as beside:
-            together = next(rest, None)
+            together = next(groups, None)
             coming = beside.submit(runner.run, together) if together else None
             while together and coming:
-                here, found = together, coming.result()
-                together = None if stopping() else next(rest, None)
+                group, group_columns = together, coming.result()
+                together = None if stopping() else next(groups, None)
                 coming = beside.submit(runner.run, together) if together else None
-                for chunk, columns in zip(here, found, strict=True):
+                for chunk, columns in zip(group, group_columns, strict=True):
                     yield encode_computed_chunk(study, seals.of(chunk), columns)
 
 
 def encode_computed_chunk(study: Study, seal: Seal, columns: Columns) -> ComputedChunk:
-    """Return a chunk with its encoded columns and its counts.
-
-    Args:
-        study: Study of the sweep.
-        seal: Seal of the chunk.
-        columns: Columns of the chunk, each of shape (samples,).
-    """
+    """Return a chunk with its encoded columns and its counts."""
     kinds = failure_masks(columns.__getitem__, study.failure_bounds, study.success)
     failed, accepted = np.any(list(kinds.values()), axis=0), is_accepted(columns["refused"])
     counts = len(failed), int(failed.sum()), int(np.sum(columns["diverged"] & accepted)), int(np.sum(~accepted))

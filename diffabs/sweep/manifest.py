@@ -61,9 +61,6 @@ def describe_owner(study: Study) -> JsonObject:
     """Return the identity of a sweep that this process computes now, as {"format", "study", "versions"}.
 
     A digest of it, the owner, is in every chunk.
-
-    Args:
-        study: Study of the sweep.
     """
     return {
         "format": MANIFEST_FORMAT,
@@ -98,24 +95,12 @@ class Seals:
 
 
 def encode_manifest(manifest: Table) -> bytes:
-    """Return the bytes of the manifest's file, with its digest.
-
-    Args:
-        manifest: Manifest without a digest.
-    """
+    """Return the bytes of the manifest's file, with its digest."""
     return json.dumps({**manifest, "digest": json_digest(manifest)}, indent=1).encode()
 
 
 def read_manifest(folder: pathlib.Path) -> JsonObject:
-    """Return the manifest of a folder, without its digest.
-
-    Args:
-        folder: Folder of the sweep.
-
-    Raises:
-        SweepError: The manifest does not exist, does not match its digest, or has an invalid entry. The message is one
-            line.
-    """
+    """Return the manifest of a folder, without its digest."""
     try:
         raw = files.read_content(pathlib.Path(folder) / MANIFEST_NAME, MAX_MANIFEST_BYTES)
     except (OSError, ValueError) as error:
@@ -128,15 +113,15 @@ def read_manifest(folder: pathlib.Path) -> JsonObject:
         raise SweepError(f"{folder} is no sweep that can be read: {MANIFEST_NAME}: {why}") from None
 
 
-def _check_manifest(given: PyTree) -> JsonObject:
-    if not isinstance(given, dict):
-        raise wrong_kind_error("it", given, "a table")
-    if given.get("format") in EARLIER_FORMATS:
+def _check_manifest(document: PyTree) -> JsonObject:
+    if not isinstance(document, dict):
+        raise wrong_kind_error("it", document, "a table")
+    if document.get("format") in EARLIER_FORMATS:
         raise ValueError(EARLIER_FORMAT_MESSAGE)
-    if given.get("format") != MANIFEST_FORMAT:
-        raise wrong_kind_error("format", given.get("format"), str(MANIFEST_FORMAT))
-    manifest = {name: value for name, value in given.items() if name != "digest"}
-    if given.get("digest") != json_digest(manifest):
+    if document.get("format") != MANIFEST_FORMAT:
+        raise wrong_kind_error("format", document.get("format"), str(MANIFEST_FORMAT))
+    manifest = {name: value for name, value in document.items() if name != "digest"}
+    if document.get("digest") != json_digest(manifest):
         raise ValueError("it was changed after it was written: its digest is another one")
     study = read_table(_Manifest, manifest, "", "a manifest").study
     for name in study.failures:
@@ -148,12 +133,12 @@ def _check_manifest(given: PyTree) -> JsonObject:
     return manifest
 
 
-def _read_utf8(given: PyTree, path: str) -> str:
+def _read_utf8(text: PyTree, path: str) -> str:
     try:
-        read_text(given, path).encode()
+        read_text(text, path).encode()
     except UnicodeEncodeError:
-        raise wrong_kind_error(path, given, "text without surrogates") from None
-    return given
+        raise wrong_kind_error(path, text, "text without surrogates") from None
+    return text
 
 
 read_notes = table_reader(_read_utf8)
@@ -175,8 +160,8 @@ class _Adaptive(_Solver):
     rtol: float = table_field(range_reader(FINITE_SPEC))
 
 
-def _read_solver(given: PyTree, path: str) -> _Solver:
-    table = {"type": "fixed", **given} if isinstance(given, Mapping) else given
+def _read_solver(entry: PyTree, path: str) -> _Solver:
+    table = {"type": "fixed", **entry} if isinstance(entry, Mapping) else entry
     return read_one({"fixed": _Fixed, "adaptive": _Adaptive}, table, path)
 
 

@@ -46,7 +46,7 @@ class Results:
         if twice := next((paths for paths in named.values() if len(paths) > 1), None):
             raise SweepError(f"{twice[0]} and {twice[1].name} are the same chunk; --resume finds out which is damaged")
         self.files = {chunk: paths[0] for chunk, paths in named.items()}
-        self._seen: dict[int, tuple[int, ...]] = {}
+        self._verified: dict[int, tuple[int, ...]] = {}
         if not self.files:
             raise SweepError(f"{self.folder} has no finished chunk yet; --resume continues it")
 
@@ -94,8 +94,8 @@ class Results:
     @property
     def variables(self) -> list[str]:
         """Paths of the parameters that vary."""
-        known = {"sample", *FLAG_COLUMNS, *self.metrics}
-        return [name for name in self._schema().names if name not in known]
+        fixed_columns = {"sample", *FLAG_COLUMNS, *self.metrics}
+        return [name for name in self._schema().names if name not in fixed_columns]
 
     def is_number(self, name: str) -> bool:
         """Return whether the column `name` contains numbers, and not names."""
@@ -111,14 +111,14 @@ class Results:
         """Open a chunk, and verify it unless its file is unchanged since the last verification."""
         path = self.files[chunk]
         state = _file_identity(path)
-        if state is not None and self._seen.get(chunk) == state:
+        if state is not None and self._verified.get(chunk) == state:
             with files.open_regular(path) as file:
                 yield pq.ParquetFile(file)
             return
-        found = seal.verify_chunk(read_chunk(path), path, self._seals.of(chunk))
+        verified = seal.verify_chunk(read_chunk(path), path, self._seals.of(chunk))
         if state is not None:
-            self._seen[chunk] = state
-        yield found
+            self._verified[chunk] = state
+        yield verified
 
     def _read_table(self, chunk: int, names: list[str] | None) -> pa.Table:
         try:
@@ -150,10 +150,10 @@ class Results:
         Raises:
             ScenarioError: No column has one of the names.
         """
-        names, there = list(columns) if columns is not None else None, self._schema().names
+        names, available = list(columns) if columns is not None else None, self._schema().names
         for name in names or ():
-            if name not in there:
-                raise unknown_name_error(f"{name} is no column of {self.folder}", name, there)
+            if name not in available:
+                raise unknown_name_error(f"{name} is no column of {self.folder}", name, available)
         return pa.concat_tables([self._read_table(chunk, names) for chunk in sorted(self.files)]).unify_dictionaries()
 
     def column(self, name: str) -> np.ndarray:
@@ -211,6 +211,6 @@ class Results:
 def _file_identity(path: pathlib.Path) -> tuple[int, ...] | None:
     """Return numbers that change with the file, or None if the file cannot be examined."""
     with contextlib.suppress(OSError):
-        there = os.stat(path)
-        return there.st_dev, there.st_ino, there.st_size, there.st_mtime_ns, there.st_ctime_ns
+        status = os.stat(path)
+        return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
     return None

@@ -93,8 +93,8 @@ def sweep(
         raise ValueError("sweep runs in one process; several machines: on=Dask(...)")
     notes = read_notes(source or {}, "source")
     if not isinstance(study, Study):
-        given = type(study).__name__ if isinstance(study, Loop) else format_value(study)
-        raise ValueError(f"study = {given} is no Study; Study(loop=..., space=..., samples=..., solver=...) makes one")
+        kind = type(study).__name__ if isinstance(study, Loop) else format_value(study)
+        raise ValueError(f"study = {kind} is no Study; Study(loop=..., space=..., samples=..., solver=...) makes one")
     store, study = Store(pathlib.Path(out)), study.check()
     if not resume:
         store.check_free()  # before a kernel is compiled
@@ -110,15 +110,15 @@ def sweep(
         tell(at)
         if missing:
             with contextlib.closing((on or Local()).run(study, missing, stopping)) as finished:
-                for done in finished:
-                    store.write(done.chunk, done.data)
+                for computed in finished:
+                    store.write(computed.chunk, computed.data)
                     at = at._replace(
-                        samples=at.samples + done.lanes,
-                        here=at.here + done.lanes,
+                        samples=at.samples + computed.lanes,
+                        here=at.here + computed.lanes,
                         seconds=time.monotonic() - begun - stopwatch.compile_time_since(begun),
-                        failed=at.failed + done.failed,
-                        diverged=at.diverged + done.diverged,
-                        refused=at.refused + done.refused,
+                        failed=at.failed + computed.failed,
+                        diverged=at.diverged + computed.diverged,
+                        refused=at.refused + computed.refused,
                     )
                     tell(at)
     return Results(store.folder)

@@ -90,8 +90,8 @@ class Runner:
             run = partial(self._run_on_device, self._variant(names))
             for k in range(0, len(blocks), len(self.devices)):
                 together = blocks[k : k + len(self.devices)]  # at most one for each device
-                for block, found in zip(together, self._pool.map(run, together, self.devices), strict=True):
-                    for name, column in found.items():
+                for block, block_columns in zip(together, self._pool.map(run, together, self.devices), strict=True):
+                    for name, column in block_columns.items():
                         drawn[block.chunk][name][block.lanes] = column[: len(block.lanes)]
         return drawn
 
@@ -101,7 +101,7 @@ class Runner:
 
     def _sort_into_blocks(self, drawn: list[Columns]) -> dict[tuple[str, ...], list[_Block]]:
         """Return the blocks, grouped by the names of their parts."""
-        found: dict[tuple[str, ...], list[_Block]] = {}
+        blocks: dict[tuple[str, ...], list[_Block]] = {}
         for c, columns in enumerate(drawn):
             names = np.array([np.asarray(columns[path], str) for path in self.study.parts]).T
             names = names.reshape(len(columns["sample"]), len(self.study.parts))
@@ -113,24 +113,24 @@ class Runner:
                     # `resize` repeats the runs: a block of full size needs no second program.
                     filled = np.resize(lanes, self.size)
                     block = _Block(c, lanes, {p: v[filled] for p, v in values.items()}, columns["sample"][filled])
-                    found.setdefault(kind, []).append(block)
-        return found
+                    blocks.setdefault(kind, []).append(block)
+        return blocks
 
     @default_flags()
     def _run_on_device(self, loop: Part, block: _Block, device: Any) -> Columns:
         with jax.default_device(device):
-            asked = batch_admissibility(loop, block.values, self.study.solver)
+            admissibility = batch_admissibility(loop, block.values, self.study.solver)
         # A kernel is made for the default platform.
-        other = device.platform != default_platform()
+        elsewhere = device.platform != default_platform()
         with (
-            jax.default_device(device) if other else contextlib.nullcontext(),
+            jax.default_device(device) if elsewhere else contextlib.nullcontext(),
             precision(self.study.dtype),
             _convert_compiler_errors(),
         ):
-            runs = asked.accepted & (np.arange(self.size) < len(block.lanes))  # the rest are copies
-            given = jax.device_put(self._arguments(loop, block, runs), device)
-            found = jax.device_get(_measure_block(*given, self.study.solver, self.study.engine))
-        return found | {"refused": asked.texts.astype(object)}
+            runs = admissibility.accepted & (np.arange(self.size) < len(block.lanes))  # the rest are copies
+            arguments = jax.device_put(self._arguments(loop, block, runs), device)
+            columns = jax.device_get(_measure_block(*arguments, self.study.solver, self.study.engine))
+        return columns | {"refused": admissibility.texts.astype(object)}
 
     def _arguments(self, loop: Part, block: _Block, accepted: Bool) -> tuple[PyTree, ...]:
         numbers = loop, dict(self.study.objectives), block.values
@@ -154,9 +154,6 @@ def find_study_objection(study: Study) -> str | None:
     """Return the reason why the study's engine cannot make the runs of the first chunk, or None.
 
     Nothing runs, but the programs are compiled, for the default platform.
-
-    Args:
-        study: Study to examine.
     """
     return _find_objection(study, default_platform())
 
@@ -170,8 +167,8 @@ def _find_objection(study: Study, platform: str) -> str | None:
         for names, blocks in runner._sort_into_blocks([runner._draw_chunk(0)]).items():
             with precision(study.dtype), _convert_compiler_errors():
                 # Lowering a program also compiles its kernel.
-                given = runner._arguments(runner._variant(names), blocks[0], np.ones(runner.size, bool))
-                _measure_block.lower(*given, study.solver, study.engine)
+                arguments = runner._arguments(runner._variant(names), blocks[0], np.ones(runner.size, bool))
+                _measure_block.lower(*arguments, study.solver, study.engine)
     except ValueError as error:
         return str(error)
     return None
@@ -190,5 +187,5 @@ def _measure_block(
 ) -> JsonObject:
     """Return metrics and flags of a block; only the accepted samples run."""
     keys = jax.vmap(lambda sample: noise_key(seed, sample))(samples)
-    done = run_batch(loop, Batch(values, keys), solver, objectives, together=False, accepted=accepted, engine=engine)
-    return done.metrics | {"stopped": done.stopped, "diverged": done.diverged}
+    runs = run_batch(loop, Batch(values, keys), solver, objectives, together=False, accepted=accepted, engine=engine)
+    return runs.metrics | {"stopped": runs.stopped, "diverged": runs.diverged}

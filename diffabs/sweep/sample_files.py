@@ -17,16 +17,7 @@ TABLE_READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
 
 
 def read_column(path: pathlib.Path, column: str) -> np.ndarray:
-    """Return a column of numbers as float64, shape (rows,).
-
-    Args:
-        path: File with the suffix .csv or .parquet.
-        column: Name of the column.
-
-    Raises:
-        ValueError: The file cannot be read, the column does not exist or is there twice, or an entry is not a finite
-            number. The message is one line.
-    """
+    """Return a column of numbers of a .csv or .parquet file as float64, shape (rows,)."""
     if path.suffix.lower() not in TABLE_READERS:
         raise ValueError(f"{path} is neither {' nor '.join(TABLE_READERS)}")
     try:
@@ -45,11 +36,11 @@ def read_column(path: pathlib.Path, column: str) -> np.ndarray:
     values, where = table.column(column), f"{path}, column {column}"
     if len(values) == 0:
         raise ValueError(f"{where} is empty")
-    found = np.array([_parse_number(value) for value in values.to_pylist()])
-    wrong = np.flatnonzero(~np.isfinite(found))
+    numbers = np.array([_parse_number(value) for value in values.to_pylist()])
+    wrong = np.flatnonzero(~np.isfinite(numbers))
     if len(wrong):
         raise ValueError(f"{where}: {values[wrong[0]].as_py()!r} in row {wrong[0] + 1} is no finite number")
-    return found
+    return numbers
 
 
 def _parse_number(value: object) -> float:

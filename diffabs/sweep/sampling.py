@@ -152,19 +152,19 @@ def _hypercube_points(seed: int, samples: int, dimension: int) -> np.ndarray:
     return points
 
 
-def _read_level(given: PyTree, where: str) -> Any:
+def _read_level(entry: PyTree, where: str) -> Any:
     return (
-        list_reader(read_any_number)(given, where)
-        if isinstance(given, list | tuple)
-        else read_whole(given, 2, MAX_UINT32, where)
+        list_reader(read_any_number)(entry, where)
+        if isinstance(entry, list | tuple)
+        else read_whole(entry, 2, MAX_UINT32, where)
     )
 
 
-def _read_levels(given: PyTree, where: str) -> Any:
+def _read_levels(entry: PyTree, where: str) -> Any:
     return (
-        table_reader(_read_level)(given, where)
-        if isinstance(given, Mapping)
-        else read_whole(given, 2, MAX_UINT32, where)
+        table_reader(_read_level)(entry, where)
+        if isinstance(entry, Mapping)
+        else read_whole(entry, 2, MAX_UINT32, where)
     )
 
 
@@ -191,11 +191,11 @@ class Grid(SamplingDesign):
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         """Return samples of a grid made by `over`, or of a grid with one number of levels for all variables."""
         del seed, samples
-        given = list(self.levels.values()) if isinstance(self.levels, Mapping) else [self.levels] * dimension
-        if len(given) != dimension:
-            raise ValueError(f"levels are given for {len(given)} variables, not {dimension}")
-        places = np.unravel_index(np.arange(start, stop), list(map(_level_count, given)))
-        return np.stack([_levels_at(place, levels) for place, levels in zip(places, given, strict=True)], 1)
+        all_levels = list(self.levels.values()) if isinstance(self.levels, Mapping) else [self.levels] * dimension
+        if len(all_levels) != dimension:
+            raise ValueError(f"levels are given for {len(all_levels)} variables, not {dimension}")
+        places = np.unravel_index(np.arange(start, stop), list(map(_level_count, all_levels)))
+        return np.stack([_levels_at(place, levels) for place, levels in zip(places, all_levels, strict=True)], 1)
 
     def count(self, variables: Table, samples: int | None) -> int:
         """Return the number of points of the grid over `variables`.
@@ -212,9 +212,9 @@ class Grid(SamplingDesign):
         if faults:
             return
         for path, levels in self.levels.items() if isinstance(self.levels, Mapping) else ():
-            given = np.asarray(levels, float)
-            if given.ndim and not (given.size and np.all((given >= 0) & (given <= 1))):
-                yield f"{name}: {path} = {given.tolist()} are not quantile levels in [0, 1]"
+            fractions = np.asarray(levels, float)
+            if fractions.ndim and not (fractions.size and np.all((fractions >= 0) & (fractions <= 1))):
+                yield f"{name}: {path} = {fractions.tolist()} are not quantile levels in [0, 1]"
         if variables is None:
             return
         if isinstance(self.levels, Mapping):
@@ -274,10 +274,10 @@ class Saltelli(SamplingDesign):
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         del samples
-        row, which = np.divmod(np.arange(start, stop), dimension + 2)
+        row, member = np.divmod(np.arange(start, stop), dimension + 2)
         first, last = start // (dimension + 2), math.ceil(stop / (dimension + 2))
         a, b = np.split(_sobol_points(seed, 0, first, last, 2 * dimension)[row - first], 2, axis=1)
-        from_b = (which[:, None] - 2 == np.arange(dimension)) | (which[:, None] == 1)
+        from_b = (member[:, None] - 2 == np.arange(dimension)) | (member[:, None] == 1)
         return np.where(from_b, b, a)
 
     def count(self, variables: Table, samples: int | None) -> int:
@@ -292,17 +292,9 @@ class Saltelli(SamplingDesign):
 DESIGN_TYPES = {kebab_case(cls.__name__): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
 
 
-def read_sampling_design(given: PyTree, where: str) -> SamplingDesign:
-    """Return the design of a table, or of the bare name of a type.
-
-    Args:
-        given: Table with `type` and fields, or a name.
-        where: Path of the table, for messages.
-
-    Raises:
-        ScenarioError: The table is no design. The message is one line.
-    """
-    return check_sound(read_one(DESIGN_TYPES, given, where), where)
+def read_sampling_design(entry: PyTree, where: str) -> SamplingDesign:
+    """Return the design of a table, or of the bare name of a type."""
+    return check_sound(read_one(DESIGN_TYPES, entry, where), where)
 
 
 def _check_seed(seed: int) -> np.uint32:
@@ -323,22 +315,22 @@ def _check_samples(samples: int | None) -> int:
     return samples
 
 
-def _check_multiple(samples: int, of: int, what: str) -> int:
+def _check_multiple(samples: int, of: int, meaning: str) -> int:
     below = samples // of * of
     if below != samples:
         near = f"{below} or {below + of}" if below else str(of)
-        raise ValueError(f"samples = {samples} is not a multiple of {of}, {what}; {near} would be")
+        raise ValueError(f"samples = {samples} is not a multiple of {of}, {meaning}; {near} would be")
     return samples
 
 
-def _check_exact_count(count: int, samples: int | None, what: str) -> int:
+def _check_exact_count(count: int, samples: int | None, meaning: str) -> int:
     if samples not in (None, count):
-        raise ValueError(f"samples = {samples} is not {count}, the number of points of {what}")
+        raise ValueError(f"samples = {samples} is not {count}, the number of points of {meaning}")
     return _check_samples(count)
 
 
 def _support_problems(name: str, path: str, variable: Any, design: str) -> Iterator[str]:
-    own = support_interval(variable)
-    if own.open_low or own.open_high:
-        reached = f"{name}: {path} = {format_table(variable)} reaches {own.interval()}"
+    support = support_interval(variable)
+    if support.open_low or support.open_high:
+        reached = f"{name}: {path} = {format_table(variable)} reaches {support.interval()}"
         yield f"{reached}; {design} needs a finite, closed support"

@@ -52,17 +52,14 @@ class Seal(NamedTuple):
 
     def metadata(self) -> dict[bytes, bytes]:
         """Return owner, number and seed as metadata of the file."""
-        told = {"owner": self.owner, "chunk": str(self.chunk), "seed": str(self.seed)}
-        return {f"diffabs.{name}".encode(): value.encode() for name, value in told.items()}
+        entries = {"owner": self.owner, "chunk": str(self.chunk), "seed": str(self.seed)}
+        return {f"diffabs.{name}".encode(): value.encode() for name, value in entries.items()}
 
 
 def json_digest(value: Scalar) -> str:
     """Return the SHA-256 of JSON values.
 
     The order of names counts, because it is the order of a design's columns.
-
-    Args:
-        value: Value of JSON types.
     """
     return hashlib.sha256(json.dumps(value, separators=(",", ":")).encode()).hexdigest()
 
@@ -70,82 +67,66 @@ def json_digest(value: Scalar) -> str:
 def encode_chunk(columns: Mapping[str, np.ndarray], seal: Seal, units: Mapping[str, str] | None = None) -> bytes:
     """Return a chunk as the bytes of its Parquet file. The same columns of the same sweep give the same bytes.
 
-    Args:
-        columns: Columns by name, each of shape (samples,).
-        seal: Seal of the chunk.
-        units: Units of columns, where they are known; a field's metadata holds its unit under `unit`.
+    The metadata of a field holds its unit, where it is known, under `unit`.
     """
     arrays = {
         name: pa.array(column.astype(str)).dictionary_encode() if column.dtype.kind in "OU" else pa.array(column)
         for name, column in columns.items()
     }
-    told = {name: {"unit": unit} for name, unit in (units or {}).items()}
-    schema = pa.schema([pa.field(n, array.type, metadata=told.get(n)) for n, array in arrays.items()], seal.metadata())
+    field_metadata = {name: {"unit": unit} for name, unit in (units or {}).items()}
+    schema = pa.schema(
+        [pa.field(n, array.type, metadata=field_metadata.get(n)) for n, array in arrays.items()], seal.metadata()
+    )
     buffer = io.BytesIO()
     pq.write_table(pa.table(list(arrays.values()), schema), buffer, compression="zstd")
     return buffer.getvalue()
 
 
 def chunk_file_name(chunk: int, data: bytes) -> str:
-    """Return the name of a chunk's file.
-
-    Args:
-        chunk: Number of the chunk.
-        data: Bytes of the file.
-    """
+    """Return the name of a chunk's file."""
     return f"part-{chunk:08d}-{hashlib.sha256(data).hexdigest()[:DIGEST_DIGITS]}.parquet"
 
 
 def verify_chunk(data: bytes, path: pathlib.Path, seal: Seal) -> pq.ParquetFile:
-    """Return the chunk in these bytes of a file.
-
-    Args:
-        data: Bytes of the file.
-        path: Path of the file.
-        seal: Seal that the chunk must have.
-
-    Raises:
-        DamagedError: The chunk is not the one that was written.
-        SweepError: The chunk belongs to another sweep.
-    """
+    """Return the chunk in a file's bytes; raise DamagedError for damage, SweepError for a chunk of another sweep."""
     if chunk_file_name(seal.chunk, data) != path.name:
         raise DamagedError(f"{path} is damaged: its contents do not match its name; --resume computes it again")
     try:
-        found = pq.ParquetFile(pa.BufferReader(data))
-        told = found.schema_arrow.metadata or {}
-        wrong = next((key for key, value in seal.metadata().items() if told.get(key) != value), None)
+        file = pq.ParquetFile(pa.BufferReader(data))
+        metadata = file.schema_arrow.metadata or {}
+        wrong = next((key for key, value in seal.metadata().items() if metadata.get(key) != value), None)
         if wrong in (b"diffabs.owner", b"diffabs.seed"):
-            raise SweepError(f"{path} is a chunk of another sweep: its {_describe_metadata(wrong, told)}; move it away")
+            raise SweepError(
+                f"{path} is a chunk of another sweep: its {_describe_metadata(wrong, metadata)}; move it away"
+            )
         if wrong:
             raise DamagedError(
-                f"{path} is not that chunk: its {_describe_metadata(wrong, told)}; --resume computes it again"
+                f"{path} is not that chunk: its {_describe_metadata(wrong, metadata)}; --resume computes it again"
             )
-        missing = sorted(seal.columns - set(found.schema_arrow.names))
+        missing = sorted(seal.columns - set(file.schema_arrow.names))
         if missing:
             raise DamagedError(f"{path} has no column {missing[0]}; --resume computes it again")
-        samples = found.read(["sample"]).column("sample").to_numpy()
+        samples = file.read(["sample"]).column("sample").to_numpy()
         if not np.array_equal(samples, np.arange(*seal.rows)):
-            wanted = f"samples {seal.rows[0]} to {seal.rows[1] - 1}"
-            raise DamagedError(f"{path} does not have {wanted}; --resume computes it again")
+            expected = f"samples {seal.rows[0]} to {seal.rows[1] - 1}"
+            raise DamagedError(f"{path} does not have {expected}; --resume computes it again")
     except (pa.ArrowException, OSError) as error:
         why = " ".join(str(error).split())
         raise DamagedError(f"{path} is no chunk: {why}; --resume computes it again") from None
-    return found
+    return file
 
 
-def _describe_metadata(key: bytes, told: Mapping[bytes, bytes]) -> str:
+def _describe_metadata(key: bytes, metadata: Mapping[bytes, bytes]) -> str:
     kind = key.decode().removeprefix("diffabs.")
     return (
-        f"{kind} is {told[key].decode(errors='replace')[:DIGEST_DIGITS]!r}" if key in told else f"{kind} is not in it"
+        f"{kind} is {metadata[key].decode(errors='replace')[:DIGEST_DIGITS]!r}"
+        if key in metadata
+        else f"{kind} is not in it"
     )
 
 
 def tables_digest(tables: Iterable[pa.Table]) -> str:
-    """Return the SHA-256 over names, types and values of all columns; equal for equal tables in any files.
-
-    Args:
-        tables: Tables, in order.
-    """
+    """Return the SHA-256 over names, types and values of all columns; equal for equal tables in any files."""
     whole = hashlib.sha256()
     for table in tables:
         for column, values in zip(table.column_names, table.columns, strict=True):

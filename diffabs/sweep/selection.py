@@ -24,16 +24,6 @@ def choose_study_engine(
 
     A study that names its engine is returned as it is. "auto" becomes the engine that the manifest in the folder
     records, if the sweep is resumed. Otherwise it becomes a kernel, if one can make the runs.
-
-    Args:
-        study: Study to run.
-        folder: Folder of the sweep.
-        resume: Whether the sweep continues in the folder.
-        remote: Whether other machines compute the chunks.
-
-    Raises:
-        ValueError: The name of the engine is unknown.
-        SweepError: The manifest cannot be read.
     """
     if study.engine != "auto":
         return study, ""

@@ -43,9 +43,6 @@ class Store:
 
         An error in the `with` block, such as a scheduler that does not answer, leaves nothing new in the folder unless
         a chunk is finished. Ctrl-C leaves the manifest.
-
-        Raises:
-            SweepError: Another process has the lock, or the folder cannot be written.
         """
         try:
             created = [path for path in (self.folder, *self.folder.parents) if not path.exists()]
@@ -77,32 +74,26 @@ class Store:
                 folder.rmdir()
 
     def check_free(self) -> None:
-        """Check that a new sweep can begin in the folder, without writing.
-
-        Raises:
-            SweepError: The folder contains finished chunks, a manifest that is none, or other files.
-        """
-        if known := (self.folder / MANIFEST_NAME).exists():
+        """Check that a new sweep can begin in the folder, without writing."""
+        if has_manifest := (self.folder / MANIFEST_NAME).exists():
             read_manifest(self.folder)
         if self._has_chunks():
             why = "already holds a sweep; --resume continues it"
-            why = why if known else f"has chunks but no {MANIFEST_NAME}; it cannot be continued"
+            why = why if has_manifest else f"has chunks but no {MANIFEST_NAME}; it cannot be continued"
             raise SweepError(f"{self.folder} {why}")
         ours = {CHUNKS_FOLDER, MANIFEST_NAME, *LEFTOVERS}
         names = (path.name for path in self.folder.iterdir()) if self.folder.is_dir() else ()
-        others = sorted(name for name in names if name not in ours and not name.startswith("."))
-        if others:
-            raise SweepError(f"{self.folder} is no sweep, but holds {others[0]}; choose a folder that is new or empty")
+        foreign_files = sorted(name for name in names if name not in ours and not name.startswith("."))
+        if foreign_files:
+            raise SweepError(
+                f"{self.folder} is no sweep, but holds {foreign_files[0]}; choose a folder that is new or empty"
+            )
 
     def begin(self, manifest: Table, *, resume: bool) -> None:
         """Write the `manifest`, or compare it with the existing one if `resume` is set.
 
         Unless `resume` is set, a sweep without a finished chunk (because its process was killed, for example) starts
         again from the beginning.
-
-        Raises:
-            SweepError: The folder contains another configuration (the message names the first differences), finished
-                chunks while `resume` is not set, or other files.
         """
         for pattern in LEFTOVERS:
             for leftover in self.folder.glob(pattern):
@@ -112,11 +103,11 @@ class Store:
             self.chunks.mkdir(exist_ok=True)
             files.write_durably(self.folder / MANIFEST_NAME, encode_manifest(manifest))
             return
-        there = read_manifest(self.folder)
-        found = list(describe_differences(_decisive_entries(there), _decisive_entries(manifest)))
-        if found:
-            more = f", and {len(found) - 3} more" if len(found) > 3 else ""
-            raise SweepError(f"{self.folder} holds another sweep: {'; '.join(found[:3])}{more}")
+        existing = read_manifest(self.folder)
+        differences = list(describe_differences(_decisive_entries(existing), _decisive_entries(manifest)))
+        if differences:
+            more = f", and {len(differences) - 3} more" if len(differences) > 3 else ""
+            raise SweepError(f"{self.folder} holds another sweep: {'; '.join(differences[:3])}{more}")
         self.chunks.mkdir(exist_ok=True)
 
     def _has_chunks(self) -> bool:
@@ -127,9 +118,6 @@ class Store:
 
         A chunk is intact if `verify_chunk` accepts it with its seal of `seals`. A damaged file is removed. A file with
         another name stays.
-
-        Raises:
-            SweepError: A chunk belongs to another sweep, or is not a file.
         """
         whole, damaged = {}, []
         for chunk, paths in list_chunks(self.folder, seals.count)[0].items():
@@ -148,12 +136,7 @@ class Store:
 
 
 def list_chunks(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathlib.Path]], list[pathlib.Path]]:
-    """Return the files of the chunks by number, and other files that a reader would take for parts of the data set.
-
-    Args:
-        folder: Folder of the sweep.
-        count: Number of chunks of the sweep.
-    """
+    """Return the files of the chunks by number, and other files that a reader would take for parts of the data set."""
     named, strays = {}, []
     for path in sorted((folder / CHUNKS_FOLDER).glob("*")):
         number = seal.CHUNK_NAME_PATTERN.fullmatch(path.name)
@@ -165,60 +148,41 @@ def list_chunks(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathli
 
 
 def check_owner(folder: pathlib.Path, manifest: Table, sample: int) -> None:
-    """Check that a chunk belongs to the manifest: the chunk with this sample, or the first one if that is missing.
-
-    Args:
-        folder: Folder of the sweep.
-        manifest: Manifest of the folder.
-        sample: Number of the sample.
-
-    Raises:
-        SweepError: The folder has no finished chunk, or the chunk does not belong to the manifest.
-    """
+    """Check that a chunk belongs to the manifest: the chunk with this sample, or the first one if that is missing."""
     seals = Seals(manifest)
     named = list_chunks(folder, seals.count)[0]
     if not named:
         raise SweepError(f"{folder} has no finished chunk yet; --resume continues it")
-    wanted = sample // manifest["study"]["chunk"]
-    chunk = wanted if wanted in named else min(named)
+    own_chunk = sample // manifest["study"]["chunk"]
+    chunk = own_chunk if own_chunk in named else min(named)
     for path in named[chunk]:
         seal.verify_chunk(read_chunk(path), path, seals.of(chunk))
 
 
 def read_chunk(path: pathlib.Path) -> bytes:
-    """Return the bytes of a chunk's file.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        SweepError: The path is not a file, or cannot be read.
-    """
+    """Return the bytes of a chunk's file."""
     try:
         return files.read_content(path)
     except OSError as error:
         raise SweepError(f"{path} cannot be read: {error.strerror}; move it away") from None
 
 
-def describe_differences(there: Any, wanted: PyTree, path: str = "") -> Iterator[str]:
+def describe_differences(existing: Any, expected: PyTree, path: str = "") -> Iterator[str]:
     """Yield one line for each difference between two documents, also of the order of equal entries.
 
     The order of the variables decides their samples.
-
-    Args:
-        there: Existing document, of JSON values.
-        wanted: Document to compare with.
-        path: Path of both documents, for messages.
     """
-    if isinstance(there, dict) and isinstance(wanted, dict):
-        keys = [*there, *(key for key in wanted if key not in there)]
+    if isinstance(existing, dict) and isinstance(expected, dict):
+        keys = [*existing, *(key for key in expected if key not in existing)]
         inner = {key: f"{path}.{key}" if path else str(key) for key in keys}
-        lines = [line for key in keys for line in describe_differences(there.get(key), wanted.get(key), inner[key])]
-        if not lines and list(there) != list(wanted):
-            lines = [f"{path} has the entries {', '.join(there)} there, {', '.join(wanted)} here"]
+        lines = [
+            line for key in keys for line in describe_differences(existing.get(key), expected.get(key), inner[key])
+        ]
+        if not lines and list(existing) != list(expected):
+            lines = [f"{path} has the entries {', '.join(existing)} there, {', '.join(expected)} here"]
         yield from lines
-    elif json.dumps(there) != json.dumps(wanted):  # as digests do: NaN is NaN, and 1 is not 1.0
-        yield f"{path} is {_abbreviate(there)} there, {_abbreviate(wanted)} here"
+    elif json.dumps(existing) != json.dumps(expected):  # as digests do: NaN is NaN, and 1 is not 1.0
+        yield f"{path} is {_abbreviate(existing)} there, {_abbreviate(expected)} here"
 
 
 def _decisive_entries(manifest: Table) -> JsonObject:

@@ -91,15 +91,17 @@ class Study:
             for place, at in enumerate(np.ndindex(np.shape(value)))
         }
         varied = {path: declared[path] for path in self.space.paths if path in declared}
-        measured = {name: resolve_unit(getattr(one, "unit", ""), loop) for name, one in self.objectives.items()}
+        measured = {
+            name: resolve_unit(getattr(objective, "unit", ""), loop) for name, objective in self.objectives.items()
+        }
         return {**varied, **{name: unit for name, unit in measured.items() if unit}}
 
     @property
     def failure_bounds(self) -> dict[str, float]:
         """Bounds of the metrics beyond which a run fails: those of the objectives, replaced by those of the study."""
-        said = {name: getattr(part, "failure", None) for name, part in self.objectives.items()}
-        own = {name: float(bound) for name, bound in said.items() if bound is not None}
-        return own | {name: float(bound) for name, bound in self.failures.items()}
+        declared = {name: getattr(part, "failure", None) for name, part in self.objectives.items()}
+        bounds = {name: float(bound) for name, bound in declared.items() if bound is not None}
+        return bounds | {name: float(bound) for name, bound in self.failures.items()}
 
     @property
     def chunks(self) -> int:
@@ -151,17 +153,17 @@ class Study:
         Raises:
             NoCompiler: The engine is a kernel, and there is no compiler.
         """
-        own: JsonObject = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
-        own |= {"failures": self.failure_bounds, "success": self.success}
+        entries: JsonObject = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
+        entries |= {"failures": self.failure_bounds, "success": self.success}
         if self.engine == "kernel":
-            own |= {"engine": {"name": self.engine, **pipeline.describe_kernel_build()}}
-        own |= {"solver": describe_solver(self.solver), "space": self.space.table()}
-        return as_plain({**own, "loop": self.loop, "parts": self.parts, "objectives": self.objectives})
+            entries |= {"engine": {"name": self.engine, **pipeline.describe_kernel_build()}}
+        entries |= {"solver": describe_solver(self.solver), "space": self.space.table()}
+        return as_plain({**entries, "loop": self.loop, "parts": self.parts, "objectives": self.objectives})
 
     def _number_problems(self) -> Iterator[str]:
-        for name, (least, most) in RANGES.items():
+        for name, (low, high) in RANGES.items():
             try:
-                read_whole(getattr(self, name), least, most, name)
+                read_whole(getattr(self, name), low, high, name)
             except ScenarioError as error:
                 yield str(error)
         if self.dtype not in DTYPES:
@@ -180,15 +182,15 @@ class Study:
     def _variable_problems(self) -> Iterator[str]:
         wrong = list(self.space.problems())
         yield from wrong
-        known = elements(self.loop)
+        specs = elements(self.loop)
         for path in self.space.paths:
             if path in self.parts:
                 yield from _part_problems(path, self.space.variables.get(path), self.parts[path], self.loop)
-            elif path not in known:
-                yield str(unknown_name_error(f"{path} is not a parameter of this loop", path, known))
+            elif path not in specs:
+                yield str(unknown_name_error(f"{path} is not a parameter of this loop", path, specs))
         yield from (f"parts.{path} has no distribution" for path in self.parts if path not in self.space.paths)
         if not wrong:
-            yield from self.space.describe_out_of_range(known)
+            yield from self.space.describe_out_of_range(specs)
             try:
                 self.space.design.count(self.space.variables, self.samples)
             except ValueError as error:
@@ -212,31 +214,18 @@ def _part_problems(path: str, distribution: Any, choices: Table, loop: Loop) -> 
 
 @contextlib.contextmanager
 def precision(dtype: str) -> Iterator[None]:
-    """Set JAX's default type of numbers in this context.
-
-    Args:
-        dtype: "float32" or "float64".
-    """
+    """Set JAX's default type of numbers in this context."""
     with jax.enable_x64(dtype == "float64"):
         yield
 
 
 def noise_key(seed: Any, i: Int) -> jax.Array:
-    """Return the random key for the sensors of sample i.
-
-    Args:
-        seed: Seed of the sweep.
-        i: Number of the sample.
-    """
+    """Return the random key for the sensors of sample i."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), NOISE_STREAM), i)
 
 
 def is_accepted(refused: Bool) -> np.ndarray:
-    """Return which samples were run, shape (samples,).
-
-    Args:
-        refused: Reason why a sample was not run, or an empty text, shape (samples,).
-    """
+    """Return which samples were run, shape (samples,): those whose reason in `refused`, of that shape, is empty."""
     return np.asarray(refused).astype(str) == ""
 
 
@@ -247,11 +236,6 @@ def failure_masks(
 
     The kinds are "diverged", a wrong end ("stopped" or "not stopped"), and "METRIC > BOUND". A sample that was not run
     has not failed.
-
-    Args:
-        column: Function that returns a column of the table by its name.
-        bounds: Bounds of metrics; a larger value is a failure.
-        success: Whether reaching the stop is a success.
     """
     run = is_accepted(column("refused"))
     kinds = {"diverged": column("diverged"), describe_wrong_end(success): has_wrong_end(column("stopped"), success)}
@@ -263,18 +247,10 @@ def has_wrong_end(stopped: Bool, success: bool) -> np.ndarray:
     """Return which runs had a wrong end, shape (samples,).
 
     The end is wrong if a run misses a stop that is a success, or reaches a stop that is not.
-
-    Args:
-        stopped: Whether each run reached its stop, shape (samples,).
-        success: Whether reaching the stop is a success.
     """
     return np.asarray(stopped) != success
 
 
 def describe_wrong_end(success: bool) -> str:
-    """Return the name of a wrong end: "not stopped" if the stop is a success, else "stopped".
-
-    Args:
-        success: Whether reaching the stop is a success.
-    """
+    """Return the name of a wrong end: "not stopped" if the stop is a success, else "stopped"."""
     return "not stopped" if success else "stopped"

@@ -25,24 +25,16 @@ def write_trajectories(study: Study, folder: str | pathlib.Path, samples: Sequen
     """Run these samples again, write their trajectories, and return the path of the group.
 
     The group replaces an earlier one. It is written completely or not at all.
-
-    Args:
-        study: Study of the sweep.
-        folder: Folder of the sweep.
-        samples: Numbers of the samples.
-
-    Raises:
-        ValueError: `samples` is empty, or a sample is not in the sweep.
     """
     if not samples:
         raise ValueError("samples = []: give the number of at least one sample")
     path = pathlib.Path(folder) / TRAJECTORIES_NAME
-    seen = [run_signals(rerun_sample(study, i).sample, study.loop.plant) for i in samples]
+    signals = [run_signals(rerun_sample(study, i).sample, study.loop.plant) for i in samples]
     with files.new_folder(path) as folder:
         group = zarr.open_group(folder, mode="w")
         numbers = {"sample": ("", np.asarray(samples, np.int64))}
-        for name, (unit, _) in seen[0].items():
-            numbers["time" if name == "t" else name] = unit, np.stack([one[name][1] for one in seen])
+        for name, (unit, _) in signals[0].items():
+            numbers["time" if name == "t" else name] = unit, np.stack([lane[name][1] for lane in signals])
         for name, (unit, values) in numbers.items():
             dimensions = ("sample", "instant")[: values.ndim]
             array = group.create_array(name, shape=values.shape, dtype=values.dtype, dimension_names=dimensions)
@@ -52,12 +44,7 @@ def write_trajectories(study: Study, folder: str | pathlib.Path, samples: Sequen
 
 
 def rerun_sample(study: Study, i: int) -> Trajectory:
-    """Return the trajectory of one sample, on the host. After the end of the run the last instant repeats.
-
-    Args:
-        study: Study of the sweep.
-        i: Number of the sample.
-    """
+    """Return the trajectory of one sample, on the host. After the end of the run the last instant repeats."""
     loop, key = study.lane(i)
     every = max(study.solver.every, -(-study.solver.steps // MAX_TRAJECTORY_INSTANTS))
     with precision(study.dtype):

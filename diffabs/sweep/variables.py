@@ -74,26 +74,18 @@ class Correlation:
             yield f"{name}: matrix is not symmetric"
         elif not np.allclose(np.diag(matrix), 1, rtol=0, atol=CORRELATION_TOLERANCE):
             yield f"{name}: matrix has {np.diag(matrix).tolist()} on its diagonal, not ones"
-        elif (least := np.linalg.eigvalsh(matrix)[0]) < MIN_CORRELATION_EIGENVALUE:
-            low = f"its least eigenvalue is {least:.3g}, below {MIN_CORRELATION_EIGENVALUE:g}"
+        elif (smallest := np.linalg.eigvalsh(matrix)[0]) < MIN_CORRELATION_EIGENVALUE:
+            low = f"its least eigenvalue is {smallest:.3g}, below {MIN_CORRELATION_EIGENVALUE:g}"
             yield f"{name}: matrix is not positive definite: {low}"
 
 
-def read_correlation(given: PyTree, where: str) -> Correlation:
-    """Return the correlation of a table.
-
-    Args:
-        given: Table with `paths` and `matrix`.
-        where: Path of the table, for messages.
-
-    Raises:
-        ScenarioError: The table is no correlation.
-    """
-    return check_sound(values.read_table(Correlation, given, where), where)
+def read_correlation(table: PyTree, where: str) -> Correlation:
+    """Return the correlation of a table."""
+    return check_sound(values.read_table(Correlation, table, where), where)
 
 
-def _read_variable(given: PyTree, where: str) -> Any:
-    return distributions.read_distribution(given, where, distributions.DISTRIBUTION_TYPES | {"rows": Rows})
+def _read_variable(entry: PyTree, where: str) -> Any:
+    return distributions.read_distribution(entry, where, distributions.DISTRIBUTION_TYPES | {"rows": Rows})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -208,17 +200,9 @@ class Space:
         return {"variables": variables, **correlation, "design": as_plain(self.design, brief=True)}
 
 
-def read_space(given: PyTree, where: str) -> Space:
-    """Return the space of a table with `variables`, and optionally `correlation` and `design`.
-
-    Args:
-        given: Table.
-        where: Path of the table, for messages.
-
-    Raises:
-        ScenarioError: One of these is wrong; the message is one line. `Space.check` finds errors in their combination.
-    """
-    return values.read_table(Space, given, where)
+def read_space(table: PyTree, where: str) -> Space:
+    """Return the space of a table with `variables`, and optionally `correlation` and `design`."""
+    return values.read_table(Space, table, where)
 
 
 def _flatten_rows(values: Params) -> dict[str, np.ndarray]:

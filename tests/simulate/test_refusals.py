@@ -350,7 +350,7 @@ def swept(tmp_path_factory):
 
 
 class TestWhoeverRuns:
-    @killed_by("sweep/statistics/summary.py", "asked = view.rows & view.accepted", "asked = view.rows")
+    @killed_by("sweep/statistics/summary.py", "eligible = view.rows & view.accepted", "eligible = view.rows")
     @pytest.mark.slow
     def test_a_refused_lane_is_a_row_with_a_reason_and_in_no_number(self, swept):
         below = swept.column("initial.speed") <= 25 / 3.6

@@ -420,7 +420,7 @@ def test_a_number_of_workers_that_cannot_be():
     assert Dask().workers == core_count()
 
 
-@killed_by("sweep/cluster.py", "for line in describe_differences(there, here):", "for line in ():")
+@killed_by("sweep/cluster.py", "for line in describe_differences(worker_versions, own_versions):", "for line in ():")
 @pytest.mark.slow
 def test_a_worker_with_other_versions(scenario, tmp_path):
     """Of the package and of JAX; and one that has no diffabs at all."""

@@ -694,7 +694,7 @@ def test_a_seed_has_32_bits(design, seed):
         design.unit(seed, 0, 4, 1, 4)
 
 
-@killed_by("sweep/distributions.py", "own.high == spec.high and spec.open_high", "False and spec.open_high")
+@killed_by("sweep/distributions.py", "support.high == spec.high and spec.open_high", "False and spec.open_high")
 @pytest.mark.parametrize(
     ("ours", "spec", "line"),
     [

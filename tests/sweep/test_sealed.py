@@ -89,7 +89,7 @@ def test_compare_sees_it_too(copy, whole):
 
 
 @pytest.mark.slow
-@killed_by("sweep/results.py", "self._seen.get(chunk) == state", "chunk in self._seen")
+@killed_by("sweep/results.py", "self._verified.get(chunk) == state", "chunk in self._verified")
 def test_a_file_that_changes_while_it_is_open_is_verified_again(copy):
     found, path = Results(copy), chunk_files(copy)[0]
     before = found.column("iae")
@@ -213,7 +213,7 @@ def test_the_digest_of_a_manifest_is_that_of_the_rest(whole, copy):
 
 
 @pytest.mark.slow
-@killed_by("sweep/manifest.py", 'if given.get("digest") != json_digest(manifest):', "if False:")
+@killed_by("sweep/manifest.py", 'if document.get("digest") != json_digest(manifest):', "if False:")
 def test_a_scenario_that_was_edited_in_the_manifest_is_seen(copy, whole):
     def heavier(there):
         there["source"]["scenario"] = there["source"]["scenario"].replace("0.0995", "0.1")

@@ -168,7 +168,7 @@ def test_worst(swept):
     assert rows.column("overshoot").to_numpy().tolist() == np.sort(values)[::-1][:7].tolist()
 
 
-@killed_by("sweep/results.py", "if name not in there", "if False")
+@killed_by("sweep/results.py", "if name not in available", "if False")
 @pytest.mark.parametrize(
     ("read", "line"),
     [
@@ -234,7 +234,7 @@ def test_stopped_and_continued_is_the_same_to_the_bit(study, swept, tmp_path):
     assert whole.digest == swept.digest
 
 
-@killed_by("sweep/checking.py", 'np.searchsorted(found.column("sample"), samples)', "samples")
+@killed_by("sweep/checking.py", 'np.searchsorted(results.column("sample"), samples)', "samples")
 @pytest.mark.slow
 def test_a_half_step_of_a_sweep_with_a_gap(study, swept, tmp_path):
     """Its samples are those of the other chunks, and each change is that of the sample's own row."""
@@ -269,7 +269,11 @@ def test_half_steps_are_made_by_the_sweeps_own_engine_and_program(study, swept, 
     assert found["metrics"]["iae"]["largest"] == pytest.approx(0.25, rel=1e-12)  # 1.25 and 0.25 are exact
 
 
-@killed_by("sweep/checking.py", "for name, one in turned.items() if one", "for name, one in turned.items() if not one")
+@killed_by(
+    "sweep/checking.py",
+    "for name, numbers in turned.items() if numbers",
+    "for name, numbers in turned.items() if not numbers",
+)
 @pytest.mark.slow
 def test_a_half_step_that_turns_never_into_a_number(study, swept):
     """The table says "never" of two of the repeated runs, which have a number with the half step."""
@@ -549,8 +553,8 @@ def test_a_sweep_without_a_chunk_is_begun_anew(study, tmp_path):
 ORDERED = {"a": 1, "b": 2.0, "c": math.nan}
 
 
-@killed_by("sweep/store.py", "if not lines and list(there) != list(wanted):", "if False:")
-@killed_by("sweep/store.py", "json.dumps(there) != json.dumps(wanted)", "there != wanted")
+@killed_by("sweep/store.py", "if not lines and list(existing) != list(expected):", "if False:")
+@killed_by("sweep/store.py", "json.dumps(existing) != json.dumps(expected)", "existing != expected")
 @pytest.mark.parametrize(
     ("other", "line"),
     [

@@ -162,8 +162,8 @@ class TestCVaR:
 
     @killed_by(
         "sweep/statistics/estimates.py",
-        "taken = np.clip(share - (reached - weights), 0.0, weights)",
-        "taken = np.clip(np.round(share) - (reached - weights), 0.0, weights)",
+        "tail_weights = np.clip(share - (reached - weights), 0.0, weights)",
+        "tail_weights = np.clip(np.round(share) - (reached - weights), 0.0, weights)",
     )
     def test_the_sample_at_the_edge_counts_in_part(self):
         assert estimates.cvar([1.0, 5.0, 2.0, 3.0], 0.625).value == pytest.approx((5 + 0.5 * 3) / 1.5, rel=1e-12)
@@ -362,7 +362,7 @@ class TestCorrelations:
         theirs = [stats.pearsonr(x, self.Y).statistic for x in self.X.T]
         np.testing.assert_allclose([one.value for one in found], theirs, rtol=1e-12, atol=0)
 
-    @killed_by("sweep/statistics/sensitivity.py", "_influence(u, v, r) + others", "_influence(u, v, r)")
+    @killed_by("sweep/statistics/sensitivity.py", "_influence(u, v, r) + rank_effect", "_influence(u, v, r)")
     @killed_by("sweep/statistics/sensitivity.py", "u * v - r * (u * u + v * v) / 2", "u * v")
     @pytest.mark.parametrize(("kind", "theirs"), [("pearson", stats.pearsonr), ("spearman", stats.spearmanr)])
     def test_the_intervals_are_those_of_samples_left_out(self, kind, theirs):
@@ -499,7 +499,7 @@ class TestPaired:
     NOISE = np.round(np.random.default_rng(20).normal(0.0, 0.5, size=75), 1)
     B = A + (0.3 + np.concatenate([NOISE, -NOISE]))  # differences without skewness: the interval is Student's
 
-    @killed_by("sweep/statistics/paired.py", "difference = one - other", "difference = other - one")
+    @killed_by("sweep/statistics/paired.py", "difference = first - second", "difference = second - first")
     def test_is_scipys_each_by_each(self):
         found = paired.compare_pairs(self.A, self.B, confidence=0.9)
         theirs = stats.ttest_rel(self.A, self.B).confidence_interval(0.9)

@@ -42,7 +42,7 @@ def in_blocks(made, metric, **flags):
 
 
 @killed_by(
-    "sweep/statistics/summary.py", 'samples // (found.study["samples"] // count), count', "samples % count, count"
+    "sweep/statistics/summary.py", 'samples // (results.study["samples"] // count), count', "samples % count, count"
 )
 def test_a_replicate_is_a_block_of_samples(made):
     """Blocks of one value each: their spread is that of 16 values, whatever is in a block."""
@@ -79,7 +79,7 @@ def of_groups(made, metric, **options):
     return made({"type": "saltelli"}, {"a": POINTS[:, 0], "b": POINTS[:, 1]}, metric, **options)
 
 
-@killed_by("sweep/statistics/rows.py", "self.samples[known] // self.period", "np.flatnonzero(known) // self.period")
+@killed_by("sweep/statistics/rows.py", "self.samples[good] // self.period", "np.flatnonzero(good) // self.period")
 @pytest.mark.parametrize(
     ("missing", "lost", "groups"),
     [((), (), 250), ((2,), (), 218), ((2,), (5, 6, 999), 216)],

@@ -37,26 +37,17 @@ class PairedComparison(NamedTuple):
 
 
 def compare_pairs(a: Scalar, b: Scalar, *, confidence: float = 0.95) -> PairedComparison:
-    """Return the comparison of two variants, sample by sample.
-
-    Args:
-        a: Outputs of the first variant, shape (n,).
-        b: Outputs of the second variant, shape (n,).
-        confidence: Confidence of the intervals, in (0, 1).
-
-    Raises:
-        ValueError: There are fewer than four samples, the lengths differ, or a value is not finite.
-    """
-    one, other = as_column(a, least=4), as_column(b)
-    if one.shape != other.shape:
-        raise ValueError(f"{len(one)} and {len(other)} values are not pairs: leave a lane out of both")
-    difference = one - other
-    apart, together = float(np.var(one) + np.var(other)), float(np.var(difference))
-    less = Count(int(np.count_nonzero(one < other)), len(one))
+    """Return the comparison of two variants by their outputs a and b, each of shape (n,)."""
+    first, second = as_column(a, minimum=4), as_column(b)
+    if first.shape != second.shape:
+        raise ValueError(f"{len(first)} and {len(second)} values are not pairs: leave a lane out of both")
+    difference = first - second
+    apart, together = float(np.var(first) + np.var(second)), float(np.var(difference))
+    less = Count(int(np.count_nonzero(first < second)), len(first))
     return PairedComparison(
         mean=Moments.of(difference).mean(confidence=confidence),
         median=quantile(difference, 0.5, confidence=confidence),
         less=less.probability(confidence=confidence),
-        ties=int(np.count_nonzero(one == other)),
+        ties=int(np.count_nonzero(first == second)),
         reduction=apart / together if together > 0 else math.inf if apart > 0 else math.nan,
     )

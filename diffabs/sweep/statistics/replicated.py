@@ -64,11 +64,7 @@ class Replicates:
     confidence: float = 0.95
 
     def mean(self, values: PyTree) -> IntervalEstimate:
-        """Return the mean of `values` (n,) with a t interval.
-
-        Raises:
-            ValueError: There are no values, or one is not finite.
-        """
+        """Return the mean of `values` (n,) with a t interval."""
         x = as_column(values)
         centre, half = float(x.mean()), self._half_width(x)
         return IntervalEstimate(centre, centre - half, centre + half, self.confidence, len(x))
@@ -78,9 +74,6 @@ class Replicates:
 
         The interval is that of Clopper and Pearson in three cases: fewer than 10 failures or successes, equal shares in
         all replicates, an empty replicate.
-
-        Raises:
-            ValueError: There are no samples.
         """
         x = as_column(failed)
         n, failures, half = len(x), int(np.count_nonzero(x)), self._half_width(x)
@@ -95,13 +88,6 @@ class Replicates:
         """Return a quantile of `values` (n,) by linear interpolation, with an interval between two order statistics.
 
         An end is infinite where no order statistic reaches the confidence. The value is clipped to the interval.
-
-        Args:
-            values: Samples, shape (n,).
-            level: Fraction of the law at or below the quantile, in (0, 1).
-
-        Raises:
-            ValueError: The level is outside (0, 1), there are no samples, or a value is not finite.
         """
         x = as_column(values)
         ordered = np.sort(x)
@@ -117,36 +103,20 @@ class Replicates:
         """Return the mean of the largest fraction 1 - level of the samples; the sample at the edge counts in part.
 
         Ends are infinite with fewer than 10 samples in the tail.
-
-        Args:
-            values: Samples, shape (n,).
-            level: Fraction below the tail, in [0, 1).
-
-        Raises:
-            ValueError: The level is outside [0, 1), there are no samples, or a value is not finite.
         """
         x = as_column(values)
         if not 0 <= level < 1:
             raise ValueError(f"level = {level:g} is outside [0, 1)")
         share = round(len(x) * (1 - level), 9)
         edge = np.sort(x)[max(math.ceil(len(x) * level) - 1, 0)]
-        found = self.mean(edge + np.maximum(x - edge, 0.0) / (1 - level))
-        return found if share >= MIN_TAIL_SAMPLES else found._replace(low=-math.inf, high=math.inf)
+        estimate = self.mean(edge + np.maximum(x - edge, 0.0) / (1 - level))
+        return estimate if share >= MIN_TAIL_SAMPLES else estimate._replace(low=-math.inf, high=math.inf)
 
     def summarise_column(self, values: PyTree, levels: Sequence[float], tail: float) -> dict[str, IntervalEstimate]:
-        """Return each estimate by its name: `mean`, `quantile 0.05` and so on, and `cvar 0.95`.
-
-        Args:
-            values: Samples, shape (n,).
-            levels: Levels of the quantiles, in (0, 1).
-            tail: Level of CVaR, in [0, 1).
-
-        Raises:
-            ValueError: A level is outside its range, there are no samples, or a value is not finite.
-        """
-        found = {"mean": self.mean(values)}
-        found |= {f"quantile {level:g}": self.quantile(values, level) for level in levels}
-        return found | {f"cvar {tail:g}": self.cvar(values, tail)}
+        """Return each estimate by its name: `mean`, `quantile 0.05` and so on, and `cvar 0.95`."""
+        estimates = {"mean": self.mean(values)}
+        estimates |= {f"quantile {level:g}": self.quantile(values, level) for level in levels}
+        return estimates | {f"cvar {tail:g}": self.cvar(values, tail)}
 
     def _half_width(self, x: np.ndarray) -> float:
         """Return t e(x), or infinity if a replicate has no sample."""

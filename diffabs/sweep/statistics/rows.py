@@ -19,21 +19,17 @@ class RowMasks:
         period: Number of runs in a group of a Saltelli design, else 1.
     """
 
-    def __init__(self, found: Results):
-        """Read the masks of the sweep `found`."""
-        space = found.study["space"]
+    def __init__(self, results: Results):
+        """Read the masks of a sweep."""
+        space = results.study["space"]
         self.design = space["design"]["type"]
         self.period = len(space["variables"]) + 2 if self.design == "saltelli" else 1
-        self.samples, self.accepted = found.column("sample"), found.accepted
-        self.good = self.accepted & ~found.column("diverged")
+        self.samples, self.accepted = results.column("sample"), results.accepted
+        self.good = self.accepted & ~results.column("diverged")
         self.rows = self.samples % self.period == 0
 
     def groups(self, values: np.ndarray) -> np.ndarray:
-        """Return a column by groups of runs, shape (groups, period), without groups that miss a good, finite run.
-
-        Args:
-            values: Column of the table, shape (rows,).
-        """
-        known = self.good & np.isfinite(values)
-        _, place, count = np.unique(self.samples[known] // self.period, return_inverse=True, return_counts=True)
-        return values[known][count[place] == self.period].reshape(-1, self.period)
+        """Return a column by groups of runs, shape (groups, period), without groups that miss a good, finite run."""
+        good = self.good & np.isfinite(values)
+        _, place, count = np.unique(self.samples[good] // self.period, return_inverse=True, return_counts=True)
+        return values[good][count[place] == self.period].reshape(-1, self.period)

@@ -70,30 +70,22 @@ class SobolIndices(NamedTuple):
 
 
 def correlations(x: Scalar, y: Scalar, *, confidence: float = 0.95) -> Correlations:
-    """Return the correlations of each column of x with y, in the order of the columns.
+    """Return the correlations of each column of x (n, d) with y (n,), in the order of the columns.
 
     If one of the two is constant but for rounding, the value is NaN. Its ends, and those of fewer than 10 samples, are
     -1 and 1.
-
-    Args:
-        x: Inputs, shape (n, d).
-        y: Output, shape (n,).
-        confidence: Confidence of the intervals, in (0, 1).
-
-    Raises:
-        ValueError: There are fewer than four samples, the lengths differ, or a value is not finite.
     """
-    outputs, inputs = as_column(y, least=4), np.asarray(x)
+    outputs, inputs = as_column(y, minimum=4), np.asarray(x)
     if inputs.ndim != 2 or len(inputs) != len(outputs):
         raise ValueError(f"inputs of shape {inputs.shape} do not fit {len(outputs)} outputs")
     outputs = outputs if varies(outputs) else np.zeros_like(outputs)
     ranked = stats.rankdata(outputs)
-    found = Correlations([], [])
+    estimates = Correlations([], [])
     for values in inputs.T:
         values = as_column(values)
-        found.pearson.append(_pearson(values, outputs, confidence))
-        found.spearman.append(_spearman(stats.rankdata(values), ranked, confidence))
-    return found
+        estimates.pearson.append(_pearson(values, outputs, confidence))
+        estimates.spearman.append(_spearman(stats.rankdata(values), ranked, confidence))
+    return estimates
 
 
 def sobol_indices(
@@ -105,24 +97,12 @@ def sobol_indices(
     replicates: int = BOOTSTRAP_REPLICATES,
     seed: int = 0,
 ) -> SobolIndices:
-    """Return the Sobol' indices of d inputs; NaN with infinite ends if f is constant but for
-    rounding.
+    """Return the Sobol' indices of d inputs, from a = f(A) and b = f(B), shape (n,), and ab = f(AB_j), shape (d, n).
 
-    The intervals assume independent rows. For rows of a low-discrepancy design they are too wide.
-
-    Args:
-        a: Outputs f(A), shape (n,).
-        b: Outputs f(B), shape (n,).
-        ab: Outputs f(AB_j), shape (d, n).
-        confidence: Confidence of the intervals, in (0, 1).
-        replicates: Number of bootstrap replicates.
-        seed: Seed of the bootstrap; the same seed gives the same intervals.
-
-    Raises:
-        ValueError: There are fewer than four rows or too few replicates, the shapes do not fit, or a value is not
-            finite.
+    They are NaN with infinite ends if f is constant but for rounding. The intervals assume independent rows. For rows
+    of a low-discrepancy design they are too wide.
     """
-    fa, fb, mixed = as_column(a, least=4), as_column(b), np.asarray(ab)
+    fa, fb, mixed = as_column(a, minimum=4), as_column(b), np.asarray(ab)
     as_column(np.ravel(mixed))
     if fa.shape != fb.shape or mixed.ndim != 2 or mixed.shape[1] != len(fa):
         raise ValueError(f"outputs of shapes {fa.shape}, {fb.shape} and {mixed.shape} do not fit: (n,), (n,), (d, n)")
@@ -133,10 +113,10 @@ def sobol_indices(
     rows = _sum_group_features(fa, fb, mixed, random)
     (values,) = _indices_from_sums(rows.sum(axis=0)[None])
     sizes = [min(REPLICATES_PER_BLOCK, replicates - start) for start in range(0, replicates, REPLICATES_PER_BLOCK)]
-    found = np.sort(
+    resampled = np.sort(
         np.concatenate([_indices_from_sums(_resample_groups(size, len(rows), random) @ rows) for size in sizes]), axis=0
     )
-    ends = np.where(np.isnan(found[-1]), [[-math.inf], [math.inf]], found[[place, -1 - place]])
+    ends = np.where(np.isnan(resampled[-1]), [[-math.inf], [math.inf]], resampled[[place, -1 - place]])
     table = zip(values.tolist(), *ends.tolist(), strict=True)
     each = [IntervalEstimate(value, low, high, confidence, n) for value, low, high in table]
     return SobolIndices(each[:d], each[d:])
@@ -153,8 +133,8 @@ def _spearman(x: np.ndarray, y: np.ndarray, confidence: float) -> IntervalEstima
     u, v = _standardise(x), _standardise(y)
     r = _product_moment(u, v)
     # The effect of a sample on the ranks of the others.
-    others = _sum_above(x, v - r * u) / np.std(x) + _sum_above(y, u - r * v) / np.std(y)
-    return _fisher_interval(r, _influence(u, v, r) + others, confidence)
+    rank_effect = _sum_above(x, v - r * u) / np.std(x) + _sum_above(y, u - r * v) / np.std(y)
+    return _fisher_interval(r, _influence(u, v, r) + rank_effect, confidence)
 
 
 def _product_moment(u: np.ndarray, v: np.ndarray) -> float:
@@ -201,10 +181,10 @@ def _sum_group_features(a: np.ndarray, b: np.ndarray, mixed: np.ndarray, random:
     # Of a constant, no rounding may be left: it would count as a variance.
     mean = (a.mean() + b.mean()) / 2 if np.ptp(np.concatenate([a, b])) > 0 else a[0]
     a, b = a - mean, b - mean
-    sums = [np.bincount(group, one) for one in (np.ones(n), a + b, a * a + b * b)]
+    sums = [np.bincount(group, feature) for feature in (np.ones(n), a + b, a * a + b * b)]
     for values in mixed:
         step = as_column(values) - mean - a
-        sums += [np.bincount(group, one) for one in (b * step, step * step)]
+        sums += [np.bincount(group, feature) for feature in (b * step, step * step)]
     return np.stack(sums, axis=1)
 
 

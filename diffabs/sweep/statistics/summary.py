@@ -42,7 +42,7 @@ INTERVAL_NOTES = {
 DETERMINISTIC_DESIGNS = ("grid", "corners")
 
 
-def summarise_sweep(found: Results) -> JsonObject:
+def summarise_sweep(results: Results) -> JsonObject:
     """Return the summary of the finished chunks.
 
     Its entries are:
@@ -59,18 +59,15 @@ def summarise_sweep(found: Results) -> JsonObject:
     Each estimate has `value`, `low`, `high`, and the number of `samples` that it is of. Of a Saltelli design these are
     the runs A, and for an index the groups of runs. Correlations are of at most the first 200,000 samples. Diverged
     runs enter the failures but no other statistic. Refused samples enter none. An infinite end is None.
-
-    Args:
-        found: Results of the sweep.
     """
-    view = RowMasks(found)
-    skewed = [name for name in found.metrics if _is_skewed(_known_values(found, view, name))]
+    view = RowMasks(results)
+    skewed = [name for name in results.metrics if _is_skewed(_known_values(results, view, name))]
     warning = f"; few samples of a skewed law, so intervals of the mean may be too narrow: {', '.join(skewed)}"
-    refused, count = ~view.accepted, _replicate_count(found)
-    reasons, counts = np.unique(found.column("refused")[refused].astype(str), return_counts=True)
+    refused, count = ~view.accepted, _replicate_count(results)
+    reasons, counts = np.unique(results.column("refused")[refused].astype(str), return_counts=True)
     return {
         "samples": len(view.samples),
-        "complete": found.complete,
+        "complete": results.complete,
         "diverged": _list_samples(view, view.accepted & ~view.good),
         "refused": {
             **_list_samples(view, refused),
@@ -79,12 +76,12 @@ def summarise_sweep(found: Results) -> JsonObject:
         "confidence": CONFIDENCE,
         "intervals": INTERVAL_NOTES["one sobol" if view.design == "sobol" and count == 1 else view.design]
         + (warning if skewed and view.design not in DETERMINISTIC_DESIGNS else ""),
-        "failures": dict(_failure_probabilities(found, view)),
-        "never": {name: never for name in found.metrics if (never := _list_never(found, view, name))["count"]},
-        "metrics": {name: _summarise_metric(found, view, name) for name in found.metrics},
-        "sensitivity": _summarise_sensitivity(found, view),
-        "worst": {name: _worst_samples(found, view, name) for name in found.metrics},
-        "digest": found.digest,
+        "failures": dict(_failure_probabilities(results, view)),
+        "never": {name: never for name in results.metrics if (never := _list_never(results, view, name))["count"]},
+        "metrics": {name: _summarise_metric(results, view, name) for name in results.metrics},
+        "sensitivity": _summarise_sensitivity(results, view),
+        "worst": {name: _worst_samples(results, view, name) for name in results.metrics},
+        "digest": results.digest,
     }
 
 
@@ -93,44 +90,44 @@ def _list_samples(view: RowMasks, rows: np.ndarray) -> JsonObject:
     return {"count": int(rows.sum()), "samples": view.samples[rows][:MAX_LISTED_SAMPLES].tolist()}
 
 
-def _list_never(found: Results, view: RowMasks, name: str) -> JsonObject:
+def _list_never(results: Results, view: RowMasks, name: str) -> JsonObject:
     """Return the number and the first samples of runs without a finite value: they never reach the measured event, or
     lack what the metric measures (NaN).
 
     An infinite value violates every bound of the metric. Its other statistics are of the finite values only.
     """
-    return _list_samples(view, view.good & view.rows & ~np.isfinite(found.column(name)))
+    return _list_samples(view, view.good & view.rows & ~np.isfinite(results.column(name)))
 
 
-def _replicate_count(found: Results) -> int:
-    return found.study["space"]["design"].get("replicates", 1) if found.complete else 1
+def _replicate_count(results: Results) -> int:
+    return results.study["space"]["design"].get("replicates", 1) if results.complete else 1
 
 
-def _select_replicates(found: Results, samples: np.ndarray) -> Replicates | None:
+def _select_replicates(results: Results, samples: np.ndarray) -> Replicates | None:
     """Return the replicates of these samples, or None if the samples are not replicated."""
-    count = _replicate_count(found)
-    return Replicates(samples // (found.study["samples"] // count), count, CONFIDENCE) if count > 1 else None
+    count = _replicate_count(results)
+    return Replicates(samples // (results.study["samples"] // count), count, CONFIDENCE) if count > 1 else None
 
 
-def _failure_probabilities(found: Results, view: RowMasks) -> Iterator[tuple[str, JsonObject]]:
-    kinds = found.failures()
+def _failure_probabilities(results: Results, view: RowMasks) -> Iterator[tuple[str, JsonObject]]:
+    kinds = results.failures()
     kinds["any"] = np.any(list(kinds.values()), axis=0)
-    asked = view.rows & view.accepted
-    if not asked.any():
+    eligible = view.rows & view.accepted
+    if not eligible.any():
         return
-    replicates = _select_replicates(found, view.samples[asked])
+    replicates = _select_replicates(results, view.samples[eligible])
     for name, failed in kinds.items():
-        count = Count(int(failed[asked].sum()), int(asked.sum()))
-        one = replicates.probability(failed[asked]) if replicates else count.probability(confidence=CONFIDENCE)
-        yield name, {"count": count.failures, **_json_estimate(one, view)}
+        count = Count(int(failed[eligible].sum()), int(eligible.sum()))
+        estimate = replicates.probability(failed[eligible]) if replicates else count.probability(confidence=CONFIDENCE)
+        yield name, {"count": count.failures, **_json_estimate(estimate, view)}
 
 
-def _is_known(found: Results, view: RowMasks, name: str) -> np.ndarray:
-    return view.good & view.rows & np.isfinite(found.column(name))
+def _is_known(results: Results, view: RowMasks, name: str) -> np.ndarray:
+    return view.good & view.rows & np.isfinite(results.column(name))
 
 
-def _known_values(found: Results, view: RowMasks, name: str) -> np.ndarray:
-    return found.column(name)[_is_known(found, view, name)]
+def _known_values(results: Results, view: RowMasks, name: str) -> np.ndarray:
+    return results.column(name)[_is_known(results, view, name)]
 
 
 def _is_skewed(values: np.ndarray) -> bool:
@@ -140,36 +137,36 @@ def _is_skewed(values: np.ndarray) -> bool:
     return abs(float(stats.skew(values))) > MAX_SKEWNESS * math.sqrt(len(values))
 
 
-def _summarise_metric(found: Results, view: RowMasks, name: str) -> JsonObject:
-    known = _is_known(found, view, name)
-    values = found.column(name)[known]
+def _summarise_metric(results: Results, view: RowMasks, name: str) -> JsonObject:
+    finite = _is_known(results, view, name)
+    values = results.column(name)[finite]
     if len(values) < MIN_SAMPLES:
         return {}
     rows = summarise_column(values, CONFIDENCE, QUANTILE_LEVELS, CVAR_LEVEL)
-    if replicates := _select_replicates(found, view.samples[known]):
+    if replicates := _select_replicates(results, view.samples[finite]):
         rows |= replicates.summarise_column(values, QUANTILE_LEVELS, CVAR_LEVEL)
     ends = {"least": float(values.min()), "greatest": float(values.max())}
-    return {**{kind: _json_estimate(one, view) for kind, one in rows.items()}, **ends}
+    return {**{kind: _json_estimate(estimate, view) for kind, estimate in rows.items()}, **ends}
 
 
-def _summarise_sensitivity(found: Results, view: RowMasks) -> JsonObject:
+def _summarise_sensitivity(results: Results, view: RowMasks) -> JsonObject:
     """Return by metric and variable the correlations, or the Sobol' indices of a Saltelli design."""
-    variables = [path for path in found.variables if found.is_number(path)]
-    metrics = {name: found.column(name) for name in found.metrics}
+    variables = [path for path in results.variables if results.is_number(path)]
+    metrics = {name: results.column(name) for name in results.metrics}
     if view.period > 1:
-        names = list(found.study["space"]["variables"])
+        names = list(results.study["space"]["variables"])
         return {name: _summarise_indices(values, view, names) for name, values in metrics.items()}
     rows = np.flatnonzero(view.good)[:MAX_CORRELATED_SAMPLES]
     if view.design in DETERMINISTIC_DESIGNS or not variables or len(rows) < MIN_SAMPLES:
         return {}
-    x = np.stack([found.column(path)[rows] for path in variables], axis=1)
+    x = np.stack([results.column(path)[rows] for path in variables], axis=1)
     result = {}
     for name, values in metrics.items():
         y = values[rows]
-        known = np.isfinite(y)
-        if known.sum() < MIN_SAMPLES:
+        finite = np.isfinite(y)
+        if finite.sum() < MIN_SAMPLES:
             continue
-        both = correlations(x[known], y[known], confidence=CONFIDENCE)
+        both = correlations(x[finite], y[finite], confidence=CONFIDENCE)
         result[name] = {
             path: {"pearson": _json_estimate(p, view), "spearman": _json_estimate(s, view)}
             for path, p, s in zip(variables, *both, strict=True)
@@ -190,15 +187,15 @@ def _summarise_indices(values: np.ndarray, view: RowMasks, names: list[str]) -> 
     }
 
 
-def _worst_samples(found: Results, view: RowMasks, name: str) -> list[JsonObject]:
-    known = view.good & np.isfinite(found.column(name))
-    tail = Tail.of(found.column(name)[known], view.samples[known], MAX_LISTED_SAMPLES)
+def _worst_samples(results: Results, view: RowMasks, name: str) -> list[JsonObject]:
+    finite = view.good & np.isfinite(results.column(name))
+    tail = Tail.of(results.column(name)[finite], view.samples[finite], MAX_LISTED_SAMPLES)
     return [{"sample": int(i), "value": float(v)} for i, v in zip(tail.indices, tail.values, strict=True)]
 
 
-def _json_estimate(one: IntervalEstimate, view: RowMasks) -> JsonObject:
+def _json_estimate(estimate: IntervalEstimate, view: RowMasks) -> JsonObject:
     """Return an estimate with null for numbers that are infinite or do not exist."""
-    low, high = (None, None) if view.design in DETERMINISTIC_DESIGNS else (one.low, one.high)
-    numbers = {"value": one.value, "low": low, "high": high}
-    known = {name: x if x is not None and math.isfinite(x) else None for name, x in numbers.items()}
-    return {**known, "samples": one.samples}
+    low, high = (None, None) if view.design in DETERMINISTIC_DESIGNS else (estimate.low, estimate.high)
+    numbers = {"value": estimate.value, "low": low, "high": high}
+    fields = {name: x if x is not None and math.isfinite(x) else None for name, x in numbers.items()}
+    return {**fields, "samples": estimate.samples}
