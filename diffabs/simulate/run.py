@@ -248,7 +248,7 @@ def _run_by_replay(
     again, spans = replay_log(
         partial(replay.step, loop, objectives, key),
         lambda carry: carry.control.last_step,
-        lambda log: log.taken,
+        lambda log: log.accepted,
         start,
         log,
     )
@@ -258,7 +258,7 @@ def _run_by_replay(
         return judged[0]
 
     instants = jnp.arange(1, instants + 1) * every * live.h
-    states = states_between(spans, log.taken, instants)
+    states = states_between(spans, log.accepted, instants)
     goes_on = instants < jax.lax.stop_gradient(again.point.t)
     first = observe(loop, start.point.t, start.point.state, jnp.asarray(True))
     trajectory = jax.vmap(partial(observe, loop))(instants, states, goes_on)

@@ -639,7 +639,7 @@ def _list_flips(loop: Part, solver: Adaptive) -> list[tuple[float, int]]:
         raise ValueError(f"t1: the run has no end, its status is {SolutionStatus(int(status)).name}")
     lands = np.ravel(log.lands)
     times = np.ravel(loop.time(log.t))
-    return [(float(times[i]), int(lands[i])) for i in np.flatnonzero(np.ravel(log.taken) & (lands >= 0))]
+    return [(float(times[i]), int(lands[i])) for i in np.flatnonzero(np.ravel(log.accepted) & (lands >= 0))]
 
 
 def _build_loop(

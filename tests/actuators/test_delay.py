@@ -198,7 +198,7 @@ def test_what_a_computer_says_comes_out_later(late):
 
 
 @killed_by("actuators/delay.py", "return jnp.any(jnp.stack(jumps))", "return jumps[0]", case="True")
-@killed_by("simulate/step/system.py", "(seen[:2], seen.signals.recorded)", "seen[:2]", case="True")
+@killed_by("simulate/step/system.py", "(dynamics[:2], dynamics.signals.recorded)", "dynamics[:2]", case="True")
 @killed_by(
     "core/blocks.py",
     "            signal = block.output(t, m, signal)\n        return found\n\n    def record",

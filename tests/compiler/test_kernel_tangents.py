@@ -352,7 +352,7 @@ def test_steps_end_on_kinks_where_those_of_xla_do():
 
 
 @killed_by(
-    "simulate/step/replay.py", "any_lane(entry.taken)", "any_lane(entry.triggered != 0)", case="slip-lmi-adaptive"
+    "simulate/step/replay.py", "any_lane(entry.accepted)", "any_lane(entry.triggered != 0)", case="slip-lmi-adaptive"
 )
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grid", "kinks", "adaptive"])

@@ -239,8 +239,8 @@ def test_two_events_in_one_step():
 @pytest.mark.slow
 @killed_by(
     "simulate/step/fixed.py",
-    "jnp.where(extra > most, RunStatus.EXHAUSTED, status)",
-    "jnp.where(extra > most, RunStatus.TIMED_OUT, status)",
+    "jnp.where(extra > max_extra, RunStatus.EXHAUSTED, status)",
+    "jnp.where(extra > max_extra, RunStatus.TIMED_OUT, status)",
 )
 def test_what_switches_in_every_step_is_no_run():
     """A relay on the rig with hardly a band: it would switch some ten times in each step of 1 ms."""

@@ -182,7 +182,7 @@ def test_what_a_loop_hides_is_told():
     assert one.hidden == []
 
 
-@killed_by("simulate/step/modes.py", "most.eps**ROUNDING_POWER *", "0.0 *")
+@killed_by("simulate/step/modes.py", "limits.eps**ROUNDING_POWER *", "0.0 *")
 def test_numbers_that_are_equal_to_rounding_say_nothing():
     one = program(lambda x, p: jnp.where(x > p, 1.0, 0.0))
     regime = held(one, 0.1)
@@ -190,7 +190,7 @@ def test_numbers_that_are_equal_to_rounding_say_nothing():
         assert any(one.look(same, 0.6 + excess, 0.6, regime)[1].contradicted) == sees
 
 
-@killed_by("simulate/step/modes.py", "against |= gives & (margin == 0) & (says() != taken)", "pass")
+@killed_by("simulate/step/modes.py", "against |= gives & (margin == 0) & (says() != answer)", "pass")
 def test_a_product_that_has_become_0_is_held_by_nobody():
     """(x - min(x, p)) x > 0 above p, and 0 > 0 below, which contradicts nobody: it gives way all the same."""
     one = program(lambda x, p: jnp.where((x - jnp.minimum(x, p)) * x > 0, 1.0, 0.0))
@@ -341,7 +341,7 @@ def test_a_step_ends_on_a_comparison_near_the_start():
 @pytest.mark.slow
 @killed_by(
     "simulate/step/fixed.py",
-    "gave_up &= decision.searches & (after.search.which < system.bit_count)",
+    "gave_up &= decision.searches & (after.search.number < system.bit_count)",
     "gave_up &= False",
 )
 def test_a_run_that_slides_along_a_kink_is_a_run():
@@ -362,7 +362,7 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
 @pytest.mark.slow
 @killed_by(
     "simulate/step/fixed.py",
-    "fine &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True",
+    "valid &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True",
     "pass",
 )
 def test_where_a_step_is_too_long_a_regime_is_not_believed():

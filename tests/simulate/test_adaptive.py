@@ -219,7 +219,7 @@ def on_limits(solver):
 
 @killed_by(
     "simulate/step/adaptive.py",
-    "surface = find_surface_crossing(seen, carry.search.which, h) if self.keeps_mode else None",
+    "surface = find_surface_crossing(dynamics, carry.search.number, h) if self.keeps_mode else None",
     "surface = None",
 )
 @pytest.mark.slow
@@ -313,8 +313,8 @@ def test_reverse_mode_is_forward_mode(name):
 
 @killed_by(
     "simulate/step/attempt.py",
-    "        shift = request.shift_end(seen)",
-    "        shift = 0.0 * request.shift_end(seen)",
+    "        shift = request.shift_end(dynamics)",
+    "        shift = 0.0 * request.shift_end(dynamics)",
 )
 @pytest.mark.slow
 def test_a_derivative_through_relay_and_latch_is_that_of_rk4():
@@ -444,7 +444,9 @@ def test_steps_that_find_themselves_are_never_unstable():
     d.check(loop, d.Adaptive(1e-5, 4.0, 1e-2))
 
 
-@killed_by("simulate/step/surfaces.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least")
+@killed_by(
+    "simulate/step/surfaces.py", "next = jnp.where((since < -nearest) & (since > next), since, next)", "del nearest"
+)
 def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = [0, 1, 33, np.array([2, 3])]
     values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]
@@ -461,12 +463,12 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
 
 @killed_by(
     "simulate/step/step_size.py",
-    "sample.output[0], *jax.tree.leaves(off))",
-    "sample.output[0], *(0.0 * x for x in jax.tree.leaves(off)))",
+    "sample.output[0], *jax.tree.leaves(state_errors))",
+    "sample.output[0], *(0.0 * x for x in jax.tree.leaves(state_errors)))",
 )
 @killed_by(
     "simulate/step/step_size.py",
-    "moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), off))",
+    "moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), state_errors))",
     "moved = state",
 )
 def test_the_error_of_a_step_is_that_of_the_worst_state():

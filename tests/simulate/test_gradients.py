@@ -361,7 +361,7 @@ def test_sensitivity_of_the_conventional_brake():
     np.testing.assert_allclose(_sensitivity(FULL, list(expected)), list(expected.values()), rtol=5e-4, atol=0)
 
 
-@killed_by("simulate/step/event_location.py", "found = near | at_once", "found = at_once", case="0.0-published0")
+@killed_by("simulate/step/event_location.py", "located = near | at_once", "located = at_once", case="0.0-published0")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("ki", "published"),

@@ -72,7 +72,7 @@ def test_an_empty_tank_fills_again():
 
 
 @pytest.mark.slow
-@killed_by("simulate/step/adaptive.py", "carry.unrestricted & is_surface_moving(seen.surfaces, changed)", "False")
+@killed_by("simulate/step/adaptive.py", "carry.unrestricted & is_surface_moving(dynamics.surfaces, changed)", "False")
 def test_a_level_that_may_fall_on_is_reported():
     """With sqrt(|h|) both 0 and -(rate t/2 - 1)^2 are solutions beyond the end."""
     found = jax.vmap(solve(lambda t, h, rate: -rate * jnp.sqrt(jnp.abs(h))))(RATES)

@@ -55,7 +55,11 @@ class Slips:
     "jnp.where(missed, RunStatus.SEEKING, RunStatus.REFINING if refines else RunStatus.LANDING)",
     "jnp.asarray(RunStatus.LANDING)",
 )
-@killed_by("simulate/step/event_location.py", "((off > probe) | ((off == 0) & (search.margin != 0)))", "(off > probe)")
+@killed_by(
+    "simulate/step/event_location.py",
+    "((distance > probe) | ((distance == 0) & (search.margin != 0)))",
+    "(distance > probe)",
+)
 @killed_by(
     "simulate/step/event_location.py",
     "missed & ~search.at_once & (search.tries < MAX_LOCATION_ATTEMPTS)",

@@ -232,7 +232,7 @@ def test_a_batch_ends_with_its_last_lane():
 
 @killed_by(
     "simulate/result.py",
-    "invalidate({n: value for n, value in metrics.items() if n != AUDIT_METRIC}, diverged, loop)",
+    "invalidate(metrics, diverged, (loop, objectives))",
     "metrics",
 )
 def test_a_diverging_run_changes_no_other_run():

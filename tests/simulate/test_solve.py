@@ -261,7 +261,9 @@ def test_a_slide_is_reported(solver):
 
 
 @pytest.mark.slow
-@killed_by("simulate/step/adaptive.py", "jnp.where(resolved, margin_error(system, carry, h, seen, state), 0.0)", "0.0")
+@killed_by(
+    "simulate/step/adaptive.py", "jnp.where(resolved, margin_error(system, carry, h, dynamics, state), 0.0)", "0.0"
+)
 def test_a_touch_is_reported_and_a_short_crossing_is_found():
     def final(level):
         return d.solve(
@@ -514,7 +516,7 @@ def test_a_kernel_solves_a_batch():
     assert jax.grad(final)(0.5) == pytest.approx(-1.0, abs=1e-8)
 
 
-@killed_by("simulate/step/advance.py", "none, UNCONSTRAINED, taken & last)", "none, UNCONSTRAINED, taken)")
+@killed_by("simulate/step/advance.py", "none, UNCONSTRAINED, accepted & last)", "none, UNCONSTRAINED, accepted)")
 @killed_by("simulate/step/fixed.py", "self.h, strike * self.h, self.h", "self.h, carry.k * self.h, self.h")
 def test_fixed_steps_of_a_smooth_field_are_rk4():
     """Values of RK4 by NumPy, backwards in time; where they overflow, the solution has diverged."""
@@ -553,7 +555,7 @@ def test_the_last_fixed_step_ends_at_t1_within_the_domain():
 @pytest.mark.slow
 @killed_by("simulate/step/advance.py", "stepping.second_order or not stepping.smooth", "not stepping.smooth")
 @killed_by("simulate/step/adaptive.py", "not self.smooth, stable=True", "not self.smooth")
-@killed_by("simulate/step/replay.py", "one.refresh | ~one.taken, 0.0", "one.refresh, 0.0")
+@killed_by("simulate/step/replay.py", "entry.refresh | ~entry.accepted, 0.0", "entry.refresh, 0.0")
 def test_reverse_mode_where_rates_end_or_vanish():
     """Beyond t1, at rest, and in attempts that were rejected, numbers are not finite, or grow."""
 

@@ -159,7 +159,9 @@ STIFFNESSES = np.linspace(0.3, 2.5, 12)
 
 
 @killed_by(
-    "simulate/step/adaptive.py", "seen.surfaces, changed, h), turns.time_since)", "seen.surfaces, changed, h), 0.0)"
+    "simulate/step/adaptive.py",
+    "dynamics.surfaces, changed, h), turns.time_since)",
+    "dynamics.surfaces, changed, h), 0.0)",
 )
 @pytest.mark.parametrize("rtol", [1e-3, 1e-4])
 def test_a_stop_that_is_passed_for_a_moment(rtol):

@@ -129,7 +129,7 @@ class AdaptiveControl(NamedTuple):
         consecutive_crossings: Number of steps that ended on switching surfaces since the last long regular step
             (`RESET_STEP_FRACTION`). If steps keep to no mode, the score of returns (`RETURN_SCORE`).
         stability_fraction: Fraction of the longest stable step that a step may have after an event.
-        taken: True if the last attempt was accepted.
+        accepted: True if the last attempt was accepted.
         triggered: Bit mask of the events at its end.
     """
 
@@ -141,7 +141,7 @@ class AdaptiveControl(NamedTuple):
     last_step: PyTree
     consecutive_crossings: Int
     stability_fraction: Scalar
-    taken: Bool
+    accepted: Bool
     triggered: Int
 
 
@@ -218,8 +218,8 @@ class AdaptiveStepping:
         state = borrow(point.state, None)
         scale = error_scales(state, point.sample)
         limit = self._find_stability_limit(loop, point.t, state, scale) if self.stable else self.h * self.steps
-        left = self._next_strike(loop, zero) * self.h
-        length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), left)
+        to_strike = self._next_strike(loop, zero) * self.h
+        length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), to_strike)
         last = span_step(point, point) if self.keeps_last_step else ()
         control = AdaptiveControl(error_limited, limit, scale, zero, zero, last, zero, 1.0 + 0.0 * self.h, no, zero)
         return cast_floats(carry._replace(length=length, base=length, strikes=strikes, control=control), self.h.dtype)
@@ -245,9 +245,7 @@ class AdaptiveStepping:
         return carry.running if until is None else carry.running & (carry.point.t < until * self.h)
 
     def observe_at(self, loop: Loop, carry: Carry, instant: Scalar) -> Trajectory:
-        """Return the signals of the `loop` at this `instant` of the grid, which lies within the last step of the
-        `carry`.
-        """
+        """Return the signals of the `loop` at this `instant` of the grid, which lies within the last step."""
         now, t, last = carry.point, instant * self.h, carry.control.last_step
         # The last step is a cubic, so the instant may lie anywhere in it. A run that is over shows its last point.
         inside = (t < now.t) & (last.flow.end > last.flow.start)
@@ -257,8 +255,8 @@ class AdaptiveStepping:
     def for_replay(self) -> "AdaptiveStepping":
         """Return the method for a run that is logged and then replayed with derivatives.
 
-        The derivative changes faster than the run. The allowed error of a step is therefore only
-        `DERIVATIVE_RTOL_FRACTION` of that for values. The steps of a run that is `smooth` need no mode.
+        The derivative changes faster than the run, so a step may have `DERIVATIVE_RTOL_FRACTION` of the error. The
+        steps of a run that is `smooth` need no mode.
         """
         rtol = clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol)
         return dataclasses.replace(self, keeps_mode=not self.smooth, stable=True, rtol=rtol)
@@ -276,25 +274,20 @@ class AdaptiveStepping:
         """Return the next step to attempt, by the run of `carry` in `system`."""
         return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.keeps_mode)
 
-    def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
-        """Return the predicted time [s] to the first change of an answer, from `seen`, for the run of `carry`.
+    def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
+        """Return the predicted time [s] to the first change of an answer, and an `Outlook`.
 
-        A step that keeps its mode gets `CROSSING_OVERREACH` times this time, so that the change lies within it. The
-        second result is an `Outlook`.
+        A step that keeps its mode gets `CROSSING_OVERREACH` times this time, so that the change lies within it.
         """
         fresh = (carry.status == RunStatus.REFRESHING) | carry.unrestricted
-        return self._look_ahead(carry.control.error_limited, carry.unrestricted, fresh, seen)
+        return self._look_ahead(carry.control.error_limited, carry.unrestricted, fresh, dynamics)
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: PyTree
     ) -> AdaptiveReport:
-        """Return the error of an attempt by the run of `carry` in `system`, and the comparisons that change in it.
-
-        The attempt has the length `h`. The dynamics `seen` and the `state` are those at its end, and `error` holds the
-        shares of the rates in the error.
-        """
-        sample, point = seen.signals.sample, carry.point
-        changed = tuple(a ^ b for a, b in zip(seen.words, point.words, strict=True))
+        """Return the error of an attempt, and the comparisons that change in it."""
+        sample, point = dynamics.signals.sample, carry.point
+        changed = tuple(a ^ b for a, b in zip(dynamics.words, point.words, strict=True))
         scale = jax.tree.map(jnp.maximum, carry.control.scale, error_scales(state, sample))
         resolved = carry.length > self.closest
         # A state that is zero until a comparison changes has no scale, and its error in the step with the change is a
@@ -303,53 +296,47 @@ class AdaptiveStepping:
         scales = jax.tree.map(
             lambda before, now: jnp.where(starts & (before == 0), jnp.inf, now), carry.control.scale, scale
         )
-        off = midpoint_error(self.tableau, error[0], seen.rates[0], h)
-        relative = error_norm(system.loop, state, off, scales, sample) / self.rtol
+        state_errors = midpoint_error(self.tableau, error[0], dynamics.rates[0], h)
+        relative = error_norm(system.loop, state, state_errors, scales, sample) / self.rtol
         if self.smooth:
             return AdaptiveReport(relative, scale, jnp.zeros_like(h), jnp.asarray(False), jnp.asarray(-1), None)
-        surface = find_surface_crossing(seen, carry.search.which, h) if self.keeps_mode else None
-        turns = watch_margins(carry, h, self._select_watched(seen), system.bit_count)
-        past_crossing = jnp.maximum(time_since_crossing(seen.surfaces, changed, h), turns.time_since)
+        surface = find_surface_crossing(dynamics, carry.search.number, h) if self.keeps_mode else None
+        turns = watch_margins(carry, h, self._select_watched(dynamics), system.bit_count)
+        past_crossing = jnp.maximum(time_since_crossing(dynamics.surfaces, changed, h), turns.time_since)
         if self.watches:
-            relative = jnp.maximum(relative, jnp.where(resolved, margin_error(system, carry, h, seen, state), 0.0))
+            relative = jnp.maximum(relative, jnp.where(resolved, margin_error(system, carry, h, dynamics, state), 0.0))
         grazes = turns.grazes | (~resolved & (turns.time_since > 0))
-        grazes |= carry.unrestricted & is_surface_moving(seen.surfaces, changed)
+        grazes |= carry.unrestricted & is_surface_moving(dynamics.surfaces, changed)
         returns = jnp.asarray(-1)
         if not self.keeps_mode:
-            which = find_return(point.forecast[2], seen.surfaces, changed, h)
-            returns = jnp.where(relative > MIN_RETURN_ERROR, which, -1)
+            number = find_return(point.forecast[2], dynamics.surfaces, changed, h)
+            returns = jnp.where(relative > MIN_RETURN_ERROR, number, -1)
         return AdaptiveReport(relative, scale, jnp.where(resolved, past_crossing, 0.0), grazes, returns, surface)
 
     def decide(
         self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
     ) -> Decision:
-        """Return the decision on the `attempt` that answers the `request`, by the run of `carry` in `system`.
-
-        Its error must be small, and no comparison may change within it. `active` is False if the run needs no attempt.
-        """
+        """Return the decision: the error must be small, and no comparison may change within the attempt."""
         error, past_crossing = attempt.report.error, attempt.report.past_crossing
-        fine = jnp.isfinite(error)  # the maximum over all states: one NaN makes it NaN
+        valid = jnp.isfinite(error)  # the maximum over all states: one NaN makes it NaN
         exact = (error <= 1) & (past_crossing <= 0)
         last = request.strikes & (request.strike >= self.steps)
-        return decide_attempt(self, system, carry, attempt, active, fine, exact, last=last, frozen=self.keeps_mode)
+        return decide_attempt(self, system, carry, attempt, active, valid, exact, last=last, frozen=self.keeps_mode)
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an `attempt` with length and status of the next attempt.
-
-        `carry` is the run in `system` before the attempt, and `decision` the decision on it.
-        """
-        control, report, taken = carry.control, attempt.report, decision.taken
+        """Return the carry `after` an `attempt` with length and status of the next attempt."""
+        control, report, accepted = carry.control, attempt.report, decision.accepted
         new = carry.status == RunStatus.RUNNING
         error_limited = self._error_limited_length(carry, attempt, decision)
         fraction = control.stability_fraction
         if self.keeps_mode:
             grown = jnp.minimum(STABILITY_FRACTION_GROWTH * fraction, 1.0)
-            fraction = jnp.where(taken, jnp.where(new, grown, INITIAL_STABILITY_FRACTION), fraction)
+            fraction = jnp.where(accepted, jnp.where(new, grown, INITIAL_STABILITY_FRACTION), fraction)
         longest = jnp.maximum(jnp.minimum(error_limited, fraction * control.limit), shortest_step(after.point.t))
-        left = (self._next_strike(system.loop, after.k) - after.k) * self.h - after.since
-        length, strikes = plan_step(longest, self._ahead(after.point), left)
+        to_strike = (self._next_strike(system.loop, after.k) - after.k) * self.h - after.since
+        length, strikes = plan_step(longest, self._ahead(after.point), to_strike)
         # A comparison changed inside the step: the next attempt ends there.
-        ends_on_crossing = ~taken & (report.past_crossing > 0) & decision.fine
+        ends_on_crossing = ~accepted & (report.past_crossing > 0) & decision.valid
         length = jnp.where(ends_on_crossing, jnp.maximum(carry.length - report.past_crossing, self.closest), length)
         falls_short = self._jumps_at_end(carry, report, decision)
         length = jnp.where(falls_short, SHORT_OF_SURFACE_FRACTION * carry.length, length)
@@ -357,42 +344,42 @@ class AdaptiveStepping:
         crossings, slides = control.consecutive_crossings, jnp.asarray(False)
         watch = after.slides
         if self.keeps_mode:
-            calm = taken & new & (carry.length > RESET_STEP_FRACTION * control.error_limited)
+            calm = accepted & new & (carry.length > RESET_STEP_FRACTION * control.error_limited)
             if self.watches:
                 # Steps without an error are as long as the run, so that no step counts as long beside them.
                 apart = carry.length > SLIDE_INTERVAL_FRACTION * self.h * self.steps
-                calm, crossings = calm | (taken & new & apart), jnp.where(apart, 0, crossings)
+                calm, crossings = calm | (accepted & new & apart), jnp.where(apart, 0, crossings)
             crosses = (
-                decision.crosses_surface | (taken & carry.unrestricted) if self.watches else decision.crosses_surface
+                decision.crosses_surface | (accepted & carry.unrestricted) if self.watches else decision.crosses_surface
             )
             crossings = jnp.where(crosses, crossings + 1, jnp.where(calm, 0, crossings))
             gave_up = searches & (after.search.tries >= MAX_LOCATION_ATTEMPTS)
-            gave_up &= after.search.which < system.bit_count
-            becomes_unrestricted = (gave_up | (taken & (crossings > MAX_CONSECUTIVE_CROSSINGS))) & ~unrestricted
+            gave_up &= after.search.number < system.bit_count
+            becomes_unrestricted = (gave_up | (accepted & (crossings > MAX_CONSECUTIVE_CROSSINGS))) & ~unrestricted
             unrestricted = (unrestricted | becomes_unrestricted) & ~(calm & have_same_answers(carry, attempt))
             if self.watches:
                 # Just before a surface that the run comes to with rate 0, each step may be too long for its mode: the
                 # square root of a level. One step without a mode goes there. If the level stays, so does the run.
-                slides = gave_up | (taken & (crossings > MAX_CONSECUTIVE_CROSSINGS))
-                unrestricted = new & ~decision.fine & (carry.length <= self.closest) & ~carry.unrestricted
+                slides = gave_up | (accepted & (crossings > MAX_CONSECUTIVE_CROSSINGS))
+                unrestricted = new & ~decision.valid & (carry.length <= self.closest) & ~carry.unrestricted
                 length = jnp.where(unrestricted, carry.length, length)
             searches &= ~(becomes_unrestricted & gave_up)
             length = jnp.where(becomes_unrestricted & gave_up, longest, length)
             status = jnp.where(becomes_unrestricted & gave_up, RunStatus.RUNNING, status)
         elif watch:
             score = jnp.maximum(crossings + jnp.where(report.returns >= 0, RETURN_SCORE, -1), 0)
-            crossings = jnp.where(taken, score, crossings)
+            crossings = jnp.where(accepted, score, crossings)
             slide = begin_slide(watch.slide, crossings >= MAX_RETURN_SCORE, report.returns, after.point.t)
             after = after._replace(slides=watch._replace(slide=slide))
         # A landing with invalid numbers is no landing: the step is attempted again, and its event located again.
-        status = jnp.where(~taken & ~searches & (status == RunStatus.LANDING), RunStatus.RUNNING, status)
+        status = jnp.where(~accepted & ~searches & (status == RunStatus.LANDING), RunStatus.RUNNING, status)
         refreshes = status == RunStatus.REFRESHING
         length = jnp.where(searches, after.length, jnp.where(refreshes, 0.0, length))
         last_step = control.last_step
         if self.keeps_last_step:
-            last_step = select(taken, span_step(carry.point, attempt.point), last_step)
+            last_step = select(accepted, span_step(carry.point, attempt.point), last_step)
         # An error that is NaN is not small. An attempt within a search need not be accurate.
-        fails = jnp.where(new, ~(report.error <= 1), ~decision.fine)
+        fails = jnp.where(new, ~(report.error <= 1), ~decision.valid)
         lost = fails & (carry.length <= shortest_step(carry.point.t))
         exhausted = control.tries > MAX_ATTEMPTS + ATTEMPTS_PER_INSTANT * self.steps
         judged = jnp.where(exhausted, RunStatus.EXHAUSTED, self._judge(report, after, slides, status))
@@ -403,12 +390,12 @@ class AdaptiveStepping:
             unrestricted=unrestricted,
             control=control._replace(
                 error_limited=error_limited,
-                scale=select(taken, report.scale, control.scale),
+                scale=select(accepted, report.scale, control.scale),
                 tries=control.tries + 1,
                 last_step=last_step,
                 consecutive_crossings=crossings,
                 stability_fraction=fraction,
-                taken=taken,
+                accepted=accepted,
                 triggered=_pack_events(decision.triggered),
             ),
             status=jnp.where(lost, RunStatus.DIVERGED, judged),
@@ -422,10 +409,7 @@ class AdaptiveStepping:
         return jnp.where(slides, RunStatus.SLID, status)
 
     def _find_stability_limit(self, loop: Loop, t: Scalar, state: LoopState, scale: Scalar) -> Scalar:
-        """Return the longest stable step [s]; the whole span if the Jacobian of the `loop` is not finite.
-
-        `t` [s], `state` and `scale` are those of `spectral_step_limit`.
-        """
+        """Return the longest stable step [s]; the whole span if the Jacobian of the `loop` is not finite."""
         limit = spectral_step_limit(loop, t, state, scale)
         return jnp.where(limit > 0, limit, self.h * self.steps)  # False also for NaN
 
@@ -433,81 +417,72 @@ class AdaptiveStepping:
         """Return the predicted time [s] to the first change of an answer."""
         return jnp.full_like(self.h, jnp.inf) if self.smooth else point.forecast[0]
 
-    def _look_ahead(self, error_limited: Scalar, unrestricted: Bool, fresh: Bool, seen: Evaluation) -> PyTree:
+    def _look_ahead(self, error_limited: Scalar, unrestricted: Bool, fresh: Bool, dynamics: Evaluation) -> PyTree:
         """Return the forecast, nothing if `smooth`; `fresh` is True if the answers are new."""
         if self.smooth:
             return ()
-        outlook = look_ahead(fresh, self._select_watched(seen))
-        ahead = self._forecast_crossing(error_limited, unrestricted, seen), outlook
-        return ahead if self.keeps_mode else (*ahead, find_imminent(seen.surfaces, error_limited))
+        outlook = look_ahead(fresh, self._select_watched(dynamics))
+        ahead = self._forecast_crossing(error_limited, unrestricted, dynamics), outlook
+        return ahead if self.keeps_mode else (*ahead, find_imminent(dynamics.surfaces, error_limited))
 
-    def _select_watched(self, seen: Evaluation) -> Evaluation:
+    def _select_watched(self, dynamics: Evaluation) -> Evaluation:
         """Return the dynamics with those margins only whose turns are looked for: of events, or all if it `watches`."""
-        return seen if self.watches else seen._replace(surfaces=[])
+        return dynamics if self.watches else dynamics._replace(surfaces=[])
 
     def _next_strike(self, loop: Loop, k: Int) -> Int:
         """Return the number of the first grid instant after the `k`-th at which a clock strikes or the run ends."""
         return jnp.minimum(loop.next_tick(k, self.h), self.steps) if loop.ticks else self.steps
 
-    def _forecast_crossing(self, error_limited: Scalar, unrestricted: Bool, seen: Evaluation) -> Scalar:
-        ahead = forecast_crossing(seen.surfaces, error_limited, self.closest)
+    def _forecast_crossing(self, error_limited: Scalar, unrestricted: Bool, dynamics: Evaluation) -> Scalar:
+        ahead = forecast_crossing(dynamics.surfaces, error_limited, self.closest)
         return jnp.where(unrestricted, 1.0, CROSSING_OVERREACH) * ahead if self.keeps_mode else ahead
 
     def _jumps_at_end(self, carry: Carry, report: AdaptiveReport, decision: Decision) -> Bool:
-        """Return True if an attempt by the run of `carry` aimed at a surface and has more than the allowed error.
+        """Return True if an attempt aimed at a surface and has more than the allowed error: a rate jumps at the
+        surface.
 
-        Then a rate jumps at the surface. A stage beyond it has the rate of the other side. The weights of the stages
-        are not all positive, so the step may even go away from the surface. Always False if steps keep to a mode, or
-        the run is `smooth`.
+        A stage beyond the surface has the rate of the other side. The weights of the stages are not all positive, so
+        the step may even go away from the surface.
         """
         if self.keeps_mode or self.smooth:  # all stages keep to one mode, or there is none
             return jnp.asarray(False)
         aimed = (carry.status == RunStatus.RUNNING) & (carry.length == self._ahead(carry.point))
-        return aimed & decision.fine & ~decision.taken & (report.error > 1) & (report.past_crossing <= 0)
+        return aimed & decision.valid & ~decision.accepted & (report.error > 1) & (report.past_crossing <= 0)
 
     def _error_limited_length(self, carry: Carry, attempt: Attempt, decision: Decision) -> Scalar:
         """Return the step length that the error allows [s].
 
-        An accepted step that was cut short may only raise this length. A rejected step with a surface inside leaves
-        it unchanged.
+        An accepted step that was cut short may only raise it. A rejected step with a surface inside leaves it
+        unchanged.
         """
         old, report = carry.control.error_limited, attempt.report
-        new = jnp.where(decision.fine, propose_length(carry.length, report.error), MIN_STEP_RATIO * carry.length)
+        new = jnp.where(decision.valid, propose_length(carry.length, report.error), MIN_STEP_RATIO * carry.length)
         # A step cut short by a clock or an event has a small error, so it may raise the allowed length only.
-        cut = decision.taken & (carry.length < old)
-        wrong = ~decision.fine | ((report.error > 1) & (report.past_crossing <= 0))
-        judged = (carry.status == RunStatus.RUNNING) & (decision.taken | wrong)
+        cut = decision.accepted & (carry.length < old)
+        wrong = ~decision.valid | ((report.error > 1) & (report.past_crossing <= 0))
+        judged = (carry.status == RunStatus.RUNNING) & (decision.accepted | wrong)
         new = jnp.where(judged, jnp.where(cut, jnp.maximum(new, old), new), old)
         if self.watches:
             # After a landing the next one may be near. A step much longer than the way there would pass over it.
-            landed = decision.taken & (carry.status == RunStatus.LANDING)
-            most = jnp.maximum(LANDED_STEP_RATIO * carry.length, LEAST_LANDED_RATIO * new)
-            new = jnp.where(landed, jnp.minimum(new, most), new)
+            landed = decision.accepted & (carry.status == RunStatus.LANDING)
+            longest = jnp.maximum(LANDED_STEP_RATIO * carry.length, LEAST_LANDED_RATIO * new)
+            new = jnp.where(landed, jnp.minimum(new, longest), new)
         return jnp.maximum(new, shortest_step(attempt.point.t))
 
 
 def clip_rtol(rtol: Scalar) -> Scalar:
-    """Return rtol, but at least the multiple `MIN_RTOL_EPS` of the machine epsilon of its type.
-
-    Args:
-        rtol: Allowed relative error of a step.
-    """
-    most = np if isinstance(rtol, np.ndarray) else jnp  # NumPy compiles nothing
-    return most.maximum(rtol, MIN_RTOL_EPS * jnp.finfo(rtol.dtype).eps)
+    """Return rtol, but at least the multiple `MIN_RTOL_EPS` of the machine epsilon of its type."""
+    numpy_like = np if isinstance(rtol, np.ndarray) else jnp  # NumPy compiles nothing
+    return numpy_like.maximum(rtol, MIN_RTOL_EPS * jnp.finfo(rtol.dtype).eps)
 
 
 def _pack_events(triggered: PyTree) -> Int:
     """Return the triggered events as a bit mask, one bit for each event."""
-    return sum((jnp.where(one, 1 << i, 0) for i, one in enumerate(jax.tree.leaves(triggered))), jnp.asarray(0))
+    return sum((jnp.where(happens, 1 << i, 0) for i, happens in enumerate(jax.tree.leaves(triggered))), jnp.asarray(0))
 
 
 def span_step(start: Point, end: Point) -> StateSpan:
-    """Return the state over the step between two points.
-
-    Args:
-        start: Point after the changes at the beginning.
-        end: Point before the changes at the end.
-    """
+    """Return the state over a step, from its start after the changes there to its end before the changes there."""
     state = borrow(start.state, None)
     rates = start.rates[0], end.rates[0]
     return StateSpan(state, HermiteStep(start.t, end.t, (state.flow(), end.state.flow()), rates))

@@ -86,8 +86,8 @@ class Decision(NamedTuple):
     """Decision on an attempt.
 
     Attributes:
-        fine: True if its numbers are finite and plausible.
-        taken: True if the attempt is accepted.
+        valid: True if its numbers are finite and plausible.
+        accepted: True if the attempt is accepted.
         searches: True if the search for an event or a switching surface begins or goes on.
         crosses_surface: True if an accepted attempt ends on a switching surface.
         triggered: True for each event at its end.
@@ -95,8 +95,8 @@ class Decision(NamedTuple):
         over: True if the run ends there.
     """
 
-    fine: Bool
-    taken: Bool
+    valid: Bool
+    accepted: Bool
     searches: Bool
     crosses_surface: Bool
     triggered: Margins
@@ -153,19 +153,19 @@ class Stepping(Protocol):
         """Return the next step to attempt, by the run of `carry` in `system`."""
         ...
 
-    def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
-        """Return the predicted time [s] to the next change of a comparison, from the dynamics `seen` at an instant.
+    def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
+        """Return the predicted time [s] to the next change of a comparison, from the `dynamics` at an instant.
 
         A method without a prediction returns (). `carry` is the run before the step that ends at the instant.
         """
         ...
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: PyTree
     ) -> Any:
         """Return the findings about an attempt, by the run of `carry` in `system`, that the method needs.
 
-        The attempt has the length `h`. The dynamics `seen` and the `state` are those at its end, and `error` holds the
+        The attempt has the length `h`. The `dynamics` and the `state` are those at its end, and `error` holds the
         shares of the rates in the error.
         """
         ...
@@ -193,16 +193,8 @@ def advance(
 ) -> Carry:
     """Return the carry after one attempt of a step.
 
-    Point and status of a run that is over do not change. With `until`, the whole carry does not change if the run is
-    over or has reached that instant.
-
-    Args:
-        stepping: Stepping method.
-        loop: Closed loop, prepared.
-        objectives: Objectives by the names of their metrics.
-        key: Random key, or None.
-        carry: Carry before the attempt.
-        until: Number of the grid instant at which to pause; None to go on to the end of the run.
+    Point and status of a run that is over do not change. With `until`, the number of the grid instant at which to
+    pause, the whole carry does not change if the run is over or has reached that instant.
     """
     active = stepping.is_active(carry, until)
     # The blocks' logs leave the carry: `select` below would otherwise copy whole tables in every step.
@@ -227,7 +219,7 @@ def advance(
     attempt = barrier(active, attempt_request)
     decision = barrier(active, lambda: stepping.decide(system, carry, request, attempt, active))
 
-    strikes = decision.taken & request.strikes
+    strikes = decision.accepted & request.strikes
     k = jnp.where(strikes, request.strike, carry.k)
     clock = Clock(attempt.point.t, stepping.h, k, key, strikes)
 
@@ -236,12 +228,12 @@ def advance(
 
     # Where a run ends, no block changes any more.
     point = select(decision.over, attempt.point, jit_barrier(active, commit) if loop.changes else commit())
-    point = select(decision.taken, point, start)
-    since = jnp.where(strikes, 0.0, jnp.where(decision.taken, carry.since + request.h, carry.since))
+    point = select(decision.accepted, point, start)
+    since = jnp.where(strikes, 0.0, jnp.where(decision.accepted, carry.since + request.h, carry.since))
     after = carry._replace(point=point, k=k, since=since)
     if carry.slides:
         landed, running = decision.crosses_surface, carry.status == RunStatus.RUNNING
-        calm = decision.taken & running & stepping.is_calm(carry)
+        calm = decision.accepted & running & stepping.is_calm(carry)
         after = after._replace(slides=watch_landing(carry.slides, carry.search, landed, calm, attempt.point.t))
     if stepping.searches:
         after = _search(stepping, system, carry, attempt, decision, after)
@@ -262,9 +254,9 @@ def _search(
 
     def next_plan() -> SearchPlan:
         margins = (jax.tree.leaves(point.margins) for point in (carry.point, attempt.point))
-        crossings = find_crossings(carry.search.which, system.bit_count, attempt.report.surface, *margins)
-        found = continue_search(plan, crossings, carry.base, system.bit_count, refines=stepping.second_order)
-        return select(decision.searches, found, plan)
+        crossings = find_crossings(carry.search.number, system.bit_count, attempt.report.surface, *margins)
+        next_search = continue_search(plan, crossings, carry.base, system.bit_count, refines=stepping.second_order)
+        return select(decision.searches, next_search, plan)
 
     # Few attempts search, so a batch skips the search unless one of its runs needs it.
     search, length, status = jax.lax.cond(any_lane(decision.searches), next_plan, lambda: plan)
@@ -274,7 +266,7 @@ def _search(
 
 def _next_status(system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, status: Scalar) -> Scalar:
     """Return the status after an attempt; `status` where it was not accepted."""
-    return jnp.where(decision.taken, status_after_step(system.loop, carry, attempt, decision), status)
+    return jnp.where(decision.accepted, status_after_step(system.loop, carry, attempt, decision), status)
 
 
 def start_carry(
@@ -282,18 +274,11 @@ def start_carry(
     loop: Loop,
     objectives: Objectives,
     key: PyTree,
-    forecast: Callable[[Evaluation], PyTree] = lambda seen: (),
+    forecast: Callable[[Evaluation], PyTree] = lambda dynamics: (),
 ) -> Carry:
     """Return the carry of a run at t = 0, without the numbers of the stepping method.
 
     A run that starts at its stop or beyond has diverged.
-
-    Args:
-        stepping: Stepping method.
-        loop: Closed loop, prepared.
-        objectives: Objectives by the names of their metrics.
-        key: Random key, or None.
-        forecast: Prediction of the stepping method (`Stepping.forecast`).
     """
     none, zero = 0.0 * stepping.h, jnp.asarray(0)
     # With the types of later steps the loop is traced once for all of them.
@@ -313,19 +298,14 @@ def start_carry(
 
 
 def propose_step(stepping: Stepping, system: LoopSystem, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:
-    """Return the step to attempt next, from the length, mode and status in a carry.
+    """Return the step to attempt next, which keeps to a mode if `frozen`.
 
-    Args:
-        stepping: Stepping method.
-        system: Dynamics of the loop and its objectives.
-        carry: Carry before the attempt.
-        strike: Number of the next instant at which a clock strikes, or the run ends.
-        frozen: True if a step keeps to a mode.
+    `strike` is the number of the next instant at which a clock strikes, or the run ends.
     """
     refresh, mode = carry.status == RunStatus.REFRESHING, UNCONSTRAINED
     if frozen:
-        which, words = carry.search.which, carry.point.words
-        beyond = mode_after_changes(system, words, which, which < system.bit_count)
+        number, words = carry.search.number, carry.point.words
+        beyond = mode_after_changes(system, words, number, number < system.bit_count)
         mode = select(refresh, beyond, mode_in_step(system, words, carry.unrestricted))
     end = jnp.where(carry.strikes, strike * stepping.h, carry.point.t + carry.length)
     return StepRequest(carry.length, end, stepping.h, mode, refresh, carry.strikes, strike)
@@ -337,7 +317,7 @@ def decide_attempt(
     carry: Carry,
     attempt: Attempt,
     active: Bool,
-    fine: Bool,
+    valid: Bool,
     exact: Bool,
     *,
     last: Bool,
@@ -345,59 +325,41 @@ def decide_attempt(
 ) -> Decision:
     """Return the decision on an attempt: accept it, search within it, or end the run.
 
-    Args:
-        stepping: Stepping method.
-        system: Dynamics of the loop and its objectives.
-        carry: Carry before the attempt.
-        attempt: The attempt.
-        active: True if the run needs an attempt.
-        fine: True if the numbers of the attempt are finite and plausible.
-        exact: True if the attempt is also accurate enough, or cannot be made shorter.
-        last: True if the run ends at the end of the attempt.
-        frozen: True if a step keeps to a mode.
+    `valid` says that its numbers are finite and plausible, and `exact` that it is accurate enough, too, or cannot be
+    made shorter. The run ends with the `last` attempt. A `frozen` step keeps to a mode.
     """
     if stepping.smooth:
-        no, taken = jnp.asarray(False), active & fine & exact
+        no, accepted = jnp.asarray(False), active & valid & exact
         none = jax.tree.map(lambda margin: no, attempt.point.margins)
-        return Decision(fine, taken, no, no, none, UNCONSTRAINED, taken & last)
+        return Decision(valid, accepted, no, no, none, UNCONSTRAINED, accepted & last)
     running, landing, refreshing = (
-        carry.status == one for one in (RunStatus.RUNNING, RunStatus.LANDING, RunStatus.REFRESHING)
+        carry.status == status for status in (RunStatus.RUNNING, RunStatus.LANDING, RunStatus.REFRESHING)
     )
-    surface, bit_count, which = attempt.report.surface, system.bit_count, carry.search.which
+    surface, bit_count, number = attempt.report.surface, system.bit_count, carry.search.number
     crossed = falls_through(jax.tree.leaves(carry.point.margins), jax.tree.leaves(attempt.point.margins))
-    crosses = [*crossed, *([] if surface is None else [surface.contradicted, surface.other >= 0])]
+    crosses = [*crossed, *([] if surface is None else [surface.contradicted, surface.unsought >= 0])]
     crosses = jnp.any(jnp.stack(crosses))
-    taken = active & fine & (landing | refreshing | (running & exact & ~crosses))
+    accepted = active & valid & (landing | refreshing | (running & exact & ~crosses))
     searches = active & ~landing & ~refreshing & (~running | (exact & crosses))
-    triggered = [taken & landing & ((which == bit_count + i) | one) for i, one in enumerate(crossed)]
+    triggered = [accepted & landing & ((number == bit_count + i) | falls) for i, falls in enumerate(crossed)]
     triggered = jax.tree.unflatten(jax.tree.structure(attempt.point.margins), triggered)
-    over = reduce(jnp.logical_or, triggered["stop"]) | (taken & last)
+    over = reduce(jnp.logical_or, triggered["stop"]) | (accepted & last)
     lands, mode = jnp.asarray(False), UNCONSTRAINED
     if frozen:
-        lands = taken & landing & (which < bit_count)
-        words = flip_answer(system, attempt.point.words, which, lands)
-        mode = mode_after_changes(system, words, which, lands)
-    return Decision(fine, taken, searches, lands, triggered, mode, over)
+        lands = accepted & landing & (number < bit_count)
+        words = flip_answer(system, attempt.point.words, number, lands)
+        mode = mode_after_changes(system, words, number, lands)
+    return Decision(valid, accepted, searches, lands, triggered, mode, over)
 
 
 def have_same_answers(carry: Carry, attempt: Attempt) -> Bool:
-    """Return True if the comparisons have the same answers at both ends of an attempt.
-
-    Args:
-        carry: Carry before the attempt.
-        attempt: The attempt.
-    """
+    """Return True if the comparisons have the same answers at both ends of an attempt."""
     pairs = zip(attempt.point.words, carry.point.words, strict=True)
     return jnp.all(jnp.array([a == b for a, b in pairs], bool))
 
 
 def cast_floats(tree: PyTree, dtype: DTypeLike) -> PyTree:
-    """Return the tree with strong types throughout, and its floating-point leaves cast to one type.
-
-    Args:
-        tree: Pytree to cast.
-        dtype: Floating-point type.
-    """
+    """Return the tree with strong types throughout, and its floating-point leaves cast to one type."""
 
     # A scan rejects a carry whose type weakens or strengthens.
     def cast(x: Scalar) -> Array:

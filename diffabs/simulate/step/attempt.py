@@ -107,13 +107,7 @@ Forecast = Callable[[Evaluation], PyTree]  # `Stepping.forecast`, for a run
 
 
 def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopState, Accumulators]:
-    """Return state and accumulators at t = 0, after the first ticks and the events of blocks with a negative margin.
-
-    Args:
-        loop: Closed loop, prepared.
-        objectives: Objectives by the names of their metrics.
-        clock: Instant t = 0.
-    """
+    """Return state and accumulators at t = 0, after the first ticks and the events of blocks with a negative margin."""
     state = loop.start()
     signals = loop.signals(clock.t, state)
     accumulators = {name: objective.start(signals.sample) for name, objective in objectives.items()}
@@ -126,16 +120,7 @@ def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopS
 def evaluate_point(
     system: LoopSystem, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode, forecast: Forecast
 ) -> Point:
-    """Return the point at an instant.
-
-    Args:
-        system: Dynamics of the loop and its objectives.
-        t: Time [s].
-        state: State of the loop, after the changes at this instant.
-        accumulators: Accumulators of the objectives.
-        mode: Mode in which the dynamics are evaluated.
-        forecast: Prediction of the stepping method (`Stepping.forecast`).
-    """
+    """Return the point at an instant, from the state after the changes there."""
     return _build_point(system.evaluate(t, state, accumulators, mode), t, state, accumulators, forecast)
 
 
@@ -149,43 +134,37 @@ def attempt_step(
 ) -> Attempt:
     """Return the end of one Runge-Kutta step from a point.
 
-    Args:
-        system: Dynamics of the loop and its objectives.
-        point: Point at the beginning.
-        request: Step to attempt.
-        tableau: Coefficients of the Runge-Kutta method.
-        forecast: Prediction of the stepping method from the end (`Stepping.forecast`).
-        report: What the stepping method needs for its decision, from the dynamics at the end, the state there, and the
-            shares of the rates in the error.
+    `report` returns what the stepping method needs for its decision, from the dynamics at the end, the state there, and
+    the shares of the rates in the error.
     """
     loop, (t, h), mode = system.loop, (request.end, request.h), request.mode
     z, held = split_flow_and_held(point.state, point.accumulators)
 
-    def flow(t: Scalar, z: PyTree, given: tuple[PyTree, Mode]) -> PyTree:
-        return system.rates(t, z, *given)
+    def flow(t: Scalar, z: PyTree, constants: tuple[PyTree, Mode]) -> PyTree:
+        return system.rates(t, z, *constants)
 
     z, error = runge_kutta_step(tableau, flow, point.t, z, point.rates, h, (held, mode))
     shift = jnp.zeros_like(h)
     if request.shift_end:
-        seen = system.evaluate(t, *with_flow(point.state, point.accumulators, z), mode)
-        shift = request.shift_end(seen)
-        t, h, z = t + shift, h + shift, axpy(shift, seen.rates, z)
+        dynamics = system.evaluate(t, *with_flow(point.state, point.accumulators, z), mode)
+        shift = request.shift_end(dynamics)
+        t, h, z = t + shift, h + shift, axpy(shift, dynamics.rates, z)
     state, accumulators = with_flow(point.state, point.accumulators, z)
     projected = state._replace(plant=loop.plant.project(state.plant))
     # A projection may move the state onto a switching surface, so the end of a frozen mode is evaluated without it.
     frozen = mode.words is not None and system.program is not None
     state = select(mode.free, projected, state) if frozen else projected
-    seen = system.evaluate(t, state, accumulators, mode)
+    dynamics = system.evaluate(t, state, accumulators, mode)
 
     smooth, within = system.program is not None, (True, True)
     if frozen:
         smooth, within = ~mode.free, (True, ~mode.free)
     elif system.has_margin_rates:
-        changed = tuple(a ^ b for a, b in zip(seen.words, point.words, strict=True))
-        within = valid_end_rates(seen.surfaces, changed, h)
-    rates = (point.signal_rates, seen.signal_rates)
+        changed = tuple(a ^ b for a, b in zip(dynamics.words, point.words, strict=True))
+        within = valid_end_rates(dynamics.surfaces, changed, h)
+    rates = (point.signal_rates, dynamics.signal_rates)
     segment = Segment(
-        *(point.sample, seen.signals.sample, h, request.grid),
+        *(point.sample, dynamics.signals.sample, h, request.grid),
         shown_rates=lambda: (Shown.of(rates[0]), Shown.of(rates[1])),
         sample_rates=lambda: rates,
         smooth=smooth,
@@ -195,8 +174,8 @@ def attempt_step(
     if not loop.ticks and (loop.eventful or frozen):
         # A step of length 0 must not count twice in the objectives.
         updated = select(request.refresh, point.accumulators, updated)
-    end = _build_point(seen, t, projected, updated, forecast)
-    return Attempt(end, seen.signals, shift, report(seen, state, error))
+    end = _build_point(dynamics, t, projected, updated, forecast)
+    return Attempt(end, dynamics.signals, shift, report(dynamics, state, error))
 
 
 def commit_step(
@@ -212,17 +191,8 @@ def commit_step(
     """Return the point at which the run continues, after the events and the ticks at the end of a step.
 
     In a loop without ticks a later step of length 0 (`StepRequest.refresh`) evaluates the rates after an event. Events
-    are rare, so this is cheaper than an evaluation after every step.
-
-    Args:
-        system: Dynamics of the loop and its objectives.
-        point: Point at the beginning of the step.
-        attempt: The step.
-        clock: Instant at the end of the step.
-        triggered: True for each event that happens there.
-        mode: Mode after the changes.
-        logs: Rows of the blocks' logs (`core.log`), which `advance` has taken out of the state.
-        forecast: Prediction of the stepping method (`Stepping.forecast`).
+    are rare, so this is cheaper than an evaluation after every step. `logs` are the rows that `advance` has taken out
+    of the state (`core.log`).
     """
     loop, end = system.loop, attempt.point
     state = end.state
@@ -240,50 +210,35 @@ def commit_step(
 
 
 def mode_in_step(system: LoopSystem, words: ModeBits, free: Bool) -> Mode:
-    """Return the mode of a step in which the comparisons keep the answers `words`, or are evaluated where it is `free`.
+    """Return the mode of a step in which the comparisons keep the answers `words`.
 
-    Args:
-        system: Dynamics of the loop and its objectives.
-        words: Answers to the comparisons.
-        free: True for a step without a mode: each stage evaluates its comparisons, across switching surfaces.
+    Where it is `free`, each stage evaluates its comparisons, across switching surfaces.
     """
     all, none = jnp.uint32(0xFFFFFFFF), jnp.uint32(0)
     return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.word_count)))
 
 
-def mode_after_changes(system: LoopSystem, words: ModeBits, which: Scalar, lands: Bool) -> Mode:
+def mode_after_changes(system: LoopSystem, words: ModeBits, number: Scalar, lands: Bool) -> Mode:
     """Return the mode in which the dynamics are evaluated after the changes at the end of a step.
 
-    All comparisons are evaluated, but for that on whose switching surface the step ended: it keeps its answer in
-    `words`. At the zero of its margin, rounding could turn it back.
-
-    Args:
-        system: Dynamics of the loop and its objectives.
-        words: Answers to the comparisons beyond the switching surface, as `flip_answer` returns them.
-        which: Number of a comparison.
-        lands: True if the step ended on its switching surface.
+    If it `lands` on the switching surface of a comparison, that one keeps its answer in `words`, those of
+    `flip_answer`: at the zero of its margin, rounding could turn it back. All others are evaluated.
     """
-    kept = (jnp.where(lands, bit, jnp.uint32(0)) for bit in single_bit(which, system.word_count))
-    return Mode(words, ~lands, tuple(~bit for bit in kept))
+    frozen = (jnp.where(lands, bit, jnp.uint32(0)) for bit in single_bit(number, system.word_count))
+    return Mode(words, ~lands, tuple(~bit for bit in frozen))
 
 
-def flip_answer(system: LoopSystem, words: ModeBits, which: Scalar, lands: Bool) -> ModeBits:
-    """Return the answers with that of one comparison reversed where a step ends on its switching surface.
-
-    Args:
-        system: Dynamics of the loop and its objectives.
-        words: Answers to the comparisons.
-        which: Number of the comparison.
-        lands: True if the step ends on its switching surface.
-    """
-    bits = single_bit(which, system.word_count)
+def flip_answer(system: LoopSystem, words: ModeBits, number: Scalar, lands: Bool) -> ModeBits:
+    """Return the answers with that of one comparison reversed where a step `lands` on its switching surface."""
+    bits = single_bit(number, system.word_count)
     return tuple(word ^ jnp.where(lands, bit, jnp.uint32(0)) for word, bit in zip(words, bits, strict=True))
 
 
 def _build_point(
-    seen: Evaluation, t: Scalar, state: LoopState, accumulators: Accumulators, forecast: Forecast
+    dynamics: Evaluation, t: Scalar, state: LoopState, accumulators: Accumulators, forecast: Forecast
 ) -> Point:
+    signals = dynamics.signals
     return Point(
-        *(t, state, accumulators, seen.signals.sample, seen.signal_rates),
-        *((seen.signals.recorded, seen.recorded_rates), seen.rates, seen.margins, seen.words, forecast(seen)),
+        *(t, state, accumulators, signals.sample, dynamics.signal_rates, (signals.recorded, dynamics.recorded_rates)),
+        *(dynamics.rates, dynamics.margins, dynamics.words, forecast(dynamics)),
     )

@@ -121,13 +121,13 @@ class SwitchedProgram:
             values.update(zip(op.outs, outs, strict=True))
         return tree.unflatten([values[i] for i in picked]), trace.answers() if look else None
 
-    def _operations_for(self, wanted: tuple[int, ...]) -> list[_Op]:
-        """Return the operations that the wanted values depend on, in the order of the program."""
-        if wanted not in self._operations:
-            self._operations[wanted] = [
-                op for op, on in zip(self.ops, self._needed_operations(set(wanted)), strict=True) if on
+    def _operations_for(self, outputs: tuple[int, ...]) -> list[_Op]:
+        """Return the operations that these output values depend on, in the order of the program."""
+        if outputs not in self._operations:
+            self._operations[outputs] = [
+                op for op, on in zip(self.ops, self._needed_operations(set(outputs)), strict=True) if on
             ]
-        return self._operations[wanted]
+        return self._operations[outputs]
 
     def _needed_operations(self, values: set[int]) -> list[bool]:
         """Return for each operation whether these values depend on it."""
@@ -145,9 +145,9 @@ class SwitchedProgram:
 
     def _add_constants(self, constants: Sequence[PyTree]) -> list[int]:
         """Return the numbers of new constants."""
-        found = [self._value(("constant", len(self._names) + i), False) for i in range(len(constants))]
-        self._constants.update(zip(found, constants, strict=True))
-        return found
+        numbers = [self._value(("constant", len(self._names) + i), False) for i in range(len(constants))]
+        self._constants.update(zip(numbers, constants, strict=True))
+        return numbers
 
     def _literal(self, literal: Any) -> int:
         x = np.asarray(literal.val)
@@ -178,10 +178,10 @@ class SwitchedProgram:
     def _operation(self, eqn: Equation, ins: tuple[int, ...], source: Source) -> list[int]:
         """Add an operation, written by the line `source`, and return the numbers of its outputs."""
         # The same operation on the same values gets the same name, so that a repeated comparison has one number.
-        said = tuple(sorted((key, str(value)) for key, value in eqn.params.items() if not callable(value)))
-        same = (eqn.primitive.name, said, tuple(self._names[i] for i in ins))
+        parameters = tuple(sorted((key, str(value)) for key, value in eqn.params.items() if not callable(value)))
+        operation_name = (eqn.primitive.name, parameters, tuple(self._names[i] for i in ins))
         moves = any(self._moves[i] for i in ins)
-        outs = [self._value((*same, i), moves) for i in range(len(eqn.outvars))]
+        outs = [self._value((*operation_name, i), moves) for i in range(len(eqn.outvars))]
         real = all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in eqn.invars)
         name = SEARCHSORTED if is_knot_search(eqn) else eqn.primitive.name
         shape = eqn.invars[0].aval.shape if name == SEARCHSORTED else eqn.outvars[0].aval.shape
@@ -189,8 +189,8 @@ class SwitchedProgram:
         self.ops.append(_Op(_bind_equation(eqn), ins, tuple(outs), shape, asks, source))
         if moves and jumps(eqn):
             self._jumping.append(self.ops[-1]._replace(name=eqn.primitive.name))
-        if found := find_hidden(eqn, [self._moves[i] for i in ins]):
-            self._hiding.append((tuple(outs), found._replace(source=_nearest_line(found.source, source))))
+        if hidden := find_hidden(eqn, [self._moves[i] for i in ins]):
+            self._hiding.append((tuple(outs), hidden._replace(source=_nearest_line(hidden.source, source))))
         return outs
 
     def _number_comparisons(self, counted: set[int]) -> None:
@@ -199,7 +199,7 @@ class SwitchedProgram:
         needed = self._needed_operations(counted)
         used = {op.outs for op, on in zip(self.ops, needed, strict=True) if on}
         self.jumps = [op for op in self._jumping if op.outs in used]
-        self.hidden = [one for outs, one in self._hiding if outs in used]
+        self.hidden = [hidden for outs, hidden in self._hiding if outs in used]
         for i, (op, on) in enumerate(zip(self.ops, needed, strict=True)):
             if on and op.name:
                 asks = [
@@ -242,14 +242,14 @@ def _bind_equation(eqn: JaxprEqn) -> Callable[..., Sequence[PyTree]]:
         return bind
     # Primitives with inner functions (custom rules, scans) cannot be bound from their parameters alone.
     places = {atom: i for i, atom in enumerate(eqn.invars) if not isinstance(atom, jex.Literal)}
-    kept = [i for i, out in enumerate(eqn.outvars) if not isinstance(out, jex.DropVar)]
-    told = jex.DebugInfo("kinks", str(eqn.primitive), None, None)
-    body = jex.Jaxpr((), list(places), [eqn.outvars[i] for i in kept], [eqn], eqn.effects, told)
+    used_outputs = [i for i, out in enumerate(eqn.outvars) if not isinstance(out, jex.DropVar)]
+    debug_info = jex.DebugInfo("kinks", str(eqn.primitive), None, None)
+    body = jex.Jaxpr((), list(places), [eqn.outvars[i] for i in used_outputs], [eqn], eqn.effects, debug_info)
     run = jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))
 
     def call(*ins: Any) -> Sequence[PyTree]:
         outs: list[PyTree] = [None] * len(eqn.outvars)
-        for i, out in zip(kept, run(*(ins[place] for place in places.values())), strict=True):
+        for i, out in zip(used_outputs, run(*(ins[place] for place in places.values())), strict=True):
             outs[i] = out
         return outs
 

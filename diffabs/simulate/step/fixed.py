@@ -50,11 +50,11 @@ class FixedStepControl(NamedTuple):
 
     Attributes:
         extra: Number of attempts so far, not counting accepted steps to the grid and attempts in REFINING.
-        here: Number of such attempts since the last instant of the grid.
+        in_step: Number of such attempts since the last instant of the grid.
     """
 
     extra: Int
-    here: Int
+    in_step: Int
 
 
 class FixedStepReport(NamedTuple):
@@ -109,7 +109,7 @@ class FixedStepping:
 
     def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
-        foresee = partial(look_ahead, jnp.asarray(True)) if self.watches else lambda seen: ()
+        foresee = partial(look_ahead, jnp.asarray(True)) if self.watches else lambda dynamics: ()
         carry = start_carry(self, loop, objectives, key, foresee)
         return cast_floats(carry._replace(control=FixedStepControl(carry.k, carry.k)), self.h.dtype)
 
@@ -128,14 +128,11 @@ class FixedStepping:
         return observe(loop, carry.point.t, carry.point.state, carry.running)
 
     def for_derivatives(self) -> "FixedStepping":
-        """Return the method for derivatives: it locates switching surfaces unless `kinks` is False.
-
-        The times of its events have second derivatives.
-        """
+        """Return the method for derivatives of both orders: it locates switching surfaces unless `kinks` is False."""
         return dataclasses.replace(self, kinks=self.kinks is not False, second_order=True)
 
     def capacity(self, loop: Loop, steps: int) -> int:
-        """Return the capacity of a scan for a number of `steps` of this `loop`: the greatest usual number of attempts.
+        """Return the capacity of a scan for this number of `steps`: the greatest usual number of attempts.
 
         An event takes at least four attempts. One of them is REFINING, which `FixedStepControl.extra` does not count.
         """
@@ -161,80 +158,71 @@ class FixedStepping:
             return StepRequest(self.h, strike * self.h, self.h, UNCONSTRAINED, no, yes, strike)
         return propose_step(self, system, carry, strike, frozen=system.program is not None)
 
-    def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
-        """Return the `Outlook` from `seen` for the run of `carry` if the method `watches`, and else nothing."""
-        return look_ahead(carry.status == RunStatus.REFRESHING, seen) if self.watches else ()
+    def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
+        """Return the `Outlook` if the method `watches`, and else nothing."""
+        return look_ahead(carry.status == RunStatus.REFRESHING, dynamics) if self.watches else ()
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: PyTree
     ) -> FixedStepReport:
-        """Return the contradicted comparisons of an attempt by the run of `carry` in `system`, from `seen` at its end.
-
-        `h` is the length of the attempt. The `state` and the shares of the `error` have no influence.
-        """
+        """Return the comparisons that an attempt contradicts at its end, and whether a margin grazes zero."""
         del state, error
-        surface, grazes = find_surface_crossing(seen, carry.search.which, h) if system.program else None, False
+        surface, grazes = find_surface_crossing(dynamics, carry.search.number, h) if system.program else None, False
         if self.watches:
-            turns = watch_margins(carry, h, seen, system.bit_count)
+            turns = watch_margins(carry, h, dynamics, system.bit_count)
             grazes = turns.grazes | (turns.time_since > 0)
         return FixedStepReport(surface, jnp.asarray(grazes))
 
     def decide(
         self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
     ) -> Decision:
-        """Return the decision on the `attempt` that answers the `request`, by the run of `carry` in `system`.
-
-        Its numbers must be finite and, within a mode, plausible. `active` is False if the run needs no attempt.
-        """
+        """Return the decision: the numbers must be finite and, within a mode, plausible."""
         end = attempt.point
         # The rates at the end of a smooth run are used nowhere else but in samples of its last step.
         numbers = jax.tree.leaves((end.state.flow(), end.rates[0] if self.smooth else ()))
-        fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in numbers]))
-        fine &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True
+        valid = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in numbers]))
+        valid &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True
         last = request.strikes & (request.strike >= self.steps)
         frozen = system.program is not None
-        return decide_attempt(self, system, carry, attempt, active, fine, fine, last=last, frozen=frozen)
+        return decide_attempt(self, system, carry, attempt, active, valid, valid, last=last, frozen=frozen)
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return `after` with length and status of the next attempt, which goes to the grid or continues the search.
-
-        `carry` is the run in `system` before the attempt, and `decision` the decision on it.
-        """
+        """Return `after` with length and status of the next attempt, which goes to the grid or continues the search."""
         if self.smooth:
-            return after._replace(status=jnp.where(decision.fine, after.status, RunStatus.DIVERGED))
-        control, on_grid = carry.control, decision.taken & carry.strikes
+            return after._replace(status=jnp.where(decision.valid, after.status, RunStatus.DIVERGED))
+        control, on_grid = carry.control, decision.accepted & carry.strikes
         extra = control.extra + jnp.where(on_grid | (carry.status == RunStatus.REFINING), 0, 1)
-        here = jnp.where(on_grid, 0, control.here + extra - control.extra)
+        in_step = jnp.where(on_grid, 0, control.in_step + extra - control.extra)
         unrestricted, status = carry.unrestricted, after.status
         if system.program:
-            crowded = control.here >= MAX_ATTEMPTS_PER_STEP
+            crowded = control.in_step >= MAX_ATTEMPTS_PER_STEP
             gave_up = (
                 crowded
                 | (after.search.tries >= MAX_LOCATION_ATTEMPTS)
                 | (control.extra > CROSSING_ATTEMPTS_PER_STEP * carry.k + SPARE_ATTEMPTS)
             )
-            gave_up &= decision.searches & (after.search.which < system.bit_count)
+            gave_up &= decision.searches & (after.search.number < system.bit_count)
             if watch := after.slides:
                 # So many landings within one step that there is no room for another return.
                 begins = gave_up & crowded & (watch.returns > 0)
-                slide = begin_slide(watch.slide, begins, after.search.which, after.point.t)
+                slide = begin_slide(watch.slide, begins, after.search.number, after.point.t)
                 after = after._replace(slides=watch._replace(slide=slide))
-            becomes_unrestricted = ~decision.taken & ~unrestricted & (~decision.fine | gave_up)
+            becomes_unrestricted = ~decision.accepted & ~unrestricted & (~decision.valid | gave_up)
             unrestricted = (unrestricted | becomes_unrestricted) & ~(on_grid & have_same_answers(carry, attempt))
             status = jnp.where(becomes_unrestricted, RunStatus.RUNNING, status)
-        most = (EVENT_ATTEMPTS_PER_STEP + CROSSING_ATTEMPTS_PER_STEP) * self.steps + SPARE_ATTEMPTS
-        lost = ~decision.fine & (carry.unrestricted if system.program else True)
+        max_extra = (EVENT_ATTEMPTS_PER_STEP + CROSSING_ATTEMPTS_PER_STEP) * self.steps + SPARE_ATTEMPTS
+        lost = ~decision.valid & (carry.unrestricted if system.program else True)
         if self.watches:
-            grazes = attempt.report.grazes & (decision.taken | decision.searches)
+            grazes = attempt.report.grazes & (decision.accepted | decision.searches)
             status = jnp.where(unrestricted, RunStatus.SLID, jnp.where(grazes, RunStatus.GRAZED, status))
-        status = jnp.where(extra > most, RunStatus.EXHAUSTED, status)
+        status = jnp.where(extra > max_extra, RunStatus.EXHAUSTED, status)
         strikes = status == RunStatus.RUNNING
         length = jnp.where(strikes, self.h - after.since, jnp.where(status == RunStatus.REFRESHING, 0.0, after.length))
         return after._replace(
             length=length,
             strikes=strikes,
             unrestricted=unrestricted,
-            control=FixedStepControl(extra, here),
+            control=FixedStepControl(extra, in_step),
             status=jnp.where(lost, RunStatus.DIVERGED, status),
         )
 
@@ -247,6 +235,6 @@ def _is_plausible(carry: Carry, attempt: Attempt) -> Bool:
     # stability goes there.
     sane = []
     for a, b, p, q in zip(*ends, *rates, strict=True):
-        most = MAX_RATE_RATIO * jnp.abs(carry.length) * jnp.maximum(jnp.abs(p), jnp.abs(q))
-        sane.append(jnp.all(jnp.abs(b - a) <= most + MAX_STATE_FRACTION * (jnp.abs(a) + jnp.abs(b))))
+        from_rates = MAX_RATE_RATIO * jnp.abs(carry.length) * jnp.maximum(jnp.abs(p), jnp.abs(q))
+        sane.append(jnp.all(jnp.abs(b - a) <= from_rates + MAX_STATE_FRACTION * (jnp.abs(a) + jnp.abs(b))))
     return jnp.all(jnp.array(sane))

@@ -53,10 +53,7 @@ class Hidden(NamedTuple):
 def open_equation(eqn: Equation, moves: Sequence[bool], bends: bool) -> jex.ClosedJaxpr | None:
     """Return the program that replaces an equation; None for an equation that stays.
 
-    Args:
-        eqn: Equation of a jaxpr.
-        moves: For each input, whether it depends on time or state.
-        bends: True if derivatives of the result are asked for.
+    `moves` says which inputs depend on time or state, and `bends` whether derivatives of the result are asked for.
     """
     name, params = eqn.primitive.name, eqn.params
     if name in INLINED_CALLS and not is_knot_search(eqn):
@@ -64,7 +61,7 @@ def open_equation(eqn: Equation, moves: Sequence[bool], bends: bool) -> jex.Clos
     if name in CUSTOM_CALLS and _origin(eqn) in BENT_RULES:
         return _close(params["call_jaxpr"])
     if name == "cond" and find_hidden(eqn, moves):
-        return _trace(eqn, lambda which, *xs: _select_branch(params["branches"], which, xs))
+        return _trace(eqn, lambda index, *xs: _select_branch(params["branches"], index, xs))
     if name == "atan2" and any(moves) and all(map(_is_real, eqn.invars)):
         return _trace(eqn, _turn_angle)
     if name in REDUCING_OPERATIONS and bends and moves[0] and _is_real(eqn.invars[0]):
@@ -73,29 +70,20 @@ def open_equation(eqn: Equation, moves: Sequence[bool], bends: bool) -> jex.Clos
 
 
 def find_hidden(eqn: Equation, moves: Sequence[bool]) -> Hidden | None:
-    """Return a comparison that depends on time or state in the inner functions of an equation, or None.
-
-    Args:
-        eqn: Equation of a jaxpr.
-        moves: For each input, whether it depends on time or state.
-    """
+    """Return a comparison that depends on inputs that move, in the inner functions of an equation, or None."""
     name = eqn.primitive.name
     if not any(moves) or is_knot_search(eqn) or (name in CUSTOM_CALLS and _origin(eqn) in SMOOTH_RULES):
         return None
     if name in HOST_CALLS:
         return Hidden(name, name, eqn.source_info)
-    for body, given in _list_bodies(eqn, list(moves)):
-        if found := _search_body(body, given)[0]:
-            return Hidden(found.name, name, found.source)
+    for body, inner_moves in _list_bodies(eqn, list(moves)):
+        if hidden := _search_body(body, inner_moves)[0]:
+            return Hidden(hidden.name, name, hidden.source)
     return None
 
 
 def jumps(eqn: Equation) -> bool:
-    """Return whether the result of an equation jumps or bends where no comparison changes: a rounded number, a place.
-
-    Args:
-        eqn: Equation of a jaxpr.
-    """
+    """Return whether the result of an equation jumps or bends where no comparison changes, as a rounded number."""
     name = eqn.primitive.name
     if not eqn.invars or not _is_real(eqn.invars[0]):
         return False
@@ -105,27 +93,19 @@ def jumps(eqn: Equation) -> bool:
 
 
 def is_knot_search(eqn: Equation) -> bool:
-    """Return whether an equation searches one number in at most `WORD_BITS` knots.
-
-    Args:
-        eqn: Equation of a jaxpr.
-    """
+    """Return whether an equation searches one number in at most `WORD_BITS` knots."""
     shapes = [atom.aval.shape for atom in eqn.invars]
     named = eqn.primitive.name in INLINED_CALLS and eqn.params.get("name") == SEARCHSORTED
     return named and len(shapes) == 2 and shapes[1] == () and len(shapes[0]) == 1 and shapes[0][0] <= WORD_BITS
 
 
 def find_bent(jaxpr: jex.Jaxpr) -> set[jex.Var]:
-    """Return the variables of a jaxpr whose derivatives reach its results: not those behind a `stop_gradient`.
-
-    Args:
-        jaxpr: jex.Jaxpr, open.
-    """
-    found = {one for one in jaxpr.outvars if not isinstance(one, jex.Literal)}
+    """Return the variables of a jaxpr whose derivatives reach its results: not those behind a `stop_gradient`."""
+    bent = {variable for variable in jaxpr.outvars if not isinstance(variable, jex.Literal)}
     for eqn in reversed(jaxpr.eqns):
-        if eqn.primitive.name != "stop_gradient" and not found.isdisjoint(eqn.outvars):
-            found.update(one for one in eqn.invars if not isinstance(one, jex.Literal))
-    return found
+        if eqn.primitive.name != "stop_gradient" and not bent.isdisjoint(eqn.outvars):
+            bent.update(variable for variable in eqn.invars if not isinstance(variable, jex.Literal))
+    return bent
 
 
 def _search_body(jaxpr: jex.Jaxpr, moves: Sequence[bool]) -> tuple[Hidden | None, list[bool]]:
@@ -156,13 +136,13 @@ def _list_bodies(eqn: Equation, moves: list[bool]) -> Iterator[tuple[jex.Jaxpr, 
     """Yield the inner jaxprs of an equation, each with those of its inputs that depend on time or state."""
     name, params = eqn.primitive.name, eqn.params
     if name == "cond":
-        yield from ((_close(one).jaxpr, moves[1:]) for one in params["branches"])
+        yield from ((_close(branch).jaxpr, moves[1:]) for branch in params["branches"])
     elif name == "scan":
         body, (fixed, many) = _close(params["jaxpr"]).jaxpr, scan_input_counts(params, len(moves))
         end = fixed + many
         yield body, [*moves[:fixed], *_follow_carry(body, moves[:fixed], moves[fixed:end], moves[end:]), *moves[end:]]
     elif name == "while":
-        ask, body = (_close(params[one]).jaxpr for one in ("cond_jaxpr", "body_jaxpr"))
+        ask, body = (_close(params[key]).jaxpr for key in ("cond_jaxpr", "body_jaxpr"))
         first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
         carry = _follow_carry(body, moves[first:second], moves[second:], [])
         yield body, [*moves[first:second], *carry]
@@ -171,29 +151,29 @@ def _list_bodies(eqn: Equation, moves: list[bool]) -> Iterator[tuple[jex.Jaxpr, 
         yield _close(params.get("jaxpr") or params["call_jaxpr"]).jaxpr, moves
     else:
         inner = jax.tree.leaves(list(params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr"))
-        bodies = [_close(one).jaxpr for one in inner if hasattr(one, "eqns") or hasattr(one, "jaxpr")]
-        yield from ((one, [True] * len(one.invars)) for one in bodies)
+        bodies = [_close(x).jaxpr for x in inner if hasattr(x, "eqns") or hasattr(x, "jaxpr")]
+        yield from ((body, [True] * len(body.invars)) for body in bodies)
 
 
-def _follow_carry(body: jex.Jaxpr, fixed: list[bool], carry: list[bool], rest: list[bool]) -> list[bool]:
+def _follow_carry(body: jex.Jaxpr, fixed: list[bool], carry: list[bool], scanned: list[bool]) -> list[bool]:
     """Return which numbers of a loop's carry depend on time or state, in any of its turns."""
     while True:
-        after = _search_body(body, [*fixed, *carry, *rest])[1][: len(carry)]
+        after = _search_body(body, [*fixed, *carry, *scanned])[1][: len(carry)]
         more = [a or b for a, b in zip(carry, after, strict=True)]
         if more == carry:
             return carry
         carry = more
 
 
-def _select_branch(branches: Sequence[jex.ClosedJaxpr], which: Array, xs: Sequence[PyTree]) -> list[PyTree]:
-    """Return the results of the branch `which`; all are computed, and the others have no derivatives."""
+def _select_branch(branches: Sequence[jex.ClosedJaxpr], index: Array, xs: Sequence[PyTree]) -> list[PyTree]:
+    """Return the results of the branch `index`; all are computed, and the others have no derivatives."""
     each = []
-    for i, one in enumerate(branches):
+    for i, branch in enumerate(branches):
         # Otherwise an infinite derivative in a branch that is not taken would become NaN.
-        given = [jax.lax.select_n(which == i, jax.lax.stop_gradient(x), x) if _is_real(x) else x for x in xs]
-        each.append(jex.jaxpr_as_fun(_close(one))(*given))
+        inputs = [jax.lax.select_n(index == i, jax.lax.stop_gradient(x), x) if _is_real(x) else x for x in xs]
+        each.append(jex.jaxpr_as_fun(_close(branch))(*inputs))
     return [
-        jax.lax.select_n(which.astype(bool) if len(outs) == 2 else which, *outs) for outs in zip(*each, strict=True)
+        jax.lax.select_n(index.astype(bool) if len(outs) == 2 else index, *outs) for outs in zip(*each, strict=True)
     ]
 
 
@@ -207,8 +187,8 @@ def _turn_angle(y: Array, x: Array) -> list[Array]:
 
 def _hold_tournament(pick: Callable[[Array, Array], Array], x: Array, axes: Sequence[int]) -> Array:
     """Return the greatest or least numbers along axes by comparisons of two."""
-    kept = [size for axis, size in enumerate(x.shape) if axis not in axes]
-    x = jnp.moveaxis(x, axes, range(len(axes))).reshape(-1, *kept)
+    remaining_shape = [size for axis, size in enumerate(x.shape) if axis not in axes]
+    x = jnp.moveaxis(x, axes, range(len(axes))).reshape(-1, *remaining_shape)
     while len(x) > 1:
         half = len(x) // 2
         x = jnp.concatenate([pick(x[:half], x[half : 2 * half]), x[2 * half :]])
@@ -216,7 +196,7 @@ def _hold_tournament(pick: Callable[[Array, Array], Array], x: Array, axes: Sequ
 
 
 def _trace(eqn: Equation, function: Callable[..., Sequence[PyTree]]) -> jex.ClosedJaxpr:
-    return jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(one.aval.shape, one.aval.dtype) for one in eqn.invars))
+    return jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars))
 
 
 def _close(jaxpr: jex.Jaxpr | jex.ClosedJaxpr) -> jex.ClosedJaxpr:
@@ -226,8 +206,8 @@ def _close(jaxpr: jex.Jaxpr | jex.ClosedJaxpr) -> jex.ClosedJaxpr:
 
 def _origin(eqn: Equation) -> str:
     """Return the name of the function of JAX that a call with a derivative rule calls; "" if it is not of JAX."""
-    told = getattr(_close(eqn.params["call_jaxpr"]).jaxpr.debug_info, "func_src_info", None) or ""
-    name, _, place = told.partition(" at ")
+    source = getattr(_close(eqn.params["call_jaxpr"]).jaxpr.debug_info, "func_src_info", None) or ""
+    name, _, place = source.partition(" at ")
     return name if "/jax/_src/" in place.replace("\\", "/") else ""
 
 

@@ -47,14 +47,9 @@ class ComparisonAnswers(NamedTuple):
     margins: list[tuple[PyTree, PyTree]]
 
 
-def single_bit(which: Scalar, words: int) -> ModeBits:
-    """Return packed words with one bit set, or without a set bit if `which` is negative.
-
-    Args:
-        which: Number of the bit.
-        words: Number of words.
-    """
-    word, place = which // WORD_BITS, (which % WORD_BITS).astype(jnp.uint32)
+def single_bit(number: Scalar, words: int) -> ModeBits:
+    """Return packed words with one bit set, or without a set bit if its `number` is negative."""
+    word, place = number // WORD_BITS, (number % WORD_BITS).astype(jnp.uint32)
     return tuple(jnp.where(word == i, jnp.uint32(1) << place, jnp.uint32(0)) for i in range(words))
 
 
@@ -62,42 +57,36 @@ class SurfaceCrossing(NamedTuple):
     """Contradicted comparisons at the end of a step: the numbers there give other answers than the mode of the step.
 
     Attributes:
-        other: A contradicted comparison other than the sought one, or -1.
+        unsought: A contradicted comparison other than the sought one, or -1.
         contradicted: True if the sought comparison is contradicted.
-        chosen: Number of the comparison to search for: `other` if only that one is contradicted, else the sought one.
-        margin: Margin of the chosen comparison.
+        target: Number of the comparison to search for: `unsought` if it alone is contradicted, else the sought one.
+        margin: Margin of that comparison.
     """
 
-    other: Int
+    unsought: Int
     contradicted: Bool
-    chosen: Int
+    target: Int
     margin: Scalar
 
 
-def find_contradicted(answers: ComparisonAnswers, which: Scalar, like: PyTree) -> SurfaceCrossing:
-    """Return which comparisons are contradicted. They are numbered by their bits.
-
-    Args:
-        answers: Answers and margins of an evaluation.
-        which: Number of the sought comparison.
-        like: A number with the type of the margin.
-    """
-    other, crossed = jnp.asarray(-1, which.dtype), jnp.asarray(False)
+def find_contradicted(answers: ComparisonAnswers, number: Scalar, like: PyTree) -> SurfaceCrossing:
+    """Return the contradicted comparisons, by the number of the sought one; `like` has the type of the margin."""
+    unsought, crossed = jnp.asarray(-1, number.dtype), jnp.asarray(False)
     for i, (word, bit) in enumerate(
-        zip(answers.contradicted, single_bit(which, len(answers.contradicted)), strict=True)
+        zip(answers.contradicted, single_bit(number, len(answers.contradicted)), strict=True)
     ):
-        rest = word & ~bit
+        remaining = word & ~bit
         # x & -x keeps the lowest set bit; one less has as many bits set as there are places below it.
-        lowest = jax.lax.population_count((rest & (~rest + 1)) - 1)
-        other = jnp.where(rest != 0, i * WORD_BITS + lowest.astype(which.dtype), other)
+        lowest = jax.lax.population_count((remaining & (~remaining + 1)) - 1)
+        unsought = jnp.where(remaining != 0, i * WORD_BITS + lowest.astype(number.dtype), unsought)
         crossed |= (word & bit) != 0
-    chosen, margin = jnp.where(crossed | (other < 0), which, other), jnp.zeros_like(like)
-    for numbers, one in answers.margins:
-        inside = chosen == numbers
-        if jnp.ndim(one):
-            inside, one = jnp.any(inside), jnp.sum(jnp.where(inside, one, 0.0))
-        margin = jnp.where(inside, one, margin)
-    return SurfaceCrossing(other, crossed, chosen, margin)
+    target, margin = jnp.where(crossed | (unsought < 0), number, unsought), jnp.zeros_like(like)
+    for numbers, values in answers.margins:
+        inside = target == numbers
+        if jnp.ndim(values):
+            inside, values = jnp.any(inside), jnp.sum(jnp.where(inside, values, 0.0))
+        margin = jnp.where(inside, values, margin)
+    return SurfaceCrossing(unsought, crossed, target, margin)
 
 
 class ComparisonTrace:
@@ -109,7 +98,7 @@ class ComparisonTrace:
         `places` holds the bits of each comparison, by its number, and `words` is the number of words.
         """
         self.places, self.mode, self.look = places, mode, look
-        self.taken: dict[int, PyTree] = {}
+        self.by_number: dict[int, PyTree] = {}
         self.against: list[PyTree] = [jnp.uint32(0)] * words
         self.said: list[PyTree] = [jnp.uint32(0)] * words
         self.margins: list[tuple[PyTree, PyTree]] = []
@@ -120,10 +109,10 @@ class ComparisonTrace:
         `ask` holds the number of the comparison, and True if that number denotes the negation.
         """
         number, turned = ask
-        if number not in self.taken:
-            self.taken[number] = self._compare(number, *((y, x, not strict) if turned else (x, y, strict)))
-        taken = self.taken[number]
-        return ~taken if turned else taken
+        if number not in self.by_number:
+            self.by_number[number] = self._compare(number, *((y, x, not strict) if turned else (x, y, strict)))
+        answer = self.by_number[number]
+        return ~answer if turned else answer
 
     def _compare(self, number: int, x: Scalar, y: Scalar, strict: bool) -> Scalar:
         """Return the frozen answer, or the answer of the numbers, and record the contradiction and the margin."""
@@ -136,20 +125,20 @@ class ComparisonTrace:
             self._pack(self.said, first, says())
             self._add(first, shape, x - y)
             return says()
-        taken = _unpack_answers(self.mode.words, first, shape)
+        answer = _unpack_answers(self.mode.words, first, shape)
         if not self.look:
-            return taken if self.mode.free is None else jnp.where(self.mode.free, says(), taken)
-        margin = jnp.where(taken, x - y, y - x)
+            return answer if self.mode.free is None else jnp.where(self.mode.free, says(), answer)
+        margin = jnp.where(answer, x - y, y - x)
         against = margin < -_rounding_error(x)
         if self.mode.released is not None:
             # A margin of exactly 0 (a product that has become 0) is no contradiction; without this line a released
             # answer would stay frozen for ever.
             gives = _unpack_answers(self.mode.released, first, shape)
-            against |= gives & (margin == 0) & (says() != taken)
-            taken ^= against & gives
+            against |= gives & (margin == 0) & (says() != answer)
+            answer ^= against & gives
         self._pack(self.against, first, against)
         self._add(first, shape, margin)
-        return taken
+        return answer
 
     def search(self, ask: tuple[int, bool], says: Callable[[], PyTree], knots: Scalar, x: Scalar) -> Scalar:
         """Return the number of knots that are not above `x`, as an integer; each knot has one bit.
@@ -203,8 +192,8 @@ class ComparisonTrace:
             words[first // WORD_BITS] |= jnp.where(answer, np.uint32(1 << first % WORD_BITS), np.uint32(0))
             return
         for start, word, places in _locate_bits(first, jnp.shape(answer)):
-            here = jnp.ravel(answer)[start : start + len(places)]
-            words[word] |= jnp.sum(jnp.where(here, np.uint32(1) << places, np.uint32(0)), dtype=jnp.uint32)
+            bits = jnp.ravel(answer)[start : start + len(places)]
+            words[word] |= jnp.sum(jnp.where(bits, np.uint32(1) << places, np.uint32(0)), dtype=jnp.uint32)
 
     def answers(self) -> ComparisonAnswers:
         """Return the answers, the contradicted bits and the margins."""
@@ -212,9 +201,9 @@ class ComparisonTrace:
         if self.mode.words is None:
             return ComparisonAnswers(tuple(self.said), tuple(against), self.margins)
         loose = self.mode.released or (np.uint32(0),) * len(against)
-        taken = (was ^ (now & give) for was, now, give in zip(self.mode.words, against, loose, strict=True))
+        words = (was ^ (now & give) for was, now, give in zip(self.mode.words, against, loose, strict=True))
         return ComparisonAnswers(
-            tuple(taken), tuple(now & ~give for now, give in zip(against, loose, strict=True)), self.margins
+            tuple(words), tuple(now & ~give for now, give in zip(against, loose, strict=True)), self.margins
         )
 
 
@@ -225,8 +214,8 @@ def _ones(count: Scalar) -> Scalar:
 
 def _rounding_error(x: Scalar) -> Scalar:
     """Return the difference from x below which a comparison is undecided by rounding."""
-    most = jnp.finfo(jnp.result_type(x))
-    return most.eps**ROUNDING_POWER * jnp.minimum(jnp.abs(x), most.max)
+    limits = jnp.finfo(jnp.result_type(x))
+    return limits.eps**ROUNDING_POWER * jnp.minimum(jnp.abs(x), limits.max)
 
 
 def _unpack_answers(words: ModeBits, first: int, shape: tuple[int, ...]) -> Scalar:
@@ -242,10 +231,10 @@ def _locate_bits(first: int, shape: tuple[int, ...]) -> list[tuple[int, int, np.
 
     An entry holds the flat index of the first element in the word, the word's index, and the bits' places in it.
     """
-    size, found, start = int(np.prod(shape)), [], 0
+    size, ranges, start = int(np.prod(shape)), [], 0
     while start < size:
         at = (first + start) % WORD_BITS
         many = min(size - start, WORD_BITS - at)
-        found.append((start, (first + start) // WORD_BITS, np.arange(at, at + many, dtype=np.uint32)))
+        ranges.append((start, (first + start) // WORD_BITS, np.arange(at, at + many, dtype=np.uint32)))
         start += many
-    return found
+    return ranges

@@ -52,17 +52,13 @@ class Turns(NamedTuple):
 def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -> Turns:
     """Return when margins first turn back beyond zero within a step, and whether one only grazes zero.
 
-    Args:
-        starts: Margins at the start.
-        ends: Margins at the end.
-        length: Length of the step [s].
-        landing: True for the margin on whose zero the step ends, shape (n,).
+    `landing` (n,) is True for the margin on whose zero the step ends.
     """
     # With the sign of the start, each margin is positive before its first crossing.
     sign = jnp.where(starts.margins < 0, -1.0, 1.0).astype(starts.margins.dtype)
     a, b, da, db = (sign * x for x in (starts.margins, ends.margins, length * starts.rates, length * ends.rates))
-    most = jnp.maximum(jnp.abs(a), jnp.abs(b))
-    undecided = max(GRAZING_DEPTH_FRACTION, GRAZING_DEPTH_EPS * float(jnp.finfo(a.dtype).eps)) * most
+    greatest = jnp.maximum(jnp.abs(a), jnp.abs(b))
+    undecided = max(GRAZING_DEPTH_FRACTION, GRAZING_DEPTH_EPS * float(jnp.finfo(a.dtype).eps)) * greatest
 
     def find() -> Turns:
         cubic = Cubic(a, b, da, db)
@@ -82,66 +78,47 @@ def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -
 
     # A slope at an end lowers the cubic by at most 4/27 of slope times length, so most steps need no cubic.
     reach = MAX_SLOPE_EFFECT * (jnp.maximum(-da, 0.0) + jnp.maximum(db, 0.0))
-    near = landing | (jnp.isfinite(most) & (jnp.minimum(a, b) <= reach + undecided))
+    near = landing | (jnp.isfinite(greatest) & (jnp.minimum(a, b) <= reach + undecided))
     return jax.lax.cond(any_lane(jnp.any(near)), find, lambda: Turns(jnp.zeros_like(length), jnp.asarray(False)))
 
 
-def look_ahead(fresh: Bool, seen: Evaluation) -> Outlook:
-    """Return the margins at an instant.
-
-    Args:
-        fresh: True if the mode of the next step has just been chosen by the numbers at this instant.
-        seen: Dynamics at the instant.
-    """
-    margins, rates, numbers = _list_margins(seen, 0)
+def look_ahead(fresh: Bool, dynamics: Evaluation) -> Outlook:
+    """Return the margins at an instant; it is `fresh` if its numbers have just chosen the mode of the next step."""
+    margins, rates, numbers = _list_margins(dynamics, 0)
     # The margin of a newly chosen answer may have any sign. It is turned so that it is positive within the mode.
-    surfaces = jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(seen.margins))
+    surfaces = jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(dynamics.margins))
     turned = fresh & surfaces & ((margins < 0) | ((margins == 0) & (rates < 0)))
     return Outlook(jnp.where(turned, -margins, margins), jnp.where(turned, -rates, rates))
 
 
-def watch_margins(carry: PyTree, h: Scalar, seen: Evaluation, bit_count: int) -> Turns:
-    """Return where margins turn back in an attempt; nowhere in the attempts of a search, before it lands.
-
-    Args:
-        carry: Carry before the attempt, with an `Outlook` in its forecast.
-        h: Length of the attempt [s].
-        seen: Dynamics at its end.
-        bit_count: Number of bits of the comparisons; events have the numbers after them.
-    """
-    margins, rates, numbers = _list_margins(seen, bit_count)
-    running, landing = (carry.status == one for one in (RunStatus.RUNNING, RunStatus.LANDING))
-    found = find_turns(_outlook(carry), Outlook(margins, rates), h, landing & (numbers == carry.search.which))
-    return Turns(jnp.where(running, found.time_since, 0.0), (running | landing) & found.grazes)
+def watch_margins(carry: PyTree, h: Scalar, dynamics: Evaluation, bit_count: int) -> Turns:
+    """Return where margins turn back in an attempt; nowhere in the attempts of a search, before it lands."""
+    margins, rates, numbers = _list_margins(dynamics, bit_count)
+    running, landing = (carry.status == status for status in (RunStatus.RUNNING, RunStatus.LANDING))
+    turns = find_turns(_outlook(carry), Outlook(margins, rates), h, landing & (numbers == carry.search.number))
+    return Turns(jnp.where(running, turns.time_since, 0.0), (running | landing) & turns.grazes)
 
 
-def margin_error(system: LoopSystem, carry: PyTree, h: Scalar, seen: Evaluation, state: LoopState) -> Scalar:
+def margin_error(system: LoopSystem, carry: PyTree, h: Scalar, dynamics: Evaluation, state: LoopState) -> Scalar:
     """Return the error of the margins' cubics in the middle of an attempt, as a multiple of the allowed one.
 
     A margin may depend on time alone, and then no error of a state shows its error. The result is 0 without margins,
-    and unless the run is RUNNING.
-
-    Args:
-        system: Dynamics of the loop and its objectives.
-        carry: Carry before the attempt, with an `Outlook` in its forecast.
-        h: Length of the attempt [s].
-        seen: Dynamics at its end.
-        state: State at its end.
+    and unless the run is RUNNING. `dynamics` and `state` are those at the end of the attempt.
     """
-    margins, rates, _ = _list_margins(seen, 0)
+    margins, rates, _ = _list_margins(dynamics, 0)
     if margins.size == 1:  # that of a stop which is never reached
         return jnp.zeros_like(h)
     point = carry.point
-    step = HermiteStep(point.t, point.t + h, (point.state.flow(), state.flow()), (point.rates[0], seen.rates[0]))
+    step = HermiteStep(point.t, point.t + h, (point.state.flow(), state.flow()), (point.rates[0], dynamics.rates[0]))
     middle = point.t + 0.5 * h
     mode = mode_in_step(system, point.words, carry.unrestricted)
-    there = system.list_margins(middle, point.state.with_flow(step.at(middle)), point.accumulators, mode)
-    there = jnp.concatenate([jnp.ravel(x) for x in there])
+    middle_margins = system.list_margins(middle, point.state.with_flow(step.at(middle)), point.accumulators, mode)
+    middle_margins = jnp.concatenate([jnp.ravel(x) for x in middle_margins])
     start = _outlook(carry)
-    most = jnp.maximum(jnp.maximum(jnp.abs(start.margins), jnp.abs(margins)), jnp.abs(there))
-    off = jnp.abs(Cubic(start.margins, margins, h * start.rates, h * rates)(0.5) - there)
-    off = jnp.where(jnp.isfinite(off) & (most > 0), off / jnp.where(most > 0, most, 1.0), 0.0)
-    return jnp.where(carry.status == RunStatus.RUNNING, jnp.max(off) / MARGIN_TOLERANCE, 0.0)
+    greatest = jnp.maximum(jnp.maximum(jnp.abs(start.margins), jnp.abs(margins)), jnp.abs(middle_margins))
+    errors = jnp.abs(Cubic(start.margins, margins, h * start.rates, h * rates)(0.5) - middle_margins)
+    errors = jnp.where(jnp.isfinite(errors) & (greatest > 0), errors / jnp.where(greatest > 0, greatest, 1.0), 0.0)
+    return jnp.where(carry.status == RunStatus.RUNNING, jnp.max(errors) / MARGIN_TOLERANCE, 0.0)
 
 
 def _outlook(carry: PyTree) -> Outlook:
@@ -149,10 +126,10 @@ def _outlook(carry: PyTree) -> Outlook:
     return forecast if isinstance(forecast, Outlook) else forecast[1]
 
 
-def _list_margins(seen: Evaluation, bit_count: int) -> tuple[Array, Array, Array]:
+def _list_margins(dynamics: Evaluation, bit_count: int) -> tuple[Array, Array, Array]:
     """Return margins, rates and numbers of the comparisons and then of the events, each of shape (n,)."""
-    surfaces = [(one.value, one.rate, one.numbers) for one in seen.surfaces]
-    values, rates = (jax.tree.leaves(tree) for tree in (seen.margins, seen.margin_rates))
+    surfaces = [(surface.value, surface.rate, surface.numbers) for surface in dynamics.surfaces]
+    values, rates = (jax.tree.leaves(tree) for tree in (dynamics.margins, dynamics.margin_rates))
     events = [(*pair, bit_count + i) for i, pair in enumerate(zip(values, rates, strict=True))]
     columns = zip(*surfaces, *events, strict=True)
     margins, rates, numbers = (jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in column]) for column in columns)

@@ -44,7 +44,7 @@ class StepLog(NamedTuple):
     """Log of the attempts of a run, one entry for each.
 
     Attributes:
-        taken: True if the attempt was accepted.
+        accepted: True if the attempt was accepted.
         t: Time at its end [s].
         length: Length [s].
         base: Length of the first attempt from the same point [s].
@@ -59,7 +59,7 @@ class StepLog(NamedTuple):
         over: True if the run ends there.
     """
 
-    taken: Bool
+    accepted: Bool
     t: Scalar
     length: Scalar
     base: Scalar
@@ -114,16 +114,13 @@ class ReplayStepping:
         return cast_floats(carry._replace(control=control, search=(), status=running), self.h.dtype)
 
     def step(self, loop: Loop, objectives: Objectives, key: Key, carry: Carry, entry: StepLog) -> Carry:
-        """Return the `carry` after the logged attempt `entry`, unchanged if the attempt was not accepted.
-
-        `loop`, `objectives` and `key` are those of `start`.
-        """
+        """Return the `carry` after the logged attempt `entry`, unchanged if the attempt was not accepted."""
         return advance(dataclasses.replace(self, entry=entry), loop, objectives, key, carry)
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
         """Return True if the logged attempt was accepted; `carry` and `until` have no influence."""
         del carry, until
-        return self.entry.taken
+        return self.entry.accepted
 
     def is_switched(self, loop: Loop) -> bool:
         """Return True: the comparisons of the `loop`'s flow are always visible."""
@@ -136,61 +133,55 @@ class ReplayStepping:
         return jnp.asarray(True)
 
     def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
-        """Return the logged attempt, for the replay `carry` in `system`.
+        """Return the logged attempt.
 
         If the last step ended late, this one is shorter: it aims at the logged time, and `shift_end` may move its end.
         An attempt that was not accepted becomes a step of length 0. It may have invalid numbers, which reverse mode in
         a batch would multiply by 0.
         """
-        one, k = self.entry, carry.k
-        h = jnp.where(one.refresh | ~one.taken, 0.0, one.length - carry.control.delay)
-        end = jnp.where(one.refresh, carry.point.t, one.t)
-        words = select(one.refresh, one.next_words, one.words)
-        mode = mode_in_step(system, words, one.unrestricted)
-        strikes = one.k != k
+        entry, k = self.entry, carry.k
+        h = jnp.where(entry.refresh | ~entry.accepted, 0.0, entry.length - carry.control.delay)
+        end = jnp.where(entry.refresh, carry.point.t, entry.t)
+        words = select(entry.refresh, entry.next_words, entry.words)
+        mode = mode_in_step(system, words, entry.unrestricted)
+        strikes = entry.k != k
 
         def shift_end(end: Evaluation) -> Scalar:
             # The zero of such a margin moves with the beginning of the step. A quotient by its slope would magnify the
             # rounding of its derivative.
-            with_start = one.begins_at_zero & ~strikes
-            return jnp.where(with_start, carry.control.delay, _time_to_event(one, strikes, end))
+            with_start = entry.begins_at_zero & ~strikes
+            return jnp.where(with_start, carry.control.delay, _time_to_event(entry, strikes, end))
 
-        return StepRequest(h, end, self.h, mode, one.refresh, strikes, one.k, shift_end)
+        return StepRequest(h, end, self.h, mode, entry.refresh, strikes, entry.k, shift_end)
 
-    def forecast(self, carry: Carry, seen: Evaluation) -> PyTree:
-        """Return nothing, from `seen` for `carry`: the log says where steps end."""
-        del carry, seen
+    def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
+        """Return nothing: the log says where steps end."""
+        del carry, dynamics
         return ()
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, seen: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: PyTree
     ) -> PyTree:
-        """Return nothing of `system`, `carry`, `h`, `seen`, `state` and `error`: the log has the decisions."""
-        del system, carry, h, seen, state, error
+        """Return nothing: the log has the decisions."""
+        del system, carry, h, dynamics, state, error
         return ()
 
     def decide(
         self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
     ) -> Decision:
-        """Return the logged decision on the `attempt`, with the mode in `system` that was logged.
-
-        `active` is True if it was accepted. The numbers of `carry` and `request` have no influence.
-        """
-        one, no = self.entry, jnp.asarray(False)
+        """Return the logged decision on the `attempt`, with the mode that was logged."""
+        entry, no = self.entry, jnp.asarray(False)
         margins, tree = jax.tree.flatten(attempt.point.margins)
-        triggered = tree.unflatten([one.triggered & (1 << i) != 0 for i in range(len(margins))])
-        mode = mode_in_step(system, one.next_words, no)
-        return Decision(active, active, no, one.lands >= 0, triggered, mode, one.over)
+        triggered = tree.unflatten([entry.triggered & (1 << i) != 0 for i in range(len(margins))])
+        mode = mode_in_step(system, entry.next_words, no)
+        return Decision(active, active, no, entry.lands >= 0, triggered, mode, entry.over)
 
     def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
-        """Return the carry `after` an `attempt` with the new delay behind the log.
-
-        `carry` is the replay in `system` before the attempt, and `decision` the decision on it.
-        """
+        """Return the carry `after` an `attempt` with the new delay behind the log."""
         delay, last = carry.control
-        delay = jnp.where(decision.taken & ~self.entry.refresh, attempt.shift, delay)
+        delay = jnp.where(decision.accepted & ~self.entry.refresh, attempt.shift, delay)
         if self.live.keeps_last_step:
-            last = select(decision.taken, span_step(carry.point, attempt.point), last)
+            last = select(decision.accepted, span_step(carry.point, attempt.point), last)
         return after._replace(control=ReplayControl(delay, last))
 
 
@@ -230,10 +221,7 @@ class LaggedReplayStepping:
         return LaggedReplay(ahead, ReplayStepping(self.live).start(loop, objectives, key))
 
     def step(self, loop: Loop, objectives: Objectives, key: Key, carry: LaggedReplay) -> LaggedReplay:
-        """Return the `carry` after one attempt of the run for values, and its replay if the attempt was accepted.
-
-        `loop`, `objectives` and `key` are those of `start`.
-        """
+        """Return the `carry` after one attempt of the run for values, and its replay if the attempt was accepted."""
         # The run ahead only chooses the steps. All derivatives pass through the replay.
         old = _stop_gradients(carry.ahead)
         new = _stop_gradients(self.live.step(_stop_gradients(loop), _stop_gradients(objectives), key, old))
@@ -242,7 +230,7 @@ class LaggedReplayStepping:
         def repeat() -> Carry:
             return replay.step(loop, objectives, key, carry.behind, entry)
 
-        return LaggedReplay(new, jax.lax.cond(any_lane(entry.taken), repeat, lambda: carry.behind))
+        return LaggedReplay(new, jax.lax.cond(any_lane(entry.accepted), repeat, lambda: carry.behind))
 
     def renew(self, loop: Loop, carry: LaggedReplay) -> LaggedReplay:
         """Return the `carry` with a new stability limit of the `loop` if the last one is too old."""
@@ -252,12 +240,7 @@ class LaggedReplayStepping:
 
 
 def log_capacity(loop: Loop, solver: Adaptive) -> int:
-    """Return the capacity of the log of a run, in attempts.
-
-    Args:
-        loop: Closed loop.
-        solver: Solver of the run.
-    """
+    """Return the capacity of the log of a run, in attempts."""
     rtol = float(clip_rtol(np.asarray(solver.rtol, float)))
     return math.ceil(BASE_LOG_CAPACITY * max(1.0, 1e-5 / rtol) ** (1 / ADAPTIVE_ERROR_ORDER)) + (
         LOG_CAPACITY_PER_TICK * solver.steps if loop.ticks else 0
@@ -265,17 +248,12 @@ def log_capacity(loop: Loop, solver: Adaptive) -> int:
 
 
 def log_attempt(old: Carry, new: Carry) -> StepLog:
-    """Return the log entry of one attempt.
-
-    Args:
-        old: Carry before the attempt.
-        new: Carry after the attempt.
-    """
-    taken, triggered = new.control.taken, new.control.triggered
+    """Return the log entry of the attempt between two carries."""
+    accepted, triggered = new.control.accepted, new.control.triggered
     landing = old.status == RunStatus.LANDING
-    lands = jnp.where(landing & taken & (triggered == 0), old.search.which, -1)
+    lands = jnp.where(landing & accepted & (triggered == 0), old.search.number, -1)
     return StepLog(
-        taken=taken,
+        accepted=accepted,
         t=new.point.t,
         length=old.length,
         base=old.base,
@@ -291,17 +269,14 @@ def log_attempt(old: Carry, new: Carry) -> StepLog:
     )
 
 
-def states_between(spans: StateSpan, taken: Bool, instants: Array) -> LoopState:
-    """Return the states at these instants, leaves (n, ...), from the steps of a replayed run.
+def states_between(spans: StateSpan, accepted: Bool, instants: Array) -> LoopState:
+    """Return the states at the times `instants` (n,) [s], leaves (n, ...), from the steps of a replayed run.
 
-    Args:
-        spans: Steps of the attempts, in blocks with leaves (blocks, attempts, ...).
-        taken: True for each attempt that was accepted, shape (blocks, attempts). The span of another attempt is that of
-            the last accepted one, or zero in a block without an accepted attempt.
-        instants: Times [s], shape (n,).
+    The spans have leaves (blocks, attempts, ...). That of an attempt that was not `accepted` (blocks, attempts) is that
+    of the last accepted one, or zero in a block without one.
     """
     begins = jax.lax.stop_gradient(spans.flow.start)
-    begins = jnp.where(jnp.any(taken, axis=1)[:, None], begins, jnp.inf).ravel()
+    begins = jnp.where(jnp.any(accepted, axis=1)[:, None], begins, jnp.inf).ravel()
     spans = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), spans)
     # A block without an accepted attempt may lie between others: sorting moves all of them to the end.
     order = jnp.argsort(begins)
@@ -309,31 +284,30 @@ def states_between(spans: StateSpan, taken: Bool, instants: Array) -> LoopState:
     return jax.vmap(StateSpan.at)(jax.tree.map(lambda x: x[place], spans), instants)
 
 
-def _time_to_event(one: StepLog, strikes: Bool, end: Evaluation) -> Scalar:
-    """Return the time [s] from the logged end of a step to its event or to the zero of its comparison.
+def _time_to_event(entry: StepLog, strikes: Bool, end: Evaluation) -> Scalar:
+    """Return the time [s] from the logged end of a step to its event or to the zero of its comparison; 0 without.
 
-    The time is 0 without an event or comparison. It is also 0 for a comparison if a clock determines the end; an event
-    there keeps its time.
+    It is also 0 for a comparison if a clock determines the end; an event there keeps its time.
     """
-    shift, most = jnp.zeros_like(one.length), MAX_SHIFT_FRACTION * one.base
+    shift, longest = jnp.zeros_like(entry.length), MAX_SHIFT_FRACTION * entry.base
     for surface in end.surfaces:
-        on = surface.numbers == one.lands
+        on = surface.numbers == entry.lands
         each = (jnp.ravel(jnp.asarray(x)) for x in (on, surface.value, surface.rate))
-        for which, margin, rate in zip(*each, strict=True):
-            close, later = _time_to_zero(which, margin, rate, most)
+        for lands, margin, rate in zip(*each, strict=True):
+            close, later = _time_to_zero(lands, margin, rate, longest)
             shift = jnp.where(close, later, shift)
     # A clock fixes the time of a crossing, but events come last: an event decides even at a clock's instant.
     shift = jnp.where(strikes, 0.0, shift)
     events = zip(jax.tree.leaves(end.margins), jax.tree.leaves(end.margin_rates), strict=True)
     for i, (margin, fall) in reversed(list(enumerate(events))):
-        close, later = _time_to_zero(one.triggered & (1 << i) != 0, margin, fall, most)
+        close, later = _time_to_zero(entry.triggered & (1 << i) != 0, margin, fall, longest)
         shift = jnp.where(close, later, shift)
     return shift
 
 
-def _time_to_zero(on: Bool, margin: Scalar, fall: Scalar, most: Scalar) -> tuple[Bool, Scalar]:
-    """Return True if the margin is sought (`on`) and zero within `most` seconds, and the time to its zero [s]."""
-    close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(most) * fall))
+def _time_to_zero(on: Bool, margin: Scalar, fall: Scalar, longest: Scalar) -> tuple[Bool, Scalar]:
+    """Return True if the margin is sought (`on`) and zero within `longest` seconds, and the time to its zero [s]."""
+    close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(longest) * fall))
     # The fall may be frozen: its derivative is multiplied by the margin, which is 0 except for rounding.
     return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))
 

@@ -70,14 +70,7 @@ TSIT5 = Tableau(
 
 
 def rk4_step(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, h: Scalar) -> X:
-    """Return x(t + h) after one step of dx/dt = derivative(t, x) by `RK4`, with a local error O(h^5).
-
-    Args:
-        derivative: Function f(t, x), with the structure of x.
-        t: Time at the beginning [s].
-        x: State at the beginning, a pytree.
-        h: Length of the step [s].
-    """
+    """Return x(t + h) after one step of dx/dt = derivative(t, x) by `RK4`, with a local error O(h^5)."""
     return _unrolled_step(RK4, derivative, t, x, derivative(t, x), h)[0]
 
 
@@ -88,35 +81,20 @@ def runge_kutta_step(
     x: X,
     rate: X,
     h: Scalar,
-    given: PyTree = (),
+    arguments: PyTree = (),
 ) -> tuple[X, X]:
-    """Return x(t + h) after one step of dx/dt = derivative(t, x, given), and the sum of the rates' shares in its error.
+    """Return x(t + h) after one step of dx/dt = derivative(t, x, arguments), and the rates' shares in its error.
 
-    `midpoint_error` completes the error by the rate at the end. Derivatives of the result are those of the same step.
-
-    Args:
-        tableau: Coefficients of the method.
-        derivative: Function f(t, x, given), with the structure of x.
-        t: Time at the beginning [s].
-        x: State at the beginning, a pytree.
-        rate: First rate k1 = f(t, x, given).
-        h: Length of the step [s].
-        given: Further arguments, a pytree. Every input of the function that is not a real number must come in by it.
+    `rate` is k1, and `midpoint_error` completes the error by the rate at the end. Derivatives of the result are those
+    of the same step. Every input of the function that is not a real number must come in by `arguments`.
     """
     # `custom_jvp` needs every differentiable input as an argument, also those in the closure of `derivative`.
-    derivative, constants = jax.closure_convert(derivative, t, x, given)
-    return _step(tableau, derivative, t, x, rate, h, (given, *constants))
+    derivative, constants = jax.closure_convert(derivative, t, x, arguments)
+    return _step(tableau, derivative, t, x, rate, h, (arguments, *constants))
 
 
 def midpoint_error(tableau: Tableau, shares: X, last: X, h: Scalar) -> X:
-    """Return the difference between the step's own solution and the cubic, in the middle of the step.
-
-    Args:
-        tableau: Coefficients of the method.
-        shares: Sum of the shares of the rates in the step, as `runge_kutta_step` returns it.
-        last: Rate at the end of the step.
-        h: Length of the step [s].
-    """
+    """Return the step's own solution minus the cubic in the middle of the step, from the shares and the last rate."""
     return jax.tree.map(lambda a, b: h * (a + tableau.midpoint[-1] * b), shares, last)
 
 
@@ -154,7 +132,7 @@ def _scanned_step(tableau: Tableau, f: Callable, t: Scalar, x: X, rate: X, h: Sc
     def stage(rates: PyTree, at: tuple[PyTree, PyTree, PyTree]) -> tuple[PyTree, None]:
         new, place, weights = at
         rate = f(t + place * h, axpy(h, weigh(weights, rates), x), *constants)
-        return jax.tree.map(lambda k, one: k.at[new].set(jnp.asarray(one, k.dtype)), rates, rate), None
+        return jax.tree.map(lambda k, x: k.at[new].set(jnp.asarray(x, k.dtype)), rates, rate), None
 
     def begin_table(rate: Scalar) -> PyTree:
         rate = jnp.asarray(rate)

@@ -42,56 +42,36 @@ class SlideWatch(NamedTuple):
 
 
 def init_watch(words: int, t: Scalar) -> SlideWatch:
-    """Return the watch at the start of a run.
-
-    Args:
-        words: Number of words that hold the answers to the comparisons.
-        t: Time of the start [s].
-    """
+    """Return the watch at the start of a run; the answers to its comparisons take this number of words."""
     zero = jnp.asarray(0)
     none = tuple(jnp.uint32(0) for _ in range(words))
     return SlideWatch(none, zero, Slide(zero - 1, t + jnp.nan))
 
 
 def watch_landing(watch: SlideWatch, search: EventSearch, landed: Bool, calm: Bool, t: Scalar) -> SlideWatch:
-    """Return the watch after an attempt.
+    """Return the watch after an attempt, the result of a `search`, that ends at `t` [s].
 
-    Args:
-        watch: Watch before the attempt.
-        search: Search whose result the attempt was.
-        landed: True if the attempt was accepted and ends on a switching surface.
-        calm: True if it was an accepted step without a landing.
-        t: Time at its end [s].
+    It has `landed` if it was accepted and ends on a switching surface. It is `calm` if it was an accepted step without
+    a landing.
     """
-    bits = single_bit(jnp.where(landed, search.which, -1), len(watch.met))
+    bits = single_bit(jnp.where(landed, search.number, -1), len(watch.met))
     again = jnp.any(jnp.stack([(met & bit) != 0 for met, bit in zip(watch.met, bits, strict=True)]))
     line = search.fall * search.place
     straight = jnp.abs(search.margin - line) <= -MAX_LINE_ERROR * line
     counts = jnp.where(search.at_once, jnp.where(straight, RETURN_AT_ONCE, 0), jnp.where(search.fall < 0, 1, 0))
     returns = jnp.where(calm, 0, watch.returns + jnp.where(again, counts, 0))
     met = tuple(jnp.where(calm, jnp.uint32(0), met | bit) for met, bit in zip(watch.met, bits, strict=True))
-    return SlideWatch(met, returns, begin_slide(watch.slide, returns >= MAX_RETURNS, search.which, t))
+    return SlideWatch(met, returns, begin_slide(watch.slide, returns >= MAX_RETURNS, search.number, t))
 
 
-def begin_slide(slide: Slide, begins: Bool, which: Int, t: Scalar) -> Slide:
-    """Return the slide, or a new one if it begins and is the first.
-
-    Args:
-        slide: First slide so far.
-        begins: True if a slide begins.
-        which: Number of its comparison.
-        t: Time [s].
-    """
+def begin_slide(slide: Slide, begins: Bool, number: Int, t: Scalar) -> Slide:
+    """Return the slide, or a new one along the comparison `number` if it begins and is the first."""
     first = begins & (slide.which < 0)
-    return Slide(jnp.where(first, which, slide.which), jnp.where(first, jax.lax.stop_gradient(t), slide.t))
+    return Slide(jnp.where(first, number, slide.which), jnp.where(first, jax.lax.stop_gradient(t), slide.t))
 
 
 def slide_of(carry: Any) -> Slide:
-    """Return the first slide of a run, without derivatives.
-
-    Args:
-        carry: Carry of the run.
-    """
+    """Return the first slide of a run, without derivatives."""
     watch = carry.slides
     if watch == ():
         none = jnp.asarray(-1)
@@ -100,9 +80,5 @@ def slide_of(carry: Any) -> Slide:
 
 
 def has_slid(slide: Slide) -> Array:
-    """Return True for a run that slides.
-
-    Args:
-        slide: First slide of the run.
-    """
+    """Return True for a run that slides."""
     return jnp.asarray(slide.which) >= 0

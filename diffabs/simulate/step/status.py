@@ -38,20 +38,12 @@ class RunStatus(enum.IntEnum):
 
 
 def is_running(carry: PyTree) -> Bool:
-    """Return True if the run needs another attempt.
-
-    Args:
-        carry: Carry of the run, with a `status`.
-    """
+    """Return True if the run needs another attempt."""
     return carry.status <= RunStatus.REFRESHING
 
 
 def end_unfinished(carry: PyTree) -> PyTree:
-    """Return the carry after the last attempt for which there is capacity: a run that still goes on is exhausted.
-
-    Args:
-        carry: Carry of the run, with a `status`.
-    """
+    """Return the carry after the last attempt for which there is capacity: a run that still goes on is exhausted."""
     status = jnp.where(is_running(carry), RunStatus.EXHAUSTED, carry.status)
     return carry._replace(status=status.astype(carry.status.dtype))
 
@@ -60,14 +52,8 @@ def status_after_step(loop: Loop, carry: PyTree, attempt: PyTree, decision: PyTr
     """Return the status after an accepted attempt.
 
     A landing whose margin is too far from zero (`MAX_MISSED_FRACTION`) misses the stop.
-
-    Args:
-        loop: Closed loop.
-        carry: Carry before the attempt.
-        attempt: The attempt.
-        decision: Decision on it.
     """
-    before, after, stops = (one["stop"] for one in (carry.point.margins, attempt.point.margins, decision.triggered))
+    before, after, stops = (x["stop"] for x in (carry.point.margins, attempt.point.margins, decision.triggered))
     at_full = jnp.abs(carry.search.at_full)
     misses = [
         stop & ~(jnp.abs(b) <= MAX_MISSED_FRACTION * (a + at_full))

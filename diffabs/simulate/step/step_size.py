@@ -31,59 +31,40 @@ MIN_CROSSING_STEP_FRACTION = 4e-3  # fraction of the length that the error allow
 
 
 def error_scales(state: LoopState, sample: Sample) -> PyTree:
-    """Return the scales of the error: the greater of |first signal| and |setpoint|, and the size of every state.
-
-    Args:
-        state: State of the loop.
-        sample: Sample of the signals.
-    """
+    """Return the scales of the error: the greater of |first signal| and |setpoint|, and the size of every state."""
     first = jnp.maximum(jnp.abs(sample.output[0]), jnp.abs(sample.setpoint))
     return first, jax.tree.map(jnp.abs, state.flow())
 
 
-def error_norm(loop: Loop, state: LoopState, off: Scalar, scale: Scalar, sample: Sample) -> PyTree:
+def error_norm(loop: Loop, state: LoopState, state_errors: Scalar, scale: Scalar, sample: Sample) -> PyTree:
     """Return the greatest error of all states and of the first signal, as a fraction of their scales.
 
     The errors of the states lie in the middle of the step. The first signal is evaluated with them at the end of the
     step, as an approximation.
-
-    Args:
-        loop: Closed loop.
-        state: State at the end of the step.
-        off: Errors of the states in the middle of the step.
-        scale: Scales of the error: the largest values so far.
-        sample: Sample at the end of the step.
     """
-    moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), off))
-    all_off = (loop.plant.output(moved.plant)[0] - sample.output[0], *jax.tree.leaves(off))
-    pairs = zip(all_off, jax.tree.leaves(scale), strict=True)
+    moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), state_errors))
+    errors = (loop.plant.output(moved.plant)[0] - sample.output[0], *jax.tree.leaves(state_errors))
+    pairs = zip(errors, jax.tree.leaves(scale), strict=True)
     return jnp.max(jnp.stack([jnp.max(jnp.abs(d) / jnp.where(c > 0, c, 1.0)) for d, c in pairs if jnp.size(c)]))
 
 
 def propose_length(length: Scalar, error: Scalar) -> Scalar:
-    """Return the length that an error allows [s]: 0.85/error^(1/4) times the present length, within limits.
-
-    Args:
-        length: Present length [s].
-        error: Error as a multiple of the allowed error.
-    """
+    """Return the length that an error allows [s]: 0.85/error^(1/4) times the present length, within limits."""
     return length * clamp(SAFETY / jnp.sqrt(jnp.sqrt(error + MIN_ERROR)), MIN_STEP_RATIO, MAX_STEP_RATIO)
 
 
-def plan_step(length: Scalar, ahead: Scalar, left: Scalar) -> tuple[PyTree, PyTree]:
+def plan_step(length: Scalar, ahead: Scalar, to_strike: Scalar) -> tuple[PyTree, PyTree]:
     """Return the length of the next step [s], and True if the step ends where a clock strikes.
 
-    Args:
-        length: Length that the error and stability allow [s].
-        ahead: Time to the next switching surface [s].
-        left: Time to the next instant of a clock [s].
+    `length` is what error and stability allow, `ahead` the time to the next switching surface [s], `to_strike` to the
+    clock.
     """
     # Two steps of 0.6 lengths instead of one full step and a very short one.
     near = jnp.where(ahead < TWO_STEP_RATIO * length, 0.5 * TWO_STEP_RATIO * length, length)
     length = jnp.where(ahead < length, jnp.maximum(ahead, MIN_CROSSING_STEP_FRACTION * length), near)
     # A step just short of the clock's instant would leave a remainder near rounding. Else, two halves share the rest.
-    ends = length > CLOCK_REACH_FRACTION * left
-    return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends
+    ends = length > CLOCK_REACH_FRACTION * to_strike
+    return jnp.where(ends, to_strike, jnp.where(2 * length > to_strike, 0.5 * to_strike, length)), ends
 
 
 def shortest_step(t: Scalar) -> Scalar:
@@ -97,14 +78,8 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
     """Return the stability limit of a step, 3/rho [s], with an estimate rho of the spectral radius of the flow's
     Jacobian.
 
-    A power iteration estimates rho: the growth of a vector per multiplication by the Jacobian. The components of
-    the vector are relative to the largest values of the states so far.
-
-    Args:
-        loop: Closed loop.
-        t: Time [s].
-        state: State of the loop.
-        scale: Largest values so far, as `error_scales` returns them.
+    A power iteration estimates rho: the growth of a vector per multiplication by the Jacobian. The components of the
+    vector are relative to the largest values of the states so far, `scale` (`error_scales`).
     """
     flow, unflatten = ravel_pytree(state.flow())
     size = ravel_pytree(scale[1])[0]
@@ -117,7 +92,7 @@ def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) 
     written_out, rows = size.size <= MAX_UNROLLED_STATES, []
     if written_out:
         moves = jnp.eye(size.size, dtype=size.dtype) * size
-        columns = jax.vmap(lambda one: jax.jvp(rates, (flow,), (one,))[1])(moves) / size
+        columns = jax.vmap(lambda move: jax.jvp(rates, (flow,), (move,))[1])(moves) / size
         # Scalars instead of a matrix product: for such small sums XLA on a CPU calls a library, at ten times the cost.
         rows = [[columns[j, i] for j in range(size.size)] for i in range(size.size)]
 

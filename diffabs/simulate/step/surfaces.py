@@ -36,30 +36,21 @@ class SwitchingFunction(NamedTuple):
 def forecast_crossing(surfaces: Sequence[SwitchingFunction], natural: Scalar, shortest: Scalar) -> Scalar:
     """Return the time [s] to the first predicted crossing of a switching surface; `NEVER_S` without one.
 
-    A crossing nearer than `shortest`, or than `IMMEDIATE_FRACTION` of `natural`, is not counted.
-
-    Args:
-        surfaces: Margins of the comparisons and their rates, at an instant.
-        natural: Length that the error allows [s].
-        shortest: Shortest length of any step [s].
+    A crossing nearer than `shortest`, the shortest step [s], or than `IMMEDIATE_FRACTION` of `natural`, the length that
+    the error allows [s], counts as past.
     """
-    # A crossing nearer than this counts as past.
-    least, next = jnp.maximum(IMMEDIATE_FRACTION * natural, shortest), jnp.full_like(natural, -NEVER_S)
-    for one in surfaces:
-        for since in _times_since_crossing(one):
-            next = jnp.where((since < -least) & (since > next), since, next)
+    nearest, next = jnp.maximum(IMMEDIATE_FRACTION * natural, shortest), jnp.full_like(natural, -NEVER_S)
+    for surface in surfaces:
+        for since in _times_since_crossing(surface):
+            next = jnp.where((since < -nearest) & (since > next), since, next)
     return -next
 
 
 def time_since_crossing(surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> Scalar:
     """Return the time [s] between the first crossing inside a step and the end of the step; 0 without one.
 
-    A crossing counts as inside between `STEP_START_FRACTION` and `STEP_END_FRACTION` of the step.
-
-    Args:
-        surfaces: Margins of the comparisons and their rates, at the end of the step.
-        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
-        length: Length of the step [s].
+    A crossing counts as inside between `STEP_START_FRACTION` and `STEP_END_FRACTION` of the step. `surfaces` are those
+    at its end, and `changed` the bits of the comparisons whose answers differ from those at its beginning.
     """
     # Crossings outside of these fractions of the step lie at its ends.
     first = low = (1 - STEP_END_FRACTION) * length
@@ -72,45 +63,33 @@ class Imminent(NamedTuple):
     """The comparison that a run is about to change.
 
     Attributes:
-        which: Number of the comparison; -1 without one.
+        number: Number of the comparison; -1 without one.
         time: Predicted time to the change [s].
     """
 
-    which: Int
+    number: Int
     time: Scalar
 
 
 def find_imminent(surfaces: Sequence[SwitchingFunction], natural: Scalar) -> Imminent:
-    """Return the comparison with the first predicted change, however near; later than `NEVER_S` counts as none.
-
-    Args:
-        surfaces: Margins of the comparisons and their rates, at an instant.
-        natural: A number with the type of a time [s].
-    """
-    which, time = jnp.asarray(-1), jnp.full_like(natural, NEVER_S)
-    for one in surfaces:
-        ahead = -_times_since_crossing(one)
-        for number, each in zip(jnp.ravel(jnp.asarray(one.numbers)), ahead, strict=True):
+    """Return the comparison with the first predicted change, however near; later than `NEVER_S` counts as none."""
+    number, time = jnp.asarray(-1), jnp.full_like(natural, NEVER_S)
+    for surface in surfaces:
+        ahead = -_times_since_crossing(surface)
+        for bit, each in zip(jnp.ravel(jnp.asarray(surface.numbers)), ahead, strict=True):
             nearer = (each >= 0) & (each < time)
-            which, time = jnp.where(nearer, number, which), jnp.where(nearer, each, time)
-    return Imminent(which, time)
+            number, time = jnp.where(nearer, bit, number), jnp.where(nearer, each, time)
+    return Imminent(number, time)
 
 
 def find_return(imminent: Imminent, surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> Int:
-    """Return the number of a comparison that a step crosses and that moves back in it or at its end; -1 without one.
-
-    Args:
-        imminent: What is about to change at the beginning of the step.
-        surfaces: Margins of the comparisons and their rates, at the end of the step.
-        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
-        length: Length of the step [s].
-    """
-    back = (imminent.time < STEP_START_FRACTION * length) & ~read_bits(changed, imminent.which)
-    which = jnp.where(back, imminent.which, -1)
-    for one in surfaces:
-        back = read_bits(changed, one.numbers) & (one.value * one.rate < 0)
-        which = jnp.maximum(which, jnp.max(jnp.where(back, jnp.asarray(one.numbers), -1)))
-    return which
+    """Return the number of a comparison that a step crosses and that moves back in it or at its end; -1 without one."""
+    back = (imminent.time < STEP_START_FRACTION * length) & ~read_bits(changed, imminent.number)
+    number = jnp.where(back, imminent.number, -1)
+    for surface in surfaces:
+        back = read_bits(changed, surface.numbers) & (surface.value * surface.rate < 0)
+        number = jnp.maximum(number, jnp.max(jnp.where(back, jnp.asarray(surface.numbers), -1)))
+    return number
 
 
 def _times_since_crossing(surface: SwitchingFunction) -> Array:
@@ -125,11 +104,6 @@ def valid_end_rates(surfaces: Sequence[SwitchingFunction], changed: ModeBits, le
     """Return two flags, for the start and the end of a step: True if the rate there is also the rate inside the step.
 
     The start's flag is False if a comparison changes at the start. The end's flag is False if one changes later.
-
-    Args:
-        surfaces: Margins of the comparisons at the end of the step, and their rates.
-        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
-        length: Length of the step [s].
     """
     at_start = later = jnp.asarray(False)
     for one_at_start, one_later, _ in _list_changes(surfaces, changed, length):
@@ -144,30 +118,21 @@ def _list_changes(
 
     A change without a time, at a rate of 0, counts as later.
     """
-    for one in surfaces:
-        for on, since in zip(jnp.ravel(read_bits(changed, one.numbers)), _times_since_crossing(one), strict=True):
+    for surface in surfaces:
+        flips = jnp.ravel(read_bits(changed, surface.numbers))
+        for on, since in zip(flips, _times_since_crossing(surface), strict=True):
             early = since >= (1 - STEP_START_FRACTION) * length
             yield on & early, on & ~early, since
 
 
 def is_surface_moving(surfaces: Sequence[SwitchingFunction], changed: ModeBits) -> Bool:
-    """Return True if the margin of a comparison that changes in a step is not at rest at its end.
-
-    Args:
-        surfaces: Margins of the comparisons at the end of the step, and their rates.
-        changed: Bits of the comparisons whose answers differ from those at the beginning of the step.
-    """
-    moving = [jnp.any(read_bits(changed, one.numbers) & (one.rate != 0)) for one in surfaces]
+    """Return True if the margin of a comparison that changes in a step is not at rest at its end."""
+    moving = [jnp.any(read_bits(changed, surface.numbers) & (surface.rate != 0)) for surface in surfaces]
     return jnp.any(jnp.array(moving, bool))
 
 
 def read_bits(words: ModeBits, numbers: PyTree) -> Scalar:
-    """Return the bits with these numbers, bool.
-
-    Args:
-        words: Packed bits.
-        numbers: Numbers of the bits.
-    """
+    """Return the bits with these numbers, bool."""
     numbers = jnp.asarray(numbers)
-    word = sum(jnp.where(numbers // WORD_BITS == i, one, jnp.uint32(0)) for i, one in enumerate(words))
+    word = sum(jnp.where(numbers // WORD_BITS == i, bits, jnp.uint32(0)) for i, bits in enumerate(words))
     return word & (jnp.uint32(1) << (numbers % WORD_BITS).astype(jnp.uint32)) != 0

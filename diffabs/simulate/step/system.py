@@ -99,7 +99,7 @@ class LoopSystem(NamedTuple):
         moving, fixed = (t, *z), (held, self.loop, self.objectives)
         if self.program is None:
             return _evaluate_rates(moving, fixed)
-        return self.program(lambda seen: seen[:2], moving, fixed, mode)
+        return self.program(lambda dynamics: dynamics[:2], moving, fixed, mode)
 
     def list_margins(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> list[Scalar]:
         """Return the margins of comparisons and then of events at time `t`, `state` and `accumulators` in a `mode`."""
@@ -108,8 +108,10 @@ class LoopSystem(NamedTuple):
         if self.program is None:
             return jax.tree.leaves(_evaluate_loop(moving, fixed).margins)
         # The rates are asked for, because they depend on all comparisons.
-        seen, answers = self.program.look(lambda seen: (seen.margins, seen[:2]), moving, fixed, mode)
-        return [margin for _, margin in answers.margins] + jax.tree.leaves(seen[0])
+        (margins, _), answers = self.program.look(
+            lambda dynamics: (dynamics.margins, dynamics[:2]), moving, fixed, mode
+        )
+        return [margin for _, margin in answers.margins] + jax.tree.leaves(margins)
 
     def evaluate(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> Evaluation:
         """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`."""
@@ -119,28 +121,30 @@ class LoopSystem(NamedTuple):
         def look(t: Scalar, z: PyTree) -> tuple[LoopEvaluation, ComparisonAnswers]:
             if self.program is None:
                 return _evaluate_loop((t, *z), fixed), ComparisonAnswers((), (), [])
-            return self.program.look(lambda seen: seen, (t, *z), fixed, mode)
+            return self.program.look(lambda dynamics: dynamics, (t, *z), fixed, mode)
 
         def moving_signals(t: Scalar, z: PyTree) -> tuple[PyTree, ComparisonAnswers]:
-            seen, answers = look(t, z)
-            sample = seen.signals.sample
+            dynamics, answers = look(t, z)
+            sample = dynamics.signals.sample
             shown = {"sample": sample, "shown": Shown.of(sample), "": ()}[self.signal_rates]
-            margins = (seen.margins, [margin for _, margin in answers.margins]) if self.has_margin_rates else ((), [])
-            return (shown, seen.signals.recorded, *margins), answers
+            margins = (
+                (dynamics.margins, [margin for _, margin in answers.margins]) if self.has_margin_rates else ((), [])
+            )
+            return (shown, dynamics.signals.recorded, *margins), answers
 
-        seen, answers = look(t, z)
-        surfaces = [SwitchingFunction(*one) for one in answers.margins]
-        signal_rates, recorded_rates, margin_rates = (), seen.signals.recorded, ()
+        dynamics, answers = look(t, z)
+        surfaces = [SwitchingFunction(*margin_pair) for margin_pair in answers.margins]
+        signal_rates, recorded_rates, margin_rates = (), dynamics.signals.recorded, ()
         if self.signal_rates or self.has_margin_rates or self.loop.recorders:
             # The derivative along (1, dz/dt) is the total time derivative on the trajectory.
-            along = (jnp.ones_like(t), seen[:2])
+            along = (jnp.ones_like(t), dynamics[:2])
             (_, _, _, values), moves, answers = jax.jvp(moving_signals, (t, z), along, has_aux=True)
             signal_rates, recorded_rates, margin_rates, rates = moves
             if self.has_margin_rates:
                 each = zip(answers.margins, values, rates, strict=True)
                 surfaces = [SwitchingFunction(numbers, value, rate) for (numbers, _), value, rate in each]
         return Evaluation(
-            *(seen[:2], seen.signals, seen.margins, answers.words, answers.contradicted, surfaces),
+            *(dynamics[:2], dynamics.signals, dynamics.margins, answers.words, answers.contradicted, surfaces),
             *(signal_rates, recorded_rates, margin_rates),
         )
 
@@ -157,44 +161,36 @@ def build_system(
 ) -> LoopSystem:
     """Return the system of a loop. Its program is traced once for each structure and for arguments of these shapes.
 
-    Of time, state and accumulators only shapes and types matter.
-
-    Args:
-        loop: Closed loop, prepared.
-        objectives: Objectives by name.
-        t: Time [s].
-        state: State of the loop.
-        accumulators: Accumulators of the objectives.
-        switched: True for a program with visible comparisons; False for direct evaluation.
-        has_margin_rates: True if an evaluation has the rates of all margins.
+    Of time, state and accumulators only shapes and types matter. A `switched` program has visible comparisons; without
+    it the parts are evaluated directly.
     """
     z, held = split_flow_and_held(state, accumulators)
     args = ((t, *z), (held, loop, objectives))
     leaves, tree = jax.tree.flatten(args)
     # `result_type(float)` is part of the key: with another precision the same shapes give another program.
     key = (tree, tuple(map(jax.typeof, leaves)), jnp.result_type(float), switched)
-    found = _traced.get(key)
-    if found is None:
+    traced = _traced.get(key)
+    if traced is None:
         while len(_traced) >= MAX_CACHED_SYSTEMS:
             _traced.pop(next(iter(_traced)), None)  # a dict keeps the order of insertion: the oldest goes first
         # `counts`: only comparisons that influence rates or recorded signals produce a kink in the run.
         program = (
-            SwitchedProgram(_evaluate_loop, *args, counts=lambda seen: (seen[:2], seen.signals.recorded))
+            SwitchedProgram(_evaluate_loop, *args, counts=lambda dynamics: (dynamics[:2], dynamics.signals.recorded))
             if switched
             else None
         )
-        found = _traced[key] = program, _find_asked_rates(loop, objectives, t, state, accumulators, smooth=switched)
-    return LoopSystem(found[0], loop, objectives, found[1], has_margin_rates)
+        traced = _traced[key] = program, _find_asked_rates(loop, objectives, t, state, accumulators, smooth=switched)
+    return LoopSystem(traced[0], loop, objectives, traced[1], has_margin_rates)
 
 
 def _find_asked_rates(
     loop: Loop, objectives: Objectives, t: Scalar, state: LoopState, accumulators: Accumulators, *, smooth: bool
 ) -> str:
     """Return the signals of a segment whose rates the objectives ask for, as `LoopSystem.signal_rates`."""
-    asked = set()
+    needed = set()
 
-    def note(what: str, rates: PyTree) -> tuple[PyTree, PyTree]:
-        asked.add(what)
+    def note(kind: str, rates: PyTree) -> tuple[PyTree, PyTree]:
+        needed.add(kind)
         return rates, rates
 
     def update(loop: Loop, objectives: Objectives, state: LoopState, accumulators: Accumulators, t: Scalar) -> PyTree:
@@ -205,31 +201,20 @@ def _find_asked_rates(
             lambda: note("sample", sample),
             smooth=t > 0 if smooth else False,
         )
-        return {name: one.update(accumulators[name], segment) for name, one in objectives.items()}
+        return {name: objective.update(accumulators[name], segment) for name, objective in objectives.items()}
 
     jax.eval_shape(update, loop, objectives, state, accumulators, t)
-    return "sample" if "sample" in asked else "shown" if asked else ""
+    return "sample" if "sample" in needed else "shown" if needed else ""
 
 
 def split_flow_and_held(state: LoopState, accumulators: Accumulators) -> tuple[PyTree, PyTree]:
-    """Return the integrated part of loop and objectives, and the part that is constant between two instants.
-
-    Args:
-        state: State of the loop.
-        accumulators: Accumulators of the objectives.
-    """
+    """Return the integrated part of loop and objectives, and the part that is constant between two instants."""
     flow = (state.flow(), {name: memory.flow for name, memory in accumulators.items()})
     return flow, ([memory.held for memory in state[1:]], {name: memory.held for name, memory in accumulators.items()})
 
 
 def with_flow(state: LoopState, accumulators: Accumulators, flow: PyTree) -> tuple[LoopState, Accumulators]:
-    """Return state and accumulators with another integrated part.
-
-    Args:
-        state: State of the loop.
-        accumulators: Accumulators of the objectives.
-        flow: Integrated part, as `split_flow_and_held` returns it.
-    """
+    """Return state and accumulators with another integrated part, as `split_flow_and_held` returns it."""
     return state.with_flow(flow[0]), {
         name: memory._replace(flow=flow[1][name]) for name, memory in accumulators.items()
     }
@@ -243,7 +228,9 @@ def _evaluate_loop(moving: PyTree, fixed: PyTree) -> LoopEvaluation:
     signals = loop.signals(t, state)
     rate = loop.flow(t, state, signals)
     margins = loop.margins(t, state, signals, lambda: rate)
-    accumulator_rates = {name: one.flow(accumulators[name], signals.sample) for name, one in objectives.items()}
+    accumulator_rates = {
+        name: objective.flow(accumulators[name], signals.sample) for name, objective in objectives.items()
+    }
     return LoopEvaluation(rate, accumulator_rates, signals, margins)
 
 
