@@ -46,29 +46,12 @@ class Data(Protocol):
 
 
 def check_sigma_table(sigma: PyTree, of: str) -> None:
-    """Check that standard deviations are given by name.
-
-    Args:
-        sigma: Standard deviations.
-        of: What the names are, for the message.
-
-    Raises:
-        ValueError: They are no mapping and, unlike a pandas Series, do not behave as one.
-    """
+    """Check that standard deviations are given by name: in a mapping, or what behaves as one, like a pandas Series."""
     if not hasattr(sigma, "keys"):
         raise ValueError(f"sigma = {format_value(sigma)} is no mapping from {of} to standard deviations")
 
 
 def check_positive(name: str, value: Scalar, unit: str) -> None:
-    """Check that a standard deviation is positive and finite.
-
-    Args:
-        name: Name for the message.
-        value: Standard deviation, a number or an array.
-        unit: Unit for the message; "1" is left out.
-
-    Raises:
-        ValueError: A value is not positive and finite.
-    """
+    """Check that a standard deviation is positive and finite."""
     if not (np.isfinite(value) & (np.asarray(value) > 0)).all():
         raise ValueError(f"{name} = {np.min(value):g} is outside (0, inf) {'' if unit == '1' else unit}".rstrip())

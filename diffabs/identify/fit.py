@@ -196,11 +196,11 @@ def fit(
     problem = FitProblem(where, part, residuals, data, as_partial(prior), norm, usable)
     n, k = problem.shapes()
     if sigma is not None:
-        given = np.asarray(sigma, float)
-        if given.shape not in ((), (n,)):
-            raise ValueError(f"sigma has shape {given.shape}; {n} residuals need a number or ({n},)")
-        if not (np.isfinite(given) & (given > 0)).all():
-            raise ValueError(f"sigma = {np.min(given):g} is not positive and finite")
+        sigmas = np.asarray(sigma, float)
+        if sigmas.shape not in ((), (n,)):
+            raise ValueError(f"sigma has shape {sigmas.shape}; {n} residuals need a number or ({n},)")
+        if not (np.isfinite(sigmas) & (sigmas > 0)).all():
+            raise ValueError(f"sigma = {np.min(sigmas):g} is not positive and finite")
     estimated = sigma is None or not absolute
     if k and estimated:
         needed = "sigma" if sigma is None else "sigma with absolute = True"
@@ -220,12 +220,12 @@ def fit(
             # An interruption skips further starts only if there is a fit to return.
             if not (any(fits) and watch.stopping()):
                 fits.append(_fit_start(problem, z, deviations, estimated, tolerances, watch))
-    done = tuple(one for one in fits if one is not None)
-    if not done:
+    finished = tuple(candidate for candidate in fits if candidate is not None)
+    if not finished:
         causes = "the run diverges, slides along a switching surface, or its step is not stable"
         raise ValueError(f"{causes}, at each of the {len(fits)} starts")
-    diverged = tuple(_values_by_path(where, z) for z, one in zip(points, fits, strict=False) if one is None)
-    return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
+    diverged = tuple(_values_by_path(where, z) for z, candidate in zip(points, fits, strict=False) if candidate is None)
+    return dataclasses.replace(min(finished, key=lambda candidate: candidate.cost), starts=finished, diverged=diverged)
 
 
 def _describe_progress(evaluations: int, cost: float) -> str:
@@ -265,19 +265,19 @@ def _fit_start(
     def value(z: np.ndarray) -> np.ndarray:
         if watch.stopping():
             raise _FitInterrupted
-        seen = problem.at(z)
-        return rejected if seen is None else problem.vector(seen, sigma)
+        evaluation = problem.at(z)
+        return rejected if evaluation is None else problem.vector(evaluation, sigma)
 
     # SciPy calls for the Jacobian at the start and at accepted points only, so this function records the history.
     def jacobian(z: np.ndarray) -> np.ndarray:
-        seen = _accepted_evaluation(problem, z)
-        history.append(float(np.sum(problem.vector(seen, sigma) ** 2)))
+        evaluation = _accepted_evaluation(problem, z)
+        history.append(float(np.sum(problem.vector(evaluation, sigma) ** 2)))
         accepted.append(z.copy())
         watch.progress(watch.before + problem.evaluations, history[-1])
-        return problem.jacobian(seen, sigma)
+        return problem.jacobian(evaluation, sigma)
 
     try:
-        found = least_squares(
+        solution = least_squares(
             value,
             start,
             jacobian,  # pyright: ignore[reportArgumentType]  # SciPy's stub infers a string from the default
@@ -288,22 +288,22 @@ def _fit_start(
             gtol=tolerances.gradient,
             max_nfev=tolerances.evaluations,
         )
-        end, reason = found.x, SCIPY_REASONS[found.status]
+        end, reason = solution.x, SCIPY_REASONS[solution.status]
     except _FitInterrupted:
         end, reason = accepted[-1], Reason.INTERRUPTED
     # Read the count first: the final point may be computed once more below, which is no evaluation of the fit.
     evaluations = problem.evaluations
     watch.before += evaluations
-    seen = _accepted_evaluation(problem, end)
-    known, ends = _parameter_uncertainty(problem.space, end, seen, sigma, estimated)
+    evaluation = _accepted_evaluation(problem, end)
+    parameter_uncertainty, ends = _parameter_uncertainty(problem.space, end, evaluation, sigma, estimated)
     return Identified(
         part=jax.tree.map(np.asarray, problem.space.at(problem.part, jnp.asarray(end))),
         values=_values_by_path(problem.space, end),
-        residuals=seen.residuals,
+        residuals=evaluation.residuals,
         sigma=sigma,
-        chi2=float(np.sum((seen.residuals / sigma) ** 2)),
-        cost=float(np.sum(problem.vector(seen, sigma) ** 2)),
-        uncertainty=known,
+        chi2=float(np.sum((evaluation.residuals / sigma) ** 2)),
+        cost=float(np.sum(problem.vector(evaluation, sigma) ** 2)),
+        uncertainty=parameter_uncertainty,
         history=history,
         evaluations=evaluations,
         reason=reason,
@@ -313,19 +313,15 @@ def _fit_start(
 
 
 def _accepted_evaluation(problem: FitProblem, z: np.ndarray) -> ResidualEvaluation:
-    """Return the evaluation of an accepted point; compute it again if the cache holds another point.
-
-    Raises:
-        RuntimeError: The point is not finite the second time.
-    """
-    seen = problem.at(z)
-    if seen is None:
+    """Return the evaluation of an accepted point; compute it again if the cache holds another point."""
+    evaluation = problem.at(z)
+    if evaluation is None:
         raise RuntimeError("an accepted point is not finite when it is computed again")
-    return seen
+    return evaluation
 
 
 def _parameter_uncertainty(
-    free: FreeSpace, z: np.ndarray, seen: ResidualEvaluation, sigma: np.ndarray, estimated: bool
+    free: FreeSpace, z: np.ndarray, evaluation: ResidualEvaluation, sigma: np.ndarray, estimated: bool
 ) -> tuple[Uncertainty, dict[str, float]]:
     """Return the uncertainty in the parameters themselves, and the end by name of each parameter that an end holds.
 
@@ -334,12 +330,12 @@ def _parameter_uncertainty(
     maps = [m for entry in free.entries for m in entry.maps]
     slope = np.array([float(jax.grad(m.value)(x)) for m, x in zip(maps, z, strict=True)])
     values = np.concatenate([np.ravel(x) for x in _values_by_path(free, z).values()])
-    chi2 = float(np.sum((seen.residuals / sigma) ** 2))
+    chi2 = float(np.sum((evaluation.residuals / sigma) ** 2))
     # An exact fit has s = 0; the smallest normal number avoids 0/0 below.
     scale = (float(np.sqrt(chi2 / (len(sigma) - free.size))) if estimated else 1.0) or float(np.finfo(float).tiny)
     size = np.maximum(np.abs(values), np.abs(slope))
     over = np.divide(1.0, slope, out=np.zeros_like(slope), where=slope != 0)
-    data, prior = seen.slopes[0] / sigma[:, None] * over, seen.slopes[1] * over
+    data, prior = evaluation.slopes[0] / sigma[:, None] * over, evaluation.slopes[1] * over
     ends = _find_ends(free, z, values, np.linalg.norm(np.concatenate([data / scale, prior]), axis=0))
     return uncertainty(free.names, size, data, prior, scale, held=ends), ends
 
@@ -352,12 +348,9 @@ def _find_ends(free: FreeSpace, z: np.ndarray, values: np.ndarray, slopes: np.nd
     beyond the end.
 
     Args:
-        free: Free parameters.
-        z: Coordinates, shape (p,).
-        values: Values, shape (p,).
         slopes: Inverse of the standard deviation of each parameter with the others fixed, shape (p,).
     """
-    found = {}
+    ends = {}
     maps = [m for entry in free.entries for m in entry.maps]
     for name, m, place, value, slope, limits in zip(free.names, maps, z, values, slopes, free.ranges, strict=True):
         end = min(limits, key=lambda x: abs(x - value))
@@ -366,8 +359,8 @@ def _find_ends(free: FreeSpace, z: np.ndarray, values: np.ndarray, slopes: np.nd
         size = abs(m.scale) if isinstance(m, HalfLine) else limits[1] - limits[0]
         # Without influence on the data any value is as good, so the end does not hold it.
         if far > END_COORDINATE and slope * size > 1 and abs(value - end) * slope < MAX_END_DISTANCE:
-            found[name] = float(end)
-    return found
+            ends[name] = float(end)
+    return ends
 
 
 def _values_by_path(free: FreeSpace, z: np.ndarray) -> JsonObject:

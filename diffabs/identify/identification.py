@@ -61,9 +61,9 @@ def identify(
     for start in starts or ({},):
         if why := _describe_refusal(first := replace(loop, dict(start)), comparison, solver):
             if why.endswith("is not stable"):  # the step is too long: the message gives the longest stable one
-                most = min(float(stable_steps(canonical_dtypes(batch)).min()) for batch in comparison.loops(first))
+                step = min(float(stable_steps(canonical_dtypes(batch)).min()) for batch in comparison.loops(first))
                 # Rounded down: the printed step must be stable, too.
-                longest = decimal.Context(prec=3, rounding=decimal.ROUND_FLOOR).create_decimal(most)
+                longest = decimal.Context(prec=3, rounding=decimal.ROUND_FLOOR).create_decimal(step)
                 why += f" at the start; the longest stable step there is {longest} s"
             raise ValueError(why)
     return fit(
@@ -85,7 +85,7 @@ def identify(
 
 def _describe_refusal(loop: Part, comparison: Comparison, solver: Solver) -> str | None:
     """Return the reason why the first refused run is not admissible, or None if all runs are."""
-    asked = (
+    verdicts = (
         batch_admissibility(None, jax.device_get(canonical_dtypes(batch)), solver) for batch in comparison.loops(loop)
     )
-    return next((next(filter(None, found.texts)) for found in asked if found.number), None)
+    return next((next(filter(None, verdict.texts)) for verdict in verdicts if verdict.number), None)

@@ -27,8 +27,8 @@ class _GaussianPrior:
 
     def __call__(self, means: Vector, deviations: Vector, part: Part) -> Scalar:
         """Return (p - mean)/deviation, concatenated over the parameters."""
-        known = zip(self.paths, means, deviations, strict=True)
-        return jnp.concatenate([jnp.ravel((get(part, path) - m) / s) for path, m, s in known])
+        terms = zip(self.paths, means, deviations, strict=True)
+        return jnp.concatenate([jnp.ravel((get(part, path) - m) / s) for path, m, s in terms])
 
 
 def gaussian(known: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
@@ -60,28 +60,16 @@ def gaussian(known: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
 
 
 def check_prior(prior: Prior | None, free: Collection[str]) -> None:
-    """Check that the parameters of a prior of `gaussian` are free: it has no effect on others.
-
-    Args:
-        prior: Prior of a fit; one that is not of `gaussian` passes.
-        free: Paths of the free parameters.
-
-    Raises:
-        ValueError: A parameter of the prior is not free.
-    """
-    made = prior.func if isinstance(prior, Partial) else None
-    paths = made.paths if isinstance(made, _GaussianPrior) else ()
+    """Check that the parameters of a prior of `gaussian` are free: it has no effect on others."""
+    function = prior.func if isinstance(prior, Partial) else None
+    paths = function.paths if isinstance(function, _GaussianPrior) else ()
     # An element of a free list, `gain.0`, is free.
-    if held := [path for path in paths if not any(f"{path}.".startswith(f"{one}.") for one in free)]:
+    if held := [path for path in paths if not any(f"{path}.".startswith(f"{free_path}.") for free_path in free)]:
         raise ValueError(f"{', '.join(held)}: a prior, but not free; free are {', '.join(free)}")
 
 
 def as_partial(prior: Prior | None) -> Prior:
-    """Return a prior as a callable pytree. A `Partial` is returned unchanged; its arguments are traced.
-
-    Args:
-        prior: Prior of a fit; None is the empty prior.
-    """
+    """Return a prior, or the empty one for None, as a callable pytree; the arguments of a `Partial` are traced."""
     return prior if isinstance(prior, Partial) else Partial(prior or _empty_prior)
 
 
@@ -157,22 +145,16 @@ class FitProblem:
     def _evaluate_at(self, z: np.ndarray) -> ResidualEvaluation | None:
         if self.usable and not self.usable(self.space.at(self.part, jnp.asarray(z))):
             return None
-        seen = _evaluate_residuals(self.space, self.residuals, self.prior, self.part, self.data, jnp.asarray(z))
-        seen = jax.tree.map(lambda x: np.asarray(x, float), jax.device_get(seen))
-        return seen if seen.finite() else None
+        evaluation = _evaluate_residuals(self.space, self.residuals, self.prior, self.part, self.data, jnp.asarray(z))
+        evaluation = jax.tree.map(lambda x: np.asarray(x, float), jax.device_get(evaluation))
+        return evaluation if evaluation.finite() else None
 
-    def vector(self, seen: ResidualEvaluation, sigma: np.ndarray) -> np.ndarray:
-        """Return sgn(r) |r/sigma|^(norm/2) followed by the prior, shape (n + k,).
+    def vector(self, evaluation: ResidualEvaluation, sigma: np.ndarray) -> np.ndarray:
+        """Return sgn(r) |r/sigma|^(norm/2) followed by the prior, shape (n + k,); its sum of squares is the cost."""
+        x = evaluation.residuals / sigma
+        return np.concatenate([np.sign(x) * np.abs(x) ** (self.norm / 2), evaluation.prior])
 
-        Its sum of squares is the cost. `seen` is the evaluation, `sigma` the standard deviations, shape (n,).
-        """
-        x = seen.residuals / sigma
-        return np.concatenate([np.sign(x) * np.abs(x) ** (self.norm / 2), seen.prior])
-
-    def jacobian(self, seen: ResidualEvaluation, sigma: np.ndarray) -> np.ndarray:
-        """Return the derivative of `vector` in z, shape (n + k, p).
-
-        `seen` is the evaluation, `sigma` the standard deviations, shape (n,).
-        """
-        x = (self.norm / 2) * np.abs(seen.residuals / sigma) ** (self.norm / 2 - 1) / sigma
-        return np.concatenate([x[:, None] * seen.slopes[0], seen.slopes[1]])
+    def jacobian(self, evaluation: ResidualEvaluation, sigma: np.ndarray) -> np.ndarray:
+        """Return the derivative of `vector` in z, shape (n + k, p)."""
+        x = (self.norm / 2) * np.abs(evaluation.residuals / sigma) ** (self.norm / 2 - 1) / sigma
+        return np.concatenate([x[:, None] * evaluation.slopes[0], evaluation.slopes[1]])

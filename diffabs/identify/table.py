@@ -58,7 +58,7 @@ class Table:
         groups = group_by_structure(loops)
         order = [list(self.values)[i] for places in groups for i in places]
         lanes = (stack_loops([loops[i] for i in places]) for places in groups)
-        batches = [(canonical_dtypes(one), batch.values) for one, batch in lanes]
+        batches = [(canonical_dtypes(stacked), batch.values) for stacked, batch in lanes]
         metrics = list(dict.fromkeys(metric for _, metric in self.labels))
         place = np.array([(order.index(row), metrics.index(metric)) for row, metric in self.labels])
         target = np.array([self.values[row][metric] for row, metric in self.labels])
@@ -73,9 +73,9 @@ class Table:
             if row not in self.loops:
                 raise ValueError(f"row {row}: no loop; there is {', '.join(self.loops)}")
             check_part(self.loops[row], f"{row}: ")
-            there = {path for path, _, _ in parameters(self.loops[row])}
+            own_paths = {path for path, _, _ in parameters(self.loops[row])}
             for path in free:
-                if path not in there or np.shape(get(self.loops[row], path)) != np.shape(get(loop, path)):
+                if path not in own_paths or np.shape(get(self.loops[row], path)) != np.shape(get(loop, path)):
                     raise ValueError(f"row {row}: {path} is not a parameter of its loop, or of another shape")
             for metric, value in line.items():
                 if metric not in self.measured:
@@ -114,5 +114,5 @@ class _MetricResiduals:
             metrics = measure(loop, self.solver, dict(self.objectives)).metrics
             return jnp.stack([metrics[name] for name, _ in self.objectives])
 
-        seen = jnp.concatenate(self.each(part, batches, row))
-        return seen[place[:, 0], place[:, 1]] - target
+        simulated = jnp.concatenate(self.each(part, batches, row))
+        return simulated[place[:, 0], place[:, 1]] - target

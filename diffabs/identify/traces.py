@@ -67,19 +67,19 @@ class Traces:
             ValueError: A column is not an output, or a shape, a value or sigma is wrong.
         """
         self._check(loop, free, solver)
-        kept = np.flatnonzero(self._kept_rows())
+        compared = np.flatnonzero(self._kept_rows())
         over = {path: np.asarray(rows, float) for path, rows in self.over.items()}
-        target = np.concatenate([self._broadcast_column(column) for column in self.columns.values()])[kept]
+        target = np.concatenate([self._broadcast_column(column) for column in self.columns.values()])[compared]
         weights = self.sigma
         sigma = (
             None
             if weights is None
-            else np.concatenate([self._broadcast_column(weights[name]) for name in self.columns])[kept]
+            else np.concatenate([self._broadcast_column(weights[name]) for name in self.columns])[compared]
         )
         simulated = _TraceResiduals(_keep_instants(solver, np.asarray(self.t, float)), tuple(self.columns))
         return Comparison(
             simulated,
-            (over, np.asarray(self.t, float), kept, target),
+            (over, np.asarray(self.t, float), compared, target),
             sigma,
             lambda part: [Batch(over).each(canonical_dtypes(part), lambda loop, key: loop)],
         )
@@ -98,8 +98,8 @@ class Traces:
 
     def _kept_rows(self) -> np.ndarray:
         until = np.inf if self.until is None else np.asarray(self.until, float)
-        kept = np.asarray(self.t, float) <= np.broadcast_to(until, self.shape[:1])[:, None]
-        return np.tile(kept.ravel(), len(self.columns))
+        compared = np.asarray(self.t, float) <= np.broadcast_to(until, self.shape[:1])[:, None]
+        return np.tile(compared.ravel(), len(self.columns))
 
     def _check(self, loop: Loop, free: Sequence[str], solver: Solver) -> None:
         Batch(self.over).check(loop)
@@ -114,8 +114,8 @@ class Traces:
             named = ", ".join(self.columns) or "none"
             raise ValueError(f"columns: {named}; there is {', '.join(_output_names(loop))}")
         shapes = (self.shape, self.shape[1:]) if self.shape[0] == 1 else (self.shape,)
-        for name, given in self.columns.items():
-            column = np.asarray(given, float)
+        for name, values in self.columns.items():
+            column = np.asarray(values, float)
             if column.shape not in shapes:
                 needed = " or ".join(map(str, shapes))
                 raise ValueError(f"{name} has shape {column.shape}; t and the runs (over) need {needed}")
@@ -173,9 +173,9 @@ class _TraceResiduals:
     solver: Solver
     fields: tuple[str, ...]
 
-    def __call__(self, loop: Part, over: Any, t: Scalar, kept: Any, target: Scalar) -> Any:
-        seen = Batch(over).each(canonical_dtypes(loop), lambda one, key: self._columns(one, t))
-        return jnp.swapaxes(seen, 0, 1).ravel()[kept] - target
+    def __call__(self, loop: Part, over: Any, t: Scalar, compared: Any, target: Scalar) -> Any:
+        simulated = Batch(over).each(canonical_dtypes(loop), lambda run_loop, key: self._columns(run_loop, t))
+        return jnp.swapaxes(simulated, 0, 1).ravel()[compared] - target
 
     def _columns(self, loop: Part, t: Scalar) -> Scalar:
         """Return the simulated columns of one run at the instants t, shape (columns, n); NaN if the run diverged."""
@@ -187,5 +187,5 @@ class _TraceResiduals:
         # The last sample repeats after the end of a run. Its zero interval makes `ratio` return 0, not NaN.
         part = clamp(ratio(t - times[i], times[i + 1] - times[i]), 0.0, 1.0)
         columns = [getattr(run.trajectory.measured, name) for name in self.fields]
-        seen = jnp.stack([x[i] + part * (x[i + 1] - x[i]) for x in columns])
-        return jnp.where(run.diverged, jnp.nan, seen)
+        values = jnp.stack([x[i] + part * (x[i + 1] - x[i]) for x in columns])
+        return jnp.where(run.diverged, jnp.nan, values)

@@ -78,7 +78,7 @@ class Uncertainty:
 
     def undetermined_directions(self, beyond: float = MAX_RELATIVE_SPREAD) -> list[Direction]:
         """Return the directions that the data leave open: their spread is larger than `beyond`, by default 100 %."""
-        return [one for one in self.directions if not one.spread <= beyond]
+        return [direction for direction in self.directions if not direction.spread <= beyond]
 
     def undetermined_parameters(self, beyond: float = MAX_RELATIVE_SPREAD) -> list[str]:
         """Return the names of the parameters that data and prior leave open.
@@ -92,7 +92,7 @@ class Uncertainty:
     @property
     def singular(self) -> np.ndarray:
         """Singular values of the directions, descending."""
-        return np.array([one.singular for one in self.directions])
+        return np.array([direction.singular for direction in self.directions])
 
 
 def uncertainty(
@@ -101,17 +101,15 @@ def uncertainty(
     """Return covariance, correlation and directions from scaled Jacobians.
 
     Args:
-        names: Names of the parameters, p of them.
         size: Sizes of the parameters, shape (p,), in their units.
         data: Jacobian A of residual/sigma by the parameters, shape (n, p).
         prior: Jacobian P of the prior by the parameters, shape (k, p).
-        scale: Factor s of the residuals' standard deviations.
         held: Names of the parameters that an end of their range holds.
     """
     free = [i for i, name in enumerate(names) if name not in held]
-    known = (data * size / scale)[:, free]
+    jacobian = (data * size / scale)[:, free]
     # An SVD of the Jacobian avoids the normal equations, whose condition number is squared.
-    _, values, vectors = _padded_svd(np.concatenate([known, (prior * size)[:, free]]))
+    _, values, vectors = _padded_svd(np.concatenate([jacobian, (prior * size)[:, free]]))
     spread = vectors.T / np.maximum(values, _zero_threshold(values, len(data)))  # a root of the relative covariance
     covariance = np.full((len(names), len(names)), np.nan)
     covariance[np.ix_(free, free)] = size[free, None] * (spread @ spread.T) * size[free]
@@ -124,19 +122,19 @@ def uncertainty(
         correlation=covariance / np.outer(deviations, deviations),
         scale=scale,
         degrees=len(data) - len(names),
-        directions=_directions([names[i] for i in free], known),
+        directions=_directions([names[i] for i in free], jacobian),
     )
 
 
-def _directions(names: Sequence[str], known: np.ndarray) -> list[Direction]:
-    _, values, vectors = _padded_svd(known)
-    zero, found = _zero_threshold(values, len(known)), []
+def _directions(names: Sequence[str], jacobian: np.ndarray) -> list[Direction]:
+    _, values, vectors = _padded_svd(jacobian)
+    zero, directions = _zero_threshold(values, len(jacobian)), []
     for value, vector in zip(values, vectors, strict=True):
         # The SVD leaves the sign open.
         vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
         spread = 1 / float(value) if value > zero else float("inf")
-        found.append(Direction(spread, float(value), dict(zip(names, vector.tolist(), strict=True))))
-    return found
+        directions.append(Direction(spread, float(value), dict(zip(names, vector.tolist(), strict=True))))
+    return directions
 
 
 def _padded_svd(matrix: np.ndarray) -> tuple[PyTree, np.ndarray, np.ndarray]:

@@ -80,8 +80,8 @@ def failure_probability(
     >>> loop = d.braking(controller=controllers.ConstantTorque(torque=500.0), **parts)  # a locked wheel
     >>> space = sweep.Space({"initial.speed": sweep.Normal(10.0, 0.5, low=6.0, high=14.0)})
     >>> study = sweep.Study(loop, space, samples=1, solver=d.FixedStep(5e-3, 6.0))
-    >>> found = reliability.failure_probability(study, "stop_time", 0.878)
-    >>> print(f"{found.probability:.0e}")  # 1.1e-3 in closed form
+    >>> event = reliability.failure_probability(study, "stop_time", 0.878)
+    >>> print(f"{event.probability:.0e}")  # 1.1e-3 in closed form
     1e-03
     """
     study.check()
@@ -112,9 +112,9 @@ def failure_probability(
         if progress:
             progress(state_bound(level))
 
-    found = subset_simulation(score, study.space.dimension, beyond, gradient=gradient, progress=report, **options)
+    event = subset_simulation(score, study.space.dimension, beyond, gradient=gradient, progress=report, **options)
     return dataclasses.replace(
-        found, levels=[state_bound(level) for level in found.levels], engine=describe_engine(study.engine)
+        event, levels=[state_bound(level) for level in event.levels], engine=describe_engine(study.engine)
     )
 
 
@@ -132,13 +132,6 @@ def find_metric_objection(study: Study, metric: str) -> str | None:
     """Return why a kernel cannot make the runs of a study that measures only this metric, or None.
 
     The check compiles the kernel but makes no run.
-
-    Args:
-        study: Loop, space, solver and objectives.
-        metric: Name of a metric that the study measures.
-
-    Raises:
-        ValueError: The loop cannot be run at all.
     """
     from diffabs.simulate.drive import kernel as native
 
@@ -149,8 +142,8 @@ def find_metric_objection(study: Study, metric: str) -> str | None:
 
 def _cast_arguments(study: Study, metric: str, values: Params) -> PyTree:
     """Return loop, values, solver and objectives; loop and objectives have the study's number type."""
-    given = study.loop, {metric: study.objectives[metric]}
-    loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), given)
+    numbers = study.loop, {metric: study.objectives[metric]}
+    loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), numbers)
     return loop, values, study.solver, objective
 
 

@@ -91,11 +91,7 @@ class CountedScore:
         return self._clean(self.score(z), z)
 
     def gradient(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the score (n,) and its derivative (n, d) at `z` (n, d).
-
-        Raises:
-            ValueError: The score or the derivative has the wrong shape.
-        """
+        """Return the score (n,) and its derivative (n, d) at `z` (n, d)."""
         assert self.slope is not None
         self.gradients += len(z)
         score, slope = self.slope(z)
@@ -113,11 +109,7 @@ class CountedScore:
         return np.where(lost, -np.inf, score)
 
     def since(self, evaluations: int, diverged: int) -> int:
-        """Return the number of runs that diverged since the counters were at `evaluations` and `diverged`.
-
-        Raises:
-            DivergenceError: The share of diverged runs exceeds the tolerated share.
-        """
+        """Return how many runs diverged since the counters had these values; raise DivergenceError for too many."""
         lost, of = self.diverged - diverged, self.evaluations - evaluations
         if lost > self.tolerated * of:
             raise DivergenceError(
@@ -149,9 +141,13 @@ class Mixture(NamedTuple):
 
     def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Return `count` points (count, d) drawn with `rng`."""
-        chosen = rng.choice(len(self.weights), size=count, p=self.weights)
-        x, u, s = rng.standard_normal((count, self.centres.shape[1])), self.directions[chosen], self.scales[chosen]
-        return self.centres[chosen] + s[:, None] * x + ((1 - s) * np.sum(u * x, axis=1))[:, None] * u
+        components = rng.choice(len(self.weights), size=count, p=self.weights)
+        x, u, s = (
+            rng.standard_normal((count, self.centres.shape[1])),
+            self.directions[components],
+            self.scales[components],
+        )
+        return self.centres[components] + s[:, None] * x + ((1 - s) * np.sum(u * x, axis=1))[:, None] * u
 
     def log_weight(self, z: np.ndarray) -> np.ndarray:
         """Return log(phi/q) at `z` (n, d), shape (n,)."""
@@ -188,7 +184,6 @@ def fit_proposal(
         failures: Points (n, d), distributed as phi on F.
         group: Integers (n,); failures with the same integer depend on each other. Fits to odd groups predict the moment
             on even groups, and vice versa.
-        probability: Probability P.
         centres: Centres (k, d) as an alternative to the fitted centres; only their weights and scales are fitted. None
             gives no alternative.
     """
@@ -209,44 +204,40 @@ def _second_moment(fit: Fit, failures: np.ndarray, odd: np.ndarray) -> float:
     halves = failures[odd], failures[~odd]
     if min(map(len, halves)) == 0:
         return np.inf
-    logs = [fit(known).log_weight(other) for known, other in (halves, halves[::-1])]
+    logs = [fit(fitted).log_weight(tested) for fitted, tested in (halves, halves[::-1])]
     return np.logaddexp.reduce(np.concatenate(logs)) - np.log(len(failures))
 
 
 def _fit_mixture(z: np.ndarray, centres: np.ndarray, *, moving: bool) -> Mixture:
     """Return the mixture with weights and scales of maximum likelihood, and fitted centres if `moving`."""
     count, d = len(centres), z.shape[1]
-    found = Mixture(centres, np.full(count, 1 / count), np.ones(count))
+    mixture = Mixture(centres, np.full(count, 1 / count), np.ones(count))
     for _ in range(EM_STEPS):
-        parts, across = found.parts(z)
+        parts, across = mixture.parts(z)
         total = np.maximum(parts.sum(axis=0), np.finfo(float).tiny)
         # Each centre has d - 1 directions across, all with the same variance.
         square = np.sum(parts * across, axis=0) / total / max(d - 1, 1)
-        found = Mixture(
+        mixture = Mixture(
             parts.T @ z / total[:, None] if moving else centres,
             (1 - DEFENSIVE_SHARE) * parts.mean(axis=0) + DEFENSIVE_SHARE / count,
             np.clip(np.sqrt(square), *SCALE_RANGE),
         )
-    return found
+    return mixture
 
 
 def choose_spread_points(z: np.ndarray, count: int) -> np.ndarray:
     """Return up to `count` of the points, far apart in direction; the first is the point nearest to the origin.
 
     Each further point has the direction farthest from the directions chosen so far.
-
-    Args:
-        z: Points, shape (n, d).
-        count: Greatest number of points.
     """
     size = np.linalg.norm(z, axis=1)
     directions = z / np.maximum(size, np.finfo(float).tiny)[:, None]
-    chosen = [int(np.argmin(size))]
-    cosine = directions @ directions[chosen[0]]
-    while len(chosen) < min(count, len(z)):
-        chosen.append(int(np.argmin(cosine)))
-        cosine = np.maximum(cosine, directions @ directions[chosen[-1]])
-    return z[chosen]
+    indices = [int(np.argmin(size))]
+    cosine = directions @ directions[indices[0]]
+    while len(indices) < min(count, len(z)):
+        indices.append(int(np.argmin(cosine)))
+        cosine = np.maximum(cosine, directions @ directions[indices[-1]])
+    return z[indices]
 
 
 def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> np.ndarray:
@@ -259,11 +250,6 @@ def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> n
 
     A trial whose run diverges or is refused halves t. A search stops at a kink, on a plateau (a = 0), or when t falls
     below 1e-3. Its point is then a poor centre, but the estimate stays unbiased for any centre.
-
-    Args:
-        gradient: Function z (n, d) -> (score g (n,), derivative (n, d)).
-        starts: Starting points, shape (n, d).
-        threshold: Score at the limit surface.
     """
     z = starts.copy()
     score, slope = gradient(z)
@@ -282,15 +268,15 @@ def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> n
         value, steep = gradient(trial)
         merit = 0.5 * np.sum(trial**2, axis=1) + penalty[go] * np.abs(threshold - value)
         better = merit < 0.5 * np.sum(z[go] ** 2, axis=1) + penalty[go] * np.abs(threshold - score[go])
-        taken = go[better]
-        z[taken], score[taken], slope[taken] = trial[better], value[better], steep[better]
+        moved = go[better]
+        z[moved], score[moved], slope[moved] = trial[better], value[better], steep[better]
         t[go] = np.where(better, 1.0, 0.5 * t[go])
     # Of searches that end at one design point, the result nearest to the origin is kept.
-    kept: list[np.ndarray] = []
+    distinct: list[np.ndarray] = []
     for point in z[np.argsort(np.linalg.norm(z, axis=1), kind="stable")]:
-        if all(np.linalg.norm(point - other) > MIN_POINT_DISTANCE for other in kept):
-            kept.append(point)
-    return np.array(kept)
+        if all(np.linalg.norm(point - neighbour) > MIN_POINT_DISTANCE for neighbour in distinct):
+            distinct.append(point)
+    return np.array(distinct)
 
 
 def try_importance_sampling(
@@ -307,18 +293,6 @@ def try_importance_sampling(
 
     The failures must predict at most half the coefficient of variation of subset simulation. Otherwise the estimate is
     None and nothing is drawn. With a gradient, design points are further candidates for centres.
-
-    Args:
-        runs: Score and its gradient.
-        failures: Failures of subset simulation, shape (n, d).
-        group: Integers (n,) that are equal for dependent failures, as in `fit_proposal`.
-        subset: Estimate of subset simulation.
-        threshold: Score at the limit surface.
-        draws: Number of draws.
-        rng: Random generator.
-
-    Raises:
-        DivergenceError: Too many runs diverge.
     """
     centres = None
     if runs.slope:
@@ -329,27 +303,23 @@ def try_importance_sampling(
     if predicted_cov > MAX_COV_RATIO * subset.cov:
         return None, f"subset simulation: {predicted_cov:.2g} is the coefficient of variation to be had otherwise"
     before = runs.evaluations, runs.diverged
-    found = importance_sampling(runs, threshold, mixture, draws, predicted_cov, rng)
+    importance = importance_sampling(runs, threshold, mixture, draws, predicted_cov, rng)
     runs.since(*before)
-    if is_better_estimate(found, subset):
-        return found, "importance sampling: less uncertain than subset simulation, and not in contradiction"
-    return found, "subset simulation: importance sampling is far below, or more uncertain"
+    if is_better_estimate(importance, subset):
+        return importance, "importance sampling: less uncertain than subset simulation, and not in contradiction"
+    return importance, "subset simulation: importance sampling is far below, or more uncertain"
 
 
-def is_better_estimate(found: ImportanceEstimate, subset: ProbabilityEstimate) -> bool:
+def is_better_estimate(importance: ImportanceEstimate, subset: ProbabilityEstimate) -> bool:
     """Return whether importance sampling is no more uncertain than subset simulation, and not far below it.
 
     The uncertainty is the coefficient of variation. Far below means more than four standard deviations in log P: such
     an estimate misses failures.
-
-    Args:
-        found: Result of importance sampling.
-        subset: Estimate of subset simulation.
     """
-    cov = found.estimate.cov
+    cov = importance.estimate.cov
     if cov > subset.cov:
         return False
-    below = math.log(subset.probability / found.estimate.probability)
+    below = math.log(subset.probability / importance.estimate.probability)
     return below <= MAX_DEVIATIONS_APART * math.sqrt(math.log1p(cov**2) + math.log1p(subset.cov**2))
 
 
@@ -361,14 +331,6 @@ def importance_sampling(
     The coefficient of variation is the greater of the observed and the predicted one, since both are low if heavy
     weights are rare. The interval is an interval of log P, from Student's t with (effective size - 1) degrees of
     freedom. If no draw fails, the probability is 0, the coefficient of variation inf and the interval (0, 1).
-
-    Args:
-        score: Function z (n, d) -> score (n,).
-        threshold: Score at the limit surface.
-        mixture: Distribution of the draws.
-        draws: Number of draws, >= 2.
-        predicted_cov: Coefficient of variation predicted from the failures.
-        rng: Random generator.
     """
     z = mixture.draw(draws, rng)
     weights = np.where(score(z) >= threshold, np.exp(mixture.log_weight(z)), 0.0)
@@ -386,10 +348,7 @@ def lognormal_estimate(probability: float, cov: float, deviation: float, degrees
     """Return the estimate with the 95 % interval P exp(+- t deviation), whose upper end is at most 1.
 
     Args:
-        probability: Probability P.
-        cov: Coefficient of variation.
         deviation: Standard deviation of log P.
-        degrees: Degrees of freedom of Student's t.
     """
     reach = math.exp(min(student_quantile(degrees) * deviation, 700.0))
     return ProbabilityEstimate(probability, cov, (probability / reach, min(1.0, probability * reach)))
@@ -400,9 +359,6 @@ def student_quantile(degrees: float) -> float:
 
     The formula is the expansion of Cornish and Fisher about the normal distribution. Its error is at most 2 % from 4
     degrees of freedom. Less than 2 degrees count as 2.
-
-    Args:
-        degrees: Degrees of freedom.
     """
     z, n = statistics.NormalDist().inv_cdf(0.5 + CONFIDENCE / 2), max(degrees, 2.0)
     return z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)

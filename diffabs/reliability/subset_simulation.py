@@ -188,8 +188,8 @@ def subset_simulation(
     the seeds in all three cases.
 
     >>> from diffabs.reliability import subset_simulation
-    >>> found = subset_simulation(lambda z: (z[:, 0] + z[:, 1]) / 2**0.5, 2, 4.5)  # exactly 3.4e-6
-    >>> print(f"{found.probability:.1e}")
+    >>> event = subset_simulation(lambda z: (z[:, 0] + z[:, 1]) / 2**0.5, 2, 4.5)  # exactly 3.4e-6
+    >>> print(f"{event.probability:.1e}")
     3.3e-06
 
     Args:
@@ -218,11 +218,11 @@ def subset_simulation(
     runs = CountedScore(score, gradient, tolerated)
     # Separate streams: importance sampling does not change the draws of subset simulation.
     first, second = (np.random.default_rng(each) for each in np.random.SeedSequence(seed).spawn(2))
-    made, last, hits, reason, failed = _run_levels(runs, dimension, plan, first, progress)
+    level_results, last, hits, reason, failed = _run_levels(runs, dimension, plan, first, progress)
     plain = _plain_estimate(failed, plan.samples)
-    subset = _product_estimate(made, last.family[hits]) if len(made) > 1 and hits.any() else plain
-    tried, note = None, _describe_subset(plan, len(made), bool(hits.any()))
-    if hits.any() and plan.draws > 0 and len(made) > 1:
+    subset = _product_estimate(level_results, last.family[hits]) if len(level_results) > 1 and hits.any() else plain
+    tried, note = None, _describe_subset(plan, len(level_results), bool(hits.any()))
+    if hits.any() and plan.draws > 0 and len(level_results) > 1:
         chain = np.flatnonzero(hits) % plan.chains
         tried, note = try_importance_sampling(
             runs, last.z[hits], chain, subset, threshold=plan.threshold, draws=plan.draws, rng=second
@@ -232,7 +232,7 @@ def subset_simulation(
     return RareEvent(
         *(tried.estimate if tried and is_better_estimate(tried, subset) else subset),
         reason=reason,
-        levels=made,
+        levels=level_results,
         subset=subset,
         plain=plain,
         importance=tried,
@@ -254,18 +254,14 @@ class _Plan(NamedTuple):
 
 
 def _make_plan(dimension: int, threshold: float, samples: int, share: float, levels: int, draws: int) -> _Plan:
-    """Return the checked settings.
-
-    Raises:
-        ValueError: A setting is invalid.
-    """
-    for name, value, least in (("dimension", dimension, 1), ("samples", samples, 4), ("levels", levels, 1)):
-        _check_integer(name, value, least)
+    """Return the checked settings."""
+    for name, value, minimum in (("dimension", dimension, 1), ("samples", samples, 4), ("levels", levels, 1)):
+        _check_integer(name, value, minimum)
     _check_integer("draws", draws, 0)
-    most = MAX_LEVEL_NUMBERS // dimension
+    limit = MAX_LEVEL_NUMBERS // dimension
     for name, value in (("samples", samples), ("draws", draws)):
-        if value > most:
-            raise ValueError(f"{name} = {value} need too much memory: at most {most} with {dimension} coordinates")
+        if value > limit:
+            raise ValueError(f"{name} = {value} need too much memory: at most {limit} with {dimension} coordinates")
     check_number("threshold", threshold)
     check_number("share", share)
     chains = round(samples * share)
@@ -278,24 +274,15 @@ def _make_plan(dimension: int, threshold: float, samples: int, share: float, lev
     return _Plan(float(threshold), samples, chains, levels, draws)
 
 
-def _check_integer(name: str, value: PyTree, least: int) -> None:
+def _check_integer(name: str, value: PyTree, minimum: int) -> None:
     if not isinstance(value, int | np.integer) or isinstance(value, bool):
-        raise ValueError(f"{name} = {format_value(value)} is no integer; an integer in [{least}, inf) is needed")
-    if value < least:
-        raise ValueError(f"{name} = {value} is outside [{least}, inf)")
+        raise ValueError(f"{name} = {format_value(value)} is no integer; an integer in [{minimum}, inf) is needed")
+    if value < minimum:
+        raise ValueError(f"{name} = {value} is outside [{minimum}, inf)")
 
 
 def check_number(name: str, value: PyTree, unit: str = "1") -> None:
-    """Check that a setting is one finite number.
-
-    Args:
-        name: Name for the message.
-        value: Given value.
-        unit: Unit for the message; "1" is left out.
-
-    Raises:
-        ValueError: The value is text, a list, complex, or not finite.
-    """
+    """Check that a setting is one finite number."""
     allowed = f"(-inf, inf) {'' if unit == '1' else unit}".rstrip()
     if line := find_value_objection(value) or ("is no single number" if np.ndim(value) else ""):
         raise ValueError(f"{name} = {format_value(value)} {line}; a number in {allowed} is needed")
@@ -337,19 +324,19 @@ def _run_levels(
     scores = runs(z)
     failed = int(np.sum(scores >= plan.threshold))
     now = _Population(z, scores, np.arange(plan.samples), 1, 1.0, FIRST_SPREAD, runs.since(0, 0))
-    made: list[SubsetLevel] = []
+    levels: list[SubsetLevel] = []
     while True:
         aim = _next_threshold(now.scores, plan)
-        ends = aim is None or aim >= plan.threshold or len(made) + 1 == plan.levels
+        ends = aim is None or aim >= plan.threshold or len(levels) + 1 == plan.levels
         value = plan.threshold if ends or aim is None else aim
         hits = now.scores >= value
         part, cov = float(np.mean(hits)), _level_cov(hits.reshape(now.length, -1))
-        made.append(SubsetLevel(value, part, cov, now.acceptance, now.spread, now.diverged))
+        levels.append(SubsetLevel(value, part, cov, now.acceptance, now.spread, now.diverged))
         if progress:
-            progress(SubsetProgress(len(made), value, part, runs.evaluations))
+            progress(SubsetProgress(len(levels), value, part, runs.evaluations))
         if ends:
             reached = SubsetReason.REACHED if aim == plan.threshold else SubsetReason.LEVELS
-            return _LevelSequence(made, now, hits, SubsetReason.PLATEAU if aim is None else reached, failed)
+            return _LevelSequence(levels, now, hits, SubsetReason.PLATEAU if aim is None else reached, failed)
         now = _advance_chains(runs, now, hits, value, plan, rng)
 
 
@@ -378,7 +365,7 @@ def _advance_chains(
     # np.resize repeats the permuted indices if fewer samples than chains reached the level.
     seeds = np.resize(rng.permutation(np.flatnonzero(hits)), plan.chains)
     z, scores, s, length = old.z[seeds], old.scores[seeds], old.spread, plan.samples // plan.chains
-    points, values, taken = [z], [scores], []
+    points, values, acceptances = [z], [scores], []
     for step in range(1, length):
         proposed = math.sqrt(1 - s**2) * z + s * rng.standard_normal(z.shape)
         new = runs(proposed)
@@ -386,11 +373,13 @@ def _advance_chains(
         z, scores = np.where(accepted[:, None], proposed, z), np.where(accepted, new, scores)
         points.append(z)
         values.append(scores)
-        taken.append(float(np.mean(accepted)))
-        s = min(1.0, s * math.exp((taken[-1] - TARGET_ACCEPTANCE) / math.sqrt(step)))
+        acceptances.append(float(np.mean(accepted)))
+        s = min(1.0, s * math.exp((acceptances[-1] - TARGET_ACCEPTANCE) / math.sqrt(step)))
     family = np.tile(old.family[seeds], length)
     lost = runs.since(*before)
-    return _Population(np.concatenate(points), np.concatenate(values), family, length, float(np.mean(taken)), s, lost)
+    return _Population(
+        np.concatenate(points), np.concatenate(values), family, length, float(np.mean(acceptances)), s, lost
+    )
 
 
 def _level_cov(hits: np.ndarray) -> float:

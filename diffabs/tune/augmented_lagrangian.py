@@ -55,19 +55,16 @@ class AugmentedLagrangianSearch:
 
         The first start is the subject itself. The method draws the others at random from the ranges of the parameters.
         `progress` and `stopping` are those of `tune`.
-
-        Raises:
-            StartError: The subject cannot run with its own parameters, and the method has no other start.
         """
         self.problem, self.method, self.progress, self.stopping = problem, method, progress, stopping
         self.refused = problem.find_refusal()
         if self.refused and method.starts == 1:
             raise StartError(f"{Reason.START.value}: {self.refused}")
-        own = problem.space.place(problem.subject)[None]
+        subject_start = problem.space.place(problem.subject)[None]
         drawn = problem.space.spread(jax.random.key(method.seed), method.starts - 1)
-        self.starts = np.concatenate([own, drawn])
+        self.starts = np.concatenate([subject_start, drawn])
         # Copies of the own start give the same batch shape as the search, so that both share one compiled program.
-        alike = np.repeat(own, len(self.starts), axis=0)
+        alike = np.repeat(subject_start, len(self.starts), axis=0)
         self.before: ObjectiveEvaluation = jax.device_get(
             slice_start(problem.evaluator(1.0)(alike, self._multipliers()).evaluation, 0)
         )
@@ -80,14 +77,9 @@ class AugmentedLagrangianSearch:
         self.best: DescentState | None = None  # snapshot of the best start so far
 
     def result(self) -> Tuned:
-        """Run the search and return the best result over all starts.
-
-        Raises:
-            StartError: No start has a finite objective, constraints and gradient, a stable step and only runs that do
-                not diverge.
-        """
+        """Run the search and return the best result over all starts."""
         problem, method = self.problem, self.method
-        chosen = (
+        optimiser = (
             lbfgs(method.memory)
             if method.optimiser is None
             else Optimiser(optax.with_extra_args_support(method.optimiser), False)
@@ -97,7 +89,7 @@ class AugmentedLagrangianSearch:
             problem.evaluator(self.scale),
             lambda z, m: loss(z, m)[0],
             problem.steady(),
-            chosen,
+            optimiser,
             method.stopping,
             self._report,
             self.stopping,
@@ -156,9 +148,9 @@ class AugmentedLagrangianSearch:
                 descent_states,
                 descent.run(np.stack([descent_state.z for descent_state in descent_states]), m),
             )
-            for one, descent_state in zip(last, descent_states, strict=True):
-                descent_state.history = _join_histories(one.history, descent_state.history)
-                descent_state.keep(one.kept)
+            for earlier_state, descent_state in zip(last, descent_states, strict=True):
+                descent_state.history = _join_histories(earlier_state.history, descent_state.history)
+                descent_state.keep(earlier_state.best_feasible)
             before, violations = violations, _violations(descent_states)
         for descent_state, converged in zip(descent_states, _have_converged(m, descent_states), strict=True):
             descent_state.converged = converged
@@ -198,12 +190,12 @@ class AugmentedLagrangianSearch:
             return (
                 f"{slid} of {lanes} lanes slide along a switching surface at the start, and have no derivatives there"
             )
-        bounds = filter(None, (getattr(one, "metric", None) for one in self.problem.constraints))
+        bounds = filter(None, (getattr(constraint, "metric", None) for constraint in self.problem.constraints))
         for name in (*self.problem.weights, *bounds):
             value, unreached = self.before.metrics[name], getattr(self.problem.measured[name], "unreached", np.nan)
             if never := np.count_nonzero(value == unreached):
-                found = f"{name} is infinite at the start in {never} of {lanes} lanes"
-                return f"{found}: such a run never settles; start from one that does, or take iae"
+                finding = f"{name} is infinite at the start in {never} of {lanes} lanes"
+                return f"{finding}: such a run never settles; start from one that does, or take iae"
             if lost := np.count_nonzero(~np.isfinite(value)):
                 return f"{name} is not finite at the start in {lost} of {lanes} lanes"
         return "the objective, a constraint or a derivative is not finite at the start"
@@ -222,8 +214,8 @@ def _have_converged(m: Multipliers, descent_states: list[DescentState]) -> list[
     change = np.abs(np.maximum(aimed, -m.values / m.penalty[:, None])).max(axis=1)
     settled = change <= np.maximum(m.margin, MIN_TOLERANCE)
     return [
-        descent_state.reason is Reason.START or (bool(one) and descent_state.history[-1].violation <= 0)
-        for one, descent_state in zip(settled, descent_states, strict=True)
+        descent_state.reason is Reason.START or (bool(is_settled) and descent_state.history[-1].violation <= 0)
+        for is_settled, descent_state in zip(settled, descent_states, strict=True)
     ]
 
 

@@ -68,7 +68,7 @@ class DescentState:
         iterations: Number of accepted steps so far.
         reason: Reason for the end; None while the descent continues.
         history: Start, and the points after the accepted steps.
-        kept: Best feasible step so far.
+        best_feasible: Best feasible step so far.
         converged: Whether the constraints hold and their multipliers pass the test of `augmented_lagrangian`; True
             without constraints.
     """
@@ -90,7 +90,7 @@ class DescentState:
     iterations: int = 0
     reason: Reason | None = None
     history: list[DescentPoint] = dataclasses.field(default_factory=list)
-    kept: FeasiblePoint | None = None
+    best_feasible: FeasiblePoint | None = None
     converged: bool = True
 
     def note(self) -> None:
@@ -109,10 +109,10 @@ class DescentState:
         if worst <= 0:
             self.keep(FeasiblePoint(self.z, self.evaluation, self.history[-1]))
 
-    def keep(self, other: FeasiblePoint | None) -> None:
-        """Keep the feasible point `other` if its objective is less than the objective of the point kept so far."""
-        if other and not (self.kept and self.kept.point.objective <= other.point.objective):
-            self.kept = other
+    def keep(self, point: FeasiblePoint | None) -> None:
+        """Keep a feasible point if its objective is less than that of the point kept so far."""
+        if point and not (self.best_feasible and self.best_feasible.point.objective <= point.point.objective):
+            self.best_feasible = point
 
     def go_back(self) -> None:
         """Go back to the feasible point that was kept, and note it, if it is better than the present point.
@@ -121,11 +121,11 @@ class DescentState:
         multipliers have not converged or the iterations ran out, the lower objective decides. A converged minimum is
         the result, although steps on its way may have had a lower objective within the margin of a constraint.
         """
-        last, kept = self.history[-1], self.kept
+        last, best = self.history[-1], self.best_feasible
         is_minimum = self.converged and self.reason is not Reason.LIMIT
-        if kept and (not last.violation <= 0 or (not is_minimum and kept.point.objective < last.objective)):
-            self.z, self.evaluation, self.reason = kept.z, kept.evaluation, Reason.KEPT
-            self.history.append(kept.point._replace(iteration=last.iteration, evaluations=last.evaluations))
+        if best and (not last.violation <= 0 or (not is_minimum and best.point.objective < last.objective)):
+            self.z, self.evaluation, self.reason = best.z, best.evaluation, Reason.KEPT
+            self.history.append(best.point._replace(iteration=last.iteration, evaluations=last.evaluations))
         elif not self.converged and self.reason is not Reason.INTERRUPTED:
             self.reason = Reason.LIMIT
 
@@ -144,11 +144,7 @@ class Optimiser(NamedTuple):
 
 
 def lbfgs(memory: int = 10) -> Optimiser:
-    """Return the optimiser that gives L-BFGS directions for the line search of this module.
-
-    Args:
-        memory: Number of steps that L-BFGS stores.
-    """
+    """Return the optimiser that gives L-BFGS directions for the line search of this module."""
     chain = optax.chain(optax.scale_by_lbfgs(memory_size=memory), optax.scale(-1.0))
     return Optimiser(optax.with_extra_args_support(chain), True)
 
@@ -166,7 +162,7 @@ class Descent:
         steady: Callable[[np.ndarray], np.ndarray],
         optimiser: Optimiser,
         stopping: Stopping,
-        told: Callable[[list[DescentState]], None],
+        report: Callable[[list[DescentState]], None],
         interrupted: Callable[[], bool] = lambda: False,
         steepness: Callable[[np.ndarray], np.ndarray] = np.ones_like,
     ):
@@ -176,13 +172,11 @@ class Descent:
             evaluate: Function (z (starts, p), multipliers) -> loss and gradient of all starts.
             loss: Function (z (p,), multipliers) -> loss of one start, for optimisers with a line search of their own.
             steady: Maps z (starts, p) to whether every run there is admissible, shape (starts,).
-            optimiser: Source of the updates.
-            stopping: Conditions that end the descent of a start.
-            told: Called with all starts after every evaluation.
-            interrupted: Called after `told`; True ends the descent of all starts.
+            report: Called with all starts after every evaluation.
+            interrupted: Called after `report`; True ends the descent of all starts.
             steepness: Maps z (p,) to the slope of each free parameter by z, relative to its slope at z = 0.
         """
-        self.evaluate, self.steady, self.stopping, self.told = evaluate, steady, stopping, told
+        self.evaluate, self.steady, self.stopping, self.report = evaluate, steady, stopping, report
         self.interrupted, self.steepness = interrupted, steepness
         self.searches = optimiser.searches
         self._init = jax.jit(jax.vmap(optimiser.transformation.init))
@@ -196,47 +190,51 @@ class Descent:
     def run(self, starts: np.ndarray, multipliers: Multipliers) -> list[DescentState]:
         """Run the descent from each of `starts` (starts, p) under `multipliers`, and return the final states."""
         self.multipliers = multipliers
-        first, fine = self._evaluate_at(starts)
+        first, usable = self._evaluate_at(starts)
         descent_states = [
             DescentState(z, float(first.loss[i]), first.gradient[i], slice_start(first.evaluation, i), np.zeros_like(z))
             for i, z in enumerate(starts)
         ]
-        for descent_state, ok in zip(descent_states, fine, strict=True):
+        for descent_state, ok in zip(descent_states, usable, strict=True):
             descent_state.reason = self._finish_reason(descent_state) if ok else Reason.START
             descent_state.note()
         self.states = self._init(jnp.asarray(starts))
         self._propose(descent_states, [descent_state.reason is None for descent_state in descent_states])
-        self.told(descent_states)
+        self.report(descent_states)
         while any(descent_state.reason is None for descent_state in descent_states) and not self.interrupted():
             # One trial step of each start that has not ended; the others only fill the compiled batch.
             trials = np.stack(
                 [descent_state.z + descent_state.t * descent_state.update for descent_state in descent_states]
             )
-            found, fine = self._evaluate_at(trials)
+            evaluation, usable = self._evaluate_at(trials)
             moved = []
             for i, descent_state in enumerate(descent_states):
-                taken = (
-                    self._judge(descent_state, fine[i], trials[i], slice_start(found, i))
+                accepted = (
+                    self._judge(descent_state, usable[i], trials[i], slice_start(evaluation, i))
                     if descent_state.reason is None
                     else None
                 )
-                if taken:
-                    self._take(descent_state, *taken)
-                moved.append(taken is not None and descent_state.reason is None)
+                if accepted:
+                    self._take(descent_state, *accepted)
+                moved.append(accepted is not None and descent_state.reason is None)
             self._propose(descent_states, moved)
-            self.told(descent_states)
+            self.report(descent_states)
         for descent_state in descent_states:
             descent_state.reason = descent_state.reason or Reason.INTERRUPTED
         return descent_states
 
     def _evaluate_at(self, z: np.ndarray) -> tuple[LossEvaluation, np.ndarray]:
         """Return the evaluation at z and a mask (starts,) of the finite, admissible points."""
-        found = jax.device_get(self.evaluate(jnp.asarray(z), self.multipliers))
-        fine = np.isfinite(found.loss) & np.isfinite(found.gradient).all(axis=1) & (found.evaluation.diverged == 0)
-        return found, fine & self.steady(z)
+        evaluation = jax.device_get(self.evaluate(jnp.asarray(z), self.multipliers))
+        usable = (
+            np.isfinite(evaluation.loss)
+            & np.isfinite(evaluation.gradient).all(axis=1)
+            & (evaluation.evaluation.diverged == 0)
+        )
+        return evaluation, usable & self.steady(z)
 
     def _judge(
-        self, descent_state: DescentState, fine: bool, z: np.ndarray, found: LossEvaluation
+        self, descent_state: DescentState, usable: bool, z: np.ndarray, evaluation: LossEvaluation
     ) -> tuple[np.ndarray, LossEvaluation] | None:
         """Return the accepted point and its evaluation; otherwise None, with the next trial step set in the state."""
         descent_state.evaluations += 1
@@ -244,34 +242,34 @@ class Descent:
         slope = float(descent_state.gradient @ descent_state.update)
         # At the greatest step no expansion is possible, so the curvature condition is waived there.
         longest = _is_longest(descent_state)
-        if fine and not self.searches:
-            return z, found
-        if not fine or float(found.loss) > descent_state.loss + ARMIJO_FRACTION * descent_state.t * slope:
-            descent_state.high, descent_state.slides = descent_state.t, bool(found.evaluation.slid > 0)
-        elif float(found.gradient @ descent_state.update) < WOLFE_FRACTION * slope and not longest:
-            descent_state.low, descent_state.better = descent_state.t, (z, found)
+        if usable and not self.searches:
+            return z, evaluation
+        if not usable or float(evaluation.loss) > descent_state.loss + ARMIJO_FRACTION * descent_state.t * slope:
+            descent_state.high, descent_state.slides = descent_state.t, bool(evaluation.evaluation.slid > 0)
+        elif float(evaluation.gradient @ descent_state.update) < WOLFE_FRACTION * slope and not longest:
+            descent_state.low, descent_state.better = descent_state.t, (z, evaluation)
         else:
             descent_state.jumps = 0
-            return z, found
+            return z, evaluation
         if descent_state.better and descent_state.trials >= MAX_TRIALS:
             # No trial below `high` satisfies the curvature condition: the loss jumps near `high`, or has a kink there.
             descent_state.jumps += np.isfinite(descent_state.high)
             return descent_state.better
-        descent_state.t = _next_step_factor(descent_state, float(found.loss) if fine else np.inf, slope)
+        descent_state.t = _next_step_factor(descent_state, float(evaluation.loss) if usable else np.inf, slope)
         if descent_state.t < MIN_STEP_FACTOR:
             descent_state.reason = Reason.SLIDE if descent_state.slides else Reason.STEP
         return None
 
-    def _take(self, descent_state: DescentState, z: np.ndarray, found: LossEvaluation) -> None:
-        gained = abs(descent_state.loss - float(found.loss))
+    def _take(self, descent_state: DescentState, z: np.ndarray, evaluation: LossEvaluation) -> None:
+        gained = abs(descent_state.loss - float(evaluation.loss))
         small = gained <= self.stopping.change * max(abs(descent_state.loss), 1e-12)
         # A greatest step from a flat end of a range may hardly change the loss: it does not count as idle.
         descent_state.idle = descent_state.idle + 1 if small and not _is_longest(descent_state) else 0
         descent_state.z, descent_state.loss, descent_state.gradient, descent_state.evaluation = (
             z,
-            float(found.loss),
-            found.gradient,
-            found.evaluation,
+            float(evaluation.loss),
+            evaluation.gradient,
+            evaluation.evaluation,
         )
         descent_state.t, descent_state.low, descent_state.high, descent_state.better, descent_state.trials = (
             1.0,
@@ -365,16 +363,11 @@ def _is_descent_direction(update: np.ndarray, gradient: np.ndarray) -> bool:
     return bool(np.isfinite(size) and update @ gradient < -1e-10 * size)
 
 
-def _select_by_start(which: np.ndarray, a: Scalar, b: Scalar) -> PyTree:
-    """Return the leaves of `a` for the starts in `which` and the leaves of `b` for the others."""
-    return jax.tree.map(lambda x, y: jnp.where(which.reshape(-1, *[1] * (jnp.ndim(x) - 1)), x, y), a, b)
+def _select_by_start(mask: np.ndarray, a: Scalar, b: Scalar) -> PyTree:
+    """Return the leaves of `a` for the starts in `mask` and the leaves of `b` for the others."""
+    return jax.tree.map(lambda x, y: jnp.where(mask.reshape(-1, *[1] * (jnp.ndim(x) - 1)), x, y), a, b)
 
 
 def slice_start(tree: PyTree, i: int) -> PyTree:
-    """Return the tree of one start: entry `i` along the leading axis of each leaf.
-
-    Args:
-        tree: Tree whose leaves have a leading axis of starts.
-        i: Index of the start.
-    """
+    """Return the tree of one start: entry `i` along the leading axis of each leaf."""
     return jax.tree.map(lambda x: x[i], tree)

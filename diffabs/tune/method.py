@@ -65,9 +65,9 @@ class Method:
         _check_size("margin", self.margin)
 
 
-def _check_whole(name: str, value: int, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
-        raise ValueError(f"{name} = {value!r} is no whole number in [{least}, inf)")
+def _check_whole(name: str, value: int, minimum: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
+        raise ValueError(f"{name} = {value!r} is no whole number in [{minimum}, inf)")
 
 
 def _check_size(name: str, value: float) -> None:

@@ -26,10 +26,6 @@ def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, PyTr
 
     The derivative is one-sided where the two numbers are equal. The name depends on the parts of the loop alone, so
     both numbers may be traced.
-
-    Args:
-        loop: Closed loop.
-        solver: Solver of the runs; its step takes part in some conditions.
     """
     sampled: Any = loop.controller
     inner: Part = getattr(sampled, "controller", sampled)
@@ -41,9 +37,9 @@ def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, PyTr
     if isinstance(sampled, SampledOnGrid):
         steps = jnp.round(sampled.delay / solver.step)
         yield "controller.delay is a whole number of steps", sampled.delay, steps * solver.step
-    for path, one in _actuators(loop.actuator):
-        if isinstance(one, Delay) and isinstance(solver, FixedStep):
-            yield f"{path}.time and the step are equal", one.time, solver.step
+    for path, actuator in _actuators(loop.actuator):
+        if isinstance(actuator, Delay) and isinstance(solver, FixedStep):
+            yield f"{path}.time and the step are equal", actuator.time, solver.step
     for sign, torque, limit in ((1, "torque_max", "high"), (-1, "torque_min", "low")):
         name = torque if hasattr(inner, torque) else limit
         if isinstance(inner, SlidingMode) and isinstance(loop.feedforward, NoFeedforward | ConstantInput):
@@ -60,14 +56,8 @@ def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, PyTr
 
 
 def warn(subject: Part, values: Params, batch: Batch, solver: Solver, where: str) -> None:
-    """Issue a UserWarning for each condition under which a derivative by these parameters is one-sided in some run.
-
-    Args:
-        subject: Loop, or a part with a method `closed_loop()`.
-        values: Values of the free parameters by path.
-        batch: The runs.
-        solver: Solver of the runs.
-        where: First words of the warning.
+    """Issue a UserWarning that begins with `where` for each condition under which a derivative is one-sided in some
+    run.
     """
 
     def compare(values: Params) -> PyTree:
@@ -99,6 +89,6 @@ def _actuators(actuator: Part) -> Iterator[tuple[str, PyTree]]:
     """Yield the path and the part of an actuator, or of each actuator in a series."""
     series = getattr(actuator, "blocks", None)
     if isinstance(series, tuple):
-        yield from ((f"actuator.blocks.{i}", one) for i, one in enumerate(series))
+        yield from ((f"actuator.blocks.{i}", block) for i, block in enumerate(series))
     else:
         yield "actuator", actuator

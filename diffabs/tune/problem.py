@@ -153,9 +153,9 @@ class Problem:
         """Return the function (z, multipliers) -> (L, (L, evaluation)) for an objective divided by `scale`."""
 
         def loss(z: AnyArray, m: Multipliers) -> tuple[PyTree, tuple[PyTree, ObjectiveEvaluation]]:
-            seen = self.evaluate(z)
-            value = seen.objective / scale + _penalty(seen.excess, m)
-            return value, (value, seen)
+            evaluation = self.evaluate(z)
+            value = evaluation.objective / scale + _penalty(evaluation.excess, m)
+            return value, (value, evaluation)
 
         return loss
 
@@ -172,8 +172,8 @@ class Problem:
         derivative = jax.jacfwd if self.mode is DerivativeMode.FORWARD else jax.grad
 
         def evaluate(z: AnyArray, m: Multipliers, scale: Scalar) -> LossEvaluation:
-            gradient, (value, seen) = derivative(self.loss(scale), has_aux=True)(z, m)
-            return LossEvaluation(value, gradient, seen)
+            gradient, (value, evaluation) = derivative(self.loss(scale), has_aux=True)(z, m)
+            return LossEvaluation(value, gradient, evaluation)
 
         options = SAME_RESULT_OPTIONS if self.batch.size <= MAX_QUICK_COMPILE_RUNS else None
         return jax.jit(jax.vmap(evaluate, in_axes=(0, 0, None)), compiler_options=options)
@@ -209,11 +209,7 @@ class Problem:
 
 
 def choose_gradient_mode(space: FreeSpace) -> DerivativeMode:
-    """Return forward mode for up to `MAX_FORWARD_PARAMETERS` parameters, otherwise reverse mode.
-
-    Args:
-        space: Space of the free parameters.
-    """
+    """Return forward mode for up to `MAX_FORWARD_PARAMETERS` parameters, otherwise reverse mode."""
     return DerivativeMode.FORWARD if space.size <= MAX_FORWARD_PARAMETERS else DerivativeMode.REVERSE
 
 

@@ -151,11 +151,7 @@ class Tuned:
 
 
 def build_subject_loop(subject: Part) -> Loop:
-    """Return the closed loop of `subject`: the subject itself, or the result of its method `closed_loop()`.
-
-    Args:
-        subject: Loop, or a part with a method `closed_loop()`.
-    """
+    """Return the closed loop of `subject`: the subject itself, or the result of its method `closed_loop()`."""
     return subject if isinstance(subject, Loop) else subject.closed_loop()
 
 

@@ -55,17 +55,17 @@ def tune(
         StartError: At every start a run diverges or is inadmissible, or the objective or its gradient is not finite.
     """
     if not isinstance(problem, Problem):
-        given = type(problem).__name__ if isinstance(problem, Loop) else format_value(problem)
+        kind = type(problem).__name__ if isinstance(problem, Loop) else format_value(problem)
         needed = "build_problem(loop, free=..., objective=..., solver=...) makes one"
-        raise ValueError(f"problem = {given} is no Problem; {needed}")
+        raise ValueError(f"problem = {kind} is no Problem; {needed}")
     subject, paths = problem.subject, [entry.path for entry in problem.space.entries]
-    own = {path: get(subject, path) for path in paths}
-    one_sided.warn(subject, own, problem.batch, problem.solver, "start")
+    start_values = {path: get(subject, path) for path in paths}
+    one_sided.warn(subject, start_values, problem.batch, problem.solver, "start")
     with ProgressLine() as line:
         report = report_to(line, progress, str)
-        found = AugmentedLagrangianSearch(problem, method or Method(), report, stopping).result()
-    one_sided.warn(subject, found.values, problem.batch, problem.solver, "result")
-    return found
+        tuned = AugmentedLagrangianSearch(problem, method or Method(), report, stopping).result()
+    one_sided.warn(subject, tuned.values, problem.batch, problem.solver, "result")
+    return tuned
 
 
 @default_flags()
@@ -111,8 +111,8 @@ def build_problem(
     >>> free, measured = {"controller.torque": (10.0, 100.0)}, {"iae": objectives.IAE()}
     >>> solver = d.FixedStep(1e-3, 6.0)
     >>> problem = tune.build_problem(loop, free=free, objective={"iae": 1.0}, measured=measured, solver=solver)
-    >>> found = tune.tune(problem)
-    >>> print(f"{found.values['controller.torque']:.1f} N m, {found.objective[0]:.2f} to {found.objective[1]:.2f} s")
+    >>> tuned = tune.tune(problem)
+    >>> print(f"{tuned.values['controller.torque']:.1f} N m, {tuned.objective[0]:.2f} to {tuned.objective[1]:.2f} s")
     85.6 N m, 1.14 to 0.18 s
     """
     check_part(subject)
@@ -157,21 +157,21 @@ def _check_constraints(
 ) -> tuple[Constraint, ...]:
     """Return the constraints; raise a ValueError if one is no constraint, or a bound does not fit the runs."""
     listed = isinstance(constraints, Iterable) and not isinstance(constraints, Mapping | str)
-    found = tuple(constraints) if listed else ()  # a generator can be read once only
-    if not listed or not all(hasattr(one, "excess") for one in found):
-        given = format_value(constraints)
-        raise ValueError(f'constraints = {given} is no list of constraints, such as [AtMost("overshoot", 0.01)]')
-    for one in found:  # AtMost, or a class of the user's own with such attributes
-        if (metric := getattr(one, "metric", None)) is None:
+    requirements = tuple(constraints) if listed else ()  # a generator can be read once only
+    if not listed or not all(hasattr(requirement, "excess") for requirement in requirements):
+        described = format_value(constraints)
+        raise ValueError(f'constraints = {described} is no list of constraints, such as [AtMost("overshoot", 0.01)]')
+    for requirement in requirements:  # AtMost, or a class of the user's own with such attributes
+        if (metric := getattr(requirement, "metric", None)) is None:
             continue
         _check_measured(metric, measured)
-        bound = getattr(one, "bound", 0.0)
+        bound = getattr(requirement, "bound", 0.0)
         if find_value_objection(bound) or not np.isfinite(np.asarray(bound, float)).all():
             raise ValueError(f"constraints: the bound of {metric} is {bound!r}, not a finite number")
         if value_shape(bound) not in ((), (runs,)):
             needed = f"one number, or one for each of {runs} runs, is needed"
             raise ValueError(f"constraints: the bound of {metric} has the shape {value_shape(bound)}; {needed}")
-    return found
+    return requirements
 
 
 def _check_not_overwritten(subject: Part, space: FreeSpace, batch: Batch) -> None:
@@ -181,10 +181,10 @@ def _check_not_overwritten(subject: Part, space: FreeSpace, batch: Batch) -> Non
         loop = canonical_dtypes(build_subject_loop(replace(subject, values)))
         return batch.each(loop, lambda loop, key: loop)
 
-    own = {entry.path: np.asarray(get(subject, entry.path), float) for entry in space.entries}
-    program = jax.make_jaxpr(loops)(own).jaxpr
+    start_values = {entry.path: np.asarray(get(subject, entry.path), float) for entry in space.entries}
+    program = jax.make_jaxpr(loops)(start_values).jaxpr
     _, used = dce_jaxpr(program, [True] * len(program.outvars))
-    if idle := [path for path, one in zip(sorted(own), used, strict=True) if not one]:
+    if idle := [path for path, is_used in zip(sorted(start_values), used, strict=True) if not is_used]:
         by = "`over`" if isinstance(subject, Loop) else "`over` or `closed_loop()`"
         raise ValueError(f"{', '.join(idle)}: free, but {by} gives its value in every run")
 

@@ -72,14 +72,9 @@ def lq_weights(loop: Loop, Q: AnyArray, R: float, design: GainDesign, path: str 
     """Return a loop with the LQ weights Q and R as its parameters.
 
     Args:
-        loop: The loop.
         Q: State weight, shape (n, n), or its diagonal (n,); positive definite.
         R: Input weight, > 0.
-        design: Function (Q, R) -> gain.
         path: Dotted path of the gain in the loop.
-
-    Raises:
-        ValueError: Q is not symmetric, finite and positive definite, or R is not positive and finite.
     """
     q = as_weight_matrix("Q", Q, len(np.atleast_1d(Q)), definite=True)
     r = as_weight_matrix("R", R, 1, definite=True)
@@ -95,11 +90,7 @@ def lq_weights(loop: Loop, Q: AnyArray, R: float, design: GainDesign, path: str 
 
 
 def lqr_gain_design(model: Part) -> GainDesign:
-    """Return the function (Q, R) -> LQ gain (1, n) of a linear model, in discrete time if the model has a period.
-
-    Args:
-        model: Linear model with one input, `matrices()` and `period`.
-    """
+    """Return the function (Q, R) -> LQ gain (1, n) of a linear model, in discrete time if the model has a period."""
     solve, (a, b) = (lqr if model.period is None else dlqr), model.matrices()
     return lambda Q, R: solve(a, b, Q, R).gain
 
@@ -108,8 +99,5 @@ def robust_gain_design(system: Polytope) -> GainDesign:
     """Return the function (Q, R) -> gain (1, n) with the least guaranteed cost over a polytope.
 
     The gain is NaN for weights without a robust gain; a search rejects such weights.
-
-    Args:
-        system: Polytope of linear models.
     """
     return lambda Q, R: robust_gain(system, Q, R)

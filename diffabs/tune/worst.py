@@ -103,10 +103,10 @@ class WorstCase:
         if self.diverged is not None:
             at = ", ".join(f"{path} = {np.asarray(v).tolist()}" for path, v in self.diverged.items())
             return f"COUNTEREXAMPLE: the run diverges at {at}."
-        found = f"{self.metric} = {self.value:.6g} at {at}"
+        case = f"{self.metric} = {self.value:.6g} at {at}"
         if self.met is False:
             beyond = f"beyond {self.bound:g} by {self.value - (self.bound or 0.0):.3g}"
-            return f"COUNTEREXAMPLE: {found}, {beyond}. {self._finder()}"
+            return f"COUNTEREXAMPLE: {case}, {beyond}. {self._finder()}"
         proof = {
             True: "The linear loop is proved stable over the box by a certificate.",
             False: "No certificate covers the box.",
@@ -114,7 +114,7 @@ class WorstCase:
         }[proved]
         within = f", within {self.bound:g}" if self.bound is not None else ""
         return (
-            f"No counterexample in {self.rollouts:.0f} rollouts: the worst is {found}{within}. {self._finder()} {proof}"
+            f"No counterexample in {self.rollouts:.0f} rollouts: the worst is {case}{within}. {self._finder()} {proof}"
         )
 
     def _finder(self) -> str:
@@ -195,10 +195,10 @@ def worst_case(
     problem = Problem(
         middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), choose_gradient_mode(free), engine
     )
-    known = runs.metrics[metric][worst]
-    known = known[np.isfinite(known)]
+    screened_values = runs.metrics[metric][worst]
+    screened_values = screened_values[np.isfinite(screened_values)]
     # The scale of the loss. It sets when an ascent ends, and the length of its first step.
-    scale = max(abs(float(known[0])), 1e-12) if len(known) else 1.0
+    scale = max(abs(float(screened_values[0])), 1e-12) if len(screened_values) else 1.0
     lanes = _ascend(problem, points[worst], scale, iterations) if starts else []
     if price is None:
         price = 1 + 1.5 * free.size if problem.mode is DerivativeMode.FORWARD else 6.0
@@ -238,11 +238,7 @@ def _check_numbers(loop: Loop, objective: Objective, bound: float | None, counts
 
 
 def _find_middle(loop: Loop, over: Mapping[str, Range]) -> dict[str, np.ndarray]:
-    """Return the middle of the box by path; a path that is no parameter is left out, for `parameter_space` to refuse.
-
-    Raises:
-        ValueError: A range is not a pair of finite numbers, or of arrays of the parameter's shape.
-    """
+    """Return the middle of the box by path, without paths that are no parameter: `parameter_space` refuses them."""
     middle = {}
     for path, spec, value in parameters(loop):
         if path not in over:
@@ -276,12 +272,12 @@ def _draw_points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
 
 def _values_by_path(free: FreeSpace, point: Any) -> dict[str, PyTree]:
     """Return the parameters by path from a vector (p,), or from the rows of a matrix (runs, p)."""
-    found, first = {}, 0
+    values, first = {}, 0
     for entry in free.entries:
         n = len(entry.maps)
-        found[entry.path] = point[..., first : first + n].reshape((*np.shape(point)[:-1], *entry.shape))
+        values[entry.path] = point[..., first : first + n].reshape((*np.shape(point)[:-1], *entry.shape))
         first += n
-    return found
+    return values
 
 
 def _find_ends(free: FreeSpace, lanes: list[DescentState]) -> np.ndarray:

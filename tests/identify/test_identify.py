@@ -87,8 +87,8 @@ class TestFit:
 
     @killed_by(
         "identify/uncertainty.py",
-        "known = (data * size / scale)[:, free]",
-        "known = (data * size)[:, free]",
+        "jacobian = (data * size / scale)[:, free]",
+        "jacobian = (data * size)[:, free]",
         case="False",
     )
     @pytest.mark.parametrize("absolute", [True, False])
@@ -126,8 +126,8 @@ class TestFit:
 
     @killed_by(
         "identify/uncertainty.py",
-        "np.concatenate([known, (prior * size)[:, free]])",
-        "np.concatenate([known, (0 * prior)[:, free]])",
+        "np.concatenate([jacobian, (prior * size)[:, free]])",
+        "np.concatenate([jacobian, (0 * prior)[:, free]])",
     )
     def test_a_gaussian_prior_has_the_closed_form(self):
         prior = gaussian({"c": (0.2, 0.05)})
@@ -250,7 +250,7 @@ class TestFit:
         )
         assert 1.5 < found.values["a"] <= 3.0
 
-    @killed_by("identify/residuals.py", "return seen if seen.finite() else None", "return seen")
+    @killed_by("identify/residuals.py", "return evaluation if evaluation.finite() else None", "return evaluation")
     def test_the_best_start_wins_and_the_others_are_kept(self):
         def well(part):
             return jnp.where(part.a > 10, jnp.nan, (part.a**2 - 4) * (part.a + 3))[None]

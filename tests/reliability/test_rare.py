@@ -162,7 +162,9 @@ class TestSubset:
         assert found.probability == pytest.approx(norm.sf(2.5), rel=0.4)  # 62 of 10000: three standard deviations
 
     @killed_by(
-        "reliability/subset_simulation.py", "if len(made) > 1 and hits.any() else plain", "if hits.any() else plain"
+        "reliability/subset_simulation.py",
+        "if len(level_results) > 1 and hits.any() else plain",
+        "if hits.any() else plain",
     )
     @pytest.mark.parametrize("truth", [0.9999, 0.9995, 0.999, 0.9, 0.3])
     def test_the_interval_of_one_level_is_that_of_a_count(self, truth):
@@ -177,8 +179,8 @@ class TestSubset:
 
     @killed_by(
         "reliability/subset_simulation.py",
-        "_product_estimate(made, last.family[hits]) if len(made) > 1 and hits.any() else plain",
-        "_product_estimate(made, last.family) if len(made) > 1 else plain",
+        "_product_estimate(level_results, last.family[hits]) if len(level_results) > 1 and hits.any() else plain",
+        "_product_estimate(level_results, last.family) if len(level_results) > 1 else plain",
     )
     def test_without_a_failure_only_the_first_level_is_known(self):
         """Of 2800 plain samples none fails: P <= 1 - 0.025^(1/2800), whatever the later levels did not find."""

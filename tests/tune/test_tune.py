@@ -186,7 +186,7 @@ class TestDescent:
 
     @killed_by(
         "tune/descent.py",
-        "elif float(found.gradient @ descent_state.update) < WOLFE_FRACTION * slope and not longest:",
+        "elif float(evaluation.gradient @ descent_state.update) < WOLFE_FRACTION * slope and not longest:",
         "elif False:",
     )
     def test_a_very_short_step_does_not_end_the_search(self):
@@ -214,7 +214,7 @@ class TestDescent:
         slope = jax.grad(lambda x: (x - 0.99) ** 2 - 1e-3 * jnp.sqrt(1 - x))
         assert float(jnp.max(jnp.abs(jax.vmap(slope)(jnp.asarray(lane.z))))) < 1e-5
 
-    @killed_by("tune/descent.py", "return found, fine & self.steady(z)", "return found, fine")
+    @killed_by("tune/descent.py", "return evaluation, usable & self.steady(z)", "return evaluation, usable")
     def test_what_is_not_stable_is_not_entered(self):
         steady = lambda z: z[:, 0] > 0.5  # noqa: E731
         (lane,) = descend(lambda z: jnp.sum(z**2), [2.0, 1.0], steady=steady)
@@ -352,7 +352,7 @@ class TestConstraints:
         assert found.values["x"] + found.values["y"] >= 1
         assert found.objective[1] == pytest.approx(2 / 3, rel=5e-3)  # a margin of 1e-3 costs 2e-3 of it
 
-    @killed_by("tune/augmented_lagrangian.py", "(bool(one) and descent_state", "(descent_state")
+    @killed_by("tune/augmented_lagrangian.py", "(bool(is_settled) and descent_state", "(descent_state")
     @pytest.mark.parametrize("start", [10.0, 2.33, 1.0])
     def test_it_goes_on_beyond_the_first_feasible_round(self, start):
         """x' = k (1 - x) - x for 2 s: the least integral of 1 - x with x(2) <= 0.7, from both sides of the bound."""

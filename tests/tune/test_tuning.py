@@ -151,8 +151,8 @@ def test_a_start_that_is_not_stable_is_refused():
 @killed_by("tune/tuning.py", " and not isinstance(constraints, Mapping | str)", "")
 @killed_by(
     "tune/tuning.py",
-    'getattr(one, "metric", None)',
-    'one.metric if type(one).__name__ == "AtMost" else None',
+    'getattr(requirement, "metric", None)',
+    'requirement.metric if type(requirement).__name__ == "AtMost" else None',
 )
 @pytest.mark.parametrize(
     ("change", "message"),
