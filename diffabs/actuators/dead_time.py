@@ -75,9 +75,9 @@ class DeadTime:
         due = clock.t + jnp.where(rises, self.rise, self.fall)
         before = m.due < due  # the switches that arrive earlier stay, the others are cancelled
         place = jnp.sum(jnp.where(before, 1, 0))
-        here = jnp.arange(self.capacity) == place
-        times = jnp.where(here, due, jnp.where(before, m.due, jnp.inf))
-        values = jnp.where(here, signal, m.values)
+        at_place = jnp.arange(self.capacity) == place
+        times = jnp.where(at_place, due, jnp.where(before, m.due, jnp.inf))
+        values = jnp.where(at_place, signal, m.values)
         applied = jnp.where(place < self.capacity, m.applied, jnp.nan)
         sent = DeadTimeMemory(applied, signal, times, values)
         changed = signal != m.newest

@@ -72,7 +72,7 @@ class DelayMemory(NamedTuple):
     Attributes:
         ring: Past steps, one row for each `Piece`.
         window: Rows of the pieces that leave next, shape (WINDOW_PIECES, columns).
-        known: Number of valid pieces in the window.
+        valid: Number of valid pieces in the window.
         place: Index in the window of the first piece that the present step may read.
         last: Index in the window of the last piece that the present step may read.
         until: Command time up to which the present step may read [s]; the delay reaches it at `until` + time.
@@ -83,7 +83,7 @@ class DelayMemory(NamedTuple):
 
     ring: Log
     window: Matrix
-    known: Int
+    valid: Int
     place: Scalar
     last: PyTree
     until: Scalar
@@ -139,7 +139,7 @@ class Delay:
         """Return the memory after a break has left the delay: the next pieces may be read."""
         del t, signal
         m: DelayMemory = memory.held
-        out = fired[0] & (m.last + 1 < m.known)
+        out = fired[0] & (m.last + 1 < m.valid)
         return memory._replace(held=self._aim_at_break(m._replace(place=jnp.where(out, m.last + 1, m.place))))
 
     def record(self, memory: Memory, step: HermiteStep) -> Memory:
@@ -170,13 +170,13 @@ class Delay:
         first, count = _ring_place(m.first + over, size), m.count - over
         rows = m.ring.read(_ring_place(first.astype(int) + jnp.arange(WINDOW_PIECES), size))
         window = jnp.where(count < size, rows, jnp.nan)  # else the ring has overwritten a piece that has not left yet
-        known, none = jnp.minimum(count, WINDOW_PIECES), jnp.zeros_like(count)
-        new = self._aim_at_break(DelayMemory(m.ring, window, known, none, none, none, first, count, m.newest))
+        valid, none = jnp.minimum(count, WINDOW_PIECES), jnp.zeros_like(count)
+        new = self._aim_at_break(DelayMemory(m.ring, window, valid, none, none, none, first, count, m.newest))
         return memory._replace(held=self._at_once(new, clock.t))
 
     def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
         """Return the memory after the breaks that leave the delay at time t or earlier."""
-        out = (m.last + 1 < m.known) & (m.until + self.time <= t)
+        out = (m.last + 1 < m.valid) & (m.until + self.time <= t)
         return self._aim_at_break(m._replace(place=jnp.where(out, m.last + 1, m.place)))
 
     def enable_derivatives(self, names: set[str]) -> "Delay":
@@ -192,14 +192,14 @@ class Delay:
 
     def _aim_at_break(self, m: DelayMemory) -> DelayMemory:
         """Return the memory with `last` and `until` set for the present `place`."""
-        last = m.known - 1
+        last = m.valid - 1
         for i in reversed(range(1, WINDOW_PIECES)):
-            last = jnp.where((i > m.place) & (i < m.known) & (m.window[i, -1] > 0.5), i - 1.0, last)
-        breaks = last + 1 < m.known
+            last = jnp.where((i > m.place) & (i < m.valid) & (m.window[i, -1] > 0.5), i - 1.0, last)
+        breaks = last + 1 < m.valid
         until = jnp.where(breaks, _piece(m.window, last + 1).start, _piece(m.window, last).end)
         # The event comes a rounding before the grid instant: on the grid its time would lose its derivatives. If the
         # newest piece limits the step, the event comes a rounding after its end, so that it does not cut the next step.
-        newest = ~breaks & (m.known == m.count)
+        newest = ~breaks & (m.valid == m.count)
         return m._replace(last=last, until=until + jnp.where(newest, 1.0, -1.0) * _time_tolerance(until + self.time))
 
     def refined(self, times: int) -> "Delay":
@@ -232,16 +232,16 @@ class _InEvents(Delay):
         # Breaks more than a few roundings in the past have left already: when the solver repeats a step, rounding may
         # reveal a break that the first try did not see.
         m = Delay._at_once(self, m, t - 4 * _time_tolerance(t))
-        late = jnp.where(m.last + 1 < m.known, t + _time_tolerance(t) - (m.until + self.time), 0.0)
+        late = jnp.where(m.last + 1 < m.valid, t + _time_tolerance(t) - (m.until + self.time), 0.0)
         return m._replace(until=m.until + jnp.maximum(jax.lax.stop_gradient(late), 0.0))
 
 
-def find_wrong_capacity(capacity: Int, least: int, unit: str) -> Iterator[str]:
-    """Yield a message if the capacity of an actuator's memory, in `unit` (plural), is no integer >= `least`."""
+def find_wrong_capacity(capacity: Int, minimum: int, unit: str) -> Iterator[str]:
+    """Yield a message if the capacity of an actuator's memory, in `unit` (plural), is no integer >= `minimum`."""
     if not isinstance(capacity, int | np.integer) or isinstance(capacity, bool):
-        yield f"capacity = {format_value(capacity)} is no integer; one in [{least}, inf) {unit} is needed"
-    elif capacity < least:
-        yield f"capacity = {capacity} is outside [{least}, inf) {unit}"
+        yield f"capacity = {format_value(capacity)} is no integer; one in [{minimum}, inf) {unit} is needed"
+    elif capacity < minimum:
+        yield f"capacity = {capacity} is outside [{minimum}, inf) {unit}"
 
 
 def _row(piece: Piece) -> Vector:

@@ -70,11 +70,11 @@ class Cascade:
     def problems(self) -> Iterator[str]:
         """Yield a line for a controller with ticks, events or a record, or without limits."""
         for name in CASCADED:
-            one = getattr(self, name)
-            if offers(one, "tick", "margins", "record"):
+            controller = getattr(self, name)
+            if offers(controller, "tick", "margins", "record"):
                 yield (
-                    f"{name} = {type(one).__name__} computes at instants; a cascade takes controllers with a flow, such"
-                    " as PID: wrap the cascade in Sampled"
+                    f"{name} = {type(controller).__name__} computes at instants; a cascade takes controllers with a"
+                    " flow, such as PID: wrap the cascade in Sampled"
                 )
         if not hasattr(self.inner, "limits"):
             yield f"inner = {type(self.inner).__name__} has no limits(): the limits of the control are unknown"
@@ -91,8 +91,8 @@ class Cascade:
         name = _inner_name(self.inner_signal, names)
         if name not in names:
             raise ValueError(f"controller.inner_signal = {name} is no output of the plant; there is {', '.join(names)}")
-        order = (name, *(other for other in names if other != name))
-        measured = _reorder_fields(order)(*(getattr(signal.measured, one) for one in order))
+        order = (name, *(field for field in names if field != name))
+        measured = _reorder_fields(order)(*(getattr(signal.measured, field) for field in order))
         return Tracking(self.outer.output(t, outer, self._outer_signal(signal)), measured, signal.feedforward)
 
 

@@ -99,5 +99,5 @@ class PID:
         """Yield a line if the gains have different signs."""
         gains = {name: float(getattr(self, name)) for name in ("kp", "ki", "kd")}
         if min(gains.values()) < 0 < max(gains.values()):
-            given = ", ".join(f"{name} = {gain:g}" for name, gain in gains.items())
-            yield f"{given} have different signs: reverse action needs the same sign in all gains"
+            listing = ", ".join(f"{name} = {gain:g}" for name, gain in gains.items())
+            yield f"{listing} have different signs: reverse action needs the same sign in all gains"

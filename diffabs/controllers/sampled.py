@@ -228,8 +228,8 @@ def inner_controller(controller: Part) -> PyTree:
 def sampling_rules(controller: Part, delay: Scalar, period: Scalar, name: str = "controller") -> Iterator[Rule]:
     """Yield the rules that delay, the controller's own clock and its Euler steps fit the period."""
     if isinstance(controller, Cascade):
-        for one in CASCADED:
-            yield from sampling_rules(getattr(controller, one), delay, period, f"{name}.{one}")
+        for part in CASCADED:
+            yield from sampling_rules(getattr(controller, part), delay, period, f"{name}.{part}")
         return
     yield Rule(
         as_rule_array(delay) <= as_rule_array(period),

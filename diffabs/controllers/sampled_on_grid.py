@@ -89,12 +89,12 @@ class SampledOnGrid:
         over = jax.lax.stop_gradient(jnp.maximum(self.delay - (self.sampling_period - 2 * close), 0.0))
         new = GridMemory(inner, output, m.next, clock.t + self.delay - over, m.applied)
         m = jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m)
-        left = m.until - clock.t
+        remaining = m.until - clock.t
         # A change exactly on the grid belongs to the step after it, so that only one step carries its derivative.
-        within = (left >= -close) & (left < clock.h - close)
+        within = (remaining >= -close) & (remaining < clock.h - close)
         # `waits` is the step's share of the previous output. Only a change inside the step gives it a derivative.
-        fixed = jax.lax.stop_gradient(left)
-        waits = clamp(fixed / clock.h, 0.0, 1.0) + jnp.where(within, (left - fixed) / clock.h, 0.0)
+        fixed = jax.lax.stop_gradient(remaining)
+        waits = clamp(fixed / clock.h, 0.0, 1.0) + jnp.where(within, (remaining - fixed) / clock.h, 0.0)
         applied = waits * m.last + (1 - waits) * m.next
         return Memory(held=m._replace(applied=jnp.where(clock.ticks()[0], applied, m.applied)))
 

@@ -91,13 +91,13 @@ class FourPhase:
         """Return the memory in the next phase, after a hold that is over, if an event of this phase has fired."""
         del t
         phase, slip = memory.held, signal.measured[0]
-        mine = jnp.where((phase == 0) | (phase == 2), fired[0], fired[1])
+        phase_ends = jnp.where((phase == 0) | (phase == 2), fired[0], fired[1])
         reached = jnp.where(phase == 0, self.torque_high, jnp.where(phase == 2, self.torque_low, memory.flow))
         # A hold whose edge the slip has already passed would never end: no margin falls through zero.
         passed = jnp.where(phase == 0, slip >= self.slip_high, (phase == 2) & (slip <= self.slip_low))
         following = phase + jnp.where(passed, 2.0, 1.0)
         following = jnp.where(following > 3, 0.0, following)
-        return Memory(jnp.where(mine, reached, memory.flow), jnp.where(mine, following, phase))
+        return Memory(jnp.where(phase_ends, reached, memory.flow), jnp.where(phase_ends, following, phase))
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rules torque_low < torque_high and slip_low < slip_high."""

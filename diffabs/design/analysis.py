@@ -91,8 +91,8 @@ class _Analysis:
         self.frame = analysis_frame(self.closed, discrete=self.discrete)
         # Entries of A and B may be off by 2^-40, so no proof goes below: a deadbeat loop has a rate that is finite.
         terms = np.abs(system.A) + np.abs(system.B) @ np.abs(k)
-        known = 2.0 ** (2 - RELATIVE_ERROR_BITS) * np.abs(np.linalg.eigvals(terms)).max()
-        self.least_factor = max(known, np.finfo(float).tiny)
+        error_bound = 2.0 ** (2 - RELATIVE_ERROR_BITS) * np.abs(np.linalg.eigvals(terms)).max()
+        self.least_factor = max(error_bound, np.finfo(float).tiny)
 
     def claims(self, fastest: bool) -> Iterator[Claim]:
         """Yield the claims whose proof succeeds; `fastest` asks for the largest decay rate."""
@@ -104,28 +104,28 @@ class _Analysis:
         yield from (claim for claim in (stable, cost) if claim is not None)
         if stable is None or stable.kind in DISPROOF_KINDS:
             return
-        for wanted, find in ((spec.damping, bounds.damping), (spec.l2, bounds.l2), (spec.input, bounds.input)):
-            claim = find() if wanted else None
+        for requirement, find in ((spec.damping, bounds.damping), (spec.l2, bounds.l2), (spec.input, bounds.input)):
+            claim = find() if requirement else None
             if claim is not None:
                 yield claim
 
     # quadratic stability, decay, and their impossibility
 
     def _stability(self, fastest: bool) -> Claim | None:
-        asked = self.spec.decay
+        decay = self.spec.decay
         if unstable := self._refute_by_vertex():
             return unstable
         for _ in range(MAX_FRAMES):
-            p, margin, w = self._common(asked)
+            p, margin, w = self._common(decay)
             if p is None:
                 break
             if margin > 0:
-                found = self._decay_claim(p, asked)
-                if found is not None:
-                    return self._fastest_decay_claim(found) if fastest else found
+                stable = self._decay_claim(p, decay)
+                if stable is not None:
+                    return self._fastest_decay_claim(stable) if fastest else stable
             # For any sign of the margin: without a common P the optimum is P = 0, with a margin of 0 up to
             # rounding.
-            claim = Claim("infeasible", {"W": w, **self._rate_data(asked)})
+            claim = Claim("infeasible", {"W": w, **self._rate_data(decay)})
             if np.isfinite(w).all() and self._verify_claim(claim):
                 return claim
             try:
@@ -134,7 +134,7 @@ class _Analysis:
                 self.frame = lyapunov_frame(p, self.closed, np.eye(1), discrete=self.discrete)
             except np.linalg.LinAlgError:
                 break
-        return self._refute_by_pair(asked)
+        return self._refute_by_pair(decay)
 
     def _refute_by_vertex(self) -> Claim | None:
         """Return a proof that one vertex is unstable, or None."""
@@ -145,9 +145,9 @@ class _Analysis:
                     return claim
         return None
 
-    def _refute_by_pair(self, asked: float) -> Claim | None:
+    def _refute_by_pair(self, decay: float) -> Claim | None:
         """Return a proof of infeasibility from two vertices whose multipliers need no solver, or None."""
-        rate, scaled = self._rate_data(asked), self.frame.states(self.closed) * self.frame.tau
+        rate, scaled = self._rate_data(decay), self.frame.states(self.closed) * self.frame.tau
         t, factor = self.frame.T, rate.get("factor")
         for w in pairs.witnesses(scaled + rate.get("rate", 0.0) * np.eye(self.system.order), factor):
             w = he(t @ w @ t.T)
@@ -166,14 +166,16 @@ class _Analysis:
         # vertices.
         sizes = np.linalg.norm(scaled, axis=(1, 2))
         sizes += 1.0 if self.discrete else sizes == 0
-        one = np.eye(n)
+        identity = np.eye(n)
         decreases = [
             unknowns.affine(
-                lambda v, c=c, s=s: decrease_matrix(v["P"], c, rate * step, discrete=self.discrete) / s - v["t"] * one
+                lambda v, c=c, s=s: (
+                    decrease_matrix(v["P"], c, rate * step, discrete=self.discrete) / s - v["t"] * identity
+                )
             )
             for c, s in zip(scaled, sizes, strict=True)
         ]
-        positive = unknowns.affine(lambda v: v["P"] - v["t"] * one)
+        positive = unknowns.affine(lambda v: v["P"] - v["t"] * identity)
         # The inequalities are homogeneous in P: without the bound on its trace the margin t would have no maximum.
         total = unknowns.affine(lambda v: (1 - np.trace(v["P"], axis1=-2, axis2=-1) / n)[:, None, None])
         answer = solver.solve_sdp(unknowns.row(lambda v: -v["t"]), [solver.stack_blocks([*decreases, positive]), total])
@@ -184,12 +186,12 @@ class _Analysis:
         w = answer.multipliers[0][:-1]
         w = (w + np.swapaxes(w, 1, 2)) / 2
         # Moved off the boundary of the cone: rounding could make them indefinite there.
-        w = w / np.trace(w.sum(axis=0)) + 1e-9 * one
+        w = w / np.trace(w.sum(axis=0)) + 1e-9 * identity
         t = self.frame.T
         w = t @ w @ t.T / sizes[:, None, None]
         return self.frame.form(values["P"]), float(values["t"][0, 0]), he(w) / np.abs(w).max()
 
-    def _decay_claim(self, p: np.ndarray, asked: float) -> Claim | None:
+    def _decay_claim(self, p: np.ndarray, specified: float) -> Claim | None:
         """Return the proved claim with the largest rate of this P, or None if that rate is below the specified one."""
         best = self._proved_rate(p)
         if best == -math.inf:
@@ -197,11 +199,11 @@ class _Analysis:
         for loosening in BOUND_LOOSENINGS:
             # At the best rate the inequality is singular, and no proof of a strict inequality succeeds: step back from
             # it.
-            rate = best - loosening * (abs(best) + asked)
-            claim = Claim("decay", {"P": p, **self._rate_data(max(rate, asked))})
+            rate = best - loosening * (abs(best) + specified)
+            claim = Claim("decay", {"P": p, **self._rate_data(max(rate, specified))})
             if self._verify_claim(claim):
                 return claim
-            if rate <= asked:
+            if rate <= specified:
                 return None
         return None
 
@@ -239,8 +241,8 @@ class _Analysis:
         root = np.linalg.inv(np.linalg.cholesky(w.sum(axis=0)))
         if self.discrete:
             spread = (self.closed @ w @ np.swapaxes(self.closed, 1, 2)).sum(axis=0)
-            least = np.linalg.eigvalsh(root @ spread @ root.T)[0]
-            return self._rate_of_factor(least) / 2
+            factor = np.linalg.eigvalsh(root @ spread @ root.T)[0]
+            return self._rate_of_factor(factor) / 2
         return -float(np.linalg.eigvalsh(root @ he(self.closed @ w).sum(axis=0) @ root.T)[0]) / 2
 
     def _proved_rate(self, p: np.ndarray) -> float:

@@ -114,8 +114,8 @@ class _Ellipsoids(NamedTuple):
     def own(self, number: Scalar) -> Matrix:
         """Return R and the instability flag of run `number`."""
         # An empty slot of a packed batch has a number beyond the last run.
-        mine = self.system[jnp.minimum(number, len(self.system) - 1)]
-        return self.roots[mine], self.hopeless[mine]
+        system = self.system[jnp.minimum(number, len(self.system) - 1)]
+        return self.roots[system], self.hopeless[system]
 
     def has_reached(self, data: PyTree, output: PyTree) -> Scalar:
         """Return whether a run is inside its ellipsoid, with a margin, or unstable."""
@@ -210,8 +210,8 @@ def region_of_attraction(
     """
     grid = np.meshgrid(first.centres, second.centres, indexing="ij")
     starts = {path: axis.ravel() for path, axis in zip(paths, grid, strict=True)}
-    found = classify_starts(loop, starts, solver, band=band, key=key, engine=engine)
-    return Basin(first, second, Outcomes(*(column.reshape(grid[0].shape) for column in found)))
+    outcomes = classify_starts(loop, starts, solver, band=band, key=key, engine=engine)
+    return Basin(first, second, Outcomes(*(column.reshape(grid[0].shape) for column in outcomes)))
 
 
 def largest_recovered_multiples(
@@ -237,12 +237,12 @@ def largest_recovered_multiples(
     rows, count = _read_columns("rows", rows)
     runs = {path: np.repeat(column, len(multiples), axis=0) for path, column in rows.items()}
     runs |= {path: np.tile(value * multiples, count) for path, value in direction.items()}
-    found = classify_starts(loop, runs, solver, engine=engine)
-    fine, open_ = (x.reshape(count, -1) for x in (found.recovered, found.undecided))
+    outcomes = classify_starts(loop, runs, solver, engine=engine)
+    recovered, open_ = (x.reshape(count, -1) for x in (outcomes.recovered, outcomes.undecided))
     # argmin of booleans is the index of the first failure.
-    good = np.where(fine.all(axis=1), len(multiples), np.argmin(fine, axis=1))
-    known = np.concatenate([[0.0], multiples])
-    return [Reach(float(known[g]), bool(g < len(multiples) and row[g])) for g, row in zip(good, open_, strict=True)]
+    good = np.where(recovered.all(axis=1), len(multiples), np.argmin(recovered, axis=1))
+    reached = np.concatenate([[0.0], multiples])
+    return [Reach(float(reached[g]), bool(g < len(multiples) and row[g])) for g, row in zip(good, open_, strict=True)]
 
 
 def recoverable_multiple(
@@ -273,11 +273,11 @@ def recoverable_multiple(
     while high - low > MULTIPLE_TOLERANCE * high:
         tried = np.linspace(low, high, SEARCH_POINTS + 1)[1:]
         starts = {path: value * tried for path, value in direction.items()}
-        found = _classify_starts(loop, starts, solver, inside, enough, key, engine)
-        good = SEARCH_POINTS if found.recovered.all() else int(np.argmin(found.recovered))
+        outcomes = _classify_starts(loop, starts, solver, inside, enough, key, engine)
+        good = SEARCH_POINTS if outcomes.recovered.all() else int(np.argmin(outcomes.recovered))
         if good == SEARCH_POINTS:
             return Reach(high, undecided)
-        low, high, undecided = (tried[good - 1] if good else low), float(tried[good]), bool(found.undecided[good])
+        low, high, undecided = (tried[good - 1] if good else low), float(tried[good]), bool(outcomes.undecided[good])
         if high < 1e-9 * most:
             return Reach(0.0, undecided)
     return Reach(float(low), undecided)
@@ -296,15 +296,15 @@ def _find_ellipsoids(
         if not 0 < band < np.inf:
             raise ValueError(f"band = {band:g} is outside (0, inf)")
         return _Ellipsoids(np.eye(6)[None] / band, np.zeros(1, bool), np.zeros(count, int)), None
-    own = [column.reshape(count, -1) for path, column in starts.items() if not path.startswith(INITIAL_PREFIX)]
+    columns = [column.reshape(count, -1) for path, column in starts.items() if not path.startswith(INITIAL_PREFIX)]
     first, system = np.zeros(1, int), np.zeros(count, int)
-    if own:
+    if columns:
         # One ellipsoid for each distinct row of values: `first` is a representative, `system` maps runs to rows.
-        _, first, system = np.unique(np.concatenate(own, axis=1), axis=0, return_index=True, return_inverse=True)
+        _, first, system = np.unique(np.concatenate(columns, axis=1), axis=0, return_index=True, return_inverse=True)
     shapes, unstable = capture_ellipsoids(loop, {path: column[first] for path, column in starts.items()})
-    known = np.isfinite(shapes[:, 0, 0])
+    finite = np.isfinite(shapes[:, 0, 0])
     roots = np.full_like(shapes, np.inf)
     # S = R'R. An unknown ellipsoid keeps R = inf, so that |R x| <= 1 is false everywhere.
-    roots[known] = np.swapaxes(np.linalg.cholesky(shapes[known]), 1, 2)
-    found = _Ellipsoids(roots, unstable, system.reshape(-1))
-    return found, found
+    roots[finite] = np.swapaxes(np.linalg.cholesky(shapes[finite]), 1, 2)
+    ellipsoids = _Ellipsoids(roots, unstable, system.reshape(-1))
+    return ellipsoids, ellipsoids

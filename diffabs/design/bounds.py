@@ -86,10 +86,10 @@ class Bounds:
         # a state.
         weight = weight + 1e-9 * np.trace(weight) * np.eye(len(weight))
         at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
-        given = None if l2.disturbance is None else at.inverse @ l2.disturbance / math.sqrt(at.tau)
+        input_matrix = None if l2.disturbance is None else at.inverse @ l2.disturbance / math.sqrt(at.tau)
 
         def gain_inequalities(v: Scalar, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
-            e = at.inverse @ b / math.sqrt(at.tau) if given is None else given
+            e = at.inverse @ b / math.sqrt(at.tau) if input_matrix is None else input_matrix
             limit = v["g"] * np.eye(e.shape[1])
             # 1e-10 keeps the answer strictly inside the inequality that the exact proof requires.
             top = decrease_matrix(v["P"], c, 0.0, discrete=self.discrete) - at.weight(z.T @ z) - 1e-10 * np.eye(len(c))

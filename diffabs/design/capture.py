@@ -71,14 +71,14 @@ class CaptureEllipsoids(NamedTuple):
 def capture_ellipsoids(loop: Loop, values: Params) -> CaptureEllipsoids:
     """Return the capture ellipsoids of loops of a balance that differ in `values` by path, each of shape (n, ...)."""
     systems = _build_closed_loops(loop, values)
-    found = CaptureEllipsoids(np.full_like(systems.closed, np.inf), np.zeros(len(systems.closed), bool))
-    known = np.flatnonzero(np.isfinite(systems.closed).all(axis=(1, 2)))
-    if len(known):
-        slowest = -np.linalg.eigvals(systems.closed[known]).real.max(axis=-1)
+    ellipsoids = CaptureEllipsoids(np.full_like(systems.closed, np.inf), np.zeros(len(systems.closed), bool))
+    finite = np.flatnonzero(np.isfinite(systems.closed).all(axis=(1, 2)))
+    if len(finite):
+        slowest = -np.linalg.eigvals(systems.closed[finite]).real.max(axis=-1)
         # A pole within rounding of the imaginary axis counts neither as stable nor as unstable.
-        found.unstable[known] = slowest < -MIN_GROWTH_RATE
-        found.shapes[known] = _largest_ellipsoids(jax.tree.map(lambda x: x[known], systems), slowest)
-    return found
+        ellipsoids.unstable[finite] = slowest < -MIN_GROWTH_RATE
+        ellipsoids.shapes[finite] = _largest_ellipsoids(jax.tree.map(lambda x: x[finite], systems), slowest)
+    return ellipsoids
 
 
 def _largest_ellipsoids(systems: _ClosedLoops, slowest: np.ndarray) -> np.ndarray:
@@ -90,12 +90,12 @@ def _largest_ellipsoids(systems: _ClosedLoops, slowest: np.ndarray) -> np.ndarra
             for arm in ARM_WEIGHT_FRACTIONS:
                 # K'K/U^2 on the right makes the ellipsoid narrow in the direction in which the voltage saturates.
                 side = np.diag([1.0, arm, 1.0, 1.0, arm, 1.0]) * size + _square(systems.gain)
-                found = _scale_to_largest_level(systems, _solve_lyapunov(systems.closed, decay * slowest, side))
-                sure = (slowest > 0) & np.isfinite(found[:, 0, 0])
+                scaled = _scale_to_largest_level(systems, _solve_lyapunov(systems.closed, decay * slowest, side))
+                sure = (slowest > 0) & np.isfinite(scaled[:, 0, 0])
                 # The volume is proportional to det(S)^(-1/2): the smallest log det S wins.
-                log = np.linalg.slogdet(np.where(sure[:, None, None], found, np.eye(6)))[1]
+                log = np.linalg.slogdet(np.where(sure[:, None, None], scaled, np.eye(6)))[1]
                 better = sure & (log < volume)
-                best[better], volume[better] = found[better], log[better]
+                best[better], volume[better] = scaled[better], log[better]
     return best
 
 
@@ -110,19 +110,19 @@ def _build_closed_loops(loop: Loop, values: Params) -> _ClosedLoops:
         a, b = jax.device_get(jax.vmap(lambda plant: BalanceModel(plant=plant).matrices())(many.plant))
         many = jax.tree.map(np.asarray, jax.device_get(many))
     gain = many.controller.gain
-    most = many.actuator.voltage_max if isinstance(loop.actuator, VoltageLimit) else np.full(len(a), np.inf)
-    asked = (gain / most[:, None])[:, None]
+    limit = many.actuator.voltage_max if isinstance(loop.actuator, VoltageLimit) else np.full(len(a), np.inf)
+    voltage = (gain / limit[:, None])[:, None]
     # Each limit is a row with |row x| <= 1: voltage, fall angle, and the plant's own limits of its motor.
     lean = (np.eye(6)[:1] / many.stop.angle[:, None])[:, None]
     return _ClosedLoops(
-        many.plant, a + b @ gain[:, None], asked, np.concatenate([asked, lean, many.plant.limits(gain)], 1)
+        many.plant, a + b @ gain[:, None], voltage, np.concatenate([voltage, lean, many.plant.limits(gain)], 1)
     )
 
 
 def _check_supported(loop: Loop) -> None:
     """Raise ValueError for a part outside the analysis."""
-    known = {"controller": BalanceFeedback, "sensor": Direct, "actuator": Direct | VoltageLimit, "stop": Fallen}
-    for name, kind in known.items():
+    supported = {"controller": BalanceFeedback, "sensor": Direct, "actuator": Direct | VoltageLimit, "stop": Fallen}
+    for name, kind in supported.items():
         if not isinstance(getattr(loop, name), kind):
             raise ValueError(f"no ellipsoid is known for the {name} {type(getattr(loop, name)).__name__}")
     if not hasattr(loop.plant, "remainder"):
@@ -157,8 +157,8 @@ def _scale_to_largest_level(systems: _ClosedLoops, p: np.ndarray) -> np.ndarray:
     # Bisection; the largest level that the linear limits admit is tried first, and low = high ends the search there.
     for tried in [high] + [None] * LEVEL_BISECTIONS:
         level = (low + high) / 2 if tried is None else tried
-        fine = _growth(systems, p, inverse, level) < decay
-        low, high = np.where(fine, level, low), np.where(fine, high, level)
+        admitted = _growth(systems, p, inverse, level) < decay
+        low, high = np.where(admitted, level, low), np.where(admitted, high, level)
     usable &= (decay > 0) & (low > 0)
     return np.where(usable[:, None, None], p / np.where(usable, SAFE_LEVEL_FRACTION * low, 1.0)[:, None, None], np.inf)
 

@@ -50,15 +50,15 @@ def witnesses(closed: np.ndarray, factor: float | None = None) -> Iterator[np.nd
         closed: Closed loops C, shape (vertices, n, n); in continuous time with the rate already added to the diagonal.
         factor: Factor of the decay per step in discrete time; None for continuous time.
     """
-    one = np.eye(closed.shape[-1])
+    identity = np.eye(closed.shape[-1])
     flows = closed
     if len(closed) > MAX_PAIRED_VERTICES:
         return
     try:
         # The Cayley transform maps discrete time to continuous time; W of the transformed loops returns as back W
         # back'.
-        back = one if factor is None else np.linalg.inv(closed + factor * one)
-        flows = closed if factor is None else (closed - factor * one) @ back
+        back = identity if factor is None else np.linalg.inv(closed + factor * identity)
+        flows = closed if factor is None else (closed - factor * identity) @ back
         inverses = np.linalg.inv(flows)
     except np.linalg.LinAlgError:
         return
@@ -76,12 +76,12 @@ def unstable_pairs(flows: np.ndarray, inverses: np.ndarray) -> Iterator[Pair]:
     A range lies between two neighbouring values of `singular_factors`.
     """
     sign = (-1.0) ** flows.shape[-1]  # of the determinant of a stable matrix
-    for inverse, others, products in ((False, flows, inverses), (True, inverses, flows)):
+    for inverse, partners, products in ((False, flows, inverses), (True, inverses, flows)):
         for i, j in itertools.combinations(range(len(flows)), 2):
             for low, high in itertools.pairwise(singular_factors(flows[i] @ products[j])):
                 # det M(k) keeps its sign between two singular k, so one point, the geometric mean, decides for the
                 # whole range.
-                middle = flows[i] + math.sqrt(low * high) * others[j]
+                middle = flows[i] + math.sqrt(low * high) * partners[j]
                 if high > low and sign * np.linalg.slogdet(middle)[0] < 0:
                     yield Pair(i, j, inverse, low, high)
 
@@ -111,20 +111,20 @@ def multipliers(pair: Pair, flows: np.ndarray, inverses: np.ndarray) -> np.ndarr
     both, second = each.sum(axis=0), np.tensordot(k, each, 1)
     W = np.zeros(flows.shape)
     W[pair.i], W[pair.j] = both, D @ second @ D.T if pair.inverse else second
-    # The factor keeps the sum over the vertices positive definite; inf makes the share of the others 0.
-    others, total = np.setdiff1d(np.arange(len(flows)), (pair.i, pair.j)), W.sum(axis=0)
-    W[others] = (
+    # The factor keeps the sum over the vertices positive definite; inf makes the share of the unpaired 0.
+    unpaired, total = np.setdiff1d(np.arange(len(flows)), (pair.i, pair.j)), W.sum(axis=0)
+    W[unpaired] = (
         OTHERS_SHARE
-        / max(1.0, least_dominating_factor(he(flows @ W).sum(axis=0), he(flows[others] @ total).sum(axis=0)))
+        / max(1.0, least_dominating_factor(he(flows @ W).sum(axis=0), he(flows[unpaired] @ total).sum(axis=0)))
         * total
     )
     return W
 
 
-def least_dominating_factor(strength: np.ndarray, taken: np.ndarray) -> float:
-    """Return the smallest c for which c strength + taken >= 0; inf if `strength` is not positive definite."""
+def least_dominating_factor(strength: np.ndarray, deficit: np.ndarray) -> float:
+    """Return the smallest c for which c strength + deficit >= 0; inf if `strength` is not positive definite."""
     try:
         root = np.linalg.inv(np.linalg.cholesky(strength))
     except np.linalg.LinAlgError:
         return np.inf
-    return -float(np.linalg.eigvalsh(root @ taken @ root.T)[0])
+    return -float(np.linalg.eigvalsh(root @ deficit @ root.T)[0])

@@ -97,8 +97,8 @@ def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9,
         )
     box = np.array([[low[path], high[path]] for path in free]).reshape(-1, 2)
     data, corners, model = evaluate_grid(model, over, 2)
-    rows, kept, coverage = _cover_box(model, free, box, data, grid, most)
-    labels = tuple(corners[i] for i in kept)
+    rows, spanning, coverage = _cover_box(model, free, box, data, grid, most)
+    labels = tuple(corners[i] for i in spanning)
     return Polytope(*data._replace(rows=rows).matrices, model.period, tuple(model.states), labels, coverage)
 
 
@@ -140,13 +140,13 @@ def _require_scipy() -> None:
 
 def check_box_bounds(model: Part, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
     """Return the low and the high end of every interval by path, after a check of each."""
-    known = {path: value for path, _, value in parameters(model)}
+    values = {path: value for path, _, value in parameters(model)}
     for path, ends in over.items():
-        if path not in known:
-            near = difflib.get_close_matches(path, known, 3, 0.4) or known
+        if path not in values:
+            near = difflib.get_close_matches(path, values, 3, 0.4) or values
             raise ValueError(f"over: the model has no parameter '{path}'; there is {', '.join(near)}")
-        if np.ndim(known[path]):
-            raise ValueError(f"over: {path} is an array of shape {np.shape(known[path])}, not a number")
+        if np.ndim(values[path]):
+            raise ValueError(f"over: {path} is an array of shape {np.shape(values[path])}, not a number")
         if np.shape(ends) != (2,):
             raise ValueError(f"over: {path} = {ends} is not an interval (low, high)")
         if ends[0] > ends[1]:
@@ -197,37 +197,37 @@ def evaluate_grid(
     return evaluate_systems(model, free, grid), labels, model
 
 
-def _points(box: np.ndarray, grid: int, most: int, seed: int) -> np.ndarray:
+def _points(box: np.ndarray, grid: int, limit: int, seed: int) -> np.ndarray:
     """Return a grid over the box and random points in it, shape (points, k)."""
     k = len(box)
-    count = max(2, min(grid, int(most ** (1 / k) + 1e-9)))
+    count = max(2, min(grid, int(limit ** (1 / k) + 1e-9)))
     axes = [np.linspace(low, high, count) for low, high in box]
-    on_grid = itertools.islice(itertools.product(*axes), most)
+    on_grid = itertools.islice(itertools.product(*axes), limit)
     random = np.random.default_rng(seed).uniform(box[:, 0], box[:, 1], (RANDOM_POINTS, k))
     return np.concatenate([np.array(list(on_grid)), random])
 
 
 def _cover_box(
-    model: Part, free: tuple[str, ...], box: np.ndarray, corners: _SystemRows, grid: int, most: int
+    model: Part, free: tuple[str, ...], box: np.ndarray, corners: _SystemRows, grid: int, limit: int
 ) -> tuple[np.ndarray, Sequence[int], Coverage]:
     """Return the vertices as rows, their corner numbers, and the coverage."""
     if not free:
         return corners.rows, [0], Coverage(1, 0.0, 1.0)
-    seen, hull = corners.rows, None
+    points, hull = corners.rows, None
     for i in range(MAX_COVER_ROUNDS):
         # The seed differs in each round, so that the random points of the last round are new to the hull.
-        new = evaluate_systems(model, free, _points(box, (grid - 1) * 2 ** min(i, 1) + 1, most, i)).rows
-        seen, reach = np.concatenate([seen, new]), hull.reach(new)[0] if hull else 1.0
+        new = evaluate_systems(model, free, _points(box, (grid - 1) * 2 ** min(i, 1) + 1, limit, i)).rows
+        points, reach = np.concatenate([points, new]), hull.reach(new)[0] if hull else 1.0
         if hull and reach <= 1 + GAUGE_TOLERANCE:
             break
         # The excess that this check finds beyond the last hull is added once more, as a margin for the systems between
         # its points.
-        hull = _Hull.around(corners.rows, seen, reach if np.isfinite(reach) else 1.0)
+        hull = _Hull.around(corners.rows, points, reach if np.isfinite(reach) else 1.0)
     assert hull is not None
-    furthest, checked = hull.reach(seen)
-    kept = [] if hull.box else _extreme_points(hull.vertices)
-    rows = hull.rows if hull.box else hull.rows[kept]
-    return rows, kept, Coverage(checked, float(furthest), float(hull.spread))
+    furthest, checked = hull.reach(points)
+    spanning = [] if hull.box else _extreme_points(hull.vertices)
+    rows = hull.rows if hull.box else hull.rows[spanning]
+    return rows, spanning, Coverage(checked, float(furthest), float(hull.spread))
 
 
 class _PlaneCoordinates(NamedTuple):
@@ -270,10 +270,10 @@ class _Hull(NamedTuple):
     box: bool
 
     @classmethod
-    def around(cls, corners: np.ndarray, seen: np.ndarray, margin: float) -> "_Hull":
+    def around(cls, corners: np.ndarray, points: np.ndarray, margin: float) -> "_Hull":
         """Return the corners, spread by up to MAX_CORNER_SPREAD to cover all rows, or else a box."""
-        frame = _PlaneCoordinates.of(seen)
-        v, x = frame.to_plane(corners), frame.to_plane(seen)
+        frame = _PlaneCoordinates.of(points)
+        v, x = frame.to_plane(corners), frame.to_plane(points)
         needed = _largest_gauge(v, x)[0]
         spread = 1.0 if needed <= 1 + GAUGE_TOLERANCE else needed * margin * (1 + GAUGE_TOLERANCE)
         count = 2 ** len(frame.half)

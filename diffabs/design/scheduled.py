@@ -71,7 +71,7 @@ def gains_at_nodes(gain: AnyArray, system: Schedule) -> np.ndarray:
         return np.repeat(as_gain_matrix(gain, shape)[None], len(system.nodes), axis=0)
     if len(gain) != len(system.nodes):
         raise ValueError(f"the gain has {len(gain)} rows of a table; the schedule has {len(system.nodes)} nodes")
-    return np.array([as_gain_matrix(one, shape) for one in gain])
+    return np.array([as_gain_matrix(matrix, shape) for matrix in gain])
 
 
 def _find_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:

@@ -91,8 +91,8 @@ class Spec:
                 "Q": as_weight_matrix("Q", self.Q, order, definite=False),
                 "R": as_weight_matrix("R", self.R, inputs, definite=True),
             }
-        most = math.inf if period is None else MAX_STEP_DECAY / period
-        _check_number("decay", self.decay, dataclasses.replace(DECAY_RANGE, high=most))
+        fastest = math.inf if period is None else MAX_STEP_DECAY / period
+        _check_number("decay", self.decay, dataclasses.replace(DECAY_RANGE, high=fastest))
         _check_number("damping", self.damping, DAMPING_RANGE)
         if self.damping and period is not None:
             raise ValueError(f"damping = {self.damping:g} needs continuous time; the system's period is {period:g} s")

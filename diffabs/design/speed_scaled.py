@@ -69,6 +69,6 @@ def _matrices(scaled: SpeedScaled, torques: tuple[bool, ...]) -> StateSpace:
     torque = jnp.array(torques)
     size = scaled.model.speed / scaled.reference_speed
     s = jnp.where(torque, size, 1.0)
-    # left = D S^-1 as a vector: only the torques are scaled.
-    left = jnp.where(torque, 1 + scaled.fall, 1.0) / s
-    return StateSpace(left[:, None] * a * s, left[:, None] * b * size)
+    # gain = D S^-1 as a vector: only the torques are scaled.
+    gain = jnp.where(torque, 1 + scaled.fall, 1.0) / s
+    return StateSpace(gain[:, None] * a * s, gain[:, None] * b * size)

@@ -112,10 +112,10 @@ def design(system: Polytope | Schedule, spec: Spec) -> Design:
         for frame, bound in itertools.islice(_frames(whole, spec), FRAMES_PER_SOLVER):
             # The cost of a schedule is a mean over its nodes, which the largest Riccati trace does not bound.
             lower = bound if spec.Q is not None and isinstance(system, Polytope) else None
-            found, trouble = _attempt(system, whole, spec, frame, solver, lower)
+            candidate, trouble = _attempt(system, whole, spec, frame, solver, lower)
             attempts.append(f"{solver}: {trouble or 'passed'}")
-            if found is not None and not trouble:
-                return found
+            if candidate is not None and not trouble:
+                return candidate
     raise DesignError("no gain passes its checks. " + "; ".join(dict.fromkeys(attempts)))
 
 
@@ -177,46 +177,50 @@ def _attempt(
     gain = gains[0] if isinstance(system, Polytope) else gains
     proof = certify(gain, system, spec, fastest=False)
     cost = None if spec.Q is None else value * program.scale
-    found = Design(gain, proof, cost, lower, gap, residual)
-    return found, _rejection_reason(found, spec, isinstance(system, Schedule))
+    candidate = Design(gain, proof, cost, lower, gap, residual)
+    return candidate, _rejection_reason(candidate, spec, isinstance(system, Schedule))
 
 
 def _residual(system: Polytope, k: np.ndarray, p: np.ndarray, spec: Spec) -> float:
     """Return the largest eigenvalue of the Riccati inequality (29) over the vertices, relative to Q + K'RK."""
     closed, weight = system.closed_loop(k), spec.Q + k.T @ spec.R @ k
     discrete = system.period is not None
-    left = weight + (np.swapaxes(closed, 1, 2) @ p @ closed - p if discrete else he(p @ closed))
+    inequality = weight + (np.swapaxes(closed, 1, 2) @ p @ closed - p if discrete else he(p @ closed))
     # Evaluated in the coordinates of P = I, where the solver worked.
     root = np.linalg.inv(np.linalg.cholesky(p)).T
-    return float(np.linalg.eigvalsh(root.T @ left @ root).max() / np.linalg.eigvalsh(root.T @ weight @ root).max())
+    return float(
+        np.linalg.eigvalsh(root.T @ inequality @ root).max() / np.linalg.eigvalsh(root.T @ weight @ root).max()
+    )
 
 
-def _rejection_reason(found: Design, spec: Spec, scheduled: bool) -> str:
+def _rejection_reason(candidate: Design, spec: Spec, scheduled: bool) -> str:
     """Return the reason to reject a design; empty if it passes all checks."""
-    proof = found.certificate
+    proof = candidate.certificate
     missing = {kind for name, kind in CLAIM_OF_SPECIFICATION.items() if _is_specified(getattr(spec, name))}
     missing -= {claim.kind for claim in proof.claims}
     if scheduled:  # a claim of kind "scheduled" may hold a decay or a cost
         missing -= {"decay"} if (proof.decay_rate or 0.0) >= spec.decay else set()
         missing -= {"cost"} if proof.guaranteed_cost is not None else set()
     if missing or not proof.verified_exactly:
-        return f"gain {found.gain.tolist()}: not proved: {', '.join(sorted(missing)) or 'its claims'}"
+        return f"gain {candidate.gain.tolist()}: not proved: {', '.join(sorted(missing)) or 'its claims'}"
     # `certify` proves the least bounds that it can, not those of the specification.
     bound, l2_gain = spec.l2 and spec.l2.bound, proof.l2_gain
     if bound is not None and l2_gain is not None and l2_gain > bound:
-        return f"gain {found.gain.tolist()}: L2 gain {l2_gain:.10g} is above its bound {bound:.10g}"
+        return f"gain {candidate.gain.tolist()}: L2 gain {l2_gain:.10g} is above its bound {bound:.10g}"
     allowed, limit = spec.input and spec.input.limit, proof.input_limit
     if allowed is not None and limit is not None and np.any(limit > allowed):
-        return f"gain {found.gain.tolist()}: inputs within {limit.tolist()}, not within {np.asarray(allowed).tolist()}"
-    cost, lower, guaranteed = found.trace_cost, found.lower_bound, proof.guaranteed_cost
+        return (
+            f"gain {candidate.gain.tolist()}: inputs within {limit.tolist()}, not within {np.asarray(allowed).tolist()}"
+        )
+    cost, lower, guaranteed = candidate.trace_cost, candidate.lower_bound, proof.guaranteed_cost
     if cost is not None and lower is not None and cost < lower * (1 - GAP):
         return f"cost {cost:.10g} is below its lower bound {lower:.10g}"
     # The proof minimises the cost for the gain alone: a larger value shows that the solver's X is inaccurate.
     if cost is not None and guaranteed is not None and not scheduled and guaranteed > cost * (1 + 10 * GAP):
         return f"the gain guarantees {guaranteed:.10g}, not the cost {cost:.10g}"
     # Where Q + K'RK is singular, the last digits of the multipliers leave a gap of some 3e-6.
-    if not found.gap <= (ROUGH_GAP if scheduled or spec.Q is None or proof.period is not None else 10 * GAP):
-        return f"the answer may be {found.gap:.2g} (relative) above the optimum"
+    if not candidate.gap <= (ROUGH_GAP if scheduled or spec.Q is None or proof.period is not None else 10 * GAP):
+        return f"the answer may be {candidate.gap:.2g} (relative) above the optimum"
     return ""
 
 

@@ -107,7 +107,7 @@ def verify_file(path: str | os.PathLike[str], seconds: float = MAX_SECONDS) -> l
     A file that is not decided within `seconds` is refused with ValueError.
     """
     # A context variable carries the deadline through the recursion, and keeps calls in other threads apart.
-    given = _deadline.set((time.monotonic() + seconds, seconds))
+    token = _deadline.set((time.monotonic() + seconds, seconds))
     try:
         stored = _certificate_from_json(_read_json(pathlib.Path(path)))
         return [
@@ -121,7 +121,7 @@ def verify_file(path: str | os.PathLike[str], seconds: float = MAX_SECONDS) -> l
     except OverflowError:
         raise ValueError("has numbers whose sum is beyond the largest double") from None
     finally:
-        _deadline.reset(given)
+        _deadline.reset(token)
 
 
 def _check_time() -> None:
@@ -161,10 +161,10 @@ def _reject_constant(word: str) -> Any:
 
 
 def _reject_duplicate_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    members = dict(pairs)
+    if len(members) != len(pairs):
         raise ValueError(f"a name comes twice among {', '.join(name for name, _ in pairs)[:200]}")
-    return found
+    return members
 
 
 def _certificate_from_json(value: Any) -> StoredCertificate:
@@ -226,18 +226,20 @@ def _read_claim(
     for name in sorted((set(data) - set(fields)) | (needed - set(data))):
         word = "not a field of" if name in data else "missing in"
         raise ValueError(f"{where}.data.{name} is {word} a claim of kind {kind}")
-    found, own = {}, dict(sizes)
-    for name, given in data.items():
-        shapes = [shape for shape in fields[name].split("|") if len(shape) == _depth(given)]
-        found[name] = _read_tensor(given, (shapes or fields[name].split("|"))[0], own, f"{where}.data.{name}")
+    tensors, letter_sizes = {}, dict(sizes)
+    for name, entry in data.items():
+        shapes = [shape for shape in fields[name].split("|") if len(shape) == _depth(entry)]
+        tensors[name] = _read_tensor(
+            entry, (shapes or fields[name].split("|"))[0], letter_sizes, f"{where}.data.{name}"
+        )
         says, holds = FIELD_RANGES.get(name, ("", lambda _: True))
-        if kind not in DISPROOF_KINDS and not holds(found[name]):
+        if kind not in DISPROOF_KINDS and not holds(tensors[name]):
             raise ValueError(f"{where}.data.{name} is outside {says}")
-    if kind == "unstable" and found["vertex"] not in range(sizes["V"]):
+    if kind == "unstable" and tensors["vertex"] not in range(sizes["V"]):
         raise ValueError(f"{where}.data.vertex is outside 0 to {sizes['V'] - 1}")
-    if any(x <= 0 for name, x in found.items() if name == "factor"):
+    if any(x <= 0 for name, x in tensors.items() if name == "factor"):
         raise ValueError(f"{where}.data.factor is outside (0, inf)")
-    return kind, found
+    return kind, tensors
 
 
 def _read_members(value: Any, where: str, *names: str) -> dict[str, Any]:
@@ -269,8 +271,8 @@ def _read_tensor(value: Any, letters: str, sizes: dict[str, int], where: str) ->
 
 def multiply_matrices(*factors: Matrix) -> Matrix:
     """Return the product of matrices, each product in integers over a common denominator."""
-    a, *rest = factors
-    for b in rest:
+    a, *followers = factors
+    for b in followers:
         (rows, below), (columns, under) = _integers(a), _integers(transpose_matrix(b))
         a = [[_quotient(map(operator.mul, row, column), below * under) for column in columns] for row in rows]
     return a
@@ -413,14 +415,14 @@ def _quadratic_conditions(
             # -V' - |z|^2 + gamma^2 |w|^2 as a matrix of (x, w).
             bw = d["Bw"] if isinstance(d["Bw"][0][0], Fraction) else d["Bw"][i]
             z = weighted_sum((1, d["C"]), (1, multiply_matrices(d["D"], k)))
-            rest = weighted_sum((1, falls), (-1, multiply_matrices(transpose_matrix(z), z)))
+            reserve = weighted_sum((1, falls), (-1, multiply_matrices(transpose_matrix(z), z)))
             supply = weighted_sum((d["gamma"] ** 2, identity_matrix(len(bw[0]))))
             cross = multiply_matrices(p, bw)
             if discrete:
                 cross = multiply_matrices(transpose_matrix(c), cross)
                 supply = weighted_sum((1, supply), (-1, multiply_matrices(transpose_matrix(bw), p, bw)))
-            left = bordered_matrix(rest, weighted_sum((-1, cross)), supply)
-            yield f"vertex {i}: what is left of the gain", is_positive_definite(left)
+            matrix = bordered_matrix(reserve, weighted_sum((-1, cross)), supply)
+            yield f"vertex {i}: what is left of the gain", is_positive_definite(matrix)
     if kind == "damping":
         yield "cot^2 (1 - zeta^2) - zeta^2", d["cot"] ** 2 * (1 - d["zeta"] ** 2) >= d["zeta"] ** 2
     if kind == "input":
@@ -453,9 +455,9 @@ def _schedule_conditions(d: Mapping[str, Any], stored: StoredCertificate) -> Ite
                 for x, y in ((kx, ky), (ky, kx)) if "R" in d else ():
                     spent.append((-width / 2, multiply_matrices(transpose_matrix(x), d["R"], y)))
                 for speed in d["rates"]:
-                    left = weighted_sum((1, falls), (-speed, moved))
-                    holds = is_positive_definite(left) and (
-                        not spent or is_positive_definite(weighted_sum((1, left), *spent))
+                    decrease = weighted_sum((1, falls), (-speed, moved))
+                    holds = is_positive_definite(decrease) and (
+                        not spent or is_positive_definite(weighted_sum((1, decrease), *spent))
                     )
                     yield f"cell {i}: what V falls by", holds
 

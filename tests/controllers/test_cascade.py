@@ -93,7 +93,7 @@ def cascade(**options):
     return Cascade(outer=outer, inner=inner, **options)
 
 
-@killed_by("controllers/cascade.py", "(name, *(other for", "(*names, *(other for")
+@killed_by("controllers/cascade.py", "(name, *(field for", "(*names, *(field for")
 @killed_by(
     "controllers/cascade.py",
     "zip(memory.flow, memory.held, strict=True)",

@@ -766,7 +766,7 @@ def test_gap_and_violation():
     assert answer._replace(y=np.array([0.4])).violation(blocks) > 0.02
 
 
-@killed_by("design/sdp/solver.py", " + float(np.abs(c - found) @ np.abs(self.y))", "")
+@killed_by("design/sdp/solver.py", " + float(np.abs(c - gradient) @ np.abs(self.y))", "")
 def test_a_gap_counts_what_the_multipliers_leave():
     """Multipliers that do not balance the objective prove nothing: the optimum of the toy program is 1/2."""
     unknowns = lmi.Unknowns(y=(1, 1))

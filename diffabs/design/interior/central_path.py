@@ -97,11 +97,11 @@ def follow_path(
     Args:
         onwards: Function (path, smallest shift, trace P) that returns the state with the next shift and mu.
     """
-    here = localise_problem(problem, path.point)
-    first = least_shift(here, discrete=discrete)
+    local = localise_problem(problem, path.point)
+    first = least_shift(local, discrete=discrete)
     # A Riccati solution satisfies its inequality with equality: `first` is 0 up to rounding, and the start needs a
     # margin.
-    rounding = jnp.finfo(first.dtype).eps ** 0.5 * jnp.max(jnp.abs(here.c))
+    rounding = jnp.finfo(first.dtype).eps ** 0.5 * jnp.max(jnp.abs(local.c))
     path = path._replace(shift=jnp.maximum(2 * first, 0.0) + 1e-3 * jnp.abs(first) + rounding)
 
     def goes_on(path: CentralPathState) -> Matrix:
@@ -117,8 +117,8 @@ def follow_path(
         """Return the state after a Newton step, with the next shift and mu if the step began near the centre."""
         point, decrement = _newton(problem, path, discrete=discrete)
         path = path._replace(steps=path.steps + 1, point=point, decrement=decrement)
-        here = localise_problem(problem, point)
-        after = onwards(path, least_shift(here, discrete=discrete), jnp.trace(here.w))
+        local = localise_problem(problem, point)
+        after = onwards(path, least_shift(local, discrete=discrete), jnp.trace(local.w))
         # Shift and mu change only near the centre, where the full Newton step converges quadratically.
         return jax.tree.map(lambda new, old: jnp.where(decrement < CENTRING_DECREMENT, new, old), after, path)
 
@@ -132,25 +132,25 @@ def localise_problem(problem: GuaranteedCostProblem, point: PathPoint) -> LocalP
     return LocalProblem(closed, inverse @ problem.B, point.K @ t, t.T @ problem.Q @ t, problem.R, inverse @ inverse.T)
 
 
-def least_shift(here: LocalProblem, *, discrete: bool) -> Matrix:
+def least_shift(local: LocalProblem, *, discrete: bool) -> Matrix:
     """Return the smallest s, a scalar, for which no S_i has a negative eigenvalue; <= 0 where all inequalities hold."""
     # At X = I the Schur complement of the discrete block matrix is (1 + s) I - Q - K'RK - C'C.
-    flow = _t(here.c) @ here.c - jnp.eye(len(here.q)) if discrete else he(here.c)
-    return jnp.max(jnp.linalg.eigvalsh(flow + here.q + here.k.T @ here.r @ here.k))
+    flow = _t(local.c) @ local.c - jnp.eye(len(local.q)) if discrete else he(local.c)
+    return jnp.max(jnp.linalg.eigvalsh(flow + local.q + local.k.T @ local.r @ local.k))
 
 
-def gradient_and_hessian(here: LocalProblem, shift: Scalar, mu: Scalar, *, discrete: bool) -> tuple[PyTree, PyTree]:
+def gradient_and_hessian(local: LocalProblem, shift: Scalar, mu: Scalar, *, discrete: bool) -> tuple[PyTree, PyTree]:
     """Return gradient (d,) and Hessian (d, d) of phi in (X, F) at the point itself, in the basis of `directions`."""
-    n = len(here.q)
-    y, g = directions(n, len(here.k))
-    f = here.k @ y + g
-    cost = he(here.q @ y + here.k.T @ here.r @ f)
-    inverse = jnp.linalg.inv(_slacks(here, jnp.zeros((n, n)), jnp.zeros_like(here.k), shift, discrete=discrete))
+    n = len(local.q)
+    y, g = directions(n, len(local.k))
+    f = local.k @ y + g
+    cost = he(local.q @ y + local.k.T @ local.r @ f)
+    inverse = jnp.linalg.inv(_slacks(local, jnp.zeros((n, n)), jnp.zeros_like(local.k), shift, discrete=discrete))
     # First derivatives of S_i at the point; the quadratic terms enter the Hessian through `curved`.
-    change = _linear_part(here, y, g, discrete=discrete) + _pad_to_block(shift * y - cost, n, discrete)[:, None]
-    moved, pushed, total = inverse @ change, here.w @ y, jnp.sum(inverse, 0)[:n, :n]
+    change = _linear_part(local, y, g, discrete=discrete) + _pad_to_block(shift * y - cost, n, discrete)[:, None]
+    moved, pushed, total = inverse @ change, local.w @ y, jnp.sum(inverse, 0)[:n, :n]
     gradient = -_trace(pushed) / mu - _trace(y) - jnp.sum(_trace(moved), 1)
-    curved = y @ (here.q @ y)[:, None] + _t(f) @ (here.r @ f)[:, None]
+    curved = y @ (local.q @ y)[:, None] + _t(f) @ (local.r @ f)[:, None]
     hessian = jnp.einsum("aij,bji->ab", y, y) + 2 / mu * jnp.einsum("aij,bji->ab", pushed, y)
     hessian += jnp.einsum("avij,bvji->ab", moved, moved) + 2 * jnp.einsum("ij,abji->ba", total, curved)
     return gradient, (hessian + hessian.T) / 2
@@ -178,14 +178,14 @@ def solve_newton_system(hessian: Matrix, right: Any) -> Matrix:
 
 def _newton(problem: GuaranteedCostProblem, path: CentralPathState, *, discrete: bool) -> tuple[PathPoint, PyTree]:
     """Return the point after the best of several lengths of Newton's step, and the decrement before it."""
-    here = localise_problem(problem, path.point)
-    gradient, hessian = gradient_and_hessian(here, path.shift, path.mu, discrete=discrete)
+    local = localise_problem(problem, path.point)
+    gradient, hessian = gradient_and_hessian(local, path.shift, path.mu, discrete=discrete)
     step = -solve_newton_system(hessian, gradient)
     decrement = jnp.sqrt(jnp.maximum(-gradient @ step, 0.0))
-    y, g = (jnp.tensordot(step, basis, 1) for basis in directions(len(here.q), len(here.k)))
+    y, g = (jnp.tensordot(step, basis, 1) for basis in directions(len(local.q), len(local.k)))
     # Several lengths are tried at once, without a line search: a batch under vmap needs no loop of its own.
     lengths = jnp.concatenate([1 / (1 + decrement)[None], jnp.asarray(STEP_LENGTHS)])[:, None, None]
-    values = _phi(here, lengths * y, lengths * g, path.shift, path.mu, discrete=discrete)
+    values = _phi(local, lengths * y, lengths * g, path.shift, path.mu, discrete=discrete)
     # Outside the domain logdet is NaN, and such a length is never the best.
     best = lengths[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))]
     x = jnp.eye(len(y)) + best * y
@@ -194,25 +194,27 @@ def _newton(problem: GuaranteedCostProblem, path: CentralPathState, *, discrete:
     return PathPoint(t @ jnp.linalg.cholesky(x), k + best * g @ jnp.linalg.inv(t @ x)), decrement
 
 
-def _phi(here: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, mu: Scalar, *, discrete: bool) -> Matrix:
+def _phi(local: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, mu: Scalar, *, discrete: bool) -> Matrix:
     """Return phi at changes (Y, G), or stacks of them."""
     x = jnp.eye(y.shape[-1]) + y
-    inside = logdet(_slacks(here, y, g, shift, discrete=discrete))
-    return _trace(jnp.linalg.inv(x) @ here.w) / mu - logdet(x) - jnp.sum(inside, -1)
+    inside = logdet(_slacks(local, y, g, shift, discrete=discrete))
+    return _trace(jnp.linalg.inv(x) @ local.w) / mu - logdet(x) - jnp.sum(inside, -1)
 
 
-def _slacks(here: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, *, discrete: bool) -> Matrix:
+def _slacks(local: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, *, discrete: bool) -> Matrix:
     """Return S_i (..., V, n, n), or in discrete time the block matrix (..., V, 2n, 2n) above."""
     x = jnp.eye(y.shape[-1]) + y
-    f = here.k @ x + g
-    rest = shift * x - x @ here.q @ x - _t(f) @ here.r @ f
-    return _linear_part(here, x, g, discrete=discrete) + _pad_to_block(rest, y.shape[-1], discrete)[..., None, :, :]
+    f = local.k @ x + g
+    quadratic = shift * x - x @ local.q @ x - _t(f) @ local.r @ f
+    return (
+        _linear_part(local, x, g, discrete=discrete) + _pad_to_block(quadratic, y.shape[-1], discrete)[..., None, :, :]
+    )
 
 
-def _linear_part(here: LocalProblem, x: Scalar, g: Matrix, *, discrete: bool) -> Matrix:
+def _linear_part(local: LocalProblem, x: Scalar, g: Matrix, *, discrete: bool) -> Matrix:
     """Return the part that is linear in (X, G): -He[c X + b G], or [[X, .], [c X + b G, X]]."""
     x = x[..., None, :, :]
-    flow = here.c @ x + here.b @ g[..., None, :, :]
+    flow = local.c @ x + local.b @ g[..., None, :, :]
     if not discrete:
         return -he(flow)
     x = jnp.broadcast_to(x, flow.shape)

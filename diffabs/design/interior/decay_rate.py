@@ -101,9 +101,9 @@ def _least_shift_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -> Matri
     s, T, weights = _follow_path(discrete, *primals)
     c, change = (jnp.linalg.inv(T) @ x @ T for x in (primals[0], first_order(tangents[0], NO_SECOND_DERIVATIVES)))
     # dL(I) = dC C' + C dC'; the trace with a symmetric W counts both terms, hence the factor 2 below.
-    left = change @ jnp.swapaxes(c, 1, 2) if discrete else change
+    derivative = change @ jnp.swapaxes(c, 1, 2) if discrete else change
     return s, first_order(
-        2 * jnp.sum(weights * left) / jnp.sum(jnp.trace(weights, axis1=1, axis2=2)), NO_SECOND_DERIVATIVES
+        2 * jnp.sum(weights * derivative) / jnp.sum(jnp.trace(weights, axis1=1, axis2=2)), NO_SECOND_DERIVATIVES
     )
 
 
@@ -114,10 +114,10 @@ def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree
     W is NaN if the path did not settle at an optimum; s then still satisfies the inequalities with X.
     """
     vertices, n, _ = closed.shape
-    one = jnp.eye(n, dtype=closed.dtype)
+    identity = jnp.eye(n, dtype=closed.dtype)
     units = _balancing_units(jnp.mean(jnp.abs(closed), 0))
     T, inverse = jnp.diag(units), 1 / units
-    L = _lyapunov_operator(_transform_loops(closed, T), one, discrete)
+    L = _lyapunov_operator(_transform_loops(closed, T), identity, discrete)
     size = _largest_norm(L)
     # The initial s exceeds the largest eigenvalue of all L_i(I), so that every S_i > 0.
     start = _DecayPathState(0, 0, T, jnp.max(jnp.linalg.eigvalsh(L)) + size, size / vertices / n, 0.0 * size, 0)
@@ -131,8 +131,8 @@ def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree
         scaled = inverse[:, None] * path.T
         c, m = _transform_loops(closed, path.T), scaled.T @ scaled / jnp.sum(scaled**2)
         T, s, decrement = _step(c, path, m, discrete)
-        left = _lyapunov_operator(_transform_loops(closed, T), one, discrete)
-        size = _largest_norm(left - one if discrete else left)
+        image = _lyapunov_operator(_transform_loops(closed, T), identity, discrete)
+        size = _largest_norm(image - identity if discrete else image)
         # A change ds of s changes the rate times 2 period by ds/s: near s = 0 only small ones leave the rate accurate.
         unit, size = (s * jnp.abs(jnp.log(s)), jnp.minimum(size, s)) if discrete else (jnp.abs(s), size)
         end = jnp.maximum(SHIFT_GAP * unit, ROUNDING_SHIFT_GAP * size) / (vertices + 1) / n
@@ -145,7 +145,7 @@ def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree
         return _DecayPathState(path.steps + 1, patience, T, s, mu, decrement, path.settled + (last & (decrement < 0.1)))
 
     path = lax.while_loop(goes_on, advance, start)
-    slack = path.s * one - _lyapunov_operator(_transform_loops(closed, path.T), one, discrete)
+    slack = path.s * identity - _lyapunov_operator(_transform_loops(closed, path.T), identity, discrete)
     weights = jnp.where(path.settled >= FINAL_CENTRE_STEPS, jnp.linalg.inv(slack), jnp.nan)
     # The first decrement is 0 times the size of the loops: NaN if they are not finite.
     return path.s + start.decrement, path.T, weights
@@ -155,12 +155,12 @@ def _step(c: Scalar, path: _DecayPathState, m: Scalar, discrete: bool) -> tuple[
     """Return T and s after a step, and the decrement before it, NaN if no step is possible; m = M/trace M."""
     vertices, n, _ = c.shape
     degree = (vertices + 1) * n
-    one, basis, s = jnp.eye(n, dtype=c.dtype), directions(n, 0)[0], path.s
-    weights = jnp.linalg.inv(s * one - _lyapunov_operator(c, one, discrete))
+    identity, basis, s = jnp.eye(n, dtype=c.dtype), directions(n, 0)[0], path.s
+    weights = jnp.linalg.inv(s * identity - _lyapunov_operator(c, identity, discrete))
     change = s * basis[:, None] - _lyapunov_operator(c, basis[:, None], discrete)
-    change = jnp.concatenate([change, jnp.broadcast_to(one, (1, *c.shape))])  # the last unknown is s
+    change = jnp.concatenate([change, jnp.broadcast_to(identity, (1, *c.shape))])  # the last unknown is s
     moved, x = weights @ change, jnp.concatenate([basis, jnp.zeros((1, n, n))])
-    gradient = -jnp.einsum("avii->a", moved) + jnp.einsum("ij,aij->a", degree * m - one, x)
+    gradient = -jnp.einsum("avii->a", moved) + jnp.einsum("ij,aij->a", degree * m - identity, x)
     # Left out: the cross term of s X, t <sum W_i, x>, which is 0 on the slice, and the negative curvature of
     # log trace(M X), which could make the Hessian indefinite.
     hessian = jnp.einsum("avij,bvji->ab", moved, moved) + jnp.einsum("aij,bji->ab", x, x)
@@ -169,14 +169,14 @@ def _step(c: Scalar, path: _DecayPathState, m: Scalar, discrete: bool) -> tuple[
     )
     lengths = jnp.append(jnp.asarray(STEP_LENGTHS), 1 / (1 + decrement))
     x, t = jnp.tensordot(lengths, jnp.tensordot(step[:-1], basis, 1), 0), lengths * step[-1]
-    left = _lyapunov_operator(c, (one + x)[:, None], discrete)
-    model = s * (one + x)[:, None] - left + (t[:, None, None] * one)[:, None]
+    image = _lyapunov_operator(c, (identity + x)[:, None], discrete)
+    model = s * (identity + x)[:, None] - image + (t[:, None, None] * identity)[:, None]
     # With s X in place of s X0: finite exactly where the new point satisfies the true inequality.
     admitted = logdet(model + (t[:, None, None] * x)[:, None]).sum(-1)
-    values = t / path.mu - logdet(model).sum(-1) - logdet(one + x) + degree * jnp.log1p(jnp.sum(m * x, (1, 2)))
+    values = t / path.mu - logdet(model).sum(-1) - logdet(identity + x) + degree * jnp.log1p(jnp.sum(m * x, (1, 2)))
     values = jnp.where(jnp.isfinite(values + admitted), values, jnp.inf)
     best = jnp.argmin(values)
-    possible, point = jnp.isfinite(values[best]), (path.T @ jnp.linalg.cholesky(one + x[best]), s + t[best])
+    possible, point = jnp.isfinite(values[best]), (path.T @ jnp.linalg.cholesky(identity + x[best]), s + t[best])
     # Without a possible length the path ends where it is, at the last point whose inequality holds.
     T, s = (jnp.where(possible, new, old) for new, old in zip(point, (path.T, s), strict=True))
     return T, s, jnp.where(possible, decrement, jnp.nan)
@@ -202,9 +202,9 @@ def _transform_loops(closed: Matrix, T: Matrix) -> Matrix:
     return jnp.linalg.inv(T) @ closed @ T
 
 
-def _largest_norm(left: Scalar) -> Matrix:
+def _largest_norm(matrices: Scalar) -> Matrix:
     """Return the largest of the vertices' norms; 1 if all are zero."""
-    size = jnp.max(jnp.linalg.norm(left, axis=(1, 2)))
+    size = jnp.max(jnp.linalg.norm(matrices, axis=(1, 2)))
     return jnp.where(size == 0, 1.0, size)
 
 
@@ -215,7 +215,7 @@ def _balancing_units(size: Scalar) -> Matrix:
     def sweep(_: object, d: Any) -> Matrix:
         row, column = size @ d / d, size.T @ (1 / d) * d
         # A state without coupling keeps its unit; the inner where avoids 0/0 for it.
-        fine = (row > 0) & (column > 0)
-        return d * jnp.where(fine, row / jnp.where(fine, column, 1.0), 1.0) ** 0.25
+        coupled = (row > 0) & (column > 0)
+        return d * jnp.where(coupled, row / jnp.where(coupled, column, 1.0), 1.0) ** 0.25
 
     return lax.fori_loop(0, BALANCING_SWEEPS, sweep, jnp.ones_like(size[0]))

@@ -76,9 +76,9 @@ def _solve_central_path(discrete: bool, problem: GuaranteedCostProblem) -> tuple
     path = central_path.follow_path(
         problem, _start_from_riccati(problem, discrete), _advance_parameters, discrete=discrete
     )
-    fine = (path.settled >= central_path.FINAL_CENTRE_STEPS) & (path.shift == 0)
+    solved = (path.settled >= central_path.FINAL_CENTRE_STEPS) & (path.shift == 0)
     inverse = jnp.linalg.inv(path.point.T)
-    K, P, mu = (jnp.where(fine, x, jnp.nan) for x in (path.point.K, inverse.T @ inverse, path.mu))
+    K, P, mu = (jnp.where(solved, x, jnp.nan) for x in (path.point.K, inverse.T @ inverse, path.mu))
     return K, P, mu
 
 
@@ -124,13 +124,13 @@ def _start_from_riccati(problem: GuaranteedCostProblem, discrete: bool) -> Centr
     return central_path.start_path(points.T[best], points.K[best], traces[best] + 0 * jnp.sum(shift))
 
 
-def _advance_parameters(path: CentralPathState, least: Scalar, cost: Scalar) -> CentralPathState:
+def _advance_parameters(path: CentralPathState, smallest: Scalar, cost: Scalar) -> CentralPathState:
     """Return the state with the next shift, or with the next mu once the shift is zero."""
-    found, last = path.shift == 0, path.mu <= 1.01 * FINAL_MU * cost
+    feasible, last = path.shift == 0, path.mu <= 1.01 * FINAL_MU * cost
     return path._replace(
         # As soon as the smallest shift is negative, the point is feasible without a shift.
-        shift=jnp.where(least < 0, 0.0, least + CENTRE_REDUCTION * (path.shift - least)),
-        mu=jnp.where(found & ~last, jnp.maximum(CENTRE_REDUCTION * path.mu, FINAL_MU * cost), path.mu),
-        settled=path.settled + (found & last & (path.decrement < 0.1)),
-        stuck=(least > 0) & (path.shift - least < SHIFT_TOLERANCE * least),
+        shift=jnp.where(smallest < 0, 0.0, smallest + CENTRE_REDUCTION * (path.shift - smallest)),
+        mu=jnp.where(feasible & ~last, jnp.maximum(CENTRE_REDUCTION * path.mu, FINAL_MU * cost), path.mu),
+        settled=path.settled + (feasible & last & (path.decrement < 0.1)),
+        stuck=(smallest > 0) & (path.shift - smallest < SHIFT_TOLERANCE * smallest),
     )

@@ -121,8 +121,8 @@ class Certificate:
         A vertex with a growing mode excludes such a P, whatever the others are.
         """
         # A scheduled claim with equal P at all nodes is a proof for one P.
-        one = [data["P"] for data in self.proved_data("scheduled") if (data["P"] == data["P"][0]).all()]
-        if one or any(self.proved_data(*QUADRATIC_KINDS)):
+        common = [data["P"] for data in self.proved_data("scheduled") if (data["P"] == data["P"][0]).all()]
+        if common or any(self.proved_data(*QUADRATIC_KINDS)):
             return True
         # Only a witness against the rate 0 excludes stability; a witness against a faster decay leaves it open.
         refuted = (
@@ -195,10 +195,10 @@ class Certificate:
         A margin is the smallest eigenvalue of a claim's inequality, relative to the largest eigenvalue of its terms by
         magnitude. A negative margin contradicts the claim up to rounding. Side conditions such as P > 0 do not count.
         """
-        found: dict[str, float] = {}
+        smallest: dict[str, float] = {}
         for kind, margins in self._margins:
-            found[kind] = min(found.get(kind, math.inf), *margins.values())
-        return found
+            smallest[kind] = min(smallest.get(kind, math.inf), *margins.values())
+        return smallest
 
     @property
     def worst_vertex(self) -> dict[str, PyTree] | None:
@@ -231,11 +231,11 @@ class Certificate:
             self.gain if self.gain.ndim == 3 else np.broadcast_to(self.gain, (len(self.cells) + 1, *self.gain.shape))
         )
         size = np.real if self.period is None else np.abs
-        found = []
+        poles = []
         for c, cell in enumerate(self.cells):
             pair = [size(np.linalg.eigvals(cell.closed_loop(gain))).max(axis=-1) for gain in gains[c : c + 2]]
-            found += np.max(pair, axis=0).tolist()
-        return tuple(found)
+            poles += np.max(pair, axis=0).tolist()
+        return tuple(poles)
 
     def summary(self) -> dict[str, PyTree]:
         """Return the proved properties for JSON.

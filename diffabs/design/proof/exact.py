@@ -226,12 +226,12 @@ def conditions(kind: str, system: Polytope | Schedule, gain: Matrix, data: Param
     """Yield the inequalities of a claim, with `proof` in exact numbers with errors of the vertices, else in floats."""
     check_claim(kind, system, gain, data)
     # The gain, P and the bounds are exact as stored; only the system's matrices come from a computation with rounding.
-    known, vertex = (as_dyadic, as_uncertain_dyadic) if proof else (np.asarray, np.asarray)
-    lifted = {name: (vertex if name == "Bw" else known)(value) for name, value in data.items()}
-    K = known(gain)
+    exact, vertex = (as_dyadic, as_uncertain_dyadic) if proof else (np.asarray, np.asarray)
+    lifted = {name: (vertex if name == "Bw" else exact)(value) for name, value in data.items()}
+    K = exact(gain)
     if isinstance(system, Schedule):
         cells = [(vertex(cell.A), vertex(cell.B)) for cell in system.cells]
-        return schedule_conditions(cells, known(system.nodes), K, lifted)
+        return schedule_conditions(cells, exact(system.nodes), K, lifted)
     loop = ClosedLoop(K, vertex(system.A) + vertex(system.B) @ K, system.period is not None)
     if kind == "unstable":
         return instability_conditions(loop, lifted, int(data["vertex"]))
@@ -266,8 +266,8 @@ def is_robustly_positive(matrix: np.ndarray, error: np.ndarray, bits: int) -> bo
     up = np.array([max(sizes) - size for size in sizes], object)
     shift = up[:, None] + up
     rows = np.left_shift(matrix, shift).tolist()
-    for i, taken in enumerate(np.left_shift(error, shift).sum(axis=1)):
-        rows[i][i] -= taken
+    for i, loss in enumerate(np.left_shift(error, shift).sum(axis=1)):
+        rows[i][i] -= loss
     return is_positive_definite(rows)
 
 
@@ -281,7 +281,7 @@ def vertex_margins(kind: str, system: Polytope | Schedule, gain: Matrix, data: P
 
     The margin of an inequality about all vertices together has the key ALL_VERTICES. Side conditions are left out.
     """
-    left: dict[int, float] = {}
+    margins: dict[int, float] = {}
     for each in conditions(kind, system, gain, data, proof=False):
         if each.vertex is None:
             continue
@@ -291,5 +291,5 @@ def vertex_margins(kind: str, system: Polytope | Schedule, gain: Matrix, data: P
         with np.errstate(divide="ignore", invalid="ignore"):
             relative = np.nan_to_num(np.linalg.eigvalsh(total)[..., 0] / size)
         for i, value in enumerate(np.atleast_1d(relative)):
-            left[each.vertex + i] = min(left.get(each.vertex + i, np.inf), float(value))
-    return left
+            margins[each.vertex + i] = min(margins.get(each.vertex + i, np.inf), float(value))
+    return margins

@@ -28,10 +28,10 @@ def describe_system(system: Polytope | Schedule) -> dict[str, PyTree]:
 
 def reject_duplicate_names(pairs: list[tuple[str, PyTree]]) -> dict[str, PyTree]:
     """Return a JSON object from its members; two readers may take different values of a name that occurs twice."""
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    members = dict(pairs)
+    if len(members) != len(pairs):
         raise ValueError(f"a name comes twice among {', '.join(name for name, _ in pairs)}")
-    return found
+    return members
 
 
 def read_members(value: Scalar, where: str, *names: str) -> list[PyTree]:
@@ -101,15 +101,15 @@ def certificate_from_json(value: Scalar) -> tuple[Polytope | Schedule, np.ndarra
         raise ValueError(
             f"format and version must be {CERTIFICATE_FORMAT!r} and {CERTIFICATE_VERSION}; are {kind!r} and {version!r}"
         )
-    found = []
+    pairs = []
     for i, claim in enumerate(read_list(claims, "claims")):
         name, data = read_members(claim, f"claims[{i}]", "kind", "data")
         if not isinstance(name, str) or not isinstance(data, dict):
             raise ValueError(f"claims[{i}] needs a kind that is a string and data that is an object")
-        found.append((name, {key: read_numbers(each, f"claims[{i}].data.{key}") for key, each in data.items()}))
+        pairs.append((name, {key: read_numbers(each, f"claims[{i}].data.{key}") for key, each in data.items()}))
     if read_numbers(gain, "gain").ndim < 2:
         raise ValueError("gain must be a list of rows, or one of these for each node")
-    return read_system(system), read_numbers(gain, "gain"), found
+    return read_system(system), read_numbers(gain, "gain"), pairs
 
 
 def read_system(value: Scalar) -> Polytope | Schedule:
@@ -118,10 +118,10 @@ def read_system(value: Scalar) -> Polytope | Schedule:
         parameter, nodes, cells = read_members(value, "system", "parameter", "nodes", "cells")
         if not isinstance(parameter, str):
             raise ValueError("system.parameter must be a string")
-        found = tuple(
+        polytopes = tuple(
             read_polytope(each, f"system.cells[{i}]") for i, each in enumerate(read_list(cells, "system.cells"))
         )
-        return Schedule(parameter, np.atleast_1d(read_numbers(nodes, "system.nodes")), found)
+        return Schedule(parameter, np.atleast_1d(read_numbers(nodes, "system.nodes")), polytopes)
     return read_polytope(value, "system")
 
 

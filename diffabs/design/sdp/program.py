@@ -183,13 +183,13 @@ class DesignProgram:
                 else (bound * (1 - SPECIFICATION_TIGHTENING) / self.output / self.disturbance) ** 2
             )
             # Divided by s and with w in units of s, the inequality is linear in s: its blocks are s E, s g I and s I.
-            limit, one = s * g * np.eye(e.shape[1]), s * np.eye(z.shape[-2])
+            limit, unit = s * g * np.eye(e.shape[1]), s * np.eye(z.shape[-2])
             if discrete:
-                return symmetric_from_blocks([[x], [None, limit], [flow, s * e, x], [z, None, None, one]])
-            return symmetric_from_blocks([[drift - he(flow)], [-s * e.T, limit], [z, None, one]])
+                return symmetric_from_blocks([[x], [None, limit], [flow, s * e, x], [z, None, None, unit]])
+            return symmetric_from_blocks([[drift - he(flow)], [-s * e.T, limit], [z, None, unit]])
 
-        wanted = ((spec.Q is not None, cost), (spec.decay > 0, decay), (spec.damping > 0, damping), (spec.l2, gain))
-        yield from (self.unknowns.affine(formula) for asked, formula in wanted if asked)
+        formulas = ((spec.Q is not None, cost), (spec.decay > 0, decay), (spec.damping > 0, damping), (spec.l2, gain))
+        yield from (self.unknowns.affine(formula) for applies, formula in formulas if applies)
 
     def _input(self, level: float) -> Iterator[SdpBlock]:
         """Yield the inequalities of the input limit for a level of V."""
@@ -204,8 +204,8 @@ class DesignProgram:
         for row, bound in zip(self.frame.U, limit.limit * (1 - SPECIFICATION_TIGHTENING), strict=True):
             # |u_j| <= bound while V <= level.
             yield self.unknowns.affine(
-                lambda v, row=row[None], most=bound**2 / level: symmetric_from_blocks(
-                    [[np.full((1, 1), most)], [np.swapaxes(row @ v["F0"], -1, -2), v["X0"]]]
+                lambda v, row=row[None], square=bound**2 / level: symmetric_from_blocks(
+                    [[np.full((1, 1), square)], [np.swapaxes(row @ v["F0"], -1, -2), v["X0"]]]
                 )
             )
 

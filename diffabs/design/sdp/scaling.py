@@ -133,8 +133,8 @@ def _solve_by_hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.nda
         p = size * np.real(stable[n:] @ np.linalg.inv(stable[:n]))
         closed = a - push @ p
         # Newton's step for the Riccati equation is a Lyapunov equation of the closed loop.
-        left = np.kron(closed.T, np.eye(n)) + np.kron(np.eye(n), closed.T)
-        p = -np.linalg.solve(left, (q + p @ push @ p).ravel()).reshape(n, n)
+        operator = np.kron(closed.T, np.eye(n)) + np.kron(np.eye(n), closed.T)
+        p = -np.linalg.solve(operator, (q + p @ push @ p).ravel()).reshape(n, n)
     except np.linalg.LinAlgError:
         return None
     p = (p + p.T) / 2

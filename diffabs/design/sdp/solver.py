@@ -46,11 +46,11 @@ class Answer(NamedTuple):
 
     def gap(self, c: np.ndarray, blocks: list[SdpBlock]) -> float:
         """Return a bound on c'y - optimum: the duality gap plus the multipliers' residual times the unknowns."""
-        # Weak duality with multipliers W >= 0 that satisfy the dual equation only approximately: |c - found| |y| covers
-        # the rest.
+        # Weak duality with multipliers W >= 0 that satisfy the dual equation only approximately: |c - gradient| |y|
+        # covers the rest.
         bound = -sum(float(np.sum(b.h * w)) for b, w in zip(blocks, self.multipliers, strict=True))
-        found = sum(np.einsum("bdij,bij->d", b.G, w) for b, w in zip(blocks, self.multipliers, strict=True))
-        return float(c @ self.y) - bound + float(np.abs(c - found) @ np.abs(self.y))
+        gradient = sum(np.einsum("bdij,bij->d", b.G, w) for b, w in zip(blocks, self.multipliers, strict=True))
+        return float(c @ self.y) - bound + float(np.abs(c - gradient) @ np.abs(self.y))
 
 
 class Unknowns:
@@ -139,10 +139,10 @@ def solvers() -> tuple[str, ...]:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"robust design needs {error.name}: {HINT}", name=error.name) from error
     installed = cvxpy.installed_solvers()
-    found = tuple(name for name in SOLVERS if name in installed)
-    if not found:
+    usable = tuple(name for name in SOLVERS if name in installed)
+    if not usable:
         raise ModuleNotFoundError(f"robust design needs one of {', '.join(SOLVERS)}: {HINT}", name="clarabel")
-    return found
+    return usable
 
 
 def solve_sdp(c: np.ndarray, blocks: list[SdpBlock], solver: str = "CLARABEL") -> Answer:
@@ -155,8 +155,8 @@ def solve_sdp(c: np.ndarray, blocks: list[SdpBlock], solver: str = "CLARABEL") -
             h.value = block.h.ravel()
             g.value = np.swapaxes(block.G.reshape(*block.G.shape[:2], -1), 1, 2).reshape(-1, len(c))
         status = _run(program.problem, solver)
-        known = program.y.value is not None
-        y = np.array(program.y.value) if known else np.full(len(c), np.nan)
+        solved = program.y.value is not None
+        y = np.array(program.y.value) if solved else np.full(len(c), np.nan)
         # Read inside the lock: another thread would overwrite the values of the shared program.
         duals = [[w.dual_value for w in group] for group in program.constraints]
     multipliers = [
@@ -191,7 +191,7 @@ def _program(unknowns: int, shapes: tuple[tuple[int, int], ...]) -> _Program:
         flat = g_all @ y + h_all
         parts = [flat[i * k * k : (i + 1) * k * k] for i in range(count)]
         constraints.append([cp.reshape(part, (k, k), order="C") >> 0 for part in parts])
-    problem = cp.Problem(cp.Minimize(cost @ y), [one for group in constraints for one in group])
+    problem = cp.Problem(cp.Minimize(cost @ y), [constraint for group in constraints for constraint in group])
     return _Program(problem, y, cost, h, g, constraints)
 
 
