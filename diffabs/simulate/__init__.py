@@ -10,15 +10,7 @@ from diffabs.runtime.exports import CallablePackage
 
 
 def simulate(*args: PyTree, **options: PyTree) -> NoReturn:
-    """Raise a TypeError that names the functions of a run.
-
-    Args:
-        *args: Any arguments.
-        **options: Any arguments.
-
-    Raises:
-        TypeError: Always.
-    """
+    """Raise a TypeError that names the functions of a run."""
     raise TypeError(
         "diffabs.simulate is a package; a run is d.rollout(loop, solver), its metrics d.measure(loop, solver,"
         " objectives), many runs d.run_batch(loop, batch, solver, objectives)"

@@ -78,16 +78,8 @@ def estimate_accuracy(
     """Return error estimates for the metrics that `measure` returns for the same arguments.
 
     The function runs the loop with the steps h, h/2 and h/4, so it costs as much as seven runs of `measure`. It is
-    pure: batch it with `jax.vmap`. Runs that are not comparable raise no error: their estimates are NaN.
-
-    Args:
-        loop: Closed loop to run.
-        solver: Solver. Every period of a block must be a multiple of `solver.step`.
-        objectives: Objectives by the names of their metrics.
-        key: Random key of `jax.random`, for noisy sensors.
-
-    Raises:
-        ValueError: `measure` rejects the arguments.
+    pure: batch it with `jax.vmap`. Runs that are not comparable raise no error: their estimates are NaN. Every period
+    of a block must be a multiple of `solver.step`.
     """
     runs = [measure_finer(loop, solver, objectives, times, key=key) for times in (1, 2, 4)]
     comparable = is_comparable(loop, solver, key)
@@ -103,34 +95,18 @@ def measure_finer(
 
     The run lasts as long as with the original step. Delays keep their length in seconds. An `Adaptive` solver also gets
     a smaller `rtol` (`refine_solver`).
-
-    Args:
-        loop: Closed loop to run.
-        solver: Solver with the original step.
-        objectives: Objectives by the names of their metrics.
-        times: Divisor of the step, a whole number.
-        key: Random key of `jax.random`, for noisy sensors.
     """
     return measure(refine_parts(loop, times), refine_solver(solver, times), objectives, key=key)
 
 
 def runs_end_alike(*runs: Run) -> PyTree:
-    """Return True if no run diverged and either all or none of the runs reached their stop.
-
-    Args:
-        runs: Runs to compare.
-    """
+    """Return True if no run diverged and either all or none of the runs reached their stop."""
     stopped = jnp.stack([run.stopped for run in runs])
     return ~jnp.stack([run.diverged for run in runs]).any(0) & (stopped.all(0) | ~stopped.any(0))
 
 
 def relative_difference(difference: Scalar, value: Scalar) -> Scalar:
-    """Return |difference/value|: 0 for a zero difference, infinite for a nonzero difference from a zero value.
-
-    Args:
-        difference: Difference, in any unit.
-        value: Value in the same unit.
-    """
+    """Return |difference/value|: 0 for a zero difference, infinite for a nonzero difference from a zero value."""
     size, of = jnp.abs(difference), jnp.abs(value)
     return jnp.where(size == 0, 0.0, size / jnp.where(of > 0, of, 1.0) + jnp.where(of > 0, 0.0, jnp.inf))
 
@@ -138,23 +114,13 @@ def relative_difference(difference: Scalar, value: Scalar) -> Scalar:
 def is_comparable(loop: Loop, solver: Solver, key: Key | None = None, divisors: tuple[int, ...] = (2, 4)) -> Bool:
     """Return True if a shorter step changes neither the noise of the loop nor the instants at which a block computes.
 
-    Args:
-        loop: Closed loop.
-        solver: Solver with the original step.
-        key: Random key of `jax.random`, for noisy sensors. Without a key (None) the noise is not compared.
-        divisors: Divisors of the step, whole numbers.
+    The step is divided by each of `divisors`. Without a key (None) the noise is not compared.
     """
     return (not any(True for _ in per_step_blocks(loop))) & _has_same_noise(loop, solver, divisors, key)
 
 
 def incomparability_reasons(loop: Loop, solver: Solver, key: Key | None = None) -> list[str]:
-    """Return one line for each reason why runs with other steps are not comparable; an empty list if they are.
-
-    Args:
-        loop: Closed loop with concrete (not traced) parameters.
-        solver: Solver with the original step.
-        key: Random key of `jax.random`, for noisy sensors.
-    """
+    """Return one line for each reason why runs with other steps are not comparable; an empty list if they are."""
     lines = [
         f"{name} computes once in every step: with another step it is another {name}" for name in per_step_blocks(loop)
     ]
@@ -164,28 +130,19 @@ def incomparability_reasons(loop: Loop, solver: Solver, key: Key | None = None) 
 
 
 def per_step_blocks(loop: Loop) -> Iterator[str]:
-    """Yield the names of the blocks (such as "controller") that compute at every integration step instead of on a
-    clock.
-
-    Args:
-        loop: Closed loop.
-    """
+    """Yield the names of the blocks (such as "controller") that compute at every step instead of on a clock."""
     for name in BLOCKS:
         block = getattr(loop, name)
         inner = getattr(block, "blocks", (block,))
-        if any(getattr(one, "every_step", False) for one in inner):
+        if any(getattr(part, "every_step", False) for part in inner):
             yield name
 
 
 def needs_key(loop: Loop) -> bool:
-    """Return True if the loop has noise: its sensor raises an error without a key.
-
-    Args:
-        loop: Closed loop.
-    """
+    """Return True if the loop has noise: its sensor raises an error without a key."""
     try:
         # Tracing for shapes alone reaches the sensor's check for a key and computes nothing.
-        jax.eval_shape(lambda one: _draws(one, 1e-3, 1, None), loop)
+        jax.eval_shape(lambda x: _draws(x, 1e-3, 1, None), loop)
     except ValueError:
         return True
     return False
@@ -202,26 +159,20 @@ def _has_same_noise(loop: Loop, solver: Solver, divisors: tuple[int, ...], key: 
     count = min(solver.steps, MAX_COMPARED_INSTANTS)
     steps = jnp.asarray([solver.step, *(solver.step / times for times in divisors)])
     # All steps share one scan: a program for each would take as long to compile as a run.
-    seen = jax.vmap(lambda h: _draws(loop, h, count * max(divisors), key))(steps)
+    outputs = jax.vmap(lambda h: _draws(loop, h, count * max(divisors), key))(steps)
 
     def agree(x: Scalar) -> Bool:
         coarse = x[0, :count]
-        fine = jnp.stack([x[i, : count * times : times] for i, times in enumerate(divisors, 1)])
-        return jnp.all((coarse == fine) | (jnp.abs(coarse - fine) <= 1e-6 * jnp.abs(coarse)))  # infinities are equal
+        finer = jnp.stack([x[i, : count * times : times] for i, times in enumerate(divisors, 1)])
+        return jnp.all((coarse == finer) | (jnp.abs(coarse - finer) <= 1e-6 * jnp.abs(coarse)))  # infinities are equal
 
-    return jnp.all(jnp.stack([agree(x) for x in jax.tree.leaves(seen)]))
+    return jnp.all(jnp.stack([agree(x) for x in jax.tree.leaves(outputs)]))
 
 
 def _draws(loop: Loop, h: Scalar, count: int, key: PyTree) -> Scalar:
     """Return the sensor's outputs at the times 0, h, 2 h, ..., a pytree with leaves (count, ...).
 
     The plant stays in its start state.
-
-    Args:
-        loop: Closed loop.
-        h: Length of a step [s].
-        count: Number of outputs.
-        key: Random key, or None.
     """
     signal = loop.plant.output(loop.plant.start(loop.initial))
     signal = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), signal)
@@ -249,8 +200,8 @@ def _estimate(coarse: Scalar, half: Scalar, quarter: Scalar, comparable: Bool) -
     order = jnp.where(rounded | (q == 0), jnp.nan, -jnp.log2(jnp.where(q > 0, q, 1.0)))
     # The geometric series |d2| (1 + q + q^2 + ...) is capped at q = MAX_DIFFERENCE_RATIO: then its sum is 4 |d2|.
     error = jnp.abs(d1) + jnp.abs(d2) / (1 - jnp.minimum(q, MAX_DIFFERENCE_RATIO))
-    known = comparable & jnp.isfinite(d1) & jnp.isfinite(d2)
-    d1, d2, order, error = (jnp.where(known, x, jnp.nan) for x in (d1, d2, order, error))
+    valid = comparable & jnp.isfinite(d1) & jnp.isfinite(d2)
+    d1, d2, order, error = (jnp.where(valid, x, jnp.nan) for x in (d1, d2, order, error))
     finite = jnp.isfinite(jnp.stack([coarse, half, quarter]))
     turned = comparable & jnp.any(finite) & ~jnp.all(finite)
-    return ErrorEstimate(coarse, d1, d2, order, known & (rounded | (q <= MAX_DIFFERENCE_RATIO)), error, turned)
+    return ErrorEstimate(coarse, d1, d2, order, valid & (rounded | (q <= MAX_DIFFERENCE_RATIO)), error, turned)

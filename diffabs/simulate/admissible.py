@@ -91,12 +91,8 @@ def check(part: T, solver: Solver | None = None) -> T:
 def find_impossible_values(loop: Loop, step: float) -> list[str]:
     """Return one line for each value of a loop that no run may have; an empty list if all are allowed.
 
-    Three groups are checked in order. They are ranges and rules of the parts, the start against the stop, and the parts
-    against the step. The lines are those of the first group with a fault.
-
-    Args:
-        loop: Closed loop with concrete parameters.
-        step: Step of the grid [s].
+    Three groups are checked in order: ranges and rules of the parts, the start against the stop, the parts against the
+    step of the grid [s]. The lines are those of the first group with a fault.
     """
     groups = part_rules(loop), [_start_rule(loop)], grid_rules(loop, step)
     return next(filter(None, map(list, map(find_broken, groups))), [])
@@ -107,10 +103,6 @@ def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
 
     Three groups are checked in order: the start against the stop, the solver itself, the parts against the step. The
     lines are those of the first group with a fault.
-
-    Args:
-        loop: Closed loop with concrete parameters.
-        solver: Solver of the run.
     """
     lines = list(find_broken([_start_rule(loop)]))
     yield from lines or find_solver_faults(solver) or find_broken(grid_rules(loop, solver.step))
@@ -121,27 +113,24 @@ def find_solver_faults(solver: Solver) -> list[str]:
 
     `kinks` must be True, False or None. Each other field must be a positive, finite number, `rtol` below 1. The step
     must not be longer than the duration. At most `MAX_SOLVER_STEPS` steps are allowed.
-
-    Args:
-        solver: Solver to check.
     """
     if not isinstance(solver, FixedStep | Adaptive):
-        known = "d.FixedStep(step=..., duration=...) or d.Adaptive(rtol=..., duration=...)"
-        return [f"solver = {kinds.format_value(solver)} is no solver; {known} is needed"]
+        solvers = "d.FixedStep(step=..., duration=...) or d.Adaptive(rtol=..., duration=...)"
+        return [f"solver = {kinds.format_value(solver)} is no solver; {solvers} is needed"]
     names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
     if lines := [f"solver.{name} {line}" for name in names if (line := _find_field_fault(name, getattr(solver, name)))]:
         return lines
-    given = getattr(solver, "kinks", None)
-    if not (given is None or isinstance(given, bool)):
-        return [f"solver.kinks = {given!r} is not a Python bool; True, False or None is needed"]
+    kinks = getattr(solver, "kinks", None)
+    if not (kinks is None or isinstance(kinks, bool)):
+        return [f"solver.kinks = {kinks!r} is not a Python bool; True, False or None is needed"]
     step, duration = solver.step, solver.duration
     if step > duration:
         return [
             f"solver.step = {step:g} s is outside (0, {duration:g}] s: longer than solver.duration = {duration:g} s"
         ]
     if duration / step > MAX_SOLVER_STEPS:
-        least = duration / MAX_SOLVER_STEPS
-        return [f"solver.step = {step:g} s is outside [{least:g}, {duration:g}] s: too many steps"]
+        shortest = duration / MAX_SOLVER_STEPS
+        return [f"solver.step = {step:g} s is outside [{shortest:g}, {duration:g}] s: too many steps"]
     return []
 
 
@@ -161,14 +150,7 @@ def _find_field_fault(name: str, value: Any) -> str:
 
 
 def find_unstable_step(loop: Loop, solver: Solver) -> Iterator[str]:
-    """Yield one line if the step is too long for the loop.
-
-    An `Adaptive` solver finds its own steps, so it yields nothing.
-
-    Args:
-        loop: Closed loop with concrete parameters.
-        solver: Solver of the run.
-    """
+    """Yield one line if the step is too long for the loop. An `Adaptive` solver finds its own steps: nothing."""
     if isinstance(solver, Adaptive):
         return
     largest, end = stable_step(loop), getattr(loop.stop, "speed", None)
@@ -188,28 +170,15 @@ _stable_steps: set[tuple[PyTree, float]] = set()  # structures of loops, with st
 
 
 def was_step_checked(loop: Loop, solver: Solver) -> bool:
-    """Return True if the step was found stable for a loop of this structure, or the solver finds its own steps.
-
-    Args:
-        loop: Closed loop, perhaps with traced parameters.
-        solver: Solver of the run.
-    """
+    """Return True if the step was found stable for a loop of this structure, or the solver finds its own steps."""
     return isinstance(solver, Adaptive) or (jax.tree.structure(loop), float(solver.step)) in _stable_steps
 
 
 def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Admissibility:
     """Make the checks of `check` for each run of a batch, and return a code for each run instead of an error.
 
-    One compiled program checks all runs. A code stands for the first check that a run fails.
-
-    Args:
-        loop: Loop that the runs have in common. If it is None, `values` is a batch of loops whose leaves have a leading
-            axis (runs,).
-        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
-        solver: Solver of all runs.
-
-    Raises:
-        ValueError: The solver is invalid (`find_solver_faults`).
+    One compiled program checks all runs. A code stands for the first check that a run fails. Without a common loop,
+    `values` is a batch of loops whose leaves have a leading axis (runs,).
     """
     if lines := find_solver_faults(solver):
         raise ValueError(lines[0])
@@ -217,48 +186,43 @@ def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Ad
     values = {path: np.asarray(x, float) for path, x in values.items()} if isinstance(values, Mapping) else values
     loop, values = jax.tree.map(lambda x: np.asarray(x, float), (loop, values))
     with jax.enable_x64(True):
-        known = jax.tree.map(lambda x: x if np.ndim(x) else as_array(float(x), x.dtype), (loop, values))
+        arguments = jax.tree.map(lambda x: x if np.ndim(x) else as_array(float(x), x.dtype), (loop, values))
         # Double precision: single precision could round a value across the end of its range.
-        codes = np.array(_codes(*known, step=step))
+        codes = np.array(_codes(*arguments, step=step))
     # Only accepted runs need the costly stability check. `np.resize` repeats them up to the batch's size, so that
     # the compiled program keeps its shapes.
     if not codes.all() and not isinstance(solver, Adaptive):
-        fine = np.flatnonzero(codes == 0)
-        asked = values if len(fine) == len(codes) else jax.tree.map(lambda x: x[np.resize(fine, len(codes))], values)
-        codes[fine[~is_step_stable(loop, asked, step)[: len(fine)]]] = -1
+        good = np.flatnonzero(codes == 0)
+        lanes = values if len(good) == len(codes) else jax.tree.map(lambda x: x[np.resize(good, len(codes))], values)
+        codes[good[~is_step_stable(loop, lanes, step)[: len(good)]]] = -1
     return _name_reasons(loop, values, step, codes)
 
 
 def _name_reasons(loop: Loop | None, values: PyTree, step: float, codes: np.ndarray) -> Admissibility:
     """Return the codes renumbered to the reasons that occur; code -1 is an unstable step."""
-    there = [code for code in np.unique(codes).tolist() if code] if codes.any() else []
+    present = [code for code in np.unique(codes).tolist() if code] if codes.any() else []
     named = {-1: f"solver.step = {step:g} s is not stable"}
-    if any(code > 0 for code in there):
+    if any(code > 0 for code in present):
         with jax.enable_x64(True):
             first = _lane(loop, jax.tree.map(lambda x: x[0], values))
             named |= {i: rule.broken for i, rule in enumerate(_rules(first, step), 1)}
-    numbers = np.select([codes == code for code in there], range(1, len(there) + 1), 0) if there else codes
-    return Admissibility(numbers, ("", *(named[code] for code in there)))
+    numbers = np.select([codes == code for code in present], range(1, len(present) + 1), 0) if present else codes
+    return Admissibility(numbers, ("", *(named[code] for code in present)))
 
 
 def first_refusal(loop: Loop, values: Params, solver: Solver) -> str | None:
     """Return a text about the first refused run and its reasons, with their numbers; None if all runs are accepted.
 
-    A semicolon separates two reasons.
-
-    Args:
-        loop: Loop that the runs have in common. Without values it is the only run.
-        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
-        solver: Solver of all runs.
+    A semicolon separates two reasons. Without values the loop is the only run.
     """
     where, lane, why = "", loop, ""
     if values:
-        found = batch_admissibility(loop, values, solver)
-        if not found.number:
+        checks = batch_admissibility(loop, values, solver)
+        if not checks.number:
             return None
-        i = int(np.flatnonzero(found.codes)[0])
+        i = int(np.flatnonzero(checks.codes)[0])
         lane = replace(loop, {path: np.asarray(column)[i] for path, column in values.items()})
-        where, why = f"lane {i}: ", found.texts[i]
+        where, why = f"lane {i}: ", checks.texts[i]
     try:
         check(lane, solver)
     except ValueError as error:

@@ -28,16 +28,13 @@ def summarise_run(run: PyTree) -> Summary:
 
     A batch gets mean, least and greatest value of each metric, over the runs that have not diverged. A traced run gets
     only the number of its metrics.
-
-    Args:
-        run: One run, or the runs of a batch.
     """
-    shape, kept = np.shape(run.stopped), run.trajectory is not None
+    shape, has_trajectory = np.shape(run.stopped), run.trajectory is not None
     if not _is_concrete(run):
         return Summary(f"Run being traced, of {len(run.metrics)} metrics")
     if shape:
         return _summarise_runs(run, int(np.prod(shape)))
-    seen = f"; a trajectory of {len(run.trajectory.running)} instants" if kept else ""
+    length = f"; a trajectory of {len(run.trajectory.running)} instants" if has_trajectory else ""
     end = f"at t = {round_for_table(run.ending.sample.t)} s"
     how = f"reached its stop {end}" if run.stopped else f"ended {end}"
     if run.diverged:
@@ -46,7 +43,7 @@ def summarise_run(run: PyTree) -> Summary:
         begins = f"slides along a switching surface from t = {round_for_table(run.slide.t)} s"
         how = begins if run.diverged else f"{how} and {begins}, so that it has no derivatives"
     rows = tuple((name, value) for name, value in run.metrics.items())
-    return Summary(f"Run that {how}{seen}", ("metric", "value"), rows)
+    return Summary(f"Run that {how}{length}", ("metric", "value"), rows)
 
 
 def _summarise_runs(run: PyTree, count: int) -> Summary:
@@ -66,28 +63,22 @@ def _summarise_runs(run: PyTree, count: int) -> Summary:
 def trajectory_columns(run: PyTree, plant: Part = None) -> dict[str, tuple[str, np.ndarray]]:
     """Return a pair (unit, values) for each signal by name, up to the end of a run; values have shape (instants,).
 
-    The names are `t`, the plant's outputs, `target`, `setpoint`, `feedforward`, `command` and `control`.
-
-    Args:
-        run: One run with a trajectory.
-        plant: Plant that defines the unit of the last three. Without a plant the unit is "control".
-
-    Raises:
-        ValueError: The run has no trajectory, or it is a batch of runs.
+    The names are `t`, the plant's outputs, `target`, `setpoint`, `feedforward`, `command` and `control`. The plant
+    defines the unit of the last three. Without a plant the unit is "control".
     """
     if run.trajectory is None:
         raise ValueError("the run has no trajectory: make it with rollout")
     if np.shape(run.stopped):
         raise ValueError("these are many runs: take one, jax.tree.map(lambda x: x[0], run)")
-    seen = run.trajectory
-    count = int(np.sum(seen.running)) + 1  # after the end the last sample is repeated
-    sample, units = seen.sample, type(seen.sample.output).units
+    trajectory = run.trajectory
+    count = int(np.sum(trajectory.running)) + 1  # after the end the last sample is repeated
+    sample, units = trajectory.sample, type(trajectory.sample.output).units
     shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
     control = plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT
     target = units[sample.output._fields[0]]
-    rest = {"target": (target, sample.target), "setpoint": (target, sample.setpoint)}
-    given = {name: (control, getattr(sample, name)) for name in ("feedforward", "command", "control")}
-    every = {"t": ("s", sample.t), **shown, **rest, **given}
+    references = {"target": (target, sample.target), "setpoint": (target, sample.setpoint)}
+    controls = {name: (control, getattr(sample, name)) for name in ("feedforward", "command", "control")}
+    every = {"t": ("s", sample.t), **shown, **references, **controls}
     return {name: (unit, np.asarray(values)[:count]) for name, (unit, values) in every.items()}
 
 
@@ -95,15 +86,7 @@ def to_pandas(run: PyTree, plant: Part = None) -> Scalar:
     """Return a pandas.DataFrame: the trajectory indexed by `t`, or without a trajectory one row per run.
 
     A trajectory has units, metrics and end flags in `attrs`. A row per run has the metrics and the end flags as
-    columns.
-
-    Args:
-        run: One run with a trajectory, or any runs without.
-        plant: Plant that defines the unit of the control.
-
-    Raises:
-        ValueError: The runs are a batch with trajectories.
-        ModuleNotFoundError: pandas is not installed.
+    columns. The plant defines the unit of the control.
     """
     pandas = import_optional("pandas")
 
@@ -113,41 +96,23 @@ def to_pandas(run: PyTree, plant: Part = None) -> Scalar:
             name: np.atleast_1d(np.asarray(values)).reshape(-1) for name, values in {**run.metrics, **flags}.items()
         }
         return pandas.DataFrame(rows)
-    found = trajectory_columns(run, plant)
-    frame = pandas.DataFrame({name: values for name, (_, values) in found.items()}).set_index("t")
-    frame.attrs |= {"units": {name: unit for name, (unit, _) in found.items()}, **_attributes(run)}
+    columns = trajectory_columns(run, plant)
+    frame = pandas.DataFrame({name: values for name, (_, values) in columns.items()}).set_index("t")
+    frame.attrs |= {"units": {name: unit for name, (unit, _) in columns.items()}, **_attributes(run)}
     return frame
 
 
 def to_xarray(run: PyTree, plant: Part = None) -> Scalar:
-    """Return the trajectory as an xarray.Dataset over `t` [s]; each variable has its `units`, and `attrs` the metrics.
-
-    Args:
-        run: One run with a trajectory.
-        plant: Plant that defines the unit of the control.
-
-    Raises:
-        ValueError: The run has no trajectory, or it is a batch of runs.
-        ModuleNotFoundError: xarray is not installed.
-    """
+    """Return the trajectory as an xarray.Dataset over `t` [s], with `units` of variables and the metrics in `attrs`."""
     xarray = import_optional("xarray")
 
-    found = trajectory_columns(run, plant)
-    each = {name: ("t", values, {"units": unit}) for name, (unit, values) in found.items()}
+    columns = trajectory_columns(run, plant)
+    each = {name: ("t", values, {"units": unit}) for name, (unit, values) in columns.items()}
     return xarray.Dataset(each, coords={"t": each.pop("t")}, attrs=_attributes(run))
 
 
 def to_figure(run: PyTree, plant: Part = None, title: str = "") -> Scalar:
-    """Return a matplotlib figure of the run. The signals of the plant's output select the kind of figure.
-
-    Args:
-        run: One run with a trajectory.
-        plant: Plant that defines the unit of the control.
-        title: Title of the figure.
-
-    Raises:
-        ValueError: The run has no trajectory.
-    """
+    """Return a matplotlib figure of the run. The signals of the plant's output select the kind of figure."""
     plot: Any = importlib.import_module("diffabs.plot")
     shown = SimpleNamespace(shows=type(run.ending.sample.output))
     unit = plant.control_unit if plant is not None else None

@@ -42,11 +42,7 @@ FAULT_TEXTS = {
 
 
 def describe_faults(run: PyTree) -> str:
-    """Return why a run diverged, or for a batch each reason with its number of runs; "" for none.
-
-    Args:
-        run: One run, or the runs of a batch, with concrete numbers.
-    """
+    """Return why a run diverged, or for a batch each reason with its number of runs; "" for none."""
     if run.fault is None:
         return ""
     faults = np.asarray(run.fault, int)

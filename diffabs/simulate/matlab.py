@@ -19,25 +19,19 @@ MAX_NAME = 60  # MATLAB reads 63 characters; a number against equal names takes 
 
 
 def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
-    """Write the trajectory of one run, up to its end, to a MAT file.
+    """Write the trajectory of one run, up to its end, to a MAT file, with `more` variables by name.
 
     The file has a column vector for each of `t`, the plant's outputs, `target`, `command` and `control`. The struct
-    `units` has their units, and the struct `metrics` the run's metrics. A name that is not
-    valid in MATLAB is changed: stop-time becomes `stop_time`.
-
-    Args:
-        path: File to write; an existing file is replaced.
-        run: One run, no batch, with a trajectory. An AssertionError refuses a run without.
-        plant: Plant that defines the signals and their units.
-        more: Further variables by name. A mapping becomes a struct.
+    `units` has their units, and the struct `metrics` the run's metrics. A mapping becomes a struct, too. A name that is
+    not valid in MATLAB is changed: stop-time becomes `stop_time`.
     """
     from scipy.io import savemat
 
     assert run.trajectory is not None
-    kept = run_signals(run.trajectory.sample, plant)
+    signals = run_signals(run.trajectory.sample, plant)
     rows = int(run.trajectory.running.sum()) + 1  # after the end the last sample is repeated
-    content: dict[str, PyTree] = {name: values[:rows] for name, (_, values) in kept.items()}
-    content["units"] = {name: unit for name, (unit, _) in kept.items()}
+    content: dict[str, PyTree] = {name: values[:rows] for name, (_, values) in signals.items()}
+    content["units"] = {name: unit for name, (unit, _) in signals.items()}
     content["metrics"] = {name: float(value) for name, value in run.metrics.items()}
     with path.open("wb") as file:
         savemat(file, _with_valid_names(content | more), do_compression=True, long_field_names=True, oned_as="column")
@@ -45,12 +39,12 @@ def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
 
 def _with_valid_names(values: Mapping[str, PyTree]) -> dict[str, PyTree]:
     """Return a mapping, and the mappings in it, with names that are valid in MATLAB and differ."""
-    found: dict[str, PyTree] = {}
+    renamed: dict[str, PyTree] = {}
     for name, value in values.items():
         valid = re.sub(r"\W+", "_", name, flags=re.ASCII)
         valid = (valid if valid[:1].isalpha() else f"x{valid}")[:MAX_NAME]
         new, number = f"{valid}_" if valid in KEYWORDS else valid, 2
-        while new in found:
+        while new in renamed:
             new, number = f"{valid}_{number}", number + 1
-        found[new] = _with_valid_names(value) if isinstance(value, Mapping) else value
-    return found
+        renamed[new] = _with_valid_names(value) if isinstance(value, Mapping) else value
+    return renamed

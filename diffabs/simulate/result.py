@@ -36,9 +36,6 @@ def prepare(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
     """Return the loop with everything precomputed that is constant during a run, and the plant's audit as an objective.
 
     The dictionary of the audit is empty if the plant has none.
-
-    Args:
-        loop: Closed loop.
     """
     loop = prepare_parts(loop)
     audit = getattr(loop.plant, "audit", None)
@@ -46,13 +43,7 @@ def prepare(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
 
 
 def finish_run(loop: Loop, objectives: dict[str, Objective], carry: PyTree) -> tuple[Run, Trajectory]:
-    """Return the result of a run that is over, and its last instant.
-
-    Args:
-        loop: Closed loop, prepared.
-        objectives: Objectives by name, including the plant's audit.
-        carry: Carry of any stepping method at the end of the run.
-    """
+    """Return the result of a run that is over, and its last instant; the objectives include the plant's audit."""
     last = observe(loop, carry.point.t, carry.point.state, carry.running)
     stopped = carry.status == RunStatus.STOPPED
     ending = Ending(last.sample, stopped, *loop.stop.remainder(last.sample, stopped))
@@ -73,14 +64,7 @@ def finish_run(loop: Loop, objectives: dict[str, Objective], carry: PyTree) -> t
 
 
 def observe(loop: Loop, t: Scalar, state: LoopState, running: AnyArray) -> Trajectory:
-    """Return the signals of the loop at an instant.
-
-    Args:
-        loop: Closed loop.
-        t: Time [s].
-        state: State of the loop.
-        running: True if the run goes on at this instant.
-    """
+    """Return the signals of the loop at an instant, `running` if the run goes on there."""
     signals = loop.signals(t, state)
     return Trajectory(signals.sample, signals.measured, state.plant, running)
 

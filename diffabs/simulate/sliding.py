@@ -31,21 +31,17 @@ def describe_slide(loop: Loop, solver: Solver, objectives: Mapping[str, Objectiv
     """Return one line about the first slide of a run, or of the first sliding run of a batch; "" without a slide.
 
     The line has the time, the comparison with its file and line, and what to do.
-
-    Args:
-        loop: Closed loop of the run; of a batch the common loop.
-        solver: Solver of the run.
-        objectives: Objectives of the run, by the names of their metrics.
-        run: Run on the host, with concrete numbers.
     """
     if run.slide is None or not np.any(run.slid):
         return ""
-    which, times, slid = (np.atleast_1d(np.asarray(x)).ravel() for x in (run.slide.which, run.slide.t, run.slid))
+    numbers, times, slid = (np.atleast_1d(np.asarray(x)).ravel() for x in (run.slide.which, run.slide.t, run.slid))
     first = int(np.flatnonzero(slid)[0])
-    who = f"{int(slid.sum())} of {len(slid)} runs slide, run {first}" if np.ndim(run.slid) else "the run slides"
-    place = _describe_comparison(_trace_program(loop, solver, objectives), int(which[first]))
-    left = "it has no metrics with adaptive steps" if isinstance(solver, Adaptive) else "its derivatives are NaN"
-    return f"{who} from t = {times[first]:.4g} s along {place}: both sides push onto it, so {left}; {SLIDE_ADVICE}"
+    subject = f"{int(slid.sum())} of {len(slid)} runs slide, run {first}" if np.ndim(run.slid) else "the run slides"
+    place = _describe_comparison(_trace_program(loop, solver, objectives), int(numbers[first]))
+    effect = "it has no metrics with adaptive steps" if isinstance(solver, Adaptive) else "its derivatives are NaN"
+    return (
+        f"{subject} from t = {times[first]:.4g} s along {place}: both sides push onto it, so {effect}; {SLIDE_ADVICE}"
+    )
 
 
 def _trace_program(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> SwitchedProgram | None:
@@ -56,10 +52,10 @@ def _trace_program(loop: Loop, solver: Solver, objectives: Mapping[str, Objectiv
     return build_system(loop, measured, zero, state, accumulators, switched=True).program
 
 
-def _describe_comparison(program: SwitchedProgram | None, which: int) -> str:
-    """Return the text, file and line of the comparison with the bit `which`."""
+def _describe_comparison(program: SwitchedProgram | None, number: int) -> str:
+    """Return the text, file and line of the comparison with this bit."""
     for (first, shape), op in zip(program.places, program.origins, strict=True) if program else ():
-        if first <= which < first + int(np.prod(shape)):
+        if first <= number < first + int(np.prod(shape)):
             return _describe_line(op.source, op.name)
     return "a switching surface"
 
@@ -67,9 +63,9 @@ def _describe_comparison(program: SwitchedProgram | None, which: int) -> str:
 def _describe_line(source: Source, name: str) -> str:
     # Innermost first. The line of a helper, such as `clamp`, says less than that of its caller.
     for frame in reversed(summarize(source, FRAMES_OF_A_COMPARISON).splitlines()):
-        found = re.match(r"(?P<file>.*?):(?P<line>\d+)(:\d+)? \((?P<function>.*)\)$", frame)
-        if found and found["file"] != numerics.__file__:
-            text = linecache.getline(found["file"], int(found["line"])).strip()
-            where = f"{pathlib.PurePath(found['file']).name}:{found['line']}, in {found['function']}"
+        match = re.match(r"(?P<file>.*?):(?P<line>\d+)(:\d+)? \((?P<function>.*)\)$", frame)
+        if match and match["file"] != numerics.__file__:
+            text = linecache.getline(match["file"], int(match["line"])).strip()
+            where = f"{pathlib.PurePath(match['file']).name}:{match['line']}, in {match['function']}"
             return f"the comparison `{text or name}` ({where})"
     return f"the comparison '{name}'"

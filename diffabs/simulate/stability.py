@@ -38,21 +38,13 @@ RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 
 def stable_step(loop: Loop) -> float:
     """Return the largest step [s] at which RK4 is stable on every damped mode of the linearised loop.
 
-    The loop is linearised at the points that the plant names, or else at its start and at rest. A linearisation that is
-    not finite has no influence. Without any damped mode the result is infinite.
-
-    Args:
-        loop: Closed loop with concrete parameters.
+    A linearisation that is not finite has no influence. Without any damped mode the result is infinite.
     """
     return float(stable_steps(jax.tree.map(lambda x: np.asarray(x)[None], canonical_dtypes(loop)))[0])
 
 
 def stable_steps(loops: Loop) -> np.ndarray:
-    """Return the result of `stable_step` for each loop of a batch, shape (n,) [s].
-
-    Args:
-        loops: Batch of loops, whose leaves have a leading axis (n,).
-    """
+    """Return the result of `stable_step` for each loop of a batch with leaves (n, ...), shape (n,) [s]."""
     drain = np.asarray(_drain_rate(loops), float)
     limits = BOUNDARY_RADII[-1] / np.where(drain > 0, drain, np.nan)
     return np.fmin(_largest_stable_steps(np.asarray(_jacobians(loops))), limits)
@@ -60,34 +52,30 @@ def stable_steps(loops: Loop) -> np.ndarray:
 
 def _largest_stable_steps(matrices: np.ndarray) -> np.ndarray:
     """Return the largest stable step of each run, shape (n,), for matrices of shape (n, k, d, d)."""
-    known = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
-    modes = np.linalg.eigvals(np.where(known[..., None, None], matrices, 0.0))
-    damped = (modes.real < 0) & known[..., None]
+    finite = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
+    modes = np.linalg.eigvals(np.where(finite[..., None, None], matrices, 0.0))
+    damped = (modes.real < 0) & finite[..., None]
     size = np.where(damped, np.abs(modes), 1.0)
     limits = np.where(damped, _radius(np.where(damped, modes, -1.0) / size) / size, np.inf)
     return limits.min(axis=tuple(range(1, limits.ndim)), initial=np.inf)
 
 
 def is_step_stable(loop: Part, values: PyTree, step: float) -> np.ndarray:
-    """Return True for each run for which the step is stable, bool, shape (runs,).
+    """Return True for each run for which the step [s] is stable, bool, shape (runs,).
 
-    Args:
-        loop: Loop that the runs have in common. If it is None, `values` is a batch of loops whose leaves have a leading
-            axis.
-        values: Values of the parameters that differ, shape (runs, ...), by dotted path.
-        step: Integration step [s].
+    Without a common loop, `values` is a batch of loops whose leaves have a leading axis.
     """
     # Cheap bounds first, in single precision, where an overflow becomes infinite. Only runs without a proof go on to
     # tighter bounds and at last to eigenvalues.
     with jax.enable_x64(False), np.errstate(over="ignore"):
-        fine = step * np.asarray(_bounds(*_as_single_precision(loop, values), squarings=0)) <= MIN_BOUNDARY_RADIUS
+        stable = step * np.asarray(_bounds(*_as_single_precision(loop, values), squarings=0)) <= MIN_BOUNDARY_RADIUS
         for squarings in (BOUND_SQUARINGS, None):
-            left = np.flatnonzero(~fine)
-            for lanes in np.split(left, range(LANES_PER_CHUNK, len(left), LANES_PER_CHUNK)) if len(left) else ():
-                fine[lanes] = _is_known_stable(loop, _at(values, np.resize(lanes, LANES_PER_CHUNK)), step, squarings)[
+            runs = np.flatnonzero(~stable)
+            for lanes in np.split(runs, range(LANES_PER_CHUNK, len(runs), LANES_PER_CHUNK)) if len(runs) else ():
+                stable[lanes] = _is_known_stable(loop, _at(values, np.resize(lanes, LANES_PER_CHUNK)), step, squarings)[
                     : len(lanes)
                 ]
-    return fine
+    return stable
 
 
 def _as_single_precision(*trees: PyTree) -> PyTree:
@@ -129,19 +117,19 @@ def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
 
     @jax.jit  # traced once, used three times
     def matrices(values: PyTree) -> jax.Array:
-        return jnp.reshape(found := _jacobians_of(_lane_builder(loop)(values)), (-1, *found.shape[-2:]))
+        return jnp.reshape(jacobians := _jacobians_of(_lane_builder(loop)(values)), (-1, *jacobians.shape[-2:]))
 
     drain = jax.vmap(lambda values: _drain_rate(_lane_builder(loop)(values)))(values)
-    one = matrices(jax.tree.map(lambda x: x[0], values))
-    balance = _balance(one)
+    first_matrices = matrices(jax.tree.map(lambda x: x[0], values))
+    balance = _balance(first_matrices)
     if not split_batched(matrices, values)[0]:  # the matrices of all runs are equal
-        return jnp.maximum(_power_norm_bound(one, balance, squarings), drain)
+        return jnp.maximum(_power_norm_bound(first_matrices, balance, squarings), drain)
     # Whole chunks: a partial chunk would need a second program.
     places = jnp.minimum(jnp.arange(-(-count // LANES_PER_CHUNK) * LANES_PER_CHUNK), count - 1)
     filled = jax.tree.map(lambda x: x[places], values) if count > LANES_PER_CHUNK else values
 
     def bound(values: PyTree) -> jax.Array:
-        if squarings or len(one) * count < MIN_ENTRYWISE_MATRICES:
+        if squarings or len(first_matrices) * count < MIN_ENTRYWISE_MATRICES:
             return _power_norm_bound(matrices(values), balance, squarings)
         return _norm_bound(_map_over_probes(_entries, _lane_builder(loop)(values)), balance)
 
@@ -150,14 +138,10 @@ def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
 
 
 def _power_norm_bound(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Array:
-    """Return an upper bound on |lambda| of all eigenvalues of k matrices, a scalar; infinite if unknown.
+    """Return an upper bound on |lambda| of all eigenvalues of k matrices A (k, n, n), a scalar; infinite if unknown.
 
     The bound of a matrix is |(D^-1 A D)^p|^(1/p) with p = 2^`squarings`, in the smaller of row-sum and column-sum norm.
-
-    Args:
-        matrices: Matrices A, shape (k, n, n).
-        balance: Diagonals of D, shape (k, n).
-        squarings: Number of squarings of each matrix.
+    `balance` holds the diagonals of D, shape (k, n).
     """
     a = matrices * (balance[:, None, :] / balance[:, :, None])
     log = jnp.zeros(len(a), a.dtype)  # logarithm of the k-th root of the scales that have been divided out
@@ -201,8 +185,8 @@ def _balance(matrices: jax.Array) -> jax.Array:
     def halve(_: object, log: jax.Array) -> jax.Array:
         scaled = size * jnp.exp(log[:, None, :] - log[:, :, None])
         rows, columns = jnp.sum(scaled, -1), jnp.sum(scaled, -2)
-        fine = (rows > 0) & (columns > 0) & jnp.isfinite(rows / columns)
-        change = 0.25 * jnp.log(jnp.where(fine, rows, 1.0) / jnp.where(fine, columns, 1.0))
+        regular = (rows > 0) & (columns > 0) & jnp.isfinite(rows / columns)
+        change = 0.25 * jnp.log(jnp.where(regular, rows, 1.0) / jnp.where(regular, columns, 1.0))
         return jnp.clip(log + change, -30.0, 30.0)
 
     return jnp.exp(jax.lax.fori_loop(0, BALANCING_ROUNDS, halve, jnp.zeros(matrices.shape[:-1], matrices.dtype)))
@@ -240,12 +224,11 @@ def _jacobians_of(loop: Loop) -> jax.Array:
 
 
 def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
-    """Return the results of `function` at k points, stacked: leaves (k, ...).
+    """Return the results of `function` at k points, stacked: leaves (k, ...). A point is the loop with another start.
 
-    A point is the loop with another start. The plant's `probes` returns starts where the loop may be stiffest.
-
-    Without `probes` there are four points. They are the start and a start of zero, each with the loop's reference and
-    with a target equal to the plant's signal (`_AtTarget`).
+    The plant's `probes` returns starts where the loop may be stiffest. Without `probes` there are four points: the
+    start and a start of zero, each with the loop's reference and with a target equal to the plant's signal
+    (`_AtTarget`).
     """
     probes = getattr(loop.plant, "probes", None)
     if probes:
@@ -254,11 +237,11 @@ def _map_over_probes(function: Callable[[Loop], PyTree], loop: Loop) -> PyTree:
     arrived = dataclasses.replace(loop, reference=_AtTarget(reference=loop.reference))
 
     # The axis is that of the factors, because a start may be without numbers.
-    def begin(factor: Scalar, one: Loop) -> PyTree:
-        return function(dataclasses.replace(one, initial=jax.tree.map(lambda x: factor * x, loop.initial)))
+    def begin(factor: Scalar, base: Loop) -> PyTree:
+        return function(dataclasses.replace(base, initial=jax.tree.map(lambda x: factor * x, loop.initial)))
 
-    found = [jax.vmap(partial(begin, one=one))(jnp.array([0.0, 1.0])) for one in (loop, arrived)]
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
+    results = [jax.vmap(partial(begin, base=base))(jnp.array([0.0, 1.0])) for base in (loop, arrived)]
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *results)
 
 
 # A caller waits for the compiler, and the limit is printed with three digits.
@@ -313,7 +296,7 @@ def _entries(loop: Loop) -> list[list[jax.Array]]:
     once = jax.extend.core.jaxpr_as_fun(jax.make_jaxpr(flow)(*leaves))
     columns = []
     for number, leaf in enumerate(leaves):
-        moved = partial(lambda number, one: once(*leaves[:number], one, *leaves[number + 1 :]), number)
+        moved = partial(lambda number, x: once(*leaves[:number], x, *leaves[number + 1 :]), number)
         for at in np.ndindex(leaf.shape):
             rates = jax.jvp(moved, (leaf,), (jnp.zeros_like(leaf).at[at].set(1.0),))[1]
             columns.append([rate[i] for rate in rates for i in np.ndindex(rate.shape)])

@@ -208,7 +208,7 @@ def test_units_are_those_of_the_loop(servo):
     assert resolve_unit("control^2 s/signal", Units("N m/A", "m/s^2")) == "N^2 m s^3/A^2"
 
 
-@killed_by("simulate/stability.py", "for one in (loop, arrived)", "for one in (loop,)")
+@killed_by("simulate/stability.py", "for base in (loop, arrived)", "for base in (loop,)")
 def test_the_step_is_judged_with_an_unsaturated_controller(servo):
     """At the start the PID commands 24 V whatever happens; its own fast mode is only seen on the target."""
     loop, _ = linear(servo, value=1.0)

@@ -48,7 +48,7 @@ def test_a_mat_file_has_metrics_and_parameters(folder):
     assert (folder / "run.mat").read_bytes()[:19] == b"MATLAB 5.0 MAT-file"
 
 
-@killed_by("simulate/matlab.py", "while new in found:", "while False:")
+@killed_by("simulate/matlab.py", "while new in renamed:", "while False:")
 @killed_by("simulate/matlab.py", "if valid in KEYWORDS", "if False")
 @killed_by("simulate/matlab.py", "[:MAX_NAME]", "[:99]")
 def test_every_name_becomes_one_of_matlab(tmp_path):

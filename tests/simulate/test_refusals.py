@@ -145,7 +145,7 @@ class TestBeforeARun:
             found = admissible.batch_admissibility(loop, {"plant.mass": np.array([5.3, -1.0])}, SOLVER)
             assert found.accepted.tolist() == [True, False], found.texts
 
-    @killed_by("simulate/admissible.py", "if not (given is None or isinstance(given, bool)):", "if False:")
+    @killed_by("simulate/admissible.py", "if not (kinks is None or isinstance(kinks, bool)):", "if False:")
     def test_a_solver_that_fits_nothing_is_named(self, any_step):
         for solver, message in (
             (d.FixedStep(0.3, 0.25), "longer than solver.duration"),
