@@ -81,10 +81,7 @@ class Graph:
     def _make(
         self, op: str, args: tuple[Node, ...], dtype: DTypeLike, attr: PyTree = None, level: UpdateLevel | None = None
     ) -> Node:
-        """Return the node with these fields, a new one only if the graph has none.
-
-        Without `level`, the node changes as often as the operand that changes most often.
-        """
+        """Return the only node with these fields; without `level`, it changes as often as its most changing operand."""
         dtype = np.dtype(dtype)
         key = (op, tuple(arg.id for arg in args), dtype, attr)
         if key not in self._by_key:

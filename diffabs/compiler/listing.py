@@ -88,7 +88,6 @@ def _kind(node: Node) -> str:
 
 
 def _operation(node: Node, names: dict[int, str]) -> str:
-    """Return the line of an operation."""
     operands = ", ".join(names[x.id] for x in node.args)
     return f"  {f'{names[node.id]} = {node.op} {operands}':<40} {_kind(node)}, {LEVEL_NAMES[node.level]}"
 

@@ -44,7 +44,6 @@ class LaneCall(NamedTuple):
 
 
 def _path(functions: TracedFunctions, level: UpdateLevel, number: int, tangent: bool) -> str:
-    """Return the name of the array of an `ArrayKey`."""
     return ("d " if tangent else "") + functions.names[level][number]
 
 

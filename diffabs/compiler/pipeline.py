@@ -123,10 +123,7 @@ def _launch_lanes(
 
 
 def describe_kernel_build() -> dict[str, str]:
-    """Return a dictionary with "compiler", "flags" and "processor" of the back end for JAX's default device.
-
-    With a program's text, they determine a kernel's numbers to the last bit.
-    """
+    """Return what `describe_compiler` returns, of the back end for JAX's default device."""
     device = gpu.find_gpu()
     return device.describe() if device else toolchain.describe_compiler()
 

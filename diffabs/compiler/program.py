@@ -54,12 +54,7 @@ class ScalarProgram:
 
 
 def lower_functions(functions: TracedFunctions) -> ScalarProgram:
-    """Return the program of single numbers of traced functions.
-
-    Raises:
-        Unsupported: A function uses an operation without a lowering rule, or a type outside `LOWERED_TYPES`. There are
-            too many operations, or the carry's real numbers do not share one type, float32 or float64.
-    """
+    """Return the program of single numbers of traced functions, or raise Unsupported for what a program cannot hold."""
     graph, inputs = Graph(), {}
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in functions.types}
 

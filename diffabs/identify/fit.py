@@ -137,7 +137,6 @@ class Identified:
         return str(self.table())
 
     def _repr_html_(self) -> str:
-        """Return the table as HTML for a notebook."""
         return self.table()._repr_html_()
 
 

@@ -145,7 +145,6 @@ class Traces:
 
 
 def _output_names(loop: Loop) -> tuple[str, ...]:
-    """Return the names of the plant's output signals."""
     return jax.eval_shape(
         lambda loop: loop.plant.output(loop.plant.start(loop.initial)), canonical_dtypes(loop)
     )._fields

@@ -129,10 +129,7 @@ def _choose_engine(study: Study, metric: str) -> Study:
 
 
 def find_metric_objection(study: Study, metric: str) -> str | None:
-    """Return why a kernel cannot make the runs of a study that measures only this metric, or None.
-
-    The check compiles the kernel but makes no run.
-    """
+    """Return why a kernel cannot make the runs of a study that measures only this metric, or None; it makes no run."""
     from diffabs.simulate.drive import kernel as native
 
     values = study.space.normal(np.zeros((1, study.space.dimension)))

@@ -345,11 +345,7 @@ def importance_sampling(
 
 
 def lognormal_estimate(probability: float, cov: float, deviation: float, degrees: float) -> ProbabilityEstimate:
-    """Return the estimate with the 95 % interval P exp(+- t deviation), whose upper end is at most 1.
-
-    Args:
-        deviation: Standard deviation of log P.
-    """
+    """Return the estimate with the 95 % interval P exp(+- t deviation) up to 1, where `deviation` is that of log P."""
     reach = math.exp(min(student_quantile(degrees) * deviation, 700.0))
     return ProbabilityEstimate(probability, cov, (probability / reach, min(1.0, probability * reach)))
 

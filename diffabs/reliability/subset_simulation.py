@@ -254,7 +254,6 @@ class _Plan(NamedTuple):
 
 
 def _make_plan(dimension: int, threshold: float, samples: int, share: float, levels: int, draws: int) -> _Plan:
-    """Return the checked settings."""
     for name, value, minimum in (("dimension", dimension, 1), ("samples", samples, 4), ("levels", levels, 1)):
         _check_integer(name, value, minimum)
     _check_integer("draws", draws, 0)

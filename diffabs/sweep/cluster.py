@@ -131,10 +131,7 @@ def _start_workers(workers: int) -> Iterator[PyTree]:
 
 
 def dask_setup(_: object) -> None:
-    """Ignore Ctrl-C in a worker, so that only the process in the terminal handles it.
-
-    Dask calls this in each new worker.
-    """
+    """Ignore Ctrl-C in a new worker, where Dask calls this: only the process in the terminal handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -217,10 +214,7 @@ def _compute_chunks(
 
 
 def _wait_for_chunk(client: Client, finished: Scalar, stopping: Callable[[], bool]) -> bool:
-    """Wait for the next chunk and return True, or False if none will come.
-
-    Ctrl-C in a terminal also ends workers, and some of them do not return.
-    """
+    """Wait for the next chunk and return True, or False if none will come: Ctrl-C in a terminal also ends workers."""
     while not finished.has_ready():
         if stopping() and not client.nthreads():
             return False
@@ -229,10 +223,7 @@ def _wait_for_chunk(client: Client, finished: Scalar, stopping: Callable[[], boo
 
 
 def _convert_to_numpy(study: Study) -> Study:
-    """Return the study with NumPy arrays.
-
-    A process with float32 as default would read JAX arrays with half of their digits.
-    """
+    """Return the study with NumPy arrays: a process with float32 as default would halve the digits of JAX arrays."""
 
     def plain(x: Scalar) -> Any:
         return np.asarray(x) if isinstance(x, jax.Array) else x

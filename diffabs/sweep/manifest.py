@@ -58,9 +58,8 @@ EARLIER_FORMAT_MESSAGE = "written by an earlier diffabs: read its chunks with pa
 
 
 def describe_owner(study: Study) -> JsonObject:
-    """Return the identity of a sweep that this process computes now, as {"format", "study", "versions"}.
-
-    A digest of it, the owner, is in every chunk.
+    """Return what a sweep of this process is, {"format", "study", "versions"}; its digest, the owner, is in every
+    chunk.
     """
     return {
         "format": MANIFEST_FORMAT,

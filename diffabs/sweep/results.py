@@ -75,7 +75,6 @@ class Results:
         return str(self._summary())
 
     def _repr_html_(self) -> str:
-        """Return a summary of the sweep for a notebook."""
         return self._summary()._repr_html_()
 
     def _summary(self) -> Summary:

@@ -151,16 +151,12 @@ def _convert_compiler_errors() -> Iterator[None]:
 
 
 def find_study_objection(study: Study) -> str | None:
-    """Return the reason why the study's engine cannot make the runs of the first chunk, or None.
-
-    Nothing runs, but the programs are compiled, for the default platform.
-    """
+    """Return why the study's engine cannot make the runs of the first chunk, or None; it compiles, but runs nothing."""
     return _find_objection(study, default_platform())
 
 
 @functools.lru_cache(maxsize=4)
 def _find_objection(study: Study, platform: str) -> str | None:
-    """Return what `find_study_objection` returns, on the default `platform`."""
     del platform
     runner = Runner(study, default_devices()[:1])
     try:

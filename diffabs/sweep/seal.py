@@ -57,10 +57,7 @@ class Seal(NamedTuple):
 
 
 def json_digest(value: Scalar) -> str:
-    """Return the SHA-256 of JSON values.
-
-    The order of names counts, because it is the order of a design's columns.
-    """
+    """Return the SHA-256 of JSON values; the order of names counts, because it is the order of a design's columns."""
     return hashlib.sha256(json.dumps(value, separators=(",", ":")).encode()).hexdigest()
 
 

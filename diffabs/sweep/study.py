@@ -244,10 +244,7 @@ def failure_masks(
 
 
 def has_wrong_end(stopped: Bool, success: bool) -> np.ndarray:
-    """Return which runs had a wrong end, shape (samples,).
-
-    The end is wrong if a run misses a stop that is a success, or reaches a stop that is not.
-    """
+    """Return which runs had a wrong end, shape (samples,): no stop though it is a success, or one that is not."""
     return np.asarray(stopped) != success
 
 

@@ -22,10 +22,7 @@ MAX_TRAJECTORY_INSTANTS = 2000  # recorded instants of a trajectory
 
 
 def write_trajectories(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pathlib.Path:
-    """Run these samples again, write their trajectories, and return the path of the group.
-
-    The group replaces an earlier one. It is written completely or not at all.
-    """
+    """Run these samples again, write their trajectories in place of an earlier group, and return the group's path."""
     if not samples:
         raise ValueError("samples = []: give the number of at least one sample")
     path = pathlib.Path(folder) / TRAJECTORIES_NAME

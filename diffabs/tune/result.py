@@ -131,7 +131,6 @@ class Tuned:
         return str(self.table())
 
     def _repr_html_(self) -> str:
-        """Return the table as HTML for a notebook."""
         return self.table()._repr_html_()
 
     @property

@@ -141,7 +141,6 @@ def build_problem(
 
 
 def _check_metrics(objective: Mapping[str, float], measured: Mapping[str, Objective]) -> None:
-    """Raise a ValueError if the objective is no mapping from measured metrics to finite weights."""
     if not isinstance(objective, Mapping):
         raise ValueError(f"objective = {format_value(objective)} is no mapping from metrics to weights")
     if not objective:

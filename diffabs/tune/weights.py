@@ -71,10 +71,7 @@ class LQWeights:
 def lq_weights(loop: Loop, Q: AnyArray, R: float, design: GainDesign, path: str = "controller.gain") -> LQWeights:
     """Return a loop with the LQ weights Q and R as its parameters.
 
-    Args:
-        Q: State weight, shape (n, n), or its diagonal (n,); positive definite.
-        R: Input weight, > 0.
-        path: Dotted path of the gain in the loop.
+    Q (n, n), or its diagonal (n,), is positive definite, and R > 0. `path` is that of the gain in the loop.
     """
     q = as_weight_matrix("Q", Q, len(np.atleast_1d(Q)), definite=True)
     r = as_weight_matrix("R", R, 1, definite=True)

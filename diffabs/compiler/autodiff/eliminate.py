@@ -89,9 +89,8 @@ class Elimination:
         return self.many * (len(keys) - units) + len(selected)
 
     def _saving_without(self, key: int, inner: Sum) -> int:
-        """Return the operations saved in all directions if the readers of a vertex use its sum `inner` instead.
-
-        Operations that compute new factors count against it.
+        """Return the operations saved, less those on new factors, if the readers of a vertex use its sum `inner`
+        instead.
         """
         spared = self.many * sum_cost(inner)
         for reader in self.readers[key]:

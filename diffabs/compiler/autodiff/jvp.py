@@ -55,9 +55,8 @@ def differentiate_functions(
 ) -> DerivativeProgram:
     """Return the program of the functions' values and one tangent direction.
 
-    Args:
-        seeded: Indices of the arrays whose initial tangents can be nonzero, by level.
-        outputs_needed: Indices of the carry's arrays whose tangents matter at the end, None for all.
+    Only the arrays in `seeded` have initial tangents that can be nonzero, and only the tangents of the carry's arrays
+    in `outputs_needed` matter at the end, None for all.
     """
     differentiable = seeded | {
         UpdateLevel.STEP: tuple(i for i, x in enumerate(functions.types[UpdateLevel.STEP]) if is_real(x.dtype))
@@ -76,10 +75,8 @@ def arrange_arrays(
 ) -> dict[UpdateLevel, list[ArrayKey]]:
     """Return the keys of the launched program's arrays by level, in their order: values, then tangents.
 
-    A uniform array that vmap has given a value per lane belongs to the level LANE, and so do its tangents.
-
-    Args:
-        per_lane_uniforms: Indices of the uniform arrays that vmap has given a value per lane.
+    A uniform array in `per_lane_uniforms`, to which vmap has given a value per lane, belongs to the level LANE, and so
+    do its tangents.
     """
     keys_by_level: dict[UpdateLevel, list[ArrayKey]] = {level: [] for level in INPUT_LEVELS}
     for tangent in (False, True):

@@ -109,7 +109,6 @@ class Algebra:
         return Factor(negative, self.graph.op("mul", x.number, y.number))
 
     def _plus(self, sum: Sum, more: Sum) -> Sum:
-        """Return the sum of two sums."""
         merged = dict(sum)
         for key, new in more.items():
             old = merged.pop(key, None)

@@ -35,10 +35,7 @@ class LaunchShape(NamedTuple):
 
 
 def emit_cpp(program: ScalarProgram, shape: LaunchShape) -> str:
-    """Return the C++ text of a program, complete with the loops over lanes and the entry point for XLA.
-
-    It contains the functions `renew` and `step` (carry to carry) and `running` (carry to boolean).
-    """
+    """Return the C++ text of a program, complete with the loops over lanes and the entry point for XLA."""
     return "\n".join(Text(program, shape).parts()) + "\n"
 
 

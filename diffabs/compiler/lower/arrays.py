@@ -144,7 +144,6 @@ def _first_extreme(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]
     dtype = eqn.params["index_dtype"]
 
     def first(*column: Node) -> Node:
-        """Return the index of the first extreme entry of a column."""
         # x != x detects NaN. A NaN replaces the best entry once, because no later comparison with it is true.
         place, best = graph.const(0, dtype), column[0]
         for i, x in enumerate(column[1:], 1):

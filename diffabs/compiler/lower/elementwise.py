@@ -71,11 +71,7 @@ def _max_min(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 def max_or_min(graph: Graph, name: str, x: Node, y: Node) -> Node:
-    """Return the larger or smaller of two numbers; NaN if either is NaN.
-
-    Args:
-        x, y: Numbers of one type, or booleans: the larger is their "or".
-    """
+    """Return the larger or smaller of two numbers, NaN if either is NaN; of booleans, the larger is their "or"."""
     if x is y:
         return x
     if x.dtype == bool:

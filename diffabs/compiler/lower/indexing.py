@@ -16,7 +16,7 @@ MAX_COMPARED_ENTRIES = 64  # possible indices of one read or write by comparison
 
 
 def _clamp_index(graph: Graph, index: Node, last: int) -> Node:
-    """Return an index clamped to [0, most]."""
+    """Return an index clamped to [0, last]."""
     low = max_or_min(graph, "max", index, graph.const(0, index.dtype))
     return max_or_min(graph, "min", low, graph.const(last, index.dtype))
 

@@ -132,10 +132,7 @@ def _erf_inv(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 def erf_inv(graph: Graph, x: Node) -> Node:
-    """Return y with erf(y) = x: infinite at x = 1 and x = -1, NaN outside [-1, 1].
-
-    Source: M. Giles, Approximating the erfinv function (2012), with XLA's coefficients.
-    """
+    """Return y with erf(y) = x: infinite at x = 1 and x = -1, NaN outside [-1, 1]."""
     w = graph.op("neg", graph.op("log1p", graph.op("neg", graph.op("mul", x, x))))
     root: Node | None = None
     for upper, shifted, powers in reversed(ERF_INV_SINGLE if x.dtype == np.float32 else ERF_INV_DOUBLE):

@@ -59,9 +59,7 @@ LOWERING_RULES: dict[str, LoweringRule] = {}
 def lowering_rule(names: str, parameters: str = "") -> Callable[[PyTree], PyTree]:
     """Return a decorator that registers a function (graph, eqn, inputs) -> outputs as the rule of some primitives.
 
-    Args:
-        names: Names of the primitives, separated by blanks.
-        parameters: Names of the parameters that the primitives may have, separated by blanks.
+    `names` lists the primitives, `parameters` all that they may have, separated by blanks.
     """
 
     def decorate(apply: Any) -> Any:

@@ -78,7 +78,6 @@ def _pack_addresses(addresses: list[int], sizes: list[int]) -> PyTree:
 
 @functools.cache
 def _cuda_device(architecture: str) -> "CudaDevice":
-    """Return the NVIDIA GPUs of an architecture; each has its loaded kernels."""
     return CudaDevice(architecture)
 
 
@@ -124,11 +123,7 @@ class CudaDevice:
         return buffer.__cuda_array_interface__["data"][0]
 
     def start(self, code: pathlib.Path, arrays: PyTree, room: int, count: int, context: PyTree) -> None:
-        """Start the kernels `begin_all` and then `run_all` of a program, on the device that holds `room`.
-
-        Args:
-            room: Device address of the memory for the counter and the shared values.
-        """
+        """Start `begin_all` and then `run_all` on the device of the address `room`, of counter and shared values."""
         ordinal = ctypes.c_int()
         # Several devices may run this program: the memory tells which one to use.
         _call_driver("cuPointerGetAttribute", ctypes.byref(ordinal), ORDINAL, ctypes.c_uint64(room))
@@ -191,7 +186,6 @@ def _call_driver(name: str, *args: PyTree) -> None:
 
 @functools.cache
 def _load_driver() -> Any:
-    """Return the CUDA driver, initialized."""
     driver = ctypes.CDLL("libcuda.so.1")
     driver.cuInit(0)
     return driver

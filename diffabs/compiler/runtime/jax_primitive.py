@@ -130,7 +130,6 @@ def _launch_once(
 def _jvp_rule(
     arrays: Sequence[PyTree], slopes: Sequence[PyTree], *, lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: Any
 ) -> PyTree:
-    """Return values and tangents of a kernel for `jax.jvp`."""
     if seeds is not None:
         raise ValueError("a kernel has no second derivatives; engine = 'xla' has")
     # Integers and truths have tangents of type float0 in JAX. They carry no derivative.
@@ -161,7 +160,6 @@ ad.primitive_jvps[run_lanes_primitive] = _jvp_rule
 
 
 def _zero_tangent(x: Scalar) -> PyTree:
-    """Return JAX's symbolic zero tangent of a value."""
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 

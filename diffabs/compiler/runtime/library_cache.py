@@ -36,11 +36,7 @@ def cache_folder() -> pathlib.Path:
 
 
 def make_cache_folder() -> pathlib.Path:
-    """Create the cache folder if it is missing, and return it.
-
-    Raises:
-        OSError: The folder cannot be created, or other users may write to it and so could place their own code there.
-    """
+    """Create the cache folder if it is missing, and return it; raise OSError if other users may write code there."""
     folder = cache_folder()
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if files.others_may_write(folder):

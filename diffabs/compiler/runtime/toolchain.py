@@ -124,10 +124,7 @@ def build_library(text: str, flags: tuple[str, ...] = ()) -> pathlib.Path:
 
 
 def describe_compiler() -> dict[str, str]:
-    """Return a dictionary with "compiler", "flags" and "processor" of the C++ back end.
-
-    With a program's text, they determine a kernel's numbers to the last bit.
-    """
+    """Return "compiler", "flags", "processor": with a program's text they fix a kernel's numbers to the last bit."""
     return {"compiler": find_compiler().version, "flags": " ".join(CPP_FLAGS), "processor": _processor()}
 
 
