@@ -16,10 +16,6 @@ def as_array(x: Scalar, dtype: DTypeLike) -> jax.Array:
     """Return `jnp.asarray(x, dtype)`, but convert untraced values by NumPy, since JAX would compile a program for each.
 
     The array of a Python float is cached, because its creation takes longer than many computations with it.
-
-    Args:
-        x: Number, array, or list of numbers.
-        dtype: Type of the array.
     """
     if isinstance(x, jax.Array):
         return jnp.asarray(x, dtype)
@@ -41,23 +37,12 @@ def _number(x: float, sign: float, dtype: np.dtype, around: Any) -> jax.Array:
 
 
 def as_rule_array(x: Scalar) -> Scalar:
-    """Return x as an array: JAX arrays and tracers in their own type, other numbers as NumPy float64.
-
-    Args:
-        x: Number, array, or list of numbers.
-    """
+    """Return x as an array: JAX arrays and tracers in their own type, other numbers as NumPy float64."""
     if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(x)):
         return jnp.asarray(x)
     return np.asarray(x, float)
 
 
 def steps_in_period(period: Scalar, h: Scalar) -> Scalar:
-    """Return the number of steps of length h in a period, rounded to an integer of at least 1.
-
-    The number has no derivative.
-
-    Args:
-        period: Period [s].
-        h: Step [s].
-    """
+    """Return the number of steps h [s] in a period [s], an integer of at least 1, without a derivative."""
     return jnp.maximum(jnp.round(jax.lax.stop_gradient(period / h)), 1).astype(int)

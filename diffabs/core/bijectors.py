@@ -119,11 +119,7 @@ Bijection = Interval | Decades | HalfLine | UnboundedLine
 def bijection(low: float, high: float, start: float) -> Bijection:
     """Return the map from the unbounded z onto the range (low, high).
 
-    Args:
-        low: Lower end, or -inf.
-        high: Upper end, or inf.
-        start: A value inside the range. For a range with an infinite end it is the value at z = 0, and it sets the
-            scale. A finite range ignores it.
+    For a range with an infinite end, `start` is the value at z = 0, and it sets the scale. A finite range ignores it.
     """
     if math.isfinite(low) and math.isfinite(high):
         if low * high > 0:
@@ -139,13 +135,7 @@ def bijection(low: float, high: float, start: float) -> Bijection:
 
 
 def reached_bound(low: float, high: float, value: float) -> str:
-    """Return "lower" or "upper" if a value is in the outer hundredth of a finite range as it is mapped, else "".
-
-    Args:
-        low: Lower end.
-        high: Upper end.
-        value: Value.
-    """
+    """Return "lower" or "upper" if a value is in the outer hundredth of a finite range as it is mapped, else ""."""
     if not (math.isfinite(low) and math.isfinite(high)):
         return ""
     if not low < value < high:
@@ -193,12 +183,12 @@ class FreeSpace:
 
     def values(self, z: AnyArray) -> dict[str, PyTree]:
         """Return the parameters at `z` by path. Differentiable."""
-        found, first = {}, 0
+        by_path, first = {}, 0
         for entry in self.entries:
             numbers = [m.value(z[first + i]) for i, m in enumerate(entry.maps)]
-            found[entry.path] = jnp.stack(numbers).reshape(entry.shape) if entry.shape else numbers[0]
+            by_path[entry.path] = jnp.stack(numbers).reshape(entry.shape) if entry.shape else numbers[0]
             first += len(entry.maps)
-        return found
+        return by_path
 
     def at(self, part: T, z: AnyArray) -> T:
         """Return `part` with its free parameters at `z`. Differentiable."""
@@ -210,19 +200,15 @@ class FreeSpace:
         return np.array([float(m.steepness(x)) for m, x in zip(maps, z, strict=True)])
 
     def place(self, part: Part) -> np.ndarray:
-        """Return z of the present values of `part`.
-
-        Raises:
-            ValueError: A value is not inside its range.
-        """
-        there = {path: value for path, _, value in parameters(part)}
-        values = [np.asarray(there[entry.path], float).ravel() for entry in self.entries]
-        found = []
+        """Return z of the present values of `part`; one that is not inside its range is a ValueError."""
+        present = {path: value for path, _, value in parameters(part)}
+        values = [np.asarray(present[entry.path], float).ravel() for entry in self.entries]
+        positions = []
         for entry, numbers in zip(self.entries, values, strict=True):
             for x, m, ends in zip(numbers, entry.maps, entry.ranges, strict=True):
                 _check_inside(entry.path, float(x), m, ends)
-            found.append(np.array([m.place(float(x)) for m, x in zip(entry.maps, numbers, strict=True)]))
-        return np.concatenate(found)
+            positions.append(np.array([m.place(float(x)) for m, x in zip(entry.maps, numbers, strict=True)]))
+        return np.concatenate(positions)
 
     def spread(self, key: jax.Array, count: int) -> np.ndarray:
         """Return `count` random starts z (count, size) from the random `key`.
@@ -241,27 +227,21 @@ class FreeSpace:
 def parameter_space(part: Part, free: Sequence[str] | Mapping[str, Range | None]) -> FreeSpace:
     """Return the space of some parameters of a part, as a map from an unbounded vector z.
 
-    Args:
-        part: Part with the parameters.
-        free: Dotted paths, or a mapping from path to range. A range is a pair of numbers or of arrays of the
-            parameter's shape; None is the declared range.
-
-    Raises:
-        ValueError: No path is given. A path is not a parameter, or a run does not depend on it smoothly. A range is
-            empty or leaves the declared range. A present value is at an end of its range or outside.
+    `free` has dotted paths, or ranges by path: pairs of numbers or of arrays of the parameter's shape; None is the
+    declared range. A present value at an end of its range, or a range that leaves the declared one, is a ValueError.
     """
     if isinstance(free, str):
         raise ValueError(f"free = {free!r} is text; a list of paths, or ranges by path, is needed")
-    given = free if isinstance(free, Mapping) else dict.fromkeys(free)
-    if not given:
+    ranges = free if isinstance(free, Mapping) else dict.fromkeys(free)
+    if not ranges:
         raise ValueError("no parameter is free")
-    there = {path: (spec, np.asarray(value, float)) for path, spec, value in parameters(part)}
-    for path in given:
-        if path not in there:
-            raise ValueError(f"{path} is not a parameter; there is {', '.join(there)}")
-        if not there[path][0].tunable:
+    declared = {path: (spec, np.asarray(value, float)) for path, spec, value in parameters(part)}
+    for path in ranges:
+        if path not in declared:
+            raise ValueError(f"{path} is not a parameter; there is {', '.join(declared)}")
+        if not declared[path][0].tunable:
             raise ValueError(f"{path} cannot be tuned: a run does not depend smoothly on it")
-    return FreeSpace(tuple(_entry(path, *there[path], ends) for path, ends in given.items()))
+    return FreeSpace(tuple(_entry(path, *declared[path], ends) for path, ends in ranges.items()))
 
 
 def _entry(path: str, spec: ParameterSpec, value: np.ndarray, ends: Range | None) -> FreeParameter:
@@ -288,12 +268,12 @@ def _entry(path: str, spec: ParameterSpec, value: np.ndarray, ends: Range | None
     )
 
 
-def _check_inside(path: str, value: float, one: Bijection, ends: tuple[float, float]) -> None:
+def _check_inside(path: str, value: float, mapping: Bijection, ends: tuple[float, float]) -> None:
     """Raise a ValueError if a value is too close to an end of its range, or outside."""
     (low, high), x = ends, value
     inside = low < value < high
-    if inside and isinstance(one, Decades):
-        low, high, x = one.logarithm.low, one.logarithm.high, math.log(one.sign * value)
+    if inside and isinstance(mapping, Decades):
+        low, high, x = mapping.logarithm.low, mapping.logarithm.high, math.log(mapping.sign * value)
     finite = [abs(end) for end in (low, high) if math.isfinite(end)]
     room = END_SHARE * (high - low if len(finite) == 2 else sum(finite))
     if not (inside and low + room <= x <= high - room):

@@ -72,12 +72,12 @@ class Series:
 
     def margins(self, t: Scalar, memory: Memory, signal: PyTree, rate: Callable[[], PyTree]) -> tuple[PyTree, ...]:
         """Return the margins of all blocks, in order."""
-        found: tuple[PyTree, ...] = ()
+        margins: tuple[PyTree, ...] = ()
         for block, m in self._pairs(memory):
             if offers(block, "margins"):
-                found += block.margins(t, m, signal, rate)
+                margins += block.margins(t, m, signal, rate)
             signal, rate = block.output(t, m, signal), partial(_output_rate, block, t, m, signal, rate)
-        return found
+        return margins
 
     def event(self, t: Scalar, memory: Memory, signal: PyTree, fired: tuple[PyTree, ...]) -> Memory:
         """Return the memories after the events of the blocks, in order."""
@@ -93,11 +93,11 @@ class Series:
 
     def recorded_signals(self, t: Scalar, memory: Memory, signal: PyTree) -> tuple[PyTree, ...]:
         """Return the inputs of the recording blocks, in order, for the input `signal` at time `t` with `memory`."""
-        found: tuple[PyTree, ...] = ()
+        inputs: tuple[PyTree, ...] = ()
         for block, m in self._pairs(memory):
-            found += (record_signal(block, t, m, signal),) if offers(block, "record") else ()
+            inputs += (record_signal(block, t, m, signal),) if offers(block, "record") else ()
             signal = block.output(t, m, signal)
-        return found
+        return inputs
 
     def record(self, memory: Memory, step: HermiteStep) -> Memory:
         """Return the memories after each recording block has recorded its input."""
@@ -116,43 +116,26 @@ class Series:
 
 
 def offers(block: Part, *hooks: str) -> bool:
-    """Return whether a block has at least one of these optional methods.
+    """Return whether a block has at least one of these optional methods; without names, `tick` or `margins`.
 
     A block with a method `offers(hook)`, such as `Series`, answers for the blocks in it.
-
-    Args:
-        block: Block.
-        hooks: Names of optional methods; without names, `tick` and `margins`.
     """
-    asked = getattr(block, "offers", None)
-    return any(asked(hook) if asked else hasattr(block, hook) for hook in hooks or ("tick", "margins"))
+    nested_offers = getattr(block, "offers", None)
+    return any(nested_offers(hook) if nested_offers else hasattr(block, hook) for hook in hooks or ("tick", "margins"))
 
 
 def next_tick(block: Part, k: Int, h: Scalar) -> Scalar:
-    """Return the number of the first grid instant after the k-th at which a block ticks.
+    """Return the number of the first grid instant after the k-th at which a block ticks, on a grid of step h [s].
 
     A block without a period ticks at every grid instant. For blocks in series, the first tick of any of them counts.
-
-    Args:
-        block: Block with a tick.
-        k: Number of the present grid instant.
-        h: Step of the grid [s].
     """
-    ticking = [one for one in getattr(block, "blocks", (block,)) if offers(one, "tick")]
-    lengths = [steps_in_period(one.period, h) if hasattr(one, "period") else 1 for one in ticking]
+    ticking = [inner for inner in getattr(block, "blocks", (block,)) if offers(inner, "tick")]
+    lengths = [steps_in_period(inner.period, h) if hasattr(inner, "period") else 1 for inner in ticking]
     return reduce(jnp.minimum, ((k // n + 1) * n for n in lengths))
 
 
 def record_signal(block: Part, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
-    """Return the signal that a block records: its input, or for blocks in series a tuple of the recording blocks'
-    inputs.
-
-    Args:
-        block: Block that records.
-        t: Time [s].
-        memory: Memory of the block.
-        signal: Input of the block.
-    """
+    """Return the signal that a block records: its input; for blocks in series the inputs of those that record."""
     inner = getattr(block, "recorded_signals", None)
     return inner(t, memory, signal) if inner else signal
 

@@ -34,12 +34,8 @@ QUICK_COMPILE_OPTIONS: dict[str, PyTree] = {
 def compile_once(static: Iterable[str] | int = (), options: dict[str, PyTree] | None = None) -> Callable[[F], F]:
     """Return a decorator like `jax.jit`, for a function that usually runs only once for each shape of its arguments.
 
-    A call with concrete numbers or arrays compiles with `options`. A call under jit, grad or vmap compiles without
-    them.
-
-    Args:
-        static: Names of static arguments, which callers pass by name, or the number of leading static arguments.
-        options: XLA's compiler options: `SAME_RESULT_OPTIONS`, `QUICK_COMPILE_OPTIONS`, or None for its defaults.
+    A call with concrete numbers or arrays compiles with XLA's `options`, a call under jit, grad or vmap without them.
+    `static` has the names of static arguments, which callers pass by name, or the number of leading ones.
     """
     leading, names = (static, ()) if isinstance(static, int) else (0, tuple(static))
     fixed: dict[str, PyTree] = {"static_argnums": tuple(range(leading)), "static_argnames": names}
@@ -59,11 +55,7 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, PyTree] | 
 
 
 def is_traced(*trees: PyTree) -> bool:
-    """Return whether a jit trace is under way, or a leaf of the trees is a tracer, as under grad and vmap.
-
-    Args:
-        trees: Pytrees of numbers or tracers.
-    """
+    """Return whether a jit trace is under way, or a leaf of the trees is a tracer, as under grad and vmap."""
     return _is_tracing() or any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 

@@ -140,9 +140,9 @@ def _refine_zero(x: Scalar, function: Callable[[PyTree], PyTree], slope: Scalar)
 
     They are the derivatives of a Newton step, and their order is twice the order of x.
     """
-    # `left - stop_gradient(left)` is 0 in value and has the derivative of `left`.
-    left = function(x)
-    return x - _quotient(left - jax.lax.stop_gradient(left), slope)
+    # `remainder - stop_gradient(remainder)` is 0 in value and has the derivative of `remainder`.
+    remainder = function(x)
+    return x - _quotient(remainder - jax.lax.stop_gradient(remainder), slope)
 
 
 def _quotient(x: Scalar, y: Scalar) -> Scalar:

@@ -17,12 +17,7 @@ _operation = jex.Primitive("first_order")
 
 
 def first_order(tangents: PyTree, why: str) -> PyTree:
-    """Return tangents unchanged; their differentiation raises a ValueError with the message `why`.
-
-    Args:
-        tangents: Pytree of tangents.
-        why: Message of the error.
-    """
+    """Return tangents unchanged; their differentiation raises a ValueError with the message `why`."""
 
     def each(x: Scalar) -> PyTree:
         return x if getattr(x, "dtype", None) == jax.dtypes.float0 else _operation.bind(x, why=why)
@@ -32,12 +27,7 @@ def first_order(tangents: PyTree, why: str) -> PyTree:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def without_derivative(path: str, x: Scalar) -> Scalar:
-    """Return x, the value of a parameter; its differentiation raises a ValueError that names the parameter.
-
-    Args:
-        path: Dotted path of the parameter.
-        x: Value of the parameter.
-    """
+    """Return x, the value of a parameter; its differentiation raises a ValueError that names the parameter."""
     del path
     return x
 

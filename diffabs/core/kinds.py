@@ -24,9 +24,6 @@ def find_value_objection(value: Scalar) -> str:
     """Return why a value cannot be a number of a run or an array of numbers, such as `is text`; empty if it can.
 
     For an array only the type counts, so it may be traced. A Python integer beyond the range of a float is refused.
-
-    Args:
-        value: Number, array, or nested lists of numbers.
     """
     if type(value) is float:
         return ""
@@ -60,24 +57,14 @@ def _of_type(dtype: DTypeLike) -> str:
 
 
 def value_shape(value: Scalar) -> tuple[int, ...]:
-    """Return the shape of an array, a number, or a nested list of numbers.
-
-    The first item of a list stands for all its items. Arrays may be traced.
-
-    Args:
-        value: Array, number, or list.
-    """
+    """Return the shape of an array, also traced, a number, or a nested list, whose first item stands for all."""
     if isinstance(value, list | tuple | range):
         return (len(value), *(value_shape(value[0]) if value else ()))
     return np.shape(value)
 
 
 def format_value(value: Scalar) -> str:
-    """Return a value or an array for a message: on one line, of at most 60 characters.
-
-    Args:
-        value: Any value.
-    """
+    """Return a value or an array for a message: on one line, of at most 60 characters."""
     try:
         text = " ".join(str(value).split()) if hasattr(value, "dtype") else repr(value).replace("\n", " ")
     except ValueError:  # a whole number of thousands of digits

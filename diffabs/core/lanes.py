@@ -18,9 +18,6 @@ def any_lane(running: Bool) -> Bool:
 
     With one condition for all runs `jax.lax.cond` skips the work. With one condition for each run JAX would execute
     both branches and select between all carries in every step. A step must therefore do nothing in a run that is over.
-
-    Args:
-        running: True if this run goes on.
     """
     return running
 
@@ -36,10 +33,6 @@ def jit_barrier(active: Bool, work: Callable[[], X]) -> X:
     """Return work(), compiled as one unit; zeros if no run of a batch is active.
 
     XLA would otherwise compile a copy of `work` into each expression that uses the result.
-
-    Args:
-        active: True if this run is active.
-        work: Function without arguments that returns a pytree of arrays.
     """
     work = jax.jit(work)  # traced once for its shape and for its program
     shape = jax.eval_shape(work)
@@ -47,20 +40,10 @@ def jit_barrier(active: Bool, work: Callable[[], X]) -> X:
 
 
 def rematerialise(body: Any) -> PyTree:
-    """Return `body` with checkpointing: reverse mode keeps only its arguments and computes everything else again.
-
-    Args:
-        body: Function to wrap, usually the body of a scan.
-    """
+    """Return `body` with checkpointing: reverse mode keeps only its arguments and computes everything else again."""
     return jax.checkpoint(body, policy=jax.checkpoint_policies.nothing_saveable, prevent_cse=False)
 
 
-def select(which: Bool, a: X, b: X) -> X:
-    """Return a if `which`, else b.
-
-    Args:
-        which: Condition.
-        a: Pytree.
-        b: Pytree of the same structure.
-    """
-    return jax.tree.map(lambda x, y: jnp.where(which, x, y), a, b)
+def select(condition: Bool, a: X, b: X) -> X:
+    """Return a where the condition holds, else b, a pytree of the same structure."""
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)

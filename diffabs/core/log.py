@@ -52,44 +52,27 @@ class Log:
 
 
 def log_rows(tree: PyTree) -> list[PyTree]:
-    """Return the rows of all logs in a pytree.
-
-    Args:
-        tree: Pytree with logs.
-    """
+    """Return the rows of all logs in a pytree."""
     return [log.rows for log in jax.tree.leaves(tree, is_leaf=_is_log) if _is_log(log)]
 
 
 def borrow(tree: PyTree, rows: list[PyTree] | None) -> PyTree:
-    """Return the tree with its logs lent to a solver, and with these rows in the logs.
-
-    Args:
-        tree: Pytree with logs.
-        rows: Rows of each log, in the order of `log_rows`; None removes the rows.
-    """
+    """Return the tree with its logs lent to a solver, and with these rows (`log_rows`) in the logs, or without rows."""
     each = iter(rows or ())
     return _map_logs(lambda log: Log(next(each) if rows else None, log.place, log.row, lent=True), tree)
 
 
 def commit(tree: PyTree, rows: list[PyTree]) -> PyTree:
-    """Return the tree with its logs no longer lent: each has its rows, and among them the row written last.
-
-    Args:
-        tree: Pytree with logs.
-        rows: Rows of each log, in the order of `log_rows`.
-    """
+    """Return the tree with its logs no longer lent: each has its rows, and among them the row written last."""
     each = iter(rows)
     return _map_logs(lambda log: Log(next(each), log.place, log.row).put(log.place, log.row), tree)
 
 
 def write_last_rows(tree: PyTree) -> list[PyTree]:
-    """Return the rows of all logs after the row written last is put in its place.
+    """Return the rows of all lent logs after the row written last is put in its place.
 
     If a step writes the previous step's row and then reads, the write happens in place. If it reads first, the write
     needs a copy, unless the row depends on the value read.
-
-    Args:
-        tree: Pytree with lent logs that have their rows.
     """
     return log_rows(commit(tree, log_rows(tree)))
 

@@ -97,8 +97,8 @@ class Loop:
     def problems(self) -> Iterator[str]:
         """Yield a line if an output of the plant has the name of another signal."""
         shown = getattr(getattr(self.plant, "shows", None), "_fields", ())
-        if taken := sorted(RESERVED_SIGNALS & set(shown)):
-            yield f"plant.shows: no output can be called {', '.join(taken)}, like a signal of the loop or of its files"
+        if clash := sorted(RESERVED_SIGNALS & set(shown)):
+            yield f"plant.shows: no output can be called {', '.join(clash)}, like a signal of the loop or of its files"
 
     def start(self) -> LoopState:
         """Return the state at t = 0, before the first tick."""
@@ -121,11 +121,11 @@ class Loop:
         control = self.actuator.output(t, state.actuator, command)
         setpoint = self.reference.setpoint(state.reference)
         sample = Sample(t, y, tracking.target, setpoint, tracking.feedforward, command, control)
-        given = _block_inputs(Signals(sample, measured, tracking, {}))
-        kept = {
-            name: record_signal(getattr(self, name), t, getattr(state, name), given[name]) for name in self.recorders
+        inputs = _block_inputs(Signals(sample, measured, tracking, {}))
+        recorded = {
+            name: record_signal(getattr(self, name), t, getattr(state, name), inputs[name]) for name in self.recorders
         }
-        return Signals(sample, measured, tracking, kept)
+        return Signals(sample, measured, tracking, recorded)
 
     def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[PyTree, ...]:
         """Return d(state.flow())/dt from the `signals` at (t, state)."""
@@ -177,13 +177,13 @@ class Loop:
         """
         # The rates cost a derivative of the loop: they are computed at most once, and only if a block calls `rate`.
         rates = cache(lambda: _block_inputs(self.signal_rates(t, state, flow())))
-        seen = _block_inputs(signals)
+        inputs = _block_inputs(signals)
 
         def of(name: str) -> tuple[PyTree, ...]:
-            return getattr(self, name).margins(t, getattr(state, name), seen[name], lambda: rates()[name])
+            return getattr(self, name).margins(t, getattr(state, name), inputs[name], lambda: rates()[name])
 
-        found = {name: of(name) for name in BLOCKS if offers(getattr(self, name), "margins")}
-        return {"stop": (self.stop.margin(signals.sample.output),), **found}
+        block_margins = {name: of(name) for name in BLOCKS if offers(getattr(self, name), "margins")}
+        return {"stop": (self.stop.margin(signals.sample.output),), **block_margins}
 
     def change(
         self,
@@ -194,19 +194,11 @@ class Loop:
         fired: Margins,
         passed: dict[str, HermiteStep] | None = None,
     ) -> LoopState:
-        """Return the state after an instant.
+        """Return the state after an instant, of the state, signals and margins before it.
 
-        Each block, in the order of the signal, has its events, records the step that ends here, and has its tick. An
-        event also occurs if the change of an earlier block makes a margin negative. The test covers both ends of the
-        signal's jump, with the jump as the rate. So the margin of a maximum sees the fall.
-
-        Args:
-            clock: The instant.
-            state: State before the instant.
-            before: Signals before the instant.
-            margins: Margins before the instant.
-            fired: For each margin, whether it has just fallen through zero.
-            passed: The step that ends here, for the blocks that record it; None at the start of a run.
+        Each block, in the order of the signal, has its events, records the step that ends here (`passed`), and has its
+        tick. An event also occurs if the change of an earlier block makes a margin negative. The test covers both ends
+        of the signal's jump, with the jump as the rate. So the margin of a maximum sees the fall.
         """
         was, moved = _block_inputs(before), False
 
@@ -220,7 +212,7 @@ class Loop:
                     jump = jax.tree.map(jnp.subtract, signal, was[name])
                     ends = (block.margins(clock.t, memory, end, lambda: jump) for end in (was[name], signal))
                     crossed = zip(happens, margins[name], *ends, strict=True)
-                    happens = tuple(one | ((a >= 0) & ((b < 0) | (c < 0))) for one, a, b, c in crossed)
+                    happens = tuple(event | ((a >= 0) & ((b < 0) | (c < 0))) for event, a, b, c in crossed)
                 memory = block.event(clock.t, memory, was[name], happens)
             if passed and name in passed:
                 memory = block.record(memory, passed[name])
@@ -248,11 +240,11 @@ class Loop:
         return Tracking(target, measured, self.feedforward.input(self.plant, measured, setpoint))
 
 
-def _jumps(one: PyTree) -> bool:
+def _jumps(component: PyTree) -> bool:
     """Return whether a part, or a part in it, declares jumps; a block without a flow has nothing to integrate."""
-    if getattr(type(one), "flow", None) is no_flow:
+    if getattr(type(component), "flow", None) is no_flow:
         return False
-    return getattr(one, "jumps", False) or any(map(_jumps, parts(one)))
+    return getattr(component, "jumps", False) or any(map(_jumps, parts(component)))
 
 
 def _block_inputs(signals: Signals) -> dict[str, PyTree]:
@@ -264,15 +256,11 @@ def _block_inputs(signals: Signals) -> dict[str, PyTree]:
 def run_signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, PyTree]]:
     """Return the stored signals of a run by name, each as (unit, values).
 
-    The names are `t`, the outputs of the plant, `target`, `command` and `control`.
-
-    Args:
-        sample: Samples of the run.
-        plant: Plant of the loop; `Loop.problems` keeps its outputs from other signals' names.
+    The names are `t`, the outputs of the plant, `target`, `command` and `control`; `Loop.problems` keeps them apart.
     """
     units = plant.shows.units
     shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
-    asked = {"target": (units[sample.output._fields[0]], sample.target)}
-    given = {name: (plant.control_unit, getattr(sample, name)) for name in ("command", "control")}
+    target = {"target": (units[sample.output._fields[0]], sample.target)}
+    controls = {name: (plant.control_unit, getattr(sample, name)) for name in ("command", "control")}
     time = {"t": ("s", sample.t)}
-    return {**time, **shown, **asked, **given}
+    return {**time, **shown, **target, **controls}

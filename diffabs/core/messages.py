@@ -212,12 +212,7 @@ def _read_cubic(read: Callable[[PyTree], Scalar], ends: Iterable[PyTree], slopes
 
 
 def resting_segment(sample: Sample, h: Scalar) -> Segment:
-    """Return a segment of length h in which nothing moves.
-
-    Args:
-        sample: Sample at both ends.
-        h: Length [s].
-    """
+    """Return a segment of length h [s] in which nothing moves."""
     sample = jax.tree.map(jnp.asarray, sample)
-    rest = jax.tree.map(jnp.zeros_like, sample)
-    return Segment(sample, sample, h, h, lambda: (Shown.of(rest), Shown.of(rest)), lambda: (rest, rest))
+    still = jax.tree.map(jnp.zeros_like, sample)
+    return Segment(sample, sample, h, h, lambda: (Shown.of(still), Shown.of(still)), lambda: (still, still))

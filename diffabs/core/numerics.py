@@ -11,16 +11,10 @@ EQUAL_EPS = 1024.0  # in units of eps: difference of a signal between instants t
 
 
 def clamp(x: Scalar, low: Scalar, high: Scalar) -> Scalar:
-    """Return x limited to [low, high].
+    """Return x limited to [low, high]; its slope in x is 1 at a limit and 0 beyond it, and in a limit 1 beyond that.
 
-    The slope in x is 1 at a limit and 0 beyond it; the slope in a limit is 1 beyond that limit. The function uses
-    selections for two reasons. The tangent of `jnp.clip` divides. In JAX 0.10, `lax.clamp` refuses to batch an upper
-    limit alone (similar to github.com/jax-ml/jax/issues/5325, whose repair leaves this case out).
-
-    Args:
-        x: Number to limit.
-        low: Lower limit.
-        high: Upper limit.
+    Selections, since the tangent of `jnp.clip` divides, and `lax.clamp` of JAX 0.10 refuses to batch an upper limit
+    alone (similar to github.com/jax-ml/jax/issues/5325, whose repair leaves this case out).
     """
     return jnp.where(jnp.less(x, low), low, jnp.where(jnp.greater(x, high), high, x))
 
@@ -29,10 +23,6 @@ def larger(x: Scalar, y: Scalar) -> Scalar:
     """Return max(x, y); where both are equal, its derivative is that of x.
 
     `jnp.maximum` shares the derivative between both, by a division in its tangent.
-
-    Args:
-        x: First number.
-        y: Second number.
     """
     return jnp.where(jnp.greater_equal(x, y), x, y)
 
@@ -42,39 +32,25 @@ def later_of_larger(x: Scalar, y: Scalar, falls: Scalar = False) -> PyTree:
 
     At the end of a step of zero length, y moves with the event there, and x does not. If the signal falls at x, the
     result moves as x instead. So a peak at an event just before a grid instant does not move with the grid.
-
-    Args:
-        x: Earlier value.
-        y: Later value.
-        falls: Whether the signal falls at x.
     """
     rounding = EQUAL_EPS * jnp.finfo(jnp.result_type(x, y)).eps * jnp.abs(x)
     more = jnp.where(falls, rounding, -rounding)
-    chosen = jnp.where(jnp.greater_equal(y, x + more), y, x)
+    moving = jnp.where(jnp.greater_equal(y, x + more), y, x)
     # The value is the larger one also within the rounding: a maximum of many values would follow a slow decline.
-    short = jnp.where(jnp.greater(y, x), y, x) - chosen
-    return chosen + jax.lax.stop_gradient(jnp.where(jnp.greater(short, 0), short, 0.0))
+    short = jnp.where(jnp.greater(y, x), y, x) - moving
+    return moving + jax.lax.stop_gradient(jnp.where(jnp.greater(short, 0), short, 0.0))
 
 
 def smaller(x: Scalar, y: Scalar) -> Scalar:
-    """Return min(x, y); where both are equal, its derivative is that of x.
-
-    Args:
-        x: First number.
-        y: Second number.
-    """
+    """Return min(x, y); where both are equal, its derivative is that of x."""
     return jnp.where(jnp.less_equal(x, y), x, y)
 
 
 def invalidate(tree: PyTree, invalid: Scalar, inputs: PyTree) -> PyTree:
-    """Return a pytree of real numbers, or NaN if they are invalid; then their derivatives by every input are NaN, too.
+    """Return a pytree of real numbers; where they are invalid, they and their derivatives by every input are NaN.
 
-    A selection (`jnp.where`) alone would give an invalid number the derivative zero.
-
-    Args:
-        tree: Result.
-        invalid: Whether the result is invalid, as a whole.
-        inputs: Pytree of everything that the result may depend on; only its floating-point leaves count.
+    A selection (`jnp.where`) alone would give an invalid number the derivative zero. `inputs` is a pytree of everything
+    that the result may depend on; only its floating-point leaves count.
     """
     factor = jnp.where(invalid, jnp.nan, 1.0)
     numbers = jax.tree.map(jnp.asarray, tree)
@@ -82,12 +58,9 @@ def invalidate(tree: PyTree, invalid: Scalar, inputs: PyTree) -> PyTree:
 
 
 def void_derivatives(tree: PyTree, void: Scalar, inputs: PyTree) -> PyTree:
-    """Return a pytree of valid numbers whose derivatives by every input are NaN if `void`.
+    """Return a pytree of valid numbers whose derivatives by every input (`invalidate`) are NaN if `void`.
 
-    Args:
-        tree: Result.
-        void: Whether its derivatives are invalid, as a whole: in reverse mode one such number makes all of it NaN.
-        inputs: Pytree of everything that the result may depend on; only its floating-point leaves count.
+    In reverse mode one such number makes the whole derivative NaN.
     """
     real = jnp.result_type(float)
     leaves = [leaf for leaf in map(jnp.asarray, jax.tree.leaves(inputs)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
@@ -129,12 +102,7 @@ def _slope_rule(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
 
 @jax.custom_jvp
 def quotient(x: Scalar, y: Scalar) -> Scalar:
-    """Return x/y; its derivatives (dx - (x/y) dy)/y share one 1/y. JAX's own derivatives divide three more times.
-
-    Args:
-        x: Numerator.
-        y: Denominator.
-    """
+    """Return x/y; its derivatives (dx - (x/y) dy)/y share one 1/y. JAX's own derivatives divide three more times."""
     return x / y
 
 
@@ -146,16 +114,10 @@ def _quotient_slope(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
 
 
 def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Scalar:
-    """Return numerator/denominator, or `otherwise` with zero slope where the denominator is zero.
-
-    Args:
-        numerator: Numerator.
-        denominator: Denominator.
-        otherwise: Value for a zero denominator.
-    """
+    """Return numerator/denominator, or `otherwise` with zero slope where the denominator is zero."""
     # The inner `where` replaces a zero denominator: 0 times the infinite derivative of 1/0 would be NaN.
-    fine = jnp.not_equal(denominator, 0)
-    return jnp.where(fine, quotient(numerator, jnp.where(fine, denominator, 1.0)), otherwise)
+    nonzero = jnp.not_equal(denominator, 0)
+    return jnp.where(nonzero, quotient(numerator, jnp.where(nonzero, denominator, 1.0)), otherwise)
 
 
 def power(base: Scalar, exponent: Scalar) -> Scalar:
@@ -163,80 +125,48 @@ def power(base: Scalar, exponent: Scalar) -> Scalar:
 
     The formula is exp(q/2 log(base^2)). XLA's own power takes three to four times as long on a CPU. The square keeps
     the number finite in a trial step that passes base = 0 with frozen comparisons.
-
-    Args:
-        base: Base.
-        exponent: Exponent q.
     """
     square = base * base
-    fine = jnp.not_equal(square, 0)
-    value = jnp.where(fine, jnp.exp(exponent * (0.5 * jnp.log(jnp.where(fine, square, 1.0)))), 0.0)
+    nonzero = jnp.not_equal(square, 0)
+    value = jnp.where(nonzero, jnp.exp(exponent * (0.5 * jnp.log(jnp.where(nonzero, square, 1.0)))), 0.0)
     return jnp.where(jnp.greater(base, 0), value, 0.0)
 
 
 @jax.jit
 def searchsorted(knots: Scalar, x: Scalar) -> Scalar:
-    """Return the number of knots that are not above x, for a few knots.
+    """Return the number of knots (n,) that are not above x, for a few increasing knots.
 
-    `simulate.step.comparisons` recognises the search by this name, which JAX uses, too. JAX's own search looks for
-    NaN among the knots in each call.
-
-    Args:
-        knots: Increasing knots, shape (n,).
-        x: Number to search.
+    `simulate.step.comparisons` recognises the search by this name, which JAX uses, too. JAX's own search looks for NaN
+    among the knots in each call.
     """
     return jnp.sum(x >= knots).astype(jnp.int32)
 
 
 def sign(x: Scalar) -> Scalar:
-    """Return +1 for x >= 0, else -1; with it, the odd extension of a curve keeps its right-hand slope at 0.
-
-    Args:
-        x: Number.
-    """
+    """Return +1 for x >= 0, else -1; with it, the odd extension of a curve keeps its right-hand slope at 0."""
     return jnp.where(jnp.greater_equal(x, 0), 1.0, -1.0)
 
 
 def odd(curve: Callable[[PyTree], PyTree], x: Scalar) -> Scalar:
-    """Return the odd extension of a curve for x >= 0, with the curve's slope at 0 (|x| would give slope 0).
-
-    Args:
-        curve: Function for x >= 0.
-        x: Argument of either sign.
-    """
+    """Return the odd extension of a curve for x >= 0, with the curve's slope at 0 (|x| would give slope 0)."""
     s = sign(x)
     return s * curve(s * x)
 
 
 def interval_shares(x: Scalar, nodes: PyTree) -> Scalar:
-    """Return the share of each interval between the nodes that lies below x, from 0 to 1, shape (n - 1,).
+    """Return the share of each interval between increasing nodes (n,) that lies below x, from 0 to 1, shape (n - 1,).
 
     `interpolate_shares` sums over the shares. It looks up no index, so its derivatives need no scatter.
-
-    Args:
-        x: Number.
-        nodes: Increasing nodes, shape (n,).
     """
     inside = (x - nodes[:-1]) / jnp.diff(nodes)
     return jnp.where(x >= nodes[1:], 1.0, jnp.where(x < nodes[:-1], 0.0, inside))
 
 
 def interpolate_shares(risen: Scalar, values: PyTree) -> Scalar:
-    """Return the piecewise linear interpolant of the values at the nodes, constant beyond the nodes.
-
-    Args:
-        risen: Shares of the intervals from `interval_shares`, shape (n - 1,).
-        values: Values at the nodes, shape (n,).
-    """
+    """Return the piecewise linear interpolant of values (n,) at the nodes of `interval_shares`, constant beyond."""
     return values[0] + jnp.sum(risen * jnp.diff(values))
 
 
 def axpy(a: Scalar, x: Scalar, y: Scalar) -> PyTree:
-    """Return a x + y on pytrees.
-
-    Args:
-        a: Factor.
-        x: Pytree.
-        y: Pytree of the same structure.
-    """
+    """Return a x + y on pytrees."""
     return jax.tree.map(lambda x, y: a * x + y, x, y)

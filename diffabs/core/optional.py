@@ -5,11 +5,7 @@ from typing import Any
 
 
 def import_optional(name: str) -> Any:
-    """Return the package `name`, which no extra of diffabs brings.
-
-    Raises:
-        ModuleNotFoundError: It, or a package that it needs, is not installed. The message is one line.
-    """
+    """Return a package that no extra of diffabs brings, or raise a ModuleNotFoundError of one line."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

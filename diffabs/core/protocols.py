@@ -224,24 +224,12 @@ class Objective(Protocol):
 
 
 def no_memory(self: Part, signal: PyTree) -> Memory:
-    """Return an empty memory: `start` of a block without memory.
-
-    Args:
-        self: Block.
-        signal: First input of the block.
-    """
+    """Return an empty memory: `start` of a block without memory."""
     del self, signal
     return Memory()
 
 
 def no_flow(self: Part, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
-    """Return no rates: `flow` of a block without continuous memory.
-
-    Args:
-        self: Block.
-        t: Time [s].
-        memory: Memory of the block.
-        signal: Input of the block.
-    """
+    """Return no rates: `flow` of a block without continuous memory."""
     del self, t, memory, signal
     return ()

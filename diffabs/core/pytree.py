@@ -57,10 +57,10 @@ class ParameterSpec:
 
     def interval(self) -> str:
         """Return the range as text: `(0, 1] kg`."""
-        left = "(" if self.open_low or self.low == -math.inf else "["
-        right = ")" if self.open_high or self.high == math.inf else "]"
+        opening = "(" if self.open_low or self.low == -math.inf else "["
+        closing = ")" if self.open_high or self.high == math.inf else "]"
         unit = "" if self.unit == "1" else f" {self.unit}"
-        return f"{left}{self.low:g}, {self.high:g}{right}{unit}"
+        return f"{opening}{self.low:g}, {self.high:g}{closing}{unit}"
 
     def around(self, units: Units | None) -> "ParameterSpec":
         """Return the declaration with `control` and `signal` in its unit replaced by the `units` of a loop; None keeps
@@ -125,11 +125,7 @@ def param(
 
 
 def part(*, default: Any = dataclasses.MISSING) -> PyTree:
-    """Return a field that holds another part, or a tuple or list of parts.
-
-    Args:
-        default: A part, or a class to call.
-    """
+    """Return a field that holds another part, or a tuple or list of parts; a default that is a class is called."""
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata={"part": True})
     make = default if isinstance(default, type) else lambda: default
@@ -137,11 +133,7 @@ def part(*, default: Any = dataclasses.MISSING) -> PyTree:
 
 
 def static(*, default: Any = dataclasses.MISSING) -> Scalar:
-    """Return a field known at trace time; another value causes another compilation.
-
-    Args:
-        default: Default value.
-    """
+    """Return a field known at trace time; another value causes another compilation."""
     return dataclasses.field(default=default, metadata={"static": True})
 
 
@@ -149,13 +141,9 @@ def static(*, default: Any = dataclasses.MISSING) -> Scalar:
     frozen_default=True, kw_only_default=True, eq_default=False, field_specifiers=(param, part, static)
 )
 def pytree(cls: type[T]) -> type[T]:
-    """Return a class as a part: a frozen dataclass and a JAX pytree.
+    """Return a class as a part: a frozen dataclass and a JAX pytree, of fields by `param`, `part` or `static`.
 
-    Args:
-        cls: Class with fields declared by `param`, `part` or `static`.
-
-    Raises:
-        TypeError: The class has `__post_init__`, which JAX would call with tracers and None, or an undeclared field.
+    A class with `__post_init__`, which JAX would call with tracers and None, is a TypeError; so is an undeclared field.
     """
     if "__post_init__" in cls.__dict__:
         raise TypeError(f"{cls.__name__}: no __post_init__ on a part; write rules(self) for check() instead")
@@ -194,12 +182,8 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
 def parameters(part: Part, prefix: str = "", units: Units | None = None) -> Iterator[tuple[str, ParameterSpec, PyTree]]:
     """Yield every parameter below a part as (dotted path, spec, value), in the order of declaration.
 
-    Relative units are resolved by the given `units`, or else by the plant of the part or of a part in it.
-
-    Args:
-        part: Part.
-        prefix: Text before every path.
-        units: Units of the loop, or None.
+    Relative units are resolved by the given `units`, or else by the plant of the part or of a part in it. `prefix` is
+    the text before every path.
     """
     units = units or units_of(getattr(part, "plant", None))
     for name, field, value in children(part, prefix):
@@ -213,13 +197,6 @@ def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[P
     """Yield (dotted path, field, value) of each field that is not static, without descending into the values.
 
     For a tuple or a list of parts it yields the items, with None as their field. For any other value it yields nothing.
-
-    Args:
-        part: Part, or tuple or list of parts.
-        prefix: Text before every path.
-
-    Raises:
-        ValueError: A class is in the place of a part.
     """
     if isinstance(part, type):
         name = prefix.removesuffix(".") or "the part"
@@ -234,11 +211,7 @@ def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[P
 
 
 def parts(part: Part) -> Iterator[PyTree]:
-    """Yield the parts directly in a part, but not the parts in those; items of a tuple or list count singly.
-
-    Args:
-        part: Part.
-    """
+    """Yield the parts directly in a part, but not the parts in those; items of a tuple or list count singly."""
     for _, field, value in children(part, ""):
         if field is None:
             yield value
@@ -247,30 +220,19 @@ def parts(part: Part) -> Iterator[PyTree]:
 
 
 def elements(part: Part) -> dict[str, ParameterSpec]:
-    """Return the declaration of every single number below a part by path.
-
-    The path of an element of an array ends in its index: `controller.gain.0`.
-
-    Args:
-        part: Part.
-    """
-    found: dict[str, ParameterSpec] = {}
+    """Return the declaration of every single number below a part by path: `controller.gain.0` for one of an array."""
+    specs: dict[str, ParameterSpec] = {}
     for path, spec, value in parameters(part):
         shape = np.shape(value)
-        found |= {".".join([path, *map(str, at)]): spec for at in np.ndindex(shape)} if shape else {path: spec}
-    return found
+        specs |= {".".join([path, *map(str, at)]): spec for at in np.ndindex(shape)} if shape else {path: spec}
+    return specs
 
 
 def get(part: Part, path: str) -> PyTree:
     """Return the value in a part at a dotted path: a parameter, a part, or an element of an array
     (`controller.gain.0`).
 
-    Args:
-        part: Part.
-        path: Dotted path.
-
-    Raises:
-        KeyError: The path does not exist, or leads to a static field; the message names the fields that exist there.
+    A path that does not exist, or leads to a static field, is a KeyError that names the fields that exist there.
     """
     words = path.split(".")
     for i, name in enumerate(words):
@@ -312,12 +274,12 @@ def replace(part: T, values: Params) -> T:
 
 
 def _replace(part: Part, names: list[str], value: Scalar) -> Any:
-    head, *rest = names
+    head, *tail = names
     if dataclasses.is_dataclass(part):
-        new = _replace(getattr(part, head), rest, value) if rest else value
+        new = _replace(getattr(part, head), tail, value) if tail else value
         return dataclasses.replace(part, **{head: new})  # pyright: ignore[reportArgumentType]  # an instance
     i = int(head)
-    new = _replace(part[i], rest, value) if rest else value
+    new = _replace(part[i], tail, value) if tail else value
     if isinstance(part, tuple) or dataclasses.is_dataclass(part[i]):
         return (*part[:i], new, *part[i + 1 :])
     part = jnp.asarray(part)
@@ -350,9 +312,6 @@ def stack_lists(part: T) -> T:
 
     A list of plain numbers becomes a NumPy array. It leaves the data type of a run to the JAX arrays among the
     parameters.
-
-    Args:
-        part: Part.
     """
     listed = {path: value for path, _, value in parameters(part) if isinstance(value, list | tuple)}
     return replace(part, {path: as_rule_array(value) for path, value in listed.items()})
@@ -363,12 +322,6 @@ def canonical_dtypes(tree: T) -> T:
 
     It is the common dtype of the float JAX arrays among the leaves, or JAX's default float if there are none. Python
     numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
-
-    Args:
-        tree: Pytree of numbers and arrays.
-
-    Raises:
-        ValueError: A leaf is not a real number, or a float of fewer than 32 bits.
     """
     leaves, structure = jax.tree.flatten(tree)
     if any(map(kinds.find_value_objection, leaves)):
@@ -389,22 +342,14 @@ def prepare_parts(part: Part) -> PyTree:
 
     The results hold precomputed values that stay constant during a run. Differentiable; a run does it once, inside its
     compiled function.
-
-    Args:
-        part: Part.
     """
     return _rebuild_parts(part, "prepared", lambda prefix: ())
 
 
 def refine_parts(part: Part, times: int) -> PyTree:
-    """Return the part for shorter steps: each part in it with a method `refined(times)` is replaced by the method's
-    result.
+    """Return the part for shorter steps: each part in it with a method `refined(times)` is replaced by its result.
 
     Such a part has a memory that covers a number of steps.
-
-    Args:
-        part: Part.
-        times: Factor by which the steps are shorter.
     """
     return _rebuild_parts(part, "refined", lambda prefix: (times,))
 
@@ -414,10 +359,6 @@ def prepare_derivatives(part: Part, paths: Iterable[str]) -> PyTree:
 
     Each part in it with a method `enable_derivatives(names)` is replaced by the method's result. `names` are the paths
     below that part, without the path of the part.
-
-    Args:
-        part: Part.
-        paths: Dotted paths.
     """
     return _rebuild_parts(
         part,

@@ -36,14 +36,7 @@ class Rule(NamedTuple):
 
 
 def order_rule(low: tuple[str, PyTree], high: tuple[str, PyTree], unit: str, *, equal: bool = True) -> Rule:
-    """Return the rule low <= high, or low < high if the limits may not be equal.
-
-    Args:
-        low: Lower limit as (name, value).
-        high: Upper limit as (name, value).
-        unit: Unit of both.
-        equal: Whether the limits may be equal.
-    """
+    """Return the rule low <= high of two limits (name, value), or low < high if they may not be equal."""
     (below, a), (above, b) = low, high
     relation = "exceeds" if equal else "is not below"
     unit = "" if unit == "1" else f" {unit}"
@@ -55,14 +48,7 @@ def order_rule(low: tuple[str, PyTree], high: tuple[str, PyTree], unit: str, *, 
 
 
 def increase_rule(name: str, values: PyTree, broken: str, unit: str) -> Rule:
-    """Return the rule that each number is greater than the one before.
-
-    Args:
-        name: Name of the numbers.
-        values: Numbers, shape (n,).
-        broken: Message after the name.
-        unit: Unit of the numbers.
-    """
+    """Return the rule that each number is greater than the one before; `broken` is the message after the name."""
     x = as_rule_array(values)
     return Rule(
         (x[1:] > x[:-1]).all(),
@@ -74,13 +60,9 @@ def increase_rule(name: str, values: PyTree, broken: str, unit: str) -> Rule:
 
 
 def whole_steps(name: str, period: Scalar, step: Scalar, called: str = "") -> Rule:
-    """Return the rule that a period is a whole multiple of the step, to a relative tolerance of 1e-6.
+    """Return the rule that a period [s] is a whole multiple of the step [s], to a relative tolerance of 1e-6.
 
-    Args:
-        name: Name of the period.
-        period: Period [s].
-        step: Step [s].
-        called: Name of the step in the message; empty for the step of the solver, with its number.
+    The message calls the step `called`, or else names that of the solver with its number.
     """
     count, called = as_rule_array(period) / step, called or f"solver.step = {step:g} s"
     return Rule(
@@ -91,12 +73,5 @@ def whole_steps(name: str, period: Scalar, step: Scalar, called: str = "") -> Ru
 
 
 def period_on_grid(self: Part, step: float) -> Iterator[Rule]:
-    """Yield the rule that a block's period is a multiple of the integration step.
-
-    A block with a `period` takes this function as its method `grid_rules`.
-
-    Args:
-        self: Block.
-        step: Integration step [s].
-    """
+    """Yield the rule that a block's period is a multiple of the step [s]: its method `grid_rules`."""
     yield whole_steps("period", self.period, step)

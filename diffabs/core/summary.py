@@ -13,31 +13,18 @@ ZERO_TOLERANCE = 1e-14  # smaller numbers, in SI units, are rounding errors
 
 
 def round_for_table(value: Scalar, digits: int = 6) -> str:
-    """Return a number as text for a table; numbers below 1e-14 are rounding errors and give 0.
-
-    Args:
-        value: Number in SI units.
-        digits: Number of significant digits.
-    """
+    """Return a number as text for a table; numbers below 1e-14 are rounding errors and give 0."""
     value = float(value)
     return "0" if abs(value) < ZERO_TOLERANCE else f"{value:.{digits}g}"
 
 
 def format_metric(value: Scalar) -> str:
-    """Return a metric as text for a table; `never` for infinity, `none` for a run without such a metric (NaN).
-
-    Args:
-        value: Metric of a run that did not diverge, in SI units.
-    """
+    """Return a metric as text for a table; `never` for infinity, `none` for a run without such a metric (NaN)."""
     return "never" if value == math.inf else "none" if math.isnan(value) else round_for_table(value)
 
 
 def format_cell(value: Scalar) -> str:
-    """Return a value as text for a table; of a list, the first four entries.
-
-    Args:
-        value: Text, number, list, or None.
-    """
+    """Return a value as text for a table; of a list, the first four entries."""
     if isinstance(value, str | bool | np.bool_) or value is None:
         return "" if value is None else str(value)
     if np.ndim(value):

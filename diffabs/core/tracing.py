@@ -14,11 +14,7 @@ from diffabs.core.types import PyTree, Scalar
 
 
 def differentiated_paths(tangents: PyTree) -> frozenset[str]:
-    """Return the paths of the parameters by which a part is differentiated.
-
-    Args:
-        tangents: Tangents of the part in a rule with `symbolic_zeros`.
-    """
+    """Return the paths of the parameters by which a part is differentiated, from tangents with symbolic zeros."""
     return frozenset(path for path, _, move in parameters(tangents) if type(move) is not SymbolicZero)
 
 
@@ -27,79 +23,58 @@ def jvp_nonzero(
 ) -> tuple[PyTree, PyTree]:
     """Return function(*primals) and its derivative along the tangents, for a rule with `symbolic_zeros`.
 
-    Only leaves with a tangent are differentiated, since zero tangents cost as much as others.
-
-    Args:
-        function: Function of the primals.
-        primals: Arguments.
-        tangents: Their tangents, with symbolic zeros.
-        once: Message of the ValueError that a second derivative raises. Empty if the function has second derivatives.
+    Only leaves with a tangent are differentiated, since zero tangents cost as much as others. `once` is the message of
+    the ValueError that a second derivative raises, or "" if the function has second derivatives.
     """
     values, tree = jax.tree.flatten(primals)
     moves = tree.flatten_up_to(tangents)
     live = [type(move) is not SymbolicZero for move in moves]
 
     def run(moving: list[PyTree]) -> Any:
-        left = iter(moving)
-        return function(*tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)]))
+        live_leaves = iter(moving)
+        return function(*tree.unflatten([next(live_leaves) if on else x for x, on in zip(values, live, strict=True)]))
 
     moving, rates = ([x for x, on in zip(xs, live, strict=True) if on] for xs in (values, moves))
     if not once:
         return jax.jvp(run, (moving,), (rates,))
-    found, rate = jax.jvp(run, (moving,), (first_order(rates, once),))
-    return found, first_order(rate, once)
+    outputs, rate = jax.jvp(run, (moving,), (first_order(rates, once),))
+    return outputs, first_order(rate, once)
 
 
 def split_batched(make: Callable[[PyTree], PyTree], batch: PyTree) -> tuple[PyTree, Callable[[PyTree], PyTree]]:
-    """Return (leaves, whole): the result of `make` for each member of a batch, with constants kept apart.
+    """Return (leaves, whole): the result of `make` for each member of a batch (n, ...), with constants kept apart.
 
-    `leaves` is a list of those leaves of the result that depend on the member, each (n, ...). `whole` takes these
-    leaves for one member and returns the result of that member. The other leaves are computed once. In a loop over runs
-    they stay numbers, which a processor keeps in registers, instead of columns.
-
-    Args:
-        make: Function of one member.
-        batch: Pytree with leaves (n, ...).
+    `leaves` are those leaves of the result that depend on the member, each (n, ...). `whole` takes these leaves for one
+    member and returns its result. The other leaves are computed once. In a loop over runs they stay numbers, which a
+    processor keeps in registers, instead of columns.
     """
-    one = jax.tree.map(lambda x: x[0], batch)
-    program, shape = jax.make_jaxpr(make, return_shape=True)(one)
+    first = jax.tree.map(lambda x: x[0], batch)
+    program, shape = jax.make_jaxpr(make, return_shape=True)(first)
     # Forward pass: each equation with a dependent input has dependent outputs. Literals have `val` and do not depend.
     depends = set(program.jaxpr.invars)
     for step in program.jaxpr.eqns:
         if any(not hasattr(v, "val") and v in depends for v in step.invars):
             depends.update(step.outvars)
     moves = [not hasattr(v, "val") and v in depends for v in program.jaxpr.outvars]
-    fixed, tree = jax.tree.leaves(make(one)), jax.tree.structure(shape)
+    fixed, tree = jax.tree.leaves(make(first)), jax.tree.structure(shape)
 
     def moving_outputs(member: PyTree) -> list[PyTree]:
         return [x for x, on in zip(jax.tree.leaves(make(member)), moves, strict=True) if on]
 
     def whole(leaves: list[PyTree]) -> Any:
-        rest = iter(leaves)
-        return tree.unflatten([next(rest) if on else x for x, on in zip(fixed, moves, strict=True)])
+        moving = iter(leaves)
+        return tree.unflatten([next(moving) if on else x for x, on in zip(fixed, moves, strict=True)])
 
     return jax.vmap(moving_outputs)(batch) if any(moves) else [], whole
 
 
 def depends_on_signal(function: Callable[[PyTree], PyTree], signal: PyTree) -> bool:
-    """Return whether a function's traced result depends on its signal; a product with a literal zero does not count.
-
-    Args:
-        function: Function of the signal.
-        signal: Signal.
-    """
+    """Return whether a function's traced result depends on its signal; a product with a literal zero does not count."""
     return any(leaf_dependence(function, signal))
 
 
 def leaf_dependence(function: Callable[[PyTree], PyTree], signal: PyTree) -> list[bool]:
-    """Return for each leaf of a signal, in the order of `jax.tree.leaves`, whether a function depends on it.
-
-    Tracing decides, as in `depends_on_signal`.
-
-    Args:
-        function: Function of the signal.
-        signal: Signal.
-    """
+    """Return for each leaf of a signal, in order, whether a function depends on it (`depends_on_signal`)."""
     program = jax.make_jaxpr(function)(signal).jaxpr
     needed = {atom for atom in program.outvars if not hasattr(atom, "val")}
     for step in reversed(program.eqns):
@@ -111,19 +86,13 @@ def leaf_dependence(function: Callable[[PyTree], PyTree], signal: PyTree) -> lis
 def read_leaves(
     function: Callable[[PyTree, PyTree], PyTree], fixed: PyTree, batch: PyTree, *, differentiably: bool = False
 ) -> PyTree:
-    """Return for each leaf of `batch` whether function(fixed, batch) of one member depends on it.
+    """Return a pytree of bools: whether function(fixed, batch) of one member depends on each leaf of `batch`.
 
-    The result is a pytree of bools with the structure of `batch`.
-
-    Args:
-        function: Function of one member of `fixed` and of `batch`.
-        fixed: Pytree with leaves (n, ...), also batched.
-        batch: Pytree with leaves (n, ...).
-        differentiably: Whether only leaves count by which the function has a derivative. Leaves that only enter
-            decisions have none.
+    Both arguments have leaves (n, ...). With `differentiably` only leaves count by which the function has a derivative.
+    Leaves that only enter decisions have none.
     """
-    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (fixed, batch))
-    program = jax.make_jaxpr(function)(*one).jaxpr
+    member = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (fixed, batch))
+    program = jax.make_jaxpr(function)(*member).jaxpr
 
     def counts(atom: PyTree) -> bool:
         # Integer and boolean values carry no derivative: a comparison ends the dependence.
@@ -138,16 +107,9 @@ def read_leaves(
 
 
 def scan_input_counts(params: Any, inputs: int) -> tuple[int, int]:
-    """Return how many inputs of a scan are constants and how many are carried.
+    """Return how many inputs of a scan are constants and how many are carried, from the primitive's parameters.
 
     Until JAX 0.10 these are numbers. Later versions store a structure with three groups of inputs, in their order.
-
-    Args:
-        params: Parameters of the primitive scan.
-        inputs: Number of its inputs.
-
-    Raises:
-        ValueError: The parameters are not known.
     """
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]

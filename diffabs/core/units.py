@@ -25,24 +25,15 @@ class Units(NamedTuple):
 
 
 def units_of(plant: Part) -> Units | None:
-    """Return the units of a plant's control and first output, or None if the plant declares none.
-
-    Args:
-        plant: Plant, or None.
-    """
+    """Return the units of a plant's control and first output, or None if the plant declares none."""
     shown = getattr(getattr(plant, "shows", None), "units", None)
     return Units(plant.control_unit, next(iter(shown.values())), tuple(shown.items())) if shown else None
 
 
 def units_inside(part: Part, name: str, units: Units | None) -> Units | None:
-    """Return the units for the part in a field of another part.
+    """Return the units for the part in the field `name` of another part.
 
     They are those of the other part, unless it has a method `units_inside(name, units)`.
-
-    Args:
-        part: Part with the field.
-        name: Name of the field.
-        units: Units of the part, or None.
     """
     hook = getattr(part, "units_inside", None)
     return hook(name, units) if hook and units else units
@@ -50,37 +41,21 @@ def units_inside(part: Part, name: str, units: Units | None) -> Units | None:
 
 @functools.lru_cache(maxsize=1024)
 def resolve_unit(unit: str, units: Units | None) -> str:
-    """Return a unit with `control` and `signal` replaced: "V s/rad". Commas separate the units of a list's elements.
-
-    Args:
-        unit: Unit.
-        units: Units of the loop; None leaves the unit unchanged.
-    """
+    """Return a unit with `control` and `signal` replaced: "V s/rad". Commas separate the units of a list's elements."""
     if units is None or not RELATIVE_UNIT.search(unit):
         return unit
     meaning = {"control": units.control, "signal": units.signal}
-    return ", ".join(_multiply_units(one, meaning) for one in unit.split(", "))
+    return ", ".join(_multiply_units(element, meaning) for element in unit.split(", "))
 
 
 def unit_at(unit: str, place: int, count: int) -> str:
-    """Return the unit of an entry of a list; each of k units applies to count/k entries, in order.
-
-    Args:
-        unit: Units, separated by commas.
-        place: Index of the entry.
-        count: Number of entries.
-    """
+    """Return the unit of the entry `place` of a list; each of k units applies to count/k entries, in order."""
     units = unit.split(", ")
     return units[place * len(units) // count]
 
 
 def insert_unit(text: str, units: Units | None) -> str:
-    """Return a sentence with the units for ` {control}` and ` {signal}`; a unit that is unknown or 1 is left out.
-
-    Args:
-        text: Sentence.
-        units: Units of the loop, or None.
-    """
+    """Return a sentence with the units for ` {control}` and ` {signal}`; a unit that is unknown or 1 is left out."""
     for name in ("control", "signal"):
         unit = getattr(units, name, "1")
         text = text.replace(f" {{{name}}}", "" if unit == "1" else f" {unit}")

@@ -26,30 +26,25 @@ def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> I
 
     For each part, four groups are checked in order: its numbers and the parts in it, the shapes of its numbers, its
     `problems`, its `rules`. The lines are those of the first group with a fault.
-
-    Args:
-        part: Part.
-        prefix: Text before every name.
-        units: Units of the loop, or None.
     """
-    found, shapes = False, []
+    has_fault, shapes = False, []
     units = units or units_of(getattr(part, "plant", None))
     for name, field, value in children(part, prefix):
         if field is not None and "spec" in field.metadata:
             spec: ParameterSpec = field.metadata["spec"].around(units)
             if line := _find_unfit(name, spec, value):
-                found = True
+                has_fault = True
                 yield line
             elif not spec.holds(value):
-                found = True
+                has_fault = True
                 yield f"{name} = {_show(value)} is outside {spec.interval()}"
             elif line := _find_wrong_shape(spec, value):
                 shapes.append(f"{field.name} {line}")
         else:
             within = list(find_problems(value, f"{name}.", units_inside(part, name.removeprefix(prefix), units)))
-            found |= bool(within)
+            has_fault |= bool(within)
             yield from within
-    if not found:
+    if not has_fault:
         shapes = shapes or list(_own(part, "problems"))
         yield from (prefix + insert_unit(line, units) for line in shapes or find_broken(_own(part, "rules")))
 
@@ -59,10 +54,6 @@ def part_rules(part: Part, prefix: str = "") -> Iterator[Rule]:
 
     These are the ranges and rules of `find_problems` in array form, for runs with different values. Only `problems` is
     missing, so the shapes must be correct.
-
-    Args:
-        part: Part.
-        prefix: Text before every name.
     """
     for name, spec, value in parameters(part, prefix):
         outside = f"is outside {spec.interval()}"
@@ -73,22 +64,12 @@ def part_rules(part: Part, prefix: str = "") -> Iterator[Rule]:
 
 
 def grid_rules(part: Part, step: float, prefix: str = "") -> Iterator[Rule]:
-    """Yield the rules of the parts on an integration step.
-
-    Args:
-        part: Part.
-        step: Integration step [s].
-        prefix: Text before every name.
-    """
+    """Yield the rules of the parts on an integration step [s]."""
     yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "grid_rules", step)
 
 
 def find_broken(rules: Iterable[Rule]) -> Iterator[str]:
-    """Yield a line for each rule that does not hold.
-
-    Args:
-        rules: Rules with concrete numbers.
-    """
+    """Yield a line for each rule that does not hold; the rules have concrete numbers."""
     yield from (rule.says() for rule in rules if not bool(rule.holds))
 
 
@@ -103,18 +84,14 @@ def _below(part: Part, prefix: str, units: Units | None, hook: str, *args: PyTre
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:
             yield from _below(value, f"{name}.", units_inside(part, name.removeprefix(prefix), units), hook, *args)
-    for found in _own(part, hook, *args):
-        yield found.under(prefix, units) if isinstance(found, Rule) else prefix + insert_unit(found, units)
+    for finding in _own(part, hook, *args):
+        yield finding.under(prefix, units) if isinstance(finding, Rule) else prefix + insert_unit(finding, units)
 
 
 def find_misshapen(part: Part, prefix: str = "") -> Iterator[str]:
     """Yield one line for each parameter of the wrong type or shape in an unbatched part, or else its `problems`.
 
     The values may be traced.
-
-    Args:
-        part: Part.
-        prefix: Text before every name.
     """
     lines = []
     for name, spec, value in parameters(part, prefix):
@@ -139,26 +116,12 @@ def _find_wrong_shape(spec: ParameterSpec, value: Scalar) -> str:
 
 
 def find_cautions(part: Part, prefix: str = "") -> Iterator[str]:
-    """Yield one line for each setting that is allowed but hardly intended, from the methods `cautions` of the parts.
-
-    Args:
-        part: Part.
-        prefix: Text before every name.
-    """
+    """Yield one line for each setting that is allowed but hardly intended (`cautions`)."""
     yield from _below(part, prefix, None, "cautions")
 
 
 def check_part(part: T, prefix: str = "") -> T:
-    """Return `part` unchanged if `find_problems` finds nothing.
-
-    Args:
-        part: Part.
-        prefix: Text before every name in a message, `"plant."`.
-
-    Raises:
-        ValueError: A field is out of range, NaN or no number, or a condition on shapes or between numbers fails. The
-            message names each field with value, range and unit.
-    """
+    """Return `part` if `find_problems` finds nothing, or else raise a ValueError of all its lines."""
     lines = list(find_problems(part, prefix))
     if lines:
         raise ValueError("; ".join(lines))

@@ -201,8 +201,8 @@ def test_what_a_computer_says_comes_out_later(late):
 @killed_by("simulate/step/system.py", "(dynamics[:2], dynamics.signals.recorded)", "dynamics[:2]", case="True")
 @killed_by(
     "core/blocks.py",
-    "            signal = block.output(t, m, signal)\n        return found\n\n    def record",
-    "        return found\n\n    def record",
+    "            signal = block.output(t, m, signal)\n        return inputs\n\n    def record",
+    "        return inputs\n\n    def record",
     case="True",
 )
 @pytest.mark.slow

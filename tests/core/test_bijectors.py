@@ -11,7 +11,7 @@ from diffabs.controllers import PID, StateFeedback
 from diffabs.core.bijectors import parameter_space
 
 
-@killed_by("core/bijectors.py", "if inside and isinstance(one, Decades):", "if False:")
+@killed_by("core/bijectors.py", "if inside and isinstance(mapping, Decades):", "if False:")
 def test_a_low_start_in_many_decades_has_a_place():
     """The range is mapped in the logarithm: there 5e-4 is in the middle, and 1e-6 (1 + 1e-9) at the end."""
     part, ends = PID(kp=60.0, ki=5e-4), {"ki": (1e-6, 1e6)}

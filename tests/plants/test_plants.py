@@ -196,7 +196,7 @@ def test_a_lever_that_locks_itself_is_refused():
         check(LabRig(road=Burckhardt(c1=1e300)))
 
 
-@killed_by("core/validity.py", "found |= bool(within)", "found |= False")
+@killed_by("core/validity.py", "has_fault |= bool(within)", "has_fault |= False")
 def test_a_lever_on_a_broken_road_is_not_asked_for():
     """Rules between parts are for parts that are sound: this spline has fewer frictions than slips."""
     broken = Tabulated(slip=np.array([0.0, 0.1, 0.2, 1.0]), mu=np.array([0.0, 0.5, 0.6]))
