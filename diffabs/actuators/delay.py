@@ -212,10 +212,10 @@ class Delay:
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """Yield the rule step <= time <= (capacity - 2) * step, up to the rounding of single precision."""
-        most, time = (self.capacity - 2) * step, as_rule_array(self.time)
-        outside = f"outside [{step:g}, {most:g}] s, one step to capacity - 2 steps"
+        longest, time = (self.capacity - 2) * step, as_rule_array(self.time)
+        outside = f"outside [{step:g}, {longest:g}] s, one step to capacity - 2 steps"
         yield Rule(
-            (step <= time * (1 + TIME_ROUNDING)) & (time * (1 - TIME_ROUNDING) <= most),
+            (step <= time * (1 + TIME_ROUNDING)) & (time * (1 - TIME_ROUNDING) <= longest),
             f"time is {outside}",
             lambda: f"time = {float(self.time):g} s is {outside}",
         )

@@ -161,8 +161,8 @@ def _read_columns(name: str, columns: Params) -> tuple[dict[str, np.ndarray], in
 
 def _check_direction(direction: Mapping[str, float]) -> None:
     """Raise ValueError unless a direction has finite values of the initial state, not all zero."""
-    if others := [path for path in direction if not path.startswith(INITIAL_PREFIX)]:
-        raise ValueError(f"{', '.join(others)}: a direction is one of the initial state")
+    if foreign := [path for path in direction if not path.startswith(INITIAL_PREFIX)]:
+        raise ValueError(f"{', '.join(foreign)}: a direction is one of the initial state")
     values = np.array(list(direction.values()), float)
     if not (np.isfinite(values).all() and values.any()):
         raise ValueError(f"direction = {dict(direction)}: it needs finite values of the initial state, not all zero")
@@ -250,12 +250,12 @@ def recoverable_multiple(
     direction: Mapping[str, float],
     solver: Solver,
     *,
-    most: float = 1.0,
+    largest: float = 1.0,
     band: float | None = None,
     key: PyTree = None,
     engine: str = "auto",
 ) -> Reach:
-    """Return the largest c in [0, `most`] up to which the loop recovers from every tried multiple of `direction`.
+    """Return the largest c in [0, `largest`] up to which the loop recovers from every tried multiple of `direction`.
 
     The search tries 33 multiples in a batch, and then refines the interval up to the first failure, to 1e-4 of c.
 
@@ -264,12 +264,12 @@ def recoverable_multiple(
         band: Bound on |x| at the end, as for `classify_starts`.
     """
     _check_direction(direction)
-    if not 0 < most < np.inf:
-        raise ValueError(f"most = {most:g} is outside (0, inf)")
+    if not 0 < largest < np.inf:
+        raise ValueError(f"largest = {largest:g} is outside (0, inf)")
     alike = {path: np.full(SEARCH_POINTS, value) for path, value in direction.items()}
     # All starts of the search share one system, so its ellipsoid is computed once.
     inside, enough = _find_ellipsoids(loop, alike, SEARCH_POINTS, band)
-    low, high, undecided = 0.0, float(most), False
+    low, high, undecided = 0.0, float(largest), False
     while high - low > MULTIPLE_TOLERANCE * high:
         tried = np.linspace(low, high, SEARCH_POINTS + 1)[1:]
         starts = {path: value * tried for path, value in direction.items()}
@@ -278,7 +278,7 @@ def recoverable_multiple(
         if good == SEARCH_POINTS:
             return Reach(high, undecided)
         low, high, undecided = (tried[good - 1] if good else low), float(tried[good]), bool(outcomes.undecided[good])
-        if high < 1e-9 * most:
+        if high < 1e-9 * largest:
             return Reach(0.0, undecided)
     return Reach(float(low), undecided)
 

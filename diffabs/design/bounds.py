@@ -168,8 +168,8 @@ class Bounds:
             return None
         values = unknowns.values(answer.y)
         for loosening in BOUND_LOOSENINGS if "g" not in values or values["g"] > 0 else ():
-            found = claim(at.form(values["P"]), values, 1 + loosening)
-            made = Claim(found.pop("kind"), found)
-            if exact.is_proved(made.kind, self.system, self.k, made.data):
-                return made
+            fields = claim(at.form(values["P"]), values, 1 + loosening)
+            proposal = Claim(fields.pop("kind"), fields)
+            if exact.is_proved(proposal.kind, self.system, self.k, proposal.data):
+                return proposal
         return None

@@ -63,8 +63,8 @@ class BalanceModel:
 @jax.jit
 def _matrices(model: BalanceModel) -> StateSpace:
     model = canonical_dtypes(model)
-    rest: Any = model.plant.start(canonical_dtypes(BalanceStart()))
-    a, b = linearize(model.plant, rest, 0.0)
+    upright: Any = model.plant.start(canonical_dtypes(BalanceStart()))
+    a, b = linearize(model.plant, upright, 0.0)
     system = StateSpace(a, b.reshape(len(a), 1))
     if not isinstance(model.sampling, Sampling):
         return system

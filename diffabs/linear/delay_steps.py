@@ -92,9 +92,9 @@ class DelayedLoop:
             # The curve may be nearer to -1 than its chord, so chords near -1 are divided.
             w = self._curve.w
             pieces = (w[near, None] + (w[near + 1] - w[near])[:, None] * np.linspace(0, 1, PIECES + 1)).ravel()
-            fine = self._bound(self._trace(pieces)[0], delay)
+            divided = self._bound(self._trace(pieces)[0], delay)
             inner = np.arange(1, len(pieces)) % (PIECES + 1) != 0
-            steps, distances = np.append(steps, fine[0][inner]), np.append(distances, fine[1][inner])
+            steps, distances = np.append(steps, divided[0][inner]), np.append(distances, divided[1][inner])
         return DelayStep(float(np.nanmin(steps)), float(np.nanmin(distances)))
 
     def _rests(self) -> np.ndarray:
@@ -152,9 +152,9 @@ class DelayedLoop:
         """Return the largest safe step, and the distance from -1, for each chord of the Nyquist curve."""
         w, row, rate, bend = curve
         whole = np.floor(delay / self.period)
-        rest = self.period - min(max(delay - whole * self.period, 0.0), self.period)
+        remainder = self.period - min(max(delay - whole * self.period, 0.0), self.period)
         plant = self.loop.plant
-        (power,), (held,) = hold_input(plant.A, plant.B, np.array([rest]))
+        (power,), (held,) = hold_input(plant.A, plant.B, np.array([remainder]))
         with np.errstate(all="ignore"):
             values = 1 + self._respond(w, row, held)[:, 0] * np.exp(-1j * w * (self.period * whole))
             now = RATE_RESERVE * np.abs((1 - np.exp(-1j * w * self.period)) * (row @ (power @ plant.B))[:, 0])
@@ -162,19 +162,19 @@ class DelayedLoop:
             at = np.clip(np.nan_to_num(-(start * along.conj()).real / np.abs(along) ** 2), 0, 1)
             distances = np.abs(start + at * along)
             fastest, sharpest, fast = (np.maximum(x[1:], x[:-1]) for x in (rate, bend, now))
-            steps = _safe_step(np.maximum(distances, LEAST_DISTANCE), fastest, sharpest, fast, rest)
+            steps = _safe_step(np.maximum(distances, LEAST_DISTANCE), fastest, sharpest, fast, remainder)
             # Between two huge values the curve passes a pole at infinity, and its chord may pass 0. The values count.
             sizes = np.abs(values)
-            alone = _safe_step(sizes, rate, bend, now, rest)
+            alone = _safe_step(sizes, rate, bend, now, remainder)
             huge = ~((sizes[1:] < HUGE) | (sizes[:-1] < HUGE))
             steps = np.where(huge, np.fmin(alone[1:], alone[:-1]), steps)
             return steps, np.where(huge, np.fmin(sizes[1:], sizes[:-1]), distances)
 
 
-def _safe_step(room: np.ndarray, rate: np.ndarray, bend: np.ndarray, now: np.ndarray, rest: float) -> np.ndarray:
+def _safe_step(room: np.ndarray, rate: np.ndarray, bend: np.ndarray, now: np.ndarray, remainder: float) -> np.ndarray:
     """Return the largest delay that moves L by at most `room`, with the rates of `_Curve` and the rate now.
 
-    `rest` is what is left of the period [s]; up to there the second derivative bounds the change of the rate.
+    `remainder` is the rest of the period [s]; up to there the second derivative bounds the change of the rate.
     """
     within = 2 * room / (now + np.sqrt(now**2 + 2 * bend * room))  # now s + bend s^2/2 = room
-    return np.maximum(room / rate, np.minimum(within, rest))
+    return np.maximum(room / rate, np.minimum(within, remainder))

@@ -65,9 +65,9 @@ def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
         if not isinstance(covariance, Tracer):
             check_symmetric(name, covariance, size)
             as_weight_matrix(name, covariance, size, definite=name == "V")
-    found = dare(A.T, C.T, W, V)
-    spread = C @ found.P @ C.T + symmetric_part(V)
-    return Filter(jnp.linalg.solve(spread, C @ found.P).T, found.P, found.stabilising)
+    riccati = dare(A.T, C.T, W, V)
+    spread = C @ riccati.P @ C.T + symmetric_part(V)
+    return Filter(jnp.linalg.solve(spread, C @ riccati.P).T, riccati.P, riccati.stabilising)
 
 
 @default_flags()

@@ -86,9 +86,9 @@ def tracking_dynamics(
             a slope of G jumps here, at a kink. Inside jit only a wrong number of components raises an error; in the
             other cases A and B are not finite. In single precision a kink is not noticed.
     """
-    found, kinked = track_outputs(plant, state, control, tracked, frozen)
+    model, kinked = track_outputs(plant, state, control, tracked, frozen)
     check_kink(", ".join(tracked), kinked)
-    return nan_at_kink(found, kinked)
+    return nan_at_kink(model, kinked)
 
 
 def track_outputs(
@@ -102,12 +102,12 @@ def track_outputs(
     plant, state, control = canonical_dtypes((plant, state, control))
     flow, x, u = as_vectors(plant, state, control)
     unravel = ravel_pytree(state)[1]
-    kept = independent_components(plant, state, (*tracked, *frozen))
+    remaining = independent_components(plant, state, (*tracked, *frozen))
 
     def chart(x: Scalar) -> AnyArray:
         y = plant.output(unravel(x))
         h, w = ([jnp.ravel(getattr(y, name)) for name in names] for names in (tracked, frozen))
-        return jnp.concatenate([*h, x[kept], *w])
+        return jnp.concatenate([*h, x[remaining], *w])
 
     by_x = jax.jacfwd(chart)(x)
     _check_chart(by_x, (*tracked, *frozen))
@@ -147,15 +147,15 @@ def is_kinked(function: Callable[..., AnyArray], moves: AnyArray, x: AnyArray, u
     return jnp.any(bent | ((near_slope > MAX_SLOPE_GROWTH * slope) & (near_slope > counts)))
 
 
-def check_kink(what: str, kinked: Bool) -> None:
+def check_kink(subject: str, kinked: Bool) -> None:
     """Raise ValueError if a flag of a kink is true; accept a traced flag."""
     if not isinstance(kinked, Tracer) and kinked:
-        raise ValueError(f"{what}: a slope jumps here, at a kink: no linear model")
+        raise ValueError(f"{subject}: a slope jumps here, at a kink: no linear model")
 
 
-def nan_at_kink(found: PyTree, kinked: Bool) -> PyTree:
+def nan_at_kink(model: PyTree, kinked: Bool) -> PyTree:
     """Return a model, or NaN in its place at a kink."""
-    return jax.tree.map(lambda x: jnp.where(kinked, jnp.nan, x), found)
+    return jax.tree.map(lambda x: jnp.where(kinked, jnp.nan, x), model)
 
 
 def coordinate_moves(by_x: AnyArray, at: AnyArray) -> AnyArray:

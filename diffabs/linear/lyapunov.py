@@ -76,23 +76,23 @@ def _solve_vectorised(operator: jax.Array, Q: jax.Array) -> jax.Array:
     return jnp.linalg.solve(operator, -Q.ravel()).reshape(Q.shape)
 
 
-def as_float_arrays(*given: PyTree) -> tuple[PyTree, ...]:
+def as_float_arrays(*values: PyTree) -> tuple[PyTree, ...]:
     """Return the arguments as arrays of one common floating-point type."""
-    given = tuple(jnp.asarray(x) if isinstance(x, list | tuple) else x for x in given)
-    kind = jnp.result_type(float, *given)
-    return tuple(jnp.asarray(x, kind) for x in given)
+    values = tuple(jnp.asarray(x) if isinstance(x, list | tuple) else x for x in values)
+    kind = jnp.result_type(float, *values)
+    return tuple(jnp.asarray(x, kind) for x in values)
 
 
-def relative_residual(left: jax.Array, *terms: jax.Array) -> jax.Array:
+def relative_residual(summed: jax.Array, *terms: jax.Array) -> jax.Array:
     """Return the norm of the sum of the terms over the sum of their norms; 0 where all terms are 0.
 
     Its derivative is zero.
     """
-    left, terms = lax.stop_gradient((left, terms))
+    summed, terms = lax.stop_gradient((summed, terms))
     axes = (0, 1)
     # `where` computes both branches, so the divisor is replaced too: no 0/0.
     total = reduce(add, (frobenius_norm(term, axes) for term in terms))
-    return jnp.where(total == 0, 0.0, frobenius_norm(left, axes) / jnp.where(total == 0, 1.0, total))
+    return jnp.where(total == 0, 0.0, frobenius_norm(summed, axes) / jnp.where(total == 0, 1.0, total))
 
 
 # Many small matrices: (rows, columns, batch)

@@ -75,8 +75,10 @@ class OpenLoop(NamedTuple):
             return _drop_unobserved_states(_series(self.plant, self.controller)._replace(delay=delay))
         # Whole periods become shifts in `Transfer`. The rest of the delay is sampled exactly.
         whole = int(np.floor(delay / self.period + WHOLE_PERIOD_TOLERANCE))
-        rest = max(delay - whole * self.period, 0.0)
-        plant = sample_plant(self.plant, self.period, rest if rest > WHOLE_PERIOD_TOLERANCE * self.period else 0.0)
+        remainder = max(delay - whole * self.period, 0.0)
+        plant = sample_plant(
+            self.plant, self.period, remainder if remainder > WHOLE_PERIOD_TOLERANCE * self.period else 0.0
+        )
         return _drop_unobserved_states(_series(plant, self.controller)._replace(delay=whole * self.period))
 
 
@@ -124,19 +126,19 @@ def _open(loop: Loop, target: Scalar, *, plant: bool) -> OpenLoop:
         raise ValueError(f"target = {float(target):g} is outside (-inf, inf), in the unit of the first signal")
     rational, delay = _split_off_delays(loop)
     _check_continuous(rational)
-    found = jax.device_get(
+    linear = jax.device_get(
         _linearize_halves(rational, _start_output_and_setpoint(loop)[1] if target is None else float(target))
     )
-    if not found.residue < MAX_REST_RESIDUE:
+    if not linear.residue < MAX_REST_RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
-    halves = (("sensor", "plant", "actuator"), plant and found.kinked[0]), (("controller",), found.kinked[1])
+    halves = (("sensor", "plant", "actuator"), plant and linear.kinked[0]), (("controller",), linear.kinked[1])
     for names, kinked in halves:
         parts = ", ".join(f"{name} {type(getattr(loop, name)).__name__}" for name in names)
         check_kink(f"{parts} at the setpoint", kinked)
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     delay += float(sampled.delay) if sampled else 0.0
-    controller = Transfer(*found.controller)._replace(period=float(sampled.period) if sampled else None)
-    model = OpenLoop(Transfer(*found.plant), controller, delay)
+    controller = Transfer(*linear.controller)._replace(period=float(sampled.period) if sampled else None)
+    model = OpenLoop(Transfer(*linear.plant), controller, delay)
     if not len(model.transfer().A):
         raise ValueError(
             f"controller {type(loop.controller).__name__}: its command does not follow what is measured at the "
@@ -150,20 +152,20 @@ def _split_off_delays(loop: Loop) -> tuple[Loop, float]:
     # A pure delay commutes with linear blocks, so its place in the series does not matter.
     blocks = loop.actuator.blocks if isinstance(loop.actuator, Series) else (loop.actuator,)
     delay = float(sum(block.time for block in blocks if isinstance(block, Delay)))
-    left = tuple(block for block in blocks if not isinstance(block, Delay))
-    return dataclasses.replace(loop, actuator=Series(blocks=left) if left else Direct()), delay  # pyright: ignore
+    undelayed = tuple(block for block in blocks if not isinstance(block, Delay))
+    return dataclasses.replace(loop, actuator=Series(blocks=undelayed) if undelayed else Direct()), delay  # pyright: ignore
 
 
 def _check_continuous(loop: Loop) -> None:
     """Raise ValueError for a block whose memory jumps at instants in dependence on its signal."""
     start = loop.start()
-    given = {
+    signals = {
         "sensor": loop.plant.output(start.plant),
         "actuator": 0.0 * loop.plant.holding(*_start_output_and_setpoint(loop)),
     }
     if not isinstance(loop.controller, Sampled):
-        given["controller"] = None
-    for name, signal in given.items():
+        signals["controller"] = None
+    for name, signal in signals.items():
         block = getattr(loop, name)
         if offers(block, "margins") or (offers(block, "tick") and (signal is None or _ticks_use_signal(block, signal))):
             hint = ": put it into a sampled controller" if name == "controller" and not offers(block, "margins") else ""
@@ -205,10 +207,10 @@ def _start_output_and_setpoint(loop: Loop) -> tuple[PyTree, PyTree]:
 def _linearize_halves(loop: Loop, setpoint: Scalar) -> _LinearHalves:
     loop, setpoint = canonical_dtypes((loop, setpoint))
     around = _Surroundings(loop, setpoint)
-    there = around.chart(around.start)
-    there = there.at[0].set(around.setpoint) if around.frozen else there
+    target = around.chart(around.start)
+    target = target.at[0].set(around.setpoint) if around.frozen else target
     # Newton's method starts on the setpoint, with the other coordinates at their start.
-    near = find_root(lambda z: around.chart(z) - there, around.start)
+    near = find_root(lambda z: around.chart(z) - target, around.start)
     guess = loop.plant.holding(around.output(near), around.setpoint)
     free = find_root(around.rest_residual, jnp.append(near, guess))
     residue = jnp.max(jnp.abs(around.rest_residual(free))) / (1 + jnp.max(jnp.abs(free)))
@@ -245,10 +247,10 @@ class _Surroundings:
         self.frozen: Any = tuple(getattr(loop.plant, "frozen", ()))
         first = loop.plant.shows._fields[0]
         size = ravel_pytree(state.plant)[0].size
-        kept = (
+        remaining = (
             independent_components(loop.plant, state.plant, (first, *self.frozen)) if self.frozen else np.arange(size)
         )
-        self.kept, self.size, self.held = kept, size, len(self.frozen)
+        self.remaining, self.size, self.held = remaining, size, len(self.frozen)
 
     def output(self, z: Matrix) -> Matrix:
         """Return the plant's output."""
@@ -281,7 +283,7 @@ class _Surroundings:
             return z
         y = self.output(z)
         last = jnp.stack([getattr(y, name) for name in self.frozen])
-        return jnp.concatenate([y[0][None], z[self.kept], z[self.size :], last])
+        return jnp.concatenate([y[0][None], z[self.remaining], z[self.size :], last])
 
     def moves(self, z: Matrix, command: Scalar) -> Matrix:
         """Return the rates of the coordinates."""
@@ -333,9 +335,9 @@ def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: S
         return c, jnp.sum(jnp.abs(rest_residual(c)))
 
     if inside.size:
-        each, left = jax.vmap(find_rest)(jnp.asarray(TARGET_OFFSETS, inside.dtype))
+        candidates, residuals = jax.vmap(find_rest)(jnp.asarray(TARGET_OFFSETS, inside.dtype))
         # The offset with the smallest finite residual.
-        inside = each[jnp.argmin(jnp.where(jnp.isfinite(left), left, jnp.inf))]
+        inside = candidates[jnp.argmin(jnp.where(jnp.isfinite(residuals), residuals, jnp.inf))]
     (f, g), (h, j) = jax.jacfwd(compute, (0, 1))(inside, signal)
     return (f, g, h[None], j[None]), lambda s, c: jnp.append(*compute(c, s)), inside
 
@@ -366,8 +368,8 @@ def sample_plant(plant: Transfer, period: float, delay: float) -> Transfer:
 
 def _drop_unobserved_states(system: Transfer) -> Transfer:
     """Return the system without the states that do not influence its output, such as an integral with gain zero."""
-    kept = (system.C != 0).any(axis=0)
-    # Each pass adds the states that influence a kept one; as many passes as states reach all of them.
-    for _ in kept:
-        kept = kept | (system.A[kept] != 0).any(axis=0)
-    return system._replace(A=system.A[np.ix_(kept, kept)], B=system.B[kept], C=system.C[:, kept])
+    observed = (system.C != 0).any(axis=0)
+    # Each pass adds the states that influence an observed one; as many passes as states reach all of them.
+    for _ in observed:
+        observed = observed | (system.A[observed] != 0).any(axis=0)
+    return system._replace(A=system.A[np.ix_(observed, observed)], B=system.B[observed], C=system.C[:, observed])

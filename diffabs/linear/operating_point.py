@@ -53,7 +53,7 @@ class OperatingPoint:
     """A loop at rest, as a linear model in continuous time. `operating_point` makes it.
 
     Attributes:
-        kept: Indices of the loop's states that the model contains.
+        indices: Indices of the loop's states that the model contains.
     """
 
     plant: Plant = part()
@@ -63,33 +63,33 @@ class OperatingPoint:
     feedforward: Feedforward = part(default=NoFeedforward)
     controller: Block = part()
     actuator: Block = part(default=Direct)
-    kept: tuple[int, ...] = static(default=())
+    indices: tuple[int, ...] = static(default=())
 
     period = None  # it is in continuous time
 
     @property
     def loop(self) -> Loop:
         """The loop, without its stop."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "kept"}  # pyright: ignore[reportArgumentType]
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "indices"}  # pyright: ignore[reportArgumentType]
         return Loop(**fields, stop=NoStop())
 
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the states; those of a part begin with it, as in `controller.integral`."""
         names = _names(self.loop)
-        return tuple(names[i] for i in self.kept)
+        return tuple(names[i] for i in self.indices)
 
     def matrices(self) -> StateSpace:
         """Return A (n, n) and B (n, 1), differentiable in every parameter; they compile once for each kind of loop.
 
         At a kink, where a slope jumps, this raises ValueError. Inside jit A and B are NaN there.
         """
-        found, kept = _smooth_model(self), np.array(self.kept, int)
-        return StateSpace(found.A[kept][:, kept], found.B[kept])
+        model, indices = _smooth_model(self), np.array(self.indices, int)
+        return StateSpace(model.A[indices][:, indices], model.B[indices])
 
     def gain(self) -> AnyArray:
         """Return K (n,) of the loop's own controller; at a kink ValueError, inside jit NaN."""
-        return _smooth_model(self).K[np.array(self.kept, int)]
+        return _smooth_model(self).K[np.array(self.indices, int)]
 
 
 @default_flags()
@@ -107,19 +107,19 @@ def operating_point(loop: Loop) -> OperatingPoint:
             kind = type(getattr(loop, name)).__name__
             raise ValueError(f"{name} {kind} acts at instants: it has no linear model in continuous time")
     model = _drop_stop(loop)
-    found = jax.device_get(_linearize_at_rest(model))
-    if not found.residue < MAX_REST_RESIDUE:
+    linear = jax.device_get(_linearize_at_rest(model))
+    if not linear.residue < MAX_REST_RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
-    check_kink("the loop at its setpoint", found.kinked)
-    if not np.any(found.B) or not np.any(found.K):
+    check_kink("the loop at its setpoint", linear.kinked)
+    if not np.any(linear.B) or not np.any(linear.K):
         raise ValueError("the control is at a limit at the setpoint, or does not act there: no linear model")
     # The plant's states come first in the vector of states.
-    plant = np.arange(len(found.A)) < len(ravel_pytree(start.plant)[0])
-    # Kept are these, those on which the command depends, and all that influence a kept one.
-    kept = plant | (found.K != 0)
-    for _ in kept:
-        kept = kept | (found.A[kept] != 0).any(axis=0)
-    return dataclasses.replace(model, kept=tuple(np.flatnonzero(kept).tolist()))  # pyright: ignore[reportArgumentType]
+    plant = np.arange(len(linear.A)) < len(ravel_pytree(start.plant)[0])
+    # The model contains these, those on which the command depends, and all that influence one of them.
+    contained = plant | (linear.K != 0)
+    for _ in contained:
+        contained = contained | (linear.A[contained] != 0).any(axis=0)
+    return dataclasses.replace(model, indices=tuple(np.flatnonzero(contained).tolist()))  # pyright: ignore[reportArgumentType]
 
 
 def loop_gain(loop: Loop, states: tuple[str, ...]) -> AnyArray:
@@ -183,11 +183,11 @@ class _VectorLoop(NamedTuple):
     def flow(self, z: AnyArray, v: Scalar) -> AnyArray:
         """Return dz/dt."""
         loop, x = self.loop, self.unravel(z)
-        y, seen = self.track(z)
+        y, signal = self.track(z)
         rates = _IntegratedStates(
             loop.plant.derivative(0.0, x.plant, loop.actuator.output(0.0, Memory(x.actuator), v)),
             loop.sensor.flow(0.0, Memory(x.sensor), y),
-            loop.controller.flow(0.0, Memory(x.controller), seen),
+            loop.controller.flow(0.0, Memory(x.controller), signal),
             loop.actuator.flow(0.0, Memory(x.actuator), v),
         )
         return ravel_pytree(rates)[0]
@@ -198,14 +198,14 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     loop = canonical_dtypes(model).loop
     setpoint = loop.reference.setpoint(loop.start().reference)
     z, unravel = ravel_pytree(_start(loop))
-    one = _VectorLoop(loop, setpoint, unravel)
+    vectors = _VectorLoop(loop, setpoint, unravel)
     at = _IntegratedStates(*(np.size(ravel_pytree(part)[0]) for part in _start(loop)))
     inside = np.repeat(np.arange(4) == _IntegratedStates._fields.index("controller"), at)
 
     def still(free: PyTree) -> Matrix:
         """Return the rates of everything but the controller, and the first signal minus the setpoint; zero at rest."""
         moved = z.at[~inside].set(free[:-1])
-        return jnp.append(one.flow(moved, free[-1])[~inside], one.track(moved)[0][0] - setpoint)
+        return jnp.append(vectors.flow(moved, free[-1])[~inside], vectors.track(moved)[0][0] - setpoint)
 
     # First the states outside the controller, together with the command that holds the plant; then the controller.
     free = find_root(still, jnp.append(z[~inside], 0.0))
@@ -214,22 +214,22 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     def rest_residual(memory: PyTree, z: Matrix = z) -> Matrix:
         """Return the rates of the controller's memory, and its command minus that which holds the plant."""
         moved = z.at[inside].set(memory)
-        return jnp.append(one.flow(moved, free[-1])[inside], one.command(moved) - free[-1])
+        return jnp.append(vectors.flow(moved, free[-1])[inside], vectors.command(moved) - free[-1])
 
     z = z.at[inside].set(find_root(rest_residual, z[inside]))
-    a, b = jax.jacfwd(one.flow, (0, 1))(z, free[-1])
+    a, b = jax.jacfwd(vectors.flow, (0, 1))(z, free[-1])
     residue = jnp.max(jnp.abs(still(free))) / (1 + jnp.max(jnp.abs(free)))
     moves, v = jnp.diag(1 + jnp.abs(z)), free[-1][None]
-    kinked = is_kinked(lambda z, v: jnp.append(one.flow(z, v[0]), one.command(z)), moves, z, v)
-    a, b, k = nan_at_kink((a, b[:, None], jax.jacfwd(one.command)(z)), kinked)
+    kinked = is_kinked(lambda z, v: jnp.append(vectors.flow(z, v[0]), vectors.command(z)), moves, z, v)
+    a, b, k = nan_at_kink((a, b[:, None], jax.jacfwd(vectors.command)(z)), kinked)
     return LinearLoop(a, b, k, residue, kinked)
 
 
 def _smooth_model(model: OperatingPoint) -> LinearLoop:
     """Return the linear model, unless it is known to be at a kink."""
-    found = _linearize_at_rest(model)
-    check_kink("the loop at its setpoint", found.kinked)
-    return found
+    linear = _linearize_at_rest(model)
+    check_kink("the loop at its setpoint", linear.kinked)
+    return linear
 
 
 def find_root(function: Any, x: Scalar) -> AnyArray:

@@ -54,26 +54,26 @@ def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[f
     left out.
     """
     a, b, d = np.asarray(A, float), np.asarray(B, float).reshape(-1), np.asarray(start, float)
-    poles, left = np.linalg.eig(a.T)
-    found, waiting = {}, (np.real(poles) > 0) & (abs(np.imag(poles)) <= ROUNDING * abs(poles))
+    poles, vectors = np.linalg.eig(a.T)
+    multiples, waiting = {}, (np.real(poles) > 0) & (abs(np.imag(poles)) <= ROUNDING * abs(poles))
     while waiting.any():
         pole = float(np.real(poles[waiting][0]))
         equal = waiting & (abs(poles - pole) <= 2 * ROUNDING * pole)
         waiting &= ~equal
         # The one input moves the left eigenvectors of a pole along one direction only, B in the basis W.
         _, sizes, basis = np.linalg.svd(
-            np.vstack([np.real(left.T[equal]), np.imag(left.T[equal])]), full_matrices=False
+            np.vstack([np.real(vectors.T[equal]), np.imag(vectors.T[equal])]), full_matrices=False
         )
         basis = basis[sizes > ROUNDING * sizes[0]]
-        reach, there = basis @ b, basis @ d
+        reach, offset = basis @ b, basis @ d
         size = np.linalg.norm(reach)
         moved = reach / size if size > 0 else reach
-        along = moved @ there
-        if np.linalg.norm(there - along * moved) > ROUNDING * np.linalg.norm(d):
-            found[pole] = 0.0
+        along = moved @ offset
+        if np.linalg.norm(offset - along * moved) > ROUNDING * np.linalg.norm(d):
+            multiples[pole] = 0.0
         else:
-            found[pole] = float(size * limit / (pole * abs(along))) if along else np.inf
-    return found
+            multiples[pole] = float(size * limit / (pole * abs(along))) if along else np.inf
+    return multiples
 
 
 def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
@@ -95,11 +95,11 @@ def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
     for degree in range(1, len(a) + 1):
         # The last row of the orthonormal basis replaces c'A^(degree - 1): powers of A would lose digits.
         basis, triangle = np.linalg.qr(rows.T, mode="complete")
-        row, rest, left = basis[:, degree - 1], basis[:, degree:], abs(triangle[degree - 1, degree - 1])
-        if left <= ROUNDING * size:
+        row, complement, pivot = basis[:, degree - 1], basis[:, degree:], abs(triangle[degree - 1, degree - 1])
+        if pivot <= ROUNDING * size:
             break
-        if left * abs(row @ b) > ROUNDING * size * np.linalg.norm(b):
-            return np.linalg.eigvals(rest.T @ (a @ rest - np.outer(b, row @ a @ rest) / (row @ b)))
+        if pivot * abs(row @ b) > ROUNDING * size * np.linalg.norm(b):
+            return np.linalg.eigvals(complement.T @ (a @ complement - np.outer(b, row @ a @ complement) / (row @ b)))
         rows, size = np.vstack([rows, row @ a]), np.linalg.norm(abs(row) @ abs(a))
     return np.array([])
 

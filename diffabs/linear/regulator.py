@@ -92,17 +92,17 @@ def dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
 def _solve_lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Regulator:
-    found = care(A, B, Q, R, S)
-    turned = jnp.asarray(B).T @ found.P + (0.0 if S is None else jnp.asarray(S).T)
-    return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R, found.P.dtype)), turned), *found)
+    riccati = care(A, B, Q, R, S)
+    turned = jnp.asarray(B).T @ riccati.P + (0.0 if S is None else jnp.asarray(S).T)
+    return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R, riccati.P.dtype)), turned), *riccati)
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
 def _solve_dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Regulator:
-    found = dare(A, B, Q, R, S)
+    riccati = dare(A, B, Q, R, S)
     b = jnp.asarray(B)
-    turned = b.T @ found.P @ jnp.asarray(A) + (0.0 if S is None else jnp.asarray(S).T)
-    return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R)) + b.T @ found.P @ b, turned), *found)
+    turned = b.T @ riccati.P @ jnp.asarray(A) + (0.0 if S is None else jnp.asarray(S).T)
+    return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R)) + b.T @ riccati.P @ b, turned), *riccati)
 
 
 def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix, *, discrete: bool) -> None:

@@ -78,8 +78,8 @@ def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
     # The scale is the geometric mean of the moduli of the Hamiltonian's eigenvalues.
     hamiltonian = _blocks(a, -G, -q, -transpose(a))
     scale = jnp.exp(gauss_jordan_solve(hamiltonian, hamiltonian[:, :0])[1] / len(hamiltonian))
-    P, found = _solve_by_doubling(*_cayley(a, G, q, scale))
-    P = _fill_unsolved(found, P, lambda: _solution_from_sign(_sign(hamiltonian)))
+    P, solved = _solve_by_doubling(*_cayley(a, G, q, scale))
+    P = _fill_unsolved(solved, P, lambda: _solution_from_sign(_sign(hamiltonian)))
     return _unscale_with_residual(
         _refine_and_prove(partial(_kleinman, a, b, q, scale), P), d, partial(_terms, A, B, Q, S)
     )
@@ -94,8 +94,8 @@ def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
     pivots, diagonal = (jnp.sum(x * eye(len(R), R), 1) for x in (cholesky(R), R))
     definite = jnp.all(pivots**2 > PIVOT_ROUNDING * diagonal, 0)
     # `lax.cond` skips the shift if every R in the chunk is definite, which is the usual case.
-    regular, same = jnp.all(definite), (Q, R, S, jnp.zeros_like(A))
-    Q, R, S, shift = lax.cond(regular, lambda: same, lambda: _shift_weights(A, B, Q, R, S, definite))
+    regular, unshifted = jnp.all(definite), (Q, R, S, jnp.zeros_like(A))
+    Q, R, S, shift = lax.cond(regular, lambda: unshifted, lambda: _shift_weights(A, B, Q, R, S, definite))
     B, S, a, b, q, d = _reduce_and_balance(A, B, Q, R, S)
     I, G = eye(len(a), a), times(b, transpose(b))
 
@@ -104,8 +104,8 @@ def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
         minus = _blocks(a - I, -G, -q, I - transpose(a))
         return _solution_from_sign(_sign(gauss_jordan_solve(minus, _blocks(a + I, G, -q, I + transpose(a)))[0]))
 
-    P, found = _solve_by_doubling(a, G, q)
-    P = _fill_unsolved(found, P, by_sign)
+    P, solved = _solve_by_doubling(a, G, q)
+    P = _fill_unsolved(solved, P, by_sign)
     P = _refine_and_prove(partial(_hewer, a, b, q), P, shift * d * d[:, None])
     P, residual = _unscale_with_residual(P, d, partial(_discrete_terms, A, B, Q, S))
 
@@ -142,8 +142,10 @@ def _shift_weights(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix, defini
     The shift is 0 where R is definite, and NaN where R is not semidefinite. In balanced coordinates it is as large as
     Q. The weight of the inputs becomes R + B' shift B. This is definite if R + B' P B is definite for any P.
     """
-    weight, one = frobenius_norm(R), eye(len(R), R)
-    semidefinite = jnp.isfinite(frobenius_norm(cholesky(R + jnp.where(weight > 0, PIVOT_ROUNDING * weight, 1.0) * one)))
+    weight, identity = frobenius_norm(R), eye(len(R), R)
+    semidefinite = jnp.isfinite(
+        frobenius_norm(cholesky(R + jnp.where(weight > 0, PIVOT_ROUNDING * weight, 1.0) * identity))
+    )
     d = _balance(A, times(B, transpose(B)), Q)
     level = frobenius_norm(Q * d * d[:, None])
     p = jnp.where(semidefinite, jnp.where(level > 0, level, 1.0) / (d * d), jnp.nan)
@@ -163,8 +165,8 @@ def _balance(A: jax.Array, G: jax.Array, Q: jax.Array) -> jax.Array:
     def sweep(_: object, d: jax.Array) -> jax.Array:
         row = (jnp.sum(A * d, 1) + jnp.sum(G / d, 1)) / d
         column = (jnp.sum(A / d[:, None], 0) + jnp.sum(Q * d, 1)) * d
-        fine = (row > 0) & (column > 0)
-        return d * jnp.where(fine, row / jnp.where(fine, column, 1.0), 1.0) ** 0.25
+        coupled = (row > 0) & (column > 0)
+        return d * jnp.where(coupled, row / jnp.where(coupled, column, 1.0), 1.0) ** 0.25
 
     # Powers of two scale without rounding.
     d = lax.fori_loop(0, BALANCING_SWEEPS, sweep, jnp.ones_like(A[0]))
@@ -210,9 +212,9 @@ def _solve_by_doubling(A: jax.Array, G: jax.Array, Q: jax.Array) -> tuple[jax.Ar
     return Q, (frobenius_norm(A) <= 1e-5) & jnp.isfinite(frobenius_norm(Q))
 
 
-def _fill_unsolved(found: jax.Array, P: jax.Array, otherwise: Callable) -> jax.Array:
+def _fill_unsolved(solved: jax.Array, P: jax.Array, otherwise: Callable) -> jax.Array:
     """Return P with `otherwise()` where P is not found; `otherwise` runs only if a solution is missing."""
-    return lax.cond(jnp.all(found), lambda: P, lambda: jnp.where(found, P, otherwise()))
+    return lax.cond(jnp.all(solved), lambda: P, lambda: jnp.where(solved, P, otherwise()))
 
 
 def _sign(Z: jax.Array) -> jax.Array:

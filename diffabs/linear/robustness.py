@@ -58,7 +58,7 @@ class Band(NamedTuple):
     @property
     def unstable(self) -> tuple[System, ...]:
         """Systems with an unstable closed loop."""
-        return tuple(one for one in self.systems if not one.margins.stable)
+        return tuple(system for system in self.systems if not system.margins.stable)
 
     def worst(self) -> dict[str, System]:
         """Return the system with the worst value of each margin, by its name in `BADNESS`; empty if a system is
@@ -68,7 +68,7 @@ class Band(NamedTuple):
         """
         if self.unstable:
             return {}
-        return {name: max(self.systems, key=lambda one, bad=bad: bad(one.margins)) for name, bad in BADNESS.items()}
+        return {name: max(self.systems, key=lambda s, bad=bad: bad(s.margins)) for name, bad in BADNESS.items()}
 
 
 @default_flags()
@@ -122,7 +122,7 @@ def frequencies(systems: Sequence[OpenLoop], decades: float = 1.5, count: int = 
 
     They end at half the lowest sampling rate at most. Without any crossover they surround 1 rad/s.
     """
-    found = [m.crossover for m in map(margins, systems) if math.isfinite(m.crossover)] or [1.0]
-    low, high = min(found) * 10**-decades, max(found) * 10**decades
+    crossovers = [m.crossover for m in map(margins, systems) if math.isfinite(m.crossover)] or [1.0]
+    low, high = min(crossovers) * 10**-decades, max(crossovers) * 10**decades
     half = [math.pi / loop.period for loop in systems if loop.period]
     return np.geomspace(low, min([high, *half]), count)

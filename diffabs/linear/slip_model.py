@@ -95,11 +95,11 @@ class SlipModel:
         start = jax.eval_shape(self.plant.start, BrakeStart(speed=self.speed, slip=self.slip))
         paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(start)]
         used = used_leaves(self.plant, start, ("slip", *FROZEN_OUTPUTS))
-        kept = [jax.tree_util.keystr(p, simple=True) for p, u in zip(paths, used, strict=True) if not u]
+        remaining = [jax.tree_util.keystr(p, simple=True) for p, u in zip(paths, used, strict=True) if not u]
         return (
             *(["integral of slip error"] if self.integral else []),
             "slip error",
-            *kept,
+            *remaining,
             *(["actuator torque"] if isinstance(self.actuator, Lag) else []),
             *(["torque of the last sample"] if isinstance(self.sampling, Sampling) else []),
             *(["filtered slip error"] if isinstance(self.filter, LowPass) else []),
@@ -114,9 +114,9 @@ class SlipModel:
                 is not noticed.
         """
         self._check_supported()
-        found, kinked = _matrices(self)
+        model, kinked = _matrices(self)
         check_kink(f"{type(self.plant).__name__} at slip {self.slip}", kinked)
-        return found
+        return model
 
     def point(self) -> tuple[PyTree, PyTree]:
         """Return (state, control) of the linearisation.
@@ -125,20 +125,20 @@ class SlipModel:
         """
         start = self.plant.start(BrakeStart(speed=self.speed, slip=self.slip))
         control = self.plant.holding(self.plant.output(start), self.slip)
-        kept = independent_components(self.plant, start, ("slip", *FROZEN_OUTPUTS))
-        if not len(kept):
+        remaining = independent_components(self.plant, start, ("slip", *FROZEN_OUTPUTS))
+        if not len(remaining):
             return start, control
         flow, x, u = as_vectors(self.plant, start, control)
 
         def rate(z: AnyArray) -> AnyArray:
-            return flow(x.at[kept].set(z), u)[kept]
+            return flow(x.at[remaining].set(z), u)[remaining]
 
         def newton(_: object, z: AnyArray) -> AnyArray:
             return z - jnp.linalg.solve(jax.jacfwd(rate)(z), rate(z))
 
         # A fixed number of iterations: a loop until convergence has no reverse-mode derivative.
-        rest = jax.lax.fori_loop(0, REMAINING_STATE_ITERATIONS, newton, x[kept])
-        return ravel_pytree(start)[1](x.at[kept].set(rest)), control
+        values = jax.lax.fori_loop(0, REMAINING_STATE_ITERATIONS, newton, x[remaining])
+        return ravel_pytree(start)[1](x.at[remaining].set(values)), control
 
     def controlled_system(self) -> tuple[StateSpace, Bool]:
         """Return plant and actuator, sampled if the controller is, and whether they are at a kink; the slip error is
@@ -169,12 +169,12 @@ class SlipModel:
         return StateSpace(a, jnp.zeros((n, 1), a.dtype).at[first : first + p].set(system.B))
 
     def _check_supported(self) -> None:
-        known = {"actuator": (Direct, Lag), "sampling": (Continuous, Sampling), "filter": (Direct, LowPass)}
-        for name, types in known.items():
-            found = getattr(self, name)
-            if not isinstance(found, types):
+        supported = {"actuator": (Direct, Lag), "sampling": (Continuous, Sampling), "filter": (Direct, LowPass)}
+        for name, types in supported.items():
+            part = getattr(self, name)
+            if not isinstance(part, types):
                 names = " and ".join(t.__name__ for t in types)
-                raise ValueError(f"{name}: a linear slip model knows {names}, not {type(found).__name__}")
+                raise ValueError(f"{name}: a linear slip model knows {names}, not {type(part).__name__}")
 
 
 @jax.jit

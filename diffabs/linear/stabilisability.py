@@ -33,8 +33,8 @@ def unstabilisable_mode(A: AnyArray, B: AnyArray, *, discrete: bool = False) -> 
     reached = (b != 0).any(axis=1)
     for _ in a:
         reached |= (a[:, reached] != 0).any(axis=1)
-    rest = ~reached
-    for mode, error in _modes(a[np.ix_(rest, rest)]):
+    unreached = ~reached
+    for mode, error in _modes(a[np.ix_(unreached, unreached)]):
         if _is_unstable(mode, error, discrete=discrete):
             return _as_number(mode)
     a, b = a[np.ix_(reached, reached)], b[reached]
@@ -68,18 +68,20 @@ def _modes(a: np.ndarray) -> Iterator[tuple[complex, float]]:
     from scipy.linalg import eig
 
     for _, matrix in _groups(a) if len(a) else ():
-        modes, left, right = eig(matrix, left=True, right=True)
-        cosines = np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), EIGENVALUE_ROUNDING**0.5)
+        modes, left_vectors, right_vectors = eig(matrix, left=True, right=True)
+        cosines = np.maximum(np.abs(np.sum(left_vectors.conj() * right_vectors, axis=0)), EIGENVALUE_ROUNDING**0.5)
         yield from zip(modes, EIGENVALUE_ROUNDING * len(a) * np.linalg.norm(matrix) / cosines, strict=True)
 
 
 def _moves(a: np.ndarray, b: np.ndarray, mode: complex) -> bool:
     """Return whether an input moves the mode; some input reaches every state."""
-    one = np.eye(len(a))
-    scales = _scale_to_unit_entries(np.hstack([np.abs(a) + abs(mode) * one, np.abs(b)]), _row_scales(a, b, abs(mode)))
+    identity = np.eye(len(a))
+    scales = _scale_to_unit_entries(
+        np.hstack([np.abs(a) + abs(mode) * identity, np.abs(b)]), _row_scales(a, b, abs(mode))
+    )
     if scales is None:
         return False
-    pencil = np.hstack([a - mode * one, b]) * scales[0][:, None] * scales[1]
+    pencil = np.hstack([a - mode * identity, b]) * scales[0][:, None] * scales[1]
     return bool(np.linalg.svd(pencil, compute_uv=False)[-1] > PBH_TOLERANCE)
 
 
@@ -114,8 +116,8 @@ def _scale_to_unit_entries(sizes: np.ndarray, rows: np.ndarray) -> tuple[np.ndar
         _, columns = linear_sum_assignment(logs, maximize=True)
     except ValueError:
         return None
-    chosen = logs[:, columns]
-    gaps = np.diag(chosen) - chosen  # row i of scale r_i keeps below 1 in the column of row k: r_i <= r_k + gap
+    selected = logs[:, columns]
+    gaps = np.diag(selected) - selected  # row i of scale r_i keeps below 1 in the column of row k: r_i <= r_k + gap
     for _ in rows:
         rows = np.min(rows + gaps, axis=1)
     highest = np.max(logs + rows[:, None], axis=0)

@@ -130,20 +130,20 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
     if np.shape(system.D) != (1, 1):
         raise ValueError(f"margins are of one input and one output; the system has {np.shape(system.D)[::-1]}")
     w = frequency_grid(system)
-    found = find_crossovers(system, w)
-    crossover = float(found.gain_at.max()) if len(found.gain_at) else math.nan
+    crossovers = find_crossovers(system, w)
+    crossover = float(crossovers.gain_at.max()) if len(crossovers.gain_at) else math.nan
     if not is_stable(system):
         none = (math.nan, math.nan)
         return Margins(False, none, none, *none, math.nan, *none, *none, crossover)
-    if not len(found.gain_at):
-        found = _touch_unit_circle(system, w, found)
-        crossover = float(found.gain_at.max()) if len(found.gain_at) else math.nan
-    i = int(np.argmin(np.abs(found.phases))) if len(found.phases) else None
-    phase, phase_at = (math.inf, math.nan) if i is None else (abs(found.phases[i]), found.gain_at[i])
-    gain, gain_at = _gain_margins(found)
+    if not len(crossovers.gain_at):
+        crossovers = _touch_unit_circle(system, w, crossovers)
+        crossover = float(crossovers.gain_at.max()) if len(crossovers.gain_at) else math.nan
+    i = int(np.argmin(np.abs(crossovers.phases))) if len(crossovers.phases) else None
+    phase, phase_at = (math.inf, math.nan) if i is None else (abs(crossovers.phases[i]), crossovers.gain_at[i])
+    gain, gain_at = _gain_margins(crossovers)
     ms, mt = _sensitivities(system, w)
     angle = (float(phase), float(phase_at))
-    return Margins(True, gain, gain_at, *angle, _delay_margin(loop, system, w, found), *ms, *mt, crossover)
+    return Margins(True, gain, gain_at, *angle, _delay_margin(loop, system, w, crossovers), *ms, *mt, crossover)
 
 
 def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers:
@@ -168,7 +168,7 @@ def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers
     return Crossovers(gain_at, falls, phases, phase_at, factors)
 
 
-def _touch_unit_circle(system: Transfer, w: np.ndarray, found: Crossovers) -> Crossovers:
+def _touch_unit_circle(system: Transfer, w: np.ndarray, crossovers: Crossovers) -> Crossovers:
     """Return the crossovers with the highest frequency at which |L| reaches 1 from below, if it does."""
     with np.errstate(all="ignore"):
         values = np.abs(_response(system, w))
@@ -177,9 +177,9 @@ def _touch_unit_circle(system: Transfer, w: np.ndarray, found: Crossovers) -> Cr
     if values[highest] >= size * (1 - UNIT_TOLERANCE):
         size, at = float(values[highest]), float(w[highest])
     if abs(size - 1) > UNIT_TOLERANCE:
-        return found
+        return crossovers
     gain_at = np.array([at])
-    return found._replace(gain_at=gain_at, falls=np.array([True]), phases=np.angle(-_response(system, gain_at)))
+    return crossovers._replace(gain_at=gain_at, falls=np.array([True]), phases=np.angle(-_response(system, gain_at)))
 
 
 def is_stable(system: Transfer) -> bool:
@@ -196,11 +196,11 @@ def is_stable(system: Transfer) -> bool:
 def _poles_gained(system: Transfer, delays: np.ndarray) -> np.ndarray:
     """Return how many more unstable poles the closed loop has with each delay (k,) [s] than without a delay."""
     system = system._replace(delay=0.0)
-    found = find_crossovers(system)
+    crossovers = find_crossovers(system)
     gained = np.zeros(len(delays))
     # A pair crosses outwards where |L| falls and inwards where |L| rises, again and again with each further turn of the
     # delay, 2 pi/w. `first` is the delay at which a pair of poles is at +-jw, or at the angle +-wT.
-    for w, falls, phase in zip(found.gain_at, found.falls, found.phases, strict=True):
+    for w, falls, phase in zip(crossovers.gain_at, crossovers.falls, crossovers.phases, strict=True):
         first = (phase % (2 * math.pi)) / w
         times = np.where(delays > first, 1 + np.floor((delays - first) * w / (2 * math.pi)), 0)
         gained += 2 * times if falls else -2 * times
@@ -344,12 +344,12 @@ def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple
 
     with np.errstate(all="ignore"):
         signs = sign(w)
-        here = np.flatnonzero(signs[1:] * signs[:-1] < 0)
-        low, high, before = w[here], w[here + 1], signs[here]
-        for _ in range(ROOT_BISECTIONS if len(here) else 0):
+        crossings = np.flatnonzero(signs[1:] * signs[:-1] < 0)
+        low, high, before = w[crossings], w[crossings + 1], signs[crossings]
+        for _ in range(ROOT_BISECTIONS if len(crossings) else 0):
             middle = 0.5 * (low + high)
-            left = sign(middle) == before
-            low, high = np.where(left, middle, low), np.where(left, high, middle)
+            before_root = sign(middle) == before
+            low, high = np.where(before_root, middle, low), np.where(before_root, high, middle)
     return 0.5 * (low + high), before > 0
 
 
@@ -405,10 +405,10 @@ def _is_real(system: Transfer, w: float) -> bool:
     )
 
 
-def _gain_margins(found: Crossovers) -> tuple[tuple[float, float], tuple[float, float]]:
+def _gain_margins(crossovers: Crossovers) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the factors nearest to 1, below and above, and their frequencies."""
     low, high, low_at, high_at = 0.0, math.inf, math.nan, math.nan
-    for factor, w in zip(found.factors.tolist(), found.phase_at.tolist(), strict=True):
+    for factor, w in zip(crossovers.factors.tolist(), crossovers.phase_at.tolist(), strict=True):
         if low < factor < 1:
             low, low_at = factor, w
         if 1 < factor < high:
@@ -416,11 +416,11 @@ def _gain_margins(found: Crossovers) -> tuple[tuple[float, float], tuple[float, 
     return (low, high), (low_at, high_at)
 
 
-def _delay_margin(loop: OpenLoop | Transfer, system: Transfer, w: np.ndarray, found: Crossovers) -> float:
+def _delay_margin(loop: OpenLoop | Transfer, system: Transfer, w: np.ndarray, crossovers: Crossovers) -> float:
     """Return the delay margin of a stable loop [s]; `system` is its transfer function on the grid `w`."""
     if _is_unstable_with_any_delay(system):
         return 0.0
-    delays = (found.phases % (2 * math.pi)) / found.gain_at
+    delays = (crossovers.phases % (2 * math.pi)) / crossovers.gain_at
     guess = float(delays.min()) if len(delays) else math.inf
     if loop.period is None:
         return guess
@@ -437,9 +437,9 @@ def _count_margin(loop: Transfer, crosses: bool, end: float) -> float:
     if not crosses and abs(_response(loop, math.pi / period)[0]) < 1:
         return math.inf
     # A pair of poles crosses at first + 2 pi k/w, and only the first whole periods after such a delay are asked.
-    found = find_crossovers(loop._replace(delay=0.0))
+    crossovers = find_crossovers(loop._replace(delay=0.0))
     ends = [loop.delay + period]
-    for w, phase in zip(found.gain_at, found.phases, strict=True):
+    for w, phase in zip(crossovers.gain_at, crossovers.phases, strict=True):
         turn = 2 * math.pi / w
         first = phase % (2 * math.pi) / w
         start = math.floor(max(loop.delay - first, 0.0) / turn)

@@ -45,9 +45,9 @@ class Transfer(NamedTuple):
         """Return the response (k, p, m) at frequencies w (k,) [rad/s], without the delay; infinite at a pole."""
         w = np.atleast_1d(np.asarray(w, float))
         # z - A = (z - 1) - (A - 1) keeps the digits of slow modes, whose z is near 1.
-        one = np.eye(len(self.A))
-        point, a = (1j * w, self.A) if self.period is None else (np.expm1(1j * w * self.period), self.A - one)
-        shifted = point[:, None, None] * one - a
+        identity = np.eye(len(self.A))
+        point, a = (1j * w, self.A) if self.period is None else (np.expm1(1j * w * self.period), self.A - identity)
+        shifted = point[:, None, None] * identity - a
         with np.errstate(all="ignore"):
             return self.C @ _solve_or_infinite(shifted, np.asarray(self.B, complex)) + self.D
 
@@ -121,11 +121,11 @@ def _solve_or_infinite(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.solve(matrices, right)
     except np.linalg.LinAlgError:
-        found = np.full(right.shape, complex(np.inf))
-        for x, matrix, one in zip(found, matrices, right, strict=True):
+        solutions = np.full(right.shape, complex(np.inf))
+        for x, matrix, column in zip(solutions, matrices, right, strict=True):
             with contextlib.suppress(np.linalg.LinAlgError):
-                x[:] = np.linalg.solve(matrix, one)
-        return found
+                x[:] = np.linalg.solve(matrix, column)
+        return solutions
 
 
 def _delay_one_period(system: Transfer) -> Transfer:
@@ -155,8 +155,10 @@ def to_control(system: Transfer, *, pade: int | None = None) -> Matrix:
             )
         delay = control.ss(control.tf(*control.pade(system.delay, pade)))
         return control.series(to_control(system._replace(delay=0.0)), delay)
-    found = system.without_delay()
-    return control.ss(found.A, found.B, found.C, found.D, 0 if found.period is None else found.period)
+    undelayed = system.without_delay()
+    return control.ss(
+        undelayed.A, undelayed.B, undelayed.C, undelayed.D, 0 if undelayed.period is None else undelayed.period
+    )
 
 
 def from_control(system: Part) -> Transfer:
@@ -170,11 +172,11 @@ def from_control(system: Part) -> Transfer:
         ValueError: The system is sampled with an unknown period (dt=True).
     """
     control: Scalar = _import_control()
-    found = control.ss(system)
-    if found.dt is True:
+    model = control.ss(system)
+    if model.dt is True:
         raise ValueError("dt is True: the system is sampled, but nothing says how often; give it a period [s]")
-    matrices = (np.array(matrix, float) for matrix in (found.A, found.B, found.C, found.D))
-    return Transfer(*matrices, period=float(found.dt) if found.dt else None)
+    matrices = (np.array(matrix, float) for matrix in (model.A, model.B, model.C, model.D))
+    return Transfer(*matrices, period=float(model.dt) if model.dt else None)
 
 
 def _import_control() -> Matrix:

@@ -36,13 +36,13 @@ def hold_input(a: np.ndarray, b: np.ndarray, times: np.ndarray) -> tuple[np.ndar
     rates[:n, :n], rates[:n, n:] = a, b
     norm = float(np.max(np.sum(np.abs(rates), axis=1), initial=0.0)) * float(np.max(times, initial=0.0))
     halvings = max(0, math.ceil(math.log2(max(norm, 0.25))) + 1)
-    scaled, one = rates * (times[:, None, None] * 2.0**-halvings), np.eye(n + m)
-    found = np.broadcast_to(one, scaled.shape)
+    scaled, identity = rates * (times[:, None, None] * 2.0**-halvings), np.eye(n + m)
+    exponential = np.broadcast_to(identity, scaled.shape)
     for i in range(TERMS):
-        found = one + scaled @ found / (TERMS - i)
+        exponential = identity + scaled @ exponential / (TERMS - i)
     for _ in range(halvings):
-        found = found @ found
-    return found[:, :n, :n], found[:, :n, n:]
+        exponential = exponential @ exponential
+    return exponential[:, :n, :n], exponential[:, :n, n:]
 
 
 def _exponential(a: Scalar) -> AnyArray:
@@ -56,6 +56,6 @@ def _exponential(a: Scalar) -> AnyArray:
     # `where`, has a reverse-mode derivative and works under vmap.
     norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(a), axis=1)))
     halvings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(norm, 0.25))) + 1, 0, EXPONENTIAL_SQUARINGS)
-    scaled, one = a * 2.0**-halvings, jnp.eye(len(a), dtype=a.dtype)
-    series = jax.lax.fori_loop(0, TERMS, lambda i, e: one + scaled @ e / (TERMS - i), one)
+    scaled, identity = a * 2.0**-halvings, jnp.eye(len(a), dtype=a.dtype)
+    series = jax.lax.fori_loop(0, TERMS, lambda i, e: identity + scaled @ e / (TERMS - i), identity)
     return jax.lax.fori_loop(0, EXPONENTIAL_SQUARINGS, lambda i, e: jnp.where(i < halvings, e @ e, e), series)

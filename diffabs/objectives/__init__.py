@@ -61,5 +61,5 @@ def default_objectives(plant: Plant) -> dict[str, Objective]:
     A plant may choose them by a method `usual_objectives`, as braked wheels and balances do. Any other plant gets a
     copy of `TRACKING`, which compares its first signal with the setpoint.
     """
-    own = getattr(plant, "usual_objectives", None)
-    return own() if own else dict(TRACKING)
+    usual = getattr(plant, "usual_objectives", None)
+    return usual() if usual else dict(TRACKING)

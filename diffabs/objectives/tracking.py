@@ -79,8 +79,8 @@ def absolute_integral(cubic: Cubic, integral: Callable[[PyTree], PyTree]) -> Sca
         integral: Function of x that returns the integral from 0 to x of p, or of p times the weight.
     """
     whole = integral(1.0)
-    left = integral(cubic.root())
-    return jnp.where(cubic.start * cubic.end < 0, jnp.abs(left) + jnp.abs(whole - left), jnp.abs(whole))
+    before_root = integral(cubic.root())
+    return jnp.where(cubic.start * cubic.end < 0, jnp.abs(before_root) + jnp.abs(whole - before_root), jnp.abs(whole))
 
 
 @pytree
@@ -229,9 +229,9 @@ class SettlingTime(HeldValue):
         outside = jnp.abs(tracking_error(last)) > self._width(last, memory.held.first)
         return jnp.where(outside, self.unreached, memory.held.entered)
 
-    def _width(self, seen: PyTree, first: Scalar) -> PyTree:
+    def _width(self, sample: PyTree, first: Scalar) -> PyTree:
         """Return half the width of the band, for a sample or another tuple with a `setpoint`."""
-        return larger(self.share * jnp.abs(seen.setpoint - first), self.band)
+        return larger(self.share * jnp.abs(sample.setpoint - first), self.band)
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rule that `share` or `band` is positive."""
@@ -289,11 +289,11 @@ def at_limits(loop: Part) -> ShareAtLimit:
     low, high = -math.inf, math.inf
     pending = [loop.controller, loop.actuator]
     while pending:
-        one = pending.pop()
+        component = pending.pop()
         # Controllers may contain controllers (`Sampled`), so the search descends into all parts.
-        pending.extend(parts(one))
-        if hasattr(one, "limits"):
-            below, above = one.limits()
+        pending.extend(parts(component))
+        if hasattr(component, "limits"):
+            below, above = component.limits()
             low, high = larger(low, below), smaller(high, above)
     return ShareAtLimit(low=low, high=high)
 

@@ -279,17 +279,17 @@ class ArmBalance:
         # inverse, and the inequality can be solved for |q''|.
         held = loop.sum(axis=-1).max(axis=-1) < 1
         safe = np.where(held[..., None, None], loop, 0.0)
-        most = np.linalg.solve(np.eye(3) - safe, accelerations[..., None])[..., 0]
-        amounts = forces + (changes @ most[..., None])[..., 0]
+        bound = np.linalg.solve(np.eye(3) - safe, accelerations[..., None])[..., 0]
+        amounts = forces + (changes @ bound[..., None])[..., 0]
         return np.concatenate([np.zeros_like(inverse), inverse], axis=-2), np.where(held[..., None], amounts, np.inf)
 
     def cautions(self) -> Iterator[str]:
         """Yield a message if the spring cannot hold the rider on an upright frame."""
-        least = self.rider_mass * self.gravity * self.rider_height
-        if self.rider_mass > 0 and not self.stiffness > least:
+        needed = self.rider_mass * self.gravity * self.rider_height
+        if self.rider_mass > 0 and not self.stiffness > needed:
             yield (
                 f"stiffness = {self.stiffness:g} N m/rad does not hold the rider: even on an upright frame that needs "
-                f"more than m3 g hg = {least:g} N m/rad"
+                f"more than m3 g hg = {needed:g} N m/rad"
             )
 
 

@@ -137,8 +137,8 @@ class LabRig(BrakedWheel):
         # reach the derivatives.
         held = arm > self.wheel_radius * mu
         spare = jnp.where(held, arm - self.wheel_radius * mu, 1.0)
-        asked = quotient(self.wheel_radius * mu * self.weight_torque, spare)
-        stuck = jnp.where(held, smaller(asked, capacity), capacity)
+        needed = quotient(self.wheel_radius * mu * self.weight_torque, spare)
+        stuck = jnp.where(held, smaller(needed, capacity), capacity)
         torque = jnp.where(state.wheel > 0, capacity + self.wheel_friction * state.wheel, stuck)
         free = arm > 0
         normal = jnp.where(free, quotient(self.weight_torque + torque, jnp.where(free, arm, 1.0)), jnp.inf)

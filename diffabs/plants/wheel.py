@@ -88,7 +88,7 @@ class BrakedWheel:
         """
         near = jnp.concatenate([setpoint - jnp.array(PROBED_OFFSETS), setpoint + jnp.array(PROBED_OFFSETS)])
         slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(PROBED_SLIPS)])
-        least = stop.speed if hasattr(stop, "speed") else self.crawl_speed
-        speeds = jnp.geomspace(initial.speed, least, PROBED_SPEEDS)
+        slowest = stop.speed if hasattr(stop, "speed") else self.crawl_speed
+        speeds = jnp.geomspace(initial.speed, slowest, PROBED_SPEEDS)
         speed, slip = jnp.meshgrid(speeds, slips, indexing="ij")
         return jax.tree.map(jnp.ravel, BrakeStart(speed=speed, slip=slip))

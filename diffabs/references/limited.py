@@ -59,6 +59,6 @@ class LimitedSlip:
         now, _ = clock.ticks(self.period)
         # h is the period scaled by v0/v: in this time the target behaves equally at every speed.
         h = self.period * self.reference_speed / jnp.maximum(signal.speed, self.floor)
-        left = self.slip - memory.held
-        step = smaller(-jnp.expm1(-h / self.time_constant) * left, h * self.rate)
+        distance = self.slip - memory.held
+        step = smaller(-jnp.expm1(-h / self.time_constant) * distance, h * self.rate)
         return Memory(held=jnp.where(now, memory.held + step, memory.held))

@@ -71,8 +71,8 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     smooth = jnp.abs(slope(s0)) < jnp.sqrt(jnp.finfo(s0.dtype).eps) * jnp.abs(curvature)
 
     def residual(s: Scalar) -> Scalar:
-        left, right = (mu(end + (s - s0)) for end in (low, high))  # s is s0: only derivatives differ from mu(end)
-        gap = left - right
+        at_low, at_high = (mu(end + (s - s0)) for end in (low, high))  # s is s0: only derivatives differ from mu(end)
+        gap = at_low - at_high
         return jnp.where(smooth, slope(s), gap - jax.lax.stop_gradient(gap))  # bisection alone places a kink
 
     rate = jax.lax.stop_gradient(jnp.where(smooth, curvature, slope(low) - slope(high)))

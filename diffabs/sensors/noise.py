@@ -220,6 +220,6 @@ class Quantisation:
 
 def _round_to(x: Scalar, q: Scalar) -> Any:
     # For q = 0 the divisor is 1, so that the branch not taken holds no NaN.
-    fine = jnp.greater(q, 0)
-    q = jnp.where(fine, q, 1.0)
-    return jnp.where(fine, q * jnp.round(x / q), x)
+    divisible = jnp.greater(q, 0)
+    q = jnp.where(divisible, q, 1.0)
+    return jnp.where(divisible, q * jnp.round(x / q), x)

@@ -81,7 +81,7 @@ def test_a_timeout_is_undecided():
     assert not np.any(early.outcomes.fell & ~late.outcomes.fell)
     assert 0.5 < np.mean(late.outcomes.recovered[early.outcomes.undecided]) < 1
     assert late.share == pytest.approx(0.33, abs=0.02)
-    assert recoverable_multiple(loop, DIRECTION, FixedStep(1e-3, 3.0), most=0.05).undecided
+    assert recoverable_multiple(loop, DIRECTION, FixedStep(1e-3, 3.0), largest=0.05).undecided
 
 
 BORDER = 0.01  # relative distance from it
@@ -97,7 +97,7 @@ def test_starts_beside_the_border_end_as_scipy_says(gain):
     rays = [{"initial.theta": float(np.cos(a)), "initial.phi": float(np.sin(a))} for a in angles]
     starts, expected = [], []
     for ray in rays:
-        border = recoverable_multiple(loop, ray, COARSE, most=1.0)
+        border = recoverable_multiple(loop, ray, COARSE, largest=1.0)
         assert not border.undecided
         for factor in (1 - BORDER, 1 + BORDER):
             x = factor * border.multiple * np.array([ray["initial.theta"], 0, ray["initial.phi"], 0, 0, 0])
@@ -125,7 +125,7 @@ def test_a_share_is_one_by_area():
 @pytest.mark.parametrize("voltage", [48.0, *(pytest.param(v, marks=pytest.mark.slow) for v in MULTIPLES if v != 48.0)])
 def test_the_largest_multiple_that_is_recovered(voltage):
     """REFERENCE has 0.080 at 48 V, and 0.046 and 0.116 at 24 and 100 V: there SciPy falls, and agrees with us."""
-    found = recoverable_multiple(closed(voltage=voltage), DIRECTION, SOLVER, most=0.12)
+    found = recoverable_multiple(closed(voltage=voltage), DIRECTION, SOLVER, largest=0.12)
     assert not found.undecided
     assert found.multiple == pytest.approx(MULTIPLES[voltage], abs=6e-5)
     assert found.multiple < float(recoverable_bound(*model(HANGING), START, voltage))
@@ -134,14 +134,14 @@ def test_the_largest_multiple_that_is_recovered(voltage):
 
 
 @killed_by("design/attraction.py", "if not 0 < band < np.inf:", "if False:")
-@killed_by("design/attraction.py", "if not 0 < most < np.inf:", "if False:")
+@killed_by("design/attraction.py", "if not 0 < largest < np.inf:", "if False:")
 def test_no_band_and_no_search_without_a_size():
     for band in (0.0, -0.1, np.nan):
         with pytest.raises(ValueError, match=rf"band = {band:g} is outside \(0, inf\)"):
             classify_starts(closed(), {"initial.theta": np.zeros(2)}, SOLVER, band=band)
     for most in (-1.0, 0.0, np.inf):
-        with pytest.raises(ValueError, match=rf"most = {most:g} is outside \(0, inf\)"):
-            recoverable_multiple(closed(), DIRECTION, SOLVER, most=most)
+        with pytest.raises(ValueError, match=rf"largest = {most:g} is outside \(0, inf\)"):
+            recoverable_multiple(closed(), DIRECTION, SOLVER, largest=most)
 
 
 ROW, NO_START = {"plant.rider_mass": np.array([50.0])}, r"it needs columns of one length, at least 1"
@@ -175,8 +175,8 @@ def test_starts_and_directions_that_say_nothing(ask, message):
 
 @pytest.mark.slow
 def test_nothing_and_all_can_be_recovered():
-    assert recoverable_multiple(closed(), DIRECTION, SOLVER, most=0.01) == (0.01, False)
-    assert recoverable_multiple(closed(controller=BalanceFeedback(gain=-GAIN)), DIRECTION, SOLVER, most=0.1) == (
+    assert recoverable_multiple(closed(), DIRECTION, SOLVER, largest=0.01) == (0.01, False)
+    assert recoverable_multiple(closed(controller=BalanceFeedback(gain=-GAIN)), DIRECTION, SOLVER, largest=0.1) == (
         0.0,
         False,
     )
@@ -197,7 +197,7 @@ def test_the_lqr_for_fifty_kilograms_holds_riders_of_up_to_71():
     assert [mass for mass, fine in held.items() if not fine] == [71.3, 72.0]
     assert heaviest(HANGING, GAIN) == pytest.approx(71.229, abs=2e-3)
     heavy = replace(closed(), {"plant.rider_mass": 68.0})
-    found = recoverable_multiple(heavy, DIRECTION, SOLVER, most=0.12)
+    found = recoverable_multiple(heavy, DIRECTION, SOLVER, largest=0.12)
     assert found.multiple == pytest.approx(0.040, abs=5e-4)
     assert arm_stays_up(heavy.plant, GAIN, 0.99 * found.multiple * START, 48.0)
     assert not arm_stays_up(heavy.plant, GAIN, 1.01 * found.multiple * START, 48.0)

@@ -247,8 +247,8 @@ def test_decay_is_what_can_be_proved(gain, system):
 @pytest.mark.slow
 @killed_by(
     "design/interior/decay_rate.py",
-    "2 * jnp.sum(weights * left)",
-    "2 * jnp.sum(jnp.mean(weights, 0) * left)",
+    "2 * jnp.sum(weights * derivative)",
+    "2 * jnp.sum(jnp.mean(weights, 0) * derivative)",
     case="continuous",
 )
 @both_times

@@ -50,7 +50,7 @@ def test_there_are_these_journeys_of_at_most_40_lines():
 @killed_by("simulate/convert.py", '.set_index("t")', "", case="journeys/pandas.md")
 @killed_by(
     "linear/transfer.py",
-    "period=float(found.dt) if found.dt else None",
+    "period=float(model.dt) if model.dt else None",
     "period=None",
     case="journeys/python-control.md",
 )

@@ -151,7 +151,9 @@ def test_the_servo_at_its_limits_agrees_with_scipy(servo):
     assert np.ptp(sample.control[:20]) == 0  # at the limit
 
 
-@killed_by("linear/operating_point.py", "kept = plant | (found.K != 0)", "kept = plant | (found.K != found.K)")
+@killed_by(
+    "linear/operating_point.py", "contained = plant | (linear.K != 0)", "contained = plant | (linear.K != linear.K)"
+)
 @pytest.mark.slow
 def test_the_linear_model_is_the_one_written_by_hand(servo):
     loop, gains = linear(servo, load=0.03)
@@ -177,7 +179,7 @@ def operating_point_speed(loop, model):
 
 
 @pytest.mark.slow
-@killed_by("linear/operating_point.py", "if not found.residue < MAX_REST_RESIDUE:", "if False:")
+@killed_by("linear/operating_point.py", "if not linear.residue < MAX_REST_RESIDUE:", "if False:")
 def test_what_has_no_linear_model_says_so(servo):
     loop, _ = linear(servo)
     with pytest.raises(ValueError, match="controller Sampled acts at instants"):

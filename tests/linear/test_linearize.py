@@ -252,11 +252,11 @@ class Hasty:
 
 
 @pytest.mark.slow
-@killed_by("linear/operating_point.py", 'check_kink("the loop at its setpoint", found.kinked)\n    if', "if")
-@killed_by("linear/opened_loop.py", "plant and found.kinked[0]", "False")
+@killed_by("linear/operating_point.py", 'check_kink("the loop at its setpoint", linear.kinked)\n    if', "if")
+@killed_by("linear/opened_loop.py", "plant and linear.kinked[0]", "False")
 @killed_by(
     "linear/operating_point.py",
-    "found = _linearize_at_rest(model)\n    check",
+    "linear = _linearize_at_rest(model)\n    check",
     "return _linearize_at_rest(model)\n    check",
 )
 @killed_by("linear/opened_loop.py", "is_kinked(compute, moves, signal, inside)", "jnp.array(False)")

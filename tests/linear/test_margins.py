@@ -312,7 +312,9 @@ HELD = {
 
 
 @killed_by("linear/stability_margins.py", "if delayed.largest < REACHING:", "if True:", case="small gain at first")
-@killed_by("linear/delay_steps.py", "np.minimum(within, rest)", "5 * np.minimum(within, rest)", case="short window")
+@killed_by(
+    "linear/delay_steps.py", "np.minimum(within, remainder)", "5 * np.minimum(within, remainder)", case="short window"
+)
 @killed_by("linear/delay_steps.py", "np.where(huge, np.fmin(alone[1:], alone[:-1]), steps)", "steps", case="no damping")
 @pytest.mark.parametrize("name", HELD)
 def test_the_delay_margin_of_a_sampled_loop_is_the_first_delay_that_destabilises(name):
@@ -457,7 +459,7 @@ def test_closed_is_the_loop_of_the_certificates(name):
     np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-9)
 
 
-@killed_by("linear/opened_loop.py", "there.at[0].set(around.setpoint) if around.frozen else there", "there")
+@killed_by("linear/opened_loop.py", "target.at[0].set(around.setpoint) if around.frozen else target", "target")
 @pytest.mark.slow
 def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
     lab = rig(plant=LabRig(), initial=BrakeStart(speed=14.0), controller=StateFeedback(gain=(-60.0, -4.0)))
@@ -487,7 +489,7 @@ def test_a_pure_delay_turns_the_phase_and_nothing_else():
     assert other.delay == pytest.approx(one.delay - 1e-3, rel=1e-9)
 
 
-@killed_by("linear/opened_loop.py", "rest = max(delay - whole * self.period, 0.0)", "rest = 0.0")
+@killed_by("linear/opened_loop.py", "remainder = max(delay - whole * self.period, 0.0)", "remainder = 0.0")
 @pytest.mark.slow
 def test_a_sampled_loop_with_delay_fits_its_step_response():
     """2.6 periods of delay: the pulse response of L(z) is that of the continuous plant, which has one state."""
@@ -682,7 +684,7 @@ def test_a_crossover_far_below_a_pole_is_found(k):
     assert (found.crossover, found.phase) == pytest.approx((w, np.arctan(1 / w)), rel=1e-9)
 
 
-@killed_by("linear/stability_margins.py", "found = _touch_unit_circle(system, w, found)", "pass")
+@killed_by("linear/stability_margins.py", "crossovers = _touch_unit_circle(system, w, crossovers)", "pass")
 def test_a_gain_that_only_reaches_one_has_a_phase_margin():
     """A sampled gain of 1 is 180 deg from -1 at every frequency; 2 s/(s + 1)^2 is 1 at 1 rad/s and less elsewhere."""
     found = margins(static(1.0, period=0.1))

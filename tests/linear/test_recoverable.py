@@ -42,7 +42,7 @@ def test_zeros_of_numbers_that_are_not_finite(place):
             transmission_zeros(*given)
 
 
-@killed_by("linear/recoverable.py", "np.linalg.norm(there - along * moved) > ROUNDING", "0.0 > ROUNDING")
+@killed_by("linear/recoverable.py", "np.linalg.norm(offset - along * moved) > ROUNDING", "0.0 > ROUNDING")
 @killed_by("linear/recoverable.py", "<= 2 * ROUNDING * pole", "<= 0.0")
 def test_one_input_returns_one_direction_of_equal_poles():
     """x' = s x + b u leaves b as the only direction from which a start returns: |x| < |b| U/s."""

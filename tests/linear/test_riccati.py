@@ -85,8 +85,8 @@ def test_dare_is_scipys(n):
 
 @killed_by(
     "linear/regulator.py",
-    "return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R, found.P.dtype)), turned)",
-    "return Regulator(jnp.linalg.solve(symmetric_part(jnp.asarray(R, found.P.dtype)), turned)",
+    "return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R, riccati.P.dtype)), turned)",
+    "return Regulator(jnp.linalg.solve(symmetric_part(jnp.asarray(R, riccati.P.dtype)), turned)",
     case="q1-140.291806958",
 )
 @pytest.mark.parametrize("speed", [FAST, SLOW])
@@ -287,8 +287,8 @@ GAINS = {
 }
 
 
-@killed_by("linear/gaussian.py", "C @ found.P @ C.T + symmetric_part(V)", "C @ found.P @ C.T + V", case="kalman")
-@killed_by("linear/regulator.py", "symmetric_part(jnp.asarray(R, found.P.dtype))", "jnp.asarray(R)", case="lqr")
+@killed_by("linear/gaussian.py", "C @ riccati.P @ C.T + symmetric_part(V)", "C @ riccati.P @ C.T + V", case="kalman")
+@killed_by("linear/regulator.py", "symmetric_part(jnp.asarray(R, riccati.P.dtype))", "jnp.asarray(R)", case="lqr")
 @killed_by("linear/regulator.py", "symmetric_part(jnp.asarray(R)) + b.T", "jnp.asarray(R) + b.T", case="dlqr")
 @pytest.mark.parametrize("name", GAINS)
 def test_traced_weights_count_by_their_symmetric_part(name):

@@ -295,7 +295,7 @@ def test_the_zero_that_nearly_cancels_the_unstable_pole():
     assert np.max(found.real) == pytest.approx(np.sqrt(98.1 / 13.7), rel=1e-10)
 
 
-@killed_by("linear/recoverable.py", "a @ rest - np.outer", "a @ rest + np.outer")
+@killed_by("linear/recoverable.py", "a @ complement - np.outer", "a @ complement + np.outer")
 @killed_by("linear/recoverable.py", "> ROUNDING * size * np.linalg.norm(b)", "> 0.0 * size")
 def test_a_slow_zero_is_found_in_any_basis():
     """(s + 1e-6)/((s + 1)(s + 2)(s + 3)(s + 4)) in random coordinates of the state: the relative degree is 3."""

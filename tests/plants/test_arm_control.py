@@ -77,7 +77,7 @@ def test_two_unstable_poles_are_two_bounds():
     assert mode_bounds(a, b, np.zeros(6), 48.0) == dict.fromkeys(found, np.inf)
 
 
-@killed_by("linear/recoverable.py", "np.linalg.norm(there - along * moved) > ROUNDING", "0.0 > ROUNDING")
+@killed_by("linear/recoverable.py", "np.linalg.norm(offset - along * moved) > ROUNDING", "0.0 > ROUNDING")
 def test_equal_poles_have_the_least_bound():
     """No control reaches the first state; in the second order it is the last one."""
     for b in ([[0.0], [1.0]], [[1.0], [0.0]]):
@@ -137,7 +137,7 @@ def corrected(observer, last, x, k=1):
 
 @pytest.mark.slow
 @killed_by(
-    "linear/gaussian.py", "jnp.linalg.solve(spread, C @ found.P).T", "jnp.linalg.solve(spread, C @ found.P @ A.T).T"
+    "linear/gaussian.py", "jnp.linalg.solve(spread, C @ riccati.P).T", "jnp.linalg.solve(spread, C @ riccati.P @ A.T).T"
 )
 def test_regulator_and_filter_are_those_of_the_weights():
     """SciPy's, of unknown accelerations that are constant over a period of 20 ms; other weights than the defaults."""

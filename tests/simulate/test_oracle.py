@@ -87,7 +87,7 @@ def test_random_scenario_agrees_with_scipy(seed):
         np.testing.assert_allclose(run.metrics[name], value, rtol=rtol, atol=1e-9, err_msg=name)
 
 
-@killed_by("plants/lab_rig.py", "stuck = jnp.where(held, smaller(asked, capacity), capacity)", "stuck = capacity")
+@killed_by("plants/lab_rig.py", "stuck = jnp.where(held, smaller(needed, capacity), capacity)", "stuck = capacity")
 def test_lab_rig_locks_and_stops_like_scipy():
     plant = plants.LabRig()
     loop = braking(
