@@ -133,7 +133,6 @@ def _follow_block(name: str, block: Part, signal: PyTree, *, is_real: bool = Fal
 
 
 def _follow_objective(path: str, objective: Objective, sample: Sample, ending: Ending) -> None:
-    """Call each method of an objective once."""
     memory = _call(path, objective, "start", sample)
     _expect_memory(f"{path}.start", memory)
     _expect_like(f"{path}.flow", _call(path, objective, "flow", memory, sample), memory.flow, "memory.flow")

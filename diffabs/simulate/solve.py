@@ -705,7 +705,6 @@ def _trace_program(loop: Part) -> SwitchedProgram:
 
 
 def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree) -> tuple[Solution, None]:
-    """Return the solution of a run that is over."""
     point, held = carry.point, carry.point.state.controller.held
     statuses = {
         RunStatus.TIMED_OUT: SolutionStatus.FINISHED,

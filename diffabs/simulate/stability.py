@@ -79,7 +79,6 @@ def is_step_stable(loop: Part, values: PyTree, step: float) -> np.ndarray:
 
 
 def _as_single_precision(*trees: PyTree) -> PyTree:
-    """Return the trees in single precision."""
     # NumPy arrays, because `enable_x64` is not consistent for JAX arrays made by several threads at once.
     return jax.tree.map(lambda x: np.asarray(x, np.float32), trees)
 

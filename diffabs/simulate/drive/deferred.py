@@ -259,7 +259,6 @@ def _push_forward(
 
 
 def _replace_leaves(leaves: Leaves, places: Sequence[int], new: Leaves) -> list[PyTree]:
-    """Return the leaves with those at `places` replaced."""
     by_place = dict(zip(places, new, strict=True))
     return [by_place.get(i, x) for i, x in enumerate(leaves)]
 
@@ -307,7 +306,6 @@ def _find_kernel(call: _Call, arguments: Sequence[Any], objection: str) -> tuple
 
 @functools.cache  # a line once, since JAX may ask for an engine several times
 def _log_choice(subject: str, objection: str) -> None:
-    """Log the engine of some runs, and the reason for XLA."""
     engine = f"XLA, not a kernel: {objection}" if objection else f"a kernel ({describe_engine('kernel')['compiler']})"
     log.info("%s: %s", subject, engine)
 

@@ -144,7 +144,6 @@ class SwitchedProgram:
         return len(self._names) - 1
 
     def _add_constants(self, constants: Sequence[PyTree]) -> list[int]:
-        """Return the numbers of new constants."""
         numbers = [self._value(("constant", len(self._names) + i), False) for i in range(len(constants))]
         self._constants.update(zip(numbers, constants, strict=True))
         return numbers

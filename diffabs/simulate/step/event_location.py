@@ -142,7 +142,6 @@ def falls_through(before: list[PyTree], after: list[PyTree]) -> list[PyTree]:
 
 
 def _find_event_crossings(number: Scalar, first: int, before: list[PyTree], after: list[PyTree]) -> AttemptCrossings:
-    """Return the crossings of events within an attempt."""
     crossed = falls_through(before, after)
     unsought_falls = [crosses & (number != first + i) for i, crosses in enumerate(crossed)]
     triples = zip(unsought_falls, before, after, strict=True)

@@ -200,7 +200,6 @@ def _trace(eqn: Equation, function: Callable[..., Sequence[PyTree]]) -> jex.Clos
 
 
 def _close(jaxpr: jex.Jaxpr | jex.ClosedJaxpr) -> jex.ClosedJaxpr:
-    """Return a jaxpr, open or closed, as a closed one."""
     return jaxpr if isinstance(jaxpr, jex.ClosedJaxpr) else jex.ClosedJaxpr(jaxpr, ())
 
 

@@ -313,5 +313,4 @@ def _time_to_zero(on: Bool, margin: Scalar, fall: Scalar, longest: Scalar) -> tu
 
 
 def _stop_gradients(tree: PyTree) -> PyTree:
-    """Return the tree without derivatives."""
     return jax.tree.map(jax.lax.stop_gradient, tree)
