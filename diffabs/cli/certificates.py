@@ -60,7 +60,7 @@ class ProofTask(NamedTuple):
         spec: Specification of the closed loops.
     """
 
-    chosen: Scenario
+    scenario: Scenario
     reduced: "ReducedLoop"
     gain: np.ndarray
     model: Part
@@ -70,13 +70,13 @@ class ProofTask(NamedTuple):
     spec: "Spec"
 
 
-def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) -> ProofTask:
+def build_proof_task(scenario: Scenario, gain: str | None = None, *, weighed: bool = False) -> ProofTask:
     """Return the linear systems of a scenario with the gain to certify.
 
     Args:
         gain: `k1,k2,...`; by default the gain of the controller.
     """
-    if weighed and chosen.design.Q is None:
+    if weighed and scenario.design.Q is None:
         raise ScenarioError("design.Q and design.R are missing: a design minimises the cost that they weigh")
     from diffabs.design import Spec
     from diffabs.design.parameter_box import polytope
@@ -84,19 +84,19 @@ def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool
     from diffabs.design.sdp import solver
     from diffabs.design.state_feedback import reduce_loop
 
-    reduced, wanted = reduce_loop(chosen.loop), chosen.design
+    reduced, design = reduce_loop(scenario.loop), scenario.design
     states = reduced.model.states
     typed = None if gain is None else _read_gain(gain, states)  # refused before anything is computed
-    spec = Spec(Q=wanted.Q, R=wanted.R, decay=wanted.decay, damping=wanted.damping)
+    spec = Spec(Q=design.Q, R=design.R, decay=design.decay, damping=design.damping)
     try:
         spec = spec.check(len(states), 1, reduced.model.period)
     except ValueError as error:
         raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
     solver.solvers()  # fails early if no SDP solver is installed
-    reduced, model, over = _follow_speed(chosen.loop, reduced, wanted.box(chosen.loop))
+    reduced, model, over = _follow_speed(scenario.loop, reduced, design.box(scenario.loop))
     values = reduced.gain if typed is None else typed
     systems = grid_polytope(model, over) if isinstance(model, BalanceModel) else polytope(model, over)
-    return ProofTask(chosen, reduced, values, model, tuple(model.states), over, systems, spec)
+    return ProofTask(scenario, reduced, values, model, tuple(model.states), over, systems, spec)
 
 
 def _follow_speed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoop", PyTree, Box]:
@@ -147,7 +147,7 @@ def _greatest_decelerations(plant: Plant, box: Box, speeds: np.ndarray) -> np.nd
         return jnp.max(every(speeds, np.linspace(0.0, 1.0, SLIPS)), axis=1)
 
     plants = (replace(plant, dict(zip(inside, corner, strict=True))) for corner in itertools.product(*inside.values()))
-    return MARGIN * np.max([np.asarray(greatest(one)) for one in plants], axis=0)
+    return MARGIN * np.max([np.asarray(greatest(corner_plant)) for corner_plant in plants], axis=0)
 
 
 def certify_gain(task: ProofTask) -> "Certificate":
@@ -215,7 +215,7 @@ def _permitted_fall(task: ProofTask) -> float | None:
     low, high = task.over.get("speed", (0.0, 0.0))
     if not 0 < low < high or task.polytope.period is not None:
         return None
-    fall = float(_greatest_decelerations(task.chosen.loop.plant, task.over, _speeds(task.over, low)).max())
+    fall = float(_greatest_decelerations(task.scenario.loop.plant, task.over, _speeds(task.over, low)).max())
     cells = schedule(task.model, task.over, along="speed", nodes=SCHEDULE_CELLS)
     return fall if analysis.certify(task.gain, cells, Spec(rates=(-fall, 0.0))).stable else None
 
@@ -225,7 +225,7 @@ def proof_document(
     proof: "Certificate | None" = None,
     out: pathlib.Path | None = None,
     reason: str | None = None,
-    known: FurtherFindings | None = None,
+    further: FurtherFindings | None = None,
     **numbers: float | None,
 ) -> JsonObject:
     """Return the JSON document of a proof, whose parameters have the names of the linear model and SI units.
@@ -238,14 +238,14 @@ def proof_document(
         summary["worst_vertex"] = summary["worst_vertex"] or slowest_vertex(proof)
     coverage = task.polytope.coverage
     return {
-        **console.describe_source(task.chosen),
+        **console.describe_source(task.scenario),
         "gain": np.ravel(proof.gain).tolist() if proof else None,  # one input: the row is the gain
         "states": list(task.states),
         **{name: summary.get(name) for name in FROM_PROOF},
         **dict.fromkeys(FROM_DESIGN),
         **numbers,
         "reason": reason,
-        "besides": known.document() if known else None,
+        "besides": further.document() if further else None,
         "period": task.polytope.period,
         "over": {path: list(ends) for path, ends in task.over.items()},
         "units": {path: spec.unit for path, spec, _ in parameters(task.model) if path in task.over},
@@ -274,45 +274,45 @@ def slowest_vertex(proof: "Certificate") -> JsonObject:
     return {"index": index, "cell": 0, "corner": corner, "claim": "poles", "margin": margin}
 
 
-def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings | None = None) -> str:
+def describe_unproved(proof: "Certificate", spec: "Spec", further: FurtherFindings | None = None) -> str:
     """Return a sentence on required properties without a proof; empty if all are proved."""
     from diffabs.design.proof.schema import DISPROOF_KINDS
 
     stable, refuted = proof.quadratically_stable, any(proof.proved_data(*DISPROOF_KINDS))
-    asked = {
+    requirements = {
         "decay": (spec.decay > 0, f"decay = {spec.decay:g} 1/s", not refuted),
         "cost": (spec.Q is not None, "a guaranteed cost", True),
         "damping": (spec.damping > 0, f"damping = {spec.damping:g}", True),
     }
-    found = [] if stable else [f"quadratic stability is {VERDICT_WORDS[stable]}"]
+    unproved = [] if stable else [f"quadratic stability is {VERDICT_WORDS[stable]}"]
     if stable is False:
-        found[0] += f": no common Lyapunov matrix exists for the {proof.cells[0].vertices} vertices"
-        found[0] += ", so no Q and R give this gain by a design over these ranges"
+        unproved[0] += f": no common Lyapunov matrix exists for the {proof.cells[0].vertices} vertices"
+        unproved[0] += ", so no Q and R give this gain by a design over these ranges"
     else:
-        for kind, (wanted, words, still_open) in asked.items():
-            if wanted and not any(proof.proved_data(kind)):
-                found.append(f"{words} is {VERDICT_WORDS[None if still_open else False]}")
-    if not found:
+        for kind, (required, words, still_open) in requirements.items():
+            if required and not any(proof.proved_data(kind)):
+                unproved.append(f"{words} is {VERDICT_WORDS[None if still_open else False]}")
+    if not unproved:
         return ""
-    if known and known.frozen.stable == known.frozen.systems:
-        return f"{', '.join(found)}; that is not instability: {describe_frozen_stability(known)}"
+    if further and further.frozen.stable == further.frozen.systems:
+        return f"{', '.join(unproved)}; that is not instability: {describe_frozen_stability(further)}"
     worst = slowest_vertex(proof)
     where = ", ".join(f"{name} {value:.6g}" for name, value in (worst["corner"] or {}).items())
     kind = "is unstable even with fixed parameters" if worst["margin"] <= 0 else "has the slowest pole"
-    return f"{', '.join(found)}; vertex {worst['index']}{f' ({where})' if where else ''} {kind}"
+    return f"{', '.join(unproved)}; vertex {worst['index']}{f' ({where})' if where else ''} {kind}"
 
 
-def describe_frozen_stability(known: FurtherFindings) -> str:
+def describe_frozen_stability(further: FurtherFindings) -> str:
     """Return a sentence on a gain whose frozen loops are all stable."""
-    loops = known.frozen
+    loops = further.frozen
     where = ", ".join(f"{name} {value:.6g}" for name, value in loops.at.items())
-    said = f"each of {loops.systems} frozen systems is stable by its poles"
-    said += f", the slowest decays at {loops.slowest:.4g} 1/s{f' ({where})' if where else ''}"
-    if known.fall is None:
-        return said
+    sentence = f"each of {loops.systems} frozen systems is stable by its poles"
+    sentence += f", the slowest decays at {loops.slowest:.4g} 1/s{f' ({where})' if where else ''}"
+    if further.fall is None:
+        return sentence
     return (
-        f"{said}, and a Lyapunov matrix that follows the speed proves stability while the speed falls by at most"
-        f" {known.fall:.4g} m/s^2, the most that friction allows"
+        f"{sentence}, and a Lyapunov matrix that follows the speed proves stability while the speed falls by at most"
+        f" {further.fall:.4g} m/s^2, the most that friction allows"
     )
 
 

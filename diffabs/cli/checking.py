@@ -23,7 +23,7 @@ CLOSER = 16  # `rtol` of the run with adaptive steps is divided by this for the 
 LOOSE, LEAST = 100, 0.01  # a change above LOOSE * rtol * max(|metric|, LEAST) is reported
 
 
-def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
+def check_run_accuracy(scenario: Scenario, key: Key) -> JsonObject:
     """Return the accuracy of each metric as JSON values.
 
     The key "metrics" has a row by metric. "value" is the metric itself. "difference" and "relative" give its change by
@@ -33,36 +33,36 @@ def check_run_accuracy(chosen: Scenario, key: Key) -> JsonObject:
     The keys beside it are "solvers", "comparable", "reasons", "ended alike" and "turned". If the runs are not
     comparable, "reasons" says why. "turned" names the metrics that are finite with one step, and not with another.
     """
-    solver = chosen.solver
+    solver = scenario.solver
     if FINEST * solver.duration / solver.step > MAX_SOLVER_STEPS:
-        least = FINEST * solver.duration / MAX_SOLVER_STEPS
+        min_step = FINEST * solver.duration / MAX_SOLVER_STEPS
         raise ScenarioError(
-            f"solver.step = {solver.step:g} s is outside [{least:g}, {solver.duration:g}] s: a quarter of it takes too "
-            "many steps for --check"
+            f"solver.step = {solver.step:g} s is outside [{min_step:g}, {solver.duration:g}] s: a quarter of it takes "
+            "too many steps for --check"
         )
-    why = incomparability_reasons(chosen.loop, solver, key)
-    found = jax.device_get(estimate_accuracy(chosen.loop, solver, chosen.objectives, key=key))
-    single = {} if needs_key(chosen.loop) else _run_in_single_precision(chosen)
+    why = incomparability_reasons(scenario.loop, solver, key)
+    accuracy = jax.device_get(estimate_accuracy(scenario.loop, solver, scenario.objectives, key=key))
+    single = {} if needs_key(scenario.loop) else _run_in_single_precision(scenario)
     metrics = {}
-    for name in chosen.objectives:
-        one = found.estimates[name]
-        value, low = float(one.value), single.get(name)
+    for name in scenario.objectives:
+        estimate = accuracy.estimates[name]
+        value, low = float(estimate.value), single.get(name)
         metrics[name] = {
             "value": value,
-            "difference": float(one.difference),
-            "relative": _relative_change(float(one.difference), value),
-            "finer difference": float(one.finer),
-            "order": float(one.order),
-            "converges": bool(one.converges),
-            "error": float(one.error),
+            "difference": float(estimate.difference),
+            "relative": _relative_change(float(estimate.difference), value),
+            "finer difference": float(estimate.finer),
+            "order": float(estimate.order),
+            "converges": bool(estimate.converges),
+            "error": float(estimate.error),
             "float32 difference": None if low is None else low - value,
         }
     return {
         "solvers": [describe_solver(refine_solver(solver, times)) for times in (1, 2, FINEST)],
         "comparable": not why,
         "reasons": why,
-        "ended alike": bool(found.alike),
-        "turned": [name for name, one in found.estimates.items() if one.turned],
+        "ended alike": bool(accuracy.alike),
+        "turned": [name for name, estimate in accuracy.estimates.items() if estimate.turned],
         "metrics": metrics,
     }
 
@@ -75,40 +75,40 @@ def describe_loose_metrics(metrics: Params, solver: Adaptive, again: Callable[[S
     metrics to compare, and the line says so.
     """
     closer = dataclasses.replace(solver, rtol=solver.rtol / CLOSER)
-    finer, found = again(closer), []
+    finer, loose_metrics = again(closer), []
     if finer.diverged:
         return [f"the run diverges with solver.rtol = {closer.rtol:.2g}: its metrics cannot be trusted"]
-    for name, other in finer.metrics.items():
-        one, other = float(metrics[name]), float(other)
-        if differs_in_kind(one, other):
-            found.append(f"{name} from {format_metric(one)} to {format_metric(other)}")
-        elif abs(one - other) > LOOSE * solver.rtol * max(abs(other), LEAST):
-            found.append(f"{name} by {100 * abs(one - other) / max(abs(other), LEAST):.2g} %")
-    if not found:
+    for name, finer_value in finer.metrics.items():
+        value, finer_value = float(metrics[name]), float(finer_value)
+        if differs_in_kind(value, finer_value):
+            loose_metrics.append(f"{name} from {format_metric(value)} to {format_metric(finer_value)}")
+        elif abs(value - finer_value) > LOOSE * solver.rtol * max(abs(finer_value), LEAST):
+            loose_metrics.append(f"{name} by {100 * abs(value - finer_value) / max(abs(finer_value), LEAST):.2g} %")
+    if not loose_metrics:
         return []
     why = "the run chatters or amplifies its errors; choose a smaller solver.rtol, or see --check"
-    return [f"solver.rtol = {closer.rtol:.2g} changes {', '.join(found)}: {why}"]
+    return [f"solver.rtol = {closer.rtol:.2g} changes {', '.join(loose_metrics)}: {why}"]
 
 
-def describe_check(found: JsonObject) -> list[str]:
+def describe_check(accuracy: JsonObject) -> list[str]:
     """Return the warnings of a check, a line each."""
-    lines = [f"accuracy unknown: {why}" for why in found["reasons"]]
-    if found["comparable"] and not found["ended alike"]:
+    lines = [f"accuracy unknown: {why}" for why in accuracy["reasons"]]
+    if accuracy["comparable"] and not accuracy["ended alike"]:
         lines.append("accuracy unknown: with a shorter step the run ends differently")
-    rows = found["metrics"].items()
-    least = {name: max(MIN_CHANGE * abs(row["value"]), ROUNDING) for name, row in rows}
-    loose = [name for name, row in rows if not row["converges"] and row["error"] > least[name]]
-    if found["comparable"] and loose:
+    rows = accuracy["metrics"].items()
+    tolerances = {name: max(MIN_CHANGE * abs(row["value"]), ROUNDING) for name, row in rows}
+    loose = [name for name, row in rows if not row["converges"] and row["error"] > tolerances[name]]
+    if accuracy["comparable"] and loose:
         lines.append(f"shorter steps do not converge for {', '.join(loose)}: the error is a guess")
     never = "is finite with one step and never with another: its value cannot be trusted"
-    return [*lines, *(f"{name} {never}" for name in found["turned"])]
+    return [*lines, *(f"{name} {never}" for name in accuracy["turned"])]
 
 
-def _run_in_single_precision(chosen: Scenario) -> dict[str, float]:
+def _run_in_single_precision(scenario: Scenario) -> dict[str, float]:
     """Return the metrics in single precision. The loop has no noise: single precision would draw another noise."""
     with jax.enable_x64(False):
-        loop, objectives = jax.tree.map(lambda x: np.asarray(x, np.float32), (chosen.loop, dict(chosen.objectives)))
-        return {name: float(x) for name, x in run_unchecked(loop, chosen.solver, objectives, None, 0).metrics.items()}
+        loop, objectives = jax.tree.map(lambda x: np.asarray(x, np.float32), (scenario.loop, dict(scenario.objectives)))
+        return {name: float(x) for name, x in run_unchecked(loop, scenario.solver, objectives, None, 0).metrics.items()}
 
 
 def _relative_change(difference: float, value: float) -> float:

@@ -37,12 +37,12 @@ def compare(
         from diffabs.sweep.store import describe_differences
 
         a, b = Results(first), Results(second)
-        for found in (a, b):
-            warn_of_strays(found)
-            if not found.complete:
-                raise ScenarioError(f"{found.folder} is not complete; diffabs sweep ... --resume completes it")
-        one, other = ({name: found.study[name] for name in SHARED_FIELDS} for found in (a, b))
-        for line in describe_differences(one, other):
+        for results in (a, b):
+            warn_of_strays(results)
+            if not results.complete:
+                raise ScenarioError(f"{results.folder} is not complete; diffabs sweep ... --resume completes it")
+        first_fields, second_fields = ({name: results.study[name] for name in SHARED_FIELDS} for results in (a, b))
+        for line in describe_differences(first_fields, second_fields):
             difference = line.replace(" there, ", " in the first, ")
             raise ScenarioError(f"the samples are not the same: {difference} in the second")
         both = [name for name in a.metrics if name in b.metrics]
@@ -69,10 +69,10 @@ def _compare_metrics(a: "Results", b: "Results", metrics: list[str]) -> JsonObje
         before, after = a.column(name)[both], b.column(name)[both]
         numbers = [None] * len(STATISTICS)
         if len(before) >= FEWEST:
-            found = compare_pairs(after, before)
+            pairs = compare_pairs(after, before)
             numbers = [Moments.of(before).mean().value, Moments.of(after).mean().value]
-            numbers += [one.table() for one in (found.mean, found.median, found.less)]
-            numbers += [found.ties, found.reduction]
+            numbers += [estimate.table() for estimate in (pairs.mean, pairs.median, pairs.less)]
+            numbers += [pairs.ties, pairs.reduction]
         rows[name] = {
             "samples": len(before),
             **dict(zip(STATISTICS, numbers, strict=True)),

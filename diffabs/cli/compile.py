@@ -52,23 +52,25 @@ def compile_scenario(
         if out and not name:
             console.fail("--out is for the text of --show")
         with targets.new_target_file(out, "--out") as file:
-            chosen = console.load_scenario(scenario, changes)
-            paths = _differentiated_paths(chosen, by or [])
-            values, derivative = console.run_with_progress(lambda: _trace(chosen, paths), f"tracing {chosen.name}")
+            setup = console.load_scenario(scenario, changes)
+            paths = _differentiated_paths(setup, by or [])
+            values, derivative = console.run_with_progress(lambda: _trace(setup, paths), f"tracing {setup.name}")
             if name:
                 # With --by every pass shows the program with tangents; without it only jvp, which values do not have.
                 call = derivative if by or name == "jvp" else values
                 text = console.run_with_progress(lambda: list_pass(call, name), f"pass {name}")
                 file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
                 return
-            result = console.run_with_progress(lambda: _count(chosen, paths, values, derivative), "counting")
-        show.as_json(result) if as_json else _show(result, chosen)
+            result = console.run_with_progress(lambda: _count(setup, paths, values, derivative), "counting")
+        show.as_json(result) if as_json else _show(result, setup)
 
 
-def _differentiated_paths(chosen: Scenario, by: list[str]) -> list[str]:
+def _differentiated_paths(scenario: Scenario, by: list[str]) -> list[str]:
     """Return the parameters to differentiate by: `by`, else the plant's first tunable number. Raises ScenarioError."""
     tunable = {
-        path: spec for path, spec, value in parameters(chosen.loop) if spec.tunable and np.ndim(np.asarray(value)) == 0
+        path: spec
+        for path, spec, value in parameters(scenario.loop)
+        if spec.tunable and np.ndim(np.asarray(value)) == 0
     }
     if by:
         for path in by:
@@ -81,28 +83,28 @@ def _differentiated_paths(chosen: Scenario, by: list[str]) -> list[str]:
         return by
     first = [path for path in tunable if path.startswith("plant.")] or list(tunable)
     if not first:
-        raise ScenarioError(f"{chosen.name} has no tunable number, by which a kernel could be differentiated")
+        raise ScenarioError(f"{scenario.name} has no tunable number, by which a kernel could be differentiated")
     return first[:1]
 
 
-def _trace(chosen: Scenario, paths: list[str]) -> tuple[LaneCall, LaneCall]:
+def _trace(scenario: Scenario, paths: list[str]) -> tuple[LaneCall, LaneCall]:
     """Return the kernel calls of one run: of its metrics, and of their derivatives by `paths`. Raises ScenarioError."""
 
     def run(x: Array) -> dict[str, Array]:
         values = {path: x[i][None] for i, path in enumerate(paths)}
-        lanes, given = Batch(values, jnp.zeros(1, int)), (chosen.solver, chosen.objectives)
-        return run_batch(chosen.loop, lanes, *given, together=False, engine="kernel").metrics
+        lanes, options = Batch(values, jnp.zeros(1, int)), (scenario.solver, scenario.objectives)
+        return run_batch(scenario.loop, lanes, *options, together=False, engine="kernel").metrics
 
-    x = jnp.asarray([float(get(chosen.loop, path)) for path in paths])
+    x = jnp.asarray([float(get(scenario.loop, path)) for path in paths])
     try:
         jaxprs = [jax.make_jaxpr(function)(x) for function in (run, jax.jacfwd(run))]
         values, derivative = (next(find_lane_calls(jaxpr)) for jaxpr in jaxprs)
     except (EngineError, NoCompiler, Unsupported) as error:
-        raise ScenarioError(f"{chosen.name} has no kernel: {error}") from None
+        raise ScenarioError(f"{scenario.name} has no kernel: {error}") from None
     return values, derivative
 
 
-def _count(chosen: Scenario, paths: list[str], values: LaneCall, derivative: LaneCall) -> JsonObject:
+def _count(scenario: Scenario, paths: list[str], values: LaneCall, derivative: LaneCall) -> JsonObject:
     """Return the numbers of operations by pass and level, for --json; `paths` are those of the tangents."""
     programs = {
         "lower": values.lanes.derivative(None).program,
@@ -112,16 +114,16 @@ def _count(chosen: Scenario, paths: list[str], values: LaneCall, derivative: Lan
         "eliminate, with tangents": derivative.program(),
     }
     return {
-        **console.describe_source(chosen),
+        **console.describe_source(scenario),
         "by": paths,
         "operations": {name: count_by_level(program) for name, program in programs.items()},
     }
 
 
-def _show(result: JsonObject, chosen: Scenario) -> None:
+def _show(result: JsonObject, scenario: Scenario) -> None:
     """Print the numbers of operations as a table."""
     table = Table("after pass", "once a launch", "once a run", "in each step")
     for name, counts in result["operations"].items():
         table.add_row(name, *(str(counts[level]) for level in ("uniform", "lane", "step")))
     by = ", ".join(result["by"])
-    tables.show_titled_table(f"{chosen.title or chosen.name}: operations of its kernel; tangents by {by}", table)
+    tables.show_titled_table(f"{scenario.title or scenario.name}: operations of its kernel; tangents by {by}", table)

@@ -29,8 +29,8 @@ def use_compilation_cache() -> pathlib.Path | None:
     None means that this function changed nothing. The cache is turned off, the user has set JAX's own cache, or the
     folder cannot be used. Commands then still work. Only a folder that other users may write to gives a warning.
     """
-    chosen = jax.config.values.get("jax_compilation_cache_dir")
-    if os.environ.get(OFF_VARIABLE) or any(name in os.environ for name in USER_VARIABLES) or chosen:
+    jax_folder = jax.config.values.get("jax_compilation_cache_dir")
+    if os.environ.get(OFF_VARIABLE) or any(name in os.environ for name in USER_VARIABLES) or jax_folder:
         return None
     try:
         folder = _user_folder() / "diffabs" / f"jax-{provenance.processor()}"
@@ -56,7 +56,7 @@ def _user_folder() -> pathlib.Path:
     """Return the system's folder for caches. Raises RuntimeError for a user without home."""
     if sys.platform == "darwin":
         return pathlib.Path.home() / "Library" / "Caches"
-    given = pathlib.Path(os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", ""))
-    if given.is_absolute():
-        return given
+    cache_home = pathlib.Path(os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", ""))
+    if cache_home.is_absolute():
+        return cache_home
     return pathlib.Path.home() / ("AppData/Local" if sys.platform == "win32" else ".cache")

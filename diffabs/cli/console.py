@@ -90,10 +90,10 @@ _given: tuple[str, ...] = ()  # the words after `diffabs`
 _begun = time.monotonic()
 
 
-def quieten(wanted: bool) -> None:
+def quieten(quiet: bool) -> None:
     """Set whether lines other than errors, warnings and interruptions are suppressed."""
     global _quiet
-    _quiet = wanted
+    _quiet = quiet
 
 
 def note_command(words: Sequence[str]) -> None:
@@ -112,12 +112,12 @@ def describe_run() -> dict[str, str | float]:
     return {**provenance.describe_making(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
 
 
-def describe_source(chosen: Scenario) -> JsonObject:
+def describe_source(scenario: Scenario) -> JsonObject:
     """Return the entries that documents on a scenario begin with: "scenario", "model" and "made".
 
     They hold its name, the values of `describe_model` and those of `describe_run`.
     """
-    return {"scenario": chosen.name, "model": describe_model(chosen), "made": describe_run()}
+    return {"scenario": scenario.name, "model": describe_model(scenario), "made": describe_run()}
 
 
 def escape_unencodable_output() -> None:
@@ -238,17 +238,18 @@ def _is_output_refused() -> bool:
 class InterruptibleEnd:
     """The reaction to Ctrl-C of work that can end early with a partial result.
 
-    The first Ctrl-C sets `asked`. The work calls this object between its steps, and ends after the current step if the
-    answer is True. The second Ctrl-C interrupts at once. The first one also does while there is no partial result.
+    The first Ctrl-C sets `is_requested`. The work calls this object between its steps, and ends after the current
+    step if the answer is True. The second Ctrl-C interrupts at once. The first one also does while there is no
+    partial result.
     """
 
-    def __init__(self, what: str, nothing: Callable[[], bool] = lambda: False):
-        """Store `what`, the step to finish, for messages, and `nothing`, which is true while there is no result."""
-        self.what, self.nothing, self.asked = what, nothing, False
+    def __init__(self, step: str, nothing: Callable[[], bool] = lambda: False):
+        """Store `step`, the step to finish, for messages, and `nothing`, which is true while there is no result."""
+        self.step, self.nothing, self.is_requested = step, nothing, False
 
     def __call__(self) -> bool:
         """Return True once Ctrl-C has requested the end."""
-        return self.asked
+        return self.is_requested
 
     def ask(self) -> None:
         """Handle Ctrl-C: request the end of the work, and say so on stderr.
@@ -256,10 +257,10 @@ class InterruptibleEnd:
         Raises:
             KeyboardInterrupt: It is the second Ctrl-C, or there is no partial result yet.
         """
-        if self.asked or self.nothing():
+        if self.is_requested or self.nothing():
             raise KeyboardInterrupt
-        self.asked = True
-        say(f"interrupted: finishing {self.what} (Ctrl-C again: at once)")
+        self.is_requested = True
+        say(f"interrupted: finishing {self.step} (Ctrl-C again: at once)")
 
 
 def run_with_progress(
@@ -283,12 +284,12 @@ def run_with_progress(
 
     # Daemon: after an interrupt the process can exit while compiled code still runs.
     thread = threading.Thread(target=run, name=WORKER, daemon=True)
-    told = (
+    display = (
         contextlib.nullcontext(lambda: None)
         if _quiet
         else progress.show_progress(message, detail, say, (SILENCE_S, SECOND_INTERRUPT_S))
     )
-    with told as tell:
+    with display as tell:
         thread.start()
         ended = False
         while not ended:
@@ -327,15 +328,15 @@ def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: b
     With `integrated` it also checks that the step is stable for the loop. With parts from outside, it raises
     ScenarioError if the friction of a road has not the sign of the slip.
     """
-    chosen = run_with_progress(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
-    road = getattr(chosen.loop.plant, "road", None) if outside.registered_modules() else None
+    setup = run_with_progress(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
+    road = getattr(setup.loop.plant, "road", None) if outside.registered_modules() else None
     if road is not None and (line := run_with_progress(lambda: find_wrong_sign(road), "checking the road")):
         raise ScenarioError(f"road: {line}")
-    for line in chosen.notes:
+    for line in setup.notes:
         say(f"note: {line}")
-    for line in chosen.cautions():
+    for line in setup.cautions():
         say(f"warning: {line}")
-    return chosen
+    return setup
 
 
 def leave(status: Int) -> NoReturn:

@@ -37,18 +37,18 @@ def design(
             from diffabs.design import synthesis
 
             try:
-                found = console.run_with_progress(
-                    lambda: synthesis.design(task.polytope, task.spec), f"designing for {task.chosen.name}"
+                solution = console.run_with_progress(
+                    lambda: synthesis.design(task.polytope, task.spec), f"designing for {task.scenario.name}"
                 )
             except synthesis.DesignError as error:
                 if as_json:
                     show.as_json(certificates.proof_document(task, reason=str(error)))
-                console.fail(f"{task.chosen.name}: {error}", console.FAILED)
-            numbers = {name: getattr(found, name) for name in (*certificates.FROM_DESIGN, "trace_cost")}
-            document = functools.partial(certificates.proof_document, task, found.certificate, **numbers)
+                console.fail(f"{task.scenario.name}: {error}", console.FAILED)
+            numbers = {name: getattr(solution, name) for name in (*certificates.FROM_DESIGN, "trace_cost")}
+            document = functools.partial(certificates.proof_document, task, solution.certificate, **numbers)
             if file:
                 with console.show_before_errors(lambda: _show(document(), task, as_json)):
-                    found.certificate.save(file)
+                    solution.certificate.save(file)
         _show(document(out), task, as_json)
 
 
@@ -68,17 +68,19 @@ def certify(
     with console.end_on_errors(), certificates.report_design_errors():
         with targets.new_target_file(out, "--out") as file:
             task = _prepare(scenario, changes or (), gain)
-            found = console.run_with_progress(lambda: certificates.certify_gain(task), f"certifying {task.chosen.name}")
+            proof = console.run_with_progress(
+                lambda: certificates.certify_gain(task), f"certifying {task.scenario.name}"
+            )
             if file:
-                with console.show_before_errors(lambda: _show(certificates.proof_document(task, found), task, as_json)):
-                    found.save(file)
-        known = console.run_with_progress(
-            lambda: certificates.find_further(task, found), "analysing the loops at fixed parameters"
+                with console.show_before_errors(lambda: _show(certificates.proof_document(task, proof), task, as_json)):
+                    proof.save(file)
+        further = console.run_with_progress(
+            lambda: certificates.find_further(task, proof), "analysing the loops at fixed parameters"
         )
-        reason = certificates.describe_unproved(found, task.spec, known)
-        _show(certificates.proof_document(task, found, out, reason=reason or None, known=known), task, as_json)
+        reason = certificates.describe_unproved(proof, task.spec, further)
+        _show(certificates.proof_document(task, proof, out, reason=reason or None, further=further), task, as_json)
         if reason:
-            console.conclude(f"{task.chosen.name}: {reason}")
+            console.conclude(f"{task.scenario.name}: {reason}")
 
 
 def verify(
@@ -127,9 +129,9 @@ def verify(
 def _prepare(
     scenario: str, changes: Sequence[str], gain: str | None = None, *, weighed: bool = False
 ) -> certificates.ProofTask:
-    chosen = console.load_scenario(scenario, changes, integrated=False)
+    setup = console.load_scenario(scenario, changes, integrated=False)
     return console.run_with_progress(
-        lambda: certificates.build_proof_task(chosen, gain, weighed=weighed), "computing the polytope"
+        lambda: certificates.build_proof_task(setup, gain, weighed=weighed), "computing the polytope"
     )
 
 
@@ -139,7 +141,7 @@ def _show(result: JsonObject, task: certificates.ProofTask, as_json: bool) -> No
     else:
         units = {path: spec.unit for path, spec, _ in parameters(task.model)}
         show.show_proof(
-            result, f"{task.chosen.name}: u = K x", units, certificates.VERDICT_WORDS[result["quadratically_stable"]]
+            result, f"{task.scenario.name}: u = K x", units, certificates.VERDICT_WORDS[result["quadratically_stable"]]
         )
     for line in task.reduced.neglected:
         console.say(f"neglected: {line}")

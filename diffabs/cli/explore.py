@@ -49,12 +49,15 @@ def explore(
         from diffabs.explore import server
         from diffabs.explore.session import Tools
 
-        there = _open_socket(port)
-        told = {"ready": lambda url: console.say(f"{url} (on this machine only; Ctrl-C ends it)"), "browser": browser}
+        listener = _open_socket(port)
+        options = {
+            "ready": lambda url: console.say(f"{url} (on this machine only; Ctrl-C ends it)"),
+            "browser": browser,
+        }
         if not interrupt.take_interrupt():  # Ctrl-C may have come during the import of the framework
             with console.warnings_in_lines():
                 tools = Tools(prove_scenario, pose_tuning, judge)
-                server.serve(scenario, tools, pathlib.Path.cwd(), there, thread=console.WORKER, **told)
+                server.serve(scenario, tools, pathlib.Path.cwd(), listener, thread=console.WORKER, **options)
             interrupt.take_interrupt()
         raise KeyboardInterrupt  # only Ctrl-C ends the server
 
@@ -88,7 +91,7 @@ def load_judge(path: pathlib.Path) -> "Callable[[Session], ProofVerdict]":
         console.fail(f"--proof {path}: {' '.join(str(error).split())}")
 
 
-def prove_scenario(chosen: Scenario) -> "ProofVerdict":
+def prove_scenario(scenario: Scenario) -> "ProofVerdict":
     """Return the verdict on a scenario's gain over the ranges of its [design].
 
     The word is "certified", "refuted" or "undecided" for quadratic stability. Without any certificate it is "unknown",
@@ -96,20 +99,20 @@ def prove_scenario(chosen: Scenario) -> "ProofVerdict":
     """
     from diffabs.explore.session import CERTIFIED, NOT_PROVED, REFUTED, UNDECIDED, ProofVerdict
 
-    found = tuning_task.certify_result(chosen)
-    sentence = found.sentence.partition(": ")[2]
-    if not found.certified:
+    outcome = tuning_task.certify_result(scenario)
+    sentence = outcome.sentence.partition(": ")[2]
+    if not outcome.certified:
         return ProofVerdict(NOT_PROVED, sentence)
     words = {True: CERTIFIED, False: REFUTED, None: UNDECIDED}
-    return ProofVerdict(words[found.document["quadratically_stable"]], sentence)
+    return ProofVerdict(words[outcome.document["quadratically_stable"]], sentence)
 
 
-def pose_tuning(chosen: Scenario) -> "TuningTask":
+def pose_tuning(scenario: Scenario) -> "TuningTask":
     """Return runs and constraints of a scenario's [tune]."""
     from diffabs.explore.tuning import TuningTask
 
     try:
-        work = tuning_task.build_work(chosen)
+        work = tuning_task.build_work(scenario)
     except ModuleNotFoundError as error:
         raise ScenarioError(str(error)) from None
     return TuningTask(work.batch, list(work.constraints.values()))

@@ -73,97 +73,99 @@ def export(
         if to is Form.FMU and period is not None:
             console.fail("--period is for a controller; --to fmu writes the plant")
         with targets.new_target_file(out, "--out") as file:
-            chosen = console.load_scenario(scenario, changes, integrated=to is Form.FMU)
-            chosen = chosen if period is None else _sample_controller(chosen, period)
+            setup = console.load_scenario(scenario, changes, integrated=to is Form.FMU)
+            setup = setup if period is None else _sample_controller(setup, period)
             try:
                 if to is Form.FMU and file and out:
-                    _write_fmu(chosen, file, out)
+                    _write_fmu(setup, file, out)
                     return
                 if to is Form.TABLE:
-                    _show_table(chosen, file, as_json)
+                    _show_table(setup, file, as_json)
                     if out:
                         console.say(f"table: {out}")
                     return
                 text = console.run_with_progress(
-                    lambda: _write_source(chosen, out, to, single, given), f"tracing {chosen.name}"
+                    lambda: _write_source(setup, out, to, single, given), f"tracing {setup.name}"
                 )
             except NotExported as error:
                 # The message names arguments of Python; here they are options of the command.
                 line = str(error).replace("give the target from outside", "say --given target")
                 line = line.replace("give the period at which", "say --period SECONDS, at which")
-                console.fail(f"{chosen.name}: {line}")
+                console.fail(f"{setup.name}: {line}")
             file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
         if out and to is Form.ST:
-            console.say(f"st: {out}; call FUNCTION_BLOCK {_function_prefix(chosen, out)} once a period")
+            console.say(f"st: {out}; call FUNCTION_BLOCK {_function_prefix(setup, out)} once a period")
         elif out:
-            console.say(f"c: {out}; try it with: cc -std=c99 -D{_function_prefix(chosen, out).upper()}_MAIN {out} -lm")
+            console.say(f"c: {out}; try it with: cc -std=c99 -D{_function_prefix(setup, out).upper()}_MAIN {out} -lm")
 
 
-def _sample_controller(chosen: Scenario, period: float) -> Scenario:
+def _sample_controller(scenario: Scenario, period: float) -> Scenario:
     """Return the scenario with its controller sampled. Raises ScenarioError."""
     from diffabs.controllers import Sampled, SampledOnGrid
 
-    inner = chosen.loop.controller
+    inner = scenario.loop.controller
     if isinstance(inner, Sampled | SampledOnGrid):
         raise ScenarioError("--period: the scenario's controller is sampled; change it with --set controller.period=")
     controller = Sampled(controller=inner, period=period)
-    if lines := list(find_problems(controller, "controller.", units_of(chosen.loop.plant))):
+    if lines := list(find_problems(controller, "controller.", units_of(scenario.loop.plant))):
         raise ScenarioError("; ".join(lines))
-    loop = dataclasses.replace(chosen.loop, controller=controller)
-    return dataclasses.replace(chosen, loop=loop)
+    loop = dataclasses.replace(scenario.loop, controller=controller)
+    return dataclasses.replace(scenario, loop=loop)
 
 
-def _function_prefix(chosen: Scenario, out: pathlib.Path | None) -> str:
+def _function_prefix(scenario: Scenario, out: pathlib.Path | None) -> str:
     """Return the prefix of the functions' names, from the name of the file or of the scenario."""
-    name = re.sub(r"[\W_]+", "_", out.stem if out else chosen.name, flags=re.ASCII).strip("_")
+    name = re.sub(r"[\W_]+", "_", out.stem if out else scenario.name, flags=re.ASCII).strip("_")
     return name if name[:1].isalpha() else f"controller_{name}".rstrip("_")
 
 
-def _write_source(chosen: Scenario, out: pathlib.Path | None, to: Form, single: bool, given: PyTree) -> str:
+def _write_source(scenario: Scenario, out: pathlib.Path | None, to: Form, single: bool, extra_input: PyTree) -> str:
     from diffabs.export import c_source, computer_program, structured_text
 
-    step = getattr(chosen.solver, "step", None)
+    step = getattr(scenario.solver, "step", None)
     dtype = np.float32 if single else np.float64
-    found = computer_program(chosen.loop, step=step, dtype=dtype, given_target=given is Given.TARGET)
-    title = f"Scenario {chosen.name}{f': {chosen.title}' if chosen.title else ''}."
+    program = computer_program(scenario.loop, step=step, dtype=dtype, given_target=extra_input is Given.TARGET)
+    title = f"Scenario {scenario.name}{f': {scenario.title}' if scenario.title else ''}."
     written = structured_text if to is Form.ST else c_source
-    return written(found, _function_prefix(chosen, out), [title, f"Written by diffabs {__version__}."])
+    return written(program, _function_prefix(scenario, out), [title, f"Written by diffabs {__version__}."])
 
 
-def _write_fmu(chosen: Scenario, file: pathlib.Path, out: pathlib.Path) -> None:
+def _write_fmu(scenario: Scenario, file: pathlib.Path, out: pathlib.Path) -> None:
     """Write the plant with the scenario's fixed steps. Raises ScenarioError, NotExported."""
     from diffabs.export import build_fmu
 
-    solver = chosen.solver
+    solver = scenario.solver
     if not isinstance(solver, FixedStep):
         raise ScenarioError("solver.type = adaptive: an FMU takes fixed steps, as in --set solver.type=fixed")
-    name, about = _function_prefix(chosen, out), chosen.title or chosen.name
+    name, about = _function_prefix(scenario, out), scenario.title or scenario.name
     times = {"step": float(solver.step), "duration": float(solver.duration)}
     data = console.run_with_progress(
-        lambda: build_fmu(chosen.loop, name, **times, about=about), f"compiling the plant of {chosen.name}"
+        lambda: build_fmu(scenario.loop, name, **times, about=about), f"compiling the plant of {scenario.name}"
     )
     file.write_bytes(data)
-    console.say(f"fmu: {out}; FMI 2.0 for co-simulation, input control [{chosen.loop.plant.control_unit}]")
+    console.say(f"fmu: {out}; FMI 2.0 for co-simulation, input control [{scenario.loop.plant.control_unit}]")
 
 
-def _show_table(chosen: Scenario, file: pathlib.Path | None, as_json: bool) -> None:
+def _show_table(scenario: Scenario, file: pathlib.Path | None, as_json: bool) -> None:
     from diffabs.export import difference_equations
 
-    found = console.run_with_progress(lambda: difference_equations(chosen.loop), f"linearising {chosen.name}")
-    states = [f"x{i + 1}" for i in range(len(found["F"]))]
-    columns = [*states, *(f"d {name}" for name in found["inputs"])]
-    rows = {f"{x}(k+1)": [*f, *g] for x, f, g in zip(states, found["F"], found["G"], strict=True)}
-    rows["d command(k)"] = [*found["H"], *found["J"]]
+    equations = console.run_with_progress(lambda: difference_equations(scenario.loop), f"linearising {scenario.name}")
+    states = [f"x{i + 1}" for i in range(len(equations["F"]))]
+    columns = [*states, *(f"d {name}" for name in equations["inputs"])]
+    rows = {f"{x}(k+1)": [*f, *g] for x, f, g in zip(states, equations["F"], equations["G"], strict=True)}
+    rows["d command(k)"] = [*equations["H"], *equations["J"]]
     if file:
         lines = [",".join(["", *columns]), *(",".join([name, *map(repr, row)]) for name, row in rows.items())]
         file.write_text("\n".join(lines) + "\n", encoding="utf-8")
     if as_json:
-        show.as_json({"scenario": chosen.name, **found, "versions": versions()})
+        show.as_json({"scenario": scenario.name, **equations, "versions": versions()})
     elif not file:
         table = Table("next", *columns)
         for name, row in rows.items():
             table.add_row(name, *(f"{value:.8g}" for value in row))
-        tables.show_titled_table(f"{chosen.title or chosen.name}: every {1e3 * found['period']:g} ms, at k", table)
+        tables.show_titled_table(
+            f"{scenario.title or scenario.name}: every {1e3 * equations['period']:g} ms, at k", table
+        )
         console.say(
             "note: d is the deviation from rest at the setpoint, x the deviation of the controller's state; limits are"
             " not included"

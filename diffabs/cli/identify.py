@@ -82,14 +82,14 @@ def identify(
         console.need_extra("tune")
         targets.check_scenario_file(out)
         with targets.new_target_file(out, "--out") as file:
-            chosen = console.load_scenario(scenario, changes)
-            units = chosen.loop.plant.shows.units
+            setup = console.load_scenario(scenario, changes)
+            units = setup.loop.plant.shows.units
             file_form = _read_renames(rename or ()), _read_separator(separator)
             readings = _compared_columns(data, column, units, *file_form)
             noise = _read_noise(sigma or (), readings, units)
-            ranges = _read_ranges(free, chosen)
-            found, noise, interrupted = _fit_with_progress(chosen, readings, ranges, noise)
-            result = {**_result(chosen, readings, ranges, found, noise), "interrupted": interrupted}
+            ranges = _read_ranges(free, setup)
+            fit, noise, interrupted = _fit_with_progress(setup, readings, ranges, noise)
+            result = {**_result(setup, readings, ranges, fit, noise), "interrupted": interrupted}
             show_result = functools.partial(show.as_json if as_json else show.show_identification, result)
             if interrupted:
                 show_result()
@@ -98,34 +98,34 @@ def identify(
             if result["undetermined"]:  # inside `with`: the exception discards the file
                 show_result()
                 missing = "; ".join(row["direction"] for row in result["undetermined"])
-                console.fail(f"{chosen.name}: not identifiable from these data: {missing}", console.FAILED)
+                console.fail(f"{setup.name}: not identifiable from these data: {missing}", console.FAILED)
             if file:
                 with console.show_before_errors(show_result):
-                    file.write_text(dump(chosen.with_loop(found.part, "identified")), encoding="utf-8")
+                    file.write_text(dump(setup.with_loop(fit.part, "identified")), encoding="utf-8")
         result["files"] |= {"out": str(out)} if out else {}
         show_result()
 
 
-def _read_renames(given: Sequence[str]) -> dict[str, str]:
+def _read_renames(options: Sequence[str]) -> dict[str, str]:
     """Return signals by the name of their column in the file."""
-    found = {}
-    for text in given:
+    names = {}
+    for text in options:
         column, equals, name = (word.strip() for word in text.rpartition("="))
         if not (equals and column and name):
             raise ScenarioError(f"--rename {format_given(text)} is not of the form column=name")
-        if column in found:
+        if column in names:
             raise ScenarioError(f"--rename {format_given(column)} is given twice")
-        found[column] = name
-    return found
+        names[column] = name
+    return names
 
 
-def _read_separator(given: str | None) -> str | None:
+def _read_separator(option: str | None) -> str | None:
     """Return the character between the cells, or None to guess it."""
-    if given is None:
+    if option is None:
         return None
-    separator = {"tab": "\t", "\\t": "\t"}.get(given, given)
+    separator = {"tab": "\t", "\\t": "\t"}.get(option, option)
     if len(separator) != 1 or separator.isalnum() or separator in "\"'+-.\r\n_":
-        raise ScenarioError(f"--separator {format_given(given)} is no separator: `tab`, or a character such as ;")
+        raise ScenarioError(f"--separator {format_given(option)} is no separator: `tab`, or a character such as ;")
     return separator
 
 
@@ -154,10 +154,10 @@ def _compared_columns(
     return Readings(readings.t, columns)
 
 
-def _read_noise(given: Sequence[str], readings: Readings, units: Mapping[str, str]) -> dict[str, float]:
+def _read_noise(options: Sequence[str], readings: Readings, units: Mapping[str, str]) -> dict[str, float]:
     """Return standard deviations by column, in SI."""
-    found: dict[str, float] = {}
-    for text in given:
+    deviations: dict[str, float] = {}
+    for text in options:
         name, equals, number = text.partition("=")
         name = name.strip()
         if not equals:
@@ -166,17 +166,17 @@ def _read_noise(given: Sequence[str], readings: Readings, units: Mapping[str, st
             raise unknown_name_error(
                 f"--sigma {format_given(name)} is not a column of the data", name, readings.columns
             )
-        if name in found:
+        if name in deviations:
             raise ScenarioError(f"--sigma {name} is given twice")
         spec = ParameterSpec(units[name], low=0.0, open_low=True)
-        found[name] = read_number_in_range(toml.parse_value(number.strip()), spec, f"--sigma {name}")
-    return found
+        deviations[name] = read_number_in_range(toml.parse_value(number.strip()), spec, f"--sigma {name}")
+    return deviations
 
 
-def _read_ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.Ends | None]:
+def _read_ranges(options: Sequence[str], scenario: Scenario) -> dict[str, section_tune.Ends | None]:
     """Return ranges by path; None for the declared range."""
     table = {}
-    for text in given:
+    for text in options:
         path, equals, ends = text.partition("=")
         low, colon, high = ends.partition(":")
         if not path.strip() or (equals and not colon):
@@ -187,13 +187,16 @@ def _read_ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tu
         table[path] = (
             [toml.parse_value(low.strip()), toml.parse_value(high.strip())] if equals else section_tune.DECLARED_RANGE
         )
-    found = section_tune.free_ranges(table, chosen.loop, "--free")
-    section_tune.check_starts(chosen.loop, found, "--free")
-    return found
+    ranges = section_tune.free_ranges(table, scenario.loop, "--free")
+    section_tune.check_starts(scenario.loop, ranges, "--free")
+    return ranges
 
 
 def _fit_with_progress(
-    chosen: Scenario, readings: Readings, ranges: Mapping[str, section_tune.Ends | None], given: Mapping[str, float]
+    scenario: Scenario,
+    readings: Readings,
+    ranges: Mapping[str, section_tune.Ends | None],
+    fixed_noise: Mapping[str, float],
 ) -> tuple["Identified", dict[str, float], bool]:
     """Return the fit, its standard deviations by column, and True if Ctrl-C ended it."""
     far: list[str] = []
@@ -202,21 +205,21 @@ def _fit_with_progress(
         far.append(f"{evaluations} evaluation{'s' if evaluations != 1 else ''}, cost {cost:.6g}")
 
     ending = console.InterruptibleEnd("the evaluation in hand", nothing=lambda: not far)
-    found, noise = console.run_with_progress(
-        lambda: _fit(chosen, readings, ranges, given, report_progress, ending),
-        f"identifying {chosen.name}",
+    fit, noise = console.run_with_progress(
+        lambda: _fit(scenario, readings, ranges, fixed_noise, report_progress, ending),
+        f"identifying {scenario.name}",
         lambda: far[-1] if far else progress.COMPILING,
         ending,
     )
-    return found, noise, ending.asked
+    return fit, noise, ending.is_requested
 
 
 def _fit(
-    chosen: Scenario,
+    scenario: Scenario,
     readings: Readings,
     ranges: Mapping[str, section_tune.Ends | None],
-    given: Mapping[str, float],
-    told: Callable[[int, float], None],
+    fixed_noise: Mapping[str, float],
+    on_progress: Callable[[int, float], None],
     stopping: Callable[[], bool],
 ) -> tuple["Identified", dict[str, float]]:
     """Return the fit, and its standard deviations by column. Raises ValueError.
@@ -227,33 +230,33 @@ def _fit(
     from diffabs.identify.identification import identify
     from diffabs.identify.traces import Traces
 
-    (solver, t), columns = _match_times(chosen.solver, readings.t), readings.columns
+    (solver, t), columns = _match_times(scenario.solver, readings.t), readings.columns
 
     def fit_traces(
-        noise: Mapping[str, float], starts: Sequence[PyTree] = (), absolute: bool = bool(given)
+        noise: Mapping[str, float], starts: Sequence[PyTree] = (), absolute: bool = bool(fixed_noise)
     ) -> tuple["Identified", dict[str, np.ndarray]]:
         traces = Traces(t=t, columns=columns, sigma=noise)
         options = {"solver": solver, "absolute": absolute, "starts": starts}
-        found = identify(chosen.loop, traces, dict(ranges), **options, progress=told, stopping=stopping)
-        return found, traces.residuals(found)
+        fit = identify(scenario.loop, traces, dict(ranges), **options, progress=on_progress, stopping=stopping)
+        return fit, traces.residuals(fit)
 
     spread = {name: float(np.std(values)) or 1.0 for name, values in columns.items()}
-    noise = {**spread, **given}
-    found, residuals = fit_traces(noise)
-    evaluations = found.evaluations
+    noise = {**spread, **fixed_noise}
+    fit, residuals = fit_traces(noise)
+    evaluations = fit.evaluations
     # Weights by residuals change the fit, and the fit its residuals: iterate a few times from the last values.
-    for _ in range(0 if len(given) == len(columns) else ROUNDS - 1):
+    for _ in range(0 if len(fixed_noise) == len(columns) else ROUNDS - 1):
         if stopping():
             break
-        least = {name: MIN_RELATIVE_NOISE * size for name, size in spread.items()}
-        left = {name: _root_mean_square(values) for name, values in residuals.items()}
-        noise = {name: given.get(name) or max(left[name], least[name]) for name in columns}
+        noise_floors = {name: MIN_RELATIVE_NOISE * size for name, size in spread.items()}
+        residual_noise = {name: _root_mean_square(values) for name, values in residuals.items()}
+        noise = {name: fixed_noise.get(name) or max(residual_noise[name], noise_floors[name]) for name in columns}
         # Residuals below the bound are errors of the solver and of the search, not noise: they do not scale the bound.
-        exact = any(left[name] < least[name] for name in columns if name not in given)
+        exact = any(residual_noise[name] < noise_floors[name] for name in columns if name not in fixed_noise)
         # A value at an end of its range cannot be moved from there: the scenario's own values are the start again.
-        found, residuals = fit_traces(noise, [] if found.ends else [found.values], bool(given) or exact)
-        evaluations += found.evaluations
-    return dataclasses.replace(found, evaluations=evaluations), noise
+        fit, residuals = fit_traces(noise, [] if fit.ends else [fit.values], bool(fixed_noise) or exact)
+        evaluations += fit.evaluations
+    return dataclasses.replace(fit, evaluations=evaluations), noise
 
 
 def _match_times(solver: Solver, t: np.ndarray) -> tuple[Solver, np.ndarray]:
@@ -274,65 +277,72 @@ def _root_mean_square(values: np.ndarray) -> float:
 
 
 def _result(
-    chosen: Scenario,
+    scenario: Scenario,
     readings: Readings,
     ranges: Mapping[str, section_tune.Ends | None],
-    found: "Identified",
+    fit: "Identified",
     noise: Mapping[str, float],
 ) -> JsonObject:
     """Return the JSON document."""
-    known = found.uncertainty
+    uncertainty = fit.uncertainty
     return {
-        **console.describe_source(chosen),
+        **console.describe_source(scenario),
         "data": {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])},
-        "values": _scalar_values(chosen, ranges, found),
+        "values": _scalar_values(scenario, ranges, fit),
         "correlations": [
-            {"between": [known.names[i], known.names[j]], "correlation": float(known.correlation[i, j])}
-            for i in range(len(known.names))
+            {
+                "between": [uncertainty.names[i], uncertainty.names[j]],
+                "correlation": float(uncertainty.correlation[i, j]),
+            }
+            for i in range(len(uncertainty.names))
             for j in range(i)
-            if abs(known.correlation[i, j]) > HIGH_CORRELATION
+            if abs(uncertainty.correlation[i, j]) > HIGH_CORRELATION
         ],
-        "notes": found.describe_limits().splitlines(),
+        "notes": fit.describe_limits().splitlines(),
         "undetermined": [
-            {"direction": one.describe(), "spread": one.spread, "components": one.components}
-            for one in known.undetermined_directions()
+            {"direction": direction.describe(), "spread": direction.spread, "components": direction.components}
+            for direction in uncertainty.undetermined_directions()
         ],
-        "residuals": _residuals(readings, found, noise, chosen.loop.plant.shows.units),
-        "chi2": found.chi2,
-        "degrees": known.degrees,
-        "scale": known.scale,
-        "reason": found.reason.value,
-        "evaluations": found.evaluations,
-        "parameters": {path: np.asarray(v, float).tolist() for path, _, v in parameters(found.part)},
+        "residuals": _residuals(readings, fit, noise, scenario.loop.plant.shows.units),
+        "chi2": fit.chi2,
+        "degrees": uncertainty.degrees,
+        "scale": uncertainty.scale,
+        "reason": fit.reason.value,
+        "evaluations": fit.evaluations,
+        "parameters": {path: np.asarray(v, float).tolist() for path, _, v in parameters(fit.part)},
         "versions": provenance.versions("optax", "scipy"),
         "files": {},
     }
 
 
 def _scalar_values(
-    chosen: Scenario, ranges: Mapping[str, section_tune.Ends | None], found: "Identified"
+    scenario: Scenario, ranges: Mapping[str, section_tune.Ends | None], fit: "Identified"
 ) -> dict[str, JsonObject]:
     """Return one row for each number: a list `controller.gain` gives `controller.gain.0` and so on."""
-    specs = {path: spec for path, spec, _ in parameters(chosen.loop)}
+    specs = {path: spec for path, spec, _ in parameters(scenario.loop)}
     rows = {}
     for path, ends in ranges.items():
         low, high = ends or (specs[path].low, specs[path].high)
-        values = np.asarray(found.values[path], float)
-        low, high, before, values = np.broadcast_arrays(low, high, np.asarray(get(chosen.loop, path), float), values)
+        values = np.asarray(fit.values[path], float)
+        low, high, before, values = np.broadcast_arrays(low, high, np.asarray(get(scenario.loop, path), float), values)
         for at in np.ndindex(values.shape):
             name = ".".join([path, *map(str, at)])
             numbers = {"before": before[at], "value": values[at], "low": low[at], "high": high[at]}
-            known = found.describe_deviation(name)
-            deviation = {"deviation": None, "why": known} if isinstance(known, str) else {"deviation": known}
+            deviation_or_reason = fit.describe_deviation(name)
+            deviation = (
+                {"deviation": None, "why": deviation_or_reason}
+                if isinstance(deviation_or_reason, str)
+                else {"deviation": deviation_or_reason}
+            )
             rows[name] = {k: float(x) for k, x in numbers.items()} | deviation | {"unit": specs[path].unit}
     return rows
 
 
 def _residuals(
-    readings: Readings, found: "Identified", noise: Mapping[str, float], units: Mapping[str, str]
+    readings: Readings, fit: "Identified", noise: Mapping[str, float], units: Mapping[str, str]
 ) -> dict[str, JsonObject]:
     """Return statistics of simulated minus measured, by column."""
-    each = np.split(np.asarray(found.residuals), len(readings.columns))
+    each = np.split(np.asarray(fit.residuals), len(readings.columns))
     return {
         name: {
             "sigma": noise[name],

@@ -87,8 +87,8 @@ def main() -> NoReturn:
     console.leave(status)
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         typer.echo(f"diffabs {__version__}")
         raise typer.Exit
 
@@ -142,128 +142,128 @@ def simulate(
             console.fail("--from-sweep runs a sample unchanged: --set and --seed do not apply")
         targets.check_picture(plot)
         targets.check_mat(mat)
-        kept = bool(csv or mat or plot)
+        keeps_trajectory = bool(csv or mat or plot)
         with contextlib.ExitStack() as files:
             csv_file = files.enter_context(targets.new_target_file(csv, "--csv"))
             mat_file = files.enter_context(targets.new_target_file(mat, "--mat"))
             picture = files.enter_context(targets.new_target_file(plot, "--plot"))
             if from_sweep and sample is not None:
-                chosen, key = console.run_with_progress(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
+                setup, key = console.run_with_progress(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
             else:
                 overrides = console.add_option_overrides(changes, "solver", seed=seed)
-                chosen = console.load_scenario(scenario or "", overrides)
-                key = chosen.key()
-            run, limited = console.run_with_progress(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
-            found = (
-                console.run_with_progress(lambda: check_run_accuracy(chosen, key), "shortening the step")
+                setup = console.load_scenario(scenario or "", overrides)
+                key = setup.key()
+            run, limited = console.run_with_progress(
+                lambda: _run(setup, key, keep=keeps_trajectory), f"simulating {setup.name}"
+            )
+            accuracy = (
+                console.run_with_progress(lambda: check_run_accuracy(setup, key), "shortening the step")
                 if check
                 else None
             )
-            lines = describe_check(found) if found else _find_loose_metrics(chosen, run, key, kept)
-            result = _result(chosen, run, limited)
+            lines = describe_check(accuracy) if accuracy else _find_loose_metrics(setup, run, key, keeps_trajectory)
+            result = _result(setup, run, limited)
             if from_sweep:  # the sweep's seed and the number of the sample decide the noise
                 result["solver"]["seed"] = None
-                result["sample"] = {"sweep": str(from_sweep), "seed": chosen.sweep.seed, "number": sample}
-            if found:
-                result["accuracy"] = found
-            with console.show_before_errors(lambda: _show(result, chosen, as_json)):
+                result["sample"] = {"sweep": str(from_sweep), "seed": setup.sweep.seed, "number": sample}
+            if accuracy:
+                result["accuracy"] = accuracy
+            with console.show_before_errors(lambda: _show(result, setup, as_json)):
                 if csv_file and run.trajectory:
-                    show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
+                    show.write_csv(run.trajectory, setup.loop.plant, csv_file)
                 if mat_file:
-                    values = {path: value for path, _, value in parameters(chosen.loop)}
-                    write_mat(mat_file, run, chosen.loop.plant, parameters=values, scenario=chosen.name)
+                    values = {path: value for path, _, value in parameters(setup.loop)}
+                    write_mat(mat_file, run, setup.loop.plant, parameters=values, scenario=setup.name)
                 if picture:
-                    console.run_with_progress(lambda: _draw(chosen, run, picture), "drawing")
+                    console.run_with_progress(lambda: _draw(setup, run, picture), "drawing")
         result["files"] |= {name: str(path) for name, path in (("csv", csv), ("mat", mat), ("plot", plot)) if path}
-        _show(result, chosen, as_json)
+        _show(result, setup, as_json)
         for line in lines:
             console.say(f"warning: {line}")
-        slides = describe_slide(
-            chosen.loop, chosen.solver, {**chosen.objectives, AT_LIMIT: at_limits(chosen.loop)}, run
-        )
-        _judge(chosen, result, slides)
+        slides = describe_slide(setup.loop, setup.solver, {**setup.objectives, AT_LIMIT: at_limits(setup.loop)}, run)
+        _judge(setup, result, slides)
 
 
-def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
-    show.as_json(result) if as_json else show.show_run(result, chosen)
+def _show(result: JsonObject, scenario: Scenario, as_json: bool) -> None:
+    show.as_json(result) if as_json else show.show_run(result, scenario)
     if "accuracy" in result and not as_json:
         show.show_accuracy(result["accuracy"])
 
 
-def _judge(chosen: Scenario, result: JsonObject, slides: str) -> None:
+def _judge(scenario: Scenario, result: JsonObject, slides: str) -> None:
     """Write the warnings, also that the run `slides`. Raises typer.Exit for a diverged run, which has no metrics."""
     if result["diverged"]:
         why = f"{result['fault']}; there are no metrics"
-        console.fail(f"{chosen.name}: {slides}" if slides else f"{chosen.name} diverged: {why}", 1)
+        console.fail(f"{scenario.name}: {slides}" if slides else f"{scenario.name} diverged: {why}", 1)
     if slides:
         console.say(f"warning: {slides}")
     for warning in result["warnings"]:
         console.say(f"warning: {warning}")
 
 
-def _warnings(chosen: Scenario, run: Run, limited: float) -> Iterator[str]:
+def _warnings(scenario: Scenario, run: Run, limited: float) -> Iterator[str]:
     """Yield warnings: an unexpected end of the run, a metric never reached, a control mostly at a limit."""
-    stop, stopped = chosen.loop.stop, bool(run.stopped)
+    stop, stopped = scenario.loop.stop, bool(run.stopped)
     if bool(run.diverged):
         return
     if stopped != stop.success:
         otherwise = getattr(stop, "otherwise", "")
-        late = f"NOT STOPPED within solver.duration = {chosen.solver.duration:g} s{otherwise and f'; {otherwise}'}"
+        late = f"NOT STOPPED within solver.duration = {scenario.solver.duration:g} s{otherwise and f'; {otherwise}'}"
         yield (otherwise or "STOPPED EARLY: the run reached its stop") if stopped else late
-    for name in chosen.objectives:
+    for name in scenario.objectives:
         if math.isinf(run.metrics[name]):
             yield f"{name} is infinite: the run ends before the event that it measures"
         elif math.isnan(run.metrics[name]):
             yield f"{name} is not a number: the run lacks what it measures, as an overshoot needs a step"
     if limited > WARNED_LIMIT_SHARE:
-        limits, unit = at_limits(chosen.loop), chosen.loop.plant.control_unit
+        limits, unit = at_limits(scenario.loop), scenario.loop.plant.control_unit
         ends = f"{float(limits.low):g} to {float(limits.high):g} {unit}"
         yield f"the control is at a limit ({ends}) for {100 * limited:.0f} % of the run: gains hardly matter there"
 
 
-def _run(chosen: Scenario, key: Key, keep: bool) -> tuple[Run, float]:
+def _run(scenario: Scenario, key: Key, keep: bool) -> tuple[Run, float]:
     """Return the run, on the host, and the share of its time with the control at a limit."""
-    measured = {**chosen.objectives, AT_LIMIT: at_limits(chosen.loop)}
+    measured = {**scenario.objectives, AT_LIMIT: at_limits(scenario.loop)}
     if keep:
         # A file needs few rows: thin the trajectory on the device, before it takes memory.
-        steps = chosen.solver.steps
-        every = min(max(chosen.solver.every, math.ceil(steps / MAX_CSV_ROWS)), steps)
-        run = rollout(chosen.loop, dataclasses.replace(chosen.solver, every=every), measured, key=key)
+        steps = scenario.solver.steps
+        every = min(max(scenario.solver.every, math.ceil(steps / MAX_CSV_ROWS)), steps)
+        run = rollout(scenario.loop, dataclasses.replace(scenario.solver, every=every), measured, key=key)
     else:
-        run = measure(chosen.loop, chosen.solver, measured, key=key)
+        run = measure(scenario.loop, scenario.solver, measured, key=key)
     run = jax.device_get(run)
-    return run._replace(metrics={name: run.metrics[name] for name in chosen.objectives}), float(run.metrics[AT_LIMIT])
+    return run._replace(metrics={name: run.metrics[name] for name in scenario.objectives}), float(run.metrics[AT_LIMIT])
 
 
-def _find_loose_metrics(chosen: Scenario, run: Run, key: Key, keep: bool) -> list[str]:
+def _find_loose_metrics(scenario: Scenario, run: Run, key: Key, keep: bool) -> list[str]:
     """Return warnings of metrics that depend on `rtol`; `_run` makes a second run with the same compiled program."""
-    solver = chosen.solver
+    solver = scenario.solver
     if not isinstance(solver, Adaptive) or run.diverged:
         return []
     return describe_loose_metrics(
-        run.metrics, solver, lambda other: _run(dataclasses.replace(chosen, solver=other), key, keep)[0]
+        run.metrics, solver, lambda other: _run(dataclasses.replace(scenario, solver=other), key, keep)[0]
     )
 
 
-def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
-    plant = chosen.loop.plant
+def _draw(scenario: Scenario, run: Run, picture: pathlib.Path) -> None:
+    plant = scenario.loop.plant
     draw = importlib.import_module("diffabs.plot").figure_for(plant)
-    draw(run, title=chosen.title or chosen.name, unit=plant.control_unit).savefig(picture)
+    draw(run, title=scenario.title or scenario.name, unit=plant.control_unit).savefig(picture)
 
 
-def _result(chosen: Scenario, run: Run, limited: float) -> JsonObject:
+def _result(scenario: Scenario, run: Run, limited: float) -> JsonObject:
     return {
-        "scenario": chosen.name,
-        "metrics": {name: float(run.metrics[name]) for name in chosen.objectives},
+        "scenario": scenario.name,
+        "metrics": {name: float(run.metrics[name]) for name in scenario.objectives},
         "stopped": bool(run.stopped),
         "diverged": bool(run.diverged),
         "fault": describe_faults(run),
         "at_limit": limited,
-        "warnings": list(_warnings(chosen, run, limited)),
-        "title": chosen.title,
-        "parts": model.describe_parts(chosen),
-        "parameters": model.describe_numbers(chosen),
-        "solver": {**describe_solver(chosen.solver), "seed": chosen.seed},
+        "warnings": list(_warnings(scenario, run, limited)),
+        "title": scenario.title,
+        "parts": model.describe_parts(scenario),
+        "parameters": model.describe_numbers(scenario),
+        "solver": {**describe_solver(scenario.solver), "seed": scenario.seed},
         "versions": provenance.versions(),
         "files": {},
     }

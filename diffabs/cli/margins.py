@@ -64,23 +64,23 @@ def margins(
     with console.end_on_errors():
         targets.check_picture(plot)
         with targets.new_target_file(plot, "--plot") as picture:
-            chosen = console.load_scenario(scenario, changes, integrated=False)
-            values, target = _read_places(chosen, at or ())
-            nominal, found = _find_margins(chosen, values, target, samples)
-            result = _document(chosen, nominal, found, values, target)
-            show_result = partial(show.as_json, result) if as_json else partial(_show, result, chosen, nominal, found)
+            setup = console.load_scenario(scenario, changes, integrated=False)
+            values, target = _read_places(setup, at or ())
+            nominal, band = _find_margins(setup, values, target, samples)
+            result = _document(setup, nominal, band, values, target)
+            show_result = partial(show.as_json, result) if as_json else partial(_show, result, setup, nominal, band)
             if picture:
                 with console.show_before_errors(show_result):
-                    console.run_with_progress(lambda: _draw(chosen, nominal, found, picture), "drawing")
+                    console.run_with_progress(lambda: _draw(setup, nominal, band, picture), "drawing")
         result["files"] |= {"plot": str(plot)} if plot else {}
         show_result()
-        _judge(chosen, nominal, found)
+        _judge(setup, nominal, band)
 
 
-def _read_places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, float], float | None]:
+def _read_places(scenario: Scenario, options: Sequence[str]) -> tuple[dict[str, float], float | None]:
     """Return values by path of the loop, in SI, and the target. Raises ScenarioError."""
     table: JsonObject = {}
-    for item in given:
+    for item in options:
         path, _, text = item.partition("=")
         try:
             value = read_decimal(text)
@@ -90,105 +90,111 @@ def _read_places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, floa
         if path in table:
             raise ScenarioError(f"--at {path} is given twice")
         table[path] = value
-    there = {**parameters_of(chosen.loop), "target": (ParameterSpec("1"), ())}
-    found = [one.single("be fixed") for one in read_entries(table, "--at", there, "no parameter of this loop")]
-    values = {one.path: read_number_in_range(one.given, one.spec, one.where) / one.scale for one in found}
+    allowed = {**parameters_of(scenario.loop), "target": (ParameterSpec("1"), ())}
+    entries = [entry.single("be fixed") for entry in read_entries(table, "--at", allowed, "no parameter of this loop")]
+    values = {entry.path: read_number_in_range(entry.given, entry.spec, entry.where) / entry.scale for entry in entries}
     return values, values.pop("target", None)
 
 
 def _find_margins(
-    chosen: Scenario, values: dict[str, float], target: float | None, samples: int
+    scenario: Scenario, values: dict[str, float], target: float | None, samples: int
 ) -> tuple["System", "Band | None"]:
     """Return the loop at these values, and over the remaining ranges. Raises typer.Exit for a loop without
     linearisation.
     """
     from diffabs.linear.robustness import band
 
-    loop = replace(chosen.loop, values)
-    over = {path: ends for path, ends in chosen.design.ranges(chosen.loop).items() if path not in values}
+    loop = replace(scenario.loop, values)
+    over = {path: ends for path, ends in scenario.design.ranges(scenario.loop).items() if path not in values}
     try:
-        one = console.run_with_progress(lambda: band(loop, {}, 0, target).systems[0], f"linearising {chosen.name}")
-        return one, console.run_with_progress(
+        nominal = console.run_with_progress(
+            lambda: band(loop, {}, 0, target).systems[0], f"linearising {scenario.name}"
+        )
+        return nominal, console.run_with_progress(
             lambda: band(loop, over, samples, target), "over the ranges"
         ) if over else None
     except ValueError as error:
-        console.fail(f"{chosen.name}: {error}", console.FAILED)
+        console.fail(f"{scenario.name}: {error}", console.FAILED)
 
 
-def _draw(chosen: Scenario, nominal: "System", found: "Band | None", picture: pathlib.Path) -> None:
+def _draw(scenario: Scenario, nominal: "System", band: "Band | None", picture: pathlib.Path) -> None:
     frequency: Scalar = importlib.import_module("diffabs.plot.frequency")
-    others = [one.loop for one in found.systems] if found else []
-    title = f"{chosen.title or chosen.name}: the open loop"
-    frequency.loop_shape(nominal.loop, nominal.margins, others, title=title).savefig(picture)
+    loops = [system.loop for system in band.systems] if band else []
+    title = f"{scenario.title or scenario.name}: the open loop"
+    frequency.loop_shape(nominal.loop, nominal.margins, loops, title=title).savefig(picture)
 
 
-def margin_numbers(found: "Margins") -> dict[str, float]:
+def margin_numbers(loop_margins: "Margins") -> dict[str, float]:
     """Return the margins by their names in the JSON document, in the units of `MARGIN_UNITS`."""
-    low, high = found.gain
+    low, high = loop_margins.gain
     return {
-        **{"gain_up": high, "gain_down": low, "phase": found.phase, "delay": found.delay},
-        **{"modulus": found.modulus, "sensitivity": found.sensitivity, "complementary": found.complementary},
-        "crossover": found.crossover,
+        **{"gain_up": high, "gain_down": low, "phase": loop_margins.phase, "delay": loop_margins.delay},
+        **{
+            "modulus": loop_margins.modulus,
+            "sensitivity": loop_margins.sensitivity,
+            "complementary": loop_margins.complementary,
+        },
+        "crossover": loop_margins.crossover,
     }
 
 
 def _document(
-    chosen: Scenario,
+    scenario: Scenario,
     nominal: "System",
-    found: "Band | None",
+    band: "Band | None",
     values: dict[str, float],
     target: float | None,
 ) -> JsonObject:
     """Return the JSON document, in SI. Infinity (no limit) is a text, as in an override."""
 
-    def plain(one: "System") -> JsonObject:
-        rows = margin_numbers(one.margins).items()
-        return {"stable": one.margins.stable, **{k: "inf" if v == math.inf else float(v) for k, v in rows}}
+    def plain(system: "System") -> JsonObject:
+        rows = margin_numbers(system.margins).items()
+        return {"stable": system.margins.stable, **{k: "inf" if v == math.inf else float(v) for k, v in rows}}
 
-    worst = found.worst() if found else {}
+    worst = band.worst() if band else {}
     return {
-        "scenario": chosen.name,
+        "scenario": scenario.name,
         "at": values | ({} if target is None else {"target": target}),
         "period": nominal.loop.period,
         "delay_in_the_loop": nominal.loop.delay,
         "order": len(nominal.loop.transfer().A),
         "margins": plain(nominal),
         "units": MARGIN_UNITS,
-        "over": {path: list(ends) for path, ends in chosen.design.ranges(chosen.loop).items() if path not in values}
-        if found
+        "over": {path: list(ends) for path, ends in scenario.design.ranges(scenario.loop).items() if path not in values}
+        if band
         else {},
-        "systems": [{"values": one.values, **plain(one)} for one in found.systems] if found else [],
-        "corners": found.corners if found else 0,
-        "unstable": len(found.unstable) if found else 0,
-        "worst": {name: {"value": plain(one)[name], "values": one.values} for name, one in worst.items()},
+        "systems": [{"values": system.values, **plain(system)} for system in band.systems] if band else [],
+        "corners": band.corners if band else 0,
+        "unstable": len(band.unstable) if band else 0,
+        "worst": {name: {"value": plain(system)[name], "values": system.values} for name, system in worst.items()},
         "versions": provenance.versions(),
         "files": {},
     }
 
 
-def _show(result: JsonObject, chosen: Scenario, nominal: "System", found: "Band | None") -> None:
+def _show(result: JsonObject, scenario: Scenario, nominal: "System", band: "Band | None") -> None:
     """Show a table of the margins, with the worst value and its place."""
     here = margin_numbers(nominal.margins)
-    worst = found.worst() if found else {}
-    columns = [f"worst of {len(found.systems)}", "where"] if worst and found else []
+    worst = band.worst() if band else {}
+    columns = [f"worst of {len(band.systems)}", "where"] if worst and band else []
     table = Table("margin", "here", *columns)
     for name, words in MARGIN_NAMES.items():
         row = [_format_margin(name, here[name], nominal.margins.stable)]
         if columns:
-            one = worst.get(name)
+            system = worst.get(name)
             row += (
                 [
-                    _format_margin(name, margin_numbers(one.margins)[name], one.margins.stable),
-                    _format_place(one.values, chosen),
+                    _format_margin(name, margin_numbers(system.margins)[name], system.margins.stable),
+                    _format_place(system.values, scenario),
                 ]
-                if one
+                if system
                 else ["", ""]
             )
         table.add_row(words, *row)
     when = f"sampled every {1e3 * result['period']:g} ms" if result["period"] else "in continuous time"
     delay = f", {1e3 * result['delay_in_the_loop']:g} ms of delay" if result["delay_in_the_loop"] else ""
-    tables.show_titled_table(f"{chosen.title or chosen.name}: the linearised loop, {when}{delay}", table)
-    if frozen := getattr(chosen.loop.plant, "frozen", ()):
+    tables.show_titled_table(f"{scenario.title or scenario.name}: the linearised loop, {when}{delay}", table)
+    if frozen := getattr(scenario.loop.plant, "frozen", ()):
         console.say(f"note: {' and '.join(frozen)} are held constant; limits are not included")
     show.show_files(result)
 
@@ -199,8 +205,8 @@ def _format_margin(name: str, value: float, stable: bool) -> str:
     return "no limit" if value == math.inf else f"{value * SHOWN_IN.get(name, 1.0):.4g}"
 
 
-def _format_place(values: dict[str, float], chosen: Scenario) -> str:
-    units = {path: spec.unit for path, (spec, _) in parameters_of(chosen.loop).items()}
+def _format_place(values: dict[str, float], scenario: Scenario) -> str:
+    units = {path: spec.unit for path, (spec, _) in parameters_of(scenario.loop).items()}
     words = []
     for path, value in values.items():
         scale, unit = (KMH, "km/h") if units[path] == "m/s" else (1.0, units[path])
@@ -208,11 +214,11 @@ def _format_place(values: dict[str, float], chosen: Scenario) -> str:
     return ", ".join(words)
 
 
-def _judge(chosen: Scenario, nominal: "System", found: "Band | None") -> None:
+def _judge(scenario: Scenario, nominal: "System", band: "Band | None") -> None:
     """Raise typer.Exit for a loop that is unstable, here or within the ranges."""
     if not nominal.margins.stable:
-        console.conclude(f"{chosen.name}: the closed loop is not stable: no margins")
-    if found and found.unstable:
-        first = _format_place(found.unstable[0].values, chosen)
-        count = f"{len(found.unstable)} of {len(found.systems)} systems"
-        console.conclude(f"{chosen.name}: not stable in {count} of the ranges, as at {first}")
+        console.conclude(f"{scenario.name}: the closed loop is not stable: no margins")
+    if band and band.unstable:
+        first = _format_place(band.unstable[0].values, scenario)
+        count = f"{len(band.unstable)} of {len(band.systems)} systems"
+        console.conclude(f"{scenario.name}: not stable in {count} of the ranges, as at {first}")

@@ -32,13 +32,13 @@ class WorkProgress(NamedTuple):
 
     Attributes:
         words: Progress in words.
-        done: Finished amount.
+        amount: Finished amount.
         total: Whole amount; None if unknown.
         at_most: True if `total` is only an upper bound.
     """
 
     words: str
-    done: float = 0.0
+    amount: float = 0.0
     total: float | None = None
     at_most: bool = False
 
@@ -48,9 +48,9 @@ Detail = Callable[[], WorkProgress | str]
 
 def format_duration(seconds: float) -> str:
     """Return a length of time in words."""
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, remainder = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {remainder} s" if minutes else f"{remainder} s"
 
 
 class WorkTiming:
@@ -66,14 +66,14 @@ class WorkTiming:
         second.
         """
         now = time.monotonic()
-        rest = self.remaining_time(far, now)
+        remaining = self.remaining_time(far, now)
         if now - self.begun < MIN_SHOWN_S:
             return ""
         parts = [format_duration(now - self.begun)]
         if (compiling := stopwatch.compile_time_since(self.begun)) >= MIN_COMPILING_S:
             parts[0] += f", {format_duration(compiling)} of it compiling"
-        if rest is not None:
-            parts.append(f"{'at most ' if far.at_most else ''}{format_duration(rest)} left")
+        if remaining is not None:
+            parts.append(f"{'at most ' if far.at_most else ''}{format_duration(remaining)} left")
         return f"{'; ' if far.words else ' '}{', '.join(parts)}"
 
     def remaining_time(self, far: WorkProgress, now: float) -> float | None:
@@ -83,10 +83,10 @@ class WorkTiming:
         """
         if far.total is None:
             return None
-        self.first = self.first or (now, far.done)
+        self.first = self.first or (now, far.amount)
         start, before = self.first
         spent = now - start - stopwatch.compile_time_since(start)
-        return None if far.done <= before or spent <= 0 else spent * (far.total - far.done) / (far.done - before)
+        return None if far.amount <= before or spent <= 0 else spent * (far.total - far.amount) / (far.amount - before)
 
 
 def can_redraw(console: Console) -> bool:
@@ -112,21 +112,21 @@ class _Picture:
         self.spinner.update(text=fit_line(words, far.words, self.pace.describe(far), options.max_width - SPINNER))
         yield self.spinner
         if far.total and not far.at_most:
-            yield ProgressBar(total=far.total, completed=far.done, width=min(60, options.max_width))
+            yield ProgressBar(total=far.total, completed=far.amount, width=min(60, options.max_width))
 
 
-def fit_line(words: str, rest: str, times: str, width: int) -> str:
+def fit_line(words: str, short_words: str, times: str, width: int) -> str:
     """Return progress and times on one line of a terminal.
 
     If the line is too long, it loses the message first. The progress is then cut at its end.
 
     Args:
-        rest: Progress alone.
+        short_words: Progress alone.
         times: Times, which are never cut.
     """
     room = width - len(times)
     if len(words) > room:
-        words = rest or words
+        words = short_words or words
     return (words if len(words) <= room else f"{words[: max(room - 1, 0)].rstrip()}…") + times
 
 
@@ -149,14 +149,14 @@ def show_progress(
         with Live(picture, console=console, transient=True, refresh_per_second=FRAMES, redirect_stdout=False):
             yield lambda: None
         return
-    due, told = time.monotonic() + timing[0], ""
+    due, last_words = time.monotonic() + timing[0], ""
 
     def line() -> None:
-        nonlocal due, told
+        nonlocal due, last_words
         if time.monotonic() > due:
             far, words = picture.far()
-            if told != (told := words):
-                tell(told + picture.pace.describe(far))
+            if last_words != (last_words := words):
+                tell(last_words + picture.pace.describe(far))
             due = time.monotonic() + timing[1] if detail else math.inf
 
     yield line

@@ -66,55 +66,55 @@ def prove(
         from diffabs.reach import NoRule, prove_box
         from diffabs.reach.equations import derive_equations
 
-        chosen = console.load_scenario(scenario, changes or (), integrated=False)
-        sides = _read_sides(over, chosen)
+        setup = console.load_scenario(scenario, changes or (), integrated=False)
+        sides = _read_sides(over, setup)
         box = {side.path: side.ends for side in sides}
         if plot:
             _choose_axes(sides)  # refuses other boxes before anything is proved
-        if "slip" not in chosen.loop.plant.shows._fields and not claim:
+        if "slip" not in setup.loop.plant.shows._fields and not claim:
             raise ScenarioError(
-                f"--claim is needed: the plant has no slip; it has {', '.join(chosen.loop.plant.shows._fields)}"
+                f"--claim is needed: the plant has no slip; it has {', '.join(setup.loop.plant.shows._fields)}"
             )
-        signals = ("slip",) if "slip" in chosen.loop.plant.shows._fields else ()
+        signals = ("slip",) if "slip" in setup.loop.plant.shows._fields else ()
         far = [""]
         with targets.new_target_file(plot, "--plot") as picture:
             with targets.new_target_file(out, "--out") as file:
                 try:
-                    equations = derive_equations(chosen.loop, box)  # refuses before anything is simulated
-                    claims = [_read_claim(text, chosen, equations) for text in claim or ()]
-                    known, where = _extreme_runs(chosen, box)
+                    equations = derive_equations(setup.loop, box)  # refuses before anything is simulated
+                    claims = [_read_claim(text, setup, equations) for text in claim or ()]
+                    extremes, where = _extreme_runs(setup, box)
                     proof = console.run_with_progress(
                         lambda: prove_box(
-                            chosen.loop, box, claims, signals=signals, horizon=chosen.solver.duration, budget=budget,
-                            known=known, suspects=_points(where), progress=lambda line: far.__setitem__(0, line),
+                            setup.loop, box, claims, signals=signals, horizon=setup.solver.duration, budget=budget,
+                            known=extremes, suspects=_points(where), progress=lambda line: far.__setitem__(0, line),
                         ),
-                        f"proving {chosen.name}",
+                        f"proving {setup.name}",
                         lambda: far[0],
                     )  # fmt: skip
                 except (NoRule, NoCompiler) as error:
                     raise ScenarioError(str(error)) from None
-                result = _document(proof, chosen, box, claims, known)
-                show_result = functools.partial(_show, result, chosen, as_json)
+                result = _document(proof, setup, box, claims, extremes)
+                show_result = functools.partial(_show, result, setup, as_json)
                 if file:
                     from diffabs.reach.certificate import certificate_document
 
                     with console.show_before_errors(show_result):
-                        file.write_text(json.dumps(certificate_document(proof, dump(chosen), box, claims)) + "\n")
+                        file.write_text(json.dumps(certificate_document(proof, dump(setup), box, claims)) + "\n")
             result["files"] = {"certificate": str(out)} if out else {}
             if picture:
                 from diffabs.plot.proofs import draw_proof
 
                 with console.show_before_errors(show_result):
-                    shown = _map_of_proof(proof, chosen, sides, claims, known, where)
+                    shown = _map_of_proof(proof, setup, sides, claims, extremes, where)
                     console.run_with_progress(lambda: draw_proof(shown).savefig(picture), "drawing")
                 result["files"] |= {"plot": str(plot)}
         show_result()
         if proof.verdict != "proved":
-            console.conclude(f"{chosen.name}: {proof.verdict}: {result['reason']}")
+            console.conclude(f"{setup.name}: {proof.verdict}: {result['reason']}")
 
 
-def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
-    views.as_json(result) if as_json else show_proofs.show_box_proof(result, chosen)
+def _show(result: JsonObject, scenario: Scenario, as_json: bool) -> None:
+    views.as_json(result) if as_json else show_proofs.show_box_proof(result, scenario)
 
 
 def read_proof_file(file: pathlib.Path) -> JsonObject | None:
@@ -142,14 +142,14 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
         text = document.get("scenario")
         if not isinstance(text, str):
             raise ValueError("scenario is missing or no text; the TOML text of a scenario is needed")
-        chosen = loads(text.encode(), file.stem, "scenario", integrated=False)
+        scenario = loads(text.encode(), file.stem, "scenario", integrated=False)
         box = read_proof(document).over
-        derive_equations(chosen.loop, box)  # refuses a loop or a box without rules before anything is simulated
+        derive_equations(scenario.loop, box)  # refuses a loop or a box without rules before anything is simulated
         # The runs that would show a false bound are looked for, and their cells are proved again.
-        known, extreme = _extreme_runs(chosen, box)
-        found = console.run_with_progress(
+        extremes, extreme = _extreme_runs(scenario, box)
+        verification = console.run_with_progress(
             lambda: verify_box(
-                chosen.loop, chosen.solver.duration, document, share, suspects=_points(extreme), known=known,
+                scenario.loop, scenario.solver.duration, document, share, suspects=_points(extreme), known=extremes,
                 progress=lambda line: far.__setitem__(0, line), processes=core_count(),
             ),
             f"verifying {file}",
@@ -157,8 +157,8 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
         )  # fmt: skip
     except (NoRule, ValueError) as error:
         console.fail(f"{file}: {' '.join(str(error).split())}")
-    proved, whole = not found.reason, found.checked == found.cells
-    cells = f"{found.checked:,} of {found.cells:,} cells proved again"
+    proved, whole = not verification.reason, verification.checked == verification.cells
+    cells = f"{verification.checked:,} of {verification.cells:,} cells proved again"
     cells += "; --share 1 proves all" if proved and not whole else ""
     views.show_verification({
         "file": str(file),
@@ -167,17 +167,17 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
         "scenario": document["scenario"],
         "over": {path: list(ends) for path, ends in box.items()},
         "claims": [
-            {"kind": statement, "says": cells, "reason": found.reason, "proved": proved}
-            for statement in found.statements
+            {"kind": statement, "says": cells, "reason": verification.reason, "proved": proved}
+            for statement in verification.statements
         ],
         "versions": provenance.versions("numpy"),
     }, as_json)  # fmt: skip
-    if found.reason:
-        console.conclude(f"{file}: not proved: {found.reason}")
+    if verification.reason:
+        console.conclude(f"{file}: not proved: {verification.reason}")
     if not as_json:
-        said = show_proofs.describe_box(box, chosen, digits=9)
+        box_words = show_proofs.describe_box(box, scenario, digits=9)
         where = "" if whole else "in the cells proved again only: "
-        console.say(f"{where}for every {said} of the scenario in the file, whatever its title says")
+        console.say(f"{where}for every {box_words} of the scenario in the file, whatever its title says")
 
 
 def _describe_claim(claim: "RunClaim") -> str:
@@ -197,10 +197,10 @@ class _Side(NamedTuple):
     scale: float
 
 
-def _read_sides(given: Sequence[str], chosen: Scenario) -> list[_Side]:
+def _read_sides(options: Sequence[str], scenario: Scenario) -> list[_Side]:
     """Return the range of each parameter, widened by a rounding so that it holds the decimal numbers given."""
     table: JsonObject = {}
-    for text in given:
+    for text in options:
         path, equals, ends = text.partition("=")
         low, colon, high = ends.partition(":")
         try:
@@ -213,7 +213,7 @@ def _read_sides(given: Sequence[str], chosen: Scenario) -> list[_Side]:
             raise ScenarioError(f"--over {path.strip()} is given twice")
         table[path.strip()] = pair
     sides = []
-    for entry in read_entries(table, "--over", parameters_of(chosen.loop), "not a parameter of this loop"):
+    for entry in read_entries(table, "--over", parameters_of(scenario.loop), "not a parameter of this loop"):
         if entry.shape:
             raise ScenarioError(f"{entry.where} is a list; a proof varies single numbers")
         low, high = entry.range()
@@ -239,8 +239,8 @@ def _choose_axes(sides: Sequence[_Side]) -> list[int]:
 
 
 def _map_of_proof(
-    proof: "BoxProof", chosen: Scenario, sides: Sequence[_Side], claims: Sequence["RunClaim"],
-    known: Mapping[str, tuple[float, float]], where: Mapping[str, list[float]],
+    proof: "BoxProof", scenario: Scenario, sides: Sequence[_Side], claims: Sequence["RunClaim"],
+    extremes: Mapping[str, tuple[float, float]], where: Mapping[str, list[float]],
 ) -> "ProofMap":  # fmt: skip
     """Return the map of the first claim's quantity, else of the greatest slip, in the units of the given ranges."""
     from diffabs.plot.proofs import ProofMap
@@ -269,29 +269,29 @@ def _map_of_proof(
         left=shown_cells(proof.left),
         refuting=None if proof.refuting is None else shown_cells(proof.refuting),
         worst=None if worst is None else np.array(worst)[axes] * scales,
-        worst_value=known[quantity][1] if quantity in known else None,
-        quantity=f"proved {kind} bound of {signal.replace('_', ' ')} [{_unit_of(quantity, chosen)}]",
+        worst_value=extremes[quantity][1] if quantity in extremes else None,
+        quantity=f"proved {kind} bound of {signal.replace('_', ' ')} [{_unit_of(quantity, scenario)}]",
         claimed=claims[0].bound if claims else None,
-        title=f"{chosen.title or chosen.name}\n{proof.verdict}{statement}",
+        title=f"{scenario.title or scenario.name}\n{proof.verdict}{statement}",
     )
 
 
-def _read_claim(text: str, chosen: Scenario, equations: "Equations") -> "RunClaim":
+def _read_claim(text: str, scenario: Scenario, equations: "Equations") -> "RunClaim":
     """Return a claim about a signal, the stop time or the stop distance. Raises ScenarioError."""
     from diffabs.reach import RunClaim
 
-    name, equals, given = text.partition("=")
-    signals = chosen.loop.plant.shows._fields
-    known = [*(f"{word}_{signal}" for signal in signals for word in ("max", "min")), *TIMES]
-    known += [OVERSHOOT, NO_LOCK] if "slip" in signals else []
-    if name not in known:
-        raise unknown_name_error(f"--claim {name} is not a quantity of this loop", name, known)
+    name, equals, number = text.partition("=")
+    signals = scenario.loop.plant.shows._fields
+    quantities = [*(f"{word}_{signal}" for signal in signals for word in ("max", "min")), *TIMES]
+    quantities += [OVERSHOOT, NO_LOCK] if "slip" in signals else []
+    if name not in quantities:
+        raise unknown_name_error(f"--claim {name} is not a quantity of this loop", name, quantities)
     if name == NO_LOCK:
         if equals:
             raise ScenarioError("--claim no_lock has no bound: it says that the slip stays below 1")
         return RunClaim("greatest slip", float(np.nextafter(1.0, 0.0)))
     try:
-        bound = read_decimal(given)
+        bound = read_decimal(number)
     except ValueError:
         bound = math.nan
     if not math.isfinite(bound):
@@ -327,14 +327,14 @@ def _overshoot_claim(bound: float, equations: "Equations") -> "RunClaim":
     return RunClaim("greatest slip", limit - rounding) if step > 0 else RunClaim("least slip", limit + rounding)
 
 
-def _unit_of(quantity: str, chosen: Scenario) -> str:
+def _unit_of(quantity: str, scenario: Scenario) -> str:
     """Return the unit of a quantity of a proof, empty if the plant declares none."""
-    units = {"stop_time": "s", "stop_distance": "m", **chosen.loop.plant.shows.units}
+    units = {"stop_time": "s", "stop_distance": "m", **scenario.loop.plant.shows.units}
     return units.get(quantity.split()[-1], "")
 
 
 def _extreme_runs(
-    chosen: Scenario, box: dict[str, tuple[float, float]]
+    scenario: Scenario, box: dict[str, tuple[float, float]]
 ) -> tuple[dict[str, tuple[float, float]], dict[str, list[float]]]:
     """Return least and greatest value of greatest slip, stop time and stop distance in a grid of runs, and the point of
     each greatest one.
@@ -344,24 +344,24 @@ def _extreme_runs(
     from diffabs.objectives import MaxSlip, StopDistance, StopTime
     from diffabs.stops import SpeedReached
 
-    if chosen.loop.plant.shows is not BrakeOutput:
+    if scenario.loop.plant.shows is not BrakeOutput:
         return {}, {}
     wide = sum(map(_is_wide, box.values()))
-    most = next(n for n in range(MANY_SEARCHED, 0, -1) if n**wide <= MOST_RUNS)
-    counts = SEARCHED if len(box) < 3 else (most,) * len(box)
+    per_axis = next(n for n in range(MANY_SEARCHED, 0, -1) if n**wide <= MOST_RUNS)
+    counts = SEARCHED if len(box) < 3 else (per_axis,) * len(box)
     axes = [np.linspace(*ends, n) if n > 1 and _is_wide(ends) else [0.5 * sum(ends)]
             for ends, n in zip(box.values(), counts, strict=False)]  # fmt: skip
     points = np.array(list(itertools.product(*axes)))
     metrics = {"greatest slip": MaxSlip(), "stop_time": StopTime(), "stop_distance": StopDistance()}
     batch = d.Batch(dict(zip(box, points.T, strict=True)))
-    runs = d.run_batch(chosen.loop, batch, chosen.solver, metrics)
-    found = {name: np.asarray(column) for name, column in runs.metrics.items()}
-    if not isinstance(chosen.loop.stop, SpeedReached):
+    runs = d.run_batch(scenario.loop, batch, scenario.solver, metrics)
+    columns = {name: np.asarray(column) for name, column in runs.metrics.items()}
+    if not isinstance(scenario.loop.stop, SpeedReached):
         # These metrics extrapolate to rest; the proof is about the stop's own speed.
-        del found["stop_time"], found["stop_distance"]
-    worst = {name: int(np.nanargmax(column)) for name, column in found.items() if np.isfinite(column).any()}
+        del columns["stop_time"], columns["stop_distance"]
+    worst = {name: int(np.nanargmax(column)) for name, column in columns.items() if np.isfinite(column).any()}
     return (
-        {name: (float(np.nanmin(found[name])), float(found[name][i])) for name, i in worst.items()},
+        {name: (float(np.nanmin(columns[name])), float(columns[name][i])) for name, i in worst.items()},
         {name: points[i].tolist() for name, i in worst.items()},
     )
 
@@ -372,16 +372,16 @@ def _points(where: Mapping[str, list[float]]) -> list[list[float]]:
 
 
 def _document(
-    proof: "BoxProof", chosen: Scenario, box: dict[str, tuple[float, float]], claims: Sequence["RunClaim"],
-    known: dict[str, tuple[float, float]],
+    proof: "BoxProof", scenario: Scenario, box: dict[str, tuple[float, float]], claims: Sequence["RunClaim"],
+    extremes: dict[str, tuple[float, float]],
 ) -> JsonObject:  # fmt: skip
     """Return the JSON document; a bound that is not proved is null."""
     bounds = {}
     for name, (low, high) in proof.bounds.items():
-        row = {"low": low, "high": high, "unit": _unit_of(name, chosen)}
+        row = {"low": low, "high": high, "unit": _unit_of(name, scenario)}
         bounds[name] = {key: x if isinstance(x, str) or math.isfinite(x) else None for key, x in row.items()}
-        if name in known:
-            bounds[name]["least_run"], worst = known[name]
+        if name in extremes:
+            bounds[name]["least_run"], worst = extremes[name]
             bounds[name]["worst_run"] = worst
             bounds[name]["looseness"] = (high - worst) / worst if worst and math.isfinite(high) else None
     widths = np.array([high - low for low, high in box.values()])
@@ -401,7 +401,7 @@ def _document(
     else:
         reason = ""
     return {
-        **console.describe_source(chosen),
+        **console.describe_source(scenario),
         "verdict": proof.verdict,
         "reason": reason,
         "over": {path: list(ends) for path, ends in box.items()},

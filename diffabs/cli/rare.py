@@ -48,36 +48,36 @@ def rare(
         console.need_extra("sweep")
         from diffabs.reliability.failure import find_metric_objection
 
-        chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
-        show_samples.say_unused_seed(chosen)
-        metric, bound = _read_failure(failure, chosen)
+        setup = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
+        show_samples.say_unused_seed(setup)
+        metric, bound = _read_failure(failure, setup)
         if samples < 20 or samples % 10:
             console.fail(f"--samples {samples} is not a multiple of 10 in [20, inf)")
-        study = section_sweep.build_study(chosen)
+        study = section_sweep.build_study(setup)
         try:
             usable = engines.choose_engine(engine, lambda: find_metric_objection(study, metric))
             study = dataclasses.replace(study, engine=usable)
         except ValueError as error:
             raise ScenarioError(str(error)) from None
-        found = _estimate(study, metric, bound, samples, gradients)
-        result = _document(found, study, chosen, metric, bound)
-        show.as_json(result) if as_json else show_samples.show_rare_event(result, chosen)
+        event = _estimate(study, metric, bound, samples, gradients)
+        result = _document(event, study, setup, metric, bound)
+        show.as_json(result) if as_json else show_samples.show_rare_event(result, setup)
 
 
-def _read_failure(text: str, chosen: Scenario) -> tuple[str, float]:
+def _read_failure(text: str, scenario: Scenario) -> tuple[str, float]:
     """Return a metric and its bound in SI. Raises ScenarioError."""
     metric, equals, bound = text.partition("=")
-    if metric not in chosen.objectives:
-        raise unknown_name_error(f"{metric} is not a metric of this scenario", metric, chosen.objectives)
+    if metric not in scenario.objectives:
+        raise unknown_name_error(f"{metric} is not a metric of this scenario", metric, scenario.objectives)
     if equals:
-        spec = ParameterSpec(unit_of(chosen.objectives[metric], chosen.loop.plant))
+        spec = ParameterSpec(unit_of(scenario.objectives[metric], scenario.loop.plant))
         value = read_number(parse_value(bound.strip()), spec, metric)
         if not math.isfinite(value):
             raise ScenarioError(f"{metric} = {value:g} is outside {spec.interval()}")
         return metric, value
-    if metric not in chosen.sweep.failures:
+    if metric not in scenario.sweep.failures:
         raise ScenarioError(f"{metric} has no bound in [sweep.failures]: say {metric}=BOUND")
-    return metric, chosen.sweep.failures[metric]
+    return metric, scenario.sweep.failures[metric]
 
 
 def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients: bool) -> "RareEvent":
@@ -105,8 +105,8 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
             raise
         probability, last = math.prod(level.share for level in levels), levels[-1]
         reached = f"{metric} {'>' if last.strict else '>='} {last.threshold:.4g}"
-        found = f"{reached} has a probability of about {probability:.2g}"
-        console.say(f"interrupted: {found}, by {last.evaluations:,} runs")
+        estimate = f"{reached} has a probability of about {probability:.2g}"
+        console.say(f"interrupted: {estimate}, by {last.evaluations:,} runs")
         raise typer.Exit(console.INTERRUPTED) from None
     except DivergenceError as error:
         console.fail(str(error), console.FAILED)
@@ -114,28 +114,28 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
         raise ScenarioError(str(error)) from None
 
 
-def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str, bound: float) -> JsonObject:
+def _document(event: "RareEvent", study: "Study", scenario: Scenario, metric: str, bound: float) -> JsonObject:
     """Return the JSON document; its failures are values by path in SI, the likeliest first."""
-    rows = study.space.normal(found.failing[:MAX_SHOWN_FAILURES]) if len(found.failing) else {}
+    rows = study.space.normal(event.failing[:MAX_SHOWN_FAILURES]) if len(event.failing) else {}
     return {
-        **console.describe_source(chosen),
+        **console.describe_source(scenario),
         "metric": metric,
         "bound": bound,
-        "unit": unit_of(chosen.objectives[metric], chosen.loop.plant),
-        "probability": found.probability,
-        "cov": found.cov,
-        "interval": list(found.interval),
-        "note": found.note,
-        "reason": found.reason.value,
-        "levels": [level._asdict() for level in found.levels],
-        "first level alone": found.plain._asdict(),
-        "subset simulation": found.subset._asdict(),
-        "importance sampling": found.importance.estimate._asdict() if found.importance else None,
+        "unit": unit_of(scenario.objectives[metric], scenario.loop.plant),
+        "probability": event.probability,
+        "cov": event.cov,
+        "interval": list(event.interval),
+        "note": event.note,
+        "reason": event.reason.value,
+        "levels": [level._asdict() for level in event.levels],
+        "first level alone": event.plain._asdict(),
+        "subset simulation": event.subset._asdict(),
+        "importance sampling": event.importance.estimate._asdict() if event.importance else None,
         "failures": {path: column.tolist() for path, column in rows.items()},
-        "runs": found.evaluations,
-        "gradients": found.gradients,
-        "diverged": found.diverged,
+        "runs": event.evaluations,
+        "gradients": event.gradients,
+        "diverged": event.diverged,
         "seed": study.seed,
-        "engine": dict(found.engine),
+        "engine": dict(event.engine),
         "versions": provenance.versions("numpy", "scipy"),
     }

@@ -47,7 +47,7 @@ def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, tit
     from diffabs.report import build_report as made
 
     try:
-        text = made([one for source in sources for one in find_documents(source)], title)
+        text = made([document for source in sources for document in find_documents(source)], title)
     except ReportError as error:
         raise ScenarioError(str(error)) from None
     # Half of a surrogate pair (in JSON, in a file name) has no UTF-8; readers of HTML show its reference as U+FFFD.

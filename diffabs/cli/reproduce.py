@@ -41,8 +41,8 @@ def reproduce(
         from diffabs.papers import PAPERS, REPRODUCTIONS, compact
 
         if name != "all" and name not in REPRODUCTIONS:
-            known = (*REPRODUCTIONS, "all")
-            raise values.unknown_name_error(f"there is no paper {values.format_given(name)}", name, known)
+            names = (*REPRODUCTIONS, "all")
+            raise values.unknown_name_error(f"there is no paper {values.format_given(name)}", name, names)
         if data is not None and name != "lab-rig":
             console.fail(f"--data {data}: only lab-rig reads measurements")
         if data is not None and not data.is_dir():

@@ -59,19 +59,19 @@ def write_csv(trajectory: Trajectory, plant: Part, path: pathlib.Path) -> None:
             file.write(",".join(f"{value:.12g}" for value in row) + "\n")
 
 
-def show_run(result: JsonObject, chosen: Scenario) -> None:
+def show_run(result: JsonObject, scenario: Scenario) -> None:
     """Show metrics with their units, and the files written."""
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
-        table.add_row(name, format_metric(value), unit_of(chosen.objectives[name], chosen.loop.plant))
-    show_titled_table(chosen.title or chosen.name, table)
+        table.add_row(name, format_metric(value), unit_of(scenario.objectives[name], scenario.loop.plant))
+    show_titled_table(scenario.title or scenario.name, table)
     show_files(result)
 
 
-def show_accuracy(found: JsonObject) -> None:
+def show_accuracy(accuracy: JsonObject) -> None:
     """Show the changes of the metrics by shorter steps and by single precision."""
     table = Table("metric", "half step", "relative", "order", "error", "float32")
-    for name, row in found["metrics"].items():
+    for name, row in accuracy["metrics"].items():
         order = "none" if not row["converges"] else "" if math.isnan(row["order"]) else f"{row['order']:.1f}"
         numbers = (row["difference"], row["relative"], row["error"], row["float32 difference"])
         half, relative, error, single = ("" if x is None or math.isnan(x) else f"{x:.1e}" for x in numbers)
@@ -127,8 +127,8 @@ def show_proof(result: JsonObject, title: str, units: Mapping[str, str], verdict
     show_titled_table(title, gains)
     numbers = Table("quantity", "value", "unit")
     numbers.add_row("common Lyapunov matrix" if result["besides"] else "quadratically stable", verdict, "")
-    if known := result["besides"]:
-        loops, fall = known["frozen"], known["proved_for_a_speed_falling_by"]
+    if further := result["besides"]:
+        loops, fall = further["frozen"], further["proved_for_a_speed_falling_by"]
         numbers.add_row("systems of the ranges, each fixed", f"{loops['stable']} of {loops['systems']} stable", "")
         numbers.add_row("slowest of them decays at", f"{loops['slowest']:.6g}", "1/s")
         if fall is not None:
@@ -138,8 +138,8 @@ def show_proof(result: JsonObject, title: str, units: Mapping[str, str], verdict
         if result[name] is not None:
             numbers.add_row(name.replace("_", " "), f"{result[name]:.8g}", unit)
     show_titled_table("proof", numbers)
-    if said := [sentence for name, sentence in COSTS.items() if result[name] is not None]:
-        open_console().print(" ".join(said))
+    if sentences := [sentence for name, sentence in COSTS.items() if result[name] is not None]:
+        open_console().print(" ".join(sentences))
     corners = result["corners"] or [{} for _ in result["poles"]]
     discrete = result["period"] is not None
     names = [f"{name} [{units[name]}]" for name in corners[0]]
@@ -167,16 +167,16 @@ def show_verification(result: JsonObject, json_wanted: bool) -> None:
     return None
 
 
-def show_tuning(result: JsonObject, chosen: Scenario) -> None:
+def show_tuning(result: JsonObject, scenario: Scenario) -> None:
     """Show parameters, metrics and constraints before and after, and the course of the tuning."""
     free = Table("parameter", "before", "after", "low", "high", "unit")
     for path, row in result["free"].items():
         free.add_row(path, *(format_brief(row[key]) for key in ("before", "after", "low", "high")), row["unit"])
-    show_titled_table(f"{chosen.title or chosen.name}: free parameters", free)
+    show_titled_table(f"{scenario.title or scenario.name}: free parameters", free)
     metrics = Table("metric", "mean before", "mean after", "worst before", "worst after", "unit")
     for name in result["metrics"]["before"]["mean"]:
         numbers = (result["metrics"][when][of][name] for of in ("mean", "worst") for when in ("before", "after"))
-        metrics.add_row(name, *map(format_brief, numbers), unit_of(chosen.objectives[name], chosen.loop.plant))
+        metrics.add_row(name, *map(format_brief, numbers), unit_of(scenario.objectives[name], scenario.loop.plant))
     show_titled_table(f"over {result['lanes']} run{'s' if result['lanes'] > 1 else ''}", metrics)
     if result["constraints"]:
         limits = Table("constraint", "bound", "before", "after", "met")
@@ -212,10 +212,10 @@ def show_identification(result: JsonObject) -> None:
         deviation = row["why"] if row["deviation"] is None else f"{row['deviation']:.3g}"
         values.add_row(name, format_brief(row["before"]), format_brief(row["value"]), deviation, row["unit"])
     show_titled_table(f"{result['scenario']}: identified from {result['data']['samples']} instants", values)
-    left = Table("column", "sigma", "rms", "mean", "largest", "unit")
+    residuals = Table("column", "sigma", "rms", "mean", "largest", "unit")
     for name, row in result["residuals"].items():
-        left.add_row(name, *(f"{row[key]:.3g}" for key in ("sigma", "rms", "mean", "largest")), row["unit"])
-    show_titled_table("simulated minus measured", left)
+        residuals.add_row(name, *(f"{row[key]:.3g}" for key in ("sigma", "rms", "mean", "largest")), row["unit"])
+    show_titled_table("simulated minus measured", residuals)
     for row in result["correlations"]:
         say(f"note: {row['between'][0]} and {row['between'][1]} are correlated by {row['correlation']:.4f}")
     for line in result["notes"]:

@@ -11,9 +11,9 @@ from diffabs.scenario.parameter_paths import parameters_of
 from diffabs.scenario.scenario import Scenario
 
 
-def show_box_proof(result: JsonObject, chosen: Scenario) -> None:
+def show_box_proof(result: JsonObject, scenario: Scenario) -> None:
     """Show the verdict and the proved bounds of a box."""
-    box = describe_box(result["over"], chosen)
+    box = describe_box(result["over"], scenario)
     table = Table("quantity", "proved from", "to", "unit", "worst run found", "looseness")
     for name, row in result["bounds"].items():
         ends = ("" if row[key] is None else f"{row[key]:z.6g}" for key in ("low", "high"))
@@ -21,19 +21,19 @@ def show_box_proof(result: JsonObject, chosen: Scenario) -> None:
         loose = f"{100 * row['looseness']:.2g} %" if row.get("looseness") is not None else ""
         table.add_row(name, *ends, row["unit"], worst, loose)
     if result["verdict"] == "proved":
-        show_titled_table(f"{chosen.title or chosen.name}: proved for every {box}", table)
+        show_titled_table(f"{scenario.title or scenario.name}: proved for every {box}", table)
     for claim in result["claims"]:
         relation = ">=" if claim["quantity"].startswith("least") else "<="
         say(f"{result['verdict']}: {claim['quantity']} {relation} {claim['bound']:.6g}")
     say(f"{result['cells']:,} cells proved, {result['tried']:,} tried, {result['seconds']:.1f} s")
 
 
-def describe_box(box: Mapping[str, Sequence[float]], chosen: Scenario, digits: int = 6) -> str:
+def describe_box(box: Mapping[str, Sequence[float]], scenario: Scenario, digits: int = 6) -> str:
     """Return a box in words, in SI units.
 
     Args:
         digits: Significant digits.
     """
-    there = parameters_of(chosen.loop)
-    units = {path: "" if there[path][0].unit == "1" else f" {there[path][0].unit}" for path in box}
+    specs = parameters_of(scenario.loop)
+    units = {path: "" if specs[path][0].unit == "1" else f" {specs[path][0].unit}" for path in box}
     return ", ".join(f"{path} {low:.{digits}g} to {high:.{digits}g}{units[path]}" for path, (low, high) in box.items())

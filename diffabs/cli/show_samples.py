@@ -16,19 +16,19 @@ if TYPE_CHECKING:
     from diffabs.sweep import Results
 
 
-def show_sweep(result: JsonObject, chosen: Scenario) -> None:
+def show_sweep(result: JsonObject, scenario: Scenario) -> None:
     """Show failures, statistics with intervals, sensitivities and the worst samples of a sweep."""
     percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
     show_titled_table(
-        f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", _failures(result["failures"])
+        f"{scenario.title or scenario.name}: {result['samples']} runs; {percent}", _failures(result["failures"])
     )
     constant = [name for name, row in result["metrics"].items() if row and row["least"] == row["greatest"]]
     moving = {name: row for name, row in result["metrics"].items() if name not in constant}
     show_titled_table(
-        "statistics of the runs that did not diverge; summary.json has all intervals", _statistics(moving, chosen)
+        "statistics of the runs that did not diverge; summary.json has all intervals", _statistics(moving, scenario)
     )
     for name in constant:
-        unit = unit_of(chosen.objectives[name], chosen.loop.plant)
+        unit = unit_of(scenario.objectives[name], scenario.loop.plant)
         say(f"{name} is {format_brief(result['metrics'][name]['mean']['value'])} {unit} in every run")
     for name, row in result["never"].items():
         where = f"{row['count']} runs, the first sample {row['samples'][0]}"
@@ -66,32 +66,32 @@ def show_sweep(result: JsonObject, chosen: Scenario) -> None:
     say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
 
 
-def _failures(found: JsonObject) -> Table:
+def _failures(failures: JsonObject) -> Table:
     """Return a table with a row for each failure that occurred, and one row for all others."""
     table = Table("failure", "runs", "probability", "low", "high")
-    for name, row in found.items():
+    for name, row in failures.items():
         if row["count"]:
             table.add_row(name, str(row["count"]), *_estimate(row))
-    unseen = [name for name, row in found.items() if not row["count"]]
+    unseen = [name for name, row in failures.items() if not row["count"]]
     if unseen:
-        table.add_row(", ".join(unseen), "0", *_estimate(found[unseen[0]]))
+        table.add_row(", ".join(unseen), "0", *_estimate(failures[unseen[0]]))
     return table
 
 
-def _statistics(metrics: JsonObject, chosen: Scenario) -> Table:
+def _statistics(metrics: JsonObject, scenario: Scenario) -> Table:
     """Return a table with a row for each metric; only the mean has its interval."""
     kinds = [
         kind for kind in next((row for row in metrics.values() if row), {}) if kind not in ("mean", "least", "greatest")
     ]
     table = Table("metric", "unit", "mean", "low", "high", *kinds)
     for name, row in metrics.items():
-        unit = unit_of(chosen.objectives[name], chosen.loop.plant)
+        unit = unit_of(scenario.objectives[name], scenario.loop.plant)
         cells = [*_estimate(row["mean"]), *(_estimate(row[kind])[0] for kind in kinds)] if row else []
         table.add_row(name, unit, *cells)
     return table
 
 
-def show_rare_event(result: JsonObject, chosen: Scenario) -> None:
+def show_rare_event(result: JsonObject, scenario: Scenario) -> None:
     """Show a small probability, its levels, and the likeliest failures."""
     levels = Table("level", "metric", "share", "coefficient of variation", "accepted", "diverged")
     for i, row in enumerate(result["levels"], 1):
@@ -99,7 +99,7 @@ def show_rare_event(result: JsonObject, chosen: Scenario) -> None:
         numbers = (f"{row[name]:.4g}" for name in ("share", "cov", "acceptance"))
         levels.add_row(str(i), reached, *numbers, str(row["diverged"]))
     show_titled_table(
-        f"{chosen.title or chosen.name}: {result['metric']} > {result['bound']:g} {result['unit']}", levels
+        f"{scenario.title or scenario.name}: {result['metric']} > {result['bound']:g} {result['unit']}", levels
     )
     estimates = Table("estimate", "probability", "low", "high", "coefficient of variation")
     for name in ("first level alone", "subset simulation", "importance sampling"):
@@ -146,14 +146,14 @@ def _estimate(row: JsonObject) -> list[str]:
     return ["" if row[key] is None else format_brief(row[key]) for key in ("value", "low", "high")]
 
 
-def say_unused_seed(chosen: Scenario) -> None:
+def say_unused_seed(scenario: Scenario) -> None:
     """Say that the seed of the solver has no effect on a study of samples, if a scenario gives one."""
-    if chosen.seed:
-        say(f"note: solver.seed = {chosen.seed} has no effect: sweep.seed decides the noise of a sweep")
+    if scenario.seed:
+        say(f"note: solver.seed = {scenario.seed} has no effect: sweep.seed decides the noise of a sweep")
 
 
-def warn_of_strays(found: "Results") -> None:
+def warn_of_strays(results: "Results") -> None:
     """Warn of files among the chunks that are not part of the sweep: other readers would read them too."""
-    if found.strays:
-        more = f" (and {len(found.strays) - 1} more)" if found.strays[1:] else ""
-        say(f"warning: {found.strays[0]}{more} is not a chunk of this sweep; other programs would read it, too")
+    if results.strays:
+        more = f" (and {len(results.strays) - 1} more)" if results.strays[1:] else ""
+        say(f"warning: {results.strays[0]}{more} is not a chunk of this sweep; other programs would read it, too")

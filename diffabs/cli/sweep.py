@@ -70,42 +70,42 @@ def sweep(
             jax.config.update("jax_num_cpu_devices", devices)
         if out:
             _check_free(out, resume)  # before anything is compiled
-        chosen = console.load_scenario(
+        setup = console.load_scenario(
             scenario, console.add_option_overrides(changes, "sweep", samples=samples, seed=seed)
         )
         if not out:
-            out = pathlib.Path("out") / f"sweep-{chosen.name}"
+            out = pathlib.Path("out") / f"sweep-{setup.name}"
             _check_free(out, resume)
-        show_samples.say_unused_seed(chosen)
+        show_samples.say_unused_seed(setup)
         if figures:
             report.check_target(out / report.DEFAULT_NAME)
-        study = _with_engine(section_sweep.build_study(chosen), engine, out, resume, remote=scheduler is not None)
-        kept = _numbers(keep, study.samples)
-        for number in kept:
+        study = _with_engine(section_sweep.build_study(setup), engine, out, resume, remote=scheduler is not None)
+        numbers = _numbers(keep, study.samples)
+        for number in numbers:
             _check_runnable(study, number)
         with _explain_resume(out, resume):
-            found = _run(study, chosen, out, resume, lambda: _computer(on, scheduler, workers))
-            show_samples.warn_of_strays(found)
-            if not found.complete:
+            results = _run(study, setup, out, resume, lambda: _computer(on, scheduler, workers))
+            show_samples.warn_of_strays(results)
+            if not results.complete:
                 raise KeyboardInterrupt
-            check = chosen.sweep.check
-            result = console.run_with_progress(lambda: _result(found, study, out, check), "computing statistics")
-            with console.show_before_errors(lambda: _show(result, chosen, as_json)):
+            check = setup.sweep.check
+            result = console.run_with_progress(lambda: _result(results, study, out, check), "computing statistics")
+            with console.show_before_errors(lambda: _show(result, setup, as_json)):
                 console.run_with_progress(
-                    lambda: _write_files(result, found, study, out, kept, figures), "writing the results"
+                    lambda: _write_files(result, results, study, out, numbers, figures), "writing the results"
                 )
-        _show(result, chosen, as_json)
+        _show(result, setup, as_json)
         from diffabs.sweep.checking import accuracy_warnings
 
         for line in accuracy_warnings(result["accuracy"]) if result["accuracy"] else ():
             console.say(f"warning: {line}")
         if result["refused"]["count"] == result["samples"]:
             why = next(iter(result["refused"]["reasons"]))
-            console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
+            console.fail(f"{setup.name}: no sample could be run: {why}", console.FAILED)
 
 
-def _show(result: JsonObject, chosen: Scenario, as_json: bool) -> None:
-    show.as_json(result) if as_json else show_samples.show_sweep(result, chosen)
+def _show(result: JsonObject, scenario: Scenario, as_json: bool) -> None:
+    show.as_json(result) if as_json else show_samples.show_sweep(result, scenario)
 
 
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
@@ -117,8 +117,8 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     source = manifest["source"]
     if "scenario" not in source:
         raise SweepError(f"{folder} was not swept from a scenario; Study.lane({number}) is this sample")
-    chosen = loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
-    study = section_sweep.build_study(chosen)
+    scenario = loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
+    study = section_sweep.build_study(scenario)
     swept = {name: value for name, value in manifest["study"].items() if name != "engine"}  # XLA runs single samples
     for line in describe_differences(swept, study.table(), "study"):
         raise SweepError(f"{folder}: the scenario in its manifest is not what was swept: {line}")
@@ -127,7 +127,7 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     check_owner(folder, manifest, number)
     loop, key = _check_runnable(study, number)
     loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
-    return dataclasses.replace(chosen, name=f"{chosen.name}, sample {number}", title="", loop=loop), key
+    return dataclasses.replace(scenario, name=f"{scenario.name}, sample {number}", title="", loop=loop), key
 
 
 def _check_runnable(study: "Study", number: int) -> tuple[PyTree, jax.Array]:
@@ -167,11 +167,11 @@ def _check_options(on: str, scheduler: str | None, workers: int | None, devices:
     ):
         if value is not None and on != needed:
             console.fail(f"{option} {value} needs --on {needed}")
-    most = max(8, 2 * (os.cpu_count() or 1))
+    limit = max(8, 2 * (os.cpu_count() or 1))
     for option, value in (("--workers", workers), ("--devices", devices)):
-        if value is not None and not 1 <= value <= most:
-            why = ": more than twice the processors only cost memory" if value > most else ""
-            console.fail(f"{option} {value} is outside [1, {most}]{why}")
+        if value is not None and not 1 <= value <= limit:
+            why = ": more than twice the processors only cost memory" if value > limit else ""
+            console.fail(f"{option} {value} is outside [1, {limit}]{why}")
     if scheduler and workers:
         console.fail(f"--workers {workers}: the scheduler at {scheduler} has its own workers")
     if figures:
@@ -229,7 +229,7 @@ def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:
     return Dask(scheduler, workers)
 
 
-def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], PyTree]) -> "Results":
+def _run(study: "Study", scenario: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], PyTree]) -> "Results":
     """Return the results. Raises KeyboardInterrupt after Ctrl-C: at once, or after the current chunks."""
     far = [progress.WorkProgress(progress.COMPILING)]
     ending = console.InterruptibleEnd("the chunks in hand")
@@ -249,13 +249,13 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: 
     def run() -> "Results":
         from diffabs.sweep import sweep as run
 
-        source = {"scenario": dump(chosen), "name": chosen.name}
+        source = {"scenario": dump(scenario), "name": scenario.name}
         return run(study, out, resume=resume, on=on(), progress=report_progress, stopping=ending, source=source)
 
-    return console.run_with_progress(run, f"sweeping {chosen.name}", lambda: far[0], ending)
+    return console.run_with_progress(run, f"sweeping {scenario.name}", lambda: far[0], ending)
 
 
-def _result(found: "Results", study: "Study", out: pathlib.Path, check: int) -> JsonObject:
+def _result(results: "Results", study: "Study", out: pathlib.Path, check: int) -> JsonObject:
     """Return the JSON document, which is also written into the folder: at first without the names of other files.
 
     A picture that cannot be drawn then loses no statistics.
@@ -265,28 +265,28 @@ def _result(found: "Results", study: "Study", out: pathlib.Path, check: int) -> 
 
     # Half steps run beside the statistics: compiled code and NumPy release Python's global lock.
     with ThreadPoolExecutor(1) as beside:
-        halved = beside.submit(check_accuracy, study, found, check) if check else None
-        said = summarise_sweep(found)
+        halved = beside.submit(check_accuracy, study, results, check) if check else None
+        summary = summarise_sweep(results)
     accuracy = halved.result() if halved else None
-    result = {"out": str(out), **said, "accuracy": accuracy, "made": console.describe_run(), "files": {}}
+    result = {"out": str(out), **summary, "accuracy": accuracy, "made": console.describe_run(), "files": {}}
     _write_summary(out, result)
     return result
 
 
 def _write_files(
-    result: JsonObject, found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool
+    result: JsonObject, results: "Results", study: "Study", out: pathlib.Path, numbers: list[int], figures: bool
 ) -> None:
     """Write trajectories, figures and report, and add their names to the document here and in the folder."""
     from diffabs.sweep.trajectories import write_trajectories
 
-    if kept:
-        result["files"]["trajectories"] = str(write_trajectories(study, out, kept))
+    if numbers:
+        result["files"]["trajectories"] = str(write_trajectories(study, out, numbers))
     if figures:
         from diffabs.plot.sweeps import draw_sweep
 
         folder = out / FIGURES
         folder.mkdir(exist_ok=True)
-        result["files"]["figures"] = [str(path) for path in draw_sweep(found, result, folder, study.units())]
+        result["files"]["figures"] = [str(path) for path in draw_sweep(results, result, folder, study.units())]
         result["files"]["report"] = str(out / report.DEFAULT_NAME)
     if result["files"]:
         _write_summary(out, result)

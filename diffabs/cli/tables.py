@@ -31,8 +31,8 @@ def fit_table(table: Table, width: int) -> list[Table]:
     The first column names the row, so it is repeated in each table.
     """
     groups: list[list[Column]] = []
-    first, *others = table.columns
-    for column in others:
+    first, *columns = table.columns
+    for column in columns:
         if groups and _least([*groups[-1], column]) <= width:
             groups[-1].append(column)
         else:

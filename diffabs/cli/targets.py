@@ -19,24 +19,24 @@ OUTPUTS = ("csv", "mat", "out", "plot")  # arguments of commands that name what 
 INPUTS = {"scenario": "the scenario", "data": "the file of --data", "source": "the result"}
 
 
-def check_distinct(given: Mapping[str, Any]) -> None:
+def check_distinct(arguments: Mapping[str, Any]) -> None:
     """Check that a command writes no file twice, and no file that it reads."""
-    wanted = {f"--{name}": given[name] for name in OUTPUTS if given.get(name)}
-    places = {option: resolve_path(path, option) for option, path in wanted.items()}
-    for one, other in itertools.combinations(places, 2):
-        if places[one] == places[other]:
-            fail(f"{one} and {other} are the same file, {wanted[one]}")
-    for option, (what, source) in itertools.product(places, _find_inputs(given)):
+    outputs = {f"--{name}": arguments[name] for name in OUTPUTS if arguments.get(name)}
+    places = {option: resolve_path(path, option) for option, path in outputs.items()}
+    for first, second in itertools.combinations(places, 2):
+        if places[first] == places[second]:
+            fail(f"{first} and {second} are the same file, {outputs[first]}")
+    for option, (description, source) in itertools.product(places, _find_inputs(arguments)):
         if os.path.isfile(source) and places[option].exists() and os.path.samefile(source, places[option]):
-            fail(f"{option} {wanted[option]} is {what} itself")
+            fail(f"{option} {outputs[option]} is {description} itself")
 
 
-def _find_inputs(given: Mapping[str, Any]) -> Iterator[tuple[str, str | pathlib.Path]]:
+def _find_inputs(arguments: Mapping[str, Any]) -> Iterator[tuple[str, str | pathlib.Path]]:
     """Yield description and path of each file that a command reads: its inputs, and the modules of `--parts`."""
-    for name, what in INPUTS.items():
-        is_packaged = name == "scenario" and given.get(name) in names()
-        if given.get(name) and not is_packaged:
-            yield what, given[name]
+    for name, description in INPUTS.items():
+        is_packaged = name == "scenario" and arguments.get(name) in names()
+        if arguments.get(name) and not is_packaged:
+            yield description, arguments[name]
     for module in outside.registered_modules():
         yield f"the module {module.__name__}", getattr(module, "__file__", None) or ""
 
@@ -100,9 +100,9 @@ def new_target_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     is left alone.
     """
     target = resolve_path(target, "--out")
-    there = set(os.listdir(target)) if target.is_dir() else set()
-    is_result = "summary.json" in there and not there & {"manifest.json", "chunks"}  # a sweep has a summary, too
-    if target.exists() and not (target.is_dir() and (is_result or not there)):
+    entries = set(os.listdir(target)) if target.is_dir() else set()
+    is_result = "summary.json" in entries and not entries & {"manifest.json", "chunks"}  # a sweep has a summary, too
+    if target.exists() and not (target.is_dir() and (is_result or not entries)):
         fail(f"--out {target}: exists and is not an earlier result; move it away")
     with _open_target(files.new_folder(target), "--out", target) as new:
         yield new
@@ -115,7 +115,7 @@ def _open_target(
     """Yield the temporary file or folder. Raises typer.Exit if it cannot be made."""
     with contextlib.ExitStack() as stack:
         try:
-            made = stack.enter_context(making)
+            temporary = stack.enter_context(making)
         except OSError as error:
             fail(f"{option} {target}: cannot be written, {error.strerror}")
-        yield made
+        yield temporary

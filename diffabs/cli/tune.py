@@ -47,24 +47,24 @@ def tune(
         targets.check_scenario_file(out)
         with targets.new_target_file(plot, "--plot") as picture:
             with targets.new_target_file(out, "--out") as out_file:
-                chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "tune", starts=starts))
-                work = console.run_with_progress(lambda: build_work(chosen), "computing the runs")
-                found, result, told = _tune_and_document(work, engine)
-                show_result = functools.partial(_show, result, told, chosen, as_json)
+                setup = console.load_scenario(scenario, console.add_option_overrides(changes, "tune", starts=starts))
+                work = console.run_with_progress(lambda: build_work(setup), "computing the runs")
+                tuned, result, sentence = _tune_and_document(work, engine)
+                show_result = functools.partial(_show, result, sentence, setup, as_json)
                 if not result["met"]:  # inside `with`: the exception discards the files
                     show_result()
                     _leave_if_interrupted(result)
                     console.fail(
-                        f"{chosen.name}: not met: {_unmet_constraints(result)}; {result['reason']}", console.FAILED
+                        f"{setup.name}: not met: {_unmet_constraints(result)}; {result['reason']}", console.FAILED
                     )
                 if out_file:
                     with console.show_before_errors(show_result):
-                        out_file.write_text(dump(chosen.with_loop(found.loop, "tuned")), encoding="utf-8")
+                        out_file.write_text(dump(setup.with_loop(tuned.loop, "tuned")), encoding="utf-8")
             # The scenario is in place: a picture that cannot be drawn does not cost it.
             result["files"] |= {"out": str(out)} if out else {}
             if picture:
                 with console.show_before_errors(show_result):
-                    result |= _draw_unless_interrupted(work, found, picture, result["interrupted"])
+                    result |= _draw_unless_interrupted(work, tuned, picture, result["interrupted"])
                 result["files"] |= {"plot": str(plot)} if picture.exists() else {}
         show_result()
         _leave_if_interrupted(result)
@@ -82,9 +82,9 @@ def _unmet_constraints(result: JsonObject) -> str:
     return ", ".join(f"{row['name']} {show.format_shortfall(row)}" for row in result["constraints"] if not row["met"])
 
 
-def _show(result: JsonObject, told: str, chosen: Scenario, as_json: bool) -> None:
-    show.as_json(result) if as_json else show.show_tuning(result, chosen)
-    console.say(told)
+def _show(result: JsonObject, sentence: str, scenario: Scenario, as_json: bool) -> None:
+    show.as_json(result) if as_json else show.show_tuning(result, scenario)
+    console.say(sentence)
 
 
 def _tune_and_document(work: Work, engine: str) -> tuple["Tuned", JsonObject, str]:
@@ -92,21 +92,21 @@ def _tune_and_document(work: Work, engine: str) -> tuple["Tuned", JsonObject, st
 
     After Ctrl-C the document lacks the parts that are not computed yet.
     """
-    found, interrupted = _tune_with_progress(work, engine)
-    after = work.chosen.with_loop(found.loop, "tuned")
+    tuned, interrupted = _tune_with_progress(work, engine)
+    after = work.scenario.with_loop(tuned.loop, "tuned")
     try:
         proved = console.run_with_progress(lambda: certify_result(after), "certifying the result")
-        result = console.run_with_progress(lambda: tuning_document(work, found, proved), "comparing before and after")
+        result = console.run_with_progress(lambda: tuning_document(work, tuned, proved), "comparing before and after")
     except KeyboardInterrupt:
         interrupted, proved = True, without_certificate("interrupted")
-        result = _without_proof(work, tuning_document(work._replace(task=None), found, proved))
-    return found, {**result, "interrupted": interrupted}, proved.sentence
+        result = _without_proof(work, tuning_document(work._replace(task=None), tuned, proved))
+    return tuned, {**result, "interrupted": interrupted}, proved.sentence
 
 
-def _draw_unless_interrupted(work: Work, found: "Tuned", picture: pathlib.Path, interrupted: bool) -> JsonObject:
+def _draw_unless_interrupted(work: Work, tuned: "Tuned", picture: pathlib.Path, interrupted: bool) -> JsonObject:
     """Draw the tuning, and return the document's entry "interrupted", which Ctrl-C changes to true."""
     try:
-        console.run_with_progress(lambda: _draw(work, found, picture), "drawing")
+        console.run_with_progress(lambda: _draw(work, tuned, picture), "drawing")
     except KeyboardInterrupt:
         picture.unlink()
         interrupted = True
@@ -115,13 +115,13 @@ def _draw_unless_interrupted(work: Work, found: "Tuned", picture: pathlib.Path, 
 
 def _without_proof(work: Work, result: JsonObject) -> JsonObject:
     """Return the document with the unchecked constraints added, as not met."""
-    seen = [row["name"] for row in result["constraints"]]
-    goal = work.chosen.tune
+    names = [row["name"] for row in result["constraints"]]
+    goal = work.scenario.tune
     bounds = {"certified decay": goal.decay, "damping": goal.damping}
     unseen = [
         {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False, "missed": None}
         for name in work.constraints
-        if name not in seen
+        if name not in names
     ]
     return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
 
@@ -131,18 +131,18 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     from diffabs import tune
     from diffabs.tune import Method, StartError, Stopping
 
-    goal, told = work.chosen.tune, list["TuningProgress"]()
-    ending = console.InterruptibleEnd("the evaluation in hand", nothing=lambda: not told)
+    goal, history = work.scenario.tune, list["TuningProgress"]()
+    ending = console.InterruptibleEnd("the evaluation in hand", nothing=lambda: not history)
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
-    most = None if work.constraints else goal.iterations  # with constraints the number of rounds is unknown
+    max_iterations = None if work.constraints else goal.iterations  # with constraints the number of rounds is unknown
 
     problem = tune.build_problem(
-        work.chosen.loop,
+        work.scenario.loop,
         free=goal.free,
         objective=goal.objective,
         over=work.batch,
-        solver=work.chosen.solver,
-        measured=work.chosen.objectives,
+        solver=work.scenario.solver,
+        measured=work.scenario.objectives,
         aggregate=goal.read_aggregate(),
         constraints=list(work.constraints.values()),
         engine=engine,
@@ -152,42 +152,42 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
         console.say(engines.XLA_NOTE.format(reason))
 
     def run_tuning() -> "Tuned":
-        return tune.tune(problem, method=method, progress=told.append, stopping=ending)
+        return tune.tune(problem, method=method, progress=history.append, stopping=ending)
 
     try:
         return console.run_with_progress(
-            run_tuning, f"tuning {work.chosen.name}", lambda: _format_progress(told, most), ending
-        ), ending.asked
+            run_tuning, f"tuning {work.scenario.name}", lambda: _format_progress(history, max_iterations), ending
+        ), ending.is_requested
     except StartError as error:
-        console.fail(f"{work.chosen.name}: no start can be used: {error}", console.FAILED)
+        console.fail(f"{work.scenario.name}: no start can be used: {error}", console.FAILED)
 
 
-def _format_progress(told: "list[TuningProgress]", most: int | None = None) -> progress.WorkProgress:
-    """Return the progress on one line; `most` is the greatest number of iterations, None if unknown."""
-    if not told:
+def _format_progress(history: "list[TuningProgress]", max_iterations: int | None = None) -> progress.WorkProgress:
+    """Return the progress on one line; `max_iterations` is the greatest number of iterations, None if unknown."""
+    if not history:
         return progress.WorkProgress(progress.COMPILING)
-    last, total = told[-1], len(told)
+    last, total = history[-1], len(history)
     words = (
         f"loss {last.point.loss:.6g}, gradient {last.point.gradient:.2g}, violation {last.point.violation:.2g},"
         f" {total} evaluations, {last.starts} under way"
     )
-    return progress.WorkProgress(words, max(one.point.iteration for one in told), most, at_most=True)
+    return progress.WorkProgress(words, max(step.point.iteration for step in history), max_iterations, at_most=True)
 
 
-def _draw(work: Work, found: "Tuned", path: pathlib.Path) -> None:
+def _draw(work: Work, tuned: "Tuned", path: pathlib.Path) -> None:
     """Draw the history, and the run that is worst after the tuning, before and after it."""
     from diffabs.plot.tuning import draw_tuning
 
-    chosen, metrics = work.chosen, found.metrics[1]
-    worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in chosen.tune.objective.items())))
-    solver = dataclasses.replace(chosen.solver, every=min(chosen.solver.every, chosen.solver.steps))
+    scenario, metrics = work.scenario, tuned.metrics[1]
+    worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in scenario.tune.objective.items())))
+    solver = dataclasses.replace(scenario.solver, every=min(scenario.solver.every, scenario.solver.steps))
 
     def roll_out(loop: Part) -> Trajectory:
-        run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=chosen.key()))
+        run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=scenario.key()))
         assert run.trajectory is not None
         return run.trajectory
 
-    runs = {"before": roll_out(chosen.loop), "after": roll_out(found.loop)}
+    runs = {"before": roll_out(scenario.loop), "after": roll_out(tuned.loop)}
     where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
-    title = chosen.title or chosen.name
-    draw_tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit).savefig(path)
+    title = scenario.title or scenario.name
+    draw_tuning(tuned.history, runs, title=title, lane=where, unit=scenario.loop.plant.control_unit).savefig(path)

@@ -32,7 +32,7 @@ class Work(NamedTuple):
         task: Linear systems for a decay rate or damping; None without these constraints.
     """
 
-    chosen: Scenario
+    scenario: Scenario
     batch: "Batch"
     constraints: JsonObject
     task: certificates.ProofTask | None
@@ -54,21 +54,21 @@ class Proved(NamedTuple):
     certified: bool = False
 
 
-def build_work(chosen: Scenario) -> Work:
+def build_work(scenario: Scenario) -> Work:
     """Return the runs and constraints of a tuning."""
     from diffabs.tune import AtMost, CertifiedDecay, Poles
 
-    goal = chosen.tune.check(chosen.loop)
-    batch = goal.batch(chosen.seed).check(chosen.loop)
-    if line := first_refusal(chosen.loop, batch.values, chosen.solver):
+    goal = scenario.tune.check(scenario.loop)
+    batch = goal.batch(scenario.seed).check(scenario.loop)
+    if line := first_refusal(scenario.loop, batch.values, scenario.solver):
         raise ScenarioError(f"tune.over: {line}")
     constraints: JsonObject = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
-    task = certificates.build_proof_task(chosen) if goal.decay or goal.damping else None
+    task = certificates.build_proof_task(scenario) if goal.decay or goal.damping else None
     if task and goal.decay:
         constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
     if task and goal.damping:
         constraints["damping"] = Poles(task.polytope, damping=goal.damping)
-    return Work(chosen, batch, constraints, task)
+    return Work(scenario, batch, constraints, task)
 
 
 def certify_result(after: Scenario) -> Proved:
@@ -80,22 +80,22 @@ def certify_result(after: Scenario) -> Proved:
     decay = after.tune.decay
     try:
         task = certificates.build_proof_task(after)
-        found = certificates.certify_gain(task)
-        if (found.decay_rate or 0.0) < decay:  # the search for the fastest decay ends slightly below the optimum
-            asked = certificates.certify_gain(
+        proof = certificates.certify_gain(task)
+        if (proof.decay_rate or 0.0) < decay:  # the search for the fastest decay ends slightly below the optimum
+            faster_proof = certificates.certify_gain(
                 task._replace(spec=dataclasses.replace(task.spec, decay=decay * (1 + BOUND_ROUNDING)))
             )
-            found = asked if (asked.decay_rate or 0.0) >= decay else found
+            proof = faster_proof if (faster_proof.decay_rate or 0.0) >= decay else proof
     except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
         return without_certificate(" ".join(str(error).split()))
-    known = certificates.find_further(task, found)
-    reason = certificates.describe_unproved(found, task.spec, known) or None
-    document = certificates.proof_document(task, found, reason=reason, known=known)
+    further = certificates.find_further(task, proof)
+    reason = certificates.describe_unproved(proof, task.spec, further) or None
+    document = certificates.proof_document(task, proof, reason=reason, further=further)
     document = {key: value for key, value in document.items() if key not in OF_THE_COMMAND}
     rate = document["decay_rate"]
     over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
-    said = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"
-    return Proved(document, f"certificate: {said}", task, certified=True)
+    sentence = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"
+    return Proved(document, f"certificate: {sentence}", task, certified=True)
 
 
 def without_certificate(why: str) -> Proved:
@@ -103,62 +103,62 @@ def without_certificate(why: str) -> Proved:
     return Proved({**dict.fromkeys(certificates.FROM_PROOF), "reason": why}, f"no certificate: {why}")
 
 
-def tuning_document(work: Work, found: "Tuned", proved: Proved) -> JsonObject:
+def tuning_document(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
     """Return the whole document, without the written files."""
-    chosen, goal = work.chosen, work.chosen.tune
+    scenario, goal = work.scenario, work.scenario.tune
     return {
-        **console.describe_source(chosen),
+        **console.describe_source(scenario),
         "lanes": work.batch.size,
-        "free": {path: _free(chosen, found, path) for path in goal.free},
-        "objective": dict(zip(WHEN, map(float, found.objective), strict=True)),
-        "metrics": {when: _over_lanes(m, chosen) for when, m in zip(WHEN, found.metrics, strict=True)},
-        "constraints": (rows := _constraints(work, found, proved)),
+        "free": {path: _free(scenario, tuned, path) for path in goal.free},
+        "objective": dict(zip(WHEN, map(float, tuned.objective), strict=True)),
+        "metrics": {when: _over_lanes(m, scenario) for when, m in zip(WHEN, tuned.metrics, strict=True)},
+        "constraints": (rows := _constraints(work, tuned, proved)),
         "met": all(row["met"] for row in rows),
-        "reason": found.reason.value,
-        "gradient_norm": float(found.gradient),
-        "evaluations": found.evaluations,
-        "mode": found.mode.value,
-        "engine": found.engine,
-        "history": [point._asdict() for point in found.history],
+        "reason": tuned.reason.value,
+        "gradient_norm": float(tuned.gradient),
+        "evaluations": tuned.evaluations,
+        "mode": tuned.mode.value,
+        "engine": tuned.engine,
+        "history": [point._asdict() for point in tuned.history],
         "starts": [
             {"objective": float(s.objective), "violation": float(s.violation), "reason": s.reason.value}
-            for s in found.starts
+            for s in tuned.starts
         ],
-        "parameters": {path: _plain(value) for path, _, value in parameters(found.loop)},
+        "parameters": {path: _plain(value) for path, _, value in parameters(tuned.loop)},
         "certificate": proved.document,
         "versions": provenance.versions("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ())),
         "files": {},
     }
 
 
-def _free(chosen: Scenario, found: "Tuned", path: str) -> JsonObject:
-    spec = next(spec for name, spec, _ in parameters(chosen.loop) if name == path)
-    low, high = chosen.tune.free[path] or (spec.low, spec.high)
-    before, after = (_plain(get(loop, path)) for loop in (chosen.loop, found.loop))
+def _free(scenario: Scenario, tuned: "Tuned", path: str) -> JsonObject:
+    spec = next(spec for name, spec, _ in parameters(scenario.loop) if name == path)
+    low, high = scenario.tune.free[path] or (spec.low, spec.high)
+    before, after = (_plain(get(loop, path)) for loop in (scenario.loop, tuned.loop))
     return {"before": before, "after": after, "low": _plain(low), "high": _plain(high), "unit": spec.unit}
 
 
-def _over_lanes(metrics: JsonObject, chosen: Scenario) -> dict[str, dict[str, float]]:
+def _over_lanes(metrics: JsonObject, scenario: Scenario) -> dict[str, dict[str, float]]:
     """Return mean and worst metrics; NaN if a run diverged, because a mean of the others would hide it."""
-    each = {name: np.asarray(metrics[name], float) for name in chosen.objectives}
+    each = {name: np.asarray(metrics[name], float) for name in scenario.objectives}
     return {
         "mean": {name: float(values.mean()) for name, values in each.items()},
         "worst": {name: float(values.max()) for name, values in each.items()},
     }
 
 
-def _constraints(work: Work, found: "Tuned", proved: Proved) -> list[JsonObject]:
+def _constraints(work: Work, tuned: "Tuned", proved: Proved) -> list[JsonObject]:
     """Return a row for each constraint: its worst value before and after, and whether it is met."""
-    goal, rows = work.chosen.tune, []
+    goal, rows = work.scenario.tune, []
     for name, bound in goal.limits.items():
-        before, after = (float(np.max(metrics[name])) for metrics in found.metrics)
+        before, after = (float(np.max(metrics[name])) for metrics in tuned.metrics)
         rows.append(_constraint_row(name, bound, before, after, at_most=True))
     if work.task and goal.decay:
         before, after = certificates.certify_gain(work.task).decay_rate, proved.document["decay_rate"]
         rows.append(_constraint_row("certified decay", goal.decay, before, after, at_most=False))
     if work.task and goal.damping:
-        before = _least_damping(work.task, work.chosen.loop)
-        after = _least_damping(proved.task or work.task, found.loop)
+        before = _least_damping(work.task, work.scenario.loop)
+        after = _least_damping(proved.task or work.task, tuned.loop)
         rows.append(_constraint_row("damping", goal.damping, before, after, at_most=False))
     return rows
 

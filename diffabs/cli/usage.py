@@ -33,14 +33,14 @@ class Group(typer.core.TyperGroup):
 
         `args` and `more` are those of Click.
         """
-        given = more.get("args", args[0] if args else None)
-        console.note_command(sys.argv[1:] if given is None else given)
+        words = more.get("args", args[0] if args else None)
+        console.note_command(sys.argv[1:] if words is None else words)
         console.escape_unencodable_output()
         try:
             with console.end_on_errors():
                 status = super().main(*args, standalone_mode=False, **more)
-        except typer.Exit as left:
-            status = left.exit_code
+        except typer.Exit as end:
+            status = end.exit_code
         except UsageError as error:
             if type(error).__name__ == "NoArgsIsHelpError":
                 error.show()
@@ -64,13 +64,13 @@ def add_command(app: typer.Typer, function: Callable[..., PyTree], example: str,
     """
 
     @functools.wraps(function)
-    def command(*args: PyTree, quiet: bool, parts: list[str] | None, **given: PyTree) -> Any:
+    def command(*args: PyTree, quiet: bool, parts: list[str] | None, **options: PyTree) -> Any:
         console.quieten(quiet)
         with console.end_on_errors():
             register_parts(parts or ())
-            targets.check_distinct(given)
-            engines.check_engine_name(given.get("engine", "auto"))
-        return function(*args, **given)
+            targets.check_distinct(options)
+            engines.check_engine_name(options.get("engine", "auto"))
+        return function(*args, **options)
 
     signature = inspect.signature(function)
     more = [

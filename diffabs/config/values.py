@@ -47,7 +47,7 @@ def dotted_path(path: str, key: str) -> str:
     return f"{path}.{key}" if path else key
 
 
-def format_given(value: Scalar, most: int = 60) -> str:
+def format_given(value: Scalar, length: int = 60) -> str:
     """Return a value from TOML, JSON or the command line for a message: on one line, of bounded length."""
     if isinstance(value, datetime.date | datetime.time):
         return value.isoformat()
@@ -57,23 +57,23 @@ def format_given(value: Scalar, most: int = 60) -> str:
         text = json.dumps(value, ensure_ascii=True) if isinstance(value, str) else repr(value)
     except (ValueError, RecursionError):  # more digits than Python converts, or deeper nesting than its recursion limit
         text = "a number of thousands of digits" if isinstance(value, int) else "something nested too deeply"
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+    return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
-def unknown_name_error(what: str, name: Any, there: Iterable[str]) -> ScenarioError:
+def unknown_name_error(beginning: str, name: Any, names: Iterable[str]) -> ScenarioError:
     """Return the error for an unknown name, with the nearest existing name."""
-    there = list(there)
-    near = _find_near_name(str(name), there)
+    names = list(names)
+    near = _find_near_name(str(name), names)
     hint = f"did you mean {near}? There is" if near else "there is"
-    return ScenarioError(f"{what}; {hint} {', '.join(there) or 'nothing'}")
+    return ScenarioError(f"{beginning}; {hint} {', '.join(names) or 'nothing'}")
 
 
-def _find_near_name(name: str, there: list[str]) -> str | None:
+def _find_near_name(name: str, names: list[str]) -> str | None:
     """Return the existing name that is probably meant: that of a part inside, or one with a similar last word."""
     words = name.split(".")
-    for path in there:
-        rest = iter(path.split("."))
-        if len(words) > 1 and all(word in rest for word in words):  # `in` moves `rest` on: the words in this order
+    for path in names:
+        remaining = iter(path.split("."))
+        if len(words) > 1 and all(word in remaining for word in words):  # `in` moves `rest` on: the words in this order
             return path
     # Paths to the fields of one part begin alike. Only their last words show whether one is meant.
     last = difflib.SequenceMatcher(b=words[-1].lower())
@@ -82,7 +82,7 @@ def _find_near_name(name: str, there: list[str]) -> str | None:
         last.set_seq1(path.rpartition(".")[2].lower())
         return last.ratio() >= MIN_LIKENESS
 
-    alike = [path for path in there if len(words) == 1 or is_similar(path)]
+    alike = [path for path in names if len(words) == 1 or is_similar(path)]
     return next(iter(difflib.get_close_matches(name.lower(), alike, 1, MIN_LIKENESS)), None)
 
 
@@ -107,10 +107,10 @@ def read_number(value: Scalar, spec: ParameterSpec, path: str) -> float:
 
 def read_number_in_range(value: Scalar, spec: ParameterSpec, path: str) -> float:
     """Return a number as a float."""
-    found = read_number(value, spec, path)
-    if not spec.holds(found):
-        raise ScenarioError(f"{path} = {format_given(found)} is outside {spec.interval()}")
-    return found
+    number = read_number(value, spec, path)
+    if not spec.holds(number):
+        raise ScenarioError(f"{path} = {format_given(number)} is outside {spec.interval()}")
+    return number
 
 
 def read_whole(value: Scalar, low: int, high: int, path: str) -> int:
@@ -125,23 +125,23 @@ def read_whole(value: Scalar, low: int, high: int, path: str) -> int:
 
 def whole_reader(low: int, high: int) -> Reader:
     """Return the reader of whole numbers in a range."""
-    return lambda given, path: read_whole(given, low, high, path)
+    return lambda value, path: read_whole(value, low, high, path)
 
 
 def range_reader(spec: ParameterSpec) -> Reader:
     """Return the reader of numbers in a range."""
-    return lambda given, path: read_number_in_range(given, spec, path)
+    return lambda value, path: read_number_in_range(value, spec, path)
 
 
 def choice_reader(*names: str) -> Reader:
     """Return the reader of one of several texts."""
 
-    def read(given: PyTree, path: str) -> str:
-        if not isinstance(given, str):
-            raise wrong_kind_error(path, given, f"one of {', '.join(names)}")
-        if given not in names:
-            raise unknown_name_error(f"{path} = {format_given(given)} is unknown", given, names)
-        return given
+    def read(value: PyTree, path: str) -> str:
+        if not isinstance(value, str):
+            raise wrong_kind_error(path, value, f"one of {', '.join(names)}")
+        if value not in names:
+            raise unknown_name_error(f"{path} = {format_given(value)} is unknown", value, names)
+        return value
 
     return read
 
@@ -149,21 +149,21 @@ def choice_reader(*names: str) -> Reader:
 def list_reader(item: Reader) -> Reader:
     """Return the reader of lists, which it returns as tuples."""
 
-    def read(given: PyTree, path: str) -> tuple[PyTree, ...]:
-        if not isinstance(given, list | tuple):
-            raise wrong_kind_error(path, given, "a list")
-        return tuple(item(value, f"{path}.{i}") for i, value in enumerate(given))
+    def read(values: PyTree, path: str) -> tuple[PyTree, ...]:
+        if not isinstance(values, list | tuple):
+            raise wrong_kind_error(path, values, "a list")
+        return tuple(item(value, f"{path}.{i}") for i, value in enumerate(values))
 
     return read
 
 
-def table_reader(item: Reader, what: str = "") -> Reader:
+def table_reader(item: Reader, contents: str = "") -> Reader:
     """Return the reader of tables with any keys."""
 
-    def read(given: PyTree, path: str) -> dict[str, PyTree]:
-        if not isinstance(given, Mapping):
-            raise wrong_kind_error(path, given, f"a table of {what}" if what else "a table")
-        return {key: item(value, dotted_path(path, key)) for key, value in given.items()}
+    def read(table: PyTree, path: str) -> dict[str, PyTree]:
+        if not isinstance(table, Mapping):
+            raise wrong_kind_error(path, table, f"a table of {contents}" if contents else "a table")
+        return {key: item(value, dotted_path(path, key)) for key, value in table.items()}
 
     return read
 
@@ -174,27 +174,27 @@ def read_as_given(value: Scalar, path: str) -> Scalar:
     return value
 
 
-def read_text(given: PyTree, path: str) -> str:
+def read_text(value: PyTree, path: str) -> str:
     """Return a text."""
-    if not isinstance(given, str):
-        raise wrong_kind_error(path, given, "text")
-    return given
+    if not isinstance(value, str):
+        raise wrong_kind_error(path, value, "text")
+    return value
 
 
-def read_printable_line(given: PyTree, path: str) -> str:
+def read_printable_line(value: PyTree, path: str) -> str:
     """Return a text that is one printable line."""
-    found = read_text(given, path)
-    if not found.isprintable():
-        raise ScenarioError(f"{path} = {format_given(found)} is outside one line of printable characters")
-    return found
+    line = read_text(value, path)
+    if not line.isprintable():
+        raise ScenarioError(f"{path} = {format_given(line)} is outside one line of printable characters")
+    return line
 
 
-def read_printable_lines(given: PyTree, path: str) -> str:
+def read_printable_lines(value: PyTree, path: str) -> str:
     """Return a text of printable lines."""
-    found = read_text(given, path)
-    if not all(line.isprintable() for line in found.split("\n")):
-        raise ScenarioError(f"{path} = {format_given(found)} is outside lines of printable characters")
-    return found
+    text = read_text(value, path)
+    if not all(line.isprintable() for line in text.split("\n")):
+        raise ScenarioError(f"{path} = {format_given(text)} is outside lines of printable characters")
+    return text
 
 
 def make_printable(text: str) -> str:
@@ -202,21 +202,21 @@ def make_printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
-def read_switch(given: PyTree, path: str) -> bool:
+def read_switch(value: PyTree, path: str) -> bool:
     """Return true or false."""
-    if not isinstance(given, bool):
-        raise wrong_kind_error(path, given, "true or false")
-    return given
+    if not isinstance(value, bool):
+        raise wrong_kind_error(path, value, "true or false")
+    return value
 
 
-def read_any_number(given: PyTree, path: str) -> float:
+def read_any_number(value: PyTree, path: str) -> float:
     """Return any number, also NaN and infinity, as a float."""
-    return read_number(given, FINITE_SPEC, path)
+    return read_number(value, FINITE_SPEC, path)
 
 
-def _choice(given: PyTree, path: str) -> float | str:
+def _choice(value: PyTree, path: str) -> float | str:
     """Return a text unchanged, or a number as a float."""
-    return given if isinstance(given, str) else read_any_number(given, path)
+    return value if isinstance(value, str) else read_any_number(value, path)
 
 
 READER_BY_TYPE: dict[PyTree, Reader] = {
@@ -237,17 +237,17 @@ def table_field(read: Reader, default: Any = dataclasses.MISSING) -> Scalar:
     return dataclasses.field(default=default, metadata={"read": read})
 
 
-def read_table(cls: type, given: PyTree, path: str, kind: str = "", **readers: Reader) -> Scalar:
+def read_table(cls: type, table: PyTree, path: str, kind: str = "", **readers: Reader) -> Scalar:
     """Return the instance of a dataclass that a table describes.
 
     Args:
         readers: Readers by name of a field, in place of the one that the field declares.
     """
     fields = {field.name: field for field in dataclasses.fields(cls)}
-    if not isinstance(given, Mapping):
-        raise wrong_kind_error(path, given, f"a table of {', '.join(fields)}")
+    if not isinstance(table, Mapping):
+        raise wrong_kind_error(path, table, f"a table of {', '.join(fields)}")
     values = {}
-    for key, item in given.items():
+    for key, item in table.items():
         if key not in fields:
             raise unknown_name_error(f"{dotted_path(path, key)} is not a field of {kind or path}", key, fields)
         values[key] = (readers.get(key) or _reader(fields[key]))(item, dotted_path(path, key))
@@ -272,15 +272,15 @@ def find_field_faults(part: Part, name: str) -> Iterator[str]:
             yield str(error)
 
 
-def read_one(kinds: Mapping[str, type], given: PyTree, path: str, **readers: Reader) -> Scalar:
+def read_one(kinds: Mapping[str, type], value: PyTree, path: str, **readers: Reader) -> Scalar:
     """Return an instance of one of several dataclasses, from a table with a key `type` or from the type's name alone.
 
     Args:
         readers: Readers by name of a field, in place of the one that the field declares.
     """
-    table = {"type": given} if isinstance(given, str) else given
+    table = {"type": value} if isinstance(value, str) else value
     if not isinstance(table, Mapping):
-        raise wrong_kind_error(path, given, f"a table, or the name of a type ({', '.join(kinds)}),")
+        raise wrong_kind_error(path, value, f"a table, or the name of a type ({', '.join(kinds)}),")
     if "type" not in table:
         raise ScenarioError(f"{path}.type is missing; there is {', '.join(kinds)}")
     kind = choice_reader(*kinds)(table["type"], f"{path}.type")
@@ -315,15 +315,15 @@ def plain_fields(part: Part, *, brief: bool = False) -> dict[str, PyTree]:
         brief: Whether to omit fields with their default values. A field whose default comes from a function always
             stays.
     """
-    found = {}
+    values = {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
         if brief and field.default is not dataclasses.MISSING and as_plain(value) == as_plain(field.default):
             continue
-        found[field.name] = (
+        values[field.name] = (
             np.asarray(value, float).tolist() if "spec" in field.metadata else as_plain(value, brief=brief)
         )
-    return found
+    return values
 
 
 def format_table(part: Part) -> str:

@@ -41,7 +41,7 @@ def lazy_getattr(package: str) -> Callable[[str], PyTree]:
     def homes() -> dict[str, str]:
         loader: Any = vars(sys.modules[package])["__loader__"]
         imports = (x for x in ast.walk(ast.parse(loader.get_source(package))) if isinstance(x, ast.ImportFrom))
-        return {one.name: str(x.module) for x in imports for one in x.names if one.asname == one.name}
+        return {alias.name: str(x.module) for x in imports for alias in x.names if alias.asname == alias.name}
 
     def export(name: str) -> Any:
         if name == "__all__":

@@ -31,10 +31,10 @@ def open_regular(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         yield file
 
 
-def read_content(path: str | os.PathLike[str], most: int = sys.maxsize) -> bytes:
+def read_content(path: str | os.PathLike[str], size: int = sys.maxsize) -> bytes:
     """Return the content of a regular file, or only its first bytes."""
     with open_regular(path) as file:
-        return file.read(-1 if most == sys.maxsize else most)
+        return file.read(-1 if size == sys.maxsize else size)
 
 
 def make_room(folder: pathlib.Path, pattern: str, room: int) -> None:
@@ -42,12 +42,12 @@ def make_room(folder: pathlib.Path, pattern: str, room: int) -> None:
 
     Half refers to the number of files, so the rest may still exceed `room`.
     """
-    found = []
+    entries = []
     for path in folder.glob(pattern):
         with contextlib.suppress(FileNotFoundError):  # another process was quicker
-            found.append((path.stat().st_mtime, path.stat().st_size, path))
-    if sum(size for _, size, _ in found) > room:
-        for _, _, path in sorted(found)[: (len(found) + 1) // 2]:
+            entries.append((path.stat().st_mtime, path.stat().st_size, path))
+    if sum(size for _, size, _ in entries) > room:
+        for _, _, path in sorted(entries)[: (len(entries) + 1) // 2]:
             with contextlib.suppress(OSError):
                 path.unlink()
 
@@ -138,8 +138,8 @@ def others_may_write(folder: pathlib.Path) -> bool:
     """
     if not hasattr(os, "getuid"):
         return False  # Windows: a user's folders are the user's
-    there = folder.stat()
-    return bool(there.st_mode & (stat.S_IWGRP | stat.S_IWOTH)) or there.st_uid not in (os.getuid(), 0)
+    status = folder.stat()
+    return bool(status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)) or status.st_uid not in (os.getuid(), 0)
 
 
 def write_durably(target: pathlib.Path, data: bytes) -> pathlib.Path:
@@ -187,12 +187,12 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
             raise
 
 
-def _exchange(one: pathlib.Path, other: pathlib.Path) -> bool:
+def _exchange(first: pathlib.Path, second: pathlib.Path) -> bool:
     """Exchange two files or folders in one step, and return True; return False where the system has no such step."""
     if sys.platform != "linux":
         return False
     with contextlib.suppress(AttributeError, OSError):  # a C library without renameat2
-        places = (AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other))
+        places = (AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(second))
         return ctypes.CDLL(None).renameat2(*places, RENAME_EXCHANGE) == 0
     return False
 

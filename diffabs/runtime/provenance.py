@@ -18,9 +18,9 @@ import jax
 
 def versions(*packages: str) -> dict[str, str]:
     """Return the versions by name: `diffabs`, `jax`, the given packages, and `python`."""
-    found = {name: importlib.metadata.version(name) for name in ("jax", *packages)}
-    own = sys.modules[__name__.partition(".")[0]].__version__  # the distribution's name differs from the package's
-    return {"diffabs": own, **found, "python": platform.python_version()}
+    installed = {name: importlib.metadata.version(name) for name in ("jax", *packages)}
+    version = sys.modules[__name__.partition(".")[0]].__version__  # the distribution's name differs from the package's
+    return {"diffabs": version, **installed, "python": platform.python_version()}
 
 
 def describe_platform(*packages: str) -> dict[str, str]:
@@ -34,11 +34,13 @@ def processor() -> str:
 
     Programs compiled for another kind may not run here, and home folders are shared between machines.
     """
-    known = f"{platform.machine()} {platform.processor()}"
+    description = f"{platform.machine()} {platform.processor()}"
     with contextlib.suppress(OSError):
         lines = pathlib.Path("/proc/cpuinfo").read_text(errors="replace").partition("\n\n")[0].splitlines()
-        known += "".join(sorted(line for line in lines if line.startswith(("model name", "flags", "Features", "CPU"))))
-    return hashlib.sha256(known.encode()).hexdigest()[:12]
+        description += "".join(
+            sorted(line for line in lines if line.startswith(("model name", "flags", "Features", "CPU")))
+        )
+    return hashlib.sha256(description.encode()).hexdigest()[:12]
 
 
 def describe_making(words: Sequence[str]) -> dict[str, str | int]:

@@ -37,10 +37,12 @@ def guess_separator(lines: Sequence[str]) -> str:
         return counts.count(counts[0]) if counts[0] > 1 and counts[0] == counts[:2][-1] else 0
 
     alike = {separator: count_alike(separator) for separator in SEPARATORS} if first else {}
-    most = max(alike.values(), default=0)
-    fits = [separator for separator, count in alike.items() if count == most] if most else [","]
+    max_count = max(alike.values(), default=0)
+    fits = [separator for separator, count in alike.items() if count == max_count] if max_count else [","]
     if len(fits) > 1:
-        raise ValueError(f"separator: {' and '.join(SEPARATORS[one] for one in fits)} both fit; name one of them")
+        raise ValueError(
+            f"separator: {' and '.join(SEPARATORS[separator] for separator in fits)} both fit; name one of them"
+        )
     return fits[0]
 
 

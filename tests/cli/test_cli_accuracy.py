@@ -213,7 +213,7 @@ def test_a_shorter_step_that_turns_a_number_into_never(file, most, turned):
     assert [said in lines] == [bool(turned)]
 
 
-@killed_by("cli/checking.py", "if differs_in_kind(one, other):", "if False:")
+@killed_by("cli/checking.py", "if differs_in_kind(value, finer_value):", "if False:")
 @killed_by("simulate/types.py", "~(np.isnan(first) & np.isnan(second))", "True", case="both NaN")
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("one", "other", "words"), PAIRS.values(), ids=PAIRS)

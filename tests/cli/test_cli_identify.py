@@ -166,7 +166,7 @@ def test_the_arguments_reach_the_fit(small, csv, invented):
     assert asked["solver"].duration == pytest.approx(0.302)
 
 
-@killed_by("cli/identify.py", "max(left[name], least[name])", "spread[name]")
+@killed_by("cli/identify.py", "max(residual_noise[name], noise_floors[name])", "spread[name]")
 def test_noise_that_is_not_known_is_taken_from_the_residuals(small, csv, invented):
     document = json.loads(run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, "--json").stdout)
     first, *others = (asked["data"].sigma for asked in invented)
@@ -245,7 +245,7 @@ def test_what_simulate_wrote_is_found_again(small, tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("cli/identify.py", "[] if found.ends else [found.values]", "[found.values]")
+@killed_by("cli/identify.py", "[] if fit.ends else [fit.values]", "[fit.values]")
 def test_a_value_at_an_end_of_its_range_has_no_deviation(small, tmp_path):
     run("simulate", small, "--csv", tmp_path / "run.csv", "--set", "plant.mass=5")
     args = ("--data", tmp_path / "run.csv", "--column", "slip", "--free", "plant.mass=5.2:8")

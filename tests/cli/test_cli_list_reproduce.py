@@ -196,7 +196,7 @@ def test_reproduce_leaves_other_peoples_folders_alone(papers, tmp_path):
     assert_one_error_line(run("reproduce", "slip-lmi", "--out", tmp_path / "slip-lmi" / "thesis.tex", status=2))
 
 
-@killed_by("cli/targets.py", 'not there & {"manifest.json", "chunks"}', "True")
+@killed_by("cli/targets.py", 'not entries & {"manifest.json", "chunks"}', "True")
 @pytest.mark.parametrize("sweeps", ["manifest.json", "chunks"])
 def test_reproduce_leaves_a_sweep_alone(papers, tmp_path, sweeps):
     (tmp_path / "slip-lmi" / sweeps).mkdir(parents=True)

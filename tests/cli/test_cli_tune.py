@@ -159,7 +159,7 @@ def test_json_has_what_scripts_rely_on(tuned):
 
 
 @pytest.mark.slow
-@killed_by("cli/tune.py", 'after = work.chosen.with_loop(found.loop, "tuned")', "after = work.chosen")
+@killed_by("cli/tune.py", 'after = work.scenario.with_loop(tuned.loop, "tuned")', "after = work.scenario")
 def test_the_tuned_scenario_simulates_to_the_reported_numbers(tuned):
     folder, document, _ = tuned
     before, after = load(folder / "small.toml"), load(folder / "out.toml")

@@ -69,7 +69,7 @@ def test_what_is_left_does_not_count_compiling(clock):
     assert pace.describe(WorkProgress("")) == " 30 s, 20 s of it compiling"
 
 
-@killed_by("cli/progress.py", "self.first = self.first or (now, far.done)", "self.first = self.first or (now, 0.0)")
+@killed_by("cli/progress.py", "self.first = self.first or (now, far.amount)", "self.first = self.first or (now, 0.0)")
 def test_what_was_there_before_is_no_pace(clock):
     """A sweep that goes on: 50 of 100 were there; 10 more took 10 s."""
     now, _ = clock
@@ -89,7 +89,7 @@ def test_a_time_in_words(seconds, words):
 
 
 @pytest.mark.slow
-@killed_by("cli/progress.py", "if told != (told := words):", "if True:")
+@killed_by("cli/progress.py", "if last_words != (last_words := words):", "if True:")
 def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     """Where nothing can be drawn over, in lines; those that only differ in time are not told again."""
     replace_seam(monkeypatch, "patience", 1.0)

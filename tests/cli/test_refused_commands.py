@@ -355,8 +355,8 @@ def test_a_refusal_is_one_line_and_leaves_nothing(command, status, needed, tmp_p
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == FILES
 
 
-@killed_by("cli/usage.py", 'given.get("engine", "auto")', '"auto"', case="tune")
-@killed_by("cli/usage.py", 'given.get("engine", "auto")', '"xla"', case="reproduce")
+@killed_by("cli/usage.py", 'options.get("engine", "auto")', '"auto"', case="tune")
+@killed_by("cli/usage.py", 'options.get("engine", "auto")', '"xla"', case="reproduce")
 @pytest.mark.parametrize(
     ("command", "needed"),
     [

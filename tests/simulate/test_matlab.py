@@ -60,7 +60,7 @@ def test_every_name_becomes_one_of_matlab(tmp_path):
     assert found == dict(zip(names, values.values(), strict=True))
 
 
-@killed_by("cli/targets.py", "if places[one] == places[other]:", "if False:")
+@killed_by("cli/targets.py", "if places[first] == places[second]:", "if False:")
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -312,7 +312,7 @@ def test_a_report_of_somebody_else_is_left_alone(file, swept, tmp_path):
     assert (folder / "report.html").read_text() == "mine"
 
 
-@killed_by("cli/show_samples.py", "    if chosen.seed:", "    if False:")
+@killed_by("cli/show_samples.py", "    if scenario.seed:", "    if False:")
 def test_the_seed_of_a_single_run_has_no_effect_and_that_is_said(file, tmp_path):
     changes = ("--set", "solver.seed=5", "--set", "sweep.samples=2")
     result = run("sweep", file(SMALL), "--out", tmp_path / "out", *changes)
@@ -479,7 +479,7 @@ def test_the_command_computes_the_table(by_command, swept):
         assert tables_digest([found.table().slice(0, 64)]) == tables_digest([swept.table().slice(0, 64)])
 
 
-@killed_by("cli/main.py", '"seed": chosen.sweep.seed', '"seed": chosen.seed')
+@killed_by("cli/main.py", '"seed": setup.sweep.seed', '"seed": setup.seed')
 @pytest.mark.slow
 def test_a_sample_that_is_simulated_again_is_its_row(by_command):
     folder, document, _ = by_command
