@@ -64,4 +64,5 @@ def _stated_ends(name: str, ends: tuple[float, float], claims: Sequence[RunClaim
             low = max(low, min(claim.bound, ends[0]))
         elif claim.quantity == name:
             high = min(high, max(claim.bound, ends[1]))
-    return [x if known and math.isfinite(x) else None for x, known in zip((low, high), proved_ends(name), strict=True)]
+    stated = zip((low, high), proved_ends(name), strict=True)
+    return [x if provable and math.isfinite(x) else None for x, provable in stated]

@@ -214,14 +214,14 @@ class _Program:
 
     def read_by(self, roots: Iterable[int]) -> set[int]:
         """Return the operations that `roots` need, themselves included."""
-        seen: set[int] = set()
-        left = [root for root in roots if root >= 0]
-        while left:
-            i = left.pop()
-            if i not in seen:
-                seen.add(i)
-                left += [a for a in self.operations[i].args if a >= 0]
-        return seen
+        needed: set[int] = set()
+        pending = [root for root in roots if root >= 0]
+        while pending:
+            i = pending.pop()
+            if i not in needed:
+                needed.add(i)
+                pending += [a for a in self.operations[i].args if a >= 0]
+        return needed
 
     def _find_states(self) -> list[int]:
         """Return the states that decide the margin, the signals, the distance and the time, or may not be negative."""
@@ -230,20 +230,20 @@ class _Program:
             e.flow[i] for i in (e.travelled, e.clock if e.paced else -1) if i >= 0
         }
         while True:
-            found = {self.operations[i].value for i in self.read_by(roots) if self.operations[i].name == "state"}
-            found |= set(e.nonnegative)
-            more = roots | {e.flow[i] for i in found} | ({e.tick[i] for i in found} if e.tick else set())
+            states = {self.operations[i].value for i in self.read_by(roots) if self.operations[i].name == "state"}
+            states |= set(e.nonnegative)
+            more = roots | {e.flow[i] for i in states} | ({e.tick[i] for i in states} if e.tick else set())
             if more == roots:
-                return sorted(found)
+                return sorted(states)
             roots = more
 
     def _limits(self, roots: Iterable[int]) -> list[int]:
         """Return the limits and roundings among the operations that `roots` need, operands first."""
-        found = sorted(i for i in self.read_by(roots) if self.operations[i].name in LIMITED)
-        for i in found:
+        limits = sorted(i for i in self.read_by(roots) if self.operations[i].name in LIMITED)
+        for i in limits:
             if any(b >= 0 and not self.static[b] for b in self.operations[i].args[1:]):
                 raise NotProved("a limit that changes during a run")
-        return found
+        return limits
 
     def states_alone(self) -> set[int]:
         """Return the states that only they themselves and others of this set move, such as a filtered target."""
@@ -312,16 +312,16 @@ class _Series:
         """Return coefficient k of operation i."""
         if k and self.program.static[i]:
             return ZERO
-        known = self.v[i]
-        while len(known) <= k:
-            x = self._value(i, len(known))
+        coefficients = self.v[i]
+        while len(coefficients) <= k:
+            x = self._value(i, len(coefficients))
             name = self.program.operations[i].name
             # The program computes the value itself, but no further coefficient, in doubles.
-            largest = inf if known else LARGEST_INPUT if name in ("state", "param") else float_info.max
+            largest = inf if coefficients else LARGEST_INPUT if name in ("state", "param") else float_info.max
             if not (x.is_finite() and x.abs_upper() < largest):
                 raise _Undefined(f"{name}: no finite value")
-            known.append(x)
-        return known[k]
+            coefficients.append(x)
+        return coefficients[k]
 
     def values(self, i: int, k: int) -> list[arb]:
         """Return coefficients 0 to k of operation i, which depends on a state; further ones may follow."""
@@ -332,10 +332,10 @@ class _Series:
         """Return the derivatives of coefficient k of operation i along the directions."""
         if k and self.program.static[i]:
             return NO_SLOPE
-        known = self.d[i]
-        while len(known) <= k:
-            known.append(self._slope(i, len(known)))
-        return known[k]
+        derivatives = self.d[i]
+        while len(derivatives) <= k:
+            derivatives.append(self._slope(i, len(derivatives)))
+        return derivatives[k]
 
     def width(self, i: int) -> arb:
         """Return the ball of all changes of operation i from the centre of the set, to first order."""
@@ -367,8 +367,8 @@ class _Series:
             case "le":
                 yes, no = x.upper() <= y.lower(), x.lower() > y.upper()
             case "eq" | "ne":
-                same, apart = x.is_exact() and y.is_exact() and x == y, not x.overlaps(y)
-                yes, no = (same, apart) if o.name == "eq" else (apart, same)
+                equal, apart = x.is_exact() and y.is_exact() and x == y, not x.overlaps(y)
+                yes, no = (equal, apart) if o.name == "eq" else (apart, equal)
             case _:
                 raise NotProved(f"{o.name}: no such condition")
         if not (yes or no):
@@ -502,11 +502,11 @@ class _Series:
 
     def _squares(self, i: int, k: int) -> list[arb]:
         """Return coefficients 0 to k of the square of operation i."""
-        known, x = self.squares.setdefault(i, []), self.values(i, k)
-        while len(known) <= k:
-            m = len(known)
-            known.append(_dot(x, x, 0, m, m))
-        return known
+        coefficients, x = self.squares.setdefault(i, []), self.values(i, k)
+        while len(coefficients) <= k:
+            m = len(coefficients)
+            coefficients.append(_dot(x, x, 0, m, m))
+        return coefficients
 
     def _convolve(self, a: int, values: list[arb], k: int) -> arb_poly:
         """Return coefficient k of the derivatives of operation a times the series with these coefficients."""
@@ -572,16 +572,16 @@ def _remainder(series: _Series, rate: int, order: int) -> arb:
 
 
 class _Quadrature:
-    """A state that the runs add up and nothing reads: centre + slopes p + [-rest, rest]."""
+    """A state that the runs add up and nothing reads: centre + slopes p + [-uncertainty, uncertainty]."""
 
     def __init__(self, rate: int, centre: arb, slopes: np.ndarray):
-        self.rate, self.centre, self.slopes, self.rest = rate, centre, slopes, ZERO
+        self.rate, self.centre, self.slopes, self.uncertainty = rate, centre, slopes, ZERO
 
     def copy(self) -> "_Quadrature":
         """Return a copy."""
-        other = _Quadrature(self.rate, self.centre, self.slopes.copy())
-        other.rest = self.rest
-        return other
+        twin = _Quadrature(self.rate, self.centre, self.slopes.copy())
+        twin.uncertainty = self.uncertainty
+        return twin
 
     def add(self, centre: arb, slopes: arb_poly, slack: arb) -> None:
         """Add an integral with a centre, derivatives along the directions, and an uncertainty."""
@@ -591,11 +591,11 @@ class _Quadrature:
         lost = sum((_symmetric(x - float(s)) for x, s in zip(total, self.slopes, strict=True)), ZERO)
         lost += sum((_symmetric(slopes[j]) for j in range(n, len(slopes))), ZERO)
         self.centre += centre
-        self.rest = (self.rest + (lost + _symmetric(slack)).abs_upper()).upper()
+        self.uncertainty = (self.uncertainty + (lost + _symmetric(slack)).abs_upper()).upper()
 
     def box(self) -> arb:
         """Return a ball with all values."""
-        return self.centre + sum((_symmetric(arb(float(s))) for s in self.slopes), ZERO) + _symmetric(self.rest)
+        return self.centre + sum((_symmetric(arb(float(s))) for s in self.slopes), ZERO) + _symmetric(self.uncertainty)
 
 
 class _Capture(NamedTuple):
@@ -746,7 +746,12 @@ class _Check:
         return _relax(x, low, high)
 
     def renew(
-        self, centre: Sequence[arb], slopes: Sequence[arb_poly], rest: Sequence[arb], extra: int = 0, turn: bool = True
+        self,
+        centre: Sequence[arb],
+        slopes: Sequence[arb_poly],
+        uncertainty: Sequence[arb],
+        extra: int = 0,
+        turn: bool = True,
     ) -> None:
         """Make the set of a centre, derivatives along the directions, and an uncertainty.
 
@@ -762,7 +767,10 @@ class _Check:
         if not (np.isfinite(c).all() and np.isfinite(G).all() and np.isfinite(A).all()):
             raise _StepFails("the set has no bounds")
         E = [
-            centre[i] - c[i] + rest[i] + sum((_symmetric(slopes[i][j] - float(G[i, j])) for j in range(np_)), ZERO)
+            centre[i]
+            - c[i]
+            + uncertainty[i]
+            + sum((_symmetric(slopes[i][j] - float(G[i, j])) for j in range(np_)), ZERO)
             for i in range(n)
         ]
         # A state without any spread keeps its own axis, so that a torque of exactly 0 stays exactly 0.
@@ -863,11 +871,11 @@ class _Check:
         point, whole, far, order = moved
         push, slack = self.disturb(box, chords, h)
         power = h ** (order + 1)
-        rest = [_remainder(far, rate, order + 1) * power for rate in p.flow]
+        remainders = [_remainder(far, rate, order + 1) * power for rate in p.flow]
         totals = [q for q in (self.travelled, self.clock) if q is not None]
         total_rest = [_remainder(far, q.rate, order + 1) * power for q in totals]
         room = [TOLERANCE + REMAINDER_SHARE * x.rad() for x in X] + [arb(TOLERANCE)] * len(totals)
-        if not all(x.rad() < most for x, most in zip((*rest, *total_rest), room, strict=True)):
+        if not all(x.rad() < allowed for x, allowed in zip((*remainders, *total_rest), room, strict=True)):
             raise _StepFails("the remainder of a step is too wide")
         across = any(not x.is_zero() for x in push)
         crossed = [q for q, chord in chords.items() if not chord.width.is_zero()]
@@ -901,15 +909,15 @@ class _Check:
         ends = self.rates is not None or not margin.lower() > 0
         if ends and not margin_rate.upper() < 0:
             raise _StepFails("the margin may rise near the end")
-        self.renew([x + y for x, y in zip(C, rest, strict=True)], J, push)
+        self.renew([x + y for x, y in zip(C, remainders, strict=True)], J, push)
         try:
             X = self.box()
         except NotProved as reason:
             self.c, self.G, self.B, self.r = before
             raise _StepFails(str(reason)) from None
         # Nothing fails from here.
-        for q, *what in sums:
-            q.add(*what)
+        for q, *increment in sums:
+            q.add(*increment)
         for name, (low, high) in limits.items():
             self.top[name], self.bottom[name] = max(self.top[name], high), min(self.bottom[name], low)
         if ends:
@@ -1054,7 +1062,7 @@ class _Check:
         self, point: _Series, whole: _Series, far: _Series, boxed: _Series, h: arb, order: int, slack: dict[int, arb]
     ) -> dict[str, tuple[arb, arb]]:
         """Return bounds of all signals during a step: from the box, or from polynomials where that extends them."""
-        found = {}
+        bounds = {}
         for name, i in self.program.signals.items():
             y = boxed.value(i)
             low, high = y.lower(), y.upper()
@@ -1064,8 +1072,8 @@ class _Check:
                     low, high = max(low, a), min(high, b)
                 except _Undefined:
                     pass  # the box bounds the signal
-            found[name] = low, high
-        return found
+            bounds[name] = low, high
+        return bounds
 
     def polynomial_bounds(
         self, point: _Series, whole: _Series, far: _Series, i: int, h: arb, order: int, slack: arb
@@ -1078,13 +1086,13 @@ class _Check:
         slopes = [whole.slope(i, k) for k in range(order)]
         every = [v + sum((_symmetric(x) for x in s.coeffs()), ZERO) for v, s in zip(values, slopes, strict=True)]
         rates = [k * every[k] for k in range(1, order)] or [ZERO]
-        rest = far.value(i, order)
+        remainder = far.value(i, order)
         lows, highs = [], []
         for piece in range(PIECES):
             t = _between(h * piece / PIECES, h * (piece + 1) / PIECES)
             middle = t.mid()
             y = _at(values, middle) + sum((_symmetric(x) for x in _at(slopes, middle).coeffs()), ZERO)
-            y += _at(rates, t) * (t - middle) + rest * t**order + slack
+            y += _at(rates, t) * (t - middle) + remainder * t**order + slack
             if not y.is_finite():
                 raise _Undefined("a signal without bounds")
             lows.append(y.lower())
@@ -1145,10 +1153,10 @@ class _Check:
         later = alpha * margin.margin + (inverse - alpha) * margin.whole  # without the slopes of the margin
         slopes = margin.slopes * alpha
         whole = later + sum((_symmetric(x) for x in slopes.coeffs()), ZERO)
-        y = q.centre + _symmetric(q.rest) + pace * later + (rate - pace) * whole
+        y = q.centre + _symmetric(q.uncertainty) + pace * later + (rate - pace) * whole
         for j in range(max(self.np, len(slopes))):
-            own = arb(float(q.slopes[j])) if j < self.np else ZERO
-            y += _symmetric(own + pace * slopes[j])
+            slope = arb(float(q.slopes[j])) if j < self.np else ZERO
+            y += _symmetric(slope + pace * slopes[j])
         return _below(y), _above(y)
 
     # The tail.
@@ -1162,10 +1170,10 @@ class _Check:
             raise NotProved("a tail needs a loop that stops at a positive speed")
         if len(settled) != len(tail.states) or e.speed in settled:
             raise NotProved("the states of the tail are not distinct states of the loop without its speed")
-        others = set(p.states) - settled - {e.speed}
+        unsettled = set(p.states) - settled - {e.speed}
         roots = p.tick if p.tick else p.flow
         read = {p.operations[i].value for i in p.read_by(roots) if p.operations[i].name == "state"}
-        if wrong := settled - set(p.states) or others & read or (others if not p.tick else set()):
+        if wrong := settled - set(p.states) or unsettled & read or (unsettled if not p.tick else set()):
             raise NotProved(f"the tail has a state that no run needs, or lacks one: {e.states[min(wrong)]}")
         decides = {p.operations[i].value for i in p.read_by([e.acceleration]) if p.operations[i].name == "state"}
         for piece in tail.pieces:
@@ -1187,16 +1195,16 @@ class _Check:
         faster = arb(self.c[v]) - piece.middle
         for i, name in enumerate(tail.states):
             k, by_speed = p.place[p.equations.states.index(name)], arb(piece.by_speed[i])
-            off = arb(self.c[k]) - piece.centre[i] - by_speed * faster
+            distance = arb(self.c[k]) - piece.centre[i] - by_speed * faster
             spread = sum(((B[k][j] - by_speed * B[v][j]).abs_upper() * self.r[j] for j in range(self.n)), ZERO)
             for j in range(self.np):
                 along = G[k][j] - by_speed * G[v][j]
                 if j < len(tail.middle):
                     by_param = arb(piece.by_param[i][j])
-                    off -= by_param * (self.mids[j] - tail.middle[j])
+                    distance -= by_param * (self.mids[j] - tail.middle[j])
                     along -= by_param * self.halves[j]
                 spread += along.abs_upper()
-            if not (off.abs_upper() + spread).upper() <= arb(piece.width[i]):
+            if not (distance.abs_upper() + spread).upper() <= arb(piece.width[i]):
                 return False
         return True
 
@@ -1229,7 +1237,7 @@ class _Check:
         def total(q: _Quadrature | None, integral: arb, rate: arb) -> tuple[float, float]:
             if q is None:
                 return -inf, inf
-            y = q.centre + integral + _symmetric(q.rest)
+            y = q.centre + integral + _symmetric(q.uncertainty)
             for j in range(self.np):
                 y += _symmetric(arb(float(q.slopes[j])) + rate * arb(float(self.G[v, j])))
             for j in range(self.n):
@@ -1249,34 +1257,34 @@ class _Check:
         if piece is None:
             return None
         try:
-            found = self.settled_bounds(piece)
+            bounds = self.settled_bounds(piece)
         except _Undefined:
             return None
-        return found if found.stop_time[1] <= latest else None
+        return bounds if bounds.stop_time[1] <= latest else None
 
     def bounds(self, ended: bool) -> CheckedBounds:
         """Return the bounds; up to the horizon only, unless the runs ended."""
         capture, rates = self.capture, self.rates
         greatest = {name: _above(x) for name, x in self.top.items()}
-        least = {name: _below(x) for name, x in self.bottom.items()}
+        smallest = {name: _below(x) for name, x in self.bottom.items()}
         if not ended or capture is None or rates is None:
             low = _below(self.travelled.box()) if self.travelled else -inf
-            return CheckedBounds((_below(self.time().box()), inf), (low, inf), greatest, least)
+            return CheckedBounds((_below(self.time().box()), inf), (low, inf), greatest, smallest)
         return CheckedBounds(
             self.at_zero(capture.clock, rates["clock"]),
             self.at_zero(capture.travelled, rates["travelled"]),
             greatest,
-            least,
+            smallest,
         )
 
 
 def _without_slopes(series: _Series) -> _Series:
     """Return the constants of a series, with derivatives along states only, which are 0."""
-    other = _Series(series.program, series.parameters, series.start)
+    constants = _Series(series.program, series.parameters, series.start)
     for i, static in enumerate(series.program.static):
         if static:
-            other.v[i], other.d[i] = series.v[i], [NO_SLOPE]
-    return other
+            constants.v[i], constants.d[i] = series.v[i], [NO_SLOPE]
+    return constants
 
 
 def _wider(x: arb) -> arb:

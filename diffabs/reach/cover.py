@@ -125,15 +125,15 @@ def prove_box(
     if unknown := [name for name in signals if name not in equations.signals]:
         raise ValueError(f"signals: {unknown[0]!r} is no signal of this loop; there is {', '.join(equations.signals)}")
     _check_claims(claims, equations.signals)
-    wanted = tuple(dict.fromkeys([*signals, *(c.quantity.split()[1] for c in claims if " " in c.quantity)]))
-    prover = Prover(equations, wanted, horizon)
+    names = tuple(dict.fromkeys([*signals, *(c.quantity.split()[1] for c in claims if " " in c.quantity)]))
+    prover = Prover(equations, names, horizon)
     box = np.array([over[path] for path in paths], float)
     fastest = [high if path == "initial.speed" else (low + high) / 2 for path, (low, high) in over.items()]
     prover.choose_weights(np.array(fastest))
     influence = _measure_influence(prover, box, np.array(fastest), threads)
     smallest = np.maximum(SMALLEST * (box[:, 1] - box[:, 0]), FEWEST * np.spacing(np.abs(box).max(1)))
     quantities = _Quantities(prover.signals)
-    left, done, rows, refuting, tried, fitting, failure = box[None], [], [], None, 0, math.inf, ""
+    unproved, proved, rows, refuting, tried, fitting, failure = box[None], [], [], None, 0, math.inf, ""
     suspects = [point for point in suspects if ((box[:, 0] <= point) & (point <= box[:, 1])).all()]
     if suspects:
         points = np.repeat(np.asarray(suspects, float)[:, :, None], 2, 2)
@@ -143,46 +143,46 @@ def prove_box(
     if hopeless:
         failure = f"even one run is not proved: {FAILURES[int(alone.failure[0])]}"
     tail, sought = None, False
-    while len(left) and refuting is None and not hopeless and time.monotonic() - began < budget:
+    while len(unproved) and refuting is None and not hopeless and time.monotonic() - began < budget:
         if tried >= MANY and not sought:
             sought, tail = True, _find_tail(prover, over, claims, known or {}, began + budget, threads)
             prover.use_tail(tail)
-        left = left[_order_neighbours(box, left)]
-        now, left = left[:BATCH], left[BATCH:]
-        now, rest = _cut_to_size(now, fitting * LARGER, influence, smallest)
-        left = np.concatenate([left, rest])
-        found = prover.prove(now, threads)
+        unproved = unproved[_order_neighbours(box, unproved)]
+        now, unproved = unproved[:BATCH], unproved[BATCH:]
+        now, postponed = _cut_to_size(now, fitting * LARGER, influence, smallest)
+        unproved = np.concatenate([unproved, postponed])
+        cell_bounds = prover.prove(now, threads)
         if tail is not None:
-            found = _follow_to_stop(prover, quantities, claims, now, found, tail, threads)
+            cell_bounds = _follow_to_stop(prover, quantities, claims, now, cell_bounds, tail, threads)
         tried += len(now)
-        refuting = _find_violation(quantities, claims, now, found)
-        fine = (found.status > 0) & _satisfy(quantities, claims, found)
-        fitting = float(_sizes(now[fine]).max()) if fine.any() else fitting
-        done.append(now[fine])
-        rows.append([column[fine] for column in found])
-        failed = found.failure[~fine]
+        refuting = _find_violation(quantities, claims, now, cell_bounds)
+        satisfied = (cell_bounds.status > 0) & _satisfy(quantities, claims, cell_bounds)
+        fitting = float(_sizes(now[satisfied]).max()) if satisfied.any() else fitting
+        proved.append(now[satisfied])
+        rows.append([column[satisfied] for column in cell_bounds])
+        failed = cell_bounds.failure[~satisfied]
         failure = FAILURES[int(np.bincount(failed[failed > 0]).argmax())] if (failed > 0).any() else ""
         matters = _widths(now) * influence
         for claim in claims:
-            vague = (found.status > 0) & ~_satisfy(quantities, [claim], found)
-            matters[vague] = quantities.weigh_sides(claim.quantity, found, _widths(now) * influence)[vague]
-        again = now[~fine]
+            vague = (cell_bounds.status > 0) & ~_satisfy(quantities, [claim], cell_bounds)
+            matters[vague] = quantities.weigh_sides(claim.quantity, cell_bounds, _widths(now) * influence)[vague]
+        again = now[~satisfied]
         # A side that is too short is not halved, however much it matters.
-        matters = np.where(_widths(now) > smallest, matters, -1.0)[~fine]
+        matters = np.where(_widths(now) > smallest, matters, -1.0)[~satisfied]
         small = (matters < 0).all(1)
-        left = np.concatenate([left, again[small], _halve(again[~small], matters[~small])])
+        unproved = np.concatenate([unproved, again[small], _halve(again[~small], matters[~small])])
         if small.any():
             break
-        progress(f"{sum(map(len, done)):,} cells proved, {len(left):,} left")
-    cells = np.concatenate(done) if done else np.empty((0, *box.shape))
+        progress(f"{sum(map(len, proved)):,} cells proved, {len(unproved):,} left")
+    cells = np.concatenate(proved) if proved else np.empty((0, *box.shape))
     merged = CellBounds(*(np.concatenate(columns) for columns in zip(*rows, strict=True))) if rows else None
-    if not claims and not len(left) and merged is not None:
+    if not claims and not len(unproved) and merged is not None:
         cells, merged, more = _refine(
             *(prover, quantities, cells, merged, influence, smallest, known or {}),
             *(began + budget, progress, threads),
         )
         tried += more
-    covered = not len(left) and merged is not None
+    covered = not len(unproved) and merged is not None
     if covered and not comes_from_halving(box.tolist(), cells.tolist()):
         raise AssertionError("the cells do not cover the box")
     bounds = quantities.over_all(merged) if covered and merged is not None else quantities.unbounded
@@ -192,13 +192,13 @@ def prove_box(
     if verdict == "proved" and (contradiction := name_contradiction(bounds, known or {})):
         verdict, failure, bounds = "undecided", contradiction, quantities.unbounded
     return BoxProof(
-        *(verdict, bounds, cells, merged, left, refuting, failure if verdict == "undecided" else "", tried),
+        *(verdict, bounds, cells, merged, unproved, refuting, failure if verdict == "undecided" else "", tried),
         *(time.monotonic() - began, equations, prover, tail),
     )
 
 
 def _follow_to_stop(
-    prover: Prover, quantities: "_Quantities", claims: Sequence[RunClaim], cells: np.ndarray, found: CellBounds,
+    prover: Prover, quantities: "_Quantities", claims: Sequence[RunClaim], cells: np.ndarray, cell_bounds: CellBounds,
     tail: RunTail, threads: int | None,
 ) -> CellBounds:  # fmt: skip
     """Return the bounds of cells; those that miss a claim about the stop are proved again without the tail.
@@ -206,25 +206,25 @@ def _follow_to_stop(
     The tail has one range of the deceleration for all parameters, so its bounds of the stop are wider.
     """
     stops = [claim for claim in claims if " " not in claim.quantity]
-    vague = np.flatnonzero((found.status > 0) & ~_satisfy(quantities, stops, found))
+    vague = np.flatnonzero((cell_bounds.status > 0) & ~_satisfy(quantities, stops, cell_bounds))
     if not len(vague):
-        return found
+        return cell_bounds
     prover.use_tail(None)
     again = prover.prove(cells[vague], threads)
     prover.use_tail(tail)
     better = again.status > 0
-    for column, other in zip(found, again, strict=True):
-        column[vague[better]] = other[better]
-    return found
+    for column, replacement in zip(cell_bounds, again, strict=True):
+        column[vague[better]] = replacement[better]
+    return cell_bounds
 
 
 def _find_tail(
     prover: Prover, over: Mapping[str, tuple[float, float]], claims: Sequence[RunClaim],
-    known: Mapping[str, tuple[float, float]], until: float, threads: int | None,
+    extremes: Mapping[str, tuple[float, float]], until: float, threads: int | None,
 ) -> RunTail | None:  # fmt: skip
     """Return a tail of the runs in which all claims hold, or None."""
     bounds = [claim.bound for claim in claims if claim.quantity == "greatest slip"]
-    greatest = min(bounds, default=known.get("greatest slip", (0.0, math.inf))[1])
+    greatest = min(bounds, default=extremes.get("greatest slip", (0.0, math.inf))[1])
     stops = not claims or any(" " not in claim.quantity for claim in claims)
     width = NARROW_TAIL_WIDTH if stops else TAIL_WIDTH
     tail = find_tail(prover, over, width, greatest, until=until, threads=threads)
@@ -248,27 +248,27 @@ class _Quantities:
         pairs = (f"{word} {name}" for name in self.signals for word in ("greatest", "least"))
         return [*pairs, "stop_time", "stop_distance"]
 
-    def of_cells(self, found: CellBounds, name: str) -> tuple[np.ndarray, np.ndarray]:
+    def of_cells(self, cell_bounds: CellBounds, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return, for each cell, proved lower and upper bounds of a quantity of all its runs."""
         if " " not in name:
-            both = found.time if name == "stop_time" else found.distance
+            both = cell_bounds.time if name == "stop_time" else cell_bounds.distance
             return both[:, 0], both[:, 1]
         word, signal = name.split()
         i = self.signals.index(signal)
         if word == "greatest":
-            return found.above[:, i], found.greatest[:, i]
-        return found.least[:, i], found.below[:, i]
+            return cell_bounds.above[:, i], cell_bounds.greatest[:, i]
+        return cell_bounds.least[:, i], cell_bounds.below[:, i]
 
-    def weigh_sides(self, name: str, found: CellBounds, otherwise: np.ndarray) -> np.ndarray:
+    def weigh_sides(self, name: str, cell_bounds: CellBounds, otherwise: np.ndarray) -> np.ndarray:
         """Return about how much each side of a cell widens its bounds of a quantity, shape (cells, sides).
 
         If no side does, return the row of `otherwise`.
         """
-        own = found.reach[:, ("stop_time", "stop_distance").index(name) + 1 if " " not in name else 0]
-        return np.where((own > 0).any(1, keepdims=True), own, otherwise)
+        influence = cell_bounds.reach[:, ("stop_time", "stop_distance").index(name) + 1 if " " not in name else 0]
+        return np.where((influence > 0).any(1, keepdims=True), influence, otherwise)
 
-    def over_all(self, found: CellBounds) -> dict[str, tuple[float, float]]:
-        pairs = {name: self.of_cells(found, name) for name in self.names()}
+    def over_all(self, cell_bounds: CellBounds) -> dict[str, tuple[float, float]]:
+        pairs = {name: self.of_cells(cell_bounds, name) for name in self.names()}
         return {name: (float(low.min()), float(high.max())) for name, (low, high) in pairs.items()}
 
     def name_unbounded(self, bounds: Mapping[str, tuple[float, float]]) -> str:
@@ -286,46 +286,46 @@ class _Quantities:
 
 def _check_claims(claims: Sequence[RunClaim], signals: Collection[str]) -> None:
     """Raise a ValueError unless each claim is about one of these signals, the stop time or distance, with a bound."""
-    known = _Quantities(tuple(signals)).names()
+    quantities = _Quantities(tuple(signals)).names()
     for claim in claims:
-        if claim.quantity not in known:
+        if claim.quantity not in quantities:
             names = f"stop_time, stop_distance, and greatest NAME or least NAME of a signal: {', '.join(signals)}"
             raise ValueError(f"claims: {claim.quantity!r} is no quantity of this loop; there is {names}")
         if not math.isfinite(claim.bound):
             raise ValueError(f"claims: {claim.quantity} has the bound {claim.bound:g}, outside (-inf, inf)")
 
 
-def _satisfy(quantities: _Quantities, claims: Sequence[RunClaim], found: CellBounds) -> np.ndarray:
+def _satisfy(quantities: _Quantities, claims: Sequence[RunClaim], cell_bounds: CellBounds) -> np.ndarray:
     """Return the cells in which every run satisfies all claims."""
-    fine = np.ones(len(found.status), bool)
+    satisfied = np.ones(len(cell_bounds.status), bool)
     for claim in claims:
-        low, high = quantities.of_cells(found, claim.quantity)
-        fine &= low >= claim.bound if claim.quantity.startswith("least") else high <= claim.bound
-    return fine
+        low, high = quantities.of_cells(cell_bounds, claim.quantity)
+        satisfied &= low >= claim.bound if claim.quantity.startswith("least") else high <= claim.bound
+    return satisfied
 
 
 def _find_violation(
-    quantities: _Quantities, claims: Sequence[RunClaim], cells: np.ndarray, found: CellBounds
+    quantities: _Quantities, claims: Sequence[RunClaim], cells: np.ndarray, cell_bounds: CellBounds
 ) -> np.ndarray | None:
     """Return a cell in which every run violates a claim, or None."""
     for claim in claims:
-        low, high = quantities.of_cells(found, claim.quantity)
+        low, high = quantities.of_cells(cell_bounds, claim.quantity)
         wrong = high < claim.bound if claim.quantity.startswith("least") else low > claim.bound
         # A stop needs a cell that ended. A signal went above its value even if the proof broke off later.
-        wrong = wrong & (found.status == 1) if " " not in claim.quantity else wrong
+        wrong = wrong & (cell_bounds.status == 1) if " " not in claim.quantity else wrong
         if wrong.any():
             return cells[np.flatnonzero(wrong)[0]]
     return None
 
 
-def name_contradiction(bounds: Mapping[str, tuple[float, float]], known: Mapping[str, tuple[float, float]]) -> str:
+def name_contradiction(bounds: Mapping[str, tuple[float, float]], extremes: Mapping[str, tuple[float, float]]) -> str:
     """Return in words the first bound that a run violates by more than the errors of runs, empty without any.
 
-    `known` has the least and greatest value of quantities in simulated runs.
+    `extremes` has the least and greatest value of quantities in simulated runs.
     """
-    for name, (least, greatest) in known.items():
+    for name, (smallest, greatest) in extremes.items():
         low, high = bounds.get(name, (-math.inf, math.inf))
-        for run, bound, beyond in ((least, low, low - least), (greatest, high, greatest - high)):
+        for run, bound, beyond in ((smallest, low, low - smallest), (greatest, high, greatest - high)):
             if beyond > RUN_ERROR * abs(run):
                 return f"a simulated run has {name} = {run:.6g}, beyond the bound {bound:.6g}: one of the two is wrong"
     return ""
@@ -339,10 +339,10 @@ def _measure_influence(prover: Prover, box: np.ndarray, point: np.ndarray, threa
     sides = box[:, 1] - box[:, 0]
     for share in PROBE_SIZES:
         cell = np.stack([np.maximum(point - share * sides, box[:, 0]), point], 1)
-        found = prover.prove(cell[None], threads)
-        if found.status[0] and (found.reach[0, 0] > 0).any():
+        cell_bounds = prover.prove(cell[None], threads)
+        if cell_bounds.status[0] and (cell_bounds.reach[0, 0] > 0).any():
             widths = cell[:, 1] - cell[:, 0]
-            influence = found.reach[0, 0] / np.where(widths > 0, widths, 1.0)
+            influence = cell_bounds.reach[0, 0] / np.where(widths > 0, widths, 1.0)
             break
     else:
         influence = 1 / np.where(sides > 0, sides, 1.0)
@@ -357,9 +357,9 @@ def _halve(cells: np.ndarray, matters: np.ndarray) -> np.ndarray:
     side = matters.argmax(1)
     rows = np.arange(len(cells))
     middle = 0.5 * (cells[rows, side, 0] + cells[rows, side, 1])
-    left, right = cells.copy(), cells.copy()
-    left[rows, side, 1] = right[rows, side, 0] = middle
-    return np.concatenate([left, right])
+    lower, upper = cells.copy(), cells.copy()
+    lower[rows, side, 1] = upper[rows, side, 0] = middle
+    return np.concatenate([lower, upper])
 
 
 def _order_neighbours(box: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -394,14 +394,14 @@ def _cut_to_size(
     A cell that is larger than `largest` is halved untried, as its neighbours of that size could not be proved. A few
     stay as they are: if they are proved, larger cells are tried again.
     """
-    kept, cells = cells[:LARGER_TRIED], cells[LARGER_TRIED:]
+    uncut, cells = cells[:LARGER_TRIED], cells[LARGER_TRIED:]
     while len(cells) < 4 * BATCH:
         matters = np.where(_widths(cells) > smallest, _widths(cells) * influence, 0.0)
         wide = (_sizes(cells) > largest) & (matters > 0).any(1)
         if not wide.any():
             break
         cells = np.concatenate([cells[~wide], _halve(cells[wide], matters[wide])])
-    cells = np.concatenate([kept, cells])
+    cells = np.concatenate([uncut, cells])
     return cells[:BATCH], cells[BATCH:]
 
 
@@ -429,11 +429,11 @@ def comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[PyTree]) 
             continue
         for i, (low, high) in enumerate(part):
             middle = 0.5 * (low + high)
-            left = [cell for cell in inside if cell[i][1] <= middle]
-            right = [cell for cell in inside if cell[i][0] >= middle]
-            if left and right and len(left) + len(right) == len(inside):
+            below = [cell for cell in inside if cell[i][1] <= middle]
+            above = [cell for cell in inside if cell[i][0] >= middle]
+            if below and above and len(below) + len(above) == len(inside):
                 # No other halving need be tried: the cells of a tree that lie in one half are a tree of that half.
-                halves = ([low, middle], left), ([middle, high], right)
+                halves = ([low, middle], below), ([middle, high], above)
                 parts += [([*part[:i], ends, *part[i + 1 :]], some) for ends, some in halves]
                 break
         else:
@@ -443,16 +443,16 @@ def comes_from_halving(box: Sequence[Sequence[float]], cells: Sequence[PyTree]) 
 
 def _refine(
     prover: Prover, quantities: _Quantities, cells: np.ndarray, rows: CellBounds,
-    influence: np.ndarray, smallest: np.ndarray, known: Mapping[str, tuple[float, float]],
+    influence: np.ndarray, smallest: np.ndarray, extremes: Mapping[str, tuple[float, float]],
     until: float, progress: Callable[[str], None], threads: int | None,
 ) -> tuple[np.ndarray, CellBounds, int]:  # fmt: skip
     """Halve the cells whose bounds are far from the least and the greatest value found, until the time is over."""
     tried = 0
     while time.monotonic() < until:
         matters = np.zeros(cells.shape[:2])
-        for name, (least, greatest) in known.items():
+        for name, (lowest, greatest) in extremes.items():
             low, high = quantities.of_cells(rows, name)
-            for excess, size in ((high - greatest, abs(greatest)), (least - low, abs(least))):
+            for excess, size in ((high - greatest, abs(greatest)), (lowest - low, abs(lowest))):
                 order = np.argsort(excess)[::-1][: BATCH // 2]
                 loose = order[excess[order] > CLOSE * size]
                 matters[loose] = quantities.weigh_sides(name, rows, _widths(cells) * influence)[loose]
@@ -461,16 +461,16 @@ def _refine(
         if not worst.any():
             break
         halves = _halve(cells[worst], matters[worst])
-        found = prover.prove(halves, threads)
+        cell_bounds = prover.prove(halves, threads)
         tried += len(halves)
         n = int(worst.sum())
-        better = (found.status[:n] > 0) & (found.status[n:] > 0)
+        better = (cell_bounds.status[:n] > 0) & (cell_bounds.status[n:] > 0)
         keep = np.logical_not(worst)
         keep[np.flatnonzero(worst)[~better]] = True
         new = np.concatenate([better, better])
         if not new.any():
             break
         cells = np.concatenate([cells[keep], halves[new]])
-        rows = CellBounds(*(np.concatenate([a[keep], b[new]]) for a, b in zip(rows, found, strict=True)))
+        rows = CellBounds(*(np.concatenate([a[keep], b[new]]) for a, b in zip(rows, cell_bounds, strict=True)))
         progress(f"{len(cells):,} cells proved, refining the worst")
     return cells, rows, tried

@@ -94,13 +94,13 @@ def library() -> ctypes.CDLL:
     sources = [(PROVER_FOLDER / name).read_text() for name in ("interval.h", "set.h", "series.h", "prove.cpp")]
     text = "\n".join(re.sub(r'#include "[a-z.]*"|#pragma once', "", source) for source in sources)
     try:
-        found = ctypes.CDLL(str(toolchain.build_library(text, FLAGS)))
+        native = ctypes.CDLL(str(toolchain.build_library(text, FLAGS)))
     except OSError as error:
         raise toolchain.NoCompiler(str(error)) from None
-    found.prove.restype = ctypes.c_long
-    if found.rounds_upward() != 1:
+    native.prove.restype = ctypes.c_long
+    if native.rounds_upward() != 1:
         raise toolchain.NoCompiler(f"{toolchain.find_compiler().version} ignores the rounding mode")
-    return found
+    return native
 
 
 def apply_operation(name: str, a: np.ndarray, b: np.ndarray | None = None) -> np.ndarray:
@@ -164,10 +164,10 @@ class Prover:
         equations: Equations of the loop.
         signals: Names of the signals whose range is wanted.
         horizon: Duration after which a run is no longer followed [s].
-        weights: Units of Lohner's step, shape (WEIGHT_TABLES, kept states); a choice, no part of the proof.
-        kept: Indices of the states that are kept over a tick.
+        weights: Units of Lohner's step, shape (WEIGHT_TABLES, persistent states); a choice, no part of the proof.
+        persistent: Indices of the states that are kept over a tick.
         moving: Indices of these and of the states that a tick sets.
-        clockwork: Places among the kept states of those that are the same in all runs.
+        clockwork: Places among the persistent states of those that are the same in all runs.
     """
 
     def __init__(
@@ -186,17 +186,17 @@ class Prover:
         e = self.equations = equations
         self.signals, self.horizon = tuple(signals), horizon
         order = order or (CONTINUOUS_ORDER if equations.period is None else SAMPLED_ORDER)
-        kept, passing, quadratures = arrange_states(e, self.signals)
-        states = [*kept, *passing, *quadratures]
+        persistent, passing, quadratures = arrange_states(e, self.signals)
+        states = [*persistent, *passing, *quadratures]
         place = {state: i for i, state in enumerate(states)}
-        if e.paced and place[e.clock] < len(kept) + len(passing):
+        if e.paced and place[e.clock] < len(persistent) + len(passing):
             raise NoRule("a continuous loop of a braked wheel that reads the time")
         for operation in e.operations:
             if operation.name == "clamp" and any(e.operations[x].name != "const" for x in operation.args[1:] if x >= 0):
                 raise NoRule("a limit that is not a number")
-        self.kept, self.moving = kept, [*kept, *passing]
-        self.clockwork = [place[i] for i in clockwork_states(e, kept)]
-        moving = len(kept) + len(passing)
+        self.persistent, self.moving = persistent, [*persistent, *passing]
+        self.clockwork = [place[i] for i in clockwork_states(e, persistent)]
+        moving = len(persistent) + len(passing)
         roots = {
             "start": [e.start[i] for i in states],
             "flow": [e.flow[i] for i in states],
@@ -205,13 +205,13 @@ class Prover:
         }
         self._arrays = {name: np.array(column, np.int32) for name, column in roots.items()}
         self._arrays |= _tape_arrays(e, place)
-        self.weights = np.ones((WEIGHT_TABLES, max(1, len(kept))))
+        self.weights = np.ones((WEIGHT_TABLES, max(1, len(persistent))))
         at = {name: column.ctypes.data for name, column in self._arrays.items()}
         columns = (at[name] for name in ("code", "a", "b", "c", "low", "high", "index"))
         low, high = decimal_ends(e.period) if e.period else (0.0, 0.0)
         self.task = _Task(
             _Tape(len(e.operations), *columns, len(e.params), moving),
-            *(moving, len(kept), len(quadratures)),
+            *(moving, len(persistent), len(quadratures)),
             *(at["start"], at["flow"], at["tick"], len(self.signals), at["signal"]),
             *(e.margin, place.get(e.travelled, -1), place.get(e.clock, -1) if e.paced else -1),
             *(place[e.nonnegative[0]] if e.nonnegative else -1, place.get(e.speed, -1), e.acceleration),
@@ -227,7 +227,7 @@ class Prover:
         if tail is None or not tail.pieces:
             self.task.pieces = 0
             return
-        pieces, n = tail.pieces, len(self.kept)
+        pieces, n = tail.pieces, len(self.persistent)
         names = [self.equations.states[i] for i in self.moving]
         settled = [names.index(name) for name in tail.states]
         by_param = np.zeros((len(pieces), n, len(tail.middle)))
@@ -309,21 +309,21 @@ class Prover:
         return _run_in_threads([lambda group=group: prove_group(*group) for group in groups], threads, stop)
 
     def scout(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return speeds [m/s] (or times [s]), kept states and absolute Jacobians of the periods of one run."""
-        n = len(self.kept)
-        found = np.zeros((SCOUTED, 1 + n + n * n))
+        """Return speeds [m/s] (or times [s]), persistent states and absolute Jacobians of the periods of one run."""
+        n = len(self.persistent)
+        rows = np.zeros((SCOUTED, 1 + n + n * n))
         cell = np.repeat(np.asarray(point, float)[None, :, None], 2, 2)
-        (count,) = self._call([(cell, np.zeros((1, self._width)))], scout=found)
-        found = found[:count][np.isfinite(found[:count]).all(1)]  # the first has no axes yet
-        return found[:, 0], found[:, 1 : 1 + n], np.abs(found[:, 1 + n :]).reshape(len(found), n, n)
+        (count,) = self._call([(cell, np.zeros((1, self._width)))], scout=rows)
+        rows = rows[:count][np.isfinite(rows[:count]).all(1)]  # the first has no axes yet
+        return rows[:, 0], rows[:, 1 : 1 + n], np.abs(rows[:, 1 + n :]).reshape(len(rows), n, n)
 
-    def share_weights(self, other: "Prover") -> None:
+    def share_weights(self, prover: "Prover") -> None:
         """Take the units of the axes from another prover of the same states, whose weights were chosen."""
-        self.weights[:] = other.weights
-        self.task.keys_low, self.task.keys_high = other.task.keys_low, other.task.keys_high
+        self.weights[:] = prover.weights
+        self.task.keys_low, self.task.keys_high = prover.task.keys_low, prover.task.keys_high
 
     def weights_at(self, speed: float) -> np.ndarray:
-        """Return the units of the axes at a speed [m/s], shape (kept states,)."""
+        """Return the units of the axes at a speed [m/s], shape (persistent states,)."""
         low, high = self.task.keys_low, self.task.keys_high
         place = (np.log(max(speed, 1e-3)) - low) / max(high - low, 1e-9) * WEIGHT_TABLES
         return self.weights[int(np.clip(place, 0, WEIGHT_TABLES - 1))]
@@ -333,7 +333,7 @@ class Prover:
 
         Without them a contracting map wraps the set and lets it grow.
         """
-        if not self.kept:
+        if not self.persistent:
             return
         keys, _, jacobians = self.scout(point)
         if not len(keys):
@@ -357,11 +357,11 @@ def _run_in_threads(calls: Sequence[Callable[[], int]], threads: int, stop: ctyp
     No signal reaches Python during a native call in the main thread, and a process waits at its end for the threads of
     an executor. So the calls run in daemon threads.
     """
-    results, errors, left = [0] * len(calls), list[BaseException](), iter(range(len(calls)))
+    results, errors, pending = [0] * len(calls), list[BaseException](), iter(range(len(calls)))
 
     def work() -> None:
         try:
-            for i in left:
+            for i in pending:
                 if stop.value:
                     return
                 results[i] = calls[i]()
@@ -416,17 +416,17 @@ def clockwork_states(e: Equations, states: list[int]) -> list[int]:
 
 def read_by(e: Equations, roots: Sequence[int]) -> tuple[set[int], set[int]]:
     """Return the states and the parameters that operations read, through their operands."""
-    states, params, left, seen = set(), set(), list(roots), set()
-    while left:
-        i = left.pop()
-        if i in seen or i < 0:
+    states, params, pending, visited = set(), set(), list(roots), set()
+    while pending:
+        i = pending.pop()
+        if i in visited or i < 0:
             continue
-        seen.add(i)
+        visited.add(i)
         if e.operations[i].name == "state":
             states.add(e.operations[i].value)
         if e.operations[i].name == "param":
             params.add(e.operations[i].value)
-        left += list(e.operations[i].args)
+        pending += list(e.operations[i].args)
     return states, params
 
 
@@ -454,7 +454,7 @@ def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], lis
     A quadrature is a state that nothing reads, such as the distance. There is no rule for a tick that changes a state
     that the stop reads.
     """
-    asked = read_by(e, [e.margin])[0]
+    margin_states = read_by(e, [e.margin])[0]
     integrals = [i for i in (e.travelled, e.clock if e.paced else -1) if i >= 0]
     live = read_by(e, [e.margin, *(e.signals[name] for name in signals), *(e.flow[i] for i in integrals)])[0]
     live |= set(e.nonnegative)  # the equations hold only where these are not negative
@@ -466,8 +466,8 @@ def arrange_states(e: Equations, signals: Sequence[str]) -> tuple[list[int], lis
     quadratures = [i for i in integrals if i not in live]
     if not e.tick:
         return sorted(live), [], quadratures
-    for i in asked:
+    for i in margin_states:
         if e.operations[e.tick[i]] != RealOperation("state", (), i):
             raise NoRule(f"the stop reads {e.states[i]}, which a tick changes")
-    kept = read_by(e, [e.tick[i] for i in live])[0] | asked
-    return sorted(kept), sorted(live - kept), quadratures
+    persistent = read_by(e, [e.tick[i] for i in live])[0] | margin_states
+    return sorted(persistent), sorted(live - persistent), quadratures

@@ -168,16 +168,16 @@ class RealGraph(Graph):
             value = exact[name](*(Fraction(float(arg.attr)) for arg in args))
             if abs(value) < 2**1000 and Fraction(float(value)) == value:
                 return self.const(float(value), args[0].dtype)
-        found = _simplify(self, name, args)
-        return self._make(name, args, args[0].dtype) if found is None else found
+        simpler = _simplify(self, name, args)
+        return self._make(name, args, args[0].dtype) if simpler is None else simpler
 
     def bits(self, x: Node, dtype: DTypeLike) -> Node:
         """Refuse the bits of a number, which real numbers have not."""
         raise Unsupported("lt_to", "a proof has no rule for a search in a table, as of jnp.interp or jnp.searchsorted")
 
-    def any(self, which: Node) -> Node:
+    def any(self, condition: Node) -> Node:
         """Return the condition itself: a result of a branch that no lane takes is a placeholder only in a kernel."""
-        return which
+        return condition
 
 
 def _is_finite(node: Node) -> bool:
@@ -220,7 +220,7 @@ def _simplify(graph: RealGraph, name: str, args: tuple[Node, ...]) -> Node | Non
     return None
 
 
-def tick_clock(own: float, t: Scalar, h: Scalar, k: Scalar) -> Clock:
+def tick_clock(loop_period: float, t: Scalar, h: Scalar, k: Scalar) -> Clock:
     """Return the clock at a tick of every block, whose number is k; a block of another period has no rule."""
 
     class Tick(Clock):
@@ -230,8 +230,8 @@ def tick_clock(own: float, t: Scalar, h: Scalar, k: Scalar) -> Clock:
                 raise NoRule("a block ticks with the integration grid, which a proof has not")
             if isinstance(period, Tracer):
                 raise NoRule("a block whose period is not its parameter `period`")
-            if period is not None and float(period) != own:
-                raise NoRule(f"clocks of different periods: {own:g} s, {float(period):g} s")
+            if period is not None and float(period) != loop_period:
+                raise NoRule(f"clocks of different periods: {loop_period:g} s, {float(period):g} s")
             return jnp.asarray(True), self.k
 
     return Tick(t, h, k, None)
@@ -260,22 +260,24 @@ class _Derivation:
     def __init__(self, loop: Loop, paths: tuple[str, ...]):
         self.loop = jax.tree.map(lambda x: np.asarray(x, float) if np.asarray(x).dtype.kind == "f" else x, loop)
         self.paths, self.graph = paths, RealGraph()
-        known = {path: value for path, _, value in parameters(self.loop)}
+        values = {path: value for path, _, value in parameters(self.loop)}
         for path in paths:
-            if path not in known:
+            if path not in values:
                 raise NoRule(f"{path} is not a parameter of the loop")
-            if np.ndim(known[path]):
+            if np.ndim(values[path]):
                 raise NoRule(f"{path} is a list; a proof varies single numbers")
             if path.split(".")[0] in BLOCKS and path.split(".")[-1] in ("period", "delay"):
                 raise NoRule(f"{path}: the proof has no rule for a range of periods or delays")
         self.period = _clock_of(self.loop)
-        self.given = [self.graph.input(np.float64, UpdateLevel.UNIFORM, (PARAM, i)) for i in range(len(paths))]
+        self.parameter_nodes = [
+            self.graph.input(np.float64, UpdateLevel.UNIFORM, (PARAM, i)) for i in range(len(paths))
+        ]
         state = loop.start().plant
         fields = set(getattr(state, "_fields", ()))
         self.charted = loop.plant.shows is BrakeOutput and isinstance(loop.initial, BrakeStart)
         self.charted &= "distance" in fields and len(fields) == len(_Chart._fields)
         self.operations: list[RealOperation] = []
-        self.known: dict[Any, int] = {}
+        self.indices: dict[Any, int] = {}
         self.converted: dict[Any, dict[int, int]] = {}
 
     def lower(self, function: Callable[..., Any], *groups: list[Node]) -> list[Node]:
@@ -283,20 +285,20 @@ class _Derivation:
 
         The loop has the parameters of the box and all its numbers as inputs, so that Python computes with none.
         """
-        shown, made = jax.tree_util.tree_flatten_with_path(self.loop)
+        shown, structure = jax.tree_util.tree_flatten_with_path(self.loop)
         fixed = [x for path, x in shown if _is_traced(path, x)]
 
-        def call(numbers: list[Any], values: list[Any], *rest: PyTree) -> PyTree:
-            given = iter(numbers)
-            leaves = [next(given) if _is_traced(path, x) else x for path, x in shown]
-            loop = replace(jax.tree.unflatten(made, leaves), dict(zip(self.paths, values, strict=True)))
-            return function(loop, *rest)
+        def call(numbers: list[Any], values: list[Any], *arguments: PyTree) -> PyTree:
+            stream = iter(numbers)
+            leaves = [next(stream) if _is_traced(path, x) else x for path, x in shown]
+            loop = replace(jax.tree.unflatten(structure, leaves), dict(zip(self.paths, values, strict=True)))
+            return function(loop, *arguments)
 
-        shapes = [[jax.ShapeDtypeStruct((), node.dtype) for node in group] for group in (self.given, *groups)]
+        shapes = [[jax.ShapeDtypeStruct((), node.dtype) for node in group] for group in (self.parameter_nodes, *groups)]
         closed = jax.make_jaxpr(call)([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in fixed], *shapes)
         constants = [constant_array(self.graph, np.asarray(x)) for x in closed.consts]
         inputs: list[Array] = [constant_array(self.graph, x) for x in fixed]
-        inputs += [scalar_array(node) for group in (self.given, *groups) for node in group]
+        inputs += [scalar_array(node) for group in (self.parameter_nodes, *groups) for node in group]
         try:
             return [x for array in lower_jaxpr(self.graph, closed.jaxpr, constants, inputs) for x in array.flat]
         except Unsupported as error:
@@ -306,7 +308,7 @@ class _Derivation:
         """Return the equations; the states are those of the loop's memory, in its order, then the time."""
         start, rates, after, show = self.programs()
         first = jax.eval_shape(self.chart, self.loop)
-        shown, made = jax.tree_util.tree_leaves_with_path(first), jax.tree.structure(first)
+        shown, structure = jax.tree_util.tree_leaves_with_path(first), jax.tree.structure(first)
         names: list[str] = []
         for (_, leaf), path in zip(shown, _state_names([path for path, _ in shown]), strict=True):
             if not np.issubdtype(leaf.dtype, np.floating):
@@ -321,7 +323,7 @@ class _Derivation:
                 size = int(np.prod(leaf.shape))
                 leaves.append(jnp.stack(numbers[at : at + size]).reshape(leaf.shape) if leaf.ndim else numbers[at])
                 at += size
-            return jax.tree.unflatten(made, leaves)
+            return jax.tree.unflatten(structure, leaves)
 
         def flat(tree: PyTree) -> list[Any]:
             return [jnp.asarray(x, float) for leaf in jax.tree.leaves(tree) for x in jnp.ravel(leaf)]
@@ -334,13 +336,13 @@ class _Derivation:
             raise NoRule("a memory whose rate has another shape, or a signal that is no single number")
         slip, speed, travelled = chart = [names.index(f"plant.{x}") if self.charted else -1 for x in _Chart._fields]
         if self.charted:
-            own = self.lower(lambda loop, z: flat(self.loop_state(loop, state_of(z[:-1])).plant), nodes)
+            plant_nodes = self.lower(lambda loop, z: flat(self.loop_state(loop, state_of(z[:-1])).plant), nodes)
             rates_of_own = [moved[i] for i in sorted(chart)]
-            shown_rates = self.chart_rates(own, rates_of_own, _Chart(*(nodes[i] for i in chart)))
+            shown_rates = self.chart_rates(plant_nodes, rates_of_own, _Chart(*(nodes[i] for i in chart)))
             for i, rate in zip(chart, shown_rates, strict=True):
                 moved[i] = rate
         # The slip and the speed that the plant computes from its own states are the states of the chart.
-        same = {shows[0].id: ("state", slip), shows[1].id: ("state", speed)} if self.charted else {}
+        chart_states = {shows[0].id: ("state", slip), shows[1].id: ("state", speed)} if self.charted else {}
         initial = {name: self.initial_node(name) for name in ("slip", "speed")} if self.charted else {}
         at_start = (
             {begun[i].id: initial[name] for i, name in ((slip, "slip"), (speed, "speed"))} if self.charted else {}
@@ -354,17 +356,17 @@ class _Derivation:
             for name, root in zip(names[:-1], ticks, strict=True):
                 if not _nodes_below(root).isdisjoint(grid):
                     raise NoRule(f"{name} depends on the number of its tick or on the step of the integration grid")
-            ticked = [self.convert(x, same) for x in ticks] + [self.make("state", (), n)]
+            ticked = [self.convert(x, chart_states) for x in ticks] + [self.make("state", (), n)]
             for i in (slip, speed, travelled) if self.charted else ():
                 ticked[i] = self.make("state", (), i)  # a tick does not move the plant
-        flow = [self.convert(x, same) for x in moved] + [self.make("const", (), 1.0)]
+        flow = [self.convert(x, chart_states) for x in moved] + [self.make("const", (), 1.0)]
         # The slip moves at a rate that goes with 1/v. With d eta = dt/v it does not, and one step suits all speeds.
         acceleration = flow[speed] if self.charted else -1
         paced = self.charted and self.period is None
         if paced:
             flow = [self.pace_rate(x, speed) for x in flow]
-        signals = {name: self.convert(x, same) for name, x in zip(signal_names, shows[:-1], strict=True)}
-        margin = self.convert(shows[-1], same)
+        signals = {name: self.convert(x, chart_states) for name, x in zip(signal_names, shows[:-1], strict=True)}
+        margin = self.convert(shows[-1], chart_states)
         if self.charted:
             check_slip_chart(self.loop, self.paths)
         return Equations(
@@ -413,24 +415,24 @@ class _Derivation:
 
         return self.chart, rates, after, show
 
-    def chart_rates(self, own: list[Node], rates: list[Node], chart: "_Chart") -> list[Node]:
+    def chart_rates(self, plant_nodes: list[Node], rates: list[Node], chart: "_Chart") -> list[Node]:
         """Return the rates of slip, speed and distance from those of the plant's own states.
 
         The graph of the speeds v and w in the plant's output is differentiated here. A derivative that a part declares
         need not be that of its values.
         """
-        graph, made = self.graph, jax.tree.structure(self.loop.start().plant)
-        inputs = [graph.input(np.float64, UpdateLevel.STEP, (OWN, i)) for i in range(len(own))]
+        graph, structure = self.graph, jax.tree.structure(self.loop.start().plant)
+        inputs = [graph.input(np.float64, UpdateLevel.STEP, (OWN, i)) for i in range(len(plant_nodes))]
 
         def speeds(loop: Loop, x: list[Any]) -> list[Any]:
-            y = loop.plant.output(jax.tree.unflatten(made, x))
+            y = loop.plant.output(jax.tree.unflatten(structure, x))
             return [jnp.asarray(y.speed, float), jnp.asarray(y.wheel_speed, float)]
 
-        known = {x.id: rate for x, rate in zip(inputs, rates, strict=True)}
-        put = {x.id: state for x, state in zip(inputs, own, strict=True)}
-        dv, dw = (self.substitute(_tangent(graph, root, known), put) for root in self.lower(speeds, inputs))
+        tangents = {x.id: rate for x, rate in zip(inputs, rates, strict=True)}
+        substitutes = {x.id: state for x, state in zip(inputs, plant_nodes, strict=True)}
+        dv, dw = (self.substitute(_tangent(graph, root, tangents), substitutes) for root in self.lower(speeds, inputs))
         loss = graph.op("sub", graph.op("mul", graph.op("sub", graph.const(1.0), chart.slip), dv), dw)
-        return [graph.op("div", loss, chart.speed), dv, jax.tree.unflatten(made, rates).distance]
+        return [graph.op("div", loss, chart.speed), dv, jax.tree.unflatten(structure, rates).distance]
 
     def chart(self, loop: Loop) -> PyTree:
         """Return the start of the loop in the coordinates of the proof."""
@@ -444,24 +446,24 @@ class _Derivation:
         """Return the node of a parameter of the start."""
         path = f"initial.{name}"
         if path in self.paths:
-            return self.given[self.paths.index(path)]
+            return self.parameter_nodes[self.paths.index(path)]
         return self.graph.const(float(getattr(self.loop.initial, name)))
 
-    def substitute(self, node: Node, known: dict[int, Node]) -> Node:
-        """Return a node with other nodes in place of those in `known`, by number; `known` gets each one."""
-        for one in live_nodes([node]):
-            if one.id not in known:
-                args = [known[arg.id] for arg in one.args]
-                known[one.id] = self.graph.again(one, args) if args else one
-        return known[node.id]
+    def substitute(self, node: Node, replacements: dict[int, Node]) -> Node:
+        """Return a node with other nodes in place of those in `replacements`, by number; that gets each node."""
+        for original in live_nodes([node]):
+            if original.id not in replacements:
+                args = [replacements[arg.id] for arg in original.args]
+                replacements[original.id] = self.graph.again(original, args) if args else original
+        return replacements[node.id]
 
     def make(self, name: str, args: tuple[int, ...], value: Any = None) -> int:
         """Return the index of an operation, which is added if it is new."""
         key = (name, args, value)
-        if key not in self.known:
+        if key not in self.indices:
             self.operations.append(RealOperation(*key))
-            self.known[key] = len(self.operations) - 1
-        return self.known[key]
+            self.indices[key] = len(self.operations) - 1
+        return self.indices[key]
 
     def number(self, value: float) -> int:
         """Return the index of a constant."""
@@ -479,8 +481,8 @@ class _Derivation:
     def function(self, name: str, u: int) -> int:
         """Return a function of an operation; its second operand is the factor g of its derivative, dy = g du."""
         key = (name, u)
-        if key in self.known:
-            return self.known[key]
+        if key in self.indices:
+            return self.indices[key]
         at = len(self.operations)
         match name:
             case "exp":
@@ -488,22 +490,22 @@ class _Derivation:
             case "sin" | "cos":
                 self.operations += [RealOperation("sin", (u, at + 1)), RealOperation("cos", (u, at + 2))]
                 self.operations.append(RealOperation("neg", (at,)))
-                self.known[("sin", u)], self.known[("cos", u)] = at, at + 1
-                return self.known[key]
+                self.indices[("sin", u)], self.indices[("cos", u)] = at, at + 1
+                return self.indices[key]
             case "log":
                 inverse = self.make("inv", (u,))
                 at = self.make(name, (u, inverse))
             case "atan":
                 inverse = self.make("inv", (self.make("add", (self.number(1.0), self.make("mul", (u, u)))),))
                 at = self.make(name, (u, inverse))
-        self.known[key] = at
+        self.indices[key] = at
         return at
 
     def power(self, u: int, exponent: int, value: float) -> int:
         """Return u^e of u >= 0. The factor of its derivative is e u^(e-1), which for e < 1 has no value at u = 0."""
         if value < 1:
             key = ("power", u, exponent)
-            if key not in self.known:
+            if key not in self.indices:
                 at = len(self.operations)
                 # g = e u^e / u needs the result itself, so the three are made together
                 self.operations.append(RealOperation("power", (u, at + 3, exponent)))
@@ -512,22 +514,22 @@ class _Derivation:
                     RealOperation("mul", (at, at + 1)),
                     RealOperation("mul", (exponent, at + 2)),
                 ]
-                self.known[key] = at
-            return self.known[key]
+                self.indices[key] = at
+            return self.indices[key]
         less = self.power(u, self.make("sub", (exponent, self.number(1.0))), value - 1)
         return self.make("power", (u, self.make("mul", (exponent, less)), exponent))
 
-    def convert(self, node: Node, same: dict[int, tuple[str, int]]) -> int:
-        """Return the index of a node's operation; `same` has the nodes that are a state of the chart."""
-        memory = self.converted.setdefault(tuple(sorted(same.items())), {})
+    def convert(self, node: Node, chart_states: dict[int, tuple[str, int]]) -> int:
+        """Return the index of a node's operation; `chart_states` has the nodes that are a state of the chart."""
+        memory = self.converted.setdefault(tuple(sorted(chart_states.items())), {})
         stack = [node]
         while stack:
             top = stack[-1]
             if top.id in memory:
                 stack.pop()
                 continue
-            if top.id in same:
-                memory[top.id] = self.make(same[top.id][0], (), same[top.id][1])
+            if top.id in chart_states:
+                memory[top.id] = self.make(chart_states[top.id][0], (), chart_states[top.id][1])
                 continue
             pattern = _power_of(top)
             needed = pattern if pattern else top.args
@@ -620,41 +622,42 @@ class _Derivation:
                     continue
                 if x == u or (above.name == "mul" and u in above.args):
                     share = self.make("sub", (self.number(1.0), self.make("mul", (c, inverse))))
-                    other = None if x == u else above.args[0] if above.args[1] == u else above.args[1]
-                    made = share if other is None else self.make("mul", (other, share))
-                    return self.make("meet", (made, self.make("mul", (x, inverse))))  # the second is exactly 0 at u = 0
+                    factor = None if x == u else above.args[0] if above.args[1] == u else above.args[1]
+                    product = share if factor is None else self.make("mul", (factor, share))
+                    # The second is exactly 0 at u = 0.
+                    return self.make("meet", (product, self.make("mul", (x, inverse))))
         return self.make("mul", (x, inverse))
 
-    def extreme(self, least: bool, x: int, y: int) -> int:
+    def extreme(self, minimum: bool, x: int, y: int) -> int:
         """Return min(x, y) or max(x, y)."""
         if self.operations[x].name == "const":
             x, y = y, x
         if self.operations[y].name == "const":
             if np.isinf(self.operations[y].value):
-                return x if (self.operations[y].value > 0) == least else y
-            low, high = (-1, y) if least else (y, -1)
+                return x if (self.operations[y].value > 0) == minimum else y
+            low, high = (-1, y) if minimum else (y, -1)
             return self.make("clamp", (x, low, high))
         # min(x, y) = y + min(x - y, 0)
         gap, zero = self.make("sub", (x, y)), self.number(0.0)
-        return self.make("add", (y, self.make("clamp", (gap, -1, zero) if least else (gap, zero, -1))))
+        return self.make("add", (y, self.make("clamp", (gap, -1, zero) if minimum else (gap, zero, -1))))
 
-    def selection(self, which: int, no: int, yes: int) -> int:
+    def selection(self, condition: int, no: int, yes: int) -> int:
         """Return a selection; the form x < low ? low : min(x, high) is a limit."""
         if no == yes:
             return no
-        if self.operations[which].name == "truth":
-            return yes if self.operations[which].value else no
-        asked, other = self.operations[which], self.operations[no]
-        if asked.name == "lt" and asked.args[1] == yes and self.operations[yes].name == "const":
-            x, low = asked.args
+        if self.operations[condition].name == "truth":
+            return yes if self.operations[condition].value else no
+        test, alternative = self.operations[condition], self.operations[no]
+        if test.name == "lt" and test.args[1] == yes and self.operations[yes].name == "const":
+            x, low = test.args
             if self.operations[low].value == -np.inf:
                 return no
-            limited = other.name == "clamp" and other.args[:2] == (x, -1)
-            if limited and self.operations[low].value <= self.operations[other.args[2]].value:
-                return self.make("clamp", (x, low, other.args[2]))
+            limited = alternative.name == "clamp" and alternative.args[:2] == (x, -1)
+            if limited and self.operations[low].value <= self.operations[alternative.args[2]].value:
+                return self.make("clamp", (x, low, alternative.args[2]))
             if no == x:
                 return self.make("clamp", (x, low, -1))
-        return self.make("select", (which, no, yes))
+        return self.make("select", (condition, no, yes))
 
 
 class _Chart(NamedTuple):
@@ -690,9 +693,9 @@ def _power_of(node: Node) -> tuple[Node, Node] | None:
     inner = unguard(inner, 0)
     if inner.op != "exp" or inner.args[0].op != "mul":
         return None
-    for exponent, rest in (inner.args[0].args, inner.args[0].args[::-1]):
-        if rest.op == "mul" and any(x.is_number(0.5) for x in rest.args):
-            log = next(x for x in rest.args if not x.is_number(0.5))
+    for exponent, scaled in (inner.args[0].args, inner.args[0].args[::-1]):
+        if scaled.op == "mul" and any(x.is_number(0.5) for x in scaled.args):
+            log = next(x for x in scaled.args if not x.is_number(0.5))
             square = unguard(log.args[0], 1) if log.op == "log" else log
             if log.op == "log" and square.op == "mul" and square.args == (base, base):
                 return base, exponent
@@ -731,12 +734,12 @@ def _is_traced(path: PyTree, leaf: np.ndarray) -> bool:
 
 def _tangent(graph: Graph, root: Node, tangents: dict[int, Node]) -> Node:
     """Return the derivative of a node along the given derivatives of other nodes, by their number."""
-    zero, op, found = graph.const(0.0), graph.op, dict(tangents)
+    zero, op, derivatives = graph.const(0.0), graph.op, dict(tangents)
 
     def of(node: Node) -> Node:
-        if node.id not in found:
-            found[node.id] = derive(node)
-        return found[node.id]
+        if node.id not in derivatives:
+            derivatives[node.id] = derive(node)
+        return derivatives[node.id]
 
     def derive(node: Node) -> Node:
         x, y = node.args[0] if node.args else node, node.args[-1] if node.args else node
@@ -760,12 +763,12 @@ def _tangent(graph: Graph, root: Node, tangents: dict[int, Node]) -> Node:
 
 def _nodes_below(root: Node) -> set[Node]:
     """Return a node, its operands, their operands, and so on."""
-    seen, left = {root}, [root]
-    while left:
-        new = set(left.pop().args) - seen
-        seen |= new
-        left += new
-    return seen
+    nodes, pending = {root}, [root]
+    while pending:
+        new = set(pending.pop().args) - nodes
+        nodes |= new
+        pending += new
+    return nodes
 
 
 def _text(path: PyTree) -> str:
@@ -802,7 +805,7 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
     closed = jax.make_jaxpr(show)(*[jax.ShapeDtypeStruct((), np.float64)] * len(inputs))
     constants = [constant_array(graph, np.asarray(x)) for x in closed.consts]
     roots = [x.item() for x in lower_jaxpr(graph, closed.jaxpr, constants, [scalar_array(x) for x in inputs])]
-    there = {path: Fraction(float(value) or 1.0) for path, _, value in parameters(loop) if path in paths}
+    nominal = {path: Fraction(float(value) or 1.0) for path, _, value in parameters(loop) if path in paths}
     draw = random.SystemRandom()  # a plant cannot know the points
     ends = (-CHART_DECADES, CHART_DECADES)
     points = [(speed, slip, [x] * len(paths)) for speed in (SLOWEST, FASTEST) for slip in CHART_SLIPS for x in ends]
@@ -810,26 +813,26 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
         speed = min(max(Fraction(10 ** draw.uniform(-1.7, 2.3)).limit_denominator(10**9), SLOWEST), FASTEST)
         points.append((speed, Fraction(draw.randint(0, 10**6 - 1), 10**6), [draw.uniform(*ends) for _ in paths]))
     for speed, slip, decades in points:
-        values = [there[path] * Fraction(10.0**x) for path, x in zip(paths, decades, strict=True)]
+        values = [nominal[path] * Fraction(10.0**x) for path, x in zip(paths, decades, strict=True)]
         distance = Fraction(draw.randint(0, 10**7), 1000)
         if _exact_values(roots, [speed, slip, distance, *values]) != [slip, speed, (1 - slip) * speed]:
             raise NoRule(f"plant {type(loop.plant).__name__}: its slip is not 1 - w/v at {float(speed):.3g} m/s")
 
 
-def _exact_values(roots: list[Node], given: list[Fraction]) -> list[Any]:
+def _exact_values(roots: list[Node], inputs: list[Fraction]) -> list[Any]:
     """Return the values of nodes in fractions."""
-    known: dict[int, Any] = {}
+    exact: dict[int, Any] = {}
 
     def value(node: Node) -> Any:
-        if node.id not in known:
-            known[node.id] = compute(node)
-        return known[node.id]
+        if node.id not in exact:
+            exact[node.id] = compute(node)
+        return exact[node.id]
 
     def compute(node: Node) -> Any:
         if node.op == "const":
             return bool(node.attr) if node.dtype == bool else Fraction(float(node.attr))
         if node.op == "input":
-            return given[node.attr[1]]
+            return inputs[node.attr[1]]
         x = [value(arg) for arg in node.args]
         match node.op:
             case "add":

@@ -86,9 +86,9 @@ def find_tail(
     """
     e = prover.equations
     end = stop_speed(e)
-    if end is None or end <= 0 or e.clock in prover.kept or not e.nonnegative:
+    if end is None or end <= 0 or e.clock in prover.persistent or not e.nonnegative:
         return None
-    settled = [i for i in prover.kept if i != e.speed]
+    settled = [i for i in prover.persistent if i != e.speed]
     slip = e.nonnegative[0]
     if slip not in settled or e.travelled in settled or not read_by(e, [e.acceleration])[0] <= set(prover.moving):
         return None
@@ -126,7 +126,7 @@ def _model_settled_states(
     All start at the greatest speed, so that one model serves all starts. Parameters that are not `lasting` have no
     effect after the start.
     """
-    places = [prover.kept.index(i) for i in settled]
+    places = [prover.persistent.index(i) for i in settled]
 
     def run(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         speeds, states, _ = prover.scout(at)
@@ -140,9 +140,9 @@ def _model_settled_states(
             continue
         ends = []
         for value in (low, high):
-            there = fastest.copy()
-            there[j] = value
-            v, y = run(there)
+            start = fastest.copy()
+            start[j] = value
+            v, y = run(start)
             if not len(v):
                 return None
             ends.append(np.stack([np.interp(speeds, v, column) for column in y.T], 1))
@@ -158,7 +158,7 @@ def _place_piece(prover: Prover, model: _Model, tail: RunTail, low: float, width
     by_speed = (model.at(model.states, high) - model.at(model.states, low)) / (high - low)
     by_param = model.at(model.by_param, middle)
     e = prover.equations
-    places = [prover.kept.index(e.states.index(name)) for name in tail.states]
+    places = [prover.persistent.index(e.states.index(name)) for name in tail.states]
     slip = tail.states.index(e.states[e.nonnegative[0]])
     # The weights are powers of two. Their mean over nearby speeds changes little from one piece to the next.
     near = [prover.weights_at(middle * factor)[places] for factor in np.geomspace(1 / SMOOTHED, SMOOTHED, 15)]
@@ -191,39 +191,40 @@ def _prove_piece(
     e, slip = prover.equations, prover.equations.states[prover.equations.nonnegative[0]]
     read = sorted(e.states[i] for i in read_by(e, [e.acceleration])[0] - {e.speed})
     shown = list(dict.fromkeys([slip, *read]))
-    own = Prover(equations_from(e, slower, piece, shown), (*prover.signals, *shown), patience)
-    own.share_weights(prover)
-    own.use_tail(slower.without_signals(len(slower.pieces), own.signals), math.inf)
+    piece_prover = Prover(equations_from(e, slower, piece, shown), (*prover.signals, *shown), patience)
+    piece_prover.share_weights(prover)
+    piece_prover.use_tail(slower.without_signals(len(slower.pieces), piece_prover.signals), math.inf)
     places = np.tile([-1.0, 1.0], (len(slower.states), 1))
     column, widest = len(prover.signals), WIDEST * piece.width[slower.states.index(slip)]
-    done: list[_Cut] = []
+    proved: list[_Cut] = []
     rows: list[CellBounds] = []
-    left = cuts
-    while left:
-        if len(left) + len(done) > MOST_CELLS or time.monotonic() > until:
+    pending = cuts
+    while pending:
+        if len(pending) + len(proved) > MOST_CELLS or time.monotonic() > until:
             return None
-        cells = np.array([cut.ends(tuple(over.values()), piece) for cut in left])
-        found = own.prove(np.concatenate([cells, np.tile(places, (len(cells), 1, 1))], 1), threads)
-        fine = (found.status == 1) & (found.greatest[:, column] - found.least[:, column] <= widest)
-        done += [cut for cut, is_fine in zip(left, fine, strict=True) if is_fine]
-        rows.append(CellBounds(*(column[fine] for column in found)))
-        left = [
+        cells = np.array([cut.ends(tuple(over.values()), piece) for cut in pending])
+        cell_bounds = piece_prover.prove(np.concatenate([cells, np.tile(places, (len(cells), 1, 1))], 1), threads)
+        narrow = (cell_bounds.status == 1) & (cell_bounds.greatest[:, column] - cell_bounds.least[:, column] <= widest)
+        proved += [cut for cut, is_narrow in zip(pending, narrow, strict=True) if is_narrow]
+        rows.append(CellBounds(*(column[narrow] for column in cell_bounds)))
+        pending = [
             half
-            for cut, is_fine in zip(left, fine, strict=True)
-            if not is_fine
+            for cut, is_narrow in zip(pending, narrow, strict=True)
+            if not is_narrow
             for half in cut.halves(tuple(over.values()), piece, sides)
         ]
-    least = np.concatenate([x.least for x in rows]).min(0)
+    smallest = np.concatenate([x.least for x in rows]).min(0)
     greatest = np.concatenate([x.greatest for x in rows]).max(0)
-    slack = RANGE_SLACK * (greatest - least)
-    ends = dict(zip(own.signals, zip((least - slack).tolist(), (greatest + slack).tolist(), strict=True), strict=True))
+    slack = RANGE_SLACK * (greatest - smallest)
+    ranges = zip((smallest - slack).tolist(), (greatest + slack).tolist(), strict=True)
+    ends = dict(zip(piece_prover.signals, ranges, strict=True))
     signals, states = ({name: ends[name] for name in names} for names in (prover.signals, read))
     if slower.pieces:
         before = slower.pieces[-1]
         signals = {name: _hull(x, before.later_signals[name]) for name, x in signals.items()}
         states = {name: _hull(x, before.later_states[name]) for name, x in states.items()}
-    cells = tuple(tuple((float(a), float(b)) for a, b in cut.ends(tuple(over.values()), piece)) for cut in done)
-    return piece._replace(later_states=states, later_signals=signals, cells=cells), done
+    cells = tuple(tuple((float(a), float(b)) for a, b in cut.ends(tuple(over.values()), piece)) for cut in proved)
+    return piece._replace(later_states=states, later_signals=signals, cells=cells), proved
 
 
 def _hull(x: Ends, y: Ends) -> Ends:

@@ -135,11 +135,11 @@ def read_proof(document: JsonObject) -> ProofFile:
 
 def _read_tail(document: JsonObject, params: int) -> RunTail:
     """Return the tail of a proof's file, for a box of so many parameters."""
-    given = document["tail"]
-    if not isinstance(given, dict):
-        raise ValueError(f"tail = {format_given(given)} is not a table")
-    given = {f"tail.{name}": value for name, value in given.items()}
-    states = tuple(_read_entries(given, "tail.states", list, str, "a name").values())
+    table = document["tail"]
+    if not isinstance(table, dict):
+        raise ValueError(f"tail = {format_given(table)} is not a table")
+    table = {f"tail.{name}": value for name, value in table.items()}
+    states = tuple(_read_entries(table, "tail.states", list, str, "a name").values())
 
     def numbers(values: Any, count: int) -> tuple[float, ...]:
         if len(values) != count:
@@ -156,7 +156,7 @@ def _read_tail(document: JsonObject, params: int) -> RunTail:
         cells = [[_pair(ends) for ends in cell] for cell in entry["cells"]]
         if any(len(cell) != params + 1 for cell in cells):
             raise ValueError("a cell has not one pair for each parameter and the speed")
-        found = TailPiece(
+        tail_piece = TailPiece(
             low=_number(entry["low"]),
             high=_number(entry["high"]),
             centre=numbers(entry["centre"], n),
@@ -167,12 +167,12 @@ def _read_tail(document: JsonObject, params: int) -> RunTail:
             later_signals=ranges(entry["later_signals"]),
             cells=tuple(tuple((low, high) for low, high in cell) for cell in cells),
         )
-        if not (0 < found.low < found.high and all(width >= 0 for width in found.width)):
+        if not (0 < tail_piece.low < tail_piece.high and all(width >= 0 for width in tail_piece.width)):
             raise ValueError("its speeds are not positive and in order, or a width is negative")
-        return found
+        return tail_piece
 
-    middle = tuple(_read_entries(given, "tail.middle", list, _number, "a finite number").values())
-    pieces = tuple(_read_entries(given, "tail.pieces", list, piece, "a piece of the tail").values())
+    middle = tuple(_read_entries(table, "tail.middle", list, _number, "a finite number").values())
+    pieces = tuple(_read_entries(table, "tail.pieces", list, piece, "a piece of the tail").values())
     if len(middle) != params:
         raise ValueError("tail.middle has not one number for each parameter of the box")
     return RunTail(states, middle, pieces)
@@ -188,36 +188,36 @@ def _read_entries(
         read: Function that returns the value of an entry, or raises an error if the entry is wrong.
         needed: What an entry has to be, in words.
     """
-    given = document.get(name)
-    if not isinstance(given, kind):
+    member = document.get(name)
+    if not isinstance(member, kind):
         word = "a table" if kind is dict else "a list"
-        raise ValueError(f"{name} is missing" if given is None else f"{name} = {format_given(given)} is not {word}")
-    found = {}
-    for key, entry in given.items() if isinstance(given, dict) else enumerate(given or ()):
+        raise ValueError(f"{name} is missing" if member is None else f"{name} = {format_given(member)} is not {word}")
+    entries = {}
+    for key, entry in member.items() if isinstance(member, dict) else enumerate(member or ()):
         try:
-            found[key] = read(entry)
+            entries[key] = read(entry)
         except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
             raise ValueError(f"{name}.{key} = {format_given(entry)}; {needed} is needed") from None
-    return found
+    return entries
 
 
-def _pair(given: Any) -> list[float]:
+def _pair(pair: Any) -> list[float]:
     """Return a pair of finite numbers of a document. Raises TypeError or ValueError for anything else."""
-    low, high = given
+    low, high = pair
     return [_number(low), _number(high)]
 
 
-def _open_pair(given: Any) -> tuple[float | None, float | None]:
+def _open_pair(pair: Any) -> tuple[float | None, float | None]:
     """Return a pair of finite numbers or None. Raises TypeError or ValueError for anything else."""
-    low, high = given
+    low, high = pair
     return None if low is None else _number(low), None if high is None else _number(high)
 
 
-def _number(given: Any) -> float:
+def _number(number: Any) -> float:
     """Return a finite number of a document. Raises ValueError for anything else."""
-    if isinstance(given, bool) or not isinstance(given, int | float) or not math.isfinite(given):
-        raise ValueError(f"{given!r} is not a finite number")
-    return float(given)
+    if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
+        raise ValueError(f"{number!r} is not a finite number")
+    return float(number)
 
 
 def verify_box(
@@ -254,7 +254,7 @@ def verify_box(
         name: (-math.inf if low is None else low, math.inf if high is None else high)
         for name, (low, high) in file.bounds.items()
     }
-    reason, done = _find_contradiction(file, horizon) or name_contradiction(bounds, known or {}), 0
+    reason, checked = _find_contradiction(file, horizon) or name_contradiction(bounds, known or {}), 0
     if not reason:
         equations = derive_equations(loop, over)
         if unknown := [name for name in file.signals if name not in equations.signals]:
@@ -268,20 +268,20 @@ def verify_box(
         if names:
             raise ValueError(f"tail: the loop has no state or signal {min(names)}")
         check = partial(_check_cell, equations, file)
-        rest = [
+        tail_cells = [
             PlacedCell(k, [[*ends] for ends in cell]) for k, piece in enumerate(file.pieces) for cell in piece.cells
         ]
-        chosen = [PlacedCell(None, cells[i]) for i in _choose_cells(cells, share, suspects)]
-        chosen += [rest[i] for i in _choose_cells(rest, share, ())]
-        for done, (cell, why) in enumerate(_map_cells(check, chosen, processes), 1):
+        sample = [PlacedCell(None, cells[i]) for i in _choose_cells(cells, share, suspects)]
+        sample += [tail_cells[i] for i in _choose_cells(tail_cells, share, ())]
+        for checked, (cell, why) in enumerate(_map_cells(check, sample, processes), 1):
             if why:
                 where = "cell" if cell.piece is None else "cell of the tail"
                 ends = zip([*over, "speed"], cell.ends, strict=False)
                 text = ", ".join(f"{path} {low:.9g} to {high:.9g}" for path, (low, high) in ends)
-                reason, done = f"{where} {text}: {why}", done - 1
+                reason, checked = f"{where} {text}: {why}", checked - 1
                 break
-            progress(f"{done} of {len(chosen)} cells")
-    return FileVerdict(done, len(cells) + sum(len(piece.cells) for piece in file.pieces), reason, file.statements)
+            progress(f"{checked} of {len(sample)} cells")
+    return FileVerdict(checked, len(cells) + sum(len(piece.cells) for piece in file.pieces), reason, file.statements)
 
 
 def _find_contradiction(file: ProofFile, horizon: float) -> str:
@@ -290,8 +290,8 @@ def _find_contradiction(file: ProofFile, horizon: float) -> str:
         return f"the file follows runs for {file.horizon:g} s, its scenario for {horizon:g} s"
     for claim in file.claims:
         low, high = file.bounds[claim.quantity]
-        worst, least = (low, True) if claim.quantity.startswith("least") else (high, False)
-        if worst is None or (worst < claim.bound if least else worst > claim.bound):
+        worst, is_lower = (low, True) if claim.quantity.startswith("least") else (high, False)
+        if worst is None or (worst < claim.bound if is_lower else worst > claim.bound):
             return f"the file's bound {worst} of {claim.quantity} violates its claim"
     if not file.statements:
         return "the file states nothing"
@@ -307,9 +307,9 @@ def _find_gap(file: ProofFile) -> str:
         if not comes_from_halving(box, piece.cells):
             return f"the cells of piece {k} of the tail do not cover it"
         for later in ("later_states", "later_signals"):
-            mine, earlier = getattr(piece, later), getattr(file.pieces[max(k - 1, 0)], later)
-            if mine.keys() != earlier.keys() or any(
-                low > earlier[name][0] or high < earlier[name][1] for name, (low, high) in mine.items()
+            ranges, earlier = getattr(piece, later), getattr(file.pieces[max(k - 1, 0)], later)
+            if ranges.keys() != earlier.keys() or any(
+                low > earlier[name][0] or high < earlier[name][1] for name, (low, high) in ranges.items()
             ):
                 return f"the ranges of piece {k} of the tail do not contain those of the piece before"
         if missing := [name for name in file.signals if name not in piece.later_signals]:
@@ -372,8 +372,8 @@ def _check_cell(equations: Equations, file: ProofFile, cell: PlacedCell) -> str:
     if cell.piece is None or file.tail is None:
         return _check(equations, file, file.bounds, file.tail, None, cell.ends, _choose_sides(file.over, cell.ends))
     piece, slip = file.pieces[cell.piece], [equations.states[i] for i in equations.nonnegative]
-    known = {name for i, name in enumerate(equations.states) if RealOperation("state", (), i) in equations.operations}
-    if unknown := sorted({*file.tail.states, *piece.later_states} - known):
+    used = {name for i, name in enumerate(equations.states) if RealOperation("state", (), i) in equations.operations}
+    if unknown := sorted({*file.tail.states, *piece.later_states} - used):
         return f"the runs have no state {unknown[0]}"
     shown = [name for name in piece.later_states if name not in equations.signals]
     if len(shown) < len(piece.later_states) or equations.speed < 0 or not slip:
@@ -414,7 +414,7 @@ def _check(
     steps = SAMPLED_STEPS if equations.period is not None else [PACED_STEP if equations.paced else file.horizon / STEPS]
     signals = list(dict.fromkeys(name.partition(" ")[2] for name in stated if " " in name))
     try:
-        found = check_cell(
+        proved = check_cell(
             equations, signals, [(low, high) for low, high in cell], steps, file.horizon, tail=tail, latest=latest
         )
     except NotProved as error:
@@ -423,10 +423,10 @@ def _check(
         reason = _compare(
             stated,
             {
-                **{f"greatest {name}": (None, x) for name, x in found.greatest.items()},
-                **{f"least {name}": (x, None) for name, x in found.least.items()},
-                "stop_time": found.stop_time,
-                "stop_distance": found.distance,
+                **{f"greatest {name}": (None, x) for name, x in proved.greatest.items()},
+                **{f"least {name}": (x, None) for name, x in proved.least.items()},
+                "stop_time": proved.stop_time,
+                "stop_distance": proved.distance,
             },
         )
         if reason and tail is not None and latest is None:  # followed to their stop, runs may have narrower bounds
@@ -440,12 +440,12 @@ def _check(
     return next((why for half in halves if (why := _check(equations, file, stated, tail, latest, half, sides[1:]))), "")
 
 
-def _compare(stated: Bounds, found: Mapping[str, tuple[float | None, float | None]]) -> str:
-    """Return a stated end that the found ends do not prove, empty if they prove all; NaN proves nothing."""
+def _compare(stated: Bounds, proved: Mapping[str, tuple[float | None, float | None]]) -> str:
+    """Return a stated end that the proved ends do not imply, empty if they prove all; NaN proves nothing."""
     for name, (low, high) in stated.items():
-        least, most = found[name]
-        if high is not None and not (most is not None and most <= high):
-            return f"{name} up to {most:.9g}, in the file {high:.9g}"
-        if low is not None and not (least is not None and least >= low):
-            return f"{name} from {least:.9g}, in the file {low:.9g}"
+        proved_low, proved_high = proved[name]
+        if high is not None and not (proved_high is not None and proved_high <= high):
+            return f"{name} up to {proved_high:.9g}, in the file {high:.9g}"
+        if low is not None and not (proved_low is not None and proved_low >= low):
+            return f"{name} from {proved_low:.9g}, in the file {low:.9g}"
     return ""

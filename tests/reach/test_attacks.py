@@ -144,11 +144,16 @@ EDITS: dict[str, Callable[[JsonObject], object]] = {
 }  # fmt: skip
 
 
-@killed_by("reach/verification.py", " or not math.isfinite(given)", "", case="a claim that is not a number")
-@killed_by("reach/verification.py", "isinstance(given, bool) or ", "", case="a bound that is a truth")
+@killed_by("reach/verification.py", " or not math.isfinite(number)", "", case="a claim that is not a number")
+@killed_by("reach/verification.py", "isinstance(number, bool) or ", "", case="a bound that is a truth")
 @killed_by("reach/verification.py", 'name.partition(" ")[2]', "name.split()[1]", case="a bound of a signal and more")
-@killed_by("reach/verification.py", "most <= high", "most <= high + 1e-3 * abs(high)", case="a bound slightly too low")
-@killed_by("reach/verification.py", "least >= low", "least >= low * 0.999", case="a bound slightly too high")
+@killed_by(
+    "reach/verification.py",
+    "proved_high <= high",
+    "proved_high <= high + 1e-3 * abs(high)",
+    case="a bound slightly too low",
+)
+@killed_by("reach/verification.py", "proved_low >= low", "proved_low >= low * 0.999", case="a bound slightly too high")
 @killed_by(
     "reach/verification.py", "if end is not None and not proved:", "if False:", case="a bound that no checker proves"
 )

@@ -241,7 +241,7 @@ def test_a_lost_disturbance_shows(monkeypatch):
 
 
 @killed_by("reach/checker.py", "self.stays_nonnegative(box, chords)", "pass")
-@killed_by("reach/checker.py", "found |= set(e.nonnegative)", "pass")
+@killed_by("reach/checker.py", "states |= set(e.nonnegative)", "pass")
 @killed_by("reach/checker.py", "if value(a).contains(0):", "if False:")
 @killed_by("reach/checker.py", "not box[s].upper() < FASTEST_SLIP:", "False:")
 @killed_by("reach/checker.py", "not box[self.speed].lower() > float(SLOWEST):", "False:")
@@ -404,7 +404,7 @@ def test_a_disturbance_reaches_what_it_moves(rate):
     assert_encloses(distance, [0.0, {"y": 0.5 * 0.1**2, "z": 50 * 0.1**3 / 6}[rate]], 0.05)
 
 
-@killed_by("reach/checker.py", "+ rest * t**order + slack", "+ slack")
+@killed_by("reach/checker.py", "+ remainder * t**order + slack", "+ slack")
 def test_a_signal_has_the_remainder_of_its_polynomial():
     """The second order of a step of 1e-3 s is 5e-6; the run ends 1e-6 s before step 100 does."""
     until = 0.1 - 1e-6

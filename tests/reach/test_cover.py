@@ -274,7 +274,7 @@ def test_many_halvings_of_many_sides_are_found() -> None:
     assert not comes_from_halving(box, [*cells[:-1], left])
 
 
-@killed_by("reach/cover.py", "again = now[~fine]\n", "again = now[~fine][1:]\n")
+@killed_by("reach/cover.py", "again = now[~satisfied]\n", "again = now[~satisfied][1:]\n")
 def test_cells_cover_the_box() -> None:
     worst = max(rig_run(m, v)[0] for m in SMALL["plant.mass"] for v in SMALL["initial.speed"])
     proof = prove_box(

@@ -146,7 +146,7 @@ def test_a_block_that_counts_its_ticks_is_refused(name: str) -> None:
         derive_equations(NUMBERED[name], ["plant.mass"])
 
 
-@killed_by("reach/equations.py", "period is not None and float(period) != own", "False")
+@killed_by("reach/equations.py", "period is not None and float(period) != loop_period", "False")
 def test_an_inner_block_with_another_period_is_refused() -> None:
     inner = d.controllers.PlayedCommand(period=0.05)
     with pytest.raises(NoRule, match=r"different periods: 0\.01 s, 0\.05 s"):

@@ -35,7 +35,7 @@ def still(period: float | None = None) -> Equations:
 
 
 @pytest.mark.usefixtures("native_prover")
-@killed_by("reach/engine.py", "if not self.kept:", "if False:")
+@killed_by("reach/engine.py", "if not self.persistent:", "if False:")
 @pytest.mark.parametrize("period", [None, 0.1], ids=["continuous", "sampled"])
 def test_signals_that_depend_on_no_state_are_bounded(period):
     prover = Prover(still(period), ("param", "const", "square", "inverse"), 1.0)

@@ -294,7 +294,11 @@ def test_the_speed_is_no_settled_state(monkeypatch: pytest.MonkeyPatch, honest: 
 
 
 @killed_by("reach/checker.py", "<= arb(piece.width[i]):", "<= arb(1):")
-@killed_by("reach/checker.py", "y = q.centre + integral + _symmetric(q.rest)", "y = q.centre + _symmetric(q.rest)")
+@killed_by(
+    "reach/checker.py",
+    "y = q.centre + integral + _symmetric(q.uncertainty)",
+    "y = q.centre + _symmetric(q.uncertainty)",
+)
 @pytest.mark.parametrize("speed", [1.1, 5.5], ids=["too slow to settle", "settles"])
 def test_the_checker_bounds_runs_that_end_in_the_tail(speed: float) -> None:
     checker = pytest.importorskip("diffabs.reach.checker")

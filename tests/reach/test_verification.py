@@ -88,7 +88,7 @@ def test_a_file_that_is_no_proof_is_refused(tmp_path: pathlib.Path, proof: pathl
         run("verify", broken, status=2)
 
 
-@killed_by("reach/verification.py", "if not isinstance(given, kind):", "if False:")
+@killed_by("reach/verification.py", "if not isinstance(member, kind):", "if False:")
 @pytest.mark.parametrize(
     ("changed", "line"),
     [
