@@ -120,7 +120,6 @@ def _build_closed_loops(loop: Loop, values: Params) -> _ClosedLoops:
 
 
 def _check_supported(loop: Loop) -> None:
-    """Raise ValueError for a part outside the analysis."""
     supported = {"controller": BalanceFeedback, "sensor": Direct, "actuator": Direct | VoltageLimit, "stop": Fallen}
     for name, kind in supported.items():
         if not isinstance(getattr(loop, name), kind):

@@ -136,7 +136,6 @@ def _as_matrix(value: Matrix, rows: int) -> np.ndarray:
 
 
 def _check_number(name: str, value: Scalar, allowed: ParameterSpec) -> None:
-    """Raise a ValueError if a value is no number, or is out of range."""
     if find_value_objection(value) or np.ndim(value):
         raise ValueError(f"{name} = {format_value(value)} is no number in {allowed.interval()}")
     if not allowed.holds(value):
@@ -144,7 +143,6 @@ def _check_number(name: str, value: Scalar, allowed: ParameterSpec) -> None:
 
 
 def _check_rates(rates: PyTree) -> None:
-    """Raise a ValueError if rates are not a lower and an upper bound."""
     if find_value_objection(rates) or np.shape(rates) != (2,) or not -np.inf < rates[0] <= rates[1] < np.inf:
         needed = "a pair (low, high) of finite numbers with low <= high, in the parameter's unit per second"
         raise ValueError(f"rates = {format_value(rates)} is not {needed}")

@@ -40,7 +40,6 @@ class SpeedScaled:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of the states."""
         return self.model.states
 
     def matrices(self) -> StateSpace:

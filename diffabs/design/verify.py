@@ -125,7 +125,6 @@ def verify_file(path: str | os.PathLike[str], seconds: float = MAX_SECONDS) -> l
 
 
 def _check_time() -> None:
-    """Raise ValueError after the deadline of this file."""
     end, seconds = _deadline.get()
     if time.monotonic() > end:
         raise ValueError(
@@ -196,7 +195,6 @@ def _certificate_from_json(value: Any) -> StoredCertificate:
 
 
 def _read_cell(value: Any, where: str, sizes: dict[str, int]) -> tuple[Cell, float | None]:
-    """Return the vertices and the period of a cell."""
     part = _read_members(value, where, "A", "B", "period", "states", "corners")
     sizes.pop("V", None)  # every cell has its own number of vertices
     a, b = (
@@ -396,7 +394,6 @@ def _instability_conditions(d: Mapping[str, Any], loops: list[Matrix], discrete:
 def _quadratic_conditions(
     kind: str, d: Mapping[str, Any], loops: list[Matrix], k: Matrix, stored: StoredCertificate
 ) -> Iterator[tuple[str, bool]]:
-    """Yield the conditions of a claim about one P, vertex by vertex."""
     p, discrete = d["P"], stored.discrete
     yield "P", is_positive_definite(p)
     for i, c in enumerate(loops):

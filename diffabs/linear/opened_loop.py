@@ -83,7 +83,6 @@ class OpenLoop(NamedTuple):
 
 
 def _check_halves(loop: OpenLoop) -> None:
-    """Raise ValueError if the two halves do not fit each other."""
     plant, controller = check_transfer(loop.plant), check_transfer(loop.controller)
     if plant.period is not None:
         raise ValueError(f"plant: period = {plant.period:g} s; the plant is in continuous time: None")
@@ -198,7 +197,6 @@ class _LinearHalves(NamedTuple):
 
 
 def _start_output_and_setpoint(loop: Loop) -> tuple[PyTree, PyTree]:
-    """Return the plant's output at the start, and the setpoint."""
     start = loop.start()
     return loop.plant.output(start.plant), loop.reference.setpoint(start.reference)
 
@@ -253,20 +251,16 @@ class _Surroundings:
         self.remaining, self.size, self.held = remaining, size, len(self.frozen)
 
     def output(self, z: Matrix) -> Matrix:
-        """Return the plant's output."""
         return self.loop.plant.output(self.unravel(z).plant)
 
     def signal(self, z: Matrix) -> Tracking:
-        """Return the controller's input signal, with the target at the setpoint."""
         measured = self.loop.sensor.output(0.0, Memory(self.unravel(z).sensor, self.memory[0]), self.output(z))
         return Tracking(self.setpoint, measured, self.loop.feedforward.input(self.loop.plant, measured, self.setpoint))
 
     def signals(self, z: Matrix) -> Matrix:
-        """Return the controller's input signal as a vector."""
         return ravel_pytree(self.signal(z))[0]
 
     def flow(self, z: Matrix, command: Scalar) -> Matrix:
-        """Return dz/dt."""
         x = self.unravel(z)
         actuator = Memory(x.actuator, self.memory[1])
         control = self.loop.actuator.output(0.0, actuator, command)
@@ -286,7 +280,6 @@ class _Surroundings:
         return jnp.concatenate([y[0][None], z[self.remaining], z[self.size :], last])
 
     def moves(self, z: Matrix, command: Scalar) -> Matrix:
-        """Return the rates of the coordinates."""
         return jax.jvp(self.chart, (z,), (self.flow(z, command),))[1]
 
     def rest_residual(self, free: PyTree) -> Matrix:
@@ -367,7 +360,6 @@ def sample_plant(plant: Transfer, period: float, delay: float) -> Transfer:
 
 
 def _drop_unobserved_states(system: Transfer) -> Transfer:
-    """Return the system without the states that do not influence its output, such as an integral with gain zero."""
     observed = (system.C != 0).any(axis=0)
     # Each pass adds the states that influence an observed one; as many passes as states reach all of them.
     for _ in observed:

@@ -69,7 +69,6 @@ class OperatingPoint:
 
     @property
     def loop(self) -> Loop:
-        """The loop, without its stop."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "indices"}  # pyright: ignore[reportArgumentType]
         return Loop(**fields, stop=NoStop())
 
@@ -132,7 +131,6 @@ def loop_gain(loop: Loop, states: tuple[str, ...]) -> AnyArray:
 
 
 def _drop_stop(loop: Loop) -> OperatingPoint:
-    """Return the operating point with all parts of a loop except its stop."""
     fields = {f.name: getattr(loop, f.name) for f in dataclasses.fields(loop) if f.name != "stop"}  # pyright: ignore[reportArgumentType]
     return OperatingPoint(**fields)
 
@@ -170,18 +168,15 @@ class _VectorLoop(NamedTuple):
     unravel: Any
 
     def track(self, z: AnyArray) -> tuple[PyTree, Tracking]:
-        """Return the plant's output and the controller's input signal."""
         loop, x = self.loop, self.unravel(z)
         y = loop.plant.output(x.plant)
         measured = loop.sensor.output(0.0, Memory(x.sensor), y)
         return y, Tracking(self.setpoint, measured, loop.feedforward.input(loop.plant, measured, self.setpoint))
 
     def command(self, z: AnyArray) -> AnyArray:
-        """Return the controller's command."""
         return self.loop.controller.output(0.0, Memory(self.unravel(z).controller), self.track(z)[1])
 
     def flow(self, z: AnyArray, v: Scalar) -> AnyArray:
-        """Return dz/dt."""
         loop, x = self.loop, self.unravel(z)
         y, signal = self.track(z)
         rates = _IntegratedStates(

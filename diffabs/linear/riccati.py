@@ -137,13 +137,11 @@ def _solve_compiled(solution: Callable, A: AnyArray, B: AnyArray, Q: AnyArray, R
 
 @jax.custom_jvp
 def _solve_continuous(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return (P, residual) of the continuous equation."""
     return solve_one(solve_care, data)
 
 
 @jax.custom_jvp
 def _solve_discrete(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return (P, residual) of the discrete equation."""
     return solve_one(solve_dare, data)
 
 

@@ -103,7 +103,6 @@ def check_transfer(system: Transfer) -> Transfer:
 
 
 def _as_matrix(name: str, value: Matrix) -> np.ndarray:
-    """Return a finite matrix as an array."""
     try:
         matrix = np.asarray(value, float)
     except (TypeError, ValueError):

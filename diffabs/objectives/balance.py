@@ -56,12 +56,10 @@ def _greatest_angle(name: str) -> tuple[PyTree, PyTree]:
     """Return start and update of the greatest |angle|, from the cubic of every step."""
 
     def start(self: Part, sample: Sample) -> Memory:
-        """Return the memory with the first |angle|."""
         del self
         return Memory(held=jnp.abs(getattr(sample.output, name)))
 
     def update(self: Part, memory: Memory, segment: Segment) -> Scalar:
-        """Return the greatest |angle| up to the end of the step."""
         del self
         angle = segment.output(lambda output: getattr(output, name))
         # `falls` refers to |angle|, so a negative angle is mirrored.
@@ -99,12 +97,10 @@ def _greatest_size(size: Scalar) -> tuple[PyTree, PyTree]:
     """
 
     def start(self: Part, sample: Sample) -> Memory:
-        """Return the memory with the first size."""
         del self
         return Memory(held=size(sample))
 
     def update(self: Part, memory: Memory, segment: Segment) -> Scalar:
-        """Return the greatest size up to the end of the step."""
         del self
         ends, falls = later_of_larger(size(segment.start), size(segment.end)), False
         if segment.smooth is not False:

@@ -74,7 +74,6 @@ class BrakedWheel:
         }
 
     def usual_objectives(self) -> dict[str, PyTree]:
-        """Return the default objectives of a brake, by name."""
         return dict(BRAKING)
 
     def probes(self, initial: BrakeStart, setpoint: Scalar, stop: Part) -> BrakeStart:

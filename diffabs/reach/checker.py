@@ -135,7 +135,6 @@ def _between(low: arb, high: arb) -> arb:
 
 
 def _hull(x: arb, y: arb) -> arb:
-    """Return a ball that contains two balls."""
     return _between(min(x.lower(), y.lower()), max(x.upper(), y.upper()))
 
 
@@ -515,7 +514,6 @@ class _Series:
 
 
 def _along(direction: int, size: arb) -> arb_poly:
-    """Return the vector of one direction."""
     return arb_poly([*[ZERO] * direction, size])
 
 
@@ -528,7 +526,6 @@ def _dot(x: Sequence[Number], y: Sequence[arb], first: int, last: int, k: int) -
 
 
 def _at(coefficients: Sequence[Number], t: arb) -> Number:
-    """Return a polynomial at t."""
     y = coefficients[-1]
     for x in reversed(coefficients[:-1]):
         y = y * t + x
@@ -578,7 +575,6 @@ class _Quadrature:
         self.rate, self.centre, self.slopes, self.uncertainty = rate, centre, slopes, ZERO
 
     def copy(self) -> "_Quadrature":
-        """Return a copy."""
         twin = _Quadrature(self.rate, self.centre, self.slopes.copy())
         twin.uncertainty = self.uncertainty
         return twin
@@ -594,7 +590,6 @@ class _Quadrature:
         self.uncertainty = (self.uncertainty + (lost + _symmetric(slack)).abs_upper()).upper()
 
     def box(self) -> arb:
-        """Return a ball with all values."""
         return self.centre + sum((_symmetric(arb(float(s))) for s in self.slopes), ZERO) + _symmetric(self.uncertainty)
 
 
@@ -653,7 +648,6 @@ class _Check:
         return _Series(self.program, self.all, states, halves=self.halves, constants=self.constant_all, **how)
 
     def begin(self) -> None:
-        """Set the states at the start."""
         e, p = self.program.equations, self.program
         tangents = [NO_SLOPE] * self.n
         start = [e.start[i] for i in p.states]
@@ -694,7 +688,6 @@ class _Check:
         ]
 
     def centre(self) -> list[arb]:
-        """Return the centre of the set."""
         return [arb(x) for x in self.c]
 
     def box(self, tangents: Sequence[arb_poly] | None = None) -> list[arb]:
@@ -853,7 +846,6 @@ class _Check:
             self.advance(h / 2, depth + 1)
 
     def step(self, h: arb) -> None:
-        """Move the set by one step of length h."""
         p, e, n = self.program, self.program.equations, self.n
         tangents, centre = self.directions(), self.centre()
         X = self.box(tangents)
@@ -1100,7 +1092,6 @@ class _Check:
         return min(lows), max(highs)
 
     def do_tick(self) -> None:
-        """Move the set by one tick."""
         p = self.program
         tangents, centre = self.directions(), self.centre()
         X = self.box(tangents)
@@ -1117,7 +1108,6 @@ class _Check:
     # The end.
 
     def time(self) -> _Quadrature:
-        """Return the time of the set."""
         return self.clock.copy() if self.clock is not None else _Quadrature(-1, self.elapsed, np.zeros(self.np))
 
     def is_over(self) -> bool:
@@ -1288,7 +1278,6 @@ def _without_slopes(series: _Series) -> _Series:
 
 
 def _wider(x: arb) -> arb:
-    """Return a ball somewhat wider than x."""
     return x + arb(0, (x.rad() * arb("0.1") + arb("1e-14")).upper())
 
 

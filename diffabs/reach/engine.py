@@ -260,7 +260,6 @@ class Prover:
 
     @property
     def _width(self) -> int:
-        """Number of results of a cell."""
         return 6 + 4 * len(self.signals) + 3 * len(self.equations.params)
 
     def prove(self, cells: np.ndarray, threads: int | None = None) -> CellBounds:

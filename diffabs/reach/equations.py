@@ -181,12 +181,10 @@ class RealGraph(Graph):
 
 
 def _is_finite(node: Node) -> bool:
-    """Return whether a node is a finite constant."""
     return node.op == "const" and bool(np.isfinite(node.attr))
 
 
 def _is_nonzero(node: Node) -> bool:
-    """Return whether a node is a finite constant other than 0."""
     return _is_finite(node) and not node.is_number(0)
 
 
@@ -443,7 +441,6 @@ class _Derivation:
         return state._replace(plant=_Chart(y.slip, y.speed, state.plant.distance))
 
     def initial_node(self, name: str) -> Node:
-        """Return the node of a parameter of the start."""
         path = f"initial.{name}"
         if path in self.paths:
             return self.parameter_nodes[self.paths.index(path)]
@@ -466,11 +463,9 @@ class _Derivation:
         return self.indices[key]
 
     def number(self, value: float) -> int:
-        """Return the index of a constant."""
         return self.make("const", (), float(value))
 
     def pace_rate(self, rate: int, speed: int) -> int:
-        """Return a rate times the speed."""
         v = self.make("state", (), speed)
         inverse = self.make("inv", (v,))
         operation = self.operations[rate]
@@ -629,7 +624,6 @@ class _Derivation:
         return self.make("mul", (x, inverse))
 
     def extreme(self, minimum: bool, x: int, y: int) -> int:
-        """Return min(x, y) or max(x, y)."""
         if self.operations[x].name == "const":
             x, y = y, x
         if self.operations[y].name == "const":
@@ -772,7 +766,6 @@ def _nodes_below(root: Node) -> set[Node]:
 
 
 def _text(path: PyTree) -> str:
-    """Return a path of a pytree as dotted text."""
     return ".".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)
 
 
@@ -820,7 +813,6 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
 
 
 def _exact_values(roots: list[Node], inputs: list[Fraction]) -> list[Any]:
-    """Return the values of nodes in fractions."""
     exact: dict[int, Any] = {}
 
     def value(node: Node) -> Any:

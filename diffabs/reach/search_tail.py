@@ -45,7 +45,6 @@ class _Cut(NamedTuple):
     path: tuple[tuple[int, int], ...] = ()
 
     def ends(self, over: Sequence[Ends], piece: TailPiece) -> list[Ends]:
-        """Return the ranges of parameters and speed."""
         ends = [*over, (piece.low, piece.high)]
         for side, upper in self.path:
             low, high = ends[side]

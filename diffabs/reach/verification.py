@@ -80,12 +80,10 @@ class ProofFile(NamedTuple):
 
     @property
     def pieces(self) -> tuple[TailPiece, ...]:
-        """The pieces of the tail."""
         return () if self.tail is None else self.tail.pieces
 
     @property
     def signals(self) -> list[str]:
-        """The signals that the file bounds."""
         return list(dict.fromkeys(name.partition(" ")[2] for name in self.bounds if " " in name))
 
     @property
@@ -202,7 +200,6 @@ def _read_entries(
 
 
 def _pair(pair: Any) -> list[float]:
-    """Return a pair of finite numbers of a document. Raises TypeError or ValueError for anything else."""
     low, high = pair
     return [_number(low), _number(high)]
 
@@ -214,7 +211,6 @@ def _open_pair(pair: Any) -> tuple[float | None, float | None]:
 
 
 def _number(number: Any) -> float:
-    """Return a finite number of a document. Raises ValueError for anything else."""
     if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
         raise ValueError(f"{number!r} is not a finite number")
     return float(number)

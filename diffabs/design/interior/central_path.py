@@ -105,7 +105,6 @@ def follow_path(
     path = path._replace(shift=jnp.maximum(2 * first, 0.0) + 1e-3 * jnp.abs(first) + rounding)
 
     def goes_on(path: CentralPathState) -> Matrix:
-        """Return whether another Newton step is necessary."""
         return (
             (path.steps < MAX_PATH_STEPS)
             & (path.settled < FINAL_CENTRE_STEPS)
@@ -195,7 +194,6 @@ def _newton(problem: GuaranteedCostProblem, path: CentralPathState, *, discrete:
 
 
 def _phi(local: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, mu: Scalar, *, discrete: bool) -> Matrix:
-    """Return phi at changes (Y, G), or stacks of them."""
     x = jnp.eye(y.shape[-1]) + y
     inside = logdet(_slacks(local, y, g, shift, discrete=discrete))
     return _trace(jnp.linalg.inv(x) @ local.w) / mu - logdet(x) - jnp.sum(inside, -1)

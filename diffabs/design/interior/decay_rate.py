@@ -91,7 +91,6 @@ def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -
 # The implicit derivative at the optimum, instead of one through some hundred iterations.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _least_shift(discrete: bool, closed: Matrix) -> Matrix:
-    """Return the smallest s."""
     return _follow_path(discrete, closed)[0]
 
 
@@ -194,7 +193,6 @@ def _newton_step_in_plane(gradient: Matrix, hessian: Matrix, normal: Matrix) -> 
 
 
 def _lyapunov_operator(c: Scalar, x: Scalar, discrete: bool) -> Matrix:
-    """Return L(X), for one X or a stack."""
     return c @ x @ jnp.swapaxes(c, -1, -2) if discrete else he(c @ x)
 
 

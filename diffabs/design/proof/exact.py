@@ -61,7 +61,6 @@ def block_matrix(rows: list[list[Matrix]]) -> Matrix:
     lead = np.broadcast_shapes(*(each.shape[:-2] for each in flat))
 
     def join_blocks(get: Callable[[Matrix], PyTree]) -> Matrix:
-        """Return the block matrix of one array of each block."""
         return np.block([[np.broadcast_to(get(each), (*lead, *each.shape[-2:])) for each in row] for row in rows])
 
     if not isinstance(flat[0], Dyadic):

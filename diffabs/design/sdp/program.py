@@ -102,7 +102,6 @@ class DesignProgram:
         return np.array(gains), np.array([self.frame.form(inverse) for inverse in inverses])
 
     def _common(self) -> Iterator[SdpBlock]:
-        """Yield the inequalities that do not depend on the level of V."""
         for place in self._vertices_at_nodes():
             yield from self._at(place)
         for i in range(self.nodes):
@@ -133,7 +132,6 @@ class DesignProgram:
                     yield VertexAtNode(*scaled, node, ((i, -slope), (i + 1, slope)))
 
     def _at(self, place: VertexAtNode) -> Iterator[SdpBlock]:
-        """Yield every inequality that a vertex has to satisfy."""
         spec, frame, discrete = self.spec, self.frame, self.period is not None
 
         def evaluate(v: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

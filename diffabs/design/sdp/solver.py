@@ -72,7 +72,6 @@ class Unknowns:
         self.stacked = {name: np.concatenate([np.zeros((1, *b.shape[1:])), b]) for name, b in self.basis.items()}
 
     def values(self, y: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the matrices in a vector `y`."""
         return {name: np.tensordot(y, unit, 1) for name, unit in self.basis.items()}
 
     def blocks(self, formulas: Callable[[Mapping[str, np.ndarray]], list[PyTree]]) -> list[SdpBlock]:
@@ -92,7 +91,6 @@ class Unknowns:
 
 
 def _units(shape: tuple[int, int] | int) -> np.ndarray:
-    """Return the unit matrices that span all matrices of a shape."""
     if isinstance(shape, tuple):
         return np.eye(shape[0] * shape[1]).reshape(-1, *shape)
     pairs = [(i, j) for i in range(shape) for j in range(i + 1)]
