@@ -40,6 +40,7 @@ class SpeedScaled:
 
     @property
     def states(self) -> tuple[str, ...]:
+        """Names of the states."""
         return self.model.states
 
     def matrices(self) -> StateSpace:

@@ -69,6 +69,7 @@ class OperatingPoint:
 
     @property
     def loop(self) -> Loop:
+        """The loop, without its stop."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "indices"}  # pyright: ignore[reportArgumentType]
         return Loop(**fields, stop=NoStop())
 

@@ -80,10 +80,12 @@ class ProofFile(NamedTuple):
 
     @property
     def pieces(self) -> tuple[TailPiece, ...]:
+        """The pieces of the tail."""
         return () if self.tail is None else self.tail.pieces
 
     @property
     def signals(self) -> list[str]:
+        """The signals that the file bounds."""
         return list(dict.fromkeys(name.partition(" ")[2] for name in self.bounds if " " in name))
 
     @property

@@ -287,7 +287,7 @@ def stepped(delay, command, slope, lengths, jumps=()):
 @killed_by(
     "actuators/delay.py",
     "_piece(m.window, last).end)",
-    "_piece(m.window, last).end + jnp.where(m.known == m.count, 0.0, 1.0))",
+    "_piece(m.window, last).end + jnp.where(m.valid == m.count, 0.0, 1.0))",
 )
 def test_steps_of_any_length():
     """A cubic command that jumps by 3 at 0.1 s. Steps between 20 us and 5 ms; the delay is 3.7 ms, so that longer ones

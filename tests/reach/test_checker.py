@@ -372,7 +372,7 @@ def test_a_function_has_its_own_derivative(name):
     """x' = 0, x(0) = p, and the distance is that of c x + f(x) over 1 s; the derivative is that of the equations."""
     c, centre, function = RISING[name]
     derivation = object.__new__(_Derivation)
-    derivation.operations, derivation.known = [], {}
+    derivation.operations, derivation.indices = [], {}
     make, number = derivation.make, derivation.number
     x, time = make("state", (), 0), make("state", (), 2)
     if name == "power":

@@ -113,7 +113,7 @@ class MomentumQuarterCar(QuarterCar):
 
 
 @killed_by("reach/equations.py", 'op("sub", of(x), op("mul", node, of(y)))', "y", case="MomentumQuarterCar")
-@killed_by("reach/equations.py", "zip(inputs, rates, strict=True)", "zip(inputs, own, strict=True)")
+@killed_by("reach/equations.py", "zip(inputs, rates, strict=True)", "zip(inputs, plant_nodes, strict=True)")
 @pytest.mark.parametrize("plant", [StoppedQuarterCar, MomentumQuarterCar])
 def test_rates_come_from_the_values_of_the_output(plant: type[QuarterCar]) -> None:
     """Not from the derivatives that a part declares, and whatever its states are."""

@@ -39,7 +39,7 @@ def still(period: float | None = None) -> Equations:
 @pytest.mark.parametrize("period", [None, 0.1], ids=["continuous", "sampled"])
 def test_signals_that_depend_on_no_state_are_bounded(period):
     prover = Prover(still(period), ("param", "const", "square", "inverse"), 1.0)
-    assert prover.kept == []
+    assert prover.persistent == []
     prover.choose_weights(np.array([0.35]))
     found = prover.prove(CELLS, 1)
     assert found.status.tolist() == [2, 2]

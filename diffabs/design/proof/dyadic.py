@@ -32,10 +32,12 @@ class Dyadic:
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
         return np.shape(self.ints)
 
     @property
     def mT(self) -> "Dyadic":
+        """The array with its last two axes exchanged."""
         return self.each(lambda array: array.mT)
 
     def each(self, function: Callable[[PyTree], PyTree], bits: int = 0) -> "Dyadic":

@@ -72,6 +72,7 @@ class Unknowns:
         self.stacked = {name: np.concatenate([np.zeros((1, *b.shape[1:])), b]) for name, b in self.basis.items()}
 
     def values(self, y: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the matrices in a vector `y`."""
         return {name: np.tensordot(y, unit, 1) for name, unit in self.basis.items()}
 
     def blocks(self, formulas: Callable[[Mapping[str, np.ndarray]], list[PyTree]]) -> list[SdpBlock]:
