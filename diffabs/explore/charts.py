@@ -24,9 +24,9 @@ LIMIT_ROOM = 1.5  # the control's axis ends at this multiple of its largest magn
 TOP, BOTTOM, BETWEEN = 6.0, 7.5, 6.5  # margins and gaps of the panels in percent of the height
 
 
-def run_chart(found: Curves) -> JsonObject:
+def run_chart(curves: Curves) -> JsonObject:
     """Return the options of the chart of a run: axes, legends, and all lines, also those without data yet."""
-    shown, given = found.panels, change_curves(found)
+    shown, change = curves.panels, change_curves(curves)
     count = len(shown)
     height = (100 - TOP - BOTTOM - BETWEEN * (count - 1)) / count
     tops = [TOP + i * (height + BETWEEN) for i in range(count)]
@@ -44,36 +44,36 @@ def run_chart(found: Curves) -> JsonObject:
         "dataZoom": [{"type": "inside", "xAxisIndex": list(range(count)), "filterMode": "none"}],
         "axisPointer": {"link": [{"xAxisIndex": "all"}], "label": {"precision": 3}},
         "xAxis": [_x(i, last=i == count - 1) for i in range(count)],
-        "yAxis": [_y(panel, i) | given["yAxis"][i] for i, panel in enumerate(shown)],
+        "yAxis": [_y(panel, i) | change["yAxis"][i] for i, panel in enumerate(shown)],
         # Series refer to these datasets by id: a change replaces columns and leaves the series alone.
-        "dataset": [*given["dataset"], *({"id": name, "source": {"t": []}} for name in ("before", "fan"))],
+        "dataset": [*change["dataset"], *({"id": name, "source": {"t": []}} for name in ("before", "fan"))],
         "series": [line for i, panel in enumerate(shown) for line in _series(panel, i)],
     }
 
 
-def change_curves(found: Curves, which: str = "now") -> JsonObject:
+def change_curves(curves: Curves, dataset: str = "now") -> JsonObject:
     """Return the change of the chart that shows a run.
 
     Args:
-        which: "now" for the current run with all its curves, "before" for the first curve of each panel of a run to
+        dataset: "now" for the current run with all its curves, "before" for the first curve of each panel of a run to
             compare with.
     """
-    source = {"t": round_for_screen(found.t)}
-    for i, panel in enumerate(found.panels):
-        lines = panel.lines if which == "now" else panel.lines[:1]
+    source = {"t": round_for_screen(curves.t)}
+    for i, panel in enumerate(curves.panels):
+        lines = panel.lines if dataset == "now" else panel.lines[:1]
         source |= {f"{i}.{j}": round_for_screen(line.values) for j, line in enumerate(lines)}
-    change: JsonObject = {"dataset": [{"id": which, "source": source}]}
-    if which == "now":
-        change["yAxis"] = [_limits(panel) for panel in found.panels]
+    change: JsonObject = {"dataset": [{"id": dataset, "source": source}]}
+    if dataset == "now":
+        change["yAxis"] = [_limits(panel) for panel in curves.panels]
     return change
 
 
-def change_fan(found: Fan | None) -> JsonObject:
+def change_fan(fan: Fan | None) -> JsonObject:
     """Return the change of the chart that shows a fan; None removes it."""
-    if found is None:
+    if fan is None:
         return clear_curves("fan")
-    source = {"t": round_for_screen(found.t)}
-    for i, band in enumerate(found.bands):
+    source = {"t": round_for_screen(fan.t)}
+    for i, band in enumerate(fan.bands):
         low, quarter, _, third, high = band
         # Stacked areas: each entry is the distance to the quantile below.
         steps = (low, quarter - low, third - quarter, high - third)
@@ -90,9 +90,9 @@ def change_time_axis(end: float | None) -> JsonObject:
     }
 
 
-def clear_curves(which: str) -> JsonObject:
+def clear_curves(dataset: str) -> JsonObject:
     """Return the change of the chart that removes curves, "before" or "fan"."""
-    return {"dataset": [{"id": which, "source": {"t": []}}]}
+    return {"dataset": [{"id": dataset, "source": {"t": []}}]}
 
 
 def pole_chart() -> JsonObject:
@@ -135,13 +135,13 @@ POLE = (
 )
 
 
-def change_poles(found: Stability | None) -> JsonObject:
+def change_poles(stability: Stability | None) -> JsonObject:
     """Return the change of the map that shows the poles of a loop; None empties the map.
 
     Poles of a sampled loop are shown as ln(z)/T.
     """
-    here = _points(found.poles, found.period) if found else []
-    around = _points(found.corners.poles, found.period) if found else []
+    here = _points(stability.poles, stability.period) if stability else []
+    around = _points(stability.corners.poles, stability.period) if stability else []
     x, y = (np.array([point[i] for point in here + around] or [-1.0]) for i in (0, 1))
     far = _round_up_nicely(1.05 * max(float(np.max(np.abs(x))), 1e-3))
     right = max(0.1 * far, _round_up_nicely(1.05 * float(x.max())) if x.max() > 0 else 0.0)
@@ -218,13 +218,13 @@ def _series(panel: Panel, i: int) -> list[JsonObject]:
     hidden |= {"lineStyle": {"width": 0}, "tooltip": {"show": False}, "z": 1}
     names = ("", OUTER, INNER, OUTER)
     shades = (0.0, 0.13, 0.26, 0.13)
-    found = [
+    series = [
         {**hidden, "name": name or f"fan {i}", "encode": {"x": "t", "y": f"{i}.{j}"}}
         | {"areaStyle": {"color": BLUE, "opacity": shade}, "itemStyle": {"color": "#8FBFDC" if j != 2 else "#5FA3CC"}}
         for j, (name, shade) in enumerate(zip(names, shades, strict=True))
     ]
     before = {"lineStyle": {"color": GREY, "width": 1.5, "type": [6, 3]}, "itemStyle": {"color": GREY}, "z": 2}
-    found.append({**place, "name": BEFORE, "datasetId": "before", "encode": {"x": "t", "y": f"{i}.0"}, **before})
+    series.append({**place, "name": BEFORE, "datasetId": "before", "encode": {"x": "t", "y": f"{i}.0"}, **before})
     signals = 0
     for j, line in enumerate(panel.lines):
         dashes = AIMS.get(line.name, "solid")
@@ -238,8 +238,8 @@ def _series(panel: Panel, i: int) -> list[JsonObject]:
         signals += line.name not in AIMS
         style = {"color": colour, "width": 2 if j == 0 else 1.4, "type": dashes}
         look = {"lineStyle": style, "itemStyle": {"color": colour}, "z": 4 if j == 0 else 3}
-        found.append({**place, "name": line.name, "datasetId": "now", "encode": {"x": "t", "y": f"{i}.{j}"}, **look})
-    return found
+        series.append({**place, "name": line.name, "datasetId": "now", "encode": {"x": "t", "y": f"{i}.{j}"}, **look})
+    return series
 
 
 def _limits(panel: Panel) -> JsonObject:
@@ -250,10 +250,10 @@ def _limits(panel: Panel) -> JsonObject:
     if panel.lines[-1].name != "command":
         return {}
     values = panel.lines[0].values[np.isfinite(panel.lines[0].values)]
-    most = float(np.max(np.abs(values))) if values.size else 0.0
-    if not most:
+    greatest = float(np.max(np.abs(values))) if values.size else 0.0
+    if not greatest:
         return {"min": -1, "max": 1}
-    nice = _round_up_nicely(LIMIT_ROOM * most)
+    nice = _round_up_nicely(LIMIT_ROOM * greatest)
     low, high = -nice if values.min() < 0 else 0, nice if values.max() > 0 else 0
     return {"min": low, "max": high, "interval": nice / 2 if low and high else _tick_interval(nice)}
 

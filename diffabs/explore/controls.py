@@ -50,7 +50,7 @@ class Controls:
         """
         self.inside.clear()
         self._fill()
-        self.made.set_text(fan)
+        self.fan_note.set_text(fan)
 
     def show(self, key: str) -> None:
         """Show the current value of the number `key` in its field and slider."""
@@ -81,13 +81,13 @@ class Controls:
             self.fields[key].props("error")
             self.refused[key] = partial(self.show, key)
 
-    def fan(self, found: Fan | None) -> None:
-        """Show the number of members of the fan `found`, and the parameters that differ between them."""
-        if found is None:
-            self.made.set_text("no fan: nothing differs between its runs")
+    def fan(self, fan: Fan | None) -> None:
+        """Show the number of members of the fan `fan`, and the parameters that differ between them."""
+        if fan is None:
+            self.fan_note.set_text("no fan: nothing differs between its runs")
             return
-        lost = [f"; {n} {words}" for n, words in ((found.refused, "refused"), (found.diverged, "diverged")) if n]
-        self.made.set_text(f"{found.members} members, {found.words}{''.join(lost)}")
+        lost = [f"; {n} {words}" for n, words in ((fan.refused, "refused"), (fan.diverged, "diverged")) if n]
+        self.fan_note.set_text(f"{fan.members} members, {fan.words}{''.join(lost)}")
 
     def _fill(self) -> None:
         self.fields, self.sliders, self.refused = {}, {}, {}
@@ -96,38 +96,40 @@ class Controls:
             labels = {source: pathlib.Path(source).name for source in self.sources}
             self._chooser("scenario", labels, self.session.source, load_basis)
             for family in EXCHANGEABLE_FAMILIES:
-                if there := self.session.choices(family):
-                    self._chooser(family, there, self.session.parts[family], partial(self.session.load_part, family))
-            for note in self.session.given.notes:
+                if choices := self.session.choices(family):
+                    self._chooser(family, choices, self.session.parts[family], partial(self.session.load_part, family))
+            for note in self.session.original.notes:
                 ui.label(note).classes("note")
             # How far the members of the fan spread around the current values.
             ui.label("fan of 200 runs").classes("group")
             words = {MASS: "masses differ by ±", ROAD: "friction differs by ±"}
-            wanted = [MASS, ROAD] if AS_GIVEN in self.session.choices("road") else [MASS]
-            for name in wanted:
+            spreads = [MASS, ROAD] if AS_GIVEN in self.session.choices("road") else [MASS]
+            for name in spreads:
                 with ui.element("div").classes("spread"):
                     ui.label(words[name])
                     field = ui.input(value=self._spread(name)).props("dense outlined")
                     field.props["data-id"] = f"fan-{name}"
                     field.on("change", lambda _, name=name, field=field: self._take_spread(name, field))
                     ui.label("%").classes("unit")
-            self.made = ui.label().classes("note").props("data-id=fan")
+            self.fan_note = ui.label().classes("note").props("data-id=fan")
             # Few numbers at first, to keep the page light: rows of the others are built when they are first opened.
             self._rows(self.session.first)
-            rest = [key for key in self.session.knobs if key not in self.session.first]
-            more = ui.expansion(f"all other numbers ({len(rest)})").classes("w-full").props("dense data-id=others")
+            hidden_keys = [key for key in self.session.knobs if key not in self.session.first]
+            more = (
+                ui.expansion(f"all other numbers ({len(hidden_keys)})").classes("w-full").props("dense data-id=others")
+            )
 
             def open_rest(event: Any) -> None:
-                if event.value and not any(key in self.fields for key in rest):
+                if event.value and not any(key in self.fields for key in hidden_keys):
                     with more:
-                        self._rows(rest)
+                        self._rows(hidden_keys)
 
             more.on_value_change(open_rest)
 
-    def _chooser(self, name: str, there: Any, value: str, load: Callable[[str], Basis]) -> None:
-        """Add a list of choices, `there`; `load` loads a chosen one."""
+    def _chooser(self, name: str, choices: Any, value: str, load: Callable[[str], Basis]) -> None:
+        """Add a list of choices, `choices`; `load` loads a chosen one."""
         field = (
-            ui.select(there, value=value, label=name).classes("w-full chooser").props("dense outlined options-dense")
+            ui.select(choices, value=value, label=name).classes("w-full chooser").props("dense outlined options-dense")
         )
         field.props["data-id"] = name
         field.on_value_change(lambda event: self._replaced(partial(load, event.value)))

@@ -34,13 +34,13 @@ TRANSIENT_MULTIPLE = 1.5  # length of a fitted time axis in transients
 MIN_TRANSIENT_SHARE = 0.1  # a fan is drawn while this share of its runs goes on
 
 
-def drawing_solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
+def drawing_solver(scenario: Scenario, instants: int = INSTANTS) -> Solver:
     """Return the scenario's solver, with `every` set for a run that may stop after a small part of its duration.
 
     The step of the integration does not change. Over the whole duration, `KEPT_MULTIPLE` times `instants` are stored.
     """
-    every = math.ceil(chosen.solver.steps / (KEPT_MULTIPLE * instants))
-    return dataclasses.replace(chosen.solver, every=max(1, every))
+    every = math.ceil(scenario.solver.steps / (KEPT_MULTIPLE * instants))
+    return dataclasses.replace(scenario.solver, every=max(1, every))
 
 
 def thin(count: int, instants: int) -> np.ndarray:
@@ -49,65 +49,67 @@ def thin(count: int, instants: int) -> np.ndarray:
     return places if count == 0 or places[-1] == count - 1 else np.append(places, count - 1)
 
 
-def draft_solver(chosen: Scenario) -> Solver | None:
+def draft_solver(scenario: Scenario) -> Solver | None:
     """Return a quicker, adaptive solver for the curve during a drag, or None if the scenario's own is to be used.
 
     The own solver stays if it is adaptive or has few steps. It also stays if a clock in the loop needs its grid.
     """
-    own = chosen.solver
-    if chosen.loop.ticks or not isinstance(own, FixedStep) or own.steps <= MIN_DRAFT_STEPS:
+    solver = scenario.solver
+    if scenario.loop.ticks or not isinstance(solver, FixedStep) or solver.steps <= MIN_DRAFT_STEPS:
         return None
-    return Adaptive(rtol=DRAFT_RTOL, duration=own.duration, step=own.duration / (KEPT_MULTIPLE * INSTANTS))
+    return Adaptive(rtol=DRAFT_RTOL, duration=solver.duration, step=solver.duration / (KEPT_MULTIPLE * INSTANTS))
 
 
-def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
+def run_curves(scenario: Scenario, by: Solver | None = None) -> Curves:
     """Return the curves of a scenario's run by a solver; None is the scenario's own."""
-    run: Run = jax.device_get(rollout(chosen.loop, by or drawing_solver(chosen), chosen.objectives, key=chosen.key()))
+    run: Run = jax.device_get(
+        rollout(scenario.loop, by or drawing_solver(scenario), scenario.objectives, key=scenario.key())
+    )
     assert run.trajectory is not None
     # Samples after the end of the run are no part of the curves.
-    count = len(trajectory_columns(run, chosen.loop.plant)["t"][1])
+    count = len(trajectory_columns(run, scenario.loop.plant)["t"][1])
     shown = thin(count, INSTANTS)
     t = np.asarray(run.trajectory.sample.t)[shown]
     panels = tuple(
         Panel(panel.unit, tuple(Curve(line.name, line.values[shown]) for line in panel.lines))
-        for panel in _layout(run, chosen.loop.plant)
+        for panel in _layout(run, scenario.loop.plant)
     )
-    metrics = {name: float(run.metrics[name]) for name in chosen.objectives}
-    return Curves(t, panels, metrics, _describe_end(chosen, run, t), by is not None)
+    metrics = {name: float(run.metrics[name]) for name in scenario.objectives}
+    return Curves(t, panels, metrics, _describe_end(scenario, run, t), by is not None)
 
 
-def transient_end(found: Curves) -> float:
+def transient_end(curves: Curves) -> float:
     """Return the end [s] of a time axis that fits the transient.
 
     It is 1.5 times the settling time of the first signal, and at most the end of the run. Settled means within 5 % of
     the largest distance from the target. Without a target the last value takes its place. A run that does not settle is
     shown whole.
     """
-    lines = {line.name: line.values for line in found.panels[0].lines}
-    signal = found.panels[0].lines[0].values
+    lines = {line.name: line.values for line in curves.panels[0].lines}
+    signal = curves.panels[0].lines[0].values
     target = lines["target"]
     away = np.abs(signal - np.where(np.isfinite(target), target, signal[-1]))
     far = np.flatnonzero(away > SETTLED_SHARE * np.max(away, initial=0.0))
-    end = float(found.t[-1])
+    end = float(curves.t[-1])
     return (
         end
         if not far.size or far[-1] + 1 >= len(signal)
-        else min(end, TRANSIENT_MULTIPLE * float(found.t[far[-1] + 1]))
+        else min(end, TRANSIENT_MULTIPLE * float(curves.t[far[-1] + 1]))
     )
 
 
-def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
+def run_fan(scenario: Scenario, spread: Spread) -> Fan | None:
     """Return the quantiles of `MEMBERS` runs with different masses and roads, or None if nothing differs.
 
     Refused and diverged runs do not count. The fan ends where too few runs still go on.
     """
-    values, words = fan_members(chosen, spread)
+    values, words = fan_members(scenario, spread)
     if not values:
         return None
-    by = draft_solver(chosen) or drawing_solver(chosen, DRAFT_INSTANTS)
-    accepted = batch_admissibility(chosen.loop, values, by).accepted
-    batch = Batch(values, keys=np.arange(MEMBERS) + chosen.seed)
-    run: Run = jax.device_get(run_batch(chosen.loop, batch, by, {}, trajectories=True, accepted=accepted))
+    by = draft_solver(scenario) or drawing_solver(scenario, DRAFT_INSTANTS)
+    accepted = batch_admissibility(scenario.loop, values, by).accepted
+    batch = Batch(values, keys=np.arange(MEMBERS) + scenario.seed)
+    run: Run = jax.device_get(run_batch(scenario.loop, batch, by, {}, trajectories=True, accepted=accepted))
     # Samples after the end of a run, and diverged runs, are no part of the quantiles.
     lost = np.asarray(run.diverged)
     assert run.trajectory is not None
@@ -117,26 +119,26 @@ def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
     longest = int(np.argmax(going.sum(axis=1)))
     count = int(np.sum(going.mean(axis=0) >= MIN_TRANSIENT_SHARE * max(1e-9, going[:, 0].mean())))
     shown = thin(count, DRAFT_INSTANTS)
-    signals = [panel.lines[0].values for panel in _layout(run, chosen.loop.plant)]
+    signals = [panel.lines[0].values for panel in _layout(run, scenario.loop.plant)]
     bands = tuple(_quantiles(np.where(going, values, np.nan)[:, shown]) for values in signals)
     refused = int(np.sum(~accepted))
     return Fan(t[longest, shown], bands, MEMBERS, refused, int(lost.sum()) - refused, words)
 
 
-def fan_members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], str]:
+def fan_members(scenario: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], str]:
     """Return the values of a fan's members by path, each of shape (MEMBERS,) in SI, and their spread in words.
 
     Every call uses the same low-discrepancy points, so the fan does not flicker during a drag. Values stay below the
     upper end of the parameter's range. A parameter without spread is left out. The dictionary is empty if no parameter
     remains.
     """
-    there = {path: spec for path, spec, _ in parameters(chosen.loop)}
-    wanted = {mass_path(chosen): spread.mass, FACTOR_PATH: spread.road}
-    wanted = {path: part for path, part in wanted.items() if path in there and part > 0}
-    unit = 2 * low_discrepancy_points(MEMBERS, len(wanted)) - 1
+    specs = {path: spec for path, spec, _ in parameters(scenario.loop)}
+    spreads = {mass_path(scenario): spread.mass, FACTOR_PATH: spread.road}
+    spreads = {path: part for path, part in spreads.items() if path in specs and part > 0}
+    unit = 2 * low_discrepancy_points(MEMBERS, len(spreads)) - 1
     values, words = {}, []
-    for i, (path, part) in enumerate(wanted.items()):
-        spec, here = there[path], float(get(chosen.loop, path))
+    for i, (path, part) in enumerate(spreads.items()):
+        spec, here = specs[path], float(get(scenario.loop, path))
         low, high = (here * (1 + sign * part) for sign in (-1, 1))
         middle, half = (low + min(high, spec.high)) / 2, (min(high, spec.high) - low) / 2
         # unit is in [-1, 1]; a range that is cut at its upper end is filled evenly.
@@ -178,10 +180,10 @@ def _in_kmh(panel: Panel) -> Panel:
     return Panel("km/h", tuple(Curve(line.name, KMH * line.values) for line in panel.lines))
 
 
-def _describe_end(chosen: Scenario, run: Run, t: np.ndarray) -> str:
+def _describe_end(scenario: Scenario, run: Run, t: np.ndarray) -> str:
     if run.diverged:
         return f"diverged: {describe_faults(run)}"
-    stop, end = chosen.loop.stop, f"after {float(t[-1]):.4g} s"
+    stop, end = scenario.loop.stop, f"after {float(t[-1]):.4g} s"
     if bool(run.stopped) == stop.success:
         return f"ends {end}"
     otherwise = getattr(stop, "otherwise", "")

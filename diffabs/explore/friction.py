@@ -18,42 +18,42 @@ ROAD, INNER = "plant.road.", "plant.road.road."
 FACTOR_PATH = "plant.road.scale"
 
 
-def with_factor(chosen: "Scenario") -> "Scenario":
+def with_factor(scenario: "Scenario") -> "Scenario":
     """Return the scenario with a friction factor at `plant.road.scale`.
 
     A scenario without a road, or whose road has a factor already, is returned unchanged.
     """
-    road = getattr(chosen.loop.plant, "road", None)
+    road = getattr(scenario.loop.plant, "road", None)
     if road is None or isinstance(road, Scaled):
-        return chosen
-    plant: Part = chosen.loop.plant
+        return scenario
+    plant: Part = scenario.loop.plant
     plant = dataclasses.replace(plant, road=Scaled(road=road))
-    return _rename_paths(chosen, plant, lambda path: INNER + path[len(ROAD) :] if path.startswith(ROAD) else path)
+    return _rename_paths(scenario, plant, lambda path: INNER + path[len(ROAD) :] if path.startswith(ROAD) else path)
 
 
-def without_factor(chosen: "Scenario", given: "Scenario") -> "Scenario":
+def without_factor(scenario: "Scenario", original: "Scenario") -> "Scenario":
     """Return the scenario without the factor that `with_factor` added, if the factor is still 1."""
-    road = getattr(chosen.loop.plant, "road", None)
-    had = isinstance(getattr(given.loop.plant, "road", None), Scaled)
+    road = getattr(scenario.loop.plant, "road", None)
+    had = isinstance(getattr(original.loop.plant, "road", None), Scaled)
     if not isinstance(road, Scaled) or had or float(road.scale) != 1.0:
-        return chosen
-    plant: Part = chosen.loop.plant
+        return scenario
+    plant: Part = scenario.loop.plant
     plant = dataclasses.replace(plant, road=road.road)
-    return _rename_paths(chosen, plant, lambda path: ROAD + path[len(INNER) :] if path.startswith(INNER) else path)
+    return _rename_paths(scenario, plant, lambda path: ROAD + path[len(INNER) :] if path.startswith(INNER) else path)
 
 
-def _rename_paths(chosen: "Scenario", plant: Part, name: Callable[[str], str]) -> "Scenario":
+def _rename_paths(scenario: "Scenario", plant: Part, name: Callable[[str], str]) -> "Scenario":
     def keys(table: Table) -> JsonObject:
         return {name(path): value for path, value in table.items()}
 
-    tune, sweep = chosen.tune, chosen.sweep
+    tune, sweep = scenario.tune, scenario.sweep
     correlation = sweep.correlation
     if correlation is not None:
         correlation = dataclasses.replace(correlation, paths=tuple(map(name, correlation.paths)))
     return dataclasses.replace(
-        chosen,
-        loop=dataclasses.replace(chosen.loop, plant=plant),
-        design=dataclasses.replace(chosen.design, over=keys(chosen.design.over)),
+        scenario,
+        loop=dataclasses.replace(scenario.loop, plant=plant),
+        design=dataclasses.replace(scenario.design, over=keys(scenario.design.over)),
         tune=dataclasses.replace(tune, free=keys(tune.free), over=keys(tune.over)),
         sweep=dataclasses.replace(sweep, over=keys(sweep.over), correlation=correlation),
     )

@@ -73,12 +73,12 @@ class Guard:
         host, origin = (request.headers.getlist(name) for name in ("host", "origin"))
         here = len(host) == 1 and host[0] in self.hosts
         # Requests without Origin pass: a browser omits it for the navigation to the page.
-        own = origin in ([], [f"http://{host[0]}"]) if here else False
-        return here and own and _loopback(request.client)
+        same_origin = origin in ([], [f"http://{host[0]}"]) if here else False
+        return here and same_origin and _loopback(request.client)
 
     # compare_digest takes the same time for every guess, so timing does not reveal the token.
-    def _same(self, given: list[str]) -> bool:
-        return len(given) == 1 and secrets.compare_digest(given[0].encode(), self.token.encode())
+    def _same(self, tokens: list[str]) -> bool:
+        return len(tokens) == 1 and secrets.compare_digest(tokens[0].encode(), self.token.encode())
 
 
 def _loopback(client: Any) -> bool:

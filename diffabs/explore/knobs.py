@@ -57,14 +57,14 @@ class Knob:
         """Path of this number, with its index in a list."""
         return self.path if self.place is None else f"{self.path}.{self.place}"
 
-    def read(self, given: PyTree) -> float:
-        """Return a typed or dragged value, `given` in the displayed unit, in SI."""
-        if isinstance(given, str):
+    def read(self, value: PyTree) -> float:
+        """Return a typed or dragged value, `value` in the displayed unit, in SI."""
+        if isinstance(value, str):
             try:
-                given = read_decimal(given)
+                value = read_decimal(value)
             except ValueError:
-                raise wrong_kind_error(self.name, given.strip(), f"a number in {self.spec.interval()}") from None
-        return read_number_in_range(given, self.spec, self.name) / self.scale
+                raise wrong_kind_error(self.name, value.strip(), f"a number in {self.spec.interval()}") from None
+        return read_number_in_range(value, self.spec, self.name) / self.scale
 
     def pick(self, value: Scalar) -> float:
         """Return this number [SI] from the `value` of its parameter."""
@@ -119,12 +119,12 @@ class Knob:
         return math.copysign(1.0, shown) * math.log(abs(shown)) if self._logarithmic else shown
 
 
-def knobs(chosen: Scenario) -> dict[str, Knob]:
+def knobs(scenario: Scenario) -> dict[str, Knob]:
     """Return every number of a scenario's loop by its key."""
-    found: dict[str, Knob] = {}
-    for path, spec, value in parameters(chosen.loop):
+    by_key: dict[str, Knob] = {}
+    for path, spec, value in parameters(scenario.loop):
         tail = path.rpartition(".")[2]
-        scale = KMH if spec.unit == "m/s" and tail in SPEED_FIELDS and is_vehicle(chosen.loop.plant) else 1.0
+        scale = KMH if spec.unit == "m/s" and tail in SPEED_FIELDS and is_vehicle(scenario.loop.plant) else 1.0
         name = canonical_path(path) + ("_kmh" if scale != 1.0 else "")
         group, _, label = canonical_path(path).partition(".")
         label = label.removeprefix(f"{group}.").replace("_", " ")
@@ -136,12 +136,14 @@ def knobs(chosen: Scenario) -> dict[str, Knob]:
             at = place[0] if place else None
             suffix = "" if at is None else f".{at}"
             unit = "km/h" if scale != 1.0 else unit_at(spec.unit, at or 0, values.size)
-            own = dataclasses.replace(spec, unit=unit, low=spec.low * scale, high=spec.high * scale)
-            low, high = _slider_ends(own, float(values[place]) * scale, _range_in_scenario(chosen, path, at, scale))
+            shown_spec = dataclasses.replace(spec, unit=unit, low=spec.low * scale, high=spec.high * scale)
+            low, high = _slider_ends(
+                shown_spec, float(values[place]) * scale, _range_in_scenario(scenario, path, at, scale)
+            )
             words = label if at is None else f"{label} {at + 1}"
-            knob = Knob(path, at, name + suffix, group, words, own, scale, low, high)
-            found[knob.key] = knob
-    return found
+            knob = Knob(path, at, name + suffix, group, words, shown_spec, scale, low, high)
+            by_key[knob.key] = knob
+    return by_key
 
 
 def is_vehicle(plant: Part) -> bool:
@@ -154,54 +156,54 @@ def unit_words(unit: str) -> str:
     return "" if unit == "1" else unit.replace("^2", "²")
 
 
-def first_knobs(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
+def first_knobs(scenario: Scenario, by_key: Mapping[str, Knob]) -> list[str]:
     """Return the keys of the numbers that the page shows at once, at most `MOST_FIRST`, sorted by group.
 
     In order of priority they are mass, speed, friction, tuned parameters, filters, gains, parameters that vary in the
     scenario, and numbers of the start. Gains are left out if the scenario tunes a parameter of the controller. Numbers
     without a slider are left out, too.
     """
-    tune, over = chosen.tune, [*chosen.design.over, *chosen.tune.over, *chosen.sweep.over]
-    paths = [*filter(None, (mass_path(chosen),)), "initial.speed", FACTOR_PATH, *tune.free]
-    paths += [knob.path for knob in known.values() if knob.path.rpartition(".")[2] in FILTERS]
+    tune, over = scenario.tune, [*scenario.design.over, *scenario.tune.over, *scenario.sweep.over]
+    paths = [*filter(None, (mass_path(scenario),)), "initial.speed", FACTOR_PATH, *tune.free]
+    paths += [knob.path for knob in by_key.values() if knob.path.rpartition(".")[2] in FILTERS]
     if not any(path.startswith("controller.") for path in tune.free):
-        tails = {knob.path: knob.path.rpartition(".")[2] for knob in known.values()}
+        tails = {knob.path: knob.path.rpartition(".")[2] for knob in by_key.values()}
         paths += [path for path, tail in tails.items() if path.startswith("controller.") and tail not in LIMITS]
-    paths += [*over, *(knob.path for knob in known.values() if knob.group == "initial")]
-    keys = [knob.key for path in dict.fromkeys(paths) for knob in known.values() if knob.path == path]
-    usable = [key for key in keys if known[key].low is not None]
-    groups = list(dict.fromkeys(known[key].group for key in usable))
-    return sorted(usable[:MOST_FIRST], key=lambda key: groups.index(known[key].group))
+    paths += [*over, *(knob.path for knob in by_key.values() if knob.group == "initial")]
+    keys = [knob.key for path in dict.fromkeys(paths) for knob in by_key.values() if knob.path == path]
+    usable = [key for key in keys if by_key[key].low is not None]
+    groups = list(dict.fromkeys(by_key[key].group for key in usable))
+    return sorted(usable[:MOST_FIRST], key=lambda key: groups.index(by_key[key].group))
 
 
-def mass_path(chosen: Scenario) -> str | None:
+def mass_path(scenario: Scenario) -> str | None:
     """Return the path of the mass that differs between vehicles or riders, or None.
 
     A mass that the scenario varies has priority over the plant's first one. If the loop has no mass, the same rule
     selects a moment of inertia.
     """
-    over = {*chosen.design.over, *chosen.tune.over, *chosen.sweep.over}
+    over = {*scenario.design.over, *scenario.tune.over, *scenario.sweep.over}
     for unit in ("kg", "kg m^2"):
-        there = [path for path, spec, value in parameters(chosen.loop) if spec.unit == unit and not np.ndim(value)]
-        if there:
-            return next((path for path in there if path in over), there[0])
+        paths = [path for path, spec, value in parameters(scenario.loop) if spec.unit == unit and not np.ndim(value)]
+        if paths:
+            return next((path for path in paths if path in over), paths[0])
     return None
 
 
-def _range_in_scenario(chosen: Scenario, path: str, place: int | None, scale: float) -> tuple[float, float] | None:
+def _range_in_scenario(scenario: Scenario, path: str, place: int | None, scale: float) -> tuple[float, float] | None:
     """Return the range in which the scenario tunes or varies a parameter, in the displayed unit, or None."""
-    tuned, varied = chosen.tune.free.get(path), chosen.design.over.get(path)
-    values = chosen.tune.over.get(path)
-    found = tuned or varied or ((min(values), max(values)) if values else None)
-    if found is None:
+    tuned, varied = scenario.tune.free.get(path), scenario.design.over.get(path)
+    values = scenario.tune.over.get(path)
+    interval = tuned or varied or ((min(values), max(values)) if values else None)
+    if interval is None:
         return None
-    ends = [np.asarray(end, float) for end in found]
+    ends = [np.asarray(end, float) for end in interval]
     low, high = (float(end if place is None or not end.ndim else end[place]) for end in ends)
     return low * scale, high * scale
 
 
 def _slider_ends(
-    spec: ParameterSpec, value: float, given: tuple[float, float] | None
+    spec: ParameterSpec, value: float, interval: tuple[float, float] | None
 ) -> tuple[float | None, float | None]:
     """Return the ends of a slider that contains the value and stays in the range, or (None, None)."""
     if not math.isfinite(value):
@@ -209,7 +211,7 @@ def _slider_ends(
     around = sorted((value / SLIDER_RATIO, value * SLIDER_RATIO)) if value else [-1.0, 1.0]
     if not value and math.isfinite(spec.low) and math.isfinite(spec.high):
         around = [spec.low, spec.high]
-    ends = [*around] if given is None else [*given, value * NARROW_RATIO, value / NARROW_RATIO]
+    ends = [*around] if interval is None else [*interval, value * NARROW_RATIO, value / NARROW_RATIO]
     low, high = max(min(ends), spec.low), min(max(ends), spec.high)
     span = high - low
     # An open end is no valid value, so the slider stops short of it.

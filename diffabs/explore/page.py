@@ -80,11 +80,11 @@ class Page:
         """Show a scenario from its beginning."""
         self.oldest_valid, self.learned = self.version + 1, {}
         self.shown = None
-        self.title.set_text(self.session.given.title or self.session.given.name)
+        self.title.set_text(self.session.original.title or self.session.original.name)
         self.end_line.set_text("compiling …")
         self.place.clear()
         self.chart: Canvas | None = None
-        self.results.begin(self.session.given)
+        self.results.begin(self.session.original)
         self.tuner.begin()
         self.redraw()
 
@@ -100,20 +100,20 @@ class Page:
             self.results.proved_box(_verdict(self.tools.judge, self.session))
         self.drawer.ask(partial(self._draw, now, self.version, edit, edited))
 
-    def later(self, show: Callable[..., None], *given: PyTree) -> None:
+    def later(self, show: Callable[..., None], *arguments: PyTree) -> None:
         """Call show(*given) in the server's thread; workers change elements through `later` only."""
 
         def do() -> None:
             if not self.client.is_deleted:
                 with self.client:
-                    show(*given)
+                    show(*arguments)
 
         self.server.call_soon_threadsafe(do)
 
-    def pin(self, found: Curves | None) -> None:
-        """Show the run `found` as the dashed curve to compare with; None removes it."""
+    def pin(self, run: Curves | None) -> None:
+        """Show the run `run` as the dashed curve to compare with; None removes it."""
         if self.chart is not None:
-            change = charts.change_curves(found, "before") if found else charts.clear_curves("before")
+            change = charts.change_curves(run, "before") if run else charts.clear_curves("before")
             self.chart.change(change)
 
     def show_until_settled(self, *, whole: bool) -> None:
@@ -142,10 +142,10 @@ class Page:
         self.tuner.end()
 
     # Methods that run in the server's thread.
-    def _change(self, key: str, given: PyTree, edit: int) -> None:
+    def _change(self, key: str, value: PyTree, edit: int) -> None:
         """Apply a dragged or typed number."""
         try:
-            self.session.put(key, given)
+            self.session.put(key, value)
         except ScenarioError as error:
             self.show_refusal(error)
             self.controls.wrong(key)
@@ -153,10 +153,10 @@ class Page:
         self.controls.show(key)
         self.redraw(edit)
 
-    def _widen(self, name: str, given: PyTree) -> bool:
+    def _widen(self, name: str, value: PyTree) -> bool:
         """Apply another spread of the fan, and return whether it is valid."""
         try:
-            self.session.widen(name, given)
+            self.session.widen(name, value)
         except ScenarioError as error:
             self.show_refusal(error)
             return False
@@ -170,9 +170,9 @@ class Page:
         """
         if version != self.version:
             return
-        for other in self.session.withdraw():
-            if other != key:
-                self.controls.show(other)
+        for withdrawn in self.session.withdraw():
+            if withdrawn != key:
+                self.controls.show(withdrawn)
         self.redraw()
         self.show_refusal(error)
         self.controls.wrong(key)
@@ -193,68 +193,68 @@ class Page:
             with self.client:
                 if basis:
                     self.session.switch(basis)
-                self.controls.rebuild("" if basis else self.controls.made.text)
+                self.controls.rebuild("" if basis else self.controls.fan_note.text)
                 if basis:
                     self.begin()
                 self.show_refusal(refusal)
 
-    def _show_curves(self, found: Curves, now: Scenario, change: str, version: int, edit: int) -> None:
+    def _show_curves(self, run: Curves, now: Scenario, change: str, version: int, edit: int) -> None:
         if version < max(self.oldest_valid, self.drawn):
             return
         self.drawn = version
         self.session.accept(now.loop)
         if self.chart is None:
             with self.place:
-                self.chart = Canvas(charts.run_chart(found), "fill")
+                self.chart = Canvas(charts.run_chart(run), "fill")
         else:
             self.chart.send(change, edit)
-        self.shown = found
+        self.shown = run
         if version == self.version != self.refused_version:
             self.show_refusal(None)
-        self.end_line.set_text(f"{self.session.given.name} {found.end}")
-        if not found.draft:
-            self.results.metrics(found.metrics, fresh=version == self.version)
+        self.end_line.set_text(f"{self.session.original.name} {run.end}")
+        if not run.draft:
+            self.results.metrics(run.metrics, fresh=version == self.version)
 
-    def _gave_up(self, what: str, error: Exception, version: int) -> None:
+    def _gave_up(self, job: str, error: Exception, version: int) -> None:
         if version != self.version:
             return
         self.show_refusal(error)
-        if what == "fan":
-            self.controls.made.set_text("no fan")
+        if job == "fan":
+            self.controls.fan_note.set_text("no fan")
             if self.chart is not None:
                 self.chart.change(charts.clear_curves("fan"))
-        if what == "run":
+        if job == "run":
             self.results.measuring.set_visibility(False)
             if self.shown is None:
                 self.end_line.set_text("no run")
 
-    def _learn(self, name: str, found: PyTree, version: int) -> None:
+    def _learn(self, name: str, value: PyTree, version: int) -> None:
         if version >= self.oldest_valid:
-            self.learned[name] = found
+            self.learned[name] = value
 
-    def _show_fan(self, found: Fan | None, change: str, version: int) -> None:
+    def _show_fan(self, fan: Fan | None, change: str, version: int) -> None:
         if version < self.oldest_valid:
             return
         if self.chart is not None:
             self.chart.send(change)
-        self.controls.fan(found)
+        self.controls.fan(fan)
 
-    def _show_stability(self, found: stability.Stability | str, version: int, whole: bool) -> None:
+    def _show_stability(self, loop_stability: stability.Stability | str, version: int, whole: bool) -> None:
         if version >= self.oldest_valid:
-            self.results.stability(found, fresh=whole and version == self.version)
+            self.results.stability(loop_stability, fresh=whole and version == self.version)
 
-    def _show_verdict(self, found: ProofVerdict, version: int) -> None:
+    def _show_verdict(self, verdict: ProofVerdict, version: int) -> None:
         if version == self.version:
-            self.results.verdict(found)
+            self.results.verdict(verdict)
 
     # Methods that run in worker threads. They reach the page through `later` only.
     @contextlib.contextmanager
-    def _report_error(self, what: str, version: int) -> Iterator[None]:
-        """Show an unexpected error of the computation `what`, and go on after it."""
+    def _report_error(self, job: str, version: int) -> Iterator[None]:
+        """Show an unexpected error of the computation `job`, and go on after it."""
         try:
             yield
         except Exception as error:
-            self.later(self._gave_up, what, error, version)
+            self.later(self._gave_up, job, error, version)
 
     def _draw(self, now: Scenario, version: int, edit: int, edited: Knob | None) -> None:
         """Compute and send the curve, after a check of the `edited` number, and then have the rest computed."""
@@ -269,16 +269,16 @@ class Page:
         # The curve comes first. Also after an error: poles and verdict may exist without a run.
         self.thinker.ask(partial(self._think, now, version))
 
-    def _send(self, found: Curves, now: Scenario, version: int, edit: int = 0) -> None:
-        self.later(self._show_curves, found, now, encode_change(charts.change_curves(found)), version, edit)
+    def _send(self, run: Curves, now: Scenario, version: int, edit: int = 0) -> None:
+        self.later(self._show_curves, run, now, encode_change(charts.change_curves(run)), version, edit)
 
     def _think(self, now: Scenario, version: int) -> None:
         """Compute everything except the curve: quick results during a drag, the others after a rest."""
         if version != self.version:
             return
         steps = {"poles": self._poles, "fan": self._fan}
-        done = [name for name in steps if self.learned.get(name, math.inf) < QUICK_JOB_S]
-        for name in done:
+        quick = [name for name in steps if self.learned.get(name, math.inf) < QUICK_JOB_S]
+        for name in quick:
             self._time_step(name, steps[name], now, version)
         if not self._wait_for_rest(REST, version):
             return
@@ -286,7 +286,7 @@ class Page:
             with self._report_error("run", version):
                 self._send(curves.run_curves(now), now, version)
         for name in steps:
-            if name not in done and version == self.version:
+            if name not in quick and version == self.version:
                 self._time_step(name, steps[name], now, version)
         if version == self.version and not self.corners_current:
             self._poles(now, version, corners=True)
@@ -303,8 +303,8 @@ class Page:
 
     def _wait_for_rest(self, seconds: float, version: int) -> bool:
         """Wait until nothing has changed for some seconds, and return whether this version is still the newest."""
-        while version == self.version and (left := self.turned_at + seconds - time.monotonic()) > 0:
-            time.sleep(min(left, 0.02))
+        while version == self.version and (remaining := self.turned_at + seconds - time.monotonic()) > 0:
+            time.sleep(min(remaining, 0.02))
         return version == self.version
 
     def _poles(self, now: Scenario, version: int, *, corners: bool = False) -> bool:
@@ -312,29 +312,29 @@ class Page:
 
         The corners are the cached ones, or with `corners` they are computed for this loop.
         """
-        found: Any
+        shown: Any
         around = self.learned.get("corners")
         try:
             if corners:
                 around = stability.linearise_corners(now, around)
                 self.later(self._learn, "corners", around, version)
-            found = stability.linear_stability(now, around)
+            shown = stability.linear_stability(now, around)
             self.corners_current = around is not None and around.of == stability.corners_of(now)
         except Exception as error:  # the card shows every error, and the thread goes on
-            found, self.corners_current = _sentence(error), True
-        self.later(self._show_stability, found, version, self.corners_current)
-        return not isinstance(found, str)
+            shown, self.corners_current = _sentence(error), True
+        self.later(self._show_stability, shown, version, self.corners_current)
+        return not isinstance(shown, str)
 
     def _fan(self, now: Scenario, version: int) -> bool:
-        found = curves.run_fan(now, self.session.spread)
-        self.later(self._show_fan, found, encode_change(charts.change_fan(found)), version)
+        fan = curves.run_fan(now, self.session.spread)
+        self.later(self._show_fan, fan, encode_change(charts.change_fan(fan)), version)
         return True
 
 
-def _verdict(judge: Callable[..., ProofVerdict], given: Scenario | Session) -> ProofVerdict:
+def _verdict(judge: Callable[..., ProofVerdict], subject: Scenario | Session) -> ProofVerdict:
     """Return the verdict on a scenario or session; the card shows every error as the reason for no verdict."""
     try:
-        return judge(given)
+        return judge(subject)
     except Exception as error:
         return ProofVerdict(NOT_PROVED, _sentence(error))
 

@@ -27,7 +27,7 @@ class ProvedBox(NamedTuple):
 
     name: str
     content: ProofFile
-    chosen: Scenario
+    scenario: Scenario
 
 
 def load_proved_box(path: pathlib.Path, document: JsonObject) -> ProvedBox:
@@ -44,44 +44,46 @@ def judge_values(proved: ProvedBox, session: Session) -> ProofVerdict:
     They do if each of the box's parameters lies in its range. The duration and the rest of the loop must be those of
     the file's scenario. The sentence gives the file's bounds, or the value that differs.
     """
-    now = friction.without_factor(session.scenario(), session.given)
-    here, there, over = now.loop, proved.chosen.loop, proved.content.over
-    if differs := _find_difference(here, there, over) or _compare_durations(now, proved.chosen):
+    now = friction.without_factor(session.scenario(), session.original)
+    here, proved_loop, over = now.loop, proved.scenario.loop, proved.content.over
+    if differs := _find_difference(here, proved_loop, over) or _compare_durations(now, proved.scenario):
         return ProofVerdict(NOT_PROVED, f"{proved.name} is about {differs}")
     for path, (low, high) in over.items():
         if not low <= (value := float(np.asarray(get(here, path)))) <= high:
-            said = (
+            sentence = (
                 f"outside of the proved box: {_show(session, path, value)} is not in {_range(session, path, low, high)}"
             )
-            return ProofVerdict(NOT_PROVED, f"{said}, by {proved.name}")
+            return ProofVerdict(NOT_PROVED, f"{sentence}, by {proved.name}")
     box = ", ".join(f"{path} {_range(session, path, *ends)}" for path, ends in over.items())
     stated = ", ".join(proved.content.statements)
     return ProofVerdict(CERTIFIED, f"{stated} for {box}, by {proved.name}; verify with diffabs verify {proved.name}")
 
 
-def _find_difference(here: Loop, there: Loop, over: dict[str, tuple[float, float]]) -> str:
+def _find_difference(here: Loop, proved_loop: Loop, over: dict[str, tuple[float, float]]) -> str:
     """Return in which value outside of the box two loops differ, empty if in none."""
     fixed = {path: low for path, (low, _) in over.items()}
-    known = {path for path, _, _ in parameters(here)}
-    if not fixed.keys() <= known or jax.tree.structure(replace(here, fixed)) != jax.tree.structure(
-        replace(there, fixed)
+    paths = {path for path, _, _ in parameters(here)}
+    if not fixed.keys() <= paths or jax.tree.structure(replace(here, fixed)) != jax.tree.structure(
+        replace(proved_loop, fixed)
     ):
         return "another loop"
     for path, spec, value in parameters(here):
-        other = get(there, path)
-        if path not in over and not np.array_equal(np.asarray(value, float), np.asarray(other, float)):
-            given, shown = (f"{_text(one)} {unit_words(spec.unit)}".rstrip() for one in (other, value))
-            return f"{path} = {given}, here it is {shown}"
-    same = (
+        proved_value = get(proved_loop, path)
+        if path not in over and not np.array_equal(np.asarray(value, float), np.asarray(proved_value, float)):
+            proved_text, shown = (
+                f"{_text(number)} {unit_words(spec.unit)}".rstrip() for number in (proved_value, value)
+            )
+            return f"{path} = {proved_text}, here it is {shown}"
+    equal_leaves = (
         np.array_equal(a, b)
-        for a, b in zip(*map(jax.tree.leaves, (replace(here, fixed), replace(there, fixed))), strict=True)
+        for a, b in zip(*map(jax.tree.leaves, (replace(here, fixed), replace(proved_loop, fixed))), strict=True)
     )
-    return "" if all(same) else "another loop"
+    return "" if all(equal_leaves) else "another loop"
 
 
-def _compare_durations(now: Scenario, there: Scenario) -> str:
+def _compare_durations(now: Scenario, proved: Scenario) -> str:
     """Return the difference of two durations, empty if there is none."""
-    ends = float(now.solver.duration), float(there.solver.duration)
+    ends = float(now.solver.duration), float(proved.solver.duration)
     return "" if ends[0] == ends[1] else f"runs of {ends[1]:g} s, here they last {ends[0]:g} s"
 
 

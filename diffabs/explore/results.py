@@ -61,11 +61,11 @@ class ResultsPanel:
         self.numbers = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
         self.numbers.props("data-id=metrics")
 
-    def begin(self, chosen: Scenario) -> None:
-        """Prepare the panel for another scenario, `chosen`."""
-        self.units = {name: unit_of(one, chosen.loop.plant) for name, one in chosen.objectives.items()}
+    def begin(self, scenario: Scenario) -> None:
+        """Prepare the panel for another scenario, `scenario`."""
+        self.units = {name: unit_of(objective, scenario.loop.plant) for name, objective in scenario.objectives.items()}
         self.verdict_box.classes(replace="verdict stale")
-        control = charts.QUANTITIES.get(chosen.loop.plant.control_unit, "control")
+        control = charts.QUANTITIES.get(scenario.loop.plant.control_unit, "control")
         for line in (self.proved_of, self.poles_of):
             line.set_text(f"of the linear model: {control} limits are not in this")
         for line in (self.word, self.why, self.none, self.loop):
@@ -85,48 +85,48 @@ class ResultsPanel:
             busy.set_visibility(True)
         self.verdict_box.classes(add="stale")
 
-    def metrics(self, found: dict[str, float], *, fresh: bool) -> None:
-        """Show the metrics `found`; `fresh` says that they belong to the current numbers."""
+    def metrics(self, values: dict[str, float], *, fresh: bool) -> None:
+        """Show the metrics `values`; `fresh` says that they belong to the current numbers."""
         self.measuring.set_visibility(not fresh)
-        for name, value in found.items():
+        for name, value in values.items():
             self.cells[name].set_text(format_reading(value))
 
-    def stability(self, found: Stability | str, *, fresh: bool) -> None:
+    def stability(self, outcome: Stability | str, *, fresh: bool) -> None:
         """Show poles and margins, or the reason why there are none.
 
-        `found` is the stability or the reason as text. `fresh` says that it belongs to the current numbers.
+        `outcome` is the stability or the reason as text. `fresh` says that it belongs to the current numbers.
         """
         self.solving.set_visibility(not fresh)
-        one = None if isinstance(found, str) else found
-        self.map.change(charts.change_poles(one))
-        self.map.element.set_visibility(one is not None)
-        self.none.set_text(found if isinstance(found, str) else self._of_poles(found))
+        loop = None if isinstance(outcome, str) else outcome
+        self.map.change(charts.change_poles(loop))
+        self.map.element.set_visibility(loop is not None)
+        self.none.set_text(outcome if isinstance(outcome, str) else self._of_poles(outcome))
         for name, (here, worst) in self.margin_cells.items():
-            lowest = one.corners.worst if one else {}
-            here.set_text(format_margin(name, one.margins[name], one.stable) if one else NO_VALUE)
+            lowest = loop.corners.worst if loop else {}
+            here.set_text(format_margin(name, loop.margins[name], loop.stable) if loop else NO_VALUE)
             worst.set_text(format_margin(name, lowest[name], stable=True) if name in lowest else NO_VALUE)
-        self.loop.set_text("" if one is None else "stable" if one.stable else "NOT STABLE")
+        self.loop.set_text("" if loop is None else "stable" if loop.stable else "NOT STABLE")
 
-    def verdict(self, found: ProofVerdict) -> None:
-        """Show the verdict `found` of the proof."""
+    def verdict(self, verdict: ProofVerdict) -> None:
+        """Show the verdict `verdict` of the proof."""
         self.proving.set_visibility(False)
-        self.verdict_box.classes(replace=f"verdict {found.word}")
-        self.word.set_text(HEADS.get(found.word, "no verdict"))
-        self.why.set_text(found.sentence)
+        self.verdict_box.classes(replace=f"verdict {verdict.word}")
+        self.word.set_text(HEADS.get(verdict.word, "no verdict"))
+        self.why.set_text(verdict.sentence)
 
-    def proved_box(self, found: ProofVerdict) -> None:
-        """Show the verdict `found` of a proof's file on the current values."""
+    def proved_box(self, verdict: ProofVerdict) -> None:
+        """Show the verdict `verdict` of a proof's file on the current values."""
         self.box_verdict.set_visibility(True)
-        self.box_verdict.classes(replace=f"verdict {found.word}")
-        self.box_word.set_text("proved for the box" if found.word == CERTIFIED else "no proof for these values")
-        self.box_why.set_text(found.sentence)
+        self.box_verdict.classes(replace=f"verdict {verdict.word}")
+        self.box_word.set_text("proved for the box" if verdict.word == CERTIFIED else "no proof for these values")
+        self.box_why.set_text(verdict.sentence)
 
     @staticmethod
-    def _of_poles(found: Stability) -> str:
+    def _of_poles(loop: Stability) -> str:
         """Return a line about the map: sampling, delay, and the corners behind the worst margins."""
-        kind = f"sampled every {1e3 * found.period:g} ms, shown as ln(z)/T" if found.period else "continuous time"
-        late = f", {1e3 * found.delay:g} ms of delay" if found.delay else ""
-        around = found.corners
+        kind = f"sampled every {1e3 * loop.period:g} ms, shown as ln(z)/T" if loop.period else "continuous time"
+        late = f", {1e3 * loop.delay:g} ms of delay" if loop.delay else ""
+        around = loop.corners
         lost = f", {around.unstable} NOT stable" if around.unstable else ""
         corners = f"; grey and worst: {around.systems} corners of [design.over]{lost}" if around.systems else ""
         return f"{kind}{late}{corners}"

@@ -23,15 +23,15 @@ class Saver:
 
     def ask(self) -> None:
         """Open the dialog."""
-        name = saving.free_name(self.folder, f"{self.session.given.name}-explored")
+        name = saving.free_name(self.folder, f"{self.session.original.name}-explored")
         self.dialog.clear()
         with self.dialog, ui.card().style("min-width: 440px").props("data-id=saving"):
             ui.label("Save the scenario with these numbers").style("font-weight:600; font-size:15px")
             ui.label(f"in {self.folder}").classes("note")
             self.name = ui.input("file", value=name).classes("w-full").props("dense outlined data-id=file")
             self.replacing = ui.checkbox("replace a file of this name").props("dense data-id=replace")
-            self.told = ui.label("").classes("refused").props("data-id=save-refused")
-            self.told.set_visibility(False)
+            self.refusal = ui.label("").classes("refused").props("data-id=save-refused")
+            self.refusal.set_visibility(False)
             with ui.row().classes("w-full justify-end"):
                 ui.button("cancel", on_click=self.dialog.close).props("flat no-caps")
                 ui.button("save", on_click=self._save).props("unelevated no-caps data-id=write")
@@ -39,11 +39,13 @@ class Saver:
 
     def _save(self) -> None:
         try:
-            chosen = self.session.to_save()
-            path = saving.save_scenario(chosen, self.folder, str(self.name.value), replacing=bool(self.replacing.value))
+            scenario = self.session.to_save()
+            path = saving.save_scenario(
+                scenario, self.folder, str(self.name.value), replacing=bool(self.replacing.value)
+            )
         except ScenarioError as error:
-            self.told.set_text(str(error))
-            self.told.set_visibility(True)
+            self.refusal.set_text(str(error))
+            self.refusal.set_visibility(True)
             return
         self.dialog.close()
         ui.notify(

@@ -10,13 +10,13 @@ from diffabs.scenario.scenario import Scenario, dump, loads
 MAX_NAME_LENGTH = 120  # characters, with the suffix
 
 
-def save_scenario(chosen: Scenario, folder: pathlib.Path, name: str, *, replacing: bool = False) -> pathlib.Path:
+def save_scenario(scenario: Scenario, folder: pathlib.Path, name: str, *, replacing: bool = False) -> pathlib.Path:
     """Write a scenario to a file atomically, and return its path.
 
     It refuses an existing file unless `replacing`, and a scenario that the command line would refuse.
     """
     path = folder / _check_name(name)
-    text = dump(chosen).encode()
+    text = dump(scenario).encode()
     loads(text, path.stem, path.name)  # raises ScenarioError if the command line would refuse the text
     try:
         if replacing and path.is_file():

@@ -30,14 +30,14 @@ def serve(
     source: str,
     tools: Tools,
     folder: pathlib.Path,
-    there: socket.socket,
+    listener: socket.socket,
     *,
     thread: str,
     ready: Callable[[str], None] = lambda url: None,
     browser: bool = False,
 ) -> None:
     """Serve the page of a scenario, with one session for each tab, until the process is interrupted."""
-    port, token = there.getsockname()[1], secrets.token_urlsafe(24)
+    port, token = listener.getsockname()[1], secrets.token_urlsafe(24)
     url = f"http://{LOOPBACK_ADDRESS}:{port}/?token={token}"
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
@@ -74,7 +74,7 @@ def serve(
         signal.signal(hang_up, end_on_hang_up)
     with tempfile.TemporaryDirectory(prefix="diffabs-explore-") as private:
         threading.Thread(target=announce, daemon=True).start()
-        server.run(sockets=[there])
+        server.run(sockets=[listener])
     if not server.started:
         raise OSError(f"no page can be served at http://{LOOPBACK_ADDRESS}:{port}/")
 

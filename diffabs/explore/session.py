@@ -57,7 +57,7 @@ class Basis(NamedTuple):
     Attributes:
         source: Path or name of the scenario.
         parts: Chosen part of each exchangeable family, or `AS_GIVEN`.
-        given: Scenario as loaded.
+        original: Scenario as loaded.
         base: The same with a friction factor.
         knobs: Numbers by key.
         first: Keys of the numbers that the page shows at once.
@@ -65,7 +65,7 @@ class Basis(NamedTuple):
 
     source: str
     parts: dict[str, str]
-    given: Scenario
+    original: Scenario
     base: Scenario
     knobs: dict[str, Knob]
     first: list[str]
@@ -77,11 +77,11 @@ def load_basis(source: str, parts: Mapping[str, str] = MappingProxyType({})) -> 
     Args:
         parts: Name of a part by exchangeable family; a family that is missing, or `AS_GIVEN`, keeps the scenario's own.
     """
-    chosen = dict.fromkeys(EXCHANGEABLE_FAMILIES, AS_GIVEN) | dict(parts)
-    given = load(source, [f"{family}={part}" for family, part in chosen.items() if part != AS_GIVEN])
-    base = friction.with_factor(given)
-    known = knobs.knobs(base)
-    return Basis(source, chosen, given, base, known, knobs.first_knobs(base, known))
+    scenario = dict.fromkeys(EXCHANGEABLE_FAMILIES, AS_GIVEN) | dict(parts)
+    original = load(source, [f"{family}={part}" for family, part in scenario.items() if part != AS_GIVEN])
+    base = friction.with_factor(original)
+    numbers = knobs.knobs(base)
+    return Basis(source, scenario, original, base, numbers, knobs.first_knobs(base, numbers))
 
 
 class Session:
@@ -117,17 +117,17 @@ class Session:
 
         The list is empty if the loop has no part of this family.
         """
-        there = family == "controller" or hasattr(self.given.loop.plant, family)
-        return [AS_GIVEN, *sorted(registry.family_types(family))] if there else []
+        has_family = family == "controller" or hasattr(self.original.loop.plant, family)
+        return [AS_GIVEN, *sorted(registry.family_types(family))] if has_family else []
 
-    def put(self, key: str, given: PyTree) -> None:
-        """Set the number `key` to `given` in its displayed unit; the loop is not checked.
+    def put(self, key: str, value: PyTree) -> None:
+        """Set the number `key` to `value` in its displayed unit; the loop is not checked.
 
         `check_edit` checks the loop and takes some milliseconds. `accept` or `withdraw` must follow it.
         """
         if key not in self.knobs:
             raise unknown_name_error(f"{key!r} is no number of this loop", key, self.knobs)
-        self._put(key, self.knobs[key].read(given))
+        self._put(key, self.knobs[key].read(value))
 
     def accept(self, loop: Loop) -> None:
         """Store the numbers of the `loop` as the state to which `withdraw` returns."""
@@ -139,12 +139,12 @@ class Session:
         self.adopt(self._accepted)
         return [key for key, value in before.items() if value != self.value(key)]
 
-    def widen(self, name: str, given: PyTree) -> None:
-        """Set the spread of the fan's members in `name` ("mass" or "road") to a value `given` in percent."""
+    def widen(self, name: str, percent: PyTree) -> None:
+        """Set the spread of the fan's members in `name` ("mass" or "road") to a value `percent` in percent."""
         try:
-            value = read_decimal(given) if isinstance(given, str) else float(given)
+            value = read_decimal(percent) if isinstance(percent, str) else float(percent)
         except (TypeError, ValueError):
-            raise wrong_kind_error(f"fan.{name}", given, f"a number in {PERCENT.interval()}") from None
+            raise wrong_kind_error(f"fan.{name}", percent, f"a number in {PERCENT.interval()}") from None
         self.spread = dataclasses.replace(
             self.spread, **{name: read_number_in_range(value, PERCENT, f"fan.{name}") / 100}
         )
@@ -166,7 +166,7 @@ class Session:
         """Return the scenario for a file, without a friction factor of 1."""
         now = self.scenario()
         changed = bool(self._changed_values()) or any(part != AS_GIVEN for part in self.parts.values())
-        return friction.without_factor(now.with_loop(now.loop, "explored") if changed else now, self.given)
+        return friction.without_factor(now.with_loop(now.loop, "explored") if changed else now, self.original)
 
     def value(self, key: str) -> float:
         """Return the current value of the number `key` in SI."""
@@ -175,7 +175,7 @@ class Session:
         return knob.pick(get(self._base.loop, knob.path) if value is None else value)
 
     def _begin(self, basis: Basis) -> None:
-        self.source, self.parts, self.given, self._base, self.knobs, self.first = basis
+        self.source, self.parts, self.original, self._base, self.knobs, self.first = basis
         self.reset()
 
     def _start(self, accepted: Loop, values: dict[str, np.ndarray]) -> None:
@@ -185,8 +185,8 @@ class Session:
 
     def _put(self, key: str, value: float) -> None:
         knob = self.knobs[key]
-        there = self._values.get(knob.path)
-        new = np.array(get(self._base.loop, knob.path) if there is None else there, float)
+        values = self._values.get(knob.path)
+        new = np.array(get(self._base.loop, knob.path) if values is None else values, float)
         new[() if knob.place is None else knob.place] = value
         # A new dict and a new array: threads may still use the old ones.
         self._values, self.edited = {**self._values, knob.path: new}, knob
@@ -197,16 +197,16 @@ class Session:
         return {path: value for path, value in self._values.items() if not np.array_equal(value, get(loop, path))}
 
 
-def check_edit(knob: Knob, chosen: Scenario) -> None:
+def check_edit(knob: Knob, scenario: Scenario) -> None:
     """Check that a scenario may be run."""
-    if lines := objections(chosen):
-        raise ScenarioError(f"{knob.name} = {knob.words(knob.pick(get(chosen.loop, knob.path)))}: {lines[0]}")
+    if lines := objections(scenario):
+        raise ScenarioError(f"{knob.name} = {knob.words(knob.pick(get(scenario.loop, knob.path)))}: {lines[0]}")
 
 
-def objections(chosen: Scenario) -> list[str]:
+def objections(scenario: Scenario) -> list[str]:
     """Return the reasons why a scenario must not be run, one line each; empty if it may be run.
 
     The command line would give the same lines.
     """
-    lines = list(find_problems(chosen.loop)) or list(find_mismatches(chosen.loop, chosen.solver))
-    return lines or list(find_unstable_step(chosen.loop, chosen.solver))
+    lines = list(find_problems(scenario.loop)) or list(find_mismatches(scenario.loop, scenario.solver))
+    return lines or list(find_unstable_step(scenario.loop, scenario.solver))

@@ -57,39 +57,39 @@ class CornerLoops(NamedTuple):
     systems: int
 
 
-def corners_of(chosen: Scenario) -> tuple[PyTree, ...]:
+def corners_of(scenario: Scenario) -> tuple[PyTree, ...]:
     """Return a key for comparison: it is equal for two scenarios if their corners are equal.
 
     It holds the ranges, and the loop with each ranged parameter at its lower end.
     """
-    ranges = chosen.design.ranges(chosen.loop)
+    ranges = scenario.design.ranges(scenario.loop)
     # With ranged parameters at fixed values, the key changes only if another parameter changes.
-    rest = replace(chosen.loop, {path: low for path, (low, _) in ranges.items()})
-    leaves, kind = jax.tree.flatten(rest)
+    fixed = replace(scenario.loop, {path: low for path, (low, _) in ranges.items()})
+    leaves, kind = jax.tree.flatten(fixed)
     return kind, tuple(ranges.items()), *(np.asarray(leaf).tobytes() for leaf in leaves)
 
 
-def linearise_corners(chosen: Scenario, known: CornerLoops | None = None) -> CornerLoops:
+def linearise_corners(scenario: Scenario, earlier: CornerLoops | None = None) -> CornerLoops:
     """Return poles and worst margins of the linearised loops at the corners of the [design.over] ranges.
 
-    A scenario without ranges, or with more than three, gets a result with zero corners. `known` is returned if the
+    A scenario without ranges, or with more than three, gets a result with zero corners. `earlier` is returned if the
     corners have not changed. Raises ValueError for a loop without a linear model.
     """
-    of = corners_of(chosen)
-    if known and known.of == of:
-        return known
-    ranges = chosen.design.ranges(chosen.loop)
+    of = corners_of(scenario)
+    if earlier and earlier.of == of:
+        return earlier
+    ranges = scenario.design.ranges(scenario.loop)
     if not 0 < len(ranges) <= MOST_RANGES:
         return CornerLoops(of, np.array([]), {}, 0, 0)
-    over = band(chosen.loop, ranges, 0)
-    worst = {name: margin_values(one.margins)[name] for name, one in over.worst().items() if name in MARGIN_KEYS}
-    poles = np.concatenate([closed_loop_poles(one.loop.transfer()) for one in over.systems])
+    over = band(scenario.loop, ranges, 0)
+    worst = {name: margin_values(system.margins)[name] for name, system in over.worst().items() if name in MARGIN_KEYS}
+    poles = np.concatenate([closed_loop_poles(system.loop.transfer()) for system in over.systems])
     return CornerLoops(of, poles, worst, len(over.unstable), len(over.systems))
 
 
-def linear_stability(chosen: Scenario, corners: CornerLoops | None) -> Stability:
+def linear_stability(scenario: Scenario, corners: CornerLoops | None) -> Stability:
     """Return poles and margins of the linearised loop. Raises ValueError for a loop without a linear model."""
-    here = band(chosen.loop, {}, 0).systems[0]
+    here = band(scenario.loop, {}, 0).systems[0]
     return Stability(
         here.loop.period,
         here.loop.delay,
@@ -100,13 +100,13 @@ def linear_stability(chosen: Scenario, corners: CornerLoops | None) -> Stability
     )
 
 
-def margin_values(found: Margins) -> dict[str, float]:
+def margin_values(margins: Margins) -> dict[str, float]:
     """Return the margins by the names of `MARGIN_KEYS`, in SI; NaN for an unstable loop.
 
     Gain and modulus margins are factors [1], the phase margin is in rad, and the delay margin in s.
     """
-    low, high = found.gain
-    values = (high, low, found.phase, found.delay, found.modulus)
+    low, high = margins.gain
+    values = (high, low, margins.phase, margins.delay, margins.modulus)
     return dict(zip(MARGIN_KEYS, values, strict=True))
 
 

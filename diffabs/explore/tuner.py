@@ -75,8 +75,8 @@ class Tuner:
             ranges.style("grid-template-columns: 1fr 92px 92px auto")
             free.on_value_change(lambda: self._bounds(ranges, now, list(free.value or ()), fields))
             self._bounds(ranges, now, paths, fields)
-            own = tuning.describe_own_objective(now)
-            goals = {tuning.OWN_OBJECTIVE: f"the scenario's objective: {own}"} if own else {}
+            objective = tuning.describe_own_objective(now)
+            goals = {tuning.OWN_OBJECTIVE: f"the scenario's objective: {objective}"} if objective else {}
             goals |= {name: name for name in now.objectives}
             small = ui.select(goals, value=metric, label="make small").props("dense outlined")
             small.classes("w-full").props("data-id=metric")
@@ -96,7 +96,7 @@ class Tuner:
 
     def _bounds(self, place: Scalar, now: Scenario, paths: list[str], fields: dict[str, Fields]) -> None:
         """Show fields for the lower and upper bound of each free number."""
-        known = self.page.session.knobs
+        knobs = self.page.session.knobs
         place.clear()
         fields.clear()
         with place:
@@ -104,32 +104,36 @@ class Tuner:
                 ui.label(words).classes("head number" if words in ("low", "high") else "head")
             for path in paths:
                 try:
-                    ends = tuning.bounds_on_page(now, path, known)
+                    ends = tuning.bounds_on_page(now, path, knobs)
                 except ScenarioError as error:
                     ui.label(str(error)).style("grid-column: 1 / 5")
                     continue
                 for key, pair in ends.items():
-                    ui.label(known[key].name)
-                    low, high = (ui.input(value=known[key].text(end)).props("dense outlined") for end in pair)
+                    ui.label(knobs[key].name)
+                    low, high = (ui.input(value=knobs[key].text(end)).props("dense outlined") for end in pair)
                     low.props["data-bound"], high.props["data-bound"] = f"{key}-low", f"{key}-high"
                     fields[key] = (low, high)
-                    ui.label(unit_words(known[key].spec.unit)).classes("note")
+                    ui.label(unit_words(knobs[key].spec.unit)).classes("note")
 
     @staticmethod
     def _about(now: Scenario) -> str:
         task = now.tune
         grid = " by ".join(f"{len(values)} of {path}" for path, values in task.over.items()) or "the run shown"
         lanes = f"{task.samples} samples of {' and '.join(task.over)}" if task.samples and task.over else grid
-        asked = [f"{name} ≤ {bound:g}" for name, bound in task.limits.items()]
-        asked += [f"certified decay ≥ {task.decay:g} 1/s"] if task.decay else []
-        asked += [f"damping ≥ {task.damping:g}"] if task.damping else []
-        most = f"at most {task.iterations} iterations"
-        return f"over {lanes}; such that {', '.join(asked)}; {most} in each round" if asked else f"over {lanes}; {most}"
+        requirements = [f"{name} ≤ {bound:g}" for name, bound in task.limits.items()]
+        requirements += [f"certified decay ≥ {task.decay:g} 1/s"] if task.decay else []
+        requirements += [f"damping ≥ {task.damping:g}"] if task.damping else []
+        limit = f"at most {task.iterations} iterations"
+        return (
+            f"over {lanes}; such that {', '.join(requirements)}; {limit} in each round"
+            if requirements
+            else f"over {lanes}; {limit}"
+        )
 
     def _start(self, paths: list[str], metric: str, bounded: dict[str, tuple[PyTree, PyTree]]) -> None:
         session = self.page.session
         try:
-            chosen = tuning.scenario_with_goal(session.scenario(), paths, metric, session.knobs, bounded)
+            scenario = tuning.scenario_with_goal(session.scenario(), paths, metric, session.knobs, bounded)
         except Exception as error:  # also an unexpected one says why nothing starts
             self.page.show_refusal(error)
             return
@@ -145,39 +149,39 @@ class Tuner:
             self.loss = Canvas(LOSS, "loss")
             ui.button("stop with the best so far", on_click=self._stop).props("flat dense no-caps size=sm data-id=stop")
         self.card.set_visibility(True)
-        self.worker.ask(lambda: self._tune(chosen))
+        self.worker.ask(lambda: self._tune(scenario))
 
     def _stop(self) -> None:
         self.stopping = True
 
     # Methods that run in the tuning's thread.
-    def _tune(self, chosen: Scenario) -> None:
+    def _tune(self, scenario: Scenario) -> None:
         later = self.page.later
         try:
-            posed = self.page.tools.pose(chosen)
-            before = curves.run_curves(chosen)
-            found = tuning.tune_scenario(
-                chosen,
+            posed = self.page.tools.pose(scenario)
+            before = curves.run_curves(scenario)
+            tuned = tuning.tune_scenario(
+                scenario,
                 posed,
                 self.page.session.knobs,
                 lambda progress: later(self._show_progress, progress),
                 lambda: self.stopping,
             )
-            after = curves.run_curves(found.after)
+            after = curves.run_curves(tuned.after)
         except Exception as error:  # the message shows every error
             later(self._gave_up, error)
         else:
-            later(self._show_result, chosen, found, before, after)
+            later(self._show_result, scenario, tuned, before, after)
 
     # Methods that run in the server's thread.
     def _show_progress(self, progress: "TuningProgress") -> None:
         iteration, loss = progress.point.iteration, progress.point.loss
         if self.origin is None:
             return
-        most = self.origin.tune.iterations
+        limit = self.origin.tune.iterations
         words = f"round {progress.round + 1}, " if progress.round else ""
-        self.far.set_text(f"{words}iteration {iteration} of at most {most}, loss {loss:.5g}")
-        self.bar.set_value(min(1.0, iteration / most))
+        self.far.set_text(f"{words}iteration {iteration} of at most {limit}, loss {loss:.5g}")
+        self.bar.set_value(min(1.0, iteration / limit))
         if not math.isfinite(loss):  # an infinite loss has no place in the chart
             return
         self.losses.append(float(f"{loss:.6g}"))
@@ -192,37 +196,37 @@ class Tuner:
         self.card.set_visibility(False)
         self.page.show_refusal(error)
 
-    def _show_result(self, chosen: Scenario, found: tuning.TuningFound, before: Curves, after: Curves) -> None:
+    def _show_result(self, scenario: Scenario, tuned: tuning.TuningFound, before: Curves, after: Curves) -> None:
         self.running = False
         if self.origin is None:
             return
         session = self.page.session
-        self._table(chosen, found, before, after)
-        session.adopt(found.after.loop)
+        self._table(scenario, tuned, before, after)
+        session.adopt(tuned.after.loop)
         self.page.controls.show_all()
         self.page.pin(before)
         self.page.redraw()
 
-    def _table(self, chosen: Scenario, found: tuning.TuningFound, before: Curves, after: Curves) -> None:
+    def _table(self, scenario: Scenario, tuned: tuning.TuningFound, before: Curves, after: Curves) -> None:
         """Show the free parameters and the metrics before and after the tuning."""
         knobs = self.page.session.knobs
         self.card.clear()
         with self.card:
             with ui.element("div").classes("card-title"):
-                ui.label("NOT tuned" if found.unstable else "tuned").props("data-id=tuned")
-                ui.label(found.reason + ("" if found.met else "; NOT every constraint is met")).classes("note")
-            for sentence in filter(None, (found.unstable, *found.at_bounds)):
+                ui.label("NOT tuned" if tuned.unstable else "tuned").props("data-id=tuned")
+                ui.label(tuned.reason + ("" if tuned.met else "; NOT every constraint is met")).classes("note")
+            for sentence in filter(None, (tuned.unstable, *tuned.at_bounds)):
                 ui.label(sentence).classes("note").props("data-id=tuning-note")
             place = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
             with place.props("data-id=before-after"):
                 for words in ("", "before", "after"):
                     ui.label(words).classes("head number")
                 for knob in knobs.values():
-                    if knob.path in chosen.tune.free:
-                        pair = (knob.pick(get(one.loop, knob.path)) for one in (chosen, found.after))
+                    if knob.path in scenario.tune.free:
+                        pair = (knob.pick(get(stage.loop, knob.path)) for stage in (scenario, tuned.after))
                         self._line(knob.label, *map(knob.text, pair))
-                for name in chosen.objectives:
-                    pair = (one.metrics[name] for one in (before, after))
+                for name in scenario.objectives:
+                    pair = (run.metrics[name] for run in (before, after))
                     self._line(name.replace("_", " "), *map(format_reading, pair))
             with ui.row().classes("gap-2"):
                 ui.button("keep", on_click=self._keep).props("flat dense no-caps size=sm data-id=keep")

@@ -45,62 +45,63 @@ class TuningFound(NamedTuple):
     unstable: str
 
 
-def describe_own_objective(chosen: Scenario) -> str:
+def describe_own_objective(scenario: Scenario) -> str:
     """Return the objective of [tune] in words, such as "iae + 0.01 overshoot"; empty without any."""
-    words = (name if weight == 1 else f"{weight:g} {name}" for name, weight in chosen.tune.objective.items())
+    words = (name if weight == 1 else f"{weight:g} {name}" for name, weight in scenario.tune.objective.items())
     return " + ".join(words)
 
 
-def tunable_parameters(chosen: Scenario) -> list[str]:
+def tunable_parameters(scenario: Scenario) -> list[str]:
     """Return the paths of the tunable parameters: those of [tune.free], then others of controller and reference."""
-    there = [
+    paths = [
         path
-        for path, spec, value in parameters(chosen.loop)
+        for path, spec, value in parameters(scenario.loop)
         if spec.tunable
         and path.startswith(("controller.", "reference."))
         and np.ndim(value) < 2  # a matrix has no numbers on the page
         and np.isfinite(value).all()
     ]
-    return list(dict.fromkeys([*chosen.tune.free, *there]))
+    return list(dict.fromkeys([*scenario.tune.free, *paths]))
 
 
-def default_tuning(chosen: Scenario) -> tuple[list[str], str]:
+def default_tuning(scenario: Scenario) -> tuple[list[str], str]:
     """Return the default free parameters and the default objective.
 
     The parameters are those of the scenario's [tune], else the first tunable parameter of the controller. The objective
     is that of the scenario, `OWN_OBJECTIVE`, else the first metric; "" without any.
     """
     paths = (
-        list(chosen.tune.free) or [path for path in tunable_parameters(chosen) if path.startswith("controller.")][:1]
+        list(scenario.tune.free)
+        or [path for path in tunable_parameters(scenario) if path.startswith("controller.")][:1]
     )
-    return paths, OWN_OBJECTIVE if chosen.tune.objective else next(iter(chosen.objectives), "")
+    return paths, OWN_OBJECTIVE if scenario.tune.objective else next(iter(scenario.objectives), "")
 
 
-def bounds_on_page(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> dict[str, tuple[float, float]]:
+def bounds_on_page(scenario: Scenario, path: str, knobs: Mapping[str, Knob]) -> dict[str, tuple[float, float]]:
     """Return the bounds of a free parameter in SI, by the key of each of its numbers.
 
     They are the bounds or the declared range that [tune] gives. Without any they are the ends of the sliders.
     """
-    mine = {key: knob for key, knob in known.items() if knob.path == path}
-    given = chosen.tune.free.get(path)
-    if path not in chosen.tune.free and not (mine and all(knob.low is not None for knob in mine.values())):
+    numbers = {key: knob for key, knob in knobs.items() if knob.path == path}
+    free_range = scenario.tune.free.get(path)
+    if path not in scenario.tune.free and not (numbers and all(knob.low is not None for knob in numbers.values())):
         raise ScenarioError(f"tune.free.{path} has no range: it is a matrix, or not finite here")
 
     def end(knob: Knob, side: int) -> float:
-        if given is None:
-            ends = (knob.spec.low, knob.spec.high) if path in chosen.tune.free else (knob.low, knob.high)
+        if free_range is None:
+            ends = (knob.spec.low, knob.spec.high) if path in scenario.tune.free else (knob.low, knob.high)
             return float(ends[side] or 0.0) / knob.scale
-        values = np.asarray(given[side], float)
+        values = np.asarray(free_range[side], float)
         return float(values if knob.place is None or not values.ndim else values[knob.place])
 
-    return {key: (end(knob, 0), end(knob, 1)) for key, knob in mine.items()}
+    return {key: (end(knob, 0), end(knob, 1)) for key, knob in numbers.items()}
 
 
 def scenario_with_goal(
-    chosen: Scenario,
+    scenario: Scenario,
     paths: Sequence[str],
     metric: str,
-    known: Mapping[str, Knob],
+    knobs: Mapping[str, Knob],
     bounded: Mapping[str, tuple[PyTree, PyTree]] | None = None,
 ) -> Scenario:
     """Return the scenario with these free parameters and this objective.
@@ -113,20 +114,20 @@ def scenario_with_goal(
     """
     if not paths:
         raise ScenarioError("tune.free is empty: choose at least one parameter")
-    own = metric == OWN_OBJECTIVE and chosen.tune.objective
-    if not own and metric not in chosen.objectives:
-        raise ScenarioError(f"tune.objective = {metric!r} is not measured; there is {', '.join(chosen.objectives)}")
-    ranges = {path: _range(chosen, path, known, bounded or {}) for path in paths}
-    task = dataclasses.replace(chosen.tune, free=ranges, objective=own or {metric: 1.0}, starts=1)
-    return dataclasses.replace(chosen, tune=task)
+    objective = metric == OWN_OBJECTIVE and scenario.tune.objective
+    if not objective and metric not in scenario.objectives:
+        raise ScenarioError(f"tune.objective = {metric!r} is not measured; there is {', '.join(scenario.objectives)}")
+    ranges = {path: _range(scenario, path, knobs, bounded or {}) for path in paths}
+    task = dataclasses.replace(scenario.tune, free=ranges, objective=objective or {metric: 1.0}, starts=1)
+    return dataclasses.replace(scenario, tune=task)
 
 
-def at_bounds(chosen: Scenario, after: Scenario, known: Mapping[str, Knob]) -> tuple[str, ...]:
+def at_bounds(scenario: Scenario, after: Scenario, knobs: Mapping[str, Knob]) -> tuple[str, ...]:
     """Return a sentence for each free number that the tuning left at a bound of its range."""
     sentences = []
-    for path in chosen.tune.free:
-        for key, (low, high) in bounds_on_page(chosen, path, known).items():
-            knob = known[key]
+    for path in scenario.tune.free:
+        for key, (low, high) in bounds_on_page(scenario, path, knobs).items():
+            knob = knobs[key]
             if side := reached_bound(low, high, knob.pick(get(after.loop, path))):
                 sentences.append(f"{knob.label} is at its {side} bound, {knob.words(low if side == 'lower' else high)}")
     return tuple(sentences)
@@ -138,20 +139,20 @@ def describe_instability(after: Scenario) -> str:
     The text is empty if all is stable, and if the loop has no linear model.
     """
     try:
-        found = linear_stability(after, linearise_corners(after))
+        loop = linear_stability(after, linearise_corners(after))
     except ValueError:
         return ""
-    lost = [] if found.stable else ["the loop is not stable"]
-    if found.corners.unstable:
-        lost.append(f"{found.corners.unstable} of {found.corners.systems} corners of [design.over] are not stable")
+    lost = [] if loop.stable else ["the loop is not stable"]
+    if loop.corners.unstable:
+        lost.append(f"{loop.corners.unstable} of {loop.corners.systems} corners of [design.over] are not stable")
     return "; ".join(lost)
 
 
 def tune_scenario(
-    chosen: Scenario,
+    scenario: Scenario,
     posed: TuningTask,
-    known: Mapping[str, Knob],
-    told: "Callable[[TuningProgress], None]",
+    knobs: Mapping[str, Knob],
+    on_progress: "Callable[[TuningProgress], None]",
     stopping: Callable[[], bool],
 ) -> TuningFound:
     """Return the result of a tuning by a scenario's [tune], from one start: the current values.
@@ -160,43 +161,43 @@ def tune_scenario(
     """
     from diffabs.tune import Method, Stopping, build_problem, tune
 
-    task = chosen.tune
+    task = scenario.tune
     problem = build_problem(
-        chosen.loop,
+        scenario.loop,
         free=task.free,
         objective=task.objective,
         over=posed.batch,
-        solver=chosen.solver,
-        measured=chosen.objectives,
+        solver=scenario.solver,
+        measured=scenario.objectives,
         aggregate=task.read_aggregate(),
         constraints=posed.constraints,
     )
-    found = tune(
+    tuned = tune(
         problem,
         method=Method(starts=1, seed=task.seed, stopping=Stopping(iterations=task.iterations)),
-        progress=told,
+        progress=on_progress,
         stopping=stopping,
     )
-    after = dataclasses.replace(chosen, loop=found.loop)
+    after = dataclasses.replace(scenario, loop=tuned.loop)
     return TuningFound(
-        after, found.met, found.reason.value, at_bounds(chosen, after, known), describe_instability(after)
+        after, tuned.met, tuned.reason.value, at_bounds(scenario, after, knobs), describe_instability(after)
     )
 
 
 def _range(
-    chosen: Scenario, path: str, known: Mapping[str, Knob], bounded: Mapping[str, tuple[PyTree, PyTree]]
+    scenario: Scenario, path: str, knobs: Mapping[str, Knob], bounded: Mapping[str, tuple[PyTree, PyTree]]
 ) -> tuple[PyTree, PyTree] | None:
     """Return the lower and the upper bound of a parameter in SI, in its shape; None for the declared range."""
-    given, read = bounds_on_page(chosen, path, known), {}
-    for key, ends in given.items():
-        knob = known[key]
+    defaults, read = bounds_on_page(scenario, path, knobs), {}
+    for key, ends in defaults.items():
+        knob = knobs[key]
         typed = bounded.get(key, map(knob.text, ends))
         # The text of an unchanged bound is rounded; the exact bound is used instead.
         low, high = (end if text == knob.text(end) else knob.read(text) for text, end in zip(typed, ends, strict=True))
         if not low < high:
             raise ScenarioError(f"tune.free.{knob.name}: {knob.text(low)} is not below {knob.words(high)}")
         read[key] = (low, high)
-    if path in chosen.tune.free and read == given:
-        return chosen.tune.free[path]
+    if path in scenario.tune.free and read == defaults:
+        return scenario.tune.free[path]
     low, high = zip(*read.values(), strict=True)
-    return (low, high) if np.shape(get(chosen.loop, path)) else (low[0], high[0])
+    return (low, high) if np.shape(get(scenario.loop, path)) else (low[0], high[0])

@@ -67,9 +67,13 @@ def find_documents(source: pathlib.Path) -> list[Document]:
     if not source.is_dir():
         return list(_documents_of_file(source, named=True))
     below = sorted(source.glob(f"*/{SUMMARY}"), key=_sort_key)
-    found = {one.path: one for path in [*sorted(source.glob("*.json")), *below] for one in _documents_of_file(path)}
-    if found:
-        return list(found.values())
+    documents = {
+        document.path: document
+        for path in [*sorted(source.glob("*.json")), *below]
+        for document in _documents_of_file(path)
+    }
+    if documents:
+        return list(documents.values())
     if (source / MANIFEST).is_file():
         raise ReportError(f"{source}: the sweep has no {SUMMARY} yet; diffabs sweep ... --resume completes it")
     raise ReportError(f"{source}: has no document that {READABLE_DOCUMENTS}")
@@ -91,10 +95,10 @@ def _documents_of_file(path: pathlib.Path, named: bool = False) -> Iterator[Docu
         if named:
             raise ReportError(f"{path}: is not a JSON document that {READABLE_DOCUMENTS}") from None
         return
-    found = list(_inside(content, path))
-    if named and not found:
+    documents = list(_inside(content, path))
+    if named and not documents:
         raise ReportError(f"{path}: is not a document that {READABLE_DOCUMENTS}")
-    yield from found
+    yield from documents
 
 
 def _read_integer(text: str) -> int:

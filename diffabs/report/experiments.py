@@ -32,24 +32,24 @@ def paper_section(document: Document) -> Section:
         raise KeyError(f"paper {name}")
     if (scenario := content.get("scenario", name)) not in names():  # a document must not name a file
         raise KeyError(f"scenario {scenario}")
-    found = compact(content)
+    digest = compact(content)
     # A name with a path is skipped, so that a document cannot name files outside of its folder.
     named = [document.folder / name for name in content["figures"] if pathlib.PurePath(name).name == name]
     return Section(
         title=content["title"],
         question="Are the numbers, figures and claims of this paper true? Its experiments are computed again, and"
         " compared with its printed values and with independent solutions.",
-        answer=list(found.agreement),
-        verdicts=[ReportVerdict(*verdict) for verdict in found.verdicts],
+        answer=list(digest.agreement),
+        verdicts=[ReportVerdict(*verdict) for verdict in digest.verdicts],
         model=model_tables(describe_model(load(scenario, integrated=False))),
         model_note=f"The packaged scenario {scenario}; the first column of the tables names the change of each row.",
         figures=[figure for path in named if (figure := embed_image(path, document.folder))],
-        tables=[ReportTable("In short", found.headings, found.lines), *_tables(content)],
+        tables=[ReportTable("In short", digest.headings, digest.lines), *_tables(content)],
         certificate=_certificates(content.get("design")),
         certificate_tables=_designs(content.get("design")),
         notes=list(content["notes"]),
         provenance=describe_origin(content, **{f"solver, {name}": value for name, value in content["solver"].items()}),
-        made=content["made"]["command"],
+        command=content["made"]["command"],
     )
 
 
@@ -66,20 +66,20 @@ def _tables(content: Table) -> list[ReportTable]:
 def _certificates(design: Table | None) -> list[ReportVerdict]:
     designs = (design or {}).get("designs") or []
     return [
-        ReportVerdict(VERDICT_NAMES[one["certificate"]["quadratically_stable"]],
-                f"u = K x with K = {one['gain']} is quadratically stable over the vertices"
-                f"{', verified in exact arithmetic' if one['certificate']['verified_exactly'] else ''}")
-        for one in designs
-        if one.get("certificate")
+        ReportVerdict(VERDICT_NAMES[row["certificate"]["quadratically_stable"]],
+                f"u = K x with K = {row['gain']} is quadratically stable over the vertices"
+                f"{', verified in exact arithmetic' if row['certificate']['verified_exactly'] else ''}")
+        for row in designs
+        if row.get("certificate")
     ]  # fmt: skip
 
 
 def _designs(design: Table | None) -> list[ReportTable]:
     designs = (design or {}).get("designs") or []
     rows = [
-        [one["Q"], one["R"], one["gain"], one["certificate"]["decay_rate"], one["certificate"]["guaranteed_cost"]]
-        for one in designs
-        if one.get("certificate")
+        [row["Q"], row["R"], row["gain"], row["certificate"]["decay_rate"], row["certificate"]["guaranteed_cost"]]
+        for row in designs
+        if row.get("certificate")
     ]
     headings = ("Q", "R", "gain", "decay rate [1/s]", "guaranteed cost")
     return [ReportTable("Designs", headings, rows)] if rows else []

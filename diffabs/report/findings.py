@@ -47,7 +47,7 @@ def tuning_section(document: Document) -> Section:
         provenance=describe_origin(content, gradients=content["evaluations"], mode=content["mode"],
                           seed=content["model"]["solver"]["seed"],
                           engine=format_pairs(content["engine"])),
-        made=content["made"]["command"],
+        command=content["made"]["command"],
     )  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def identification_section(document: Document) -> Section:
         tables=list(_identification_tables(content)),
         notes=["Interrupted: the values so far, not the best ones."] if content.get("interrupted") else [],
         provenance=describe_origin(content, evaluations=content["evaluations"]),
-        made=content["made"]["command"],
+        command=content["made"]["command"],
     )  # fmt: skip
 
 

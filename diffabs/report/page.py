@@ -74,7 +74,7 @@ class Section:
         certificate_tables: Numbers of a proof.
         notes: Further sentences.
         provenance: Names and values: date, commit, machine, versions, seeds.
-        made: Command that made the document, as the document says.
+        command: Command that made the document, as the document says.
         again: Commands about the result, which this package writes.
     """
 
@@ -91,7 +91,7 @@ class Section:
     certificate_tables: list[ReportTable] = dataclasses.field(default_factory=list)
     notes: list[str] = dataclasses.field(default_factory=list)
     provenance: list[tuple[str, PyTree]] = dataclasses.field(default_factory=list)
-    made: str = ""
+    command: str = ""
     again: list[str] = dataclasses.field(default_factory=list)
 
 
@@ -109,7 +109,7 @@ def shown_numbers(value: Scalar) -> list[ShownNumber | str]:
     if isinstance(value, float):
         return [ShownNumber(round_for_table(value) if math.isfinite(value) else str(value), repr(value))]
     if isinstance(value, list | tuple):
-        shown = [one for entry in value[:MAX_SHOWN_ENTRIES] for one in shown_numbers(entry)]
+        shown = [part for entry in value[:MAX_SHOWN_ENTRIES] for part in shown_numbers(entry)]
         return [*shown, *([f"... ({len(value)})"] if len(value) > MAX_SHOWN_ENTRIES else [])]
     return [str(value)]
 
@@ -172,15 +172,15 @@ def table_unit(text: str | None) -> str:
 
 def describe_origin(content: Table, **more: Any) -> list[tuple[str, PyTree]]:
     """Return the origin of a document as rows of name and value: date, commit, machine, versions and `more`."""
-    made = {name: value for name, value in (content.get("made") or {}).items() if name != "command"}
+    origin = {name: value for name, value in (content.get("made") or {}).items() if name != "command"}
     versions = {f"version of {name}": value for name, value in (content.get("versions") or {}).items()}
     # Papers and manifests keep part of the origin among the versions.
     for name in ("commit", "machine", "backend"):
         if value := versions.pop(f"version of {name}", None):
-            made.setdefault(name, value)
+            origin.setdefault(name, value)
     rows = {
         "date": "not known: the document does not say",
-        **made,
+        **origin,
         **{name: value for name, value in more.items() if value is not None},
         **versions,
     }

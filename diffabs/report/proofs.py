@@ -51,7 +51,7 @@ def design_section(document: Document) -> Section:
         certificate_tables=proof_tables(content, content),
         notes=_notes(content),
         provenance=describe_origin(content),
-        made=content["made"]["command"],
+        command=content["made"]["command"],
         again=list(map(_verify_command, content["files"].values())),
     )  # fmt: skip
 
@@ -68,12 +68,13 @@ def proof_verdicts(proof: Table) -> list[ReportVerdict]:
     about = (
         f"one Lyapunov matrix for all {proof['vertices']} vertices, for parameters that vary arbitrarily fast{exactly}"
     )
-    found = [ReportVerdict(VERDICT_NAMES[stable], about)]
-    found += [ReportVerdict("proved" if one["proved"] else "not proved", f"{one['kind']}{_value(one['kind'], proof)}")
-              for one in proof["claims"] or []]  # fmt: skip
+    verdicts = [ReportVerdict(VERDICT_NAMES[stable], about)]
+    for claim in proof["claims"] or []:
+        kind = claim["kind"]
+        verdicts.append(ReportVerdict("proved" if claim["proved"] else "not proved", f"{kind}{_value(kind, proof)}"))
     if proof.get("reason"):
-        found.append(ReportVerdict("note", proof["reason"]))
-    return found
+        verdicts.append(ReportVerdict("note", proof["reason"]))
+    return verdicts
 
 
 def _verify_command(path: Any) -> str:
@@ -105,8 +106,8 @@ def proof_tables(proof: Table, content: Table) -> list[ReportTable]:
     names = list(corners[0]) if corners else []
     pole = "slowest pole, real part [1/s]" if proof["period"] is None else "largest |pole| [1]"
     rows = [
-        [i, *(corner.get(name) for name in names), one]
-        for i, (corner, one) in enumerate(zip(corners, poles, strict=False))
+        [i, *(corner.get(name) for name in names), pole_value]
+        for i, (corner, pole_value) in enumerate(zip(corners, poles, strict=False))
     ]
     heads = [f"{name} [{table_unit(units[name])}]" if name in units else name for name in names]
     return [ReportTable("Numbers of the certificate", ("quantity", "value", "unit"), numbers),
@@ -132,13 +133,13 @@ def certificate_section(document: Document) -> Section:
         title=f"Certificate {document.path.name}",
         question="Does the saved certificate prove what it claims? It is proved again, in fractions, by code that"
         " is independent of the code that made it.",
-        answer=[f"{sum(not one.reason for one in proved)} of {len(proved)} claims are proved."],
+        answer=[f"{sum(not claim.reason for claim in proved)} of {len(proved)} claims are proved."],
         model=[
             ReportTable("Vertices", ("vertex", *names), [[i, *row.values()] for i, row in enumerate(corners)], "in SI")
         ],
         tables=[ReportTable("Gain", tuple(states), content["gain"])],
-        certificate=[ReportVerdict("not proved" if one.reason else "proved",
-                             f"{one.kind}: {one.says}{one.reason and f' ({one.reason})'}") for one in proved],
+        certificate=[ReportVerdict("not proved" if claim.reason else "proved",
+                             f"{claim.kind}: {claim.says}{claim.reason and f' ({claim.reason})'}") for claim in proved],
         provenance=describe_origin(content),
         again=[_verify_command(document.path)],
     )  # fmt: skip
@@ -152,7 +153,7 @@ def box_section(document: Document) -> Section:
     ranges = join_words(
         f"{path} from {low:.6g} to {high:.6g}{_unit(units.get(path))}" for path, (low, high) in content["over"].items()
     )
-    asked = f"Does every run satisfy {join_words(claims)}" if claims else "Which bounds hold for every run"
+    question = f"Does every run satisfy {join_words(claims)}" if claims else "Which bounds hold for every run"
     files = content.get("files") or {}
     sides = [[path, *ends, table_unit(units.get(path))] for path, ends in content["over"].items()]
     keys = ("low", "high", "worst_run", "looseness", "unit")
@@ -163,7 +164,7 @@ def box_section(document: Document) -> Section:
     figures = list(filter(None, [embed_named(document.folder, files.get("plot"), "The cells of the proof")]))
     return Section(
         title=f"Proof over a box of {content['scenario']}",
-        question=f"{asked}, for every {ranges}?",
+        question=f"{question}, for every {ranges}?",
         answer=[f"{verdict}: {content['reason']}." if content["reason"] else f"{verdict}."],
         verdicts=[ReportVerdict(verdict, claim) for claim in claims] or [ReportVerdict(verdict, "the bounds below")],
         model=model_tables(content["model"]),
@@ -182,7 +183,7 @@ def box_section(document: Document) -> Section:
         ],
         notes=["The runs are those of the model in real numbers, without the rounding of the simulation."],
         provenance=describe_origin(content),
-        made=content["made"]["command"],
+        command=content["made"]["command"],
         again=[_verify_command(files["certificate"])] if verdict == "proved" and "certificate" in files else [],
     )
 

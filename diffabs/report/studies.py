@@ -43,26 +43,26 @@ def sweep_section(document: Document) -> Section:
     manifest = json.loads(files.read_content(document.folder / MANIFEST, MAX_DOCUMENT_BYTES))
     study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
     commit = {"commit": manifest["commit"]} if manifest.get("commit") else {}
-    made = content.get("made", {})  # a summary of `summarise_sweep` has none
-    found, note = _scenario_model(source, document.folder)
+    origin = content.get("made", {})  # a summary of `summarise_sweep` has none
+    model, note = _scenario_model(source, document.folder)
     varied, percent = join_words(study["space"]["variables"]), f"{100 * content['confidence']:g} %"
     return Section(
         title=f"Sweep of {source.get('name') or document.folder.name}",
         question=f"How do {join_words(content['metrics'])} spread while {varied} vary, and how probable is a"
         " failure?",
         answer=[_failure_tables(content, percent)],
-        model=[*model_tables(found), _space(study["space"], units)],
+        model=[*model_tables(model), _space(study["space"], units)],
         model_note=note,
         figures=_figures(document.folder),
         figures_note="" if (document.folder / FIGURES).is_dir() else UNDRAWN,
         tables=list(_tables(content, units, percent)),
         notes=list(_notes(content)),
         provenance=describe_origin(
-            {"versions": manifest["versions"], "made": {**made, **commit}},
+            {"versions": manifest["versions"], "made": {**origin, **commit}},
             seed=study["seed"], samples=study["samples"], numbers=study["dtype"],
             engine=format_pairs(study.get("engine") or {}) or "xla", digest=content["digest"],
         ),
-        made=made.get("command", ""),
+        command=origin.get("command", ""),
         again=_sample(content, document.folder),
     )  # fmt: skip
 
@@ -82,24 +82,24 @@ def _scenario_model(source: Table, folder: pathlib.Path) -> tuple[JsonObject | N
 def _space(space: Table, units: Mapping[str, str]) -> ReportTable:
     """Return a table of the distributions."""
     variables = space["variables"]
-    keys = list(dict.fromkeys(key for one in variables.values() for key in one if key != "type"))
+    keys = list(dict.fromkeys(key for distribution in variables.values() for key in distribution if key != "type"))
     rows = [
-        [path, one["type"], *(one.get(key) for key in keys), table_unit(units.get(path))]
-        for path, one in variables.items()
+        [path, distribution["type"], *(distribution.get(key) for key in keys), table_unit(units.get(path))]
+        for path, distribution in variables.items()
     ]
     design = ", ".join(map(str, space["design"].values()))
     return ReportTable("Varied parameters", ("parameter", "distribution", *keys, "unit"), rows, f"sampling: {design}")
 
 
 def _failure_tables(content: Table, percent: str) -> str:
-    one = content["failures"].get("any")
+    failures = content["failures"].get("any")
     lost = content["diverged"]["count"]
     line = f"{content['samples']:,} runs; {lost:,} diverged, {content['refused']['count']:,} were refused."
-    if one and one["value"] is not None:
-        line += f" {one['count']:,} of {one['samples']:,} failed: a probability of {one['value']:.4g}"
+    if failures and failures["value"] is not None:
+        line += f" {failures['count']:,} of {failures['samples']:,} failed: a probability of {failures['value']:.4g}"
         # A grid and corners are not random, so their documents have no interval.
-        known = None not in (one["low"], one["high"])
-        line += f" ({percent} interval {one['low']:.4g} to {one['high']:.4g})." if known else "."
+        has_interval = None not in (failures["low"], failures["high"])
+        line += f" ({percent} interval {failures['low']:.4g} to {failures['high']:.4g})." if has_interval else "."
     return line
 
 
@@ -180,7 +180,7 @@ def rare_section(document: Document) -> Section:
     failing = [[path, *column] for path, column in content["failures"].items()]
     # JSON has no NaN: null stands for a probability that is undecided, as no sample failed.
     probability = "undecided" if content["probability"] is None else f"{content['probability']:.3g}"
-    most = max((len(row) for row in failing), default=1) - 1
+    count = max((len(row) for row in failing), default=1) - 1
     return Section(
         title=f"A rare failure of {content['scenario']}",
         question=f"How probable is {failure}, while what [sweep.over] names varies?",
@@ -192,11 +192,11 @@ def rare_section(document: Document) -> Section:
                   estimates),
             ReportTable("Levels", ("level", "metric", f"threshold [{content['unit']}]", "share",
                              "coefficient of variation", "accepted", "diverged"), levels),
-            ReportTable("The likeliest failures", ("parameter", *map(str, range(1, most + 1))), failing, "in SI"),
+            ReportTable("The likeliest failures", ("parameter", *map(str, range(1, count + 1))), failing, "in SI"),
         ],
         notes=[content["note"]] if content["note"] else [],
         provenance=describe_origin(
             content, seed=content["seed"], runs=content["runs"], engine=format_pairs(content["engine"])
         ),
-        made=content["made"]["command"],
+        command=content["made"]["command"],
     )  # fmt: skip

@@ -36,7 +36,7 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
     """
     import jinja2
 
-    sections = [_section(one) for one in found]
+    sections = [_section(document) for document in found]
     text = (importlib.resources.files("diffabs.report") / "report.html.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
@@ -46,15 +46,17 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
     try:
         return environment.from_string(text).render(title=whole, sections=sections, version=__version__)
     except RecursionError:  # lists in lists
-        raise ReportError(f"{', '.join(str(one.path) for one in found)}: values are nested too deeply") from None
+        raise ReportError(
+            f"{', '.join(str(document.path) for document in found)}: values are nested too deeply"
+        ) from None
 
 
 def _section(document: Document) -> Section:
     try:
         return SECTION_BY_KIND[document.kind](document)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError, RecursionError) as error:
-        said = " ".join(f"{type(error).__name__} {error}".split())
-        raise ReportError(f"{document.path}: cannot be read as a document of {document.kind}: {said}") from None
+        message = " ".join(f"{type(error).__name__} {error}".split())
+        raise ReportError(f"{document.path}: cannot be read as a document of {document.kind}: {message}") from None
 
 
 def is_report(path: pathlib.Path) -> bool:

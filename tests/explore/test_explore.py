@@ -96,10 +96,10 @@ def test_every_packaged_scenario_opens_with_what_one_drags(name):
     units = [found.knobs[key].spec.unit for key in found.first]
     assert units[0] in ("kg", "kg m^2")  # what is heavy comes first
     assert any(key.startswith("controller.") for key in found.first)
-    assert ("plant.road.scale" in found.first) == hasattr(found.given.loop.plant, "road")
-    assert ("initial.speed" in found.first) == hasattr(found.given.loop.initial, "speed")
+    assert ("plant.road.scale" in found.first) == hasattr(found.original.loop.plant, "road")
+    assert ("initial.speed" in found.first) == hasattr(found.original.loop.initial, "speed")
     assert set(found.first) <= found.knobs.keys()
-    assert {path.split(".")[0] for path in found.given.tune.free} <= {key.split(".")[0] for key in found.first}
+    assert {path.split(".")[0] for path in found.original.tune.free} <= {key.split(".")[0] for key in found.first}
     for key in found.first:  # the value as it is lies on its slider
         knob = found.knobs[key]
         assert knob.low <= found.value(key) * knob.scale <= knob.high
@@ -150,11 +150,11 @@ def test_a_slider_over_decades_is_even_in_the_logarithm(session):
 
 @killed_by(
     "explore/knobs.py",
-    "return read_number_in_range(given, self.spec, self.name) / self.scale",
-    "return float(given) / self.scale",
+    "return read_number_in_range(value, self.spec, self.name) / self.scale",
+    "return float(value) / self.scale",
     case="plant.mass--3-plant.mass = -3 is outside 0, inf kg",
 )
-@killed_by("explore/session.py", "    if lines := objections(chosen):\n", "    if (lines := []):\n")
+@killed_by("explore/session.py", "    if lines := objections(scenario):\n", "    if (lines := []):\n")
 @pytest.mark.parametrize(
     ("key", "given", "said"),
     [
@@ -187,7 +187,9 @@ def test_a_spread_that_is_none_is_refused(session, given):
     assert session.spread == Spread()
 
 
-@killed_by("explore/session.py", "return lines or list(find_unstable_step(chosen.loop, chosen.solver))", "return lines")
+@killed_by(
+    "explore/session.py", "return lines or list(find_unstable_step(scenario.loop, scenario.solver))", "return lines"
+)
 @killed_by("explore/knobs.py", 'return "" if unit == "1" else unit', "return unit")
 def test_a_step_that_is_not_stable_is_refused(file, monkeypatch):
 
@@ -327,7 +329,7 @@ def test_a_file_is_only_replaced_when_that_is_said(session, tmp_path):
     assert (folder / "mine.toml").read_text() == "mine"
     assert saving.free_name(folder, "mine") == "mine-2.toml"
     saving.save_scenario(session.to_save(), folder, "mine.toml", replacing=True)
-    assert load(folder / "mine.toml").loop.plant.mass == session.given.loop.plant.mass
+    assert load(folder / "mine.toml").loop.plant.mass == session.original.loop.plant.mass
     assert left_in(folder) == {"mine.toml"}
 
 
@@ -415,8 +417,8 @@ def test_margins_are_those_of_the_library(session):
 
 
 @pytest.mark.slow
-@killed_by("explore/stability.py", "if known and known.of == of:", "if known:")
-@killed_by("explore/stability.py", "if known and known.of == of:", "if False:")
+@killed_by("explore/stability.py", "if earlier and earlier.of == of:", "if earlier:")
+@killed_by("explore/stability.py", "if earlier and earlier.of == of:", "if False:")
 def test_corners_are_looked_at_again_only_where_they_move(session):
     first = stability.linearise_corners(session.scenario())
     turn(session, "plant.mass", "5.5")  # has a range in [design.over]
@@ -521,7 +523,7 @@ def test_a_tuning_names_the_bounds_at_which_it_ended(file):
     assert sentences(-110.0, -16.0) == ()
 
 
-@killed_by("explore/tuning.py", "if found.corners.unstable:", "if False:")
+@killed_by("explore/tuning.py", "if loop.corners.unstable:", "if False:")
 def test_unstable_corners_are_named(file):
     """By the poles of the closed loops; a positive gain drives the slip away."""
     session = Session(str(file(SHORT)))
@@ -535,7 +537,7 @@ def test_unstable_corners_are_named(file):
 
 
 @killed_by("explore/tuning.py", "{knob.words(high)}", "{knob.text(high)} {knob.spec.unit}")
-@killed_by("explore/tuning.py", "given = chosen.tune.free.get(path)", "given = None")
+@killed_by("explore/tuning.py", "free_range = scenario.tune.free.get(path)", "free_range = None")
 def test_a_tuning_stays_between_the_bounds_that_are_typed(file):
     session = Session(str(file(SHORT)))
     now, known = session.scenario(), session.knobs
@@ -561,7 +563,7 @@ def test_a_tuning_stays_between_the_bounds_that_are_typed(file):
 @killed_by("explore/tuning.py", "and np.ndim(value) < 2", "and True")
 @killed_by(
     "explore/tuning.py",
-    "    if path in chosen.tune.free and read == given:\n        return chosen.tune.free[path]\n",
+    "    if path in scenario.tune.free and read == defaults:\n        return scenario.tune.free[path]\n",
     "",
 )
 @killed_by("explore/session.py", "if not np.array_equal(", "if np.ndim(value) < 2 and not np.array_equal(")
@@ -590,12 +592,14 @@ def test_a_matrix_is_tuned_in_its_own_bounds_only(file):
 
 @killed_by(
     "explore/tuning.py",
-    "if path in chosen.tune.free and read == given:",
-    "if chosen.tune.free.get(path) and read == given:",
+    "if path in scenario.tune.free and read == defaults:",
+    "if scenario.tune.free.get(path) and read == defaults:",
 )
 @killed_by("explore/tuning.py", "end if text == knob.text(end) else knob.read(text)", "knob.read(text)")
 @killed_by(
-    "explore/tuning.py", "if path in chosen.tune.free else (knob.low, knob.high)", "if False else (knob.low, knob.high)"
+    "explore/tuning.py",
+    "if path in scenario.tune.free else (knob.low, knob.high)",
+    "if False else (knob.low, knob.high)",
 )
 def test_a_declared_range_is_that_of_the_command(file):
     text = SHORT.replace("[tune.free]\n", '[tune.free]\n"reference.slip" = "declared"\n"initial.speed" = "declared"\n')
@@ -644,7 +648,7 @@ def test_speeds_of_a_plant_without_a_wheel_stay_in_si(session):
             units = MappingProxyType({"position": "m", "speed": "m/s"})
 
     assert not is_vehicle(Cart())
-    assert is_vehicle(session.given.loop.plant)
+    assert is_vehicle(session.original.loop.plant)
     assert session.knobs["initial.speed"].spec.unit == "km/h"
 
 
@@ -695,7 +699,7 @@ def test_charts_are_plain_json_whatever_a_run_was():
 
 
 @killed_by("explore/guard.py", "len(host) == 1 and host[0] in self.hosts", "len(host) == 1")
-@killed_by("explore/guard.py", "return here and own and", "return here and")
+@killed_by("explore/guard.py", "return here and same_origin and", "return here and")
 @killed_by("explore/guard.py", "_loopback(request.client)", "True")
 @killed_by("explore/guard.py", "if port == HTTP_PORT else", "if False else")
 @pytest.mark.parametrize(
@@ -734,8 +738,8 @@ def test_only_the_own_page_on_this_machine_is_answered(allowed, host, origin, cl
 )
 @killed_by(
     "explore/guard.py",
-    "len(given) == 1 and secrets.compare_digest(given[0].encode(), self.token.encode())",
-    "len(given) == 1",
+    "len(tokens) == 1 and secrets.compare_digest(tokens[0].encode(), self.token.encode())",
+    "len(tokens) == 1",
 )
 @killed_by("explore/guard.py", "Path=/; HttpOnly;", "Path=/;")
 @pytest.mark.parametrize(

@@ -255,7 +255,7 @@ def test_a_late_fan_does_not_return_after_a_reset(visit, monkeypatch):
         (given,) = late
         with opened.client:
             page._show_fan(*given)
-        assert page.controls.made.text == ""
+        assert page.controls.fan_note.text == ""
 
     visit(user)
 
@@ -295,8 +295,8 @@ def broken(*given, **more):
 
 @killed_by(
     "explore/page.py",
-    "            return\n        self.show_refusal(error)\n        if what",
-    "            pass\n        self.show_refusal(error)\n        if what",
+    "            return\n        self.show_refusal(error)\n        if job",
+    "            pass\n        self.show_refusal(error)\n        if job",
 )
 @pytest.mark.parametrize("action", ["edit", "scenario"])
 def test_an_error_of_an_old_run_is_not_shown(visit, monkeypatch, action):
@@ -347,7 +347,7 @@ def test_an_error_in_the_check_withdraws_the_number(visit, monkeypatch):
     case="run",
 )
 @killed_by("explore/page.py", "with self._report_error(name, version):", "if True:", case="fan")
-@killed_by("explore/page.py", 'if what == "fan":', "if False:", case="fan")
+@killed_by("explore/page.py", 'if job == "fan":', "if False:", case="fan")
 @killed_by("explore/page.py", 'self.chart.change(charts.clear_curves("fan"))', "pass", case="fan")
 @pytest.mark.parametrize("failing", ["run", "fan"])
 def test_an_error_stops_no_other_result(visit, monkeypatch, failing):
@@ -368,7 +368,7 @@ def test_an_error_stops_no_other_result(visit, monkeypatch, failing):
         assert not page.results.proving.visible
         assert not page.results.measuring.visible
         if failing == "fan":
-            assert page.controls.made.text == "no fan"
+            assert page.controls.fan_note.text == "no fan"
             assert changes == [{"dataset": [{"id": "fan", "source": {"t": []}}]}]
 
     visit(user)
@@ -386,7 +386,7 @@ def test_an_error_in_a_proof_file_is_on_its_card(visit):
     visit(user)
 
 
-@killed_by("explore/controls.py", "for note in self.session.given.notes:", "for note in ():")
+@killed_by("explore/controls.py", "for note in self.session.original.notes:", "for note in ():")
 def test_entries_that_a_part_removes_are_named(visit):
     async def user(opened):
         with opened.client:
@@ -398,29 +398,29 @@ def test_entries_that_a_part_removes_are_named(visit):
     visit(user)
 
 
-@killed_by("explore/controls.py", '(found.refused, "refused")', '(0, "refused")')
+@killed_by("explore/controls.py", '(fan.refused, "refused")', '(0, "refused")')
 def test_refused_members_of_a_fan_are_counted(visit):
     async def user(opened):
         opened.page.controls.fan(Fan(None, (), 200, 3, 2, "mass ± 90 %"))
-        assert opened.page.controls.made.text == "200 members, mass ± 90 %; 3 refused; 2 diverged"
+        assert opened.page.controls.fan_note.text == "200 members, mass ± 90 %; 3 refused; 2 diverged"
 
     visit(user)
 
 
 @killed_by("explore/page.py", "Exception as error:  # also an error in", "ScenarioError as error:  # also an error in")
-@killed_by("explore/page.py", '"" if basis else self.controls.made.text', '""')
+@killed_by("explore/page.py", '"" if basis else self.controls.fan_note.text', '""')
 def test_a_part_with_a_defect_changes_nothing(visit, monkeypatch):
     async def user(opened):
         page, asked = opened.page, threading.Event()
-        page.controls.made.set_text("200 members")
+        page.controls.fan_note.set_text("200 members")
         monkeypatch.setattr(opened.session, "load_part", lambda *given: (asked.set(), broken()))
-        page.controls.rebuild(page.controls.made.text)
+        page.controls.rebuild(page.controls.fan_note.text)
         with opened.client:
             opened.find("controller").set_value("relay")
         await settled(opened, lambda: asked.is_set() and not page.switching.locked())
         assert page.controls.message.text == "TypeError: broken part"
         assert opened.session.parts["controller"] == opened.find("controller").value == AS_GIVEN
-        assert page.controls.made.text == "200 members"
+        assert page.controls.fan_note.text == "200 members"
 
     visit(user)
 
@@ -483,8 +483,8 @@ def test_a_tuning_that_cannot_start_says_why(visit, monkeypatch):
     visit(user)
 
 
-@killed_by("explore/tuner.py", '"NOT tuned" if found.unstable else "tuned"', '"tuned"')
-@killed_by("explore/tuner.py", "(found.unstable, *found.at_bounds)", "(found.unstable,)")
+@killed_by("explore/tuner.py", '"NOT tuned" if tuned.unstable else "tuned"', '"tuned"')
+@killed_by("explore/tuner.py", "(tuned.unstable, *tuned.at_bounds)", "(tuned.unstable,)")
 def test_a_result_with_unstable_corners_is_not_called_tuned(visit):
     async def user(opened):
         tuner, now = opened.page.tuner, opened.session.scenario()
@@ -502,7 +502,7 @@ def test_a_result_with_unstable_corners_is_not_called_tuned(visit):
 
 @killed_by("explore/tuner.py", "if task.samples and task.over else grid", "if False else grid")
 @killed_by("explore/tuner.py", "if not math.isfinite(loss):", "if False:")
-@killed_by("explore/tuner.py", "min(1.0, iteration / most)", "min(1.0, len(self.losses) / most)")
+@killed_by("explore/tuner.py", "min(1.0, iteration / limit)", "min(1.0, len(self.losses) / limit)")
 @killed_by("explore/tuner.py", "if progress.round else", "if False else")
 def test_the_card_counts_runs_rounds_and_iterations(visit):
     async def user(opened):

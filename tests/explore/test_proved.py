@@ -46,7 +46,7 @@ def proved(document: dict[str, Any]) -> ProvedBox:
 
 
 @killed_by(
-    "explore/proved.py", "now = friction.without_factor(session.scenario(), session.given)", "now = session.given"
+    "explore/proved.py", "now = friction.without_factor(session.scenario(), session.original)", "now = session.original"
 )
 def test_values_in_the_box_are_covered(session: Session, proved: ProvedBox) -> None:
     assert judge_values(proved, session) == (
@@ -91,7 +91,7 @@ def test_another_value_is_not_covered(session: Session, proved: ProvedBox, key: 
     assert judge_values(proved, session).word == CERTIFIED
 
 
-@killed_by("explore/proved.py", " or _compare_durations(now, proved.chosen)", "")
+@killed_by("explore/proved.py", " or _compare_durations(now, proved.scenario)", "")
 def test_another_loop_or_duration_is_not_covered(proved: ProvedBox, file) -> None:
     longer = Session(str(file(SHORT.replace("duration = 1.0", "duration = 2.0"))))
     assert judge_values(proved, longer) == (NOT_PROVED, "p.json is about runs of 1 s, here they last 2 s")

@@ -177,7 +177,7 @@ def test_numbers_are_those_of_the_document(results, kind):
     assert set(found.numbers) <= known
 
 
-@killed_by("report/proofs.py", "sum(not one.reason for one in proved)", "len(proved)")
+@killed_by("report/proofs.py", "sum(not claim.reason for claim in proved)", "len(proved)")
 def test_a_certificate_says_what_is_proved(results):
     found = page(results, "design")
     content = json.loads((results / "design.json").read_text())
@@ -334,7 +334,7 @@ def test_a_reproduction_names_no_file_as_its_scenario(tmp_path):
         build_report(find_documents(tmp_path / "x.json"))
 
 
-@killed_by("report/report.html.j2", "section.made | printable", "section.made")
+@killed_by("report/report.html.j2", "section.command | printable", "section.command")
 def test_the_command_of_a_document_is_said_to_be_its_own(results, tmp_path):
     """It is not a command of this package, and hides nothing behind a line's end or a mark of direction."""
     content = json.loads((results / "tune.json").read_text())
@@ -413,7 +413,7 @@ def invented_sweep(folder, design, variables=("plant.mass", "plant.road.w4"), n=
 
 
 @killed_by("report/studies.py", 'content.get("made", {})', 'content["made"]')
-@killed_by("report/studies.py", 'None not in (one["low"], one["high"])', "True")
+@killed_by("report/studies.py", 'None not in (failures["low"], failures["high"])', "True")
 @killed_by("report/studies.py", "return [] if worst is None else [shlex.join(command)]", 'return [" ".join(command)]')
 def test_a_grid_has_a_report_without_intervals(tmp_path):
     _, text = invented_sweep(tmp_path / "my $sweep", {"type": "grid", "levels": 8})
@@ -522,7 +522,7 @@ def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
     assert not (folder / "report.html").exists()
 
 
-@killed_by("report/documents.py", "if named and not found:", "if False:")
+@killed_by("report/documents.py", "if named and not documents:", "if False:")
 @pytest.mark.parametrize(
     "text", ["hello", '{"a": 1}', "[1, 2]", '{"papers": {}, "out": "x"}', '{"format": "diffabs box proof 1"}']
 )
