@@ -248,7 +248,17 @@ ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {
 
 # The largest programs to compile, and a wheel that locks, of which test_kinks.py has closed forms.
 SLOW = (
-    *("estimated speed", "filtered reference", "arm, observed", "proportional", "computer", "noisy", "relay", "delay"),
+    *(
+        "cascade",
+        "estimated speed",
+        "filtered reference",
+        "arm, observed",
+        "proportional",
+        "computer",
+        "noisy",
+        "relay",
+        "delay",
+    ),
     *(
         "lock",
         "arm",

@@ -227,6 +227,7 @@ def test_on_the_grid_a_part_of_it_is_missing():
     np.testing.assert_allclose(slope, 2.01 / np.sqrt(2.01**2 - 2) - 1, rtol=1e-7)
 
 
+@pytest.mark.slow
 @killed_by("simulate/step/replay.py", "landing & old.search.at_once", "old.search.at_once")
 def test_a_wheel_that_turns_again_has_a_derivative():
     """The relay of a laggard brake locks the wheel and lets it go; against central differences of three widths."""

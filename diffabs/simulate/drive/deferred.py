@@ -44,7 +44,7 @@ from diffabs.simulate.drive.engine import EngineError, check_process, describe_e
 from diffabs.simulate.result import Finish, prepare
 
 MIN_RUNS = 2  # runs whose values a kernel makes: the values of one run wait longer for its compiler than for XLA
-MAX_DIRECTIONS = 64  # inputs of a run up to which a kernel's Jacobian costs less than XLA's vector-Jacobian product
+MAX_DIRECTIONS = 32  # inputs of a run up to which a kernel's Jacobian costs about what XLA's reverse mode does
 MANY_INPUTS_REASON = f"a run has more than {MAX_DIRECTIONS} inputs"
 MAX_KEPT_PROGRAMS = 64  # traced kernels that are kept, by the structure and the shapes of their runs
 
