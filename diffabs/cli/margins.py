@@ -92,7 +92,7 @@ def _read_places(scenario: Scenario, options: Sequence[str]) -> tuple[dict[str, 
         table[path] = value
     allowed = {**parameters_of(scenario.loop), "target": (ParameterSpec("1"), ())}
     entries = [entry.single("be fixed") for entry in read_entries(table, "--at", allowed, "no parameter of this loop")]
-    values = {entry.path: read_number_in_range(entry.given, entry.spec, entry.where) / entry.scale for entry in entries}
+    values = {entry.path: read_number_in_range(entry.value, entry.spec, entry.where) / entry.scale for entry in entries}
     return values, values.pop("target", None)
 
 

@@ -218,7 +218,7 @@ def _read_sides(options: Sequence[str], scenario: Scenario) -> list[_Side]:
             raise ScenarioError(f"{entry.where} is a list; a proof varies single numbers")
         low, high = entry.range()
         if not (math.isfinite(low) and math.isfinite(high)):
-            raise ScenarioError(f"{entry.where} = {format_given(entry.given)}: both ends must be finite")
+            raise ScenarioError(f"{entry.where} = {format_given(entry.value)}: both ends must be finite")
         # Zero is exact, and a slip must not be less.
         ends = (low and math.nextafter(low, -math.inf), high and math.nextafter(high, math.inf))
         sides.append(_Side(entry.path, ends, f"{entry.path} [{entry.spec.unit or 1}]", entry.scale))
@@ -266,7 +266,7 @@ def _map_of_proof(
         box=shown_cells(np.array([side.ends for side in sides])),
         cells=shown_cells(proof.cells),
         bounds=bounds,
-        left=shown_cells(proof.left),
+        undecided=shown_cells(proof.left),
         refuting=None if proof.refuting is None else shown_cells(proof.refuting),
         worst=None if worst is None else np.array(worst)[axes] * scales,
         worst_value=extremes[quantity][1] if quantity in extremes else None,

@@ -42,15 +42,15 @@ def c_source(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> st
 class _Text:
     """A writer of the file."""
 
-    def __init__(self, found: ComputerProgram, name: str, notes: Sequence[str]):
-        self.device, self.name, self.notes = found, name, notes
+    def __init__(self, device: ComputerProgram, name: str, notes: Sequence[str]):
+        self.device, self.name, self.notes = device, name, notes
         self.real = f"{name}_real"
-        self.program = program = Lowered(found)
+        self.program = program = Lowered(device)
         self.fields = {
             where: identifiers(paths)
-            for where, paths in ((INPUTS, program.read), (MEMORY, [*program.kept, "held"]), (NUMBERS, program.used))
+            for where, paths in ((INPUTS, program.read), (MEMORY, [*program.memory, "held"]), (NUMBERS, program.used))
         }
-        self.words = Words(self.real, self._place, single=found.dtype == np.float32)
+        self.words = Words(self.real, self._place, single=device.dtype == np.float32)
 
     def _place(self, where: str, path: str) -> str:
         """Return the C expression of an input, memory entry or parameter; the loop counter has no struct."""
@@ -100,9 +100,9 @@ class _Text:
         yield from self._struct("What is measured at a sample.", "input", read)
         used = [f"{real} {numbers[x]}; /* {comment_text(specs[x])} */" for x in program.used]
         yield from self._struct("What can be changed, also between two samples.", "parameters", used)
-        kept = [f"{self.words.type(program.state[x])} {memory[x]};" for x in program.kept]
+        declarations = [f"{self.words.type(program.state[x])} {memory[x]};" for x in program.memory]
         held = f"bool {memory['held']}; /* whether the last sample could not be used */"
-        yield from self._struct("What is remembered from one sample to the next.", "state", [*kept, held])
+        yield from self._struct("What is remembered from one sample to the next.", "state", [*declarations, held])
 
     def _struct(self, about: str, name: str, members: Sequence[str]) -> Iterator[str]:
         """Yield a struct with a comment; an empty one gets a placeholder, because C99 has no empty structs."""

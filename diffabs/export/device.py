@@ -195,9 +195,9 @@ def computer_program(
     )  # fmt: skip
 
 
-def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Iterator[DeviceParameter]:
+def _numbers(loop: Loop, typed: Loop, inputs: Input, given_target: bool) -> Iterator[DeviceParameter]:
     """Yield the parameters that the computer's calculation depends on."""
-    measured = given.measured
+    measured = inputs.measured
 
     def ahead(plant: Part) -> Any:
         return typed.feedforward.input(plant, measured, measured[0])
@@ -248,23 +248,23 @@ def _check_reference(loop: Loop, measured: PyTree) -> None:
 class _Work:
     """The computer's calculation for a loop whose real numbers have one type."""
 
-    def __init__(self, loop: Loop, count: int, given_target: bool, given: Input):
-        self.loop, self.count, self.given_target, self.given = loop, count, given_target, given
+    def __init__(self, loop: Loop, count: int, given_target: bool, inputs: Input):
+        self.loop, self.count, self.given_target, self.inputs = loop, count, given_target, inputs
         assert isinstance(loop.controller, Sampled)
         self.sampled = loop.controller
 
-    def start(self, parts: Parts, given: Input) -> State:
+    def start(self, parts: Parts, inputs: Input) -> State:
         """Return the memory at the first sample."""
-        loop, given = self._with(parts), replace_nan(given)
-        reference = Memory() if self.given_target else loop.reference.start(given.measured)
-        tracking, _ = self._track(loop, reference, given, 0.0)
+        loop, inputs = self._with(parts), replace_nan(inputs)
+        reference = Memory() if self.given_target else loop.reference.start(inputs.measured)
+        tracking, _ = self._track(loop, reference, inputs, 0.0)
         zero = jnp.zeros_like(tracking.target)
         return State(loop.controller.controller.start(tracking), jnp.zeros((), jnp.int64), zero, reference)
 
-    def step(self, parts: Parts, state: State, given: Input) -> tuple[Memory, PyTree, PyTree, PyTree]:
+    def step(self, parts: Parts, state: State, inputs: Input) -> tuple[Memory, PyTree, PyTree, PyTree]:
         """Return the controller's memory after a sample, the number of samples, the command, and the truth `held`."""
         loop, t = self._with(parts), self._time(state)
-        tracking, lost = self._track(loop, state.reference, given, t)
+        tracking, lost = self._track(loop, state.reference, inputs, t)
         clock = Clock(t, loop.controller.period, state.samples, None, before=tracking)
         inner, command, held = loop.controller.compute_guarded(clock, state.controller, state.command, tracking, lost)
         return inner, state.samples + 1, command, held
@@ -274,7 +274,7 @@ class _Work:
         loop = self._with(parts)
         h, memory = loop.controller.period / self.count, state.reference
         # `_check_reference` has shown that the reference ignores measurements, so zeros stand for them.
-        zero = jax.tree.map(jnp.zeros_like, self.given.measured)
+        zero = jax.tree.map(jnp.zeros_like, self.inputs.measured)
 
         def rate(t: Scalar, x: Scalar) -> Any:
             return loop.reference.flow(t, memory._replace(flow=x), zero)
@@ -292,11 +292,11 @@ class _Work:
         period = self.sampled.period
         return state.samples.astype(jnp.result_type(period)) * period
 
-    def _track(self, loop: Loop, reference: Memory, given: Input, t: Scalar) -> tuple[Tracking, PyTree]:
+    def _track(self, loop: Loop, reference: Memory, inputs: Input, t: Scalar) -> tuple[Tracking, PyTree]:
         """Return the controller's input, and whether a NaN enters the feed-forward."""
-        measured = replace_nan(given.measured)
+        measured = replace_nan(inputs.measured)
         if self.given_target:
-            target, setpoint = given.target, replace_nan(given.target)
+            target, setpoint = inputs.target, replace_nan(inputs.target)
         else:
             target = loop.reference.output(t, reference, measured)
             setpoint = loop.reference.setpoint(reference)
@@ -305,6 +305,6 @@ class _Work:
             return loop.feedforward.input(loop.plant, measured, setpoint)
 
         # Only measurements that the feed-forward depends on can spoil it. The controller checks the others itself.
-        followed = zip(jax.tree.leaves(given.measured), leaf_dependence(ahead, measured), strict=True)
+        followed = zip(jax.tree.leaves(inputs.measured), leaf_dependence(ahead, measured), strict=True)
         lost = reduce(jnp.logical_or, [jnp.isnan(x) for x, on in followed if on], False)
-        return Tracking(target, given.measured, ahead(measured)), lost
+        return Tracking(target, inputs.measured, ahead(measured)), lost

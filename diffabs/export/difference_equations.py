@@ -35,17 +35,17 @@ def difference_equations(loop: Loop, target: Scalar = None) -> JsonObject:
     loop = with_sampled_controller(loop)
     try:
         with jax.enable_x64(True):
-            found = linear_controller(jax.tree.map(lambda x: jnp.asarray(x, float), loop), target)
+            controller = linear_controller(jax.tree.map(lambda x: jnp.asarray(x, float), loop), target)
     except ValueError as error:
         raise NotExported(str(error)) from None
-    found = found._replace(**{name: _round_entries(getattr(found, name)) for name in "ABCD"})
+    controller = controller._replace(**{name: _round_entries(getattr(controller, name)) for name in "ABCD"})
     names = ["target", *loop.plant.shows._fields, "feedforward"]
     # Inputs without any coefficient are left out, such as an unused feed-forward.
-    used = (np.abs(found.B).max(axis=0, initial=0) > 0) | (np.abs(found.D[0]) > 0)
-    kept = [i for i, one in enumerate(used) if one]
+    used = (np.abs(controller.B).max(axis=0, initial=0) > 0) | (np.abs(controller.D[0]) > 0)
+    columns = [i for i, is_used in enumerate(used) if is_used]
     return {
-        "period": found.period, "inputs": [names[i] for i in kept], "F": found.A.tolist(),
-        "G": found.B[:, kept].tolist(), "H": found.C[0].tolist(), "J": found.D[0, kept].tolist(),
+        "period": controller.period, "inputs": [names[i] for i in columns], "F": controller.A.tolist(),
+        "G": controller.B[:, columns].tolist(), "H": controller.C[0].tolist(), "J": controller.D[0, columns].tolist(),
     }  # fmt: skip
 
 

@@ -32,59 +32,61 @@ class Lowered:
         place: Node of the counter of these steps.
         command: Node of the command.
         held: Boolean node: the sample cannot be used.
-        kept: Names of the memory that the command or `held` depends on, at once or later, and "command" itself.
-        read: Names of the inputs that the kept memory or `held` depends on.
-        used: Names of the parameters that the kept memory or `held` depends on.
-        stored: Nodes of the memory after a sample for the names in `kept`, without `moving`.
+        memory: Names of the memory that the command or `held` depends on, at once or later, and "command" itself.
+        read: Names of the inputs that this memory or `held` depends on.
+        used: Names of the parameters that this memory or `held` depends on.
+        stored: Nodes of the memory after a sample for the names in `memory`, without `moving`.
     """
 
-    def __init__(self, found: ComputerProgram):
+    def __init__(self, device: ComputerProgram):
         """Trace and lower start, step and move."""
-        self.device = found
+        self.device = device
         graph = Labelled()
-        self.inputs = number_leaves(found.input, graph, INPUTS, lambda path: path.removeprefix("measured."))
-        self.numbers = number_leaves(found.parts, graph, NUMBERS, lambda path: path.removeprefix("controller."))
+        self.inputs = number_leaves(device.input, graph, INPUTS, lambda path: path.removeprefix("measured."))
+        self.numbers = number_leaves(device.parts, graph, NUMBERS, lambda path: path.removeprefix("controller."))
         # The field names flow and held in a memory path tell a reader nothing.
-        self.state = number_leaves(found.state, graph, MEMORY, lambda path: re.sub(r"\.(flow|held)(?=\.|$)", "", path))
-        values = [float(x) for leaf in jax.tree.leaves(found.parts) for x in np.asarray(leaf, float).flat]
+        self.state = number_leaves(device.state, graph, MEMORY, lambda path: re.sub(r"\.(flow|held)(?=\.|$)", "", path))
+        values = [float(x) for leaf in jax.tree.leaves(device.parts) for x in np.asarray(leaf, float).flat]
         self.values = dict(zip(self.numbers, values, strict=True))
-        given, parts = fill_shapes(found.input, self.inputs), fill_shapes(found.parts, self.numbers)
-        started = trace_outputs(graph, lambda both: found.start(*both), (found.parts, found.input), [*parts, *given])
-        held = fill_shapes(found.state, self.state)
-        shapes = (found.parts, found.state, found.input)
-        *after, self.held = trace_outputs(graph, lambda all: found.step(*all), shapes, [*parts, *held, *given])
+        inputs, parts = fill_shapes(device.input, self.inputs), fill_shapes(device.parts, self.numbers)
+        started = trace_outputs(
+            graph, lambda both: device.start(*both), (device.parts, device.input), [*parts, *inputs]
+        )
+        held = fill_shapes(device.state, self.state)
+        shapes = (device.parts, device.state, device.input)
+        *after, self.held = trace_outputs(graph, lambda all: device.step(*all), shapes, [*parts, *held, *inputs])
         self.place = graph.input(np.int64, UpdateLevel.UNIFORM, ("", "i"))
         moved: list[Node] = []
-        if found.moves:
+        if device.moves:
             place, count = np.full((), self.place, object), jax.ShapeDtypeStruct((), np.int64)
-            shapes = (found.parts, found.state, count)
-            moved = trace_outputs(graph, lambda all: found.move(*all), shapes, [*parts, *held, place])
+            shapes = (device.parts, device.state, count)
+            moved = trace_outputs(graph, lambda all: device.move(*all), shapes, [*parts, *held, place])
         # The reference's memory comes last in the state, and only `move` changes it.
         moving = dict(zip([*self.state][len(after) :], moved, strict=bool(moved)))
         self.after = dict(zip(self.state, after, strict=False)) | moving
         self.command = self.after["command"]
-        self.kept = self._kept_memory()
-        self.moving = {name: node for name, node in moving.items() if name in self.kept}
-        self.begun = {name: node for name, node in zip(self.state, started, strict=True) if name in self.kept}
-        self.stored = {name: self.after[name] for name in self.kept if name in self.after and name not in moving}
-        roots = [self.held, *(self.after[name] for name in self.kept if name in self.after), *self.begun.values()]
-        seen = {node.id for node in live_nodes(roots)}
-        self.read = [name for name, node in self.inputs.items() if node.id in seen]
-        self.used = [name for name, node in self.numbers.items() if node.id in seen]
+        self.memory = self._find_memory()
+        self.moving = {name: node for name, node in moving.items() if name in self.memory}
+        self.begun = {name: node for name, node in zip(self.state, started, strict=True) if name in self.memory}
+        self.stored = {name: self.after[name] for name in self.memory if name in self.after and name not in moving}
+        roots = [self.held, *(self.after[name] for name in self.memory if name in self.after), *self.begun.values()]
+        live = {node.id for node in live_nodes(roots)}
+        self.read = [name for name, node in self.inputs.items() if node.id in live]
+        self.used = [name for name, node in self.numbers.items() if node.id in live]
 
-    def _kept_memory(self) -> list[str]:
+    def _find_memory(self) -> list[str]:
         """Return the names of the memory that the command depends on, from one sample to the next."""
-        kept = {"command"}
+        names = {"command"}
         roots = [self.command, self.held]
         while True:
             needed = {node.id for node in live_nodes(roots)}
             # A fixed point: memory that the command reads depends on further memory one sample earlier.
-            more = {name for name, node in self.state.items() if node.id in needed} - kept
+            more = {name for name, node in self.state.items() if node.id in needed} - names
             if not more:
                 break
-            kept |= more
-            roots = [self.command, self.held, *(self.after[name] for name in kept if name in self.after)]
-        return [name for name in self.state if name in kept]
+            names |= more
+            roots = [self.command, self.held, *(self.after[name] for name in names if name in self.after)]
+        return [name for name in self.state if name in names]
 
 
 def number_leaves(shape: PyTree, graph: Graph, where: str, flat: PyTree) -> dict[str, Node]:
@@ -95,16 +97,16 @@ def number_leaves(shape: PyTree, graph: Graph, where: str, flat: PyTree) -> dict
         flat: Function path -> name; a path such as measured.slip or gain.0. A number whose name another one has is
             called by its path.
     """
-    found: dict[str, Node] = {}
+    nodes: dict[str, Node] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(shape):
         words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
         for at in np.ndindex(leaf.shape):
             full = ".".join([*words, *map(str, at)])
-            name = flat(full) if flat(full) not in found else full
-            if name in found:
+            name = flat(full) if flat(full) not in nodes else full
+            if name in nodes:
                 raise NotExported(f"two numbers are called {name}: rename a field of one of their parts")
-            found[name] = graph.input(leaf.dtype, UpdateLevel.UNIFORM, (where, name))
-    return found
+            nodes[name] = graph.input(leaf.dtype, UpdateLevel.UNIFORM, (where, name))
+    return nodes
 
 
 def fill_shapes(shape: PyTree, nodes: dict[str, Node]) -> list[Array]:
@@ -113,11 +115,11 @@ def fill_shapes(shape: PyTree, nodes: dict[str, Node]) -> list[Array]:
     Args:
         nodes: Nodes in the order of the leaves' entries, one for each number.
     """
-    left, arrays = iter(nodes.values()), []
+    remaining, arrays = iter(nodes.values()), []
     for leaf in jax.tree.leaves(shape):
         out = np.empty(leaf.shape, object)
         for at in np.ndindex(leaf.shape):
-            out[at] = next(left)
+            out[at] = next(remaining)
         arrays.append(out)
     return arrays
 

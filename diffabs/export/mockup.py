@@ -80,11 +80,13 @@ def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, abou
 
 def _source(plant: PlantSource, guid: str, step: float) -> str:
     """Return all C of the FMU as one file."""
-    outputs = sum(one.role == "output" for one in plant.variables)
+    outputs = sum(variable.role == "output" for variable in plant.variables)
     number = Words("double", lambda op, place: place).literal  # a literal has no place
-    begun = ", ".join(number(one.value) for one in plant.variables)
+    begun = ", ".join(number(variable.value) for variable in plant.variables)
     struct = "double v[VARIABLES], x[STATES], time, stop;\n  int phase, ready;\n  char guid[sizeof GUID];"
-    limits = {name: ", ".join(number(getattr(one, name)) for one in plant.variables) for name in ("low", "high")}
+    limits = {
+        name: ", ".join(number(getattr(variable, name)) for variable in plant.variables) for name in ("low", "high")
+    }
     head = (
         "#include <math.h>\n#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n\n"
         # Constants, not macros: a macro would replace variables of the same name in the plant's code.
@@ -106,11 +108,11 @@ def _compile_library(source: str) -> bytes:
         text.write_text(source, encoding="utf-8")
         try:
             command = [*find_compiler().command, *FMU_COMPILER_FLAGS, str(text), "-o", str(result), "-lm"]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=MOCKUP_COMPILE_TIMEOUT_S)
+            compilation = subprocess.run(command, capture_output=True, text=True, timeout=MOCKUP_COMPILE_TIMEOUT_S)
         except (NoCompiler, OSError, subprocess.TimeoutExpired) as error:
             raise NotExported(f"an FMU needs a C compiler: {' '.join(str(error).split())}") from None
-        if done.returncode or not result.is_file():
-            raise NotExported(f"{command[0]} does not compile it: {' '.join(done.stderr.split())[:300]}")
+        if compilation.returncode or not result.is_file():
+            raise NotExported(f"{command[0]} does not compile it: {' '.join(compilation.stderr.split())[:300]}")
         return result.read_bytes()
 
 
@@ -124,18 +126,18 @@ def _description(plant: PlantSource, name: str, guid: str, step: float, duration
         **{"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"},
     })  # fmt: skip
     xml.SubElement(xml.SubElement(simulation, "SourceFiles"), "File", {"name": f"{name}.c"})
-    units = dict.fromkeys(one.unit for one in plant.variables if one.unit not in ("", "1"))
+    units = dict.fromkeys(variable.unit for variable in plant.variables if variable.unit not in ("", "1"))
     if units:
         definitions = xml.SubElement(root, "UnitDefinitions")
         for unit in units:
             xml.SubElement(definitions, "Unit", {"name": make_printable(unit)})
     xml.SubElement(root, "DefaultExperiment", {"startTime": "0.0", "stopTime": repr(duration), "stepSize": repr(step)})
     variables = xml.SubElement(root, "ModelVariables")
-    for reference, one in enumerate(plant.variables):
-        _variable(variables, one, reference)
+    for reference, variable in enumerate(plant.variables):
+        _variable(variables, variable, reference)
     structure = xml.SubElement(root, "ModelStructure")
     # Every output depends on the state, and in initialization on the parameters.
-    outputs = [k for k, one in enumerate(plant.variables, 1) if one.role == "output"]
+    outputs = [k for k, variable in enumerate(plant.variables, 1) if variable.role == "output"]
     for tag in ("Outputs", "InitialUnknowns"):
         parent = xml.SubElement(structure, tag)
         for index in outputs:
@@ -144,15 +146,17 @@ def _description(plant: PlantSource, name: str, guid: str, step: float, duration
     return xml.tostring(root, encoding="UTF-8", xml_declaration=True)
 
 
-def _variable(parent: Any, one: FmuVariable, reference: int) -> None:
+def _variable(parent: Any, variable: FmuVariable, reference: int) -> None:
     """Add a ScalarVariable to the description."""
     scalar = xml.SubElement(parent, "ScalarVariable", {
-        "name": one.name, "valueReference": str(reference), **CAUSES[one.role],
+        "name": variable.name, "valueReference": str(reference), **CAUSES[variable.role],
     })  # fmt: skip
-    start = {} if one.role == "output" else {"start": repr(one.value).replace("inf", "INF")}
-    limits = {"min": one.low, "max": one.high} if one.role == "parameter" else {}
+    start = {} if variable.role == "output" else {"start": repr(variable.value).replace("inf", "INF")}
+    limits = {"min": variable.low, "max": variable.high} if variable.role == "parameter" else {}
     # A limit of the largest double means no limit, and FMI's readers need no such attribute.
     shown = {name: repr(limit) for name, limit in limits.items() if abs(limit) < sys.float_info.max}
     xml.SubElement(
-        scalar, "Real", {**shown, **start, **({} if one.unit in ("", "1") else {"unit": make_printable(one.unit)})}
+        scalar,
+        "Real",
+        {**shown, **start, **({} if variable.unit in ("", "1") else {"unit": make_printable(variable.unit)})},
     )

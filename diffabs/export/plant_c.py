@@ -80,16 +80,16 @@ def plant_source(loop: Loop) -> PlantSource:
 def _variables(loop: Loop) -> tuple[FmuVariable, ...]:
     """Return the variables: outputs, control, then each number of the parameters of plant and start."""
     plant = loop.plant
-    found = [FmuVariable(name, "output", 0.0, plant.shows.units[name]) for name in plant.shows._fields]
-    found.append(FmuVariable(CONTROL, "input", 0.0, plant.control_unit))
+    variables = [FmuVariable(name, "output", 0.0, plant.shows.units[name]) for name in plant.shows._fields]
+    variables.append(FmuVariable(CONTROL, "input", 0.0, plant.control_unit))
     for where, part in (("plant", plant), ("initial", loop.initial)):
         for path, spec, value in parameters(part):
             numbers = np.asarray(value, float)
             for k, at in enumerate(np.ndindex(numbers.shape)):
                 unit = unit_at(spec.unit, k, numbers.size)
                 name = ".".join([where, path, *map(str, at)])
-                found.append(FmuVariable(name, "parameter", float(numbers[at]), unit, *_limits(spec)))
-    return tuple(found)
+                variables.append(FmuVariable(name, "parameter", float(numbers[at]), unit, *_limits(spec)))
+    return tuple(variables)
 
 
 def _limits(spec: ParameterSpec) -> tuple[float, float]:
@@ -102,19 +102,19 @@ def _limits(spec: ParameterSpec) -> tuple[float, float]:
         low = sys.float_info.min if low == 0 else math.nextafter(low, math.inf)
     if spec.open_high:
         high = -sys.float_info.min if high == 0 else math.nextafter(high, -math.inf)
-    most = math.inf if spec.infinite else sys.float_info.max
-    return max(low, -most), min(high, most)
+    largest = math.inf if spec.infinite else sys.float_info.max
+    return max(low, -largest), min(high, largest)
 
 
 class _Written:
     """A writer of the plant's functions."""
 
     def __init__(self, typed: tuple[PyTree, PyTree], variables: Sequence[FmuVariable]):
-        self.places = {one.name: k for k, one in enumerate(variables)}
+        self.places = {variable.name: k for k, variable in enumerate(variables)}
         self.words = Words("double", self._place)
         graph = Labelled()
         plant, initial = typed
-        given = [
+        inputs = [
             number
             for where, part in (("plant", plant), ("initial", initial))
             for number in fill_shapes(
@@ -122,7 +122,7 @@ class _Written:
             )
         ]
         # The first leaves are the plant's. The start's parameters matter only in `plant_start`.
-        own = given[: len(jax.tree.leaves(plant))]
+        plant_inputs = inputs[: len(jax.tree.leaves(plant))]
         state = jax.eval_shape(lambda both: prepare_parts(both[0]).start(both[1]), typed)
         held = fill_shapes(state, number_leaves(state, graph, "x", str))
         if any(not is_real(leaf.dtype) for leaf in jax.tree.leaves(state)):
@@ -134,12 +134,14 @@ class _Written:
             np.full((), graph.input(np.float64, UpdateLevel.UNIFORM, place), object)
             for place in (("v", CONTROL), ("", "t"), ("", "h"))
         )
-        self.begun = trace_outputs(graph, lambda both: prepare_parts(both[0]).start(both[1]), typed, given)
+        self.begun = trace_outputs(graph, lambda both: prepare_parts(both[0]).start(both[1]), typed, inputs)
         moving, shown = (plant, state, one, one, one), (plant, state)
         self.moved = trace_outputs(
-            graph, lambda all: _advance_state(*all), moving, [*own, *held, control, time, length]
+            graph, lambda all: _advance_state(*all), moving, [*plant_inputs, *held, control, time, length]
         )
-        self.shown = trace_outputs(graph, lambda both: prepare_parts(both[0]).output(both[1]), shown, [*own, *held])
+        self.shown = trace_outputs(
+            graph, lambda both: prepare_parts(both[0]).output(both[1]), shown, [*plant_inputs, *held]
+        )
 
     def _place(self, where: str, path: str) -> str:
         """Return the C expression of an input of the graph."""

@@ -67,14 +67,14 @@ def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()
 class _Block:
     """A writer of the function block."""
 
-    def __init__(self, found: ComputerProgram, name: str, notes: Sequence[str]):
-        self.device, self.name, self.notes = found, name, notes
-        self.program = program = Lowered(found)
-        self.real = "REAL" if found.dtype == np.float32 else "LREAL"
-        self.taken = taken = OWN | {name.lower()}
-        self.names = {(INPUTS, path): _fresh(path, taken) for path in program.read}
-        self.names |= {(NUMBERS, path): _fresh(path, taken) for path in program.used}
-        self.names |= {(MEMORY, path): _fresh(f"m_{path}", taken) for path in program.kept if path != "command"}
+    def __init__(self, device: ComputerProgram, name: str, notes: Sequence[str]):
+        self.device, self.name, self.notes = device, name, notes
+        self.program = program = Lowered(device)
+        self.real = "REAL" if device.dtype == np.float32 else "LREAL"
+        self.used_names = used_names = OWN | {name.lower()}
+        self.names = {(INPUTS, path): _fresh(path, used_names) for path in program.read}
+        self.names |= {(NUMBERS, path): _fresh(path, used_names) for path in program.used}
+        self.names |= {(MEMORY, path): _fresh(f"m_{path}", used_names) for path in program.memory if path != "command"}
         self.names[MEMORY, "command"] = "command"
         self.temporary: dict[str, str] = {}  # types by name
         self.called: dict[int, str] = {}  # variables by the id of the node
@@ -94,7 +94,7 @@ class _Block:
         if program.used:
             yield from ["VAR (* parameters *)", *self._parameters(), "END_VAR"]
         yield "VAR"
-        for path in program.kept:
+        for path in program.memory:
             if path != "command":
                 yield f"  {self.names[MEMORY, path]} : {self._type(program.state[path])};"
         yield "  started : BOOL := FALSE;\nEND_VAR"
@@ -180,7 +180,7 @@ class _Block:
     def _variable(self, node: Node) -> str:
         """Return the variable of a number."""
         if node.id not in self.called:
-            self.called[node.id] = _fresh(node.label or node.op, self.taken)
+            self.called[node.id] = _fresh(node.label or node.op, self.used_names)
         return self.called[node.id]
 
     def _type(self, node: Node) -> str:
@@ -258,12 +258,12 @@ def _scientific(x: float) -> str:
     return np.format_float_scientific(x, trim="0", exp_digits=1).replace("e", "E")
 
 
-def _fresh(path: str, taken: set[str]) -> str:
-    """Return a new identifier for a path and add it to `taken`; identifiers ignore case, and `_table` is reserved."""
+def _fresh(path: str, used_names: set[str]) -> str:
+    """Return a new identifier for a path, and add it to `used_names`; case is ignored, `_table` is reserved."""
     name = re.sub(r"[\W_]+", "_", path, flags=re.ASCII).strip("_")
     name = f"x_{name}".strip("_") if _is_reserved(name) or not name[:1].isalpha() else name
     number, fresh = 2, name
-    while taken & (both := {fresh.lower(), f"{fresh}_table".lower()}):
+    while used_names & (both := {fresh.lower(), f"{fresh}_table".lower()}):
         number, fresh = number + 1, f"{name}_{number}"
-    taken |= both
+    used_names |= both
     return fresh

@@ -16,7 +16,7 @@ LIGHT = 0.25  # opacity of the band
 LEAST_DB = -80.0  # lower end of the magnitude axis; half of it for the sensitivities
 
 
-def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *, title: str = "") -> PyTree:
+def loop_shape(loop: OpenLoop, margins: Margins, band: Sequence[OpenLoop] = (), *, title: str = "") -> PyTree:
     """Return a figure of the open loop L, which includes the controller, and its sensitivities S and T.
 
     The panels are magnitude and phase of L, its Nyquist plot, and |S| and |T|. For a stable loop the Nyquist plot has a
@@ -27,7 +27,7 @@ def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *,
     """
     w = frequencies([loop, *band])
     figure, (magnitude, nyquist, phase, closed) = sheet(2, 2, title=title, size=(5.6, 3.4))
-    main, around = _response(loop, w), np.array([_response(one, w) for one in band])
+    main, around = _response(loop, w), np.array([_response(open_loop, w) for open_loop in band])
     for ax in (magnitude, phase, closed):
         make_logarithmic(ax, "x")
         ax.set_xlim(w[0], w[-1])
@@ -35,19 +35,19 @@ def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *,
     magnitude.axhline(0, color=GREY, linewidth=0.8)
     magnitude.set_ylim(max(magnitude.get_ylim()[0], LEAST_DB), None)
     label_axes(magnitude, "", "|L| [dB]", legend=False)
-    _draw_band(phase, w, _degrees(main), np.array([_degrees(one) for one in around]), COLOURS[0], "L")
+    _draw_band(phase, w, _degrees(main), np.array([_degrees(response) for response in around]), COLOURS[0], "L")
     phase.axhline(-180, color=GREY, linewidth=0.8)
     label_axes(phase, "frequency [rad/s]", "phase of L [degrees]", legend=False)
-    _nyquist(nyquist, main, around, found)
+    _nyquist(nyquist, main, around, margins)
     for values, colour, name in ((1 / (1 + main), COLOURS[1], "S"), (main / (1 + main), COLOURS[2], "T")):
-        others = 1 / (1 + around) if name == "S" else around / (1 + around)
-        _draw_band(closed, w, _db(values), _db(others), colour, name)
+        band_values = 1 / (1 + around) if name == "S" else around / (1 + around)
+        _draw_band(closed, w, _db(values), _db(band_values), colour, name)
     closed.axhline(0, color=GREY, linewidth=0.8)
     closed.set_ylim(max(closed.get_ylim()[0], LEAST_DB / 2), None)
     label_axes(closed, "frequency [rad/s]", "sensitivities [dB]")
-    if np.isfinite(found.crossover):
+    if np.isfinite(margins.crossover):
         for ax in (magnitude, phase):
-            ax.axvline(found.crossover, color=GREY, linewidth=0.8, linestyle=":")
+            ax.axvline(margins.crossover, color=GREY, linewidth=0.8, linestyle=":")
     return figure
 
 
@@ -75,16 +75,16 @@ def _draw_band(ax: Any, w: np.ndarray, main: np.ndarray, around: np.ndarray, col
     ax.plot(w, main, color=colour, label=name)
 
 
-def _nyquist(ax: Any, main: Any, around: Any, found: Margins) -> None:
+def _nyquist(ax: Any, main: Any, around: Any, margins: Margins) -> None:
     """Draw L in the complex plane, with the point -1 and the circle that L does not enter."""
     for values in around:
         ax.plot(values.real, values.imag, color=COLOURS[0], alpha=LIGHT, linewidth=0.7)
     ax.plot(main.real, main.imag, color=COLOURS[0], label="L")
     ax.plot([-1], [0], "+", color=COLOURS[1], markersize=10)
-    if found.stable:
+    if margins.stable:
         turn = np.linspace(0, 2 * np.pi, 181)
-        circle = -1 + found.modulus * np.exp(1j * turn)
-        ax.plot(circle.real, circle.imag, "--", color=COLOURS[1], linewidth=1, label=f"1/Ms = {found.modulus:.3g}")
+        circle = -1 + margins.modulus * np.exp(1j * turn)
+        ax.plot(circle.real, circle.imag, "--", color=COLOURS[1], linewidth=1, label=f"1/Ms = {margins.modulus:.3g}")
     ax.set_xlim(-MAX_NYQUIST_RADIUS, MAX_NYQUIST_RADIUS - 1)
     ax.set_ylim(-MAX_NYQUIST_RADIUS + 0.5, MAX_NYQUIST_RADIUS - 0.5)
     ax.set_aspect("equal", adjustable="box")

@@ -21,7 +21,7 @@ class ProofMap(NamedTuple):
         box: Low and high end of each parameter, shape (parameters, 2).
         cells: Proved cells, shape (cells, parameters, 2).
         bounds: Bound that is proved in each cell, shape (cells,); not finite where nothing is proved of the quantity.
-        left: Cells that are not proved, shape (left, parameters, 2).
+        undecided: Cells that are not proved, shape (left, parameters, 2).
         refuting: Cell in which every run violates a claim, shape (parameters, 2), or None; it may be a point.
         worst: The worst run found, its parameters, shape (parameters,), or None.
         worst_value: Value of the quantity in that run.
@@ -34,7 +34,7 @@ class ProofMap(NamedTuple):
     box: np.ndarray
     cells: np.ndarray
     bounds: np.ndarray
-    left: np.ndarray
+    undecided: np.ndarray
     refuting: np.ndarray | None
     worst: np.ndarray | None
     worst_value: float | None
@@ -51,7 +51,7 @@ def draw_proof(shown: ProofMap) -> Figure:
     else:
         _draw_intervals(ax, shown)
     handles, names = ax.get_legend_handles_labels()
-    if len(shown.left):
+    if len(shown.undecided):
         handles.append(Patch(facecolor="none", edgecolor=GREY, hatch=LEFT_HATCH))
         names.append("not proved")
     if len(shown.labels) == 2 and not np.isfinite(shown.bounds).all():
@@ -65,17 +65,17 @@ def draw_proof(shown: ProofMap) -> Figure:
 def _draw_rectangles(figure: Figure, ax: Axes, shown: ProofMap) -> None:
     """Draw the cells over two parameters."""
     ax.grid(visible=False)
-    known = np.isfinite(shown.bounds)
+    bounded = np.isfinite(shown.bounds)
     thin = 0.3 if len(shown.cells) < MANY_CELLS else 0.05
-    if known.any():
-        proved = PatchCollection(_rectangles(shown.cells[known]), cmap="viridis", edgecolor="white", linewidth=thin)
-        proved.set_array(shown.bounds[known])
+    if bounded.any():
+        proved = PatchCollection(_rectangles(shown.cells[bounded]), cmap="viridis", edgecolor="white", linewidth=thin)
+        proved.set_array(shown.bounds[bounded])
         ax.add_collection(proved)
         figure.colorbar(proved, ax=ax, label=shown.quantity)
-    if not known.all():
-        ax.add_collection(PatchCollection(_rectangles(shown.cells[~known]), facecolor=UNBOUNDED, edgecolor="white"))
-    if len(shown.left):
-        hatched = PatchCollection(_rectangles(shown.left), facecolor="none", edgecolor=GREY, hatch=LEFT_HATCH)
+    if not bounded.all():
+        ax.add_collection(PatchCollection(_rectangles(shown.cells[~bounded]), facecolor=UNBOUNDED, edgecolor="white"))
+    if len(shown.undecided):
+        hatched = PatchCollection(_rectangles(shown.undecided), facecolor="none", edgecolor=GREY, hatch=LEFT_HATCH)
         hatched.set_linewidth(thin)
         ax.add_collection(hatched)
     if shown.refuting is not None:
@@ -93,7 +93,7 @@ def _draw_intervals(ax: Axes, shown: ProofMap) -> None:
     """Draw the bound of each cell over one parameter."""
     sides = shown.cells[:, 0]
     ax.hlines(shown.bounds, sides[:, 0], sides[:, 1], color=COLOURS[0], linewidth=2.0, label="proved")
-    for low, high in shown.left[:, 0]:
+    for low, high in shown.undecided[:, 0]:
         ax.axvspan(low, high, facecolor="none", edgecolor=GREY, hatch=LEFT_HATCH, linewidth=0.5)
     if shown.claimed is not None:
         ax.axhline(shown.claimed, color="black", linestyle="--", linewidth=1.1, label="claimed")

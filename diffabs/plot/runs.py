@@ -38,16 +38,16 @@ def draw_braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
     Raises:
         ValueError: The run has no trajectory, as from `measure`.
     """
-    seen, title = _trajectory(run, title)
+    trajectory, title = _trajectory(run, title)
     figure, (top, speed, torque, brake) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
-    t, sample = np.asarray(seen.sample.t), seen.sample
+    t, sample = np.asarray(trajectory.sample.t), trajectory.sample
     top.plot(t, sample.output.slip, color=COLOURS[0], label="slip")
     top.plot(t, sample.target, "--", color=COLOURS[1], label="target")
     top.plot(t, sample.setpoint, ":", color="black", label="setpoint")
     label_axes(top, "", "slip [1]")
-    _speeds(speed, seen)
+    _speeds(speed, trajectory)
     label_axes(speed, "", "speed [km/h]")
-    _control(torque, seen, unit)
+    _control(torque, trajectory, unit)
     brake.plot(t, sample.output.deceleration, color=COLOURS[0])
     label_axes(brake, "time [s]", "deceleration [m/s²]")
     return figure
@@ -64,17 +64,17 @@ def draw_balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
     Raises:
         ValueError: The run has no trajectory, as from `measure`.
     """
-    seen, title = _trajectory(run, title)
+    trajectory, title = _trajectory(run, title)
     figure, (angles, rates, voltage, torque) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
-    t, sample = np.asarray(seen.sample.t), seen.sample
-    draw_angle_lines(angles, seen)
+    t, sample = np.asarray(trajectory.sample.t), trajectory.sample
+    draw_angle_lines(angles, trajectory)
     label_axes(angles, "", "angle [rad]")
-    draw_angle_lines(rates, seen, "_rate")
+    draw_angle_lines(rates, trajectory, "_rate")
     label_axes(rates, "", "rate [rad/s]", legend=False)
-    _control(voltage, seen, unit)
+    _control(voltage, trajectory, unit)
     # The axis follows the delivered control: a command far beyond the supply would flatten it.
-    most = np.max(np.abs(sample.control))
-    voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # 1e-9: limits that differ at zero control
+    peak = np.max(np.abs(sample.control))
+    voltage.set_ylim(-1.5 * peak - 1e-9, 1.5 * peak + 1e-9)  # 1e-9: limits that differ at zero control
     torque.plot(t, motor_torque(sample), color=COLOURS[0])
     label_axes(torque, "time [s]", "motor torque [N m]")
     return figure
@@ -93,8 +93,8 @@ def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     Raises:
         ValueError: The run has no trajectory, as from `measure`.
     """
-    seen, title = _trajectory(run, title)
-    t, sample = np.asarray(seen.sample.t), seen.sample
+    trajectory, title = _trajectory(run, title)
+    t, sample = np.asarray(trajectory.sample.t), trajectory.sample
     groups: dict[str, list[str]] = {}
     for name, of_signal in sample.output.units.items():
         groups.setdefault(of_signal, []).append(name)
@@ -109,7 +109,7 @@ def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
         words = f"{spaced_name(names[0])} " if alone else ""
         label_axes(ax, "", f"{words}[{of_signal}]", legend=ax is axes[0] or not alone)
     count = len(groups) + 1
-    _control(axes[count - 1], seen, unit)
+    _control(axes[count - 1], trajectory, unit)
     for ax in axes[count:]:
         ax.set_visible(False)
     # With a shared time axis only the last row has labels; above a hidden panel they must be shown again.
@@ -119,9 +119,9 @@ def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     return figure
 
 
-def _control(ax: Axes, seen: Trajectory, unit: str) -> None:
+def _control(ax: Axes, trajectory: Trajectory, unit: str) -> None:
     """Draw the controller's command and the control that the actuator delivers."""
-    t, sample = np.asarray(seen.sample.t), seen.sample
+    t, sample = np.asarray(trajectory.sample.t), trajectory.sample
     ax.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
     ax.plot(t, sample.control, color=COLOURS[0], label="control")
     label_axes(ax, "time [s]", control_label(unit))
@@ -198,8 +198,8 @@ def draw_slip_lines(ax: Axes, runs: Mapping[str, Trajectory]) -> None:
         ax: Axes to draw into.
         runs: Trajectories by name.
     """
-    for i, (name, seen) in enumerate(runs.items()):
-        ax.plot(np.asarray(seen.sample.t), seen.sample.output.slip, label=name, **curve_style(i))
+    for i, (name, trajectory) in enumerate(runs.items()):
+        ax.plot(np.asarray(trajectory.sample.t), trajectory.sample.output.slip, label=name, **curve_style(i))
     first = next(iter(runs.values())).sample
     ax.plot(np.asarray(first.t), first.setpoint, color="black", linewidth=0.9, linestyle=":", label="setpoint")
 
@@ -212,9 +212,9 @@ def draw_speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
         title: Title of the figure.
     """
     figure, axes = sheet(1, len(runs), title=title, size=(5.2 if len(runs) > 1 else 6.4, 3.6), sharex=True, sharey=True)
-    for i, (ax, (name, seen)) in enumerate(zip(axes, runs.items(), strict=True)):
-        _speeds(ax, seen)
-        words = f"{name}: ends at {float(seen.sample.t[-1]):.2f} s" if name else ""
+    for i, (ax, (name, trajectory)) in enumerate(zip(axes, runs.items(), strict=True)):
+        _speeds(ax, trajectory)
+        words = f"{name}: ends at {float(trajectory.sample.t[-1]):.2f} s" if name else ""
         label_axes(ax, "time [s]", "" if i else "speed [km/h]", words)
         ax.set_xlim(0, None)
     # The automatic end below 0 keeps the line of a locked wheel off the axis.
@@ -222,8 +222,8 @@ def draw_speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
     return figure
 
 
-def _speeds(ax: Axes, seen: Trajectory) -> None:
-    t, y = np.asarray(seen.sample.t), seen.sample.output
+def _speeds(ax: Axes, trajectory: Trajectory) -> None:
+    t, y = np.asarray(trajectory.sample.t), trajectory.sample.output
     ax.plot(t, KMH * np.asarray(y.wheel_speed), color=COLOURS[1], linestyle="--", linewidth=1.3, label="wheel")
     ax.plot(t, KMH * np.asarray(y.speed), color=COLOURS[0], linewidth=1.6, label="vehicle")
 
@@ -242,14 +242,17 @@ def draw_positions(
     figure, axes = sheet(1, len(groups), title=title, size=(5.2, 3.6), sharey=zoom is None)
     for i, (ax, runs) in enumerate(zip(axes, groups, strict=True)):
         single = len(runs) == 1
-        for j, (name, seen) in enumerate(runs.items()):
-            t, x = np.asarray(seen.sample.t), np.asarray(seen.sample.output.distance)
+        for j, (name, trajectory) in enumerate(runs.items()):
+            t, x = np.asarray(trajectory.sample.t), np.asarray(trajectory.sample.output.distance)
             ax.plot(t, x, label=None if single else f"{name}: {x[-1]:.2f} m", **curve_style(j))
             ax.plot(t[-1:], x[-1:], marker="o", markersize=4.5, **curve_style(j))
         label_axes(ax, "time [s]", "" if i else "position [m]", next(iter(runs)) if single else "")
         ax.set_xlim(0, None)
     if zoom:
-        ends = [np.interp(zoom, seen.sample.t, seen.sample.output.distance) for seen in panels[-1].values()]
+        ends = [
+            np.interp(zoom, trajectory.sample.t, trajectory.sample.output.distance)
+            for trajectory in panels[-1].values()
+        ]
         low, high = float(np.min(ends)), float(np.max(ends))
         axes[-1].set_xlim(*zoom)
         axes[-1].set_ylim(low, high + 0.08 * (high - low))

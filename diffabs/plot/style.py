@@ -110,10 +110,10 @@ def make_logarithmic(ax: Axes, axis: str) -> None:
         axis: "x" or "y".
     """
     (ax.set_xscale if axis == "x" else ax.set_yscale)("log")
-    one = ax.xaxis if axis == "x" else ax.yaxis
-    one.set_major_locator(_Decades())
-    one.set_major_formatter(_Powers())
-    one.set_minor_formatter(NullFormatter())
+    scale_axis = ax.xaxis if axis == "x" else ax.yaxis
+    scale_axis.set_major_locator(_Decades())
+    scale_axis.set_major_formatter(_Powers())
+    scale_axis.set_minor_formatter(NullFormatter())
 
 
 class _Decades(LogLocator):
@@ -123,8 +123,8 @@ class _Decades(LogLocator):
         """Return the places of the labels between `vmin` and `vmax`."""
         decades = np.log10(vmax / vmin) if vmin > 0 else np.inf
         self.set_params(subs=(1.0, 2.0, 5.0) if decades < FEW_DECADES else (1.0,))
-        found = np.asarray(super().tick_values(vmin, vmax))
-        return found if decades >= FEW_DECADES else found[(found >= vmin) & (found <= vmax)]
+        places = np.asarray(super().tick_values(vmin, vmax))
+        return places if decades >= FEW_DECADES else places[(places >= vmin) & (places <= vmax)]
 
 
 class _Powers(Formatter):

@@ -50,16 +50,16 @@ class SweepView:
         leading: First varying metric with a bound, else the first varying metric; "" if none varies.
     """
 
-    def __init__(self, found: Results, units: Mapping[str, str] = {}):
-        """Select the rows and metrics of the sweep `found`; `units` are by the name of a column."""
-        self.found, self.units, self.bounds = found, units, found.study["failures"]
-        masks = RowMasks(found)
+    def __init__(self, results: Results, units: Mapping[str, str] = {}):
+        """Select the rows and metrics of the sweep `results`; `units` are by the name of a column."""
+        self.results, self.units, self.bounds = results, units, results.study["failures"]
+        masks = RowMasks(results)
         self.design, self.period, self.accepted, self.good = masks.design, masks.period, masks.accepted, masks.good
         self.rows = masks.good & masks.rows
-        least = LEVEL_ROUNDING_EPS * np.finfo(found.study["dtype"]).eps
-        columns = ((name, found.column(name)[self.rows]) for name in found.metrics if self.rows.any())
+        rounding = LEVEL_ROUNDING_EPS * np.finfo(results.study["dtype"]).eps
+        columns = ((name, results.column(name)[self.rows]) for name in results.metrics if self.rows.any())
         finite = ((name, x[np.isfinite(x)]) for name, x in columns)
-        self.varying = [name for name, x in finite if x.size and np.ptp(x) > least * max(1.0, np.abs(x).max())]
+        self.varying = [name for name, x in finite if x.size and np.ptp(x) > rounding * max(1.0, np.abs(x).max())]
         self.leading = next((name for name in [*self.bounds, *self.varying] if name in self.varying), "")
 
     def known_rows(self, name: str, rows: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ class SweepView:
 
         For example, a run that never settles has an infinite settling time and is left out.
         """
-        return rows & np.isfinite(self.found.column(name)) if name else rows
+        return rows & np.isfinite(self.results.column(name)) if name else rows
 
     def never(self, name: str, rows: np.ndarray) -> str:
         """Return a note such as " (3 never: left out)" on the runs of the mask `rows` with an infinite metric `name`.
@@ -82,21 +82,21 @@ class SweepView:
         unit = self.units.get(name, "")
         return f"{name} [{unit}]" if unit else name
 
-    def title(self, what: str, count: Scalar) -> str:
-        """Return a title: name of the scenario, the words `what`, and the number of runs `count`.
+    def title(self, statement: str, count: Scalar) -> str:
+        """Return a title: name of the scenario, the words `statement`, and the number of runs `count`.
 
         The numbers of diverged and refused runs follow in brackets.
         """
-        name, bad = self.found.manifest.get("source", {}).get("name"), np.sum(self.accepted & ~self.good)
+        name, bad = self.results.manifest.get("source", {}).get("name"), np.sum(self.accepted & ~self.good)
         refused = np.sum(~self.accepted)
         runs = f"{count:,} runs" + (f" ({bad:,} diverged)" if bad else "")
         runs += f" ({refused:,} refused)" if refused else ""
-        return f"{name}: {what} {runs}" if name else f"{what} {runs}"
+        return f"{name}: {statement} {runs}" if name else f"{statement} {runs}"
 
     def variable(self, path: str, rows: np.ndarray) -> AxisVariable:
         """Return the varied parameter `path` in the runs of the mask `rows`, for an axis."""
-        values = self.found.column(path)[rows]
-        if not self.found.is_number(path):
+        values = self.results.column(path)[rows]
+        if not self.results.is_number(path):
             names, places = np.unique(values.astype(str), return_inverse=True)
             return AxisVariable(path, places, names.tolist())
         fast = self.units.get(path) == "m/s"
@@ -113,18 +113,18 @@ class SweepView:
         best: list[str] = []
         for _ in range(2 if len(result) else 0):
             rank = {}
-            for path in self.found.variables:
-                one = self.variable(path, rows)
-                if path not in best and np.ptp(one.values) > 0:
-                    rank[path] = (numbers_first and bool(one.names), -np.var(cell_means(one, result)))
+            for path in self.results.variables:
+                variable = self.variable(path, rows)
+                if path not in best and np.ptp(variable.values) > 0:
+                    rank[path] = (numbers_first and bool(variable.names), -np.var(cell_means(variable, result)))
             # The second variable is chosen on the residual of the first.
             if rank:
                 best.append(min(rank, key=rank.__getitem__))
                 result = result - cell_means(self.variable(best[-1], rows), result)
-        return sorted(best, key=lambda path: not self.found.is_number(path))
+        return sorted(best, key=lambda path: not self.results.is_number(path))
 
 
-def assign_cells(one: AxisVariable, along: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def assign_cells(variable: AxisVariable, along: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """Return the cell index of each run, shape (runs,), and the edges of the cells, shape (cells + 1,).
 
     A variable with few different values has one cell around each value. Other cells are equally wide.
@@ -132,18 +132,18 @@ def assign_cells(one: AxisVariable, along: int = 2) -> tuple[np.ndarray, np.ndar
     Args:
         along: Number of variables of the map, 1 or 2; two variables get fewer cells each.
     """
-    levels, n = np.unique(one.values), len(one.values)
-    if one.names or len(levels) <= min(CELL_COUNTS[1], n / 2):
+    levels, n = np.unique(variable.values), len(variable.values)
+    if variable.names or len(levels) <= min(CELL_COUNTS[1], n / 2):
         middles = (levels[1:] + levels[:-1]) / 2
         edges = np.array([2 * levels[0] - middles[0], *middles, 2 * levels[-1] - middles[-1]])
     else:
         edges = np.linspace(
             levels[0], levels[-1], int(np.clip((n / MIN_RUNS_PER_CELL) ** (1 / along), *CELL_COUNTS)) + 1
         )
-    return np.clip(np.searchsorted(edges, one.values, side="right") - 1, 0, len(edges) - 2), edges
+    return np.clip(np.searchsorted(edges, variable.values, side="right") - 1, 0, len(edges) - 2), edges
 
 
-def cell_means(one: AxisVariable, result: np.ndarray) -> np.ndarray:
+def cell_means(variable: AxisVariable, result: np.ndarray) -> np.ndarray:
     """Return for each run the mean of the result over its cell, shape (runs,).
 
     The variance of these means measures influence. Unlike a correlation, it shows a result that is worst in the middle
@@ -152,5 +152,5 @@ def cell_means(one: AxisVariable, result: np.ndarray) -> np.ndarray:
     Args:
         result: Result of each run, shape (runs,).
     """
-    place = assign_cells(one)[0]
+    place = assign_cells(variable)[0]
     return (np.bincount(place, result) / np.maximum(np.bincount(place), 1))[place]

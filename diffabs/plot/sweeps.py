@@ -37,24 +37,24 @@ ROW = 0.055  # height of a line of text beside the axes, as a share of their hei
 ABOVE = dict(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False, fontsize=9, handlelength=1.5)
 
 
-def draw_sweep(found: Results, document: Any, folder: pathlib.Path, units: Mapping[str, str]) -> list[pathlib.Path]:
+def draw_sweep(results: Results, document: Any, folder: pathlib.Path, units: Mapping[str, str]) -> list[pathlib.Path]:
     """Write every figure that has content as PNG, and return the paths."""
     figures = {
-        "distributions": draw_distributions(found, units),
-        "exceedance": draw_exceedance(found, units, document["confidence"]),
-        "worst": draw_worst(found, units),
-        "sensitivity": draw_sensitivity(found, document),
-        "failure_map": draw_failure_map(found, units),
+        "distributions": draw_distributions(results, units),
+        "exceedance": draw_exceedance(results, units, document["confidence"]),
+        "worst": draw_worst(results, units),
+        "sensitivity": draw_sensitivity(results, document),
+        "failure_map": draw_failure_map(results, units),
     }
     return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items() if figure]
 
 
-def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
+def draw_distributions(results: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """Return histograms of each metric with its median and two quantiles, or None if no metric varies."""
-    view = SweepView(found, units)
+    view = SweepView(results, units)
     figure, axes = _panels(view.varying, view.title("distributions of", np.sum(view.rows)))
     for ax, name in zip(axes, view.varying, strict=True):
-        values = found.column(name)[view.known_rows(name, view.rows)]
+        values = results.column(name)[view.known_rows(name, view.rows)]
         low, middle, high = np.quantile(values, (0.05, 0.5, 0.95))
         far = MAX_BOUND_DISTANCE * (high - low) or np.inf
         ends = max(values.min(), low - far), min(values.max(), high + far)
@@ -71,22 +71,22 @@ def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure 
     return figure
 
 
-def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: float = 0.95) -> Figure | None:
+def draw_exceedance(results: Results, units: Mapping[str, str] = {}, confidence: float = 0.95) -> Figure | None:
     """Return the share of runs above each value, for each metric, or None if no metric varies.
 
     Pointwise intervals of Clopper and Pearson are drawn unless the design is a grid or corners, which are not random.
     """
-    view = SweepView(found, units)
+    view = SweepView(results, units)
     band = f"{100 * confidence:g} % band" + ("" if view.design == "random" else " (as if independent)")
     figure, axes = _panels(view.varying, view.title("how often a value is exceeded in", np.sum(view.rows)))
     for ax, name in zip(axes, view.varying, strict=True):
-        values = np.sort(found.column(name)[view.known_rows(name, view.rows)])
+        values = np.sort(results.column(name)[view.known_rows(name, view.rows)])
         n, limits = len(values), _limits(ax, values[0], values[-1], view.bounds.get(name))
         x, counts = _exceedance_corners(values, *limits)
         ax.plot(x, counts / n, color=COLOURS[0], label=f"runs{view.never(name, view.rows)}")
         if view.design not in ("grid", "corners"):
-            known = [Count(int(k), n).probability(confidence=confidence) for k in counts]
-            ends = [one.low for one in known], [one.high for one in known]
+            intervals = [Count(int(k), n).probability(confidence=confidence) for k in counts]
+            ends = [interval.low for interval in intervals], [interval.high for interval in intervals]
             ax.fill_between(x, *ends, color=COLOURS[0], alpha=0.25, linewidth=0, label=band)
         make_logarithmic(ax, "y")
         ax.set_xlim(limits)
@@ -96,26 +96,26 @@ def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: f
     return figure
 
 
-def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -> Figure | None:
+def draw_worst(results: Results, units: Mapping[str, str] = {}, count: int = 10) -> Figure | None:
     """Return a scatter of the runs over two variables, coloured by a metric, or None if nothing varies.
 
     The metric is the first varying one with a bound of failure, else the first varying one. The variables are the two
     that influence it most, numeric ones first. With one variable, the figure shows the metric over it. The worst runs,
     with the greatest values, are marked with sample number and value.
     """
-    view = SweepView(found, units)
+    view = SweepView(results, units)
     metric = view.leading
     good = view.known_rows(metric, view.good)
-    paths = view.influential(good, found.column(metric)[good], numbers_first=True) if metric else []
-    if not (ones := [view.variable(path, good) for path in paths]):
+    paths = view.influential(good, results.column(metric)[good], numbers_first=True) if metric else []
+    if not (variables := [view.variable(path, good) for path in paths]):
         return None
-    values, samples = found.column(metric)[good], found.column("sample")[good]
+    values, samples = results.column(metric)[good], results.column("sample")[good]
     bound, tail = view.bounds.get(metric), Tail.of(values, samples, count)
     ends = np.searchsorted(samples, tail.indices)  # sample numbers ascend
     shown = np.union1d(np.random.default_rng(0).permutation(len(values))[: POINTS - count], ends)
     # Later points cover earlier ones: ascending values keep the worst run of a place visible.
     shown = shown[np.argsort(values[shown], kind="stable")]
-    x, y = ones[0].values, ones[1].values if ones[1:] else values
+    x, y = variables[0].values, variables[1].values if variables[1:] else values
     title = view.title(f"greatest {metric} of", np.sum(good)) + view.never(metric, view.good)
     figure, (ax,) = sheet(title=title, size=(8.4, 4.8))
     dots = ax.scatter(x[shown], y[shown], 10, values[shown], cmap="viridis", linewidths=0)
@@ -125,31 +125,31 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
         bar.set_label(f"{view.label(metric)}, line: bound {bound:g}")
     ax.plot(x[ends], y[ends], "o", color=COLOURS[1], fillstyle="none", label=f"the worst {len(ends)}, sample: value")
     _callouts(ax, x[ends], y[ends], [f"{i}: {v:.4g}" for i, v in zip(tail.indices, tail.values, strict=True)])
-    _name_axes(ax, ones, view.label(metric))
+    _name_axes(ax, variables, view.label(metric))
     ax.legend(**ABOVE)
     return figure
 
 
-def draw_sensitivity(found: Results, document: Table) -> Figure | None:
+def draw_sensitivity(results: Results, document: Table) -> Figure | None:
     """Return bars with intervals for each metric, or None if the document has no sensitivities.
 
     The bars are rank correlations, or Sobol' indices for a Saltelli design.
     """
-    view = SweepView(found)
+    view = SweepView(results)
     sobol = view.design == "saltelli"
-    kinds, what = (("first", "total"), "Sobol indices") if sobol else (("spearman",), "rank correlations")
+    kinds, kind = (("first", "total"), "Sobol indices") if sobol else (("spearman",), "rank correlations")
     table = {name: rows for name in view.varying if (rows := document["sensitivity"].get(name))}
     paths = dict.fromkeys(path for rows in table.values() for path in rows)
     great = {path: max(abs(rows[path][kinds[-1]]["value"] or 0.0) for rows in table.values()) for path in paths}
-    most = sorted((path for path in paths if great[path]), key=lambda path: -great[path])
+    ordered = sorted((path for path in paths if great[path]), key=lambda path: -great[path])
     used = max((rows[path][kinds[-1]]["samples"] for rows in table.values() for path in rows), default=0) * view.period
-    title = view.title(f"{what} with {100 * document['confidence']:g} % intervals,", used)
-    names, height = list(table) if most else [], 1.3 + 0.3 * len(most) * len(kinds)
+    title = view.title(f"{kind} with {100 * document['confidence']:g} % intervals,", used)
+    names, height = list(table) if ordered else [], 1.3 + 0.3 * len(ordered) * len(kinds)
     figure, axes = _panels(names, title, (4.4, height), sharey=True)
     for ax, (name, rows) in zip(axes, table.items(), strict=False):
-        _bars(ax, [rows[path] for path in most], kinds)
-        ax.set_yticks(range(len(most)), most)
-        ax.set_ylim(len(most) - 0.4, -0.6)
+        _bars(ax, [rows[path] for path in ordered], kinds)
+        ax.set_yticks(range(len(ordered)), ordered)
+        ax.set_ylim(len(ordered) - 0.4, -0.6)
         ax.set_xlim(*((None, None) if sobol else (-1.05, 1.05)))
         label_axes(ax, "share of the variance [1]" if sobol else "rank correlation [1]", "", name, legend=False)
     if figure and sobol:
@@ -157,7 +157,7 @@ def draw_sensitivity(found: Results, document: Table) -> Figure | None:
     return figure
 
 
-def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
+def draw_failure_map(results: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """Return a map of the share of failed runs over two variables, or None if there is nothing to draw.
 
     The variables are the two that influence failure most. With fewer than ten failed runs, or fewer than ten others,
@@ -167,17 +167,17 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
 
     The function returns None if no variable varies, and if no run failed and no metric varies.
     """
-    view = SweepView(found, units)
-    failed = found.failed_samples()[every := view.accepted]
+    view = SweepView(results, units)
+    failed = results.failed_samples()[every := view.accepted]
     if not (failed.any() or view.leading):
         return None
     rows, result = every, failed
     if view.leading and min(np.sum(failed), np.sum(~failed)) < FEW:
         rows = view.known_rows(view.leading, view.good)
-        result = found.column(view.leading)[rows]
-    if not (ones := [view.variable(path, every) for path in view.influential(rows, result)]):
+        result = results.column(view.leading)[rows]
+    if not (variables := [view.variable(path, every) for path in view.influential(rows, result)]):
         return None
-    places, edges = zip(*(assign_cells(one, len(ones)) for one in ones), strict=True)
+    places, edges = zip(*(assign_cells(variable, len(variables)) for variable in variables), strict=True)
     shape = [len(edge) - 1 for edge in edges]
     cell = np.ravel_multi_index(places, shape)
     lanes, bad = (np.bincount(cell, w, np.prod(shape)).reshape(shape[0], -1) for w in (None, failed))
@@ -186,7 +186,7 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
         table, words = bad / np.maximum(lanes, 1), "share of failed runs [1]"
         colours = {"cmap": "Oranges", "vmin": 0, "vmax": np.max(table)}
     else:
-        values, greatest = found.column(view.leading)[every], np.full(lanes.size, -np.inf)
+        values, greatest = results.column(view.leading)[every], np.full(lanes.size, -np.inf)
         np.maximum.at(greatest, cell, values)
         table, bound = greatest.reshape(lanes.shape), view.bounds.get(view.leading)
         words = f"greatest {view.label(view.leading)}" + ("" if bound is None else f", fails beyond {bound:g}")
@@ -199,10 +199,10 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
         worst = Patch(color=COLOURS[1], label=f"{view.leading}: never in a run")
         figure.legend(handles=[worst], loc="outside lower center", frameon=False)
     ax.set_facecolor("#BBBBBB")
-    ax.yaxis.set_visible(len(ones) > 1)
-    _name_axes(ax, ones)
+    ax.yaxis.set_visible(len(variables) > 1)
+    _name_axes(ax, variables)
     bounds = "".join(f", {name} > {bound:g}" for name, bound in view.bounds.items())
-    ax.set_title(f"failed: diverged, {describe_wrong_end(found.study['success'])}{bounds}", fontsize=9.5)
+    ax.set_title(f"failed: diverged, {describe_wrong_end(results.study['success'])}{bounds}", fontsize=9.5)
     return figure
 
 
@@ -227,9 +227,9 @@ def _bars(ax: Axes, rows: Sequence[Table], kinds: Sequence[str]) -> None:
         ax.barh(
             at, [row[kind]["value"] or 0 for row in rows], 0.7 / len(kinds), color=COLOURS[j], alpha=0.6, label=kind
         )
-        for y, one in zip(at, (row[kind] for row in rows), strict=True):
-            if one["low"] is not None and one["high"] is not None:
-                ax.plot([one["low"], one["high"]], [y, y], "|-", color="black", linewidth=1, markersize=5)
+        for y, interval in zip(at, (row[kind] for row in rows), strict=True):
+            if interval["low"] is not None and interval["high"] is not None:
+                ax.plot([interval["low"], interval["high"]], [y, y], "|-", color="black", linewidth=1, markersize=5)
     ax.axvline(0, color=GREY, linewidth=0.9)
 
 
@@ -273,8 +273,8 @@ def _panels(names: Sequence[str], title: str, size: tuple[float, float] = (5.0, 
     return figure, axes[: len(names)]
 
 
-def _name_axes(ax: Axes, ones: Sequence[AxisVariable], upward: str = "") -> None:
-    label_axes(ax, ones[0].label, ones[1].label if ones[1:] else upward, legend=False)
-    for axis, one in zip((ax.xaxis, ax.yaxis), ones, strict=False):
-        if one.names:
-            axis.set_ticks(range(len(one.names)), one.names)
+def _name_axes(ax: Axes, variables: Sequence[AxisVariable], upward: str = "") -> None:
+    label_axes(ax, variables[0].label, variables[1].label if variables[1:] else upward, legend=False)
+    for axis, variable in zip((ax.xaxis, ax.yaxis), variables, strict=False):
+        if variable.names:
+            axis.set_ticks(range(len(variable.names)), variable.names)

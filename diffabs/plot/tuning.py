@@ -79,28 +79,28 @@ def pareto_front(x: Scalar, y: Scalar) -> np.ndarray:
     x, y = np.asarray(x, float), np.asarray(y, float)
     # In the order of x (of equal x the smallest y first), a point is on the front if its y is a new minimum.
     order = [i for i in np.lexsort((y, x)) if np.isfinite([x[i], y[i]]).all()]
-    kept, least = [], np.inf
+    front, lowest = [], np.inf
     for i in order:
-        if y[i] < least:
-            kept.append(i)
-            least = y[i]
-    return np.array(kept, int)
+        if y[i] < lowest:
+            front.append(i)
+            lowest = y[i]
+    return np.array(front, int)
 
 
 def _objective(ax: Axes, points: Sequence[PyTree]) -> None:
     """Draw the objective and, on an axis of its own, the largest violation of a constraint."""
     n, values = [p.evaluations for p in points], np.array([p.objective for p in points])
     ax.plot(n, values, "o-", markersize=3.5, color=COLOURS[0], label="objective")
-    known = values[np.isfinite(values)]
-    if len(known) and known.min() > 0 and known.max() > MAX_DECADES * known.min():
+    finite = values[np.isfinite(values)]
+    if len(finite) and finite.min() > 0 and finite.max() > MAX_DECADES * finite.min():
         make_logarithmic(ax, "y")
     violation = np.array([p.violation for p in points])
     if np.any(violation > 0):
-        other = ax.twinx()
-        other.spines[["top", "left"]].set_visible(False)
-        other.plot(n, violation, "--", color=COLOURS[1], linewidth=1.2)
-        other.set_ylabel("greatest violation [of its bound]", fontsize=10, color=COLOURS[1])
-        other.set_ylim(0, None)
+        right = ax.twinx()
+        right.spines[["top", "left"]].set_visible(False)
+        right.plot(n, violation, "--", color=COLOURS[1], linewidth=1.2)
+        right.set_ylabel("greatest violation [of its bound]", fontsize=10, color=COLOURS[1])
+        right.set_ylim(0, None)
     label_axes(ax, "gradients computed", "objective", legend=False)
 
 
@@ -112,10 +112,10 @@ def _gradient(ax: Axes, points: Sequence[PyTree]) -> None:
 
 def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str = "", unit: str = "N m") -> None:
     """Draw the first signal (the slip of a brake) with its setpoint, and the control."""
-    for i, (name, seen) in enumerate(runs.items()):
-        t = np.asarray(seen.sample.t)
-        slip.plot(t, seen.sample.output[0], label=name, **curve_style(i))
-        torque.plot(t, seen.sample.control, label=name, linewidth=1.2, **curve_style(i))
+    for i, (name, trajectory) in enumerate(runs.items()):
+        t = np.asarray(trajectory.sample.t)
+        slip.plot(t, trajectory.sample.output[0], label=name, **curve_style(i))
+        torque.plot(t, trajectory.sample.control, label=name, linewidth=1.2, **curve_style(i))
     first = next(iter(runs.values())).sample
     slip.plot(np.asarray(first.t), first.setpoint, color=GREY, linewidth=0.9, linestyle=":", label="setpoint")
     label_axes(slip, "time [s]", signal_label(first.output), title)
@@ -131,9 +131,9 @@ def _arrival_time(runs: Mapping[str, Trajectory]) -> float:
     The transient of a run ends when its first signal stays within 2 % of its largest magnitude around the setpoint.
     """
     ends = []
-    for seen in runs.values():
-        t, slip = np.asarray(seen.sample.t), np.asarray(seen.sample.output[0])
-        away = np.flatnonzero(np.abs(slip - np.asarray(seen.sample.setpoint)) > 0.02 * np.max(np.abs(slip)))
+    for trajectory in runs.values():
+        t, slip = np.asarray(trajectory.sample.t), np.asarray(trajectory.sample.output[0])
+        away = np.flatnonzero(np.abs(slip - np.asarray(trajectory.sample.setpoint)) > 0.02 * np.max(np.abs(slip)))
         ends.append(float(t[away[-1]]) if len(away) else 0.0)
-    whole = max(float(np.asarray(seen.sample.t)[-1]) for seen in runs.values())
+    whole = max(float(np.asarray(trajectory.sample.t)[-1]) for trajectory in runs.values())
     return min(whole, SETTLED_MULTIPLE * max(ends)) or whole

@@ -77,12 +77,12 @@ def read_measurements(
     except ValueError as error:
         hint = " with --separator" if str(error).startswith("separator") else ""
         raise ScenarioError(f"--data {path}: {error}{hint}") from None
-    given = [cell.strip() for cell in rows[0]] if rows else []
-    header = _translate(given, path, units, renamed or {})
-    names, unread = _names(header, given, path, units, strict)
+    titles = [cell.strip() for cell in rows[0]] if rows else []
+    header = _translate(titles, path, units, renamed or {})
+    names, unread = _names(header, titles, path, units, strict)
     used = [header.index(TIME_COLUMN), *names]
     comma = _has_decimal_commas(rows, used, separator, path)
-    numbers = np.array([_numbers(row, i, given, used, comma, path) for i, row in enumerate(rows[1:], 2) if row], float)
+    numbers = np.array([_numbers(row, i, titles, used, comma, path) for i, row in enumerate(rows[1:], 2) if row], float)
     if not len(numbers):
         raise ScenarioError(f"--data {path}: has a header and no numbers")
     lines = [i for i, row in enumerate(rows[1:], 2) if row]
@@ -93,7 +93,7 @@ def read_measurements(
     for i, j in np.argwhere(~np.isfinite(numbers)):
         if used[j] not in unlimited:
             cell = rows[lines[i] - 1][used[j]].strip()
-            raise ScenarioError(f"--data {path}, line {lines[i]}: {given[used[j]]} = {cell} is outside (-inf, inf)")
+            raise ScenarioError(f"--data {path}, line {lines[i]}: {titles[used[j]]} = {cell} is outside (-inf, inf)")
     late = np.flatnonzero(np.diff(t) <= 0)
     if t[0] < 0 or len(late):
         line, before = (lines[late[0] + 1], t[late[0]]) if len(late) else (lines[0], 0.0)
@@ -104,14 +104,14 @@ def read_measurements(
 
 
 def _translate(
-    given: Sequence[str], path: pathlib.Path, units: Mapping[str, str], renamed: Mapping[str, str]
+    titles: Sequence[str], path: pathlib.Path, units: Mapping[str, str], renamed: Mapping[str, str]
 ) -> list[str]:
     """Return the header with `name [unit]` for each name that is renamed, or written in another way."""
     headers = {"t": TIME_COLUMN} | {name: f"{name} [{unit}]" for name, unit in units.items()}
     for column, name in renamed.items():
-        if column not in given:
-            what = f"--rename {format_given(column)} is no column of {path}"
-            raise unknown_name_error(what, column, given)
+        if column not in titles:
+            message = f"--rename {format_given(column)} is no column of {path}"
+            raise unknown_name_error(message, column, titles)
         if name not in headers and name not in headers.values():
             raise unknown_name_error(f"--rename {format_given(name)} is not a signal", name, headers)
 
@@ -121,30 +121,30 @@ def _translate(
         plain = re.sub(r"\s*[\[(]\s*(.*?)\s*[\])]$", r" [\1]", column).replace("[-]", "[1]")
         return TIME_COLUMN if plain.lower() in TIME_NAMES else plain if plain in headers.values() else column
 
-    return [translate(column) for column in given]
+    return [translate(column) for column in titles]
 
 
 def _names(
-    header: Sequence[str], given: Sequence[str], path: pathlib.Path, units: Mapping[str, str], strict: bool
+    header: Sequence[str], titles: Sequence[str], path: pathlib.Path, units: Mapping[str, str], strict: bool
 ) -> tuple[dict[int, str], tuple[str, ...]]:
     """Return the names of the compared columns by column number, and the names of unknown columns."""
     headers = {f"{name} [{unit}]": name for name, unit in units.items()}
-    there = ", ".join((TIME_COLUMN, *headers))
-    has = f"the file has {', '.join(format_given(name) for name in given[:MAX_LISTED])}"
-    has += f" and {len(given) - MAX_LISTED} more" if len(given) > MAX_LISTED else ""
+    expected = ", ".join((TIME_COLUMN, *headers))
+    has = f"the file has {', '.join(format_given(name) for name in titles[:MAX_LISTED])}"
+    has += f" and {len(titles) - MAX_LISTED} more" if len(titles) > MAX_LISTED else ""
     if TIME_COLUMN not in header:
-        what = f"line 1 has no column {TIME_COLUMN}; {has}" if header else "is empty"
-        raise ScenarioError(f"--data {path}: {what}; there is {there}{'; ' + RENAME_HINT if header else ''}")
+        message = f"line 1 has no column {TIME_COLUMN}; {has}" if header else "is empty"
+        raise ScenarioError(f"--data {path}: {message}; there is {expected}{'; ' + RENAME_HINT if header else ''}")
     unread = []
     for name in header:
-        known = name == TIME_COLUMN or name in headers
-        if known and header.count(name) > 1:
+        is_known = name == TIME_COLUMN or name in headers
+        if is_known and header.count(name) > 1:
             raise ScenarioError(f"--data {path}: column {format_given(name)} occurs twice")
-        if known or not name or name.startswith(IGNORED):  # without a name: a separator at the end of the lines
+        if is_known or not name or name.startswith(IGNORED):  # without a name: a separator at the end of the lines
             continue
         if strict:
-            what = f"--data {path}: column {format_given(name)} is unknown"
-            error = unknown_name_error(what, name, (TIME_COLUMN, *headers))
+            message = f"--data {path}: column {format_given(name)} is unknown"
+            error = unknown_name_error(message, name, (TIME_COLUMN, *headers))
             raise ScenarioError(f"{error}; {has}; {RENAME_HINT}")
         unread.append(name)
     names = {i: headers[name] for i, name in enumerate(header) if name in headers}
@@ -163,9 +163,9 @@ def _has_decimal_commas(rows: Sequence[Sequence[str]], used: Sequence[int], sepa
                 if i < len(row) and mark in row[i]:
                     first.setdefault(mark, (line, row[i].strip()))
     if len(first) == 2:
-        (line, cell), (_, other) = sorted(first.values(), reverse=True)
+        (line, cell), (_, other_cell) = sorted(first.values(), reverse=True)
         raise ScenarioError(
-            f"--data {path}, line {line}: {format_given(cell)} has another decimal mark than {format_given(other)}"
+            f"--data {path}, line {line}: {format_given(cell)} has another decimal mark than {format_given(other_cell)}"
         )
     return "," in first
 
@@ -176,12 +176,12 @@ def _numbers(
     """Return the numbers of the `used` columns of a row."""
     if len(row) != len(header):
         raise ScenarioError(f"--data {path}, line {line}: has {len(row)} cells; the header has {len(header)}")
-    found = []
+    numbers = []
     for i in used:
         try:
-            found.append(separated.read_decimal(row[i], comma))
+            numbers.append(separated.read_decimal(row[i], comma))
         except ValueError:
             raise ScenarioError(
                 f"--data {path}, line {line}: {header[i]} = {format_given(row[i])} is text; a number is needed"
             ) from None
-    return found
+    return numbers

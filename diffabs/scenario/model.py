@@ -15,30 +15,32 @@ if TYPE_CHECKING:
     from diffabs.scenario.scenario import Scenario
 
 
-def describe_model(chosen: "Scenario") -> JsonObject:
+def describe_model(scenario: "Scenario") -> JsonObject:
     """Return a scenario as JSON values.
 
     They are title, description, parts, parameters with units, solver, and units of the metrics.
     """
     return {
-        "title": chosen.title,
-        "description": chosen.description,
-        "parts": describe_parts(chosen),
-        "parameters": describe_numbers(chosen),
-        "solver": {**describe_solver(chosen.solver), "seed": chosen.seed},
-        "metrics": {name: registry.unit_of(one, chosen.loop.plant) for name, one in chosen.objectives.items()},
+        "title": scenario.title,
+        "description": scenario.description,
+        "parts": describe_parts(scenario),
+        "parameters": describe_numbers(scenario),
+        "solver": {**describe_solver(scenario.solver), "seed": scenario.seed},
+        "metrics": {
+            name: registry.unit_of(objective, scenario.loop.plant) for name, objective in scenario.objectives.items()
+        },
     }
 
 
-def describe_parts(chosen: "Scenario") -> dict[str, JsonObject]:
+def describe_parts(scenario: "Scenario") -> dict[str, JsonObject]:
     """Return every part, objectives included, by its path: its type, and its fields that are not parameters."""
-    found = dict(registry.part_choices(chosen.loop))
-    for name, one in chosen.objectives.items():
-        found |= registry.part_choices(one, f"objective.{name}")
-    return found
+    parts = dict(registry.part_choices(scenario.loop))
+    for name, objective in scenario.objectives.items():
+        parts |= registry.part_choices(objective, f"objective.{name}")
+    return parts
 
 
-def describe_numbers(chosen: "Scenario") -> dict[str, JsonObject]:
+def describe_numbers(scenario: "Scenario") -> dict[str, JsonObject]:
     """Return value (in SI) and unit of every parameter, those of objectives included, by its path.
 
     JSON has no infinity and no NaN: these become texts, which an override accepts.
@@ -49,10 +51,10 @@ def describe_numbers(chosen: "Scenario") -> dict[str, JsonObject]:
 
     objectives = (
         (f"objective.{name}.{path}", spec, value)
-        for name, one in chosen.objectives.items()
-        for path, spec, value in parameters(one, units=units_of(chosen.loop.plant))
+        for name, objective in scenario.objectives.items()
+        for path, spec, value in parameters(objective, units=units_of(scenario.loop.plant))
     )
     return {
         path: {"value": np.vectorize(plain, otypes=[object])(np.asarray(value, float)).tolist(), "unit": spec.unit}
-        for path, spec, value in (*parameters(chosen.loop), *objectives)
+        for path, spec, value in (*parameters(scenario.loop), *objectives)
     }

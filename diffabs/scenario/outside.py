@@ -108,15 +108,15 @@ def describe_outside_error(error: BaseException, names: Iterable[str] | None = N
     Args:
         names: Modules whose packages count as outside code; by default all registered modules.
     """
-    known = names or [module.__name__ for module in registered_modules()]
-    outer = {name.partition(".")[0] for name in known} - {"diffabs"}
+    modules = names or [module.__name__ for module in registered_modules()]
+    outer = {name.partition(".")[0] for name in modules} - {"diffabs"}
     frames = [
         f"{frame.f_code.co_filename}, line {line}"
         for frame, line in traceback.walk_tb(error.__traceback__)
         if frame.f_globals.get("__name__", "").partition(".")[0] in outer
     ]
-    said = [type(error).__name__, " ".join(str(error).split())]
-    return ": ".join([frames[-1], *filter(None, said)]) if frames else ""
+    message = [type(error).__name__, " ".join(str(error).split())]
+    return ": ".join([frames[-1], *filter(None, message)]) if frames else ""
 
 
 def _find_incomplete_class(module: ModuleType) -> str:
@@ -128,12 +128,15 @@ def _find_incomplete_class(module: ModuleType) -> str:
     if parts:
         cls = parts[0]
         kind, missing = _missing_methods(cls)
-        own = ", ".join(sorted(_public_methods(cls)))
-        return (
-            f"there is no part in this module: class {cls.__name__} lacks {', '.join(missing)} of {kind}; it has {own}"
-        )
-    made = [cls for cls in classes if _public_methods(cls)]
-    return f"there is no part in this module: class {made[0].__name__} is not made with @pytree" if made else ""
+        methods = ", ".join(sorted(_public_methods(cls)))
+        lacks = f"lacks {', '.join(missing)} of {kind}; it has {methods}"
+        return f"there is no part in this module: class {cls.__name__} {lacks}"
+    candidates = [cls for cls in classes if _public_methods(cls)]
+    return (
+        f"there is no part in this module: class {candidates[0].__name__} is not made with @pytree"
+        if candidates
+        else ""
+    )
 
 
 def _missing_methods(cls: type) -> tuple[str, list[str]]:
@@ -142,19 +145,19 @@ def _missing_methods(cls: type) -> tuple[str, list[str]]:
     The nearest contract has the most methods in common, misspelled ones included, and then the fewest missing. A class
     without methods lacks none: it is an initial state.
     """
-    own = _public_methods(cls)
-    if not own or "rate" in own:  # `rate` alone is the contract of an anti-windup
+    methods = _public_methods(cls)
+    if not methods or "rate" in methods:  # `rate` alone is the contract of an anti-windup
         return "", []
 
     def distance(contract: frozenset[str]) -> tuple[int, int]:
-        close = [name for name in contract if difflib.get_close_matches(name, own, cutoff=MIN_METHOD_LIKENESS)]
-        return -len(close), len(contract - own)
+        close = [name for name in contract if difflib.get_close_matches(name, methods, cutoff=MIN_METHOD_LIKENESS)]
+        return -len(close), len(contract - methods)
 
     needed = {kind: _public_methods(contract) for kind, contract in CONTRACTS.items()}
-    if any(contract <= own for contract in needed.values()):
+    if any(contract <= methods for contract in needed.values()):
         return "", []
     kind = min(needed, key=lambda kind: distance(needed[kind]))
-    return kind, sorted(needed[kind] - own)
+    return kind, sorted(needed[kind] - methods)
 
 
 def _public_methods(cls: type) -> frozenset[str]:
@@ -177,8 +180,8 @@ def _find_wrong_friction(module: ModuleType) -> str:
         except (Exception, SystemExit):
             continue
         if value.shape or value.dtype.kind in "OSU":
-            found = f"values of shape {value.shape}" if value.shape else repr(mu)
-            return f"{name}.friction returns {found}; one number is needed"
+            description = f"values of shape {value.shape}" if value.shape else repr(mu)
+            return f"{name}.friction returns {description}; one number is needed"
     return ""
 
 

@@ -53,7 +53,7 @@ class ParameterEntry:
     Attributes:
         path: Path of the parameter in the loop.
         where: Place of the value, for messages.
-        given: The value, in the unit of `spec`.
+        value: The value, in the unit of `spec`.
         spec: Unit and range of the parameter, in the unit in which the value was given.
         shape: Shape of the parameter, () for a number.
         scale: Factor from SI to the given unit: 3.6 for a speed in km/h, else 1.
@@ -61,25 +61,27 @@ class ParameterEntry:
 
     path: str
     where: str
-    given: PyTree
+    value: PyTree
     spec: ParameterSpec
     shape: tuple[int, ...]
     scale: float
 
-    def single(self, what: str) -> "ParameterEntry":
+    def single(self, verb: str) -> "ParameterEntry":
         """Return this entry if the parameter is a single number."""
         if self.shape:
-            raise ScenarioError(f"{self.where} is a list of {self.shape[0]} numbers; only single numbers can {what}")
+            raise ScenarioError(f"{self.where} is a list of {self.shape[0]} numbers; only single numbers can {verb}")
         return self
 
     def values(self) -> tuple[float, ...]:
         """Return the given numbers in SI; a single number counts as a list of one."""
-        if (ends := interval_ends(self.given, self.where)) is not None:
+        if (ends := interval_ends(self.value, self.where)) is not None:
             raise ScenarioError(f"{self.where} is an interval; a list [{format_given(ends[0])}, ...] is needed")
-        given = self.given if isinstance(self.given, list) else [self.given]
-        if not given:
+        numbers = self.value if isinstance(self.value, list) else [self.value]
+        if not numbers:
             raise ScenarioError(f"{self.where} = [] is empty; numbers in {self.spec.interval()} are needed")
-        return tuple(read_number_in_range(x, self.spec, f"{self.where}.{i}") / self.scale for i, x in enumerate(given))
+        return tuple(
+            read_number_in_range(x, self.spec, f"{self.where}.{i}") / self.scale for i, x in enumerate(numbers)
+        )
 
     def range(self, or_else: str = "") -> Ends:
         """Return low and high in SI: numbers, or tuples where a list was given for a parameter that is a list.
@@ -90,14 +92,14 @@ class ParameterEntry:
                 excludes.
         """
         needed = f"a range {{ low, high }} in {self.spec.interval()}"
-        given = interval_ends(self.given, self.where)
-        if given is None and not isinstance(self.given, list):
-            raise wrong_kind_error(self.where, self.given, needed + or_else)
+        pair = interval_ends(self.value, self.where)
+        if pair is None and not isinstance(self.value, list):
+            raise wrong_kind_error(self.where, self.value, needed + or_else)
         # A list of values is no range, so the two ends in a list have one meaning here.
-        given = self.given if given is None else given
-        if len(given) != 2:
-            raise ScenarioError(f"{self.where} = {format_given(given)} is not {needed}")
-        ends = [self._end(item, f"{self.where}.{name}") for name, item in zip(INTERVAL_KEYS, given, strict=True)]
+        pair = self.value if pair is None else pair
+        if len(pair) != 2:
+            raise ScenarioError(f"{self.where} = {format_given(pair)} is not {needed}")
+        ends = [self._end(item, f"{self.where}.{name}") for name, item in zip(INTERVAL_KEYS, pair, strict=True)]
         low, high = map(np.asarray, ends)
         closed = dataclasses.replace(self.spec, open_low=False, open_high=False, infinite=True)
         allowed = closed if or_else else self.spec
@@ -109,26 +111,26 @@ class ParameterEntry:
             )
         return tuple(scale_to_si(end, self.scale) for end in ends)
 
-    def _end(self, given: PyTree, path: str) -> Scalar:
+    def _end(self, value: PyTree, path: str) -> Scalar:
         """Return one end of a range: a number, or a tuple with as many numbers as the parameter."""
-        if not self.shape or not isinstance(given, list):
-            return read_number(given, self.spec, path)
-        if len(given) != self.shape[0]:
-            have = f"has {len(given)} numbers; the parameter has {self.shape[0]}"
-            raise ScenarioError(f"{path} = {format_given(given)} {have}")
-        return tuple(read_number(item, self.spec, f"{path}.{i}") for i, item in enumerate(given))
+        if not self.shape or not isinstance(value, list):
+            return read_number(value, self.spec, path)
+        if len(value) != self.shape[0]:
+            have = f"has {len(value)} numbers; the parameter has {self.shape[0]}"
+            raise ScenarioError(f"{path} = {format_given(value)} {have}")
+        return tuple(read_number(item, self.spec, f"{path}.{i}") for i, item in enumerate(value))
 
 
-def interval_ends(given: PyTree, where: str) -> list[PyTree] | None:
+def interval_ends(value: PyTree, where: str) -> list[PyTree] | None:
     """Return the ends of an interval `{ low, high }` or "low:high" as given, or None for a value of another form."""
-    if isinstance(given, str) and given.count(":") == 1:
-        ends = [parse_value(text.strip()) for text in given.split(":")]
+    if isinstance(value, str) and value.count(":") == 1:
+        ends = [parse_value(text.strip()) for text in value.split(":")]
         return ends if all(isinstance(end, int | float) for end in ends) else None
-    if not isinstance(given, dict) or "type" in given or "choices" in given:
+    if not isinstance(value, dict) or "type" in value or "choices" in value:
         return None
-    if given.keys() != set(INTERVAL_KEYS):
-        raise ScenarioError(f"{where} = {format_given(given)} is no interval {{ low = ..., high = ... }}")
-    return [given[key] for key in INTERVAL_KEYS]
+    if value.keys() != set(INTERVAL_KEYS):
+        raise ScenarioError(f"{where} = {format_given(value)} is no interval {{ low = ..., high = ... }}")
+    return [value[key] for key in INTERVAL_KEYS]
 
 
 def interval_table(low: Scalar, high: Scalar) -> JsonObject:
@@ -201,7 +203,7 @@ def flatten_table(table: Table, section: str) -> JsonObject:
 
     A table with the key `type` or `choices` is a value, and so is a table of `low` and `high` below a dotted path.
     """
-    found: JsonObject = {}
+    flat: JsonObject = {}
     pending = list(table.items())[::-1]
     while pending:
         path, value = pending.pop()
@@ -212,10 +214,10 @@ def flatten_table(table: Table, section: str) -> JsonObject:
             pending += [(f"{path}.{key}", item) for key, item in list(value.items())[::-1]]
             continue
         path = canonical_path(path)
-        if path in found:
+        if path in flat:
             raise ScenarioError(f"{_where(section, path)} is given twice")
-        found[path] = value
-    return found
+        flat[path] = value
+    return flat
 
 
 def canonical_path(path: str) -> str:
@@ -225,28 +227,30 @@ def canonical_path(path: str) -> str:
 
 
 def read_entries(
-    table: Table, section: str, there: Mapping[str, tuple[ParameterSpec, tuple[int, ...]]], otherwise: str
+    table: Table, section: str, allowed: Mapping[str, tuple[ParameterSpec, tuple[int, ...]]], otherwise: str
 ) -> Iterator[ParameterEntry]:
     """Yield one entry for each parameter in a table.
 
     A speed may have the suffix `_kmh`.
 
     Args:
-        there: Spec and shape of each allowed parameter by path of the loop.
+        allowed: Spec and shape of each allowed parameter by path of the loop.
     """
-    known = {canonical_path(path): (path, spec, shape, 1.0) for path, (spec, shape) in there.items()}
-    known |= {f"{k}_kmh": (path, in_kmh(spec), n, KMH) for k, (path, spec, n, _) in known.items() if spec.unit == "m/s"}
-    seen = set()
-    for key, given in flatten_table(table, section).items():
-        if key not in known:
+    by_key = {canonical_path(path): (path, spec, shape, 1.0) for path, (spec, shape) in allowed.items()}
+    by_key |= {
+        f"{k}_kmh": (path, in_kmh(spec), n, KMH) for k, (path, spec, n, _) in by_key.items() if spec.unit == "m/s"
+    }
+    paths = set()
+    for key, value in flatten_table(table, section).items():
+        if key not in by_key:
             head = f"{key.partition('.')[0]}."
-            beside = [path for path in known if path.startswith(head)]  # a loop has some sixty parameters
-            raise unknown_name_error(f"{_where(section, key)} is {otherwise}", key, beside or known)
-        path, spec, shape, scale = known[key]
-        if path in seen:
+            beside = [path for path in by_key if path.startswith(head)]  # a loop has some sixty parameters
+            raise unknown_name_error(f"{_where(section, key)} is {otherwise}", key, beside or by_key)
+        path, spec, shape, scale = by_key[key]
+        if path in paths:
             raise ScenarioError(f"{_where(section, canonical_path(path))} is given twice, in m/s and in km/h")
-        seen.add(path)
-        yield ParameterEntry(path, _where(section, key), given, spec, shape, scale)
+        paths.add(path)
+        yield ParameterEntry(path, _where(section, key), value, spec, shape, scale)
 
 
 def parameters_of(loop: Part) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]]:
@@ -260,7 +264,7 @@ def _where(section: str, path: str) -> str:
 
 
 def metric_reader(
-    objectives: Mapping[str, Objective], what: str, unit: Callable[[Objective], str] = lambda _: "1"
+    objectives: Mapping[str, Objective], contents: str, unit: Callable[[Objective], str] = lambda _: "1"
 ) -> Reader:
     """Return the reader (given, path) -> {metric: number} of a table, which raises ScenarioError for a wrong one.
 
@@ -268,15 +272,15 @@ def metric_reader(
         unit: Function from an objective to the unit of its number.
     """
 
-    def read(given: PyTree, path: str) -> dict[str, float]:
-        for name in table_reader(read_as_given, what)(given, path):
+    def read(table: PyTree, path: str) -> dict[str, float]:
+        for name in table_reader(read_as_given, contents)(table, path):
             if name not in objectives:
                 raise unknown_name_error(
                     f"{dotted_path(path, name)} is not a metric of this scenario", name, objectives
                 )
         return {
             name: read_number_in_range(x, ParameterSpec(unit(objectives[name])), dotted_path(path, name))
-            for name, x in given.items()
+            for name, x in table.items()
         }
 
     return read

@@ -92,26 +92,26 @@ def register_parts(names: Iterable[str]) -> None:
         outside.register_modules(names)
     except ValueError as error:
         raise ScenarioError(str(error)) from None
-    there = {id(item) for family in FAMILIES for item in family_types(family).values()}
+    part_ids = {id(item) for family in FAMILIES for item in family_types(family).values()}
     for module in outside.registered_modules():
-        if module.__name__ in names and not there & {id(part) for part in _parts_of(module).values()}:
+        if module.__name__ in names and not part_ids & {id(part) for part in _parts_of(module).values()}:
             raise ScenarioError(f"--parts {module.__name__}: there is no part in this module")
 
 
 @cache
 def _outside_parts(family: str, modules: tuple[ModuleType, ...]) -> Table:
     """Return the parts of outside modules by name. Raises ScenarioError for a name that is already used."""
-    found: JsonObject = {}
+    parts: JsonObject = {}
     for module in modules:
         for exported, part in _parts_of(module).items():
             name = kebab_case(exported)
             if family not in _families_of(type(part)):
                 continue
-            if name in _packaged_parts(family) or name in found:
+            if name in _packaged_parts(family) or name in parts:
                 whose = "diffabs" if name in _packaged_parts(family) else "another module"
                 raise ScenarioError(f"parts of {module.__name__}: a {family} {name} exists already, in {whose}")
-            found[name] = part
-    return found
+            parts[name] = part
+    return parts
 
 
 @cache
@@ -129,8 +129,8 @@ def _families_of(cls: type) -> set[str]:
     Among the contracts that fit, the one with the most methods decides. The contract of a block belongs to three
     families, so a plain block is in all three.
     """
-    if said := getattr(cls, "family", None):
-        return {said}
+    if family := getattr(cls, "family", None):
+        return {family}
     fits = {name: len(contract) for name, (_, contract) in FAMILIES.items() if contract and contract <= _methods(cls)}
     if not fits:
         return set() if _methods(cls) else {"initial"}
@@ -141,12 +141,12 @@ def _families_of(cls: type) -> set[str]:
 def _packaged_parts(family: str) -> Table:
     """Return the parts of diffabs itself by name."""
     modules, contract = FAMILIES[family]
-    found = {}
+    parts = {}
     for exported, item in ((n, x) for module in modules for n, x in vars(module).items()):
         cls = item if isinstance(item, type) else type(item)
         if dataclasses.is_dataclass(cls) and (contract <= _methods(cls) if contract else not _methods(cls)):
-            found[kebab_case(exported)] = item() if isinstance(item, type) else item
-    return found
+            parts[kebab_case(exported)] = item() if isinstance(item, type) else item
+    return parts
 
 
 def name_of(family: str, part: Part) -> str:
@@ -163,33 +163,33 @@ def family_of(field: str, enclosing: str) -> str:
     return next((name for name in (field, field.removesuffix("s")) if name in FAMILIES), enclosing)
 
 
-def type_name(given: PyTree) -> Scalar:
+def type_name(section: PyTree) -> Scalar:
     """Return the name of the type in a section: the section itself if it is a bare word, else its `type`, or None."""
-    return given.get("type") if isinstance(given, dict) else given
+    return section.get("type") if isinstance(section, dict) else section
 
 
-def describe_missing_inner_parts(family: str, given: PyTree, path: str) -> list[str]:
+def describe_missing_inner_parts(family: str, section: PyTree, path: str) -> list[str]:
     """Return a line for each enclosed part of the same family whose type the table does not give.
 
     Such a part would get the default type of the enclosing class, whatever the scenario has there. A named constant
     brings its own parts.
     """
-    name, lines = type_name(given), []
+    name, lines = type_name(section), []
     part = family_types(family).get(name) if isinstance(name, str) else None
     is_class = part is not None and name == kebab_case(type(part).__name__)
     for field in () if part is None else dataclasses.fields(part):
         if "part" not in field.metadata:
             continue
-        inner = given.get(field.name) if isinstance(given, dict) else None
-        where, what = f"{path}.{field.name}", family_of(field.name, family)
+        inner = section.get(field.name) if isinstance(section, dict) else None
+        where, inner_family = f"{path}.{field.name}", family_of(field.name, family)
         if isinstance(getattr(part, field.name), tuple):
             items = inner.items() if isinstance(inner, dict) else enumerate(inner if isinstance(inner, list) else ())
             for key, item in items:
-                lines += describe_missing_inner_parts(what, item, f"{where}.{key}")
-        elif is_class and what == family and type_name(inner) is None:
+                lines += describe_missing_inner_parts(inner_family, item, f"{where}.{key}")
+        elif is_class and inner_family == family and type_name(inner) is None:
             lines.append(f"{where} is missing: {name} encloses another {family}; give its type")
         else:
-            lines += describe_missing_inner_parts(what, inner, where)
+            lines += describe_missing_inner_parts(inner_family, inner, where)
     return lines
 
 
@@ -203,7 +203,7 @@ def unit_of(objective: Any, plant: Part = None) -> str:
     return resolve_unit(getattr(objective, "unit", ""), units_of(plant) or DEFAULT_UNITS)
 
 
-def build_part(family: str, given: PyTree, default: Any, path: str, units: Units | None = None) -> PyTree:
+def build_part(family: str, section: PyTree, default: Any, path: str, units: Units | None = None) -> PyTree:
     """Return the part that a table, or the bare name of a type, describes.
 
     A type selects its own default fields; a table without `type` changes fields of `default`. Ranges of numbers are
@@ -212,19 +212,19 @@ def build_part(family: str, given: PyTree, default: Any, path: str, units: Units
     Args:
         default: Part with the default fields; None if a type is required.
     """
-    there = family_types(family)
-    table = {"type": given} if isinstance(given, str) else given
+    types = family_types(family)
+    table = {"type": section} if isinstance(section, str) else section
     if not isinstance(table, dict):
-        raise wrong_kind_error(path, given, f"a table, or the name of a type ({', '.join(there)}),")
+        raise wrong_kind_error(path, section, f"a table, or the name of a type ({', '.join(types)}),")
     name = table.get("type")
     if name is None and default is None:
-        raise unknown_name_error(f"{path}.type is missing", path.rpartition(".")[2].replace("_", "-"), there)
+        raise unknown_name_error(f"{path}.type is missing", path.rpartition(".")[2].replace("_", "-"), types)
     if name is not None and not isinstance(name, str):
-        raise wrong_kind_error(f"{path}.type", name, f"one of {', '.join(there)}")
-    if name is not None and name not in there:
-        error = unknown_name_error(f"{path}.type = {format_given(name)} is unknown", name, there)
+        raise wrong_kind_error(f"{path}.type", name, f"one of {', '.join(types)}")
+    if name is not None and name not in types:
+        error = unknown_name_error(f"{path}.type = {format_given(name)} is unknown", name, types)
         raise ScenarioError(f"{error}; {OUTSIDE_HINT}")
-    template = default if name is None else there[name]
+    template = default if name is None else types[name]
     return fill_part(template, {k: v for k, v in table.items() if k != "type"}, family, path, units)
 
 
@@ -236,7 +236,7 @@ def fill_part(template: Any, table: JsonObject, family: str, path: str, units: U
     # Every field in m/s may also be given as <field>_kmh.
     edge = {f"{n}_kmh": f for n, f in fields.items() if "spec" in f.metadata and f.metadata["spec"].unit == "m/s"}
     values = {}
-    for key, given in table.items():
+    for key, value in table.items():
         where = join_path(path, key)
         if key not in fields and key not in edge:
             whose = f"a field of {name_of(family, template)}" if path else "a section"
@@ -247,9 +247,9 @@ def fill_part(template: Any, table: JsonObject, family: str, path: str, units: U
         if field.name in values:
             raise ScenarioError(f"{join_path(path, field.name)} is given twice, in m/s and in km/h")
         if key in edge:
-            values[field.name] = read_number_in_range(given, in_kmh(field.metadata["spec"]), where) / KMH
+            values[field.name] = read_number_in_range(value, in_kmh(field.metadata["spec"]), where) / KMH
         else:
-            values[field.name] = _value(given, field, template, (family, where), units)
+            values[field.name] = _value(value, field, template, (family, where), units)
     return dataclasses.replace(template, **values) if values else template
 
 
@@ -257,11 +257,11 @@ def _find_inner_field(part: Part, key: str) -> str:
     """Return the path of a field of this name in a part inside this one, or an empty text."""
     pending = [("", part)]
     while pending:
-        path, one = pending.pop(0)
-        for field in dataclasses.fields(one):
+        path, owner = pending.pop(0)
+        for field in dataclasses.fields(owner):
             if path and field.name == key:
                 return f"{path}.{key}"
-            value = getattr(one, field.name)
+            value = getattr(owner, field.name)
             if "part" in field.metadata and dataclasses.is_dataclass(value):
                 pending.append((f"{path}.{field.name}".removeprefix("."), value))
     return ""
@@ -273,8 +273,8 @@ def build_loop(sections: JsonObject) -> Loop:
     A section that is left out gets the plant's usual part.
     """
     plant = fill_part(braking(), {"plant": sections["plant"]}, "", "").plant if "plant" in sections else braking().plant
-    own, units = getattr(plant, "usual_parts", dict), units_of(plant)
-    usual = own()
+    usual_parts, units = getattr(plant, "usual_parts", dict), units_of(plant)
+    usual = usual_parts()
     for name, part in usual.items():
         if not dataclasses.is_dataclass(part) and not isinstance(part, tuple):
             whose = f"usual_parts of plant {name_of('plant', plant)}"
@@ -283,8 +283,8 @@ def build_loop(sections: JsonObject) -> Loop:
     needed = [f.name for f in dataclasses.fields(Loop) if dataclasses.MISSING is f.default is f.default_factory]
     for family in (name for name in needed if name not in parts):
         if family not in sections:
-            there = f"there is {', '.join(family_types(family))}"
-            raise ScenarioError(f"{family} is missing: plant {name_of('plant', plant)} has no usual one; {there}")
+            hint = f"there is {', '.join(family_types(family))}"
+            raise ScenarioError(f"{family} is missing: plant {name_of('plant', plant)} has no usual one; {hint}")
         parts[family] = build_part(family, sections[family], None, family, units)
     return fill_part(Loop(**parts), sections, "", "", units)
 
@@ -299,53 +299,53 @@ def join_path(path: str, key: str) -> str:
 
 
 def _value(
-    given: PyTree, field: dataclasses.Field[Any], template: Any, place: tuple[str, str], units: Units | None
+    value: PyTree, field: dataclasses.Field[Any], template: Any, place: tuple[str, str], units: Units | None
 ) -> Any:
     (family, path), default = place, getattr(template, field.name)
     if "part" in field.metadata:
         inner, units = family_of(field.name, family), units_inside(template, field.name, units)
         if isinstance(default, tuple):
-            return _parts(inner, given, default, path, units)
-        return build_part(inner, given, default, path, units)
+            return _parts(inner, value, default, path, units)
+        return build_part(inner, value, default, path, units)
     if "static" in field.metadata:
         if low_high := _whole_range(field, default):
-            return read_whole(given, *low_high, path)
+            return read_whole(value, *low_high, path)
         if type(default) not in READER_BY_TYPE:
-            raise wrong_kind_error(path, given, f"a value like {format_given(default)}")
-        return READER_BY_TYPE[type(default)](given, path)
-    return _numbers(given, np.ndim(default), field.metadata["spec"].around(units), path)
+            raise wrong_kind_error(path, value, f"a value like {format_given(default)}")
+        return READER_BY_TYPE[type(default)](value, path)
+    return _numbers(value, np.ndim(default), field.metadata["spec"].around(units), path)
 
 
 def _whole_range(field: dataclasses.Field[Any], value: Scalar) -> tuple[int, int] | None:
     """Return the range of a static whole number, by its class's default; None for a value of another kind."""
     if type(value) is not int:
         return None
-    least = value if field.default is dataclasses.MISSING else field.default
-    return (1 if least >= 1 else -MAX_STATIC), MAX_STATIC
+    default = value if field.default is dataclasses.MISSING else field.default
+    return (1 if default >= 1 else -MAX_STATIC), MAX_STATIC
 
 
-def _numbers(given: PyTree, depth: int, spec: ParameterSpec, path: str) -> Any:
+def _numbers(value: PyTree, depth: int, spec: ParameterSpec, path: str) -> Any:
     """Return a number (`depth` 0), or the array of lists that are nested `depth` deep."""
     if not depth:
-        return read_number(given, spec, path)
-    if not isinstance(given, list):
-        raise wrong_kind_error(path, given, f"a list of {'lists of ' * (depth - 1)}numbers in {spec.interval()}")
-    rows = [_numbers(item, depth - 1, spec, f"{path}.{i}") for i, item in enumerate(given)]
+        return read_number(value, spec, path)
+    if not isinstance(value, list):
+        raise wrong_kind_error(path, value, f"a list of {'lists of ' * (depth - 1)}numbers in {spec.interval()}")
+    rows = [_numbers(item, depth - 1, spec, f"{path}.{i}") for i, item in enumerate(value)]
     if len({np.shape(row) for row in rows}) > 1:
-        raise ScenarioError(f"{path} = {format_given(given)} has rows of different lengths")
+        raise ScenarioError(f"{path} = {format_given(value)} has rows of different lengths")
     return np.array(rows, float)
 
 
 def _parts(
-    family: str, given: PyTree, default: tuple[PyTree, ...], path: str, units: Units | None
+    family: str, value: PyTree, default: tuple[PyTree, ...], path: str, units: Units | None
 ) -> tuple[PyTree, ...]:
     """Return a tuple of parts from a list, or from a table that changes default parts by number or adds the next."""
-    if isinstance(given, list) and given:
-        return tuple(build_part(family, item, None, f"{path}.{i}", units) for i, item in enumerate(given))
-    if not isinstance(given, dict):
-        raise wrong_kind_error(path, given, "a list of parts")
+    if isinstance(value, list) and value:
+        return tuple(build_part(family, item, None, f"{path}.{i}", units) for i, item in enumerate(value))
+    if not isinstance(value, dict):
+        raise wrong_kind_error(path, value, "a list of parts")
     parts = list(default)
-    for key, item in given.items():
+    for key, item in value.items():
         if key not in map(str, range(len(parts) + 1)):
             raise unknown_name_error(f"{join_path(path, key)} is not there", key, map(str, range(len(parts))))
         place = int(key)

@@ -177,12 +177,12 @@ def loads(
     _refuse(_without_inner(before, table))
     if overrides:
         # The texts of the file may be wrong for other values; a text that an override sets itself stays.
-        said = {override.partition("=")[0].strip() for override in overrides}
+        overridden = {override.partition("=")[0].strip() for override in overrides}
         texts = {"title": make_printable(f"{name} with {', '.join(overrides)}"), "description": ""}
-        table |= {key: text for key, text in texts.items() if key not in said}
+        table |= {key: text for key, text in texts.items() if key not in overridden}
     scenario = _assemble(name, table, folder, notes)
-    asked = (scenario.loop, scenario.solver)
-    _refuse(find_mismatches(*asked), find_unstable_step(*asked) if integrated else ())
+    loop_and_solver = (scenario.loop, scenario.solver)
+    _refuse(find_mismatches(*loop_and_solver), find_unstable_step(*loop_and_solver) if integrated else ())
     return scenario
 
 
@@ -196,9 +196,9 @@ def _without_inner(before: Table, table: Table) -> Iterator[str]:
 def _refuse(*objections: Iterable[str]) -> None:
     """Raise ScenarioError with all lines of the first check that yields any; the checks after it do not run."""
     for lines in objections:
-        found = [re.sub(r"^plant\.road\b", "road", line) for line in lines]
-        if found:
-            raise ScenarioError("; ".join(found))
+        errors = [re.sub(r"^plant\.road\b", "road", line) for line in lines]
+        if errors:
+            raise ScenarioError("; ".join(errors))
 
 
 def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
@@ -266,8 +266,8 @@ def _override(table: JsonObject, override: str) -> str:
     old_type = node.get("type", _usual_type(table, replaced)) if place == "type" else None
     if isinstance(place, str):
         # An override in m/s replaces a value in km/h and the reverse; both together would be given twice.
-        other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
-        node.pop(other, None)
+        alternative = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
+        node.pop(alternative, None)
     try:
         node[place] = toml.parse_value(text.strip())
     except ScenarioError as error:
@@ -294,29 +294,29 @@ def _usual_type(table: JsonObject, keys: Sequence[str]) -> str | None:
 def _place(node: Any, key: str, path: str) -> Any:
     if isinstance(node, dict):
         return key
-    there = [str(i) for i in range(len(node))]
-    if key not in there:
-        raise unknown_name_error(f"{path}.{key} is not there", key, there)
+    numbers = [str(i) for i in range(len(node))]
+    if key not in numbers:
+        raise unknown_name_error(f"{path}.{key} is not there", key, numbers)
     return int(key)
 
 
 def _assemble(name: str, table: JsonObject, folder: pathlib.Path, notes: Iterable[str]) -> Scenario:
     texts = {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
     solver, seed = section_solver.read_solver_section(table.get("solver", {}))
-    given = table.get("objective", {})
-    if not isinstance(given, dict):
-        raise wrong_kind_error("objective", given, "a table of objectives")
-    if len(given) > MAX_OBJECTIVES:
-        raise ScenarioError(f"objective has {len(given)} entries, outside [0, {MAX_OBJECTIVES}]")
+    section = table.get("objective", {})
+    if not isinstance(section, dict):
+        raise wrong_kind_error("objective", section, "a table of objectives")
+    if len(section) > MAX_OBJECTIVES:
+        raise ScenarioError(f"objective has {len(section)} entries, outside [0, {MAX_OBJECTIVES}]")
     loop = _build_loop(table)
     report = default_objectives(loop.plant)
     measured = {}
-    for key, value in given.items():
+    for key, value in section.items():
         place = join_path("objective", read_printable_line(key, "a name in objective"))
         measured[key] = build_part("objective", value, report.get(key), place, units_of(loop.plant))
     objectives = {**report, **measured}
     # First: the sections below need valid parameters.
-    named = {join_path("objective", key): one for key, one in objectives.items()}
+    named = {join_path("objective", key): objective for key, objective in objectives.items()}
     _refuse(_wrong_values(loop, objectives), find_misfits(loop, named))
     return Scenario(
         name=name,

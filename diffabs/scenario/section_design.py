@@ -42,21 +42,23 @@ ENTRY = ParameterSpec("1")
 Range = tuple[float, float]
 
 
-def _weight(given: PyTree, path: str) -> Scalar:
+def _weight(weight: PyTree, path: str) -> Scalar:
     """Return a weight as a number or nested tuples, which can be compared.
 
     The size is not checked here: only the linear model has the order.
     """
     from diffabs.linear.weights import as_weight_matrix
 
-    if not isinstance(given, list | int | float) or isinstance(given, bool):
-        raise wrong_kind_error(path, given, "a number, a diagonal or a matrix")
-    if given == []:
+    if not isinstance(weight, list | int | float) or isinstance(weight, bool):
+        raise wrong_kind_error(path, weight, "a number, a diagonal or a matrix")
+    if weight == []:
         raise ScenarioError(f"{path} = [] is empty")
-    rows = given if isinstance(given, list) and any(isinstance(row, list) for row in given) else ()
+    rows = weight if isinstance(weight, list) and any(isinstance(row, list) for row in weight) else ()
     if not all(isinstance(row, list) and len(row) == len(rows) for row in rows):
-        raise ScenarioError(f"{path} = {format_given(given)} is not square: {len(rows)} rows need as many numbers each")
-    value = _numbers(given, path)
+        raise ScenarioError(
+            f"{path} = {format_given(weight)} is not square: {len(rows)} rows need as many numbers each"
+        )
+    value = _numbers(weight, path)
     try:
         as_weight_matrix(path, value, len(np.atleast_1d(value)), definite=path == "design.R")
     except ValueError as error:
@@ -64,10 +66,10 @@ def _weight(given: PyTree, path: str) -> Scalar:
     return value
 
 
-def _numbers(given: PyTree, path: str) -> Any:
-    if not isinstance(given, list):
-        return read_number(given, ENTRY, path)
-    return tuple(_numbers(item, f"{path}.{i}") for i, item in enumerate(given))
+def _numbers(value: PyTree, path: str) -> Any:
+    if not isinstance(value, list):
+        return read_number(value, ENTRY, path)
+    return tuple(_numbers(item, f"{path}.{i}") for i, item in enumerate(value))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,8 +95,8 @@ class DesignTask:
 
         A speed without a range gets the range from the loop's stop to its start, even if nothing else has a range.
         """
-        known = _rangeable_parameters(loop)
-        return {known[path].model: ends for path, ends in self._with_speed(loop).items()}
+        allowed = _rangeable_parameters(loop)
+        return {allowed[path].model: ends for path, ends in self._with_speed(loop).items()}
 
     def ranges(self, loop: Loop) -> dict[str, Range]:
         """Return the ranges (low, high) in SI by path of `loop`, without ranges of a single value.
@@ -104,9 +106,9 @@ class DesignTask:
         """
         over = self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else self.over
         ranges = {path: ends for path, ends in over.items() if ends[0] < ends[1]}
-        known = {path for path, _, _ in parameters(loop)}
+        paths = {path for path, _, _ in parameters(loop)}
         for path in ranges:
-            if path not in known:
+            if path not in paths:
                 where = f"design.over.{canonical_path(path)} is a parameter of the linear model, but not of this loop"
                 raise ScenarioError(f"{where}: remove it from [design.over]")
         return ranges
@@ -135,18 +137,18 @@ class _Parameter:
 
 def read_design_section(table: PyTree, loop: Loop) -> DesignTask:
     """Return the task that a section describes."""
-    task: DesignTask = read_table(DesignTask, table, "design", over=lambda given, path: _over(given, path, loop))
-    for there, missing in (("Q", "R"), ("R", "Q")):
-        if getattr(task, there) is not None and getattr(task, missing) is None:
-            raise ScenarioError(f"design.{missing} is missing: with design.{there}, a cost needs both")
+    task: DesignTask = read_table(DesignTask, table, "design", over=lambda value, path: _over(value, path, loop))
+    for present, missing in (("Q", "R"), ("R", "Q")):
+        if getattr(task, present) is not None and getattr(task, missing) is None:
+            raise ScenarioError(f"design.{missing} is missing: with design.{present}, a cost needs both")
     return task
 
 
-def _over(given: PyTree, path: str, loop: Loop) -> dict[str, Range]:
-    table = table_reader(read_as_given, "ranges")(given, path)
-    there = {name: (parameter.spec, parameter.shape) for name, parameter in _rangeable_parameters(loop).items()}
-    found = read_entries(table, path, there, "not a parameter of this loop's linear model")
-    return {item.path: item.single("have a range").range() for item in found}
+def _over(value: PyTree, path: str, loop: Loop) -> dict[str, Range]:
+    table = table_reader(read_as_given, "ranges")(value, path)
+    allowed = {name: (parameter.spec, parameter.shape) for name, parameter in _rangeable_parameters(loop).items()}
+    entries = read_entries(table, path, allowed, "not a parameter of this loop's linear model")
+    return {item.path: item.single("have a range").range() for item in entries}
 
 
 def _rangeable_parameters(loop: Loop) -> dict[str, _Parameter]:
@@ -157,18 +159,21 @@ def _rangeable_parameters(loop: Loop) -> dict[str, _Parameter]:
     if not hasattr(loop.plant, "frozen"):
         return {path: _Parameter(path, spec, np.shape(x)) for path, spec, x in parameters(loop.plant, "plant.")}
     model = {field.name: field.metadata["spec"] for field in dataclasses.fields(SlipModel) if "spec" in field.metadata}
-    found = {"initial.speed": _Parameter("speed", model["speed"]), "reference.slip": _Parameter("slip", model["slip"])}
+    rangeable = {
+        "initial.speed": _Parameter("speed", model["speed"]),
+        "reference.slip": _Parameter("slip", model["slip"]),
+    }
     for path, spec, value in parameters(loop.plant, "plant."):
-        found[path] = _Parameter(path, spec, np.shape(value))
+        rangeable[path] = _Parameter(path, spec, np.shape(value))
     actuators = {"actuator.": loop.actuator}
     if isinstance(loop.actuator, Series):
         actuators = {f"actuator.blocks.{i}.": block for i, block in enumerate(loop.actuator.blocks)}
     for prefix, block in actuators.items():
         if isinstance(block, Lag | RateLimit):
-            found |= _parameter(block, prefix, "time_constant", "actuator.time_constant")
+            rangeable |= _parameter(block, prefix, "time_constant", "actuator.time_constant")
     if isinstance(loop.controller, Sampled):
-        found |= _parameter(loop.controller, "controller.", "delay", "sampling.delay")
-    return found
+        rangeable |= _parameter(loop.controller, "controller.", "delay", "sampling.delay")
+    return rangeable
 
 
 def _parameter(part: Part, prefix: str, name: str, model: str) -> dict[str, _Parameter]:

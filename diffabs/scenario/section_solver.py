@@ -43,20 +43,20 @@ class _Adaptive(_Any):
 SECTIONS = {"fixed": _Fixed, "adaptive": _Adaptive}
 
 
-def read_solver_section(given: PyTree) -> tuple[Solver, int]:
+def read_solver_section(table: PyTree) -> tuple[Solver, int]:
     """Return solver and seed of a section."""
-    if isinstance(given, Mapping):
-        fixed = {"step", "kinks"} & given.keys() and "rtol" not in given
-        given = {"type": "fixed" if fixed else "adaptive", **given}
-    found = read_one(SECTIONS, given, "solver")
-    said = plain_fields(found)
-    seed = said.pop("seed")
-    kind = next(name for name, section in SECTIONS.items() if type(found) is section)
-    return SOLVER_TYPES[kind](**said), seed
+    if isinstance(table, Mapping):
+        fixed = {"step", "kinks"} & table.keys() and "rtol" not in table
+        table = {"type": "fixed" if fixed else "adaptive", **table}
+    settings = read_one(SECTIONS, table, "solver")
+    fields = plain_fields(settings)
+    seed = fields.pop("seed")
+    kind = next(name for name, section in SECTIONS.items() if type(settings) is section)
+    return SOLVER_TYPES[kind](**fields), seed
 
 
 def write_solver_section(solver: Solver, seed: int) -> JsonObject:
     """Return the section that `read_solver_section` reads back to the same solver and seed."""
-    kind = next(name for name, one in SOLVER_TYPES.items() if type(solver) is one)
-    said = {name: value for name, value in plain_fields(solver).items() if value is not None}
-    return {"type": kind, **said, "seed": seed}
+    kind = next(name for name, cls in SOLVER_TYPES.items() if type(solver) is cls)
+    fields = {name: value for name, value in plain_fields(solver).items() if value is not None}
+    return {"type": kind, **fields, "seed": seed}

@@ -70,12 +70,12 @@ class Choice:
     """A categorical distribution over parts.
 
     Attributes:
-        given: Values as read from TOML.
+        toml_value: Values as read from TOML.
         names: Distribution of the names of the parts.
         parts: The part of each name.
     """
 
-    given: PyTree
+    toml_value: PyTree
     names: distributions.Categorical
     parts: Table
 
@@ -109,17 +109,17 @@ class SweepSection:
     def table(self) -> JsonObject:
         """Return the section as TOML values, with short forms for common values."""
         design = as_plain(self.design, brief=True)
-        given = {"design": design["type"] if len(design) == 1 else design}
-        given["over"] = {path: _format_item(item) for path, item in self.over.items()}
-        given["correlation"] = plain_fields(self.correlation) if self.correlation else {}
-        return plain_fields(dataclasses.replace(self, over={}, correlation=None)) | given
+        short = {"design": design["type"] if len(design) == 1 else design}
+        short["over"] = {path: _format_item(item) for path, item in self.over.items()}
+        short["correlation"] = plain_fields(self.correlation) if self.correlation else {}
+        return plain_fields(dataclasses.replace(self, over={}, correlation=None)) | short
 
 
 def _format_item(item: Any) -> PyTree:
     """Return a distribution, or a choice of parts, as a TOML value."""
     if isinstance(item, distributions.Uniform):
         return interval_table(item.low, item.high)
-    return item.given if isinstance(item, Choice) else as_plain(item, brief=True)
+    return item.toml_value if isinstance(item, Choice) else as_plain(item, brief=True)
 
 
 def read_sweep_section(
@@ -133,9 +133,9 @@ def read_sweep_section(
         SweepSection,
         table,
         "sweep",
-        over=lambda given, path: _over(flatten_table(table_reader(read_as_given)(given, path), path), loop, folder),
-        correlation=lambda given, path: read_correlation(given, path) if given != {} else None,
-        failures=metric_reader(objectives, "bounds by metric", lambda one: unit_of(one, loop.plant)),
+        over=lambda value, path: _over(flatten_table(table_reader(read_as_given)(value, path), path), loop, folder),
+        correlation=lambda value, path: read_correlation(value, path) if value != {} else None,
+        failures=metric_reader(objectives, "bounds by metric", lambda objective: unit_of(objective, loop.plant)),
     )
     if plan.correlation:
         paths = dict.fromkeys(plan.correlation.paths)
@@ -147,57 +147,57 @@ def read_sweep_section(
     return plan
 
 
-def _by_varied_path(given: Table, where: str, over: Params, loop: Loop) -> JsonObject:
+def _by_varied_path(table: Table, where: str, over: Params, loop: Loop) -> JsonObject:
     """Return the values given for varied parameters by path of the loop; the keys may have any allowed form."""
     specs = elements(loop)
-    there = {path: (specs.get(path, ParameterSpec("1")), ()) for path in over}
-    return {item.path: item.given for item in read_entries(given, where, there, "not varied in sweep.over")}
+    allowed = {path: (specs.get(path, ParameterSpec("1")), ()) for path in over}
+    return {item.path: item.value for item in read_entries(table, where, allowed, "not varied in sweep.over")}
 
 
-def _over(given: Table, loop: Loop, folder: pathlib.Path) -> JsonObject:
+def _over(table: Table, loop: Loop, folder: pathlib.Path) -> JsonObject:
     """Return distributions and choices by path of the loop, in the order given."""
-    there = {path: (spec, ()) for path, spec in elements(loop).items()}
-    numbers = {path: item for path, item in given.items() if path not in PARTS}
-    known = read_entries(numbers, "sweep.over", there, "not a parameter of this loop")
-    found = {}
-    for key, value in given.items():
+    allowed = {path: (spec, ()) for path, spec in elements(loop).items()}
+    numbers = {path: item for path, item in table.items() if path not in PARTS}
+    entries = read_entries(numbers, "sweep.over", allowed, "not a parameter of this loop")
+    varied = {}
+    for key, value in table.items():
         if key in PARTS:
             path = "plant.road" if key == "road" else key
-            found[path] = _choice(key, value, get(loop, path))
+            varied[path] = _choice(key, value, get(loop, path))
         else:
-            item = next(known)
-            found[item.path] = _distribution(item, folder)
-    return found
+            item = next(entries)
+            varied[item.path] = _distribution(item, folder)
+    return varied
 
 
 def _distribution(item: ParameterEntry, folder: pathlib.Path) -> PyTree:
     """Return the distribution of one parameter, in SI; an interval is uniform."""
-    given = item.given
-    if isinstance(given, list):
-        low, high = (given[0], given[-1]) if given else (0, 1)
+    value = item.value
+    if isinstance(value, list):
+        low, high = (value[0], value[-1]) if value else (0, 1)
         raise ScenarioError(
-            f"{item.where} = {format_given(given)} is a list; an interval is {{ low = {format_given(low)}, high ="
-            f' {format_given(high)} }}, a choice of values {{ type = "categorical", choices = {format_given(given)} }}'
+            f"{item.where} = {format_given(value)} is a list; an interval is {{ low = {format_given(low)}, high ="
+            f' {format_given(high)} }}, a choice of values {{ type = "categorical", choices = {format_given(value)} }}'
         )
-    if (ends := interval_ends(given, item.where)) is not None:
-        given = {"type": "uniform", **interval_table(*ends)}
-    if not isinstance(given, dict):
-        raise wrong_kind_error(item.where, given, "an interval { low, high } or a table with a type")
-    found = distributions.read_distribution(_with_numbers(given, item.where, folder), item.where)
-    if line := distributions.describe_out_of_range(found, item.spec, item.where):
+    if (ends := interval_ends(value, item.where)) is not None:
+        value = {"type": "uniform", **interval_table(*ends)}
+    if not isinstance(value, dict):
+        raise wrong_kind_error(item.where, value, "an interval { low, high } or a table with a type")
+    distribution = distributions.read_distribution(_with_numbers(value, item.where, folder), item.where)
+    if line := distributions.describe_out_of_range(distribution, item.spec, item.where):
         raise ScenarioError(line)
-    return distributions.convert_distribution_to_si(found, item.scale)
+    return distributions.convert_distribution_to_si(distribution, item.scale)
 
 
-def _with_numbers(given: Table, where: str, folder: pathlib.Path) -> Table:
+def _with_numbers(table: Table, where: str, folder: pathlib.Path) -> Table:
     """Return the table of a distribution, with the numbers of a file in the place of its name."""
-    if given.get("type") != "empirical" or "file" not in given:
-        return given
-    if "values" in given:
+    if table.get("type") != "empirical" or "file" not in table:
+        return table
+    if "values" in table:
         raise ScenarioError(f"{where} has values and a file; one of them is needed")
-    if "column" not in given:
-        raise ScenarioError(f"{where}.column is missing: name a column of {format_given(given['file'])}")
-    file, column = (read_text(given[key], f"{where}.{key}") for key in ("file", "column"))
+    if "column" not in table:
+        raise ScenarioError(f"{where}.column is missing: name a column of {format_given(table['file'])}")
+    file, column = (read_text(table[key], f"{where}.{key}") for key in ("file", "column"))
     try:
         from diffabs.sweep import sample_files
     except ImportError:
@@ -206,15 +206,15 @@ def _with_numbers(given: Table, where: str, folder: pathlib.Path) -> Table:
         values = sample_files.read_column(folder / file, column)
     except ValueError as error:
         raise ScenarioError(f"{where}: {error}") from None
-    return {key: value for key, value in given.items() if key not in ("file", "column")} | {"values": values.tolist()}
+    return {key: value for key, value in table.items() if key not in ("file", "column")} | {"values": values.tolist()}
 
 
-def _choice(key: str, given: PyTree, default: Any) -> Choice:
+def _choice(key: str, value: PyTree, default: Any) -> Choice:
     """Return a choice of parts; a part given as a table has its number as its name."""
     where = f"sweep.over.{key}"
-    table = {"choices": given} if isinstance(given, list) else given
+    table = {"choices": value} if isinstance(value, list) else value
     if not isinstance(table, dict) or not isinstance(table.get("choices"), list) or not table["choices"]:
-        raise wrong_kind_error(where, given, "a list of parts, or a table of choices and weights,")
+        raise wrong_kind_error(where, value, "a list of parts, or a table of choices and weights,")
     names = [item if isinstance(item, str) else f"{i}" for i, item in enumerate(table["choices"])]
     drawn = distributions.read_distribution({**table, "type": "categorical", "choices": names}, where)
     family, parts = family_of(key, key), {}
@@ -222,14 +222,14 @@ def _choice(key: str, given: PyTree, default: Any) -> Choice:
         if lines := describe_missing_inner_parts(family, item, f"{where}.{i}"):
             raise ScenarioError("; ".join(lines))
         parts[name] = build_part(family, item, default, f"{where}.{i}")
-    return Choice(given, drawn, parts)
+    return Choice(value, drawn, parts)
 
 
-def build_study(chosen: Any) -> "Study":
+def build_study(scenario: Any) -> "Study":
     """Return the sweep of a scenario."""
     from diffabs.sweep import Study
 
-    plan: SweepSection = chosen.sweep
+    plan: SweepSection = scenario.sweep
     if not plan.over:
         raise ScenarioError('sweep.over is empty; for example [sweep.over] "plant.mass" = { low = 5.3, high = 6.2 }')
     choices = {path: item for path, item in plan.over.items() if isinstance(item, Choice)}
@@ -237,11 +237,11 @@ def build_study(chosen: Any) -> "Study":
     space = Space(variables, plan.correlation, plan.design)
     try:
         return Study(
-            loop=chosen.loop,
+            loop=scenario.loop,
             space=space,
             samples=plan.samples or _natural_count(space),
-            solver=chosen.solver,
-            objectives=chosen.objectives,
+            solver=scenario.solver,
+            objectives=scenario.objectives,
             seed=plan.seed,
             chunk=plan.chunk,
             dtype=plan.dtype,

@@ -62,9 +62,9 @@ DECLARED_RANGE = "declared"
 MOST_LANES = 100_000
 
 
-def _aggregate(given: PyTree, path: str) -> JsonObject:
+def _aggregate(value: PyTree, path: str) -> JsonObject:
     """Return type and fields of an aggregate."""
-    part = read_one(risk.AGGREGATE_TYPES, given, path)
+    part = read_one(risk.AGGREGATE_TYPES, value, path)
     return {
         "type": next(name for name, kind in risk.AGGREGATE_TYPES.items() if type(part) is kind),
         **plain_fields(part),
@@ -151,10 +151,12 @@ def read_tune_section(table: PyTree, loop: Loop, objectives: Mapping[str, Object
         Goal,
         table,
         "tune",
-        free=lambda given, path: free_ranges(table_reader(read_as_given, "ranges")(given, path), loop, path),
-        over=lambda given, path: _over(table_reader(read_as_given, "values")(given, path), loop, bool(samples)),
+        free=lambda value, path: free_ranges(table_reader(read_as_given, "ranges")(value, path), loop, path),
+        over=lambda value, path: _over(table_reader(read_as_given, "values")(value, path), loop, bool(samples)),
         objective=metric_reader(objectives, "weights of metrics"),
-        limits=metric_reader(objectives, "greatest values of metrics", lambda one: unit_of(one, loop.plant)),
+        limits=metric_reader(
+            objectives, "greatest values of metrics", lambda objective: unit_of(objective, loop.plant)
+        ),
     )
     lanes = math.prod(map(len, goal.over.values()))
     if lanes > MOST_LANES and not goal.samples:
@@ -171,21 +173,21 @@ def free_ranges(table: JsonObject, loop: Loop, section: str) -> dict[str, Ends |
 
     Each end is a number, or a tuple where a list was given for a parameter that is a list.
     """
-    found: dict[str, Ends | None] = {}
+    ranges: dict[str, Ends | None] = {}
     for item in _entries(table, section, loop):
         if not item.spec.tunable:
             raise ScenarioError(f"{item.where} cannot be tuned: a run does not depend smoothly on it")
-        found[item.path] = None if item.given == DECLARED_RANGE else item.range(f', or "{DECLARED_RANGE}",')
-    return found
+        ranges[item.path] = None if item.value == DECLARED_RANGE else item.range(f', or "{DECLARED_RANGE}",')
+    return ranges
 
 
 def _over(table: JsonObject, loop: Loop, drawn: bool) -> dict[str, tuple[float, ...]]:
     """Return values by path; the ends of an interval if the runs are drawn from it."""
-    found = {}
+    values = {}
     for item in _entries(table, "tune.over", loop):
-        one = item.single("differ between lanes")
-        found[item.path] = one.range() if drawn and interval_ends(one.given, one.where) else one.values()
-    return found
+        entry = item.single("differ between lanes")
+        values[item.path] = entry.range() if drawn and interval_ends(entry.value, entry.where) else entry.values()
+    return values
 
 
 def check_starts(loop: Loop, free: Mapping[str, Ends | None], section: str) -> None:

@@ -325,7 +325,7 @@ REFUSALS = [
 )
 @killed_by(
     "scenario/section_design.py",
-    "            if path not in known:",
+    "            if path not in paths:",
     "            if False:",
     case="margins slip-lmi --set reference=setpoin",
 )

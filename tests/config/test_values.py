@@ -132,9 +132,9 @@ DRAWN = f"sweep.over={{'initial.speed_kmh'={{low=36,high=72}}, 'road.w4'={W4}, '
 
 
 @killed_by(
-    "scenario/section_sweep.py", "return distributions.convert_distribution_to_si(found, item.scale)", "return found"
+    "scenario/section_sweep.py", "distributions.convert_distribution_to_si(distribution, item.scale)", "distribution"
 )
-@killed_by("scenario/section_sweep.py", "return {item.path: item.given for", "return {item.where: item.given for")
+@killed_by("scenario/section_sweep.py", "return {item.path: item.value for", "return {item.where: item.value for")
 def test_a_sweep_is_read_once_into_si_by_path_of_the_loop():
     chosen = load("slip-lmi", [DRAWN, "sweep.design=sobol", "sweep.correlation={paths=['road.w4'], matrix=[[1]]}"])
     assert list(chosen.sweep.over.items()) == [

@@ -223,8 +223,8 @@ def test_the_step_is_judged_with_an_unsaturated_controller(servo):
 
 @killed_by(
     "scenario/registry.py",
-    'own, units = getattr(plant, "usual_parts", dict), units_of(plant)',
-    "own, units = braking().plant.usual_parts, units_of(plant)",
+    'usual_parts, units = getattr(plant, "usual_parts", dict), units_of(plant)',
+    "usual_parts, units = braking().plant.usual_parts, units_of(plant)",
 )
 def test_what_a_plant_of_ones_own_needs_is_asked_for_by_name(servo, file):
     text = (HERE / "servo.toml").read_text()
@@ -248,7 +248,7 @@ def test_a_scenario_never_imports_code():
     assert "dc-motor" not in registry.family_types("plant")
 
 
-@killed_by("scenario/registry.py", "if name in _packaged_parts(family) or name in found:", "if name in found:")
+@killed_by("scenario/registry.py", "if name in _packaged_parts(family) or name in parts:", "if name in parts:")
 @pytest.mark.parametrize(
     ("module", "text", "line"),
     [

@@ -543,7 +543,7 @@ def test_inputs_are_what_the_plant_shows():
     assert isinstance(LOOPS["observer"].plant, ArmBalance)
 
 
-@killed_by("export/lowered.py", "flat(full) if flat(full) not in found else full", "flat(full)")
+@killed_by("export/lowered.py", "flat(full) if flat(full) not in nodes else full", "flat(full)")
 @needs_cc
 def test_two_memories_of_one_controller_have_two_names(tmp_path):
     """The torque and the phase of the four-phase logic, against the automaton of its module's head in Python."""
@@ -608,7 +608,7 @@ def test_an_option_out_of_range_is_named(options):
         computer_program(LOOPS["state feedback"], **options)
 
 
-@killed_by("export/lowered.py", "if name in found:", "if False:")
+@killed_by("export/lowered.py", "if name in nodes:", "if False:")
 def test_numbers_that_would_have_one_name_are_refused():
     """A part of the controller that is called as the loop's reference is."""
 
@@ -656,7 +656,7 @@ def test_a_target_that_moves_is_returned_as_it_was(tmp_path):
     np.testing.assert_allclose([*map(float, said.split())], 0.2 - 0.1 * np.exp(-np.arange(3) / 10), rtol=1e-6)
 
 
-@killed_by("export/lowered.py", "if not more:\n                break", "if kept:\n                break")
+@killed_by("export/lowered.py", "if not more:\n                break", "if names:\n                break")
 @needs_cc
 def test_memory_behind_memory_is_kept(tmp_path):
     """The command is the double integral of the error: it needs the first integral only a sample later."""
@@ -826,7 +826,7 @@ def test_hyperbolic_functions_are_right_near_zero_and_up_to_their_overflow(name,
 )
 @killed_by("compiler/emit/c99_words.py", 'used_names & {new, f"{new}_table"}', "new in used_names", case="table last")
 @killed_by(
-    "export/structured_text.py", "taken & (both := {", "fresh.lower() in taken or not (both := {", case="table last"
+    "export/structured_text.py", "used_names & (both", "fresh.lower() in used_names or not (both", case="table last"
 )
 @pytest.mark.parametrize("order", ["table first", "table last"])
 @needs_cc

@@ -191,7 +191,7 @@ def test_a_plant_may_use_the_names_of_the_glue():
 
 
 @killed_by("export/mockup.py", "enumerate(plant.variables, 1)", "enumerate(plant.variables)")
-@killed_by("export/mockup.py", '{"unit": make_printable(one.unit)}', "{}")
+@killed_by("export/mockup.py", '{"unit": make_printable(variable.unit)}', "{}")
 @killed_by("export/mockup.py", "zipfile.ZipInfo(path, LONG_AGO)", "path")
 def test_the_description_says_what_is_what(tmp_path):
     one = imported(PLANTS["mirrored rig"], tmp_path)

@@ -30,7 +30,7 @@ def boxes(axis):
     return np.array([text.get_window_extent().get_points() for text in seen])
 
 
-@killed_by("plot/style.py", "one.set_minor_formatter(NullFormatter())", "pass", case="0.2, 0.9")
+@killed_by("plot/style.py", "scale_axis.set_minor_formatter(NullFormatter())", "pass", case="0.2, 0.9")
 @pytest.mark.parametrize(
     "ends", [(0.2, 0.9), (0.05, 4.0), (3e-7, 2e-6), (1e-5, 1e-3), (1e-9, 1e3), (2e4, 3e7)], ids=readable_id
 )

@@ -14,7 +14,7 @@ MAP = ProofMap(
     box=np.array([[0, 2], [0, 2]], float),
     cells=CELLS,
     bounds=np.array([0.1, 0.2, np.inf]),
-    left=LEFT,
+    undecided=LEFT,
     refuting=REFUTING,
     worst=np.array([2.0, 2.0]),
     worst_value=0.3,
@@ -31,8 +31,8 @@ def rectangles(collection: PatchCollection) -> np.ndarray:
     )
 
 
-@killed_by("plot/proofs.py", "proved.set_array(shown.bounds[known])", "proved.set_array(np.arange(known.sum()))")
-@killed_by("plot/proofs.py", "known = np.isfinite(shown.bounds)", "known = np.isfinite(shown.bounds) | True")
+@killed_by("plot/proofs.py", "proved.set_array(shown.bounds[bounded])", "proved.set_array(np.arange(bounded.sum()))")
+@killed_by("plot/proofs.py", "bounded = np.isfinite(shown.bounds)", "bounded = np.isfinite(shown.bounds) | True")
 def test_two_parameters_are_a_map_of_rectangles() -> None:
     figure = draw_proof(MAP)
     ax, bar = figure.axes
@@ -53,7 +53,7 @@ def test_two_parameters_are_a_map_of_rectangles() -> None:
 
 def test_one_parameter_is_a_line_of_intervals() -> None:
     one = MAP._replace(labels=MAP.labels[:1], box=MAP.box[:1], cells=CELLS[:2, :1], bounds=MAP.bounds[:2])
-    figure = draw_proof(one._replace(left=LEFT[:, :1], refuting=None, worst=np.array([2.0])))
+    figure = draw_proof(one._replace(undecided=LEFT[:, :1], refuting=None, worst=np.array([2.0])))
     (ax,) = figure.axes
     np.testing.assert_array_equal(ax.collections[0].get_segments(), [[[0, 0.1], [1, 0.1]], [[1, 0.2], [2, 0.2]]])
     claimed, worst = ax.get_lines()
@@ -65,7 +65,7 @@ def test_one_parameter_is_a_line_of_intervals() -> None:
 @pytest.mark.parametrize("parameters", [1, 2])
 def test_a_proof_of_nothing_is_drawn(parameters: int) -> None:
     none = MAP._replace(labels=MAP.labels[:parameters], box=MAP.box[:parameters], cells=np.empty((0, parameters, 2)))
-    none = none._replace(bounds=np.empty(0), left=MAP.box[None, :parameters], refuting=None, worst=None)
+    none = none._replace(bounds=np.empty(0), undecided=MAP.box[None, :parameters], refuting=None, worst=None)
     figure = draw_proof(none)
     figure.draw_without_rendering()
     assert [text.get_text() for text in figure.legends[0].get_texts()][-1:] == ["not proved"]

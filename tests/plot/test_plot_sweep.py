@@ -148,7 +148,7 @@ def test_of_a_saltelli_design_the_rows_a_are_drawn(made):
     assert counts.sum() == N / 4
 
 
-@killed_by("plot/sweeps.py", 'found.column("sample")[good]\n', "np.arange(np.sum(good))\n")
+@killed_by("plot/sweeps.py", 'results.column("sample")[good]\n', "np.arange(np.sum(good))\n")
 def test_the_worst_are_marked_and_named(found):
     figure = plots.draw_worst(found, UNITS, count=6)
     ax = figure.axes[0]

@@ -62,7 +62,7 @@ def test_runs_are_shown_until_they_have_settled():
         assert ax.get_xlim()[1] == pytest.approx(1.5 * np.log(50) / 10, abs=0.02)
 
 
-@killed_by("plot/tuning.py", "        if y[i] < least:", "        if True:")
+@killed_by("plot/tuning.py", "        if y[i] < lowest:", "        if True:")
 def test_a_front_has_the_points_that_no_other_beats():
     x, y = np.random.default_rng(2).random((2, 60)).round(2)
     x[5] = np.nan

@@ -158,7 +158,7 @@ def test_a_message_does_not_repeat_a_long_key(file):
     assert refused("simulate", file(f"[{key}]\n[{key}]")).endswith("twice (at line 2, column 10002)\n")
 
 
-@killed_by("scenario/scenario.py", "if len(given) > MAX_OBJECTIVES:", "if False:")
+@killed_by("scenario/scenario.py", "if len(section) > MAX_OBJECTIVES:", "if False:")
 def test_more_objectives_than_can_be_checked(file):
     text = "".join(f"[objective.o{i}]\ntype = 'iae'\n" for i in range(201))
     assert refused("simulate", file(text)).endswith("objective has 201 entries, outside [0, 200]\n")

@@ -127,7 +127,7 @@ def folder(tmp_path, monkeypatch) -> Iterator[None]:
 
 @killed_by("scenario/outside.py", 'if name.endswith(".py"):', "if False:", case="file.py")
 @killed_by("scenario/outside.py", "_find_incomplete_class(module) or ", "", case="misspelled")
-@killed_by("scenario/outside.py", "return -len(close), len(contract - own)", "return 0, 0", case="outptu")
+@killed_by("scenario/outside.py", "return -len(close), len(contract - methods)", "return 0, 0", case="outptu")
 @killed_by("scenario/outside.py", 'value.dtype.kind in "OSU"', "False", case="none")
 @killed_by("roads/sign.py", "mu * slips >= 0)", "mu * slips >= -9)", case="driving")
 @killed_by("roads/sign.py", "slips == 0, abs(mu) <= MAX_FRICTION_AT_REST", "slips == 0, True", case="resting")

@@ -152,7 +152,7 @@ class Chooser:
 """
 
 
-@killed_by("scenario/registry.py", "1 if least >= 1 else -MAX_STATIC", "1")
+@killed_by("scenario/registry.py", "1 if default >= 1 else -MAX_STATIC", "1")
 @killed_by("scenario/registry.py", "value if field.default is dataclasses.MISSING else field.default", "value")
 @killed_by("scenario/registry.py", "type(value) is not int", "not isinstance(value, int)")
 @pytest.mark.parametrize("changes", [[], ["order=-2", "taps=9", "scale=4", "soft=true", "mode=firm"]], ids=["0", "5"])
@@ -336,7 +336,7 @@ damping = 0.25
 @killed_by(
     "scenario/parameter_paths.py",
     '            pending += [(f"{path}.{key}", item) for key, item in list(value.items())[::-1]]\n            continue',
-    "            found[path] = value\n            continue",
+    "            flat[path] = value\n            continue",
 )
 def test_ranges_are_the_same_however_they_are_written(file):
     dotted = load(
@@ -689,7 +689,7 @@ def test_a_level_of_a_grid_is_changed(file):
     assert build_study(load(path, changes)).samples == 20
 
 
-@killed_by("scenario/registry.py", "is_class and what == family", "what == family")
+@killed_by("scenario/registry.py", "is_class and inner_family == family", "inner_family == family")
 def test_a_constant_has_its_own_inner_part(tmp_path):
     text = "from diffabs import roads\nWORN = roads.Scaled(road=roads.ICE, scale=0.8)\n"
     (tmp_path / "worn_roads.py").write_text(text)
@@ -710,7 +710,7 @@ def test_the_load_of_a_quarter_car_in_feet(name, share):
     assert scale == pytest.approx(share * 32.18 * 0.3048 / 9.81 / 4, rel=1e-11)
 
 
-@killed_by("scenario/section_design.py", "if ends[0] < ends[1]}\n        known", "}\n        known")
+@killed_by("scenario/section_design.py", "if ends[0] < ends[1]}\n        paths", "}\n        paths")
 def test_a_single_value_of_the_model_is_no_range():
     changes = ["reference=setpoint", "reference.value=0.2", "design.over.reference.slip=0.2,0.2"]
     chosen = load("slip-lmi", changes, integrated=False)

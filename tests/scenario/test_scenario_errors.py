@@ -377,8 +377,15 @@ def test_a_choice_of_a_sweep_names_the_part_inside(choice):
     }
 
 
-@killed_by("scenario/registry.py", "lines += describe_missing_inner_parts(what, inner, where)", "pass", case="scaled")
-@killed_by("scenario/registry.py", "describe_missing_inner_parts(what, item,", "() and (what, item,", case="patches")
+@killed_by(
+    "scenario/registry.py", "lines += describe_missing_inner_parts(inner_family, inner, where)", "0", case="scaled"
+)
+@killed_by(
+    "scenario/registry.py",
+    "describe_missing_inner_parts(inner_family, item,",
+    "() and (inner_family, item,",
+    case="patches",
+)
 @pytest.mark.parametrize(
     ("choice", "place"),
     [
