@@ -252,10 +252,10 @@ def _push_forward(
 ) -> tuple[list[PyTree], list[PyTree]]:
     """Return values and tangents of a function, for tangents of the arguments `places`; the others are constants."""
 
-    def restricted(arguments: list[PyTree]) -> list[PyTree]:
+    def call_with(arguments: list[PyTree]) -> list[PyTree]:
         return function(*_replace_leaves(primals, places, arguments))
 
-    return jax.jvp(restricted, ([primals[i] for i in places],), (list(tangents),))
+    return jax.jvp(call_with, ([primals[i] for i in places],), (list(tangents),))
 
 
 def _replace_leaves(leaves: Leaves, places: Sequence[int], new: Leaves) -> list[PyTree]:
