@@ -129,13 +129,13 @@ class _Written:
             raise NotExported(f"plant {type(plant).__name__} has a state that is no real number")
         self.order = {node.attr[1]: k for k, node in enumerate(node for array in held for node in array.flat)}
         self.states = len(self.order)
-        one = jax.ShapeDtypeStruct((), np.float64)
+        scalar = jax.ShapeDtypeStruct((), np.float64)
         control, time, length = (
             np.full((), graph.input(np.float64, UpdateLevel.UNIFORM, place), object)
             for place in (("v", CONTROL), ("", "t"), ("", "h"))
         )
         self.begun = trace_outputs(graph, lambda both: prepare_parts(both[0]).start(both[1]), typed, inputs)
-        moving, shown = (plant, state, one, one, one), (plant, state)
+        moving, shown = (plant, state, scalar, scalar, scalar), (plant, state)
         self.moved = trace_outputs(
             graph, lambda all: _advance_state(*all), moving, [*plant_inputs, *held, control, time, length]
         )

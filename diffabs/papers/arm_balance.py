@@ -137,18 +137,19 @@ def runs() -> dict[str, Run]:
     }
     solvers = {"correct, no limit": FINE}
     return {
-        name: jax.tree.map(np.asarray, rollout(one, solvers.get(name, SOLVER), BALANCE)) for name, one in cases.items()
+        name: jax.tree.map(np.asarray, rollout(case, solvers.get(name, SOLVER), BALANCE))
+        for name, case in cases.items()
     }
 
 
-def recovered_multiples(one: Loop, rows: Table) -> list[Reach]:
+def recovered_multiples(closed_loop: Loop, rows: Table) -> list[Reach]:
     """Return, for each row, the greatest of `MULTIPLES` up to which every multiple of the paper's start is recovered.
 
     Args:
         rows: Values by parameter path, each of shape (rows,); all paths of a row change together.
     """
     direction = {"initial.theta": PAPER_START[0], "initial.phi": PAPER_START[2]}
-    return largest_recovered_multiples(one, rows, direction, MULTIPLES, LONG_SOLVER)
+    return largest_recovered_multiples(closed_loop, rows, direction, MULTIPLES, LONG_SOLVER)
 
 
 def largest_possible_multiples(plant: ArmBalance, riders: Any) -> np.ndarray:
@@ -181,11 +182,11 @@ def heaviest(plant: ArmBalance, gain: np.ndarray) -> float:
 
 def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
     """Return the regions of attraction at 48 V by name of the gain."""
-    gains, found = {"LQR": lqr_gain(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": TUNED}, {}
+    gains, basins = {"LQR": lqr_gain(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": TUNED}, {}
     for name, gain in gains.items():
         progress(f"arm-balance: {BOX.number**2} starts, {name}")
-        found[name] = region_of_attraction(loop(HANGING, gain), BOX, BOX, LONG_SOLVER)
-    return found
+        basins[name] = region_of_attraction(loop(HANGING, gain), BOX, BOX, LONG_SOLVER)
+    return basins
 
 
 def robust_gains(progress: Callable[[str], None]) -> JsonObject:
@@ -201,25 +202,25 @@ def robust_gains(progress: Callable[[str], None]) -> JsonObject:
         from diffabs.design.parameter_grid import grid_polytope
 
         over = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "plant.damping": (70.0, 130.0)}
-        found = design(grid_polytope(BalanceModel(plant=HANGING), over), Spec(Q=WEIGHTS, R=EFFORT))
-        gains["LMI for 40 to 100 kg"] = found.gain[0]
+        solution = design(grid_polytope(BalanceModel(plant=HANGING), over), Spec(Q=WEIGHTS, R=EFFORT))
+        gains["LMI for 40 to 100 kg"] = solution.gain[0]
     except ModuleNotFoundError:
         pass
-    found = {}
+    multiples = {}
     for name, gain in gains.items():
         progress(f"arm-balance: {len(RIDERS)} riders, {name}")
-        found[name] = gain, recovered_multiples(loop(HANGING, gain), {"plant.rider_mass": RIDERS})
-    return found
+        multiples[name] = gain, recovered_multiples(loop(HANGING, gain), {"plant.rider_mass": RIDERS})
+    return multiples
 
 
-def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[JsonObject]:
+def table(runs_by_name: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[JsonObject]:
     """Return the rows that compare our numbers with the independent ones."""
     a, b = upright_model(ArmBalance())
     poles = np.sort_complex(np.linalg.eigvals(np.asarray(a)))
     real = poles[np.abs(poles.imag) < 1e-9].real
     rows = [
-        record.computed_row("correct model", "real pole", "1/s", ours, reference=known)
-        for ours, known in zip(real, POLES, strict=True)
+        record.computed_row("correct model", "real pole", "1/s", ours, reference=reference)
+        for ours, reference in zip(real, POLES, strict=True)
     ]
     zero = np.max(np.real(transmission_zeros(a, b, np.eye(6)[0])))
     rows.append(record.computed_row("correct model", "unstable zero of theta", "1/s", zero, reference=ZERO))
@@ -233,20 +234,24 @@ def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[JsonObje
             "hanging arm", "bound, multiple at 48 V", "1", largest_possible_multiples(HANGING, [50.0])[0]
         )
     )
-    for name, known, unit in (("peak_arm_angle", PEAKS[0], "rad"), ("peak_voltage", PEAKS[1], "V")):
+    for name, reference, unit in (("peak_arm_angle", PEAKS[0], "rad"), ("peak_voltage", PEAKS[1], "V")):
         rows.append(
-            record.computed_row("printed model, Fig. 3", name, unit, seen["printed"].metrics[name], reference=known)
+            record.computed_row(
+                "printed model, Fig. 3", name, unit, runs_by_name["printed"].metrics[name], reference=reference
+            )
         )
-    for name, known in zip(("peak_lean", "peak_arm_angle"), HANGING_PEAKS, strict=True):
+    for name, reference in zip(("peak_lean", "peak_arm_angle"), HANGING_PEAKS, strict=True):
         rows.append(
-            record.computed_row("hanging arm, 0.06 of it", name, "rad", seen["hanging"].metrics[name], reference=known)
+            record.computed_row(
+                "hanging arm, 0.06 of it", name, "rad", runs_by_name["hanging"].metrics[name], reference=reference
+            )
         )
     for name in ("correct, no limit", "correct, 48 V", "hanging", "hanging, tuned"):
-        rows.append(record.computed_row(name, "fell", "1", seen[name].metrics["fell"]))
-    known = lqr_gain(HANGING, WEIGHTS, EFFORT)
-    rows.append(record.computed_row("hanging arm, LQR", "heaviest rider held", "kg", heaviest(HANGING, known)))
-    found = recovered_multiples(loop(HANGING, known), {"actuator.voltage_max": np.array(VOLTAGES)})
-    for voltage, reach in zip(VOLTAGES, found, strict=True):
+        rows.append(record.computed_row(name, "fell", "1", runs_by_name[name].metrics["fell"]))
+    hanging_gain = lqr_gain(HANGING, WEIGHTS, EFFORT)
+    rows.append(record.computed_row("hanging arm, LQR", "heaviest rider held", "kg", heaviest(HANGING, hanging_gain)))
+    reaches = recovered_multiples(loop(HANGING, hanging_gain), {"actuator.voltage_max": np.array(VOLTAGES)})
+    for voltage, reach in zip(VOLTAGES, reaches, strict=True):
         words = f"recovered multiple at {voltage:g} V"
         rows.append(
             record.computed_row("hanging arm, LQR", words, "1", reach.multiple, reference=PUBLISHED_MULTIPLES[voltage])
@@ -284,14 +289,14 @@ def compact(summary: Table) -> Digest:
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObject:
     """Write figures and `summary.json` into the folder, and return the summary."""
     progress("arm-balance: Fig. 3, printed and correct equations")
-    seen = runs()
+    runs_by_name = runs()
     basins = maps(progress)
     over_riders = robust_gains(progress)
     progress(f"arm-balance: starts recovered at {', '.join(f'{volts:g}' for volts in VOLTAGES)} V")
-    rows = table(seen, basins)
+    rows = table(runs_by_name, basins)
     progress("arm-balance: figures")
     limit = largest_possible_multiples(HANGING, RIDERS)
-    drawn = arm_figures.figures(seen, basins, RIDERS, over_riders, limit, PAPER_START, upright_model(HANGING))
+    drawn = arm_figures.figures(runs_by_name, basins, RIDERS, over_riders, limit, PAPER_START, upright_model(HANGING))
     summary = {
         "paper": "arm-balance",
         "title": TITLE,

@@ -13,7 +13,7 @@ from diffabs.simulate.types import Run
 
 
 def figures(
-    seen: Mapping[str, Run],
+    runs: Mapping[str, Run],
     basins: Mapping[str, Basin],
     riders: np.ndarray,
     over_riders: Mapping[str, tuple[PyTree, list[Reach]]],
@@ -30,16 +30,16 @@ def figures(
         start: Start of the paper's Fig. 3, shape (6,).
     """
     return {
-        "fig3_printed_and_correct": _claim(seen),
+        "fig3_printed_and_correct": _claim(runs),
         "hanging_arm": plot.draw_balance(
-            seen["hanging"], title="Hanging arm at 48 V, from 0.06 of the start of Fig. 3"
+            runs["hanging"], title="Hanging arm at 48 V, from 0.06 of the start of Fig. 3"
         ),
         "attraction_48V": _maps(basins, start, hanging),
         "riders": _riders(riders, over_riders, limit),
     }
 
 
-def _claim(seen: Mapping[str, Run]) -> Any:
+def _claim(runs: Mapping[str, Run]) -> Any:
     figure, axes = plot.sheet(1, 3, title="The same start, the same kind of LQR", size=(4.6, 3.4))
     titles = {
         "printed": "the paper's printed equations (its Fig. 3)",
@@ -47,7 +47,7 @@ def _claim(seen: Mapping[str, Run]) -> Any:
         "correct, 48 V": "correct equations, 48 V: falls",
     }
     for i, (ax, (name, title)) in enumerate(zip(axes, titles.items(), strict=True)):
-        trajectory = seen[name].trajectory
+        trajectory = runs[name].trajectory
         assert trajectory is not None
         plot.draw_angle_lines(ax, trajectory)
         plot.label_axes(ax, "time [s]", "angle [rad]", title, legend=i == 0)
@@ -85,15 +85,15 @@ def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
     return figure
 
 
-def _riders(riders: np.ndarray, found: Mapping[str, tuple[PyTree, list[Reach]]], limit: np.ndarray) -> Any:
+def _riders(riders: np.ndarray, over_riders: Mapping[str, tuple[PyTree, list[Reach]]], limit: np.ndarray) -> Any:
     figure, (ax,) = plot.sheet(title="One gain for every rider, hanging arm, 48 V", size=(6.6, 4.0))
     ax.plot(riders, limit, color="black", linewidth=1.2, label="no control beyond (linear)")
-    for i, (name, (_, reaches)) in enumerate(found.items()):
+    for i, (name, (_, reaches)) in enumerate(over_riders.items()):
         multiples = [reach.multiple for reach in reaches]
         ax.plot(riders, multiples, "o" + plot.DASHES[i], color=plot.COLOURS[i], markersize=4, label=name)
-        least = [(m, reach.multiple) for m, reach in zip(riders, reaches, strict=True) if reach.undecided]
-        if least:
-            ax.plot(*zip(*least, strict=True), "^", color=plot.COLOURS[i], label="at least")
+        lower_bounds = [(m, reach.multiple) for m, reach in zip(riders, reaches, strict=True) if reach.undecided]
+        if lower_bounds:
+            ax.plot(*zip(*lower_bounds, strict=True), "^", color=plot.COLOURS[i], label="at least")
     plot.label_axes(ax, "rider [kg]", "recovered multiple of (0.5, 0, 0.2) rad")
     ax.set_ylim(0, None)
     return figure

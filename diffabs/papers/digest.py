@@ -71,7 +71,7 @@ def digest(
         headings=headings,
         lines=lines,
         agreement=[text for text in (count_published(*printed), count_computed(independent)) if text],
-        verdicts=[found for claim in claims if (found := verdict(summary["rows"], claim))],
+        verdicts=[judgement for claim in claims if (judgement := verdict(summary["rows"], claim))],
         figures=len(summary["figures"]),
     )
 
@@ -86,14 +86,14 @@ def is_reproduced(row: Row) -> bool:
     return row["matches"] if "matches" in row else rounds_to(row["ours"], row["published"])
 
 
-def rounds_to(number: float | str, given: float) -> bool:
+def rounds_to(number: float | str, printed: float) -> bool:
     """Return whether a number rounds to another number at the other's decimals; a word such as "never" does not."""
-    return not isinstance(number, str) and round(number, decimals(given)) == given
+    return not isinstance(number, str) and round(number, decimals(printed)) == printed
 
 
-def decimals(given: float) -> int:
+def decimals(printed: float) -> int:
     """Return the number of decimals of a number as written."""
-    exponent = Decimal(repr(given)).normalize().as_tuple().exponent
+    exponent = Decimal(repr(printed)).normalize().as_tuple().exponent
     return max(0, -int(exponent))
 
 
@@ -102,10 +102,12 @@ def is_close(row: Row) -> bool:
 
     Rounding counts only if the independent number has decimals; without decimals, 0.4 would agree with 0.
     """
-    known, gap = row["reference"], row["difference"]
+    reference, gap = row["reference"], row["difference"]
     if gap is None:  # beside a word, such as "never"
-        return row["ours"] == known
-    return abs(gap) <= RELATIVE_TOLERANCE * abs(known) or (decimals(known) > 0 and rounds_to(row["ours"], known))
+        return row["ours"] == reference
+    return abs(gap) <= RELATIVE_TOLERANCE * abs(reference) or (
+        decimals(reference) > 0 and rounds_to(row["ours"], reference)
+    )
 
 
 def count_published(where: str, rows: Sequence[Row]) -> str:
@@ -123,8 +125,8 @@ def count_computed(rows: Sequence[Row]) -> str:
 def _share(rows: Sequence[Row], agrees: Callable[[Row], bool], words: str) -> str:
     missed = [row for row in rows if not agrees(row)]
     ours = [row["ours"] if isinstance(row["ours"], str) else f"{row['ours']:.5g}" for row in missed]
-    which = "; ".join(f"{row['name']}, {row['quantity']}: {x}" for row, x in zip(missed, ours, strict=True))
-    return f"{len(rows) - len(missed)} of {len(rows)} {words}{f', not {which}' if missed else ''}." if rows else ""
+    exceptions = "; ".join(f"{row['name']}, {row['quantity']}: {x}" for row, x in zip(missed, ours, strict=True))
+    return f"{len(rows) - len(missed)} of {len(rows)} {words}{f', not {exceptions}' if missed else ''}." if rows else ""
 
 
 def verdict(rows: Sequence[Row], claim: Refuted) -> tuple[str, str] | None:

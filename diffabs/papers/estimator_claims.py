@@ -40,24 +40,24 @@ def variation(run: Run) -> float:
 
 def jerk(run: Run) -> float:
     """Return the greatest |da/dt| of the vehicle between stored samples from `LATE_TIME` on [m/s^3]."""
-    one = run_columns(run)
-    t = one["t"]
-    rates = np.abs(np.diff(one["deceleration"]) / np.diff(t))
+    columns = run_columns(run)
+    t = columns["t"]
+    rates = np.abs(np.diff(columns["deceleration"]) / np.diff(t))
     return float(np.max(rates[t[:-1] >= LATE_TIME]))
 
 
 def rebounds(run: Run) -> int:
     """Return the number of sign changes of the wheel's acceleration from 0.3 s to 1 s."""
-    one = run_columns(run)
-    rate = np.diff(one["wheel_speed"])[(one["t"][:-1] >= 0.3) & (one["t"][:-1] < 1.0)]
+    columns = run_columns(run)
+    rate = np.diff(columns["wheel_speed"])[(columns["t"][:-1] >= 0.3) & (columns["t"][:-1] < 1.0)]
     return int(np.sum(np.diff(np.sign(rate)) != 0))
 
 
 def slow_deceleration(run: Run) -> float:
     """Return the mean deceleration over distance [m/s^2], from 20 km/h (`SLOW_SPEED`) to the last sample."""
-    one = run_columns(run)
-    slow = one["speed"] <= SLOW_SPEED
-    v, x = one["speed"][slow], one["distance"][slow]
+    columns = run_columns(run)
+    slow = columns["speed"] <= SLOW_SPEED
+    v, x = columns["speed"][slow], columns["distance"][slow]
     return float((v[0] ** 2 - v[-1] ** 2) / (2 * (x[-1] - x[0])))
 
 
@@ -66,15 +66,15 @@ def braking_gain(slower: Run, faster: Run) -> tuple[float, float]:
 
     The distance is the integral of v dv/a(v), so its integrand gives the gain at each speed.
     """
-    one, other = run_columns(slower), run_columns(faster)
-    v = np.linspace(one["speed"][-1], one["speed"][1], 20_001)  # the first sample has no friction
-    shorter = v * (1 / _at(v, one) - 1 / _at(v, other))
+    slow, fast = run_columns(slower), run_columns(faster)
+    v = np.linspace(slow["speed"][-1], slow["speed"][1], 20_001)  # the first sample has no friction
+    shorter = v * (1 / _at(v, slow) - 1 / _at(v, fast))
     return float(np.trapezoid(shorter, v)), float(np.trapezoid(np.where(v <= SLOW_SPEED, shorter, 0.0), v))
 
 
-def _at(v: np.ndarray, one: Mapping[str, np.ndarray]) -> np.ndarray:
+def _at(v: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the deceleration at these speeds [m/s^2]; requires a speed that only falls."""
-    return np.interp(v, one["speed"][::-1], one["deceleration"][::-1])
+    return np.interp(v, columns["speed"][::-1], columns["deceleration"][::-1])
 
 
 def judge_estimator_claims(runs: Mapping[str, Run], roads: Table) -> list[JsonObject]:

@@ -151,16 +151,16 @@ def _coasting_residuals(wheel: Coasting, t: Vector, speed: Vector) -> Vector:
 
 def fit_coasting() -> dict[str, Identified]:
     """Return a fit of speed, viscous and dry friction to each of the four coasting curves, by name of the curve."""
-    found = {}
+    fits = {}
     for name, curve in read_curves().items():
         if name.startswith("coasting-"):
             body = name.split("-")[1]
             inertia = MASK.wheel_inertia if body == "wheel" else MASK.drum_inertia
             start = Coasting(speed=float(curve[0, 1]), inertia=inertia)
             data = (jnp.asarray(curve[:, 0]), jnp.asarray(curve[:, 1]))
-            found[name] = fit(start, ["speed", "friction", "stiction"], _coasting_residuals, data=data,
+            fits[name] = fit(start, ["speed", "friction", "stiction"], _coasting_residuals, data=data,
                               sigma=np.array(READING_SHARE * PIXEL[body]), absolute=False)  # fmt: skip
-    return found
+    return fits
 
 
 def build_rig(coasting: Params) -> LabRig:
@@ -169,7 +169,9 @@ def build_rig(coasting: Params) -> LabRig:
     The relay commands 0 or 1 only, so its brake has one torque: `brake_gain` at full command, with `brake_offset` 0.
     """
     means = {
-        f"{body}_{kind}": float(np.mean([found.values[kind] for name, found in coasting.items() if body in name]))
+        f"{body}_{kind}": float(
+            np.mean([identified.values[kind] for name, identified in coasting.items() if body in name])
+        )
         for body in ("wheel", "drum")
         for kind in ("friction", "stiction")
     }
@@ -192,48 +194,48 @@ def with_scaled_brake(rig: LabRig) -> LabRig:
     return dataclasses.replace(rig, brake_gain=slope, brake_offset=-rig.brake_threshold * slope)
 
 
-def build_run(record: Record, given: bool, rig: LabRig) -> RecordedRun:
+def build_run(record: Record, replays: bool, rig: LabRig) -> RecordedRun:
     """Return a run of the measured rig from 1,700 rpm.
 
     Args:
-        given: True plays the recorded commands; False lets the loop's relay switch.
+        replays: True plays the recorded commands; False lets the loop's relay switch.
     """
-    return RecordedRun(loop=build_record_loop(record, given, rig))
+    return RecordedRun(loop=build_record_loop(record, replays, rig))
 
 
-def fit_load(record: Record, rig: LabRig, found: Identified) -> Identified:
+def fit_load(record: Record, rig: LabRig, friction_fit: Identified) -> Identified:
     """Return the other reading of a record: the mask's friction, and a load on the wheel that is free instead.
 
     A normal force is the moment that presses the wheel on the drum, over a lever. The drum and the wheel feel friction
     times normal force, so a record of both hardly tells a small friction from a small load.
     """
     friction = float(get(MASK, "road.w4"))
-    load = float(rig.weight_torque * found.values[FRICTION] / friction)
+    load = float(rig.weight_torque * friction_fit.values[FRICTION] / friction)
     free = {path: PARAMETER_RANGES[path] for path in FREE if path != FRICTION} | {LOAD: LOAD_RANGE}
-    run = with_values(build_run(record, True, rig), {**found.values, FRICTION: friction, LOAD: load})
+    run = with_values(build_run(record, True, rig), {**friction_fit.values, FRICTION: friction, LOAD: load})
     return fit_record(run, free, record)
 
 
 def judge(record: Record, rig: LabRig, values: Params) -> JsonObject:
     """Return how far the loop is from a record under recorded commands and under its own relay, and the readings."""
-    given, own = (
+    replayed, relayed = (
         compare_with_record(with_values(build_run(record, mode, rig), values), record) for mode in (True, False)
     )
     measured = describe_record(record)
     return {
-        "wheel_rms_percent_given": given.wheel_rms_percent,
-        "slip_rms_given": given.slip_rms,
-        "wheel_rms_percent_own": own.wheel_rms_percent,
-        "slip_rms_own": own.slip_rms,
-        **_ends(own),
-        "given": _ends(given),
+        "wheel_rms_percent_given": replayed.wheel_rms_percent,
+        "slip_rms_given": replayed.slip_rms,
+        "wheel_rms_percent_own": relayed.wheel_rms_percent,
+        "slip_rms_own": relayed.slip_rms,
+        **_ends(relayed),
+        "given": _ends(replayed),
         "measured": {**_ends(measured), "printed_distance": record.printed_distance},
     }
 
 
-def _ends(seen: RecordMatch) -> JsonObject:
-    time, distance = (record.format_time(x) for x in (seen.stop_time, seen.stop_distance))
-    return {"cycles": seen.cycles, "stop_time": time, "stop_distance": distance}
+def _ends(match: RecordMatch) -> JsonObject:
+    time, distance = (record.format_time(x) for x in (match.stop_time, match.stop_distance))
+    return {"cycles": match.cycles, "stop_time": time, "stop_distance": distance}
 
 
 def compare_tables(rig: LabRig) -> list[JsonObject]:
@@ -245,16 +247,18 @@ def compare_tables(rig: LabRig) -> list[JsonObject]:
         For each table its name, its unit, and the rms distance of the `mask` and of the `identified` rig.
     """
 
-    def torque(one: LabRig, u: np.ndarray) -> np.ndarray:
-        return np.where(u >= one.brake_threshold, np.maximum(one.brake_gain * u + one.brake_offset, 0.0), 0.0)
+    def torque(candidate: LabRig, u: np.ndarray) -> np.ndarray:
+        return np.where(
+            u >= candidate.brake_threshold, np.maximum(candidate.brake_gain * u + candidate.brake_offset, 0.0), 0.0
+        )
 
-    def friction(one: LabRig, slip: np.ndarray) -> np.ndarray:
-        return np.asarray(one.road.friction(jnp.asarray(slip), 0.0, 0.0))
+    def friction(candidate: LabRig, slip: np.ndarray) -> np.ndarray:
+        return np.asarray(candidate.road.friction(jnp.asarray(slip), 0.0, 0.0))
 
     rows = []
     for name, unit, ours in (("brake-torque", "N m", torque), ("friction", "1", friction)):
         x, measured = read_curves()[name].T
-        mask, identified = (float(np.sqrt(np.mean((ours(one, x) - measured) ** 2))) for one in (MASK, rig))
+        mask, identified = (float(np.sqrt(np.mean((ours(candidate, x) - measured) ** 2))) for candidate in (MASK, rig))
         rows.append({"table": name, "unit": unit, "mask": mask, "identified": identified})
     return rows
 
@@ -298,7 +302,7 @@ def read_step(command: float) -> StepCurves:
     Before the step the drawn rim of the wheel is 1.8 % faster than that of the drum. The radii of the manual are not
     those of the rig. Each curve is therefore divided by its own first reading.
     """
-    (t, wheel), (drum_t, drum) = (read_curves()[f"step-braking {command:g} {one}"].T for one in ("wheel", "drum"))
+    (t, wheel), (drum_t, drum) = (read_curves()[f"step-braking {command:g} {body}"].T for body in ("wheel", "drum"))
     return StepCurves(command, float(drum[0]), t, wheel / wheel[0], drum_t, drum / drum[0])
 
 
@@ -383,9 +387,9 @@ def compare_steps(rig: LabRig, loaded: LabRig) -> list[JsonObject]:
     rows = []
     for command in STEP_COMMANDS:
         curves = read_step(command)
-        found = fit_step(curves, rig)
-        values, deviations = found.values, found.uncertainty.deviations
-        fitted = match_step(curves, found.part.loop.plant) | {
+        step_fit = fit_step(curves, rig)
+        values, deviations = step_fit.values, step_fit.uncertainty.deviations
+        fitted = match_step(curves, step_fit.part.loop.plant) | {
             name + suffix: factor * float(of[f"loop.plant.{path}"])
             for name, path, factor in (("friction", "road.w4", 1.0), ("brake_torque", "brake_gain", command),
                                        ("brake_rate", "brake_rate", 1.0))
@@ -403,25 +407,25 @@ def compare_steps(rig: LabRig, loaded: LabRig) -> list[JsonObject]:
     return rows
 
 
-def parameter_rows(found: Identified, coasting: Params) -> list[JsonObject]:
+def parameter_rows(identified: Identified, coasting: Params) -> list[JsonObject]:
     """Return each identified parameter with the value of the model's mask, unit and standard deviation."""
     rows = [
-        {"name": f"{name}: {kind}", "value": float(one.values[kind]), "unit": unit, "mask": float(mask),
-         "standard_deviation": float(one.uncertainty.deviations[kind]), "what": f"bearing's {kind}, from its curve"}
-        for name, one in coasting.items()
+        {"name": f"{name}: {kind}", "value": float(bearing.values[kind]), "unit": unit, "mask": float(mask),
+         "standard_deviation": float(bearing.uncertainty.deviations[kind]), "what": f"bearing's {kind}, from its curve"}
+        for name, bearing in coasting.items()
         for kind, unit in (("friction", "N m s"), ("stiction", "N m"))
         for mask in [getattr(MASK, f"{name.split('-')[1]}_{kind}")]
     ]  # fmt: skip
-    for path, (unit, what) in (FREE | {LOAD: ("N m", "moment that presses the wheel on the drum")}).items():
-        if path not in found.values:
+    for path, (unit, meaning) in (FREE | {LOAD: ("N m", "moment that presses the wheel on the drum")}).items():
+        if path not in identified.values:
             continue
         head, _, field = path.partition("loop.plant.")
         mask = None if head else float(get(MASK, field))
         if field == "brake_gain":
             mask = float(MASK.brake_gain + MASK.brake_offset)
         rows.append(
-            {"name": path, "value": float(found.values[path]), "unit": unit, "mask": mask,
-             "standard_deviation": float(found.uncertainty.deviations[path]), "what": what}
+            {"name": path, "value": float(identified.values[path]), "unit": unit, "mask": mask,
+             "standard_deviation": float(identified.uncertainty.deviations[path]), "what": meaning}
         )  # fmt: skip
     return rows
 
@@ -432,32 +436,39 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
     Args:
         data: Folder with finer readings of both experiments; None takes the packaged ones.
     """
-    first, second = (read_record(one, data) for one in EXPERIMENTS)
+    first, second = (read_record(experiment, data) for experiment in EXPERIMENTS)
     progress("lab-rig: the maker's own simulations")
     maker = compare_with_maker()
     progress("lab-rig: bearing friction from four coasting curves")
     coasting = fit_coasting()
     rig = build_rig(coasting)
     progress("lab-rig: fitting experiment 1")
-    found = fit_record(
+    identified = fit_record(
         build_run(first, True, rig), {path: PARAMETER_RANGES[path] for path in FREE}, first, starts=STARTS
     )
     progress("lab-rig: judging by experiment 2")
-    judged = {name: judge(one, rig, found.values) for name, one in (("fitted", first), ("judged", second))}
+    judged = {
+        name: judge(recording, rig, identified.values) for name, recording in (("fitted", first), ("judged", second))
+    }
     progress("lab-rig: the mask's friction with another load")
-    loaded = fit_load(first, rig, found)
+    loaded = fit_load(first, rig, identified)
     with_load = {FRICTION: float(get(MASK, "road.w4")), **loaded.values}
-    other = {name: judge(one, rig, with_load) for name, one in (("fitted", first), ("judged", second))}
-    before = {name: judge(one, MASK, MASK_VALUES) for name, one in (("fitted", first), ("judged", second))}
-    parameters = parameter_rows(found, coasting)
+    with_other_load = {
+        name: judge(recording, rig, with_load) for name, recording in (("fitted", first), ("judged", second))
+    }
+    before = {name: judge(recording, MASK, MASK_VALUES) for name, recording in (("fitted", first), ("judged", second))}
+    parameters = parameter_rows(identified, coasting)
     progress("lab-rig: step braking")
-    rigs: Any = (with_values(build_run(first, True, rig), values).loop.plant for values in (found.values, with_load))
+    rigs: Any = (
+        with_values(build_run(first, True, rig), values).loop.plant for values in (identified.values, with_load)
+    )
     plant, pressed = rigs
     steps = compare_steps(plant, pressed)
     progress("lab-rig: figures")
-    names = record.save_figures(draw_figures((first, second), rig, found.values, coasting), folder)
+    names = record.save_figures(draw_figures((first, second), rig, identified.values, coasting), folder)
     open_directions = [
-        {"spread": one.spread, "direction": one.describe()} for one in found.uncertainty.undetermined_directions(0.1)
+        {"spread": direction.spread, "direction": direction.describe()}
+        for direction in identified.uncertainty.undetermined_directions(0.1)
     ]
     summary = {
         "paper": "lab-rig",
@@ -467,7 +478,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
         **judged,
         "before": before,
         "mask_friction": {
-            **other,
+            **with_other_load,
             "tables": compare_tables(with_scaled_brake(pressed)),
             "parameters": parameter_rows(loaded, {}),
         },
@@ -475,7 +486,10 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
         "tables": compare_tables(with_scaled_brake(plant)),
         "steps": steps,
         "parameters": parameters,
-        "correlation": {"names": list(found.uncertainty.names), "matrix": found.uncertainty.correlation.tolist()},
+        "correlation": {
+            "names": list(identified.uncertainty.names),
+            "matrix": identified.uncertainty.correlation.tolist(),
+        },
         "hardly_determined": open_directions,
         "readings": "of the manual's figures, thinned to 80 a curve" if data is None else "finer, from a folder",
         "figures": names,
@@ -506,13 +520,13 @@ def _rows(judged: Table) -> list[JsonObject]:
 def _step_rows(steps: list[JsonObject]) -> list[JsonObject]:
     """Return the rows of `record.computed_row` for the step-braking runs."""
     rows = []
-    for one in steps:
+    for step in steps:
         for state in ("mask", "identified", "mask_friction", "fitted"):
-            name = f"step braking with {one['command']:g} ({state})"
+            name = f"step braking with {step['command']:g} ({state})"
             for quantity, unit in (("wheel_rms_percent", "%"), ("drum_rms_percent", "%")):
-                rows.append(record.computed_row(name, quantity, unit, one[state][quantity]))
-            rows.append(record.computed_row(name, "fall_time", "s", one[state]["fall_time"],
-                                            reference=one["measured"]["fall_time"]))  # fmt: skip
+                rows.append(record.computed_row(name, quantity, unit, step[state][quantity]))
+            rows.append(record.computed_row(name, "fall_time", "s", step[state]["fall_time"],
+                                            reference=step["measured"]["fall_time"]))  # fmt: skip
     return rows
 
 
@@ -520,25 +534,29 @@ def draw_figures(records: tuple[Record, Record], rig: LabRig, values: Params, co
     """Return the figures by file name: both experiments, and the coasting curves."""
     titles = ("Experiment 1: relay at slip 0.1 (fitted)", "Experiment 2: relay at slip 0.7 (judged)")
     drawn = {
-        f"experiment_{i + 1}": _draw_experiment(one, rig, values, title)
-        for i, (one, title) in enumerate(zip(records, titles, strict=True))
+        f"experiment_{i + 1}": _draw_experiment(recording, rig, values, title)
+        for i, (recording, title) in enumerate(zip(records, titles, strict=True))
     }
     panels = [
-        plot.MeasuredPanel(f"{name.split('-')[1]} [rad/s]", t, speed, np.asarray(found.part.at(t)), "bearing friction")
-        for name, found in coasting.items()
+        plot.MeasuredPanel(
+            f"{name.split('-')[1]} [rad/s]", t, speed, np.asarray(bearing.part.at(t)), "bearing friction"
+        )
+        for name, bearing in coasting.items()
         for t, speed in [read_curves()[name].T]
     ]
     return {**drawn, "coasting": plot.draw_measured(panels, title="Coasting: a wheel that only its bearing brakes")}
 
 
-def _draw_experiment(one: Record, rig: LabRig, values: Params, title: str) -> Any:
-    panels, turns = [], one.wheel > HARDLY_TURNS / 4
-    for given, name in ((True, "simulated, measured commands"), (False, "simulated, its own relay")):
-        recorded = with_values(build_run(one, given, rig), values)
-        wheel, slip = simulate_readings(simulate(recorded.loop, solver_for(one)), recorded, solver_for(one), one.t)
-        measured, ours = (np.where(turns, x, np.nan) for x in (one.slip, np.asarray(slip)))
-        panels.append(plot.MeasuredPanel("wheel [rad/s]", one.t, one.wheel, np.asarray(wheel), name))
-        panels.append(plot.MeasuredPanel("slip [1]", one.t, measured, ours, name))
+def _draw_experiment(recording: Record, rig: LabRig, values: Params, title: str) -> Any:
+    panels, turns = [], recording.wheel > HARDLY_TURNS / 4
+    for replays, name in ((True, "simulated, measured commands"), (False, "simulated, its own relay")):
+        recorded = with_values(build_run(recording, replays, rig), values)
+        wheel, slip = simulate_readings(
+            simulate(recorded.loop, solver_for(recording)), recorded, solver_for(recording), recording.t
+        )
+        measured, ours = (np.where(turns, x, np.nan) for x in (recording.slip, np.asarray(slip)))
+        panels.append(plot.MeasuredPanel("wheel [rad/s]", recording.t, recording.wheel, np.asarray(wheel), name))
+        panels.append(plot.MeasuredPanel("slip [1]", recording.t, measured, ours, name))
     return plot.draw_measured(panels, title=title)
 
 
@@ -565,10 +583,10 @@ def compact(summary: Table) -> Digest:
     ]
     rule = "Given, own: rms error of the wheel's speed under the measured commands and under its own relay."
     steps = [
-        f"Step braking with {one['command']:g}: wheel's rms error {one['mask']['wheel_rms_percent']:.1f} % (mask), "
-        f"{one['identified']['wheel_rms_percent']:.1f} % (identified), {one['fitted']['wheel_rms_percent']:.1f} % "
-        f"(fitted to it: {one['fitted']['brake_torque']:.1f} N m, friction w4 = {one['fitted']['friction']:.3f})."
-        for one in summary["steps"]
+        f"Step braking with {step['command']:g}: wheel's rms error {step['mask']['wheel_rms_percent']:.1f} % (mask), "
+        f"{step['identified']['wheel_rms_percent']:.1f} % (identified), {step['fitted']['wheel_rms_percent']:.1f} % "
+        f"(fitted to it: {step['fitted']['brake_torque']:.1f} N m, friction w4 = {step['fitted']['friction']:.3f})."
+        for step in summary["steps"]
     ]
     sentences = [rule, *values, *steps]
     return Digest(summary["title"].split(" (")[0], headings, lines, sentences, (), len(summary["figures"]))

@@ -80,9 +80,11 @@ def _until_end(run: Run) -> tuple[Any, ...]:
     """Return time, slip, vehicle speed, wheel speed, distance and control of a run up to its end."""
     assert run.trajectory is not None
     sample, running = run.trajectory.sample, np.asarray(run.trajectory.running)
-    kept = np.concatenate([[True], running[:-1]])
+    before_end = np.concatenate([[True], running[:-1]])
     y = sample.output
-    return tuple(np.asarray(x)[kept] for x in (sample.t, y.slip, y.speed, y.wheel_speed, y.distance, sample.control))
+    return tuple(
+        np.asarray(x)[before_end] for x in (sample.t, y.slip, y.speed, y.wheel_speed, y.distance, sample.control)
+    )
 
 
 def _stop_time(run: Run, row: Table) -> float:
@@ -225,8 +227,8 @@ _run_row = jax.jit(run_unchecked, static_argnums=(1, 4))
 @functools.cache
 def simulate_row(scenario: str, overrides: tuple[str, ...]) -> Run:
     """Return the run of a scenario with overrides. Several rows read the same run."""
-    given = load_row_scenario(scenario, overrides)
-    return _run_row(given.loop, given.solver, dict(given.objectives), None, given.solver.every)
+    case = load_row_scenario(scenario, overrides)
+    return _run_row(case.loop, case.solver, dict(case.objectives), None, case.solver.every)
 
 
 def our_value(row: Table) -> float | None:
@@ -295,7 +297,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
         "scenario": SHOWN,
         "title": TITLE,
         "rows": rows,
-        "sources": {name: {key: one[key] for key in ("title", "place")} for name, one in read_sources().items()},
+        "sources": {name: {key: source[key] for key in ("title", "place")} for name, source in read_sources().items()},
         "figures": record.save_figures({"printed_against_ours": draw_rows(rows)}, folder),
         "notes": NOTES,
         "solver": {"method": "RK4, fixed step of each scenario", f"step of {SHOWN}": solver.step},
@@ -334,11 +336,11 @@ def scenario_parameters(name: str) -> JsonObject:
     """Return the parameters of a scenario by path, each with value and unit."""
     scenario = load_row_scenario(name)
     units = units_of(scenario.loop.plant)
-    found: JsonObject = {
+    described: JsonObject = {
         path: {"value": np.asarray(value).tolist(), "unit": resolve_unit(spec.unit, units)}
         for path, spec, value in parameters(scenario.loop)
     }
-    return {key: one for key, one in found.items() if np.all(np.isfinite(one["value"]))}
+    return {key: row for key, row in described.items() if np.all(np.isfinite(row["value"]))}
 
 
 # Figure and digest

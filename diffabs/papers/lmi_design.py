@@ -68,7 +68,7 @@ CLAIMS = (
         "eqs. (30)-(32) give its gain",
         "no Q, R do; they need |k2| > {1:.2f}",
         [("K = [-11753, -48], 5..50 km/h", "common Lyapunov matrix"), ("k1 = -11753", "least |k2| with a common one")],
-        lambda common, least: common == 0.0 and least > -PUBLISHED_GAIN[1],
+        lambda common, threshold: common == 0.0 and threshold > -PUBLISHED_GAIN[1],
     ),
     Refuted(
         "eq. (31) has the rig's vertices",
@@ -115,36 +115,36 @@ def _as_printed(system: Polytope) -> Polytope:
     speeds = np.array([corner["speed"] for corner in system.corners])
     heavy = np.array([corner["plant.mass"] == DESIGN_BOX["plant.mass"][1] for corner in system.corners])
     low = speeds == speeds.min()
-    other = {(mass, slow): i for i, (mass, slow) in enumerate(zip(heavy, low, strict=True))}
+    places = {(mass, slow): i for i, (mass, slow) in enumerate(zip(heavy, low, strict=True))}
     # (heavy, fast) and (light, slow) are correct. (heavy, slow) gets B of the high speed, and (light, fast) gets B of
     # the low speed.
     swap = [
-        other[(mass, not slow)] if mass == slow else i for i, (mass, slow) in enumerate(zip(heavy, low, strict=True))
+        places[(mass, not slow)] if mass == slow else i for i, (mass, slow) in enumerate(zip(heavy, low, strict=True))
     ]
     return Polytope(A=system.A, B=system.B[swap], states=system.states)
 
 
-def table(found: Designed, braked: Mapping[str, Run]) -> list[JsonObject]:
+def table(designed: Designed, braked: Mapping[str, Run]) -> list[JsonObject]:
     """Return the rows of gains, costs, certificates, poles and overshoots."""
     rows = []
     for weights, (gain, trace) in REFERENCE_GAINS.items():
         name = f"LMI, Q = diag({weights[0]:.6g}, {weights[1]:g})"
-        ours = found.designs[weights]
+        ours = designed.designs[weights]
         rows.append(record.computed_row(name, "trace Z", "1", ours.trace_cost, reference=trace))
         for i, unit in enumerate(("N m/s", "N m")):
             rows.append(record.computed_row(name, f"k{i + 1}", unit, ours.gain[0, i], reference=gain[i]))
-        printed = found.printed[weights]
+        printed = designed.printed[weights]
         rows.append(record.computed_row(f"{name}, (31) as printed", "trace Z", "1", printed.trace_cost))
         rows.append(record.computed_row(f"{name}, (31) as printed", "k2", "N m", printed.gain[0, 1]))
-        holds = _truth(certify(printed.gain, found.system))
+        holds = _truth(certify(printed.gain, designed.system))
         rows.append(record.computed_row(f"{name}, (31) as printed", "proved at the true vertices", "1", holds))
-    for k2, proof in found.verdicts.items():
+    for k2, proof in designed.verdicts.items():
         stable = {-48.0: 0.0, -76.6: 0.0, -76.7: 1.0, SAME_INTEGRAL[1]: 1.0}[k2]
         name = f"K = [-11753, {k2:g}], 5..50 km/h"
         rows.append(record.computed_row(name, "common Lyapunov matrix", "1", _truth(proof), reference=stable))
     rows.append(
         record.computed_row(
-            "published gain, speed cannot jump", "proved stable", "1", bool(found.varying.stable), reference=1.0
+            "published gain, speed cannot jump", "proved stable", "1", bool(designed.varying.stable), reference=1.0
         )
     )
     rows.append(
@@ -152,11 +152,11 @@ def table(found: Designed, braked: Mapping[str, Run]) -> list[JsonObject]:
             "k1 = -11753",
             "least |k2| with a common one",
             "N m",
-            stability_threshold(found.system),
+            stability_threshold(designed.system),
             reference=REFERENCE_THRESHOLD,
         )
     )
-    pole = slowest_pole(found.system, PUBLISHED_GAIN)
+    pole = slowest_pole(designed.system, PUBLISHED_GAIN)
     for quantity, unit, ours, exact in zip(
         ("pole, real part", "pole, imaginary part", "damping"), ("1/s", "rad/s", "1"), pole, REFERENCE_POLE, strict=True
     ):
@@ -194,36 +194,36 @@ def slowest_pole(system: Polytope, gain: tuple[float, float]) -> tuple[float, fl
     return float(np.real(pole)), float(np.imag(pole)), float(-np.real(pole) / abs(pole))
 
 
-def design_summary(found: Designed) -> JsonObject:
+def design_summary(designed: Designed) -> JsonObject:
     """Return the part of `summary.json` on section 4."""
 
-    def one(answer: Design) -> JsonObject:
+    def describe_design(answer: Design) -> JsonObject:
         numbers = {name: getattr(answer, name) for name in ("trace_cost", "lower_bound", "gap", "residual")}
         return {"gain": answer.gain[0].tolist(), **numbers, "certificate": answer.certificate.summary()}
 
     def name_answers(answers: Mapping[tuple[float, float], Design]) -> list[JsonObject]:
-        return [{"Q": list(weights), "R": 1.0, **one(answer)} for weights, answer in answers.items()]
+        return [{"Q": list(weights), "R": 1.0, **describe_design(answer)} for weights, answer in answers.items()]
 
-    verdicts = [{"gain": [-K1, k2], **proof.summary()} for k2, proof in found.verdicts.items()]
-    coverage = found.system.coverage
+    verdicts = [{"gain": [-K1, k2], **proof.summary()} for k2, proof in designed.verdicts.items()]
+    coverage = designed.system.coverage
     return {
-        "designs": name_answers(found.designs),
-        "as_printed": name_answers(found.printed),
+        "designs": name_answers(designed.designs),
+        "as_printed": name_answers(designed.printed),
         "verdicts": verdicts,
-        "published_gain_with_bounded_deceleration": found.varying.summary(),
+        "published_gain_with_bounded_deceleration": designed.varying.summary(),
         "coverage": None if coverage is None else {"checked": coverage.checked, "spread": coverage.spread},
     }
 
 
-def figures(found: Designed, braked: Mapping[str, Run]) -> JsonObject:
+def figures(designed: Designed, braked: Mapping[str, Run]) -> JsonObject:
     """Return the figures of the gains that explain the overshoot: poles and damping over speed, and trajectories."""
     gains = {"published": PUBLISHED_GAIN, "LMI, same k1": SAME_INTEGRAL, "K = [-121.8, -158.2]": GENTLE}
     speeds = np.geomspace(*DESIGN_BOX["speed"], 200)
-    i = int(np.argmin([corner["plant.mass"] - corner["speed"] for corner in found.system.corners]))
+    i = int(np.argmin([corner["plant.mass"] - corner["speed"] for corner in designed.system.corners]))
     slower = np.stack([np.ones_like(speeds), DESIGN_BOX["speed"][1] / speeds], -1)[
         ..., None
     ]  # eqs. (16), (21): 1/omega_2
-    loci = {name: np.linalg.eigvals(slower * found.system.closed_loop(gain)[i]) for name, gain in gains.items()}
+    loci = {name: np.linalg.eigvals(slower * designed.system.closed_loop(gain)[i]) for name, gain in gains.items()}
     return {
         "gain_poles": _poles(loci, speeds),
         "gain_damping": _draw_damping(loci, speeds),

@@ -92,9 +92,9 @@ class Record(NamedTuple):
         """
         if np.isinf(self.stop_time):
             return float(np.inf)
-        known = (self.slip < MAX_KNOWN_SLIP) & (self.t < self.stop_time)
-        left = 1 - self.slip[known]
-        cubic = np.polyfit(self.t[known], self.wheel[known] * WHEEL_RADIUS / left, 3, w=left)
+        usable = (self.slip < MAX_KNOWN_SLIP) & (self.t < self.stop_time)
+        complement = 1 - self.slip[usable]
+        cubic = np.polyfit(self.t[usable], self.wheel[usable] * WHEEL_RADIUS / complement, 3, w=complement)
         t = np.linspace(0.0, self.stop_time, 400)
         return float(np.trapezoid(np.maximum(np.polyval(cubic, t), 0.0), t))
 
@@ -213,11 +213,11 @@ def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> np.ndarray:
     raise ScenarioError(f"{path}: needs UTF-8 text with the columns {', '.join(columns)}, and a number in every row")
 
 
-def build_record_loop(record: Record, given: bool, rig: LabRig = MASK) -> Loop:
+def build_record_loop(record: Record, replays: bool, rig: LabRig = MASK) -> Loop:
     """Return the loop of an experiment.
 
     Args:
-        given: True plays the recorded commands; False lets the loop's relay switch.
+        replays: True plays the recorded commands; False lets the loop's relay switch.
     """
     relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
     return braking(
@@ -225,7 +225,7 @@ def build_record_loop(record: Record, given: bool, rig: LabRig = MASK) -> Loop:
         initial=BrakeStart(speed=BRAKING_SPEED * rig.drum_radius),
         sensor=EncoderSlip(period=PERIOD),
         reference=FixedSlip(slip=record.threshold),
-        controller=PlayedCommand(commands=record.commands, period=PERIOD) if given else relay,
+        controller=PlayedCommand(commands=record.commands, period=PERIOD) if replays else relay,
         actuator=DeadTime(),
         stop=Standstill(speed=0.05),
     )
@@ -304,10 +304,12 @@ def fit_record(
         starts: Values by path of each start; without any, the run's own. The best fit is returned.
         tolerance: Relative change of the cost at which a fit ends.
     """
-    kept = record.t <= until
-    solver = FixedStep(step=FIT_STEP, duration=round(float(record.t[kept][-1]) + PERIOD, 2))  # to the last sample's end
+    counted = record.t <= until
+    solver = FixedStep(
+        step=FIT_STEP, duration=round(float(record.t[counted][-1]) + PERIOD, 2)
+    )  # to the last sample's end
     columns = (record.t, record.wheel, record.slip, slip_weight(record.wheel))
-    data = tuple(jnp.asarray(x[kept]) for x in columns)
+    data = tuple(jnp.asarray(x[counted]) for x in columns)
     return fit(
         recorded, free, RecordResiduals(solver), data=data, sigma=np.array(1.0), absolute=False,
         tolerances=Tolerances(cost=tolerance, step=1e-6, gradient=1e-6, evaluations=40), starts=starts,

@@ -102,8 +102,8 @@ def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
         lanes = stack_loops(
             [loop(car, reference, PID(kp=3893.0, ki=ki, kd=kd, low=0.0, high=90.0)) for ki, kd in PID_GAINS.values()]
         )
-        done = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)
-        runs |= {f"{method} {name}": record.lane(done, i) for i, name in enumerate(PID_GAINS)}
+        batch = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)
+        runs |= {f"{method} {name}": record.lane(batch, i) for i, name in enumerate(PID_GAINS)}
     return runs
 
 
@@ -196,21 +196,25 @@ def bound_rows(results: EstimatorResults) -> list[JsonObject]:
 def figures(results: EstimatorResults) -> JsonObject:
     """Return the figures by file name."""
     runs = results.runs["spline B"]
-    seen = {name: _trajectory(one) for name, one in runs.items()}
+    trajectories = {name: _trajectory(simulated) for name, simulated in runs.items()}
     drawn = {
-        "fig1_no_abs": plot.draw_speeds({"": seen["no ABS"]}, title="Fig. 1: full brake without anti-lock control")
+        "fig1_no_abs": plot.draw_speeds(
+            {"": trajectories["no ABS"]}, title="Fig. 1: full brake without anti-lock control"
+        )
     }
     for number, controller in ((7, "PID"), (8, "PD"), (9, "PI"), (10, "P")):
-        pair = {f"({x}) {name}": seen[f"{name} {controller}"] for x, name in zip("ab", PAPER_METHODS, strict=True)}
+        pair = {
+            f"({x}) {name}": trajectories[f"{name} {controller}"] for x, name in zip("ab", PAPER_METHODS, strict=True)
+        }
         drawn[f"fig{number}_{controller.lower()}"] = plot.draw_speeds(
             pair, title=f"Fig. {number}: {controller} control"
         )
-    both = {name: seen[f"{name} PI"] for name in PAPER_METHODS}
-    single = [{f"({x}) {name}": one} for x, (name, one) in zip("ab", both.items(), strict=True)]
+    both = {name: trajectories[f"{name} PI"] for name in PAPER_METHODS}
+    single = [{f"({x}) {name}": trajectory} for x, (name, trajectory) in zip("ab", both.items(), strict=True)]
     drawn["fig11_positions_pi"] = plot.draw_positions(single, title="Fig. 11: position, PI control")
     title = "Fig. 12: comparison of the positions, PI control"
     drawn["fig12_comparison"] = plot.draw_positions([both], zoom=(2.0, 3.3), title=title)
-    printed = {"as printed, P": _trajectory(results.literal[0]), "as a latch, P": seen["proposed P"]}
+    printed = {"as printed, P": _trajectory(results.literal[0]), "as a latch, P": trajectories["proposed P"]}
     title = "The estimator read literally does not brake"
     drawn["literal_estimator"] = plot.draw_speeds(printed, title=title)
     roads = {f"{name} (identified)": car.road for name, car in CARS.items()}
@@ -246,9 +250,9 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
 
 
 def _step_note(results: EstimatorResults) -> str:
-    fine, coarse = results.runs["spline B"], results.coarse
+    fine_runs, coarse = results.runs["spline B"], results.coarse
     gaps = [
-        max(abs(float(fine[name].metrics[m] - coarse[name].metrics[m])) for name in fine)
+        max(abs(float(fine_runs[name].metrics[m] - coarse[name].metrics[m])) for name in fine_runs)
         for m in ("stop_time", "stop_distance")
     ]
     return (

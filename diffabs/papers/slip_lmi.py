@@ -133,8 +133,8 @@ def loop(case: Case, reference: Part = None) -> Loop:
 def run() -> dict[str, Run]:
     """Return the runs of all cases by name."""
     cases = CASES + GAIN_CASES
-    done = run_batch(*stack_loops([loop(case) for case in cases]), SOLVER, BRAKING, trajectories=True, accepted=True)
-    return {case.name: record.lane(done, i) for i, case in enumerate(cases)}
+    batch = run_batch(*stack_loops([loop(case) for case in cases]), SOLVER, BRAKING, trajectories=True, accepted=True)
+    return {case.name: record.lane(batch, i) for i, case in enumerate(cases)}
 
 
 def run_filtered() -> Run:
@@ -143,19 +143,19 @@ def run_filtered() -> Run:
     return jax.tree.map(np.asarray, rollout(loop(CASES[0], filtered), SOLVER, BRAKING))
 
 
-def convergence_errors(fine: Mapping[str, Run]) -> Errors:
+def convergence_errors(finer_runs: Mapping[str, Run]) -> Errors:
     """Return the relative errors against finer runs, as {case: {quantity: errors}} with one error for each of
     `HALVINGS`.
 
     Args:
-        fine: Runs at a finer step, by name.
+        finer_runs: Runs at a finer step, by name.
     """
     lanes = stack_loops([loop(case) for case in CONVERGENCE])
     solvers = [FixedStep(step=step, duration=step * HALVING_STEPS) for step in HALVINGS]
     runs = [run_batch(*lanes, solver, BRAKING, together=True, accepted=True) for solver in solvers]
 
     def errors(i: int, name: str, quantity: str) -> list[float]:
-        exact = float(fine[name].metrics[quantity])
+        exact = float(finer_runs[name].metrics[quantity])
         return [abs(float(r.metrics[quantity][i]) / exact - 1) for r in runs]
 
     names = ("stop_time", "stop_distance", "max_slip", "iae")
@@ -193,36 +193,36 @@ def table(runs: Mapping[str, Run]) -> list[JsonObject]:
 
 def reference_and_order_rows(filtered: Run, errors: Errors) -> list[JsonObject]:
     """Return the rows of the filtered reference, the friction curve and the measured order of convergence."""
-    found = jax.jit(peak)(RIG)
+    greatest = jax.jit(peak)(RIG)
     rows = [
         record.computed_row("reference filter, 35 ms", "overshoot", "1", filtered.metrics["overshoot"], reference=0.0),
-        record.computed_row("friction curve, local peak", "slip", "1", found.slip, reference=REFERENCE_PEAK[0]),
-        record.computed_row("friction curve, local peak", "mu", "1", found.mu, reference=REFERENCE_PEAK[1]),
+        record.computed_row("friction curve, local peak", "slip", "1", greatest.slip, reference=REFERENCE_PEAK[0]),
+        record.computed_row("friction curve, local peak", "mu", "1", greatest.mu, reference=REFERENCE_PEAK[1]),
     ]
     for slip, exact in REFERENCE_MU.items():
         rows.append(record.computed_row(f"friction curve at {slip:g}", "mu", "1", RIG.friction(slip), reference=exact))
     for case, (expected, points) in CONVERGENCE.items():
         for quantity in ("stop_time", "stop_distance"):
-            found = convergence_order(errors[case.name][quantity], points)
+            order = convergence_order(errors[case.name][quantity], points)
             rows.append(
-                record.computed_row(f"order of the step: {case.name}", quantity, "1", found, reference=expected)
+                record.computed_row(f"order of the step: {case.name}", quantity, "1", order, reference=expected)
             )
     return rows
 
 
 def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> JsonObject:
     """Return the figures by file name."""
-    seen: JsonObject = {name: one.trajectory for name, one in runs.items()}
+    trajectories: JsonObject = {name: simulated.trajectory for name, simulated in runs.items()}
     drawn = {}
     for case, number in ((CASES[0], 4), (CASES[3], 6)):
         name, mass = case.name, f"{case.mass:g} kg"
         drawn[f"fig{number}_slip_{case.mass:g}kg"] = plot.draw_slips(
-            {"slip": seen[name]}, title=f"Fig. {number}: slip, {mass}"
+            {"slip": trajectories[name]}, title=f"Fig. {number}: slip, {mass}"
         )
         title = f"Fig. {number + 1}: vehicle and wheel speed, {mass}"
-        drawn[f"fig{number + 1}_speeds_{case.mass:g}kg"] = plot.draw_speeds({"": seen[name]}, title=title)
-    drawn["torque_limits"] = _torque_limits({case.name: seen[case.name] for case in CASES[:3]})
-    both = {"reference 0.2 at once": seen[CASES[0].name], "reference filtered, 35 ms": filtered.trajectory}
+        drawn[f"fig{number + 1}_speeds_{case.mass:g}kg"] = plot.draw_speeds({"": trajectories[name]}, title=title)
+    drawn["torque_limits"] = _torque_limits({case.name: trajectories[case.name] for case in CASES[:3]})
+    both = {"reference 0.2 at once": trajectories[CASES[0].name], "reference filtered, 35 ms": filtered.trajectory}
     drawn["reference_filter"] = plot.draw_slips(both, title="The cure for the overshoot, same gain, 5.3 kg", until=0.4)
     drawn["friction_curve"] = plot.draw_friction(
         {"eq. (13)": RIG},
@@ -271,9 +271,9 @@ def compact(summary: Table) -> Digest:
     rows, columns = summary["rows"], ("max_slip", "settling_time", "stop_time", "stop_distance")
     lines = []
     for name in (*REFERENCE_RUNS, *REFERENCE_CAR):
-        found = {row["quantity"]: row for row in rows if row["name"] == name}
-        cells = (f"{found[column]['ours']:.4f}" if column in found else "" for column in columns)
-        worst = max(abs(row["difference"] / row["reference"]) for row in found.values())
+        quantities = {row["quantity"]: row for row in rows if row["name"] == name}
+        cells = (f"{quantities[column]['ours']:.4f}" if column in quantities else "" for column in columns)
+        worst = max(abs(row["difference"] / row["reference"]) for row in quantities.values())
         lines.append((name, *cells, f"{worst:.0e}"))
     independent = [row for row in rows if row["reference"] is not None and "order of the step" not in row["name"]]
     headings = ("published gain", "slip", "settled [s]", "time [s]", "distance [m]", "off by")
@@ -284,23 +284,23 @@ def compact(summary: Table) -> Digest:
 def _design_section(runs: Mapping[str, Run], filtered: Run) -> tuple[list[JsonObject], JsonObject, JsonObject]:
     """Return rows, figures and summary entries of section 4; only a note if its solver is not installed."""
     try:
-        found = lmi_design.Designed()
+        designed = lmi_design.Designed()
     except ModuleNotFoundError as error:
         return [], {}, {"notes": [f"Section 4, the design, is left out: {error}"], "design": None, "judged": []}
     shown = {"published": runs[CASES[0].name], **{case.name: runs[case.name] for case in GAIN_CASES}}
     shown["published, reference filtered"] = filtered
-    gains = {weights: answer.gain[0] for weights, answer in found.designs.items()}
-    judged = lmi_claims.judge_lmi_claims(found.system, gains)
-    more = {"notes": lmi_design.NOTES, "design": lmi_design.design_summary(found), "judged": judged}
-    return lmi_design.table(found, runs), lmi_design.figures(found, shown), more
+    gains = {weights: answer.gain[0] for weights, answer in designed.designs.items()}
+    judged = lmi_claims.judge_lmi_claims(designed.system, gains)
+    more = {"notes": lmi_design.NOTES, "design": lmi_design.design_summary(designed), "judged": judged}
+    return lmi_design.table(designed, runs), lmi_design.figures(designed, shown), more
 
 
 def _torque_limits(runs: Mapping[str, Trajectory]) -> Any:
     figure, (top, bottom) = plot.sheet(2, 1, title="What torque limits do: windup", size=(6.8, 2.7), sharex=True)
     plot.draw_slip_lines(top, runs)
     plot.label_axes(top, "", "slip [1]")
-    for i, (name, seen) in enumerate(runs.items()):
-        bottom.plot(seen.sample.t, seen.sample.control, plot.DASHES[i], color=plot.COLOURS[i], label=name)
+    for i, (name, trajectory) in enumerate(runs.items()):
+        bottom.plot(trajectory.sample.t, trajectory.sample.control, plot.DASHES[i], color=plot.COLOURS[i], label=name)
     plot.label_axes(bottom, "time [s]", "brake torque [N m]", legend=False)
     bottom.set_xlim(0, 0.5)
     return figure
