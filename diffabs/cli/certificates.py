@@ -50,7 +50,7 @@ class ProofTask(NamedTuple):
     """A scenario reduced to linear systems, with the gain to certify.
 
     Attributes:
-        chosen: Scenario.
+        scenario: Scenario.
         reduced: Linear loop of the scenario, with the gain of its controller.
         gain: Gain to certify, one number per state.
         model: Linear model with one gain; the paths of the box are its parameters.

@@ -244,7 +244,7 @@ class InterruptibleEnd:
     """
 
     def __init__(self, step: str, nothing: Callable[[], bool] = lambda: False):
-        """Store `step`, the step to finish, for messages, and `nothing`, which is true while there is no result."""
+        """Store the `step` to finish, for messages, and `nothing`, which is true while there is no result."""
         self.step, self.nothing, self.is_requested = step, nothing, False
 
     def __call__(self) -> bool:

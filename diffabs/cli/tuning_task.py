@@ -26,7 +26,7 @@ class Work(NamedTuple):
     """The task of a tuning.
 
     Attributes:
-        chosen: Scenario.
+        scenario: Scenario.
         batch: Runs.
         constraints: Constraints by name.
         task: Linear systems for a decay rate or damping; None without these constraints.

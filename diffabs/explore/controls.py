@@ -82,7 +82,7 @@ class Controls:
             self.refused[key] = partial(self.show, key)
 
     def fan(self, fan: Fan | None) -> None:
-        """Show the number of members of the fan `fan`, and the parameters that differ between them."""
+        """Show the number of members of the fan, and the parameters that differ between them."""
         if fan is None:
             self.fan_note.set_text("no fan: nothing differs between its runs")
             return
@@ -127,7 +127,7 @@ class Controls:
             more.on_value_change(open_rest)
 
     def _chooser(self, name: str, choices: Any, value: str, load: Callable[[str], Basis]) -> None:
-        """Add a list of choices, `choices`; `load` loads a chosen one."""
+        """Add a list of `choices`; `load` loads the part of a choice."""
         field = (
             ui.select(choices, value=value, label=name).classes("w-full chooser").props("dense outlined options-dense")
         )

@@ -58,7 +58,7 @@ class Knob:
         return self.path if self.place is None else f"{self.path}.{self.place}"
 
     def read(self, value: PyTree) -> float:
-        """Return a typed or dragged value, `value` in the displayed unit, in SI."""
+        """Return a typed or dragged `value`, in the displayed unit, in SI."""
         if isinstance(value, str):
             try:
                 value = read_decimal(value)

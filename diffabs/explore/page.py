@@ -111,7 +111,7 @@ class Page:
         self.server.call_soon_threadsafe(do)
 
     def pin(self, run: Curves | None) -> None:
-        """Show the run `run` as the dashed curve to compare with; None removes it."""
+        """Show `run` as the dashed curve to compare with; None removes it."""
         if self.chart is not None:
             change = charts.change_curves(run, "before") if run else charts.clear_curves("before")
             self.chart.change(change)

@@ -22,7 +22,7 @@ class ProvedBox(NamedTuple):
     Attributes:
         name: Name of the file, for the page.
         content: Box, cells and bounds.
-        chosen: Scenario of the file.
+        scenario: Scenario of the file.
     """
 
     name: str

@@ -62,7 +62,7 @@ class ResultsPanel:
         self.numbers.props("data-id=metrics")
 
     def begin(self, scenario: Scenario) -> None:
-        """Prepare the panel for another scenario, `scenario`."""
+        """Prepare the panel for another scenario."""
         self.units = {name: unit_of(objective, scenario.loop.plant) for name, objective in scenario.objectives.items()}
         self.verdict_box.classes(replace="verdict stale")
         control = charts.QUANTITIES.get(scenario.loop.plant.control_unit, "control")
@@ -86,7 +86,7 @@ class ResultsPanel:
         self.verdict_box.classes(add="stale")
 
     def metrics(self, values: dict[str, float], *, fresh: bool) -> None:
-        """Show the metrics `values`; `fresh` says that they belong to the current numbers."""
+        """Show the metrics; `fresh` says that they belong to the current numbers."""
         self.measuring.set_visibility(not fresh)
         for name, value in values.items():
             self.cells[name].set_text(format_reading(value))
@@ -108,14 +108,14 @@ class ResultsPanel:
         self.loop.set_text("" if loop is None else "stable" if loop.stable else "NOT STABLE")
 
     def verdict(self, verdict: ProofVerdict) -> None:
-        """Show the verdict `verdict` of the proof."""
+        """Show the verdict of the proof."""
         self.proving.set_visibility(False)
         self.verdict_box.classes(replace=f"verdict {verdict.word}")
         self.word.set_text(HEADS.get(verdict.word, "no verdict"))
         self.why.set_text(verdict.sentence)
 
     def proved_box(self, verdict: ProofVerdict) -> None:
-        """Show the verdict `verdict` of a proof's file on the current values."""
+        """Show the verdict of a proof's file on the current values."""
         self.box_verdict.set_visibility(True)
         self.box_verdict.classes(replace=f"verdict {verdict.word}")
         self.box_word.set_text("proved for the box" if verdict.word == CERTIFIED else "no proof for these values")

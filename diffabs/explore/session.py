@@ -140,7 +140,7 @@ class Session:
         return [key for key, value in before.items() if value != self.value(key)]
 
     def widen(self, name: str, percent: PyTree) -> None:
-        """Set the spread of the fan's members in `name` ("mass" or "road") to a value `percent` in percent."""
+        """Set the spread of the fan's members in `name` ("mass" or "road") in percent."""
         try:
             value = read_decimal(percent) if isinstance(percent, str) else float(percent)
         except (TypeError, ValueError):

@@ -38,7 +38,7 @@ class SweepView:
     """The rows, metrics and variables of a sweep that its figures show.
 
     Attributes:
-        found: Results of the sweep.
+        results: Results of the sweep.
         units: Units by the name of a column.
         bounds: Bounds of a failure by metric.
         design: Type of the sampling design.
@@ -83,7 +83,7 @@ class SweepView:
         return f"{name} [{unit}]" if unit else name
 
     def title(self, statement: str, count: Scalar) -> str:
-        """Return a title: name of the scenario, the words `statement`, and the number of runs `count`.
+        """Return a title: name of the scenario, the words of `statement`, and the number of runs `count`.
 
         The numbers of diverged and refused runs follow in brackets.
         """
