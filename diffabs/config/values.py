@@ -73,9 +73,8 @@ def _find_near_name(name: str, names: list[str]) -> str | None:
     words = name.split(".")
     for path in names:
         remaining = iter(path.split("."))
-        if len(words) > 1 and all(
-            word in remaining for word in words
-        ):  # `in` moves `remaining` on: the words in this order
+        # `in` moves `remaining` on, so the words are in this order.
+        if len(words) > 1 and all(word in remaining for word in words):
             return path
     # Paths to the fields of one part begin alike. Only their last words show whether one is meant.
     last = difflib.SequenceMatcher(b=words[-1].lower())
