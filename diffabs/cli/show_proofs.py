@@ -29,11 +29,7 @@ def show_box_proof(result: JsonObject, scenario: Scenario) -> None:
 
 
 def describe_box(box: Mapping[str, Sequence[float]], scenario: Scenario, digits: int = 6) -> str:
-    """Return a box in words, in SI units.
-
-    Args:
-        digits: Significant digits.
-    """
+    """Return a box in words, in SI units."""
     specs = parameters_of(scenario.loop)
     units = {path: "" if specs[path][0].unit == "1" else f" {specs[path][0].unit}" for path in box}
     return ", ".join(f"{path} {low:.{digits}g} to {high:.{digits}g}{units[path]}" for path, (low, high) in box.items())

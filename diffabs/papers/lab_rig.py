@@ -376,9 +376,6 @@ def fit_step(curves: StepCurves, rig: LabRig) -> Identified:
 def compare_steps(rig: LabRig, loaded: LabRig) -> list[JsonObject]:
     """Return how far the mask's and the identified rigs are from the three step-braking curves.
 
-    Args:
-        loaded: Rig with the mask's friction and another load, of `fit_load`.
-
     Returns:
         For each command: `measured`, with the `fall_time` [s]; `mask`, `identified` and `mask_friction` (the loaded
         rig), from `match_step`. `fitted` is the same for a fit of `rig` to each curve alone, with `friction` [1],

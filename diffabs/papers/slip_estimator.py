@@ -140,11 +140,7 @@ def table(runs: Mapping[str, Run]) -> list[JsonObject]:
 
 
 def worst_difference(rows: list[JsonObject], quantity: str) -> float:
-    """Return the largest absolute difference from a published number, in the unit of the quantity.
-
-    Args:
-        quantity: Quantity of the rows that count.
-    """
+    """Return the largest absolute difference from a published number, in the unit of the quantity."""
     return max(abs(row["difference"]) for row in rows if row["quantity"] == quantity)
 
 

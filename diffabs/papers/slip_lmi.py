@@ -146,9 +146,6 @@ def run_filtered() -> Run:
 def convergence_errors(finer_runs: Mapping[str, Run]) -> Errors:
     """Return the relative errors against finer runs, as {case: {quantity: errors}} with one error for each of
     `HALVINGS`.
-
-    Args:
-        finer_runs: Runs at a finer step, by name.
     """
     lanes = stack_loops([loop(case) for case in CONVERGENCE])
     solvers = [FixedStep(step=step, duration=step * HALVING_STEPS) for step in HALVINGS]

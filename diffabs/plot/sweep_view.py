@@ -148,9 +148,6 @@ def cell_means(variable: AxisVariable, result: np.ndarray) -> np.ndarray:
 
     The variance of these means measures influence. Unlike a correlation, it shows a result that is worst in the middle
     of a range. It also shows the influence of a variable with names.
-
-    Args:
-        result: Result of each run, shape (runs,).
     """
     place = assign_cells(variable)[0]
     return (np.bincount(place, result) / np.maximum(np.bincount(place), 1))[place]

@@ -27,11 +27,7 @@ SETTLED_MULTIPLE = 1.5  # length of the time axis, in transients
 def draw_tuning(
     points: Sequence[PyTree], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
 ) -> Figure:
-    """Return the figure of `diffabs tune`: convergence above, the runs before and after below.
-
-    Args:
-        lane: Description of this run, the worst of the batch.
-    """
+    """Return the figure of `diffabs tune`: convergence above, the runs before and after below."""
     figure, (objective, gradient, slip, torque) = sheet(2, 2, title=title, size=(5.8, 3.1))
     _objective(objective, points)
     _gradient(gradient, points)
