@@ -17,6 +17,7 @@ import os
 import pathlib
 import time
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +31,8 @@ from diffabs import controllers, objectives, plants, references, stops
 from diffabs.scenario import load
 from diffabs.scenario.defaults import braking
 
+# Of a function of shared numbers.
+READINGS = {"value": lambda f: f, "forward": jax.jacfwd, "reverse": jax.value_and_grad}
 SETTINGS = {"diffabs": 1e-5, "diffrax": 1e-6, "scan": 2e-4}  # tolerances, and a step [s]: errors below 1e-4
 
 
@@ -75,13 +78,17 @@ def optax_case(runs):
     return loss, jnp.log(jnp.array([11753.0, 48.0, 0.03])), None, by_kernel
 
 
-def brake_case(side, runs, setting):
-    """Return the distances of the peers' problem, (runs,), as a function of two shared factors, by one side."""
+def brake_case(side, runs, setting, reading="value"):
+    """Return the distances of the peers' problem, (runs,), as a function of two shared factors, by one side.
+
+    diffrax needs to know the `reading`: its loop has one mode of derivatives at a time.
+    """
     masses, speeds = (jnp.asarray(x, jnp.result_type(float)) for x in problem.lanes(runs))
     if side == "scan":
         return lambda factors: jax_scan.scanned(masses * factors[0], speeds * factors[1], setting)[1]
     if side == "diffrax":
-        one = jax.vmap(lambda m, v: diffrax_event.one(m, v, setting)[1])
+        adjoint = diffrax.ForwardMode() if reading == "forward" else diffrax.RecursiveCheckpointAdjoint()
+        one = jax.vmap(lambda m, v: diffrax_event.one(m, v, setting, adjoint=adjoint)[1])
         return lambda factors: one(masses * factors[0], speeds * factors[1])
     rig = braking(
         plant=plants.MirroredRig(),
@@ -114,11 +121,6 @@ def processor_time(call):
     return time.process_time() - begun
 
 
-def readings(function):
-    """Return the three ways to read a function of shared numbers."""
-    return {"value": function, "forward": jax.jacfwd(function), "reverse": jax.value_and_grad(function)}
-
-
 def main() -> None:
     """Measure, print tables, and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -134,9 +136,9 @@ def main() -> None:
     for name, case in (("readme", readme_case), ("optax", optax_case)):
         mean, x, runs, by_kernel = case(options.runs)
         for engine in options.engines:
-            for reading, function in readings(mean).items():
+            for reading, differentiate in READINGS.items():
                 key = f"{name}, {reading}, {engine}"
-                calls[key], starts[key] = compile_call(function, x, engine)
+                calls[key], starts[key] = compile_call(differentiate(mean), x, engine)
                 values[key] = np.ravel(jax.tree.leaves(calls[key]())[-1]).astype(float).tolist()
             if runs:
                 calls[f"{name}, all metrics, {engine}"], _ = compile_call(lambda _, runs=runs: runs(), x, engine)
@@ -148,9 +150,11 @@ def main() -> None:
     for side in options.sides:
         distances, x = brake_case(side, options.runs, SETTINGS[side]), jnp.ones(2)
         errors[side] = float(np.max(np.abs(np.asarray(jax.jit(distances)(x)) / exact - 1)))
-        for reading, function in readings(lambda x, distances=distances: jnp.mean(distances(x))).items():
+        for reading, differentiate in READINGS.items():
+            distances = brake_case(side, options.runs, SETTINGS[side], reading)
             key = f"brake, {reading}, {side}"
-            calls[key], starts[key] = compile_call(function, x, "auto")
+            mean = differentiate(lambda x, distances=distances: jnp.mean(distances(x)))
+            calls[key], starts[key] = compile_call(mean, x, "auto")
             values[key] = np.ravel(jax.tree.leaves(calls[key]())[-1]).astype(float).tolist()
     taken = record.in_turn({key: lambda call=call: processor_time(call) for key, call in calls.items()}, options.rounds)
     table = Table("call", "first [s]", "later [s]", "last numbers")

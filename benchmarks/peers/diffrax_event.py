@@ -17,8 +17,8 @@ BLOCK, SAVED, WINDOW = 64, 241, 0.12  # [s], in which every lane has its greates
 MOST_STEPS = 100_000
 
 
-def one(mass, speed, tolerance):
-    """The four numbers of one lane."""
+def one(mass, speed, tolerance, **settings):
+    """The four numbers of one lane. Further settings are diffeqsolve's."""
     hold = holding(mass)
     root = 1e-9 if mass.dtype == jnp.float64 else 1e-5
     at_end = diffrax.SubSaveAt(t1=True)
@@ -37,6 +37,7 @@ def one(mass, speed, tolerance):
         event=diffrax.Event(lambda t, y, args, **_: R2 * y[0] - STOP, optimistix.Newton(rtol=root, atol=root)),
         max_steps=MOST_STEPS,
         throw=False,
+        **settings,
     )
     y, values = jax.tree.map(lambda x: x[-1], run.ys[0]), run.ys[1]
     i = jnp.clip(jnp.argmax(values), 1, SAVED - 2)
