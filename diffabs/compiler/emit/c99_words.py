@@ -55,6 +55,7 @@ class Words:
             yield f"{indent}const {self.type(node)} {self.name(node)} = {self._expression(node)};"
 
     def type(self, node: Node) -> str:
+        """Return the C type of a number."""
         return self.real if is_real(node.dtype) else C_TYPES[node.dtype.name]
 
     def name(self, node: Node) -> str:
