@@ -160,7 +160,18 @@ def run_differentiable(capacity: RunCapacity, run: PyTree) -> PyTree:
     """Return the run of (loop, objectives, method, key), as `capacity.finish` makes it of the last carry."""
     loop, objectives, method, key = run
     _, instants, every, finish = capacity
-    return _run(loop, objectives, method, key, jax.device_put(every), instants=instants, finish=finish)
+    return _vary_together(_run(loop, objectives, method, key, jax.device_put(every), instants=instants, finish=finish))
+
+
+def _vary_together(run: PyTree) -> PyTree:
+    """Return the run, all of whose results have the axis of `jax.vmap` if one has it.
+
+    Under `jax.vmap` JAX takes the axes of a custom derivative's results from the values' run where it stages them, and
+    from the derivative's run where it differentiates. A constant signal of a trajectory has it only there.
+    """
+    if getattr(run, "trajectory", None) is None:
+        return run
+    return jax.tree.map(lambda x: jnp.where(run.diverged, x, x), run)
 
 
 def _rule(capacity: RunCapacity, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
@@ -169,7 +180,7 @@ def _rule(capacity: RunCapacity, primals: PyTree, tangents: PyTree) -> tuple[PyT
     paths = differentiated_paths(tangents[0][0])
 
     def reversible(run: PyTree) -> Run:
-        return _run_reversible(prepare_derivatives(run[0], paths), *run[1:], capacity=capacity)
+        return _vary_together(_run_reversible(prepare_derivatives(run[0], paths), *run[1:], capacity=capacity))
 
     return jvp_nonzero(reversible, primals, tangents, once=_second_derivative_objection(loop, method))
 
