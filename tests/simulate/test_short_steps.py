@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from marks import cases
 from mutants import killed_by
+from shown_state import ShownState
 
 import diffabs as d
 from diffabs import controllers, objectives, references, stops
@@ -89,7 +90,7 @@ class CoastStart:
 
 
 @pytree
-class Coast:
+class Coast(ShownState):
     """`coast` as a plant: no control moves it."""
 
     brake: Any = param(default=9.81, unit="m/s^2", above=0.0)
@@ -100,15 +101,6 @@ class Coast:
 
     def derivative(self, t, state, control):
         return CoastOutput(1 / state.speed + 0.0 * control, -self.brake)
-
-    def project(self, state):
-        return state
-
-    def output(self, state):
-        return state
-
-    def holding(self, output, target):
-        return 0.0 * target
 
 
 @pytest.mark.slow
@@ -140,7 +132,7 @@ class WakingOutput(NamedTuple):
 
 
 @pytree
-class Waking:
+class Waking(ShownState):
     """A speed 1 - t, and heat that is exactly zero until the speed is below `wakes`, with a kink or a jump."""
 
     wakes: Any = param(default=0.5, unit="m/s", above=0.0)
@@ -154,15 +146,6 @@ class Waking:
     def derivative(self, t, state, control):
         below = self.wakes - state.speed
         return WakingOutput(jnp.where(below > 0, self.slope * below + self.jump, 0.0) + 0.0 * control, -1.0)
-
-    def project(self, state):
-        return state
-
-    def output(self, state):
-        return state
-
-    def holding(self, output, target):
-        return 0.0 * target
 
 
 @killed_by("simulate/step/adaptive.py", "jnp.where(starts & (before == 0), jnp.inf, now)", "now")

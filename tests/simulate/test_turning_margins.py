@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from marks import cases
 from mutants import killed_by
+from shown_state import ShownState
 
 import diffabs as d
 from diffabs.actuators import Lag
@@ -37,7 +38,7 @@ class Start:
 
 
 @pytree
-class Swing:
+class Swing(ShownState):
     """A mass of 1 kg on a spring: v = 4 cos(sqrt(k) t)."""
 
     stiffness: float = param(default=1.0, unit="N/m")
@@ -48,15 +49,6 @@ class Swing:
 
     def derivative(self, t, state, control):
         return Motion(control - self.stiffness * state.x, state.v)
-
-    def project(self, state):
-        return state
-
-    def output(self, state):
-        return state
-
-    def holding(self, output, target):
-        return 0.0 * target
 
 
 @pytree

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
+from shown_state import ShownState
 
 import diffabs as d
 from diffabs.controllers import PID
@@ -21,15 +22,10 @@ class Shown(NamedTuple):
     units = MappingProxyType({"y": "1"})
 
 
-class Scalar:
+class Scalar(ShownState):
     """A plant with one state, which is its output."""
 
     shows, control_unit = Shown, "1"
-
-    def project(self, state):
-        return state
-
-    output = project
 
 
 @pytree
@@ -96,9 +92,6 @@ class Block(Scalar):
     def derivative(self, t, x, u):
         return Shown(u - self.Fc * jnp.where(x.y > 0, 1.0, jnp.where(x.y < 0, -1.0, 0.0)))
 
-    def holding(self, output, target):
-        return 0.0 * target
-
 
 class Pair(NamedTuple):
     y: Any
@@ -111,7 +104,7 @@ DRIFT = np.array([[0.0, 1.0], [-4.0, -0.4]])
 
 
 @pytree
-class Switched:
+class Switched(ShownState):
     """z' = A z + b + d1 sign(n1 z - c1) + d2 sign(n2 z - c2): an oscillator with two switches."""
 
     b: Any = param(default=np.zeros(2), unit="1")
@@ -124,19 +117,11 @@ class Switched:
     def start(self, initial):
         return Pair(1.0 + 0.0 * self.c[0], 0.3 + 0.0 * self.c[0])
 
-    def project(self, state):
-        return state
-
-    output = project
-
     def derivative(self, t, x, u):
         z = jnp.stack([x.y, x.w])
         sides = [jnp.where(self.n[i] @ z > self.c[i], 1.0, -1.0) for i in range(2)]
         rate = DRIFT @ z + self.b + self.d[0] * sides[0] + self.d[1] * sides[1]
         return Pair(rate[0] + 0.0 * u, rate[1])
-
-    def holding(self, output, target):
-        return 0.0 * target
 
 
 def draw_switched(rng):
