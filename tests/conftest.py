@@ -84,6 +84,17 @@ def _float64():
     assert jax.config.jax_enable_x64
 
 
+@pytest.fixture(autouse=True)
+def _handlers():
+    """A command in this process hears the signals itself; the test after it gets the handlers that pytest had."""
+    numbers = [number for name in ("SIGINT", "SIGTERM", "SIGHUP") if (number := getattr(signal, name, None))]
+    before = {number: signal.getsignal(number) for number in numbers}
+    yield
+    for number, handler in before.items():
+        if signal.getsignal(number) is not handler:
+            signal.signal(number, handler)
+
+
 @pytest.fixture(scope="module")
 def any_step_is_stable():
     """Loading a scenario without the seconds of the stability check, which has tests of its own."""

@@ -200,14 +200,7 @@ def test_what_fits(name):
         assert_fits(types.SimpleNamespace(raw=f"before\r\n{line}\r\n"))
 
 
-@pytest.fixture
-def signals():
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-def test_a_library_leaves_control_c_alone(signals):
+def test_a_library_leaves_control_c_alone():
     interrupt.end_early_on_interrupt()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -223,7 +216,7 @@ def test_a_library_leaves_control_c_alone(signals):
         pytest.param("mine/__main__.py", [interrupt.CHILD_FLAG], "default_int_handler", id="child of another program"),
     ],
 )
-def test_control_c_while_a_process_imports(program, words, answer, signals, monkeypatch):
+def test_control_c_while_a_process_imports(program, words, answer, monkeypatch):
     """The command ends; its children leave it to the command, which says once that it was interrupted."""
     monkeypatch.setattr(sys, "argv", [program])
     monkeypatch.setattr(sys, "orig_argv", ["python", program, *words])
@@ -231,14 +224,14 @@ def test_control_c_while_a_process_imports(program, words, answer, signals, monk
     assert answer in repr(signal.getsignal(signal.SIGINT))
 
 
-def test_what_is_to_be_ignored_stays_ignored(signals):
+def test_what_is_to_be_ignored_stays_ignored():
     """As a shell has it for what runs behind it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     interrupt.begin_hearing()
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
-def test_a_press_interrupts_where_work_is_waited_for(signals):
+def test_a_press_interrupts_where_work_is_waited_for():
     """Not where the signal finds the program, which may be anywhere."""
     interrupt.begin_hearing()
     signal.raise_signal(signal.SIGINT)
@@ -247,7 +240,7 @@ def test_a_press_interrupts_where_work_is_waited_for(signals):
     assert not interrupt.take_interrupt()
 
 
-def test_work_that_can_end_early_is_asked_first(signals, capsys):
+def test_work_that_can_end_early_is_asked_first(capsys):
     interrupt.begin_hearing()
     ending = console.InterruptibleEnd("this")
 
@@ -265,7 +258,7 @@ def test_work_that_can_end_early_is_asked_first(signals, capsys):
         console.run_with_progress(lambda: time.sleep(5), "working", ending=ending)
 
 
-def test_nothing_to_show_is_not_waited_for(signals):
+def test_nothing_to_show_is_not_waited_for():
     interrupt.begin_hearing()
     interrupt._press()
     with pytest.raises(KeyboardInterrupt):
