@@ -27,6 +27,7 @@ lint: $(VENV)/.lint $(VENV)/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --threads 2
 	$(BIN)/lint-imports
+	$(BIN)/zizmor --offline --no-progress .github
 
 # the site, in out/site; a warning or a dead link is an error
 docs: $(VENV)/.docs
@@ -72,8 +73,8 @@ BASE ?= main
 mutate-changes: $(VENV)/.mutate
 	$(BIN)/python tests/support/mutate_changes.py --base $(BASE)
 
-# the oldest and newest Python and JAX: VERSIONS="python3.11=0.10 ..."
-VERSIONS ?= python3.11=0.10 python3.12=0.11 python3.13=0.12
+# each Python and JAX: VERSIONS="python3.11=0.10 ..."; JAX `pre` is its newest pre-release
+VERSIONS ?= python3.11=0.10 python3.12=0.11 python3.13=0.12 python3.14=0.12
 versions:
 	$(PYTHON) tests/support/versions.py $(VERSIONS)
 

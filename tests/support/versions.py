@@ -1,10 +1,11 @@
 """Run tests under other versions of Python and JAX.
 
-    python tests/support/versions.py python3.11=0.10 python3.12=0.11 python3.13=0.12
+    python tests/support/versions.py python3.11=0.10 python3.12=0.11 python3.13=0.12 python3.14=pre
 
-Each pair gets a virtual environment of its own below --out, with the package, its extras and the tests' group. The fast
-tests run with the compiler flags that users have: how long XLA compiles a loop depends on its version. Prints a line
-for each pair; exits with 1 if one has failed.
+`pre` is JAX's newest pre-release, which may be newer than the package allows. Each pair gets a virtual environment of
+its own below --out, with the package, its extras and the tests' group. The fast tests run with the compiler flags that
+users have: how long XLA compiles a loop depends on its version. Prints a line for each pair; exits with 1 if one has
+failed.
 """
 
 import argparse
@@ -15,6 +16,8 @@ import sys
 
 from project import ROOT
 
+PRE_RELEASES = "https://us-python.pkg.dev/ml-oss-artifacts-published/jax/simple/"  # of JAX, built each night
+
 
 def environment(folder: pathlib.Path, python: str, jax: str) -> pathlib.Path:
     """The interpreter of a virtual environment with this JAX. Raises CalledProcessError."""
@@ -23,8 +26,11 @@ def environment(folder: pathlib.Path, python: str, jax: str) -> pathlib.Path:
         subprocess.run([python, "-m", "venv", folder], check=True)
     pip = [interpreter, "-m", "pip", "install", "--quiet"]
     subprocess.run([*pip, "--upgrade", "pip>=25.1"], check=True, cwd=ROOT)
-    subprocess.run([*pip, f"jax=={jax}.*", "--editable", ".[all]"], check=True, cwd=ROOT)
+    release = [] if jax == "pre" else [f"jax=={jax}.*"]
+    subprocess.run([*pip, *release, "--editable", ".[all]"], check=True, cwd=ROOT)
     subprocess.run([*pip, "--group", "test"], check=True, cwd=ROOT)
+    if jax == "pre":  # last, and apart from the package, whose limit would exclude it
+        subprocess.run([*pip, "--pre", "--upgrade", "--extra-index-url", PRE_RELEASES, "jax", "jaxlib"], check=True)
     return interpreter
 
 
@@ -37,7 +43,7 @@ def main() -> int:
     options = parser.parse_args()
     pairs = [tuple(pair.rpartition("=")[::2]) for pair in options.pairs]
     if not all(python and jax for python, jax in pairs):
-        parser.error("a pair is PYTHON=JAX, as in python3.13=0.12")
+        parser.error("a pair is PYTHON=JAX, as in python3.13=0.12 or python3.14=pre")
     failed = 0
     for python, jax in pairs:
         folder = options.out.absolute() / f"{pathlib.Path(python).name}-jax-{jax}"
