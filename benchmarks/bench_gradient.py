@@ -43,7 +43,7 @@ LMI = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=50 / 3.6),
     stop=stops.SpeedReached(speed=5 / 3.6),
-    controller=controllers.StateFeedback(torque_min=0.0, torque_max=9.03),
+    controller=controllers.StateFeedback(low=0.0, high=9.03),
     feedforward=controllers.HoldingInput(),
 )
 EST = braking(
@@ -59,7 +59,7 @@ CASES = {
         LMI,
         (5.3, 6.2),
         1.7,
-        ("controller.gain", "reference.slip", "controller.torque_max", "plant.road.w4", "plant.road.w1")
+        ("controller.gain", "reference.slip", "controller.high", "plant.road.w4", "plant.road.w1")
         + ("plant.wheel_inertia", "initial.speed"),
     ),
     "est": (EST, (14.0, 16.0), 3.4, EST_PARAMETERS),

@@ -92,7 +92,7 @@ def brake_case(side, runs, setting, reading="value"):
         return lambda factors: one(masses * factors[0], speeds * factors[1])
     rig = braking(
         plant=plants.MirroredRig(),
-        controller=controllers.StateFeedback(gain=(problem.K1, problem.K2), torque_min=0.0, torque_max=problem.U),
+        controller=controllers.StateFeedback(gain=(problem.K1, problem.K2), low=0.0, high=problem.U),
         feedforward=controllers.HoldingInput(),
         stop=stops.SpeedReached(speed=problem.STOP),
     )

@@ -124,6 +124,6 @@ class _Computer:
         )
         k1, k2 = (speed / float(c.reference_speed) * float(k) for k in c.gain)
         raw = float(one.feedforward.value) + k1 * self.integral + k2 * (slip - self.target)
-        u = min(max(raw, float(c.torque_min)), float(c.torque_max))
+        u = min(max(raw, float(c.low)), float(c.high))
         self.integral += h * (slip - self.target + (u - raw) / (k1 * float(c.antiwindup.tracking_time)))
         return u

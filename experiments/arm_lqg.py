@@ -50,7 +50,7 @@ def observed(config: Config, noise: tuple[float, float]) -> Loop:
     """The hanging arm under LQG."""
     loop = load("arm-hanging").loop
     known = tuple(max(x, config.least_noise) for x in noise)
-    limit = float(loop.actuator.voltage_max)
+    limit = float(loop.actuator.high)
     controller = lqg(
         loop.plant,
         WEIGHTS,
@@ -58,7 +58,7 @@ def observed(config: Config, noise: tuple[float, float]) -> Loop:
         period=config.period,
         disturbance=config.disturbance,
         noise=known,
-        voltage_max=limit,
+        predicted_high=limit,
     )
     sensor = AngleSensor(theta=noise[0], psi=noise[1], period=config.period)
     return dataclasses.replace(loop, controller=controller, sensor=sensor)

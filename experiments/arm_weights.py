@@ -80,7 +80,7 @@ def possible(config: Config) -> tuple[float, tuple[float, float]]:
     of |theta0/t + phi0/p| <= 1."""
     loop = load("arm-hanging").loop
     a, b = BalanceModel(plant=loop.plant).matrices()
-    limit, unit = float(loop.actuator.voltage_max), np.eye(6)
+    limit, unit = float(loop.actuator.high), np.eye(6)
     (theta,), (phi,) = (mode_bounds(a, b, unit[i], limit).values() for i in (0, 2))
     a, b = config.box / theta, config.box / phi
     beyond = max(a + b - 1, 0.0) ** 2 - max(abs(a - b) - 1, 0.0) ** 2  # two corners of the box, less what leaves it

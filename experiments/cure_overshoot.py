@@ -87,7 +87,7 @@ def holding(config: Config) -> float:
 def loop(config: Config, controller: Any, time_constant: float = 0.0, *, exact: bool = False) -> Loop:
     """The rig as it is. Time constant 0: no filter; `exact`: the holding torque of the true mass."""
     low, high = config.torque
-    controller = dataclasses.replace(controller, torque_min=low, torque_max=high)
+    controller = dataclasses.replace(controller, low=low, high=high)
     filtered = (
         FilteredSlip(slip=config.slip, time_constant=time_constant) if time_constant else FixedSlip(slip=config.slip)
     )

@@ -146,7 +146,7 @@ def lagged(config: Config, lag: float, low: float, high: float) -> Loop:
         initial=BrakeStart(speed=config.start_kmh / 3.6),
         reference=FixedSlip(),
         feedforward=HoldingInput(),
-        controller=StateFeedback(gain=np.array(config.gain), torque_min=low, torque_max=high),
+        controller=StateFeedback(gain=np.array(config.gain), low=low, high=high),
         actuator=Lag(time_constant=lag),
         stop=SpeedReached(speed=config.stop_kmh / 3.6),
     )

@@ -324,11 +324,11 @@ def torque_controllers() -> dict[str, dict[str, Any]]:
     return {
         "published gain": {
             "feedforward": holding, "reference": FixedSlip(),
-            "controller": StateFeedback(gain=np.array([-11753.0, -48.0]), torque_min=0.0, torque_max=9.03),
+            "controller": StateFeedback(gain=np.array([-11753.0, -48.0]), low=0.0, high=9.03),
         },
         "first cure": {
             "feedforward": holding, "reference": FilteredSlip(time_constant=0.01732),
-            "controller": ProportionalFeedback(gain=np.array([-17300.0, -348.6]), torque_min=0.0, torque_max=9.03),
+            "controller": ProportionalFeedback(gain=np.array([-17300.0, -348.6]), low=0.0, high=9.03),
         },
         "tuned for CVaR": {
             "feedforward": holding,
@@ -336,7 +336,7 @@ def torque_controllers() -> dict[str, dict[str, Any]]:
                 rate=value["reference.rate"], time_constant=value["reference.time_constant"], period=1e-3
             ),
             "controller": ProportionalFeedback(
-                gain=np.array(value["controller.controller.gain"]), torque_min=0.0, torque_max=9.03,
+                gain=np.array(value["controller.controller.gain"]), low=0.0, high=9.03,
                 antiwindup=BackCalculation(tracking_time=value["controller.controller.antiwindup.tracking_time"]),
             ),
         },
@@ -350,7 +350,7 @@ def as_command(parts: Mapping[str, Any]) -> dict[str, Any]:
         **parts,
         "feedforward": ConstantInput(value=(parts["feedforward"].value - offset) / slope),
         "controller": dataclasses.replace(
-            controller, gain=np.asarray(controller.gain) / slope, torque_min=0.0, torque_max=1.0
+            controller, gain=np.asarray(controller.gain) / slope, low=0.0, high=1.0
         ),
     }  # fmt: skip
 

@@ -113,7 +113,7 @@ def proved_tuning(config: Config) -> list[dict[str, float]]:
 def tube(config: Config) -> tuple[Any, Any]:
     """Return the proved tube of the slip on a grid of times, shape (times, 3), and the slips of runs at these times."""
     low, high = config.limits
-    loop = load("slip-lmi", [f"controller.torque_min={low}", f"controller.torque_max={high}"]).loop
+    loop = load("slip-lmi", [f"controller.low={low}", f"controller.high={high}"]).loop
     proof = prove_box(loop, {"plant.mass": config.mass}, signals=("slip",), horizon=3.0, budget=config.budget)
     if proof.verdict != "proved":
         raise SystemExit("the tube is not proved within the budget")

@@ -49,7 +49,7 @@ ASKED = {
 }
 FEEDBACK = [
     "error = slip_k - target_k; x_0 = 0",
-    "raw = ff + g (k1 x_k + k2 error), u_k = min(max(raw, torque_min), torque_max)",
+    "raw = ff + g (k1 x_k + k2 error), u_k = min(max(raw, low), high)",
     "x_(k+1) = x_k + h [error + (u_k - raw)/(g k1 tracking_time)]; without anti-windup x_k + h error",
 ]
 LAWS = {

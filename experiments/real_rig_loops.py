@@ -41,8 +41,8 @@ def loop(
     fixed: Fixed, controller: Any, speed: str, reference: Any = None, estimator: Any = None, *, smooth: bool = False
 ) -> Loop:
     """The rig around a controller that a computer runs; its delay is not located by an event (`SampledOnGrid`)."""
-    names = ("low", "high") if hasattr(controller, "low") else ("torque_min", "torque_max")
-    limited = dataclasses.replace(controller, **dict(zip(names, fixed.torque, strict=True)))
+    low, high = fixed.torque
+    limited = dataclasses.replace(controller, low=low, high=high)
     return braking(
         plant=MirroredRig(mass=NOMINAL["mass"]),
         initial=BrakeStart(speed=NOMINAL["speed"] / KMH),

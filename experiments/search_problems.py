@@ -90,7 +90,7 @@ def rig(config: Config) -> Loop:
     return braking(
         plant=MirroredRig(),
         initial=BrakeStart(speed=config.speeds[-1] / plot.KMH),
-        controller=StateFeedback(gain=np.array(config.gain), torque_min=0.0, torque_max=9.03),
+        controller=StateFeedback(gain=np.array(config.gain), low=0.0, high=9.03),
         feedforward=HoldingInput(),
         actuator=Lag(time_constant=config.lag),
         stop=SpeedReached(speed=config.last_speed / plot.KMH),
@@ -137,7 +137,7 @@ CAR_RANGES = {
 def scheduled(config: Config, speeds: np.ndarray) -> ScheduledFeedback:
     """A gain at each of these speeds, all alike."""
     integral, proportional = (np.full(len(speeds), k) for k in config.gain)
-    limits = {"torque_min": 0.0, "torque_max": 9.03}
+    limits = {"low": 0.0, "high": 9.03}
     return ScheduledFeedback(speeds=speeds, integral_gains=integral, gains=proportional, **limits)
 
 

@@ -117,8 +117,8 @@ def unlimited(one: Loop) -> Loop:
     """The same loop, its torque limits moved from the controller into the actuator, where they do the same (there is no
     anti-windup): what the controller asks for is then seen."""
     inner = one.controller.controller  # pyright: ignore[reportAttributeAccessIssue]
-    limits = Limits(low=inner.torque_min, high=inner.torque_max)
-    free = dataclasses.replace(inner, torque_min=-np.inf, torque_max=np.inf)
+    limits = Limits(low=inner.low, high=inner.high)
+    free = dataclasses.replace(inner, low=-np.inf, high=np.inf)
     controller = dataclasses.replace(one.controller, controller=free)  # pyright: ignore[reportArgumentType]
     return dataclasses.replace(one, controller=controller, actuator=Series(blocks=(limits, one.actuator)))
 

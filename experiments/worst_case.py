@@ -57,7 +57,7 @@ class Config:
 def loops() -> dict[str, Loop]:
     """The cure, and the published gain in its place."""
     cure = load("slip-cured").loop
-    feedback = StateFeedback(gain=np.array(lmi_design.PUBLISHED_GAIN), torque_min=0.0, torque_max=9.03)
+    feedback = StateFeedback(gain=np.array(lmi_design.PUBLISHED_GAIN), low=0.0, high=9.03)
     sampled = dataclasses.replace(cure.controller, controller=feedback)
     published = dataclasses.replace(cure, controller=sampled, reference=FixedSlip(slip=cure.reference.slip))
     return {"published gain": published, "the cure": cure}

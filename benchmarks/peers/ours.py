@@ -16,7 +16,7 @@ LOOP = braking(
     plant=plants.MirroredRig(),
     initial=diffabs.BrakeStart(speed=50 / 3.6),
     stop=stops.SpeedReached(speed=problem.STOP),
-    controller=controllers.StateFeedback(torque_min=0.0, torque_max=problem.U),
+    controller=controllers.StateFeedback(low=0.0, high=problem.U),
     feedforward=controllers.HoldingInput(),
 )
 KINDS = ("fixed", "adaptive")

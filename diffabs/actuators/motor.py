@@ -8,9 +8,9 @@ from diffabs.core.types import Scalar
 
 @pytree
 class VoltageLimit:
-    """control = clamp(command, -voltage_max, voltage_max)."""
+    """control = clamp(command, -high, high)."""
 
-    voltage_max: Scalar = param(default=48.0, unit="V", above=0.0)
+    high: Scalar = param(default=48.0, unit="V", above=0.0)
 
     start = no_memory
     flow = no_flow
@@ -18,8 +18,8 @@ class VoltageLimit:
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
         """Return the voltage at the motor [V]."""
         del t, memory
-        return clamp(signal, -self.voltage_max, self.voltage_max)
+        return clamp(signal, -self.high, self.high)
 
     def limits(self) -> tuple[Scalar, Scalar]:
         """Return the lower and the upper limit of the control."""
-        return -self.voltage_max, self.voltage_max
+        return -self.high, self.high

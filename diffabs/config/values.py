@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.pytree import ParameterSpec
+from diffabs.core.renamed import current_name
 from diffabs.core.types import Part, PyTree, Scalar
 
 FINITE_SPEC = ParameterSpec("1")
@@ -61,8 +62,10 @@ def format_given(value: Scalar, length: int = 60) -> str:
 
 
 def unknown_name_error(beginning: str, name: Any, names: Iterable[str]) -> ScenarioError:
-    """Return the error for an unknown name, with the nearest existing name."""
+    """Return the error for an unknown name, with its new name if it has one, else with the nearest existing name."""
     names = list(names)
+    if new := current_name(str(name), names):
+        return ScenarioError(f"{beginning}; it is now {new}")
     near = _find_near_name(str(name), names)
     hint = f"did you mean {near}? There is" if near else "there is"
     return ScenarioError(f"{beginning}; {hint} {', '.join(names) or 'nothing'}")

@@ -65,7 +65,7 @@ class ObserverMemory(NamedTuple):
 class ObserverFeedback:
     """u = K x^: a steady-state Kalman filter in discrete time estimates the state x^ from theta and psi.
 
-    The prediction uses the voltage clamped to +-voltage_max. The output itself has no limit. Without `Sampled`, the
+    The prediction uses the voltage clamped to +-predicted_high. The output itself has no limit. Without `Sampled`, the
     observer computes in every step of the integration, so A and B must be those of this step. The target and the
     feed-forward have no effect.
 
@@ -74,14 +74,14 @@ class ObserverFeedback:
         transition: A, shape (6, 6).
         entry: B, shape (6,) [rad/V, rad/(s V)].
         correction: L, shape (6, 2) [1, 1/s].
-        voltage_max: Limit of the voltage in the prediction [V], > 0.
+        predicted_high: Upper limit of the voltage in the prediction [V], > 0.
     """
 
     gain: Vector = param(default=DEFAULT_BALANCE_GAIN, unit="V/rad, V s/rad")
     transition: Matrix = param(default=np.eye(6), unit="1")
     entry: Vector = param(default=np.zeros(6), unit="rad/V, rad/(s V)")
     correction: Matrix = param(default=np.eye(6)[:, :2], unit="1, 1/s")
-    voltage_max: Scalar = param(default=np.inf, unit="V", above=0.0, infinite=True)
+    predicted_high: Scalar = param(default=np.inf, unit="V", above=0.0, infinite=True)
 
     every_step = True
     flow = no_flow
@@ -105,7 +105,7 @@ class ObserverFeedback:
         """
         now, number = clock.ticks()
         estimate: ObserverMemory = memory.held
-        voltage = clamp(estimate.voltage, -self.voltage_max, self.voltage_max)
+        voltage = clamp(estimate.voltage, -self.predicted_high, self.predicted_high)
         predicted = self.transition @ estimate.state + self.entry * voltage
         error = jnp.stack(
             [getattr(signal.measured, name) - predicted[STATE_NAMES.index(name)] for name in MEASURED_NAMES]

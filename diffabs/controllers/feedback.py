@@ -21,18 +21,18 @@ from diffabs.core.types import Part, Scalar, Vector
 
 @pytree
 class StateFeedback:
-    """u = clamp(ff + k1 x1 + k2 x2, torque_min, torque_max). The default gain is the paper's (section 4).
+    """u = clamp(ff + k1 x1 + k2 x2, low, high). The default gain is the paper's (section 4).
 
     Attributes:
         gain: (k1, k2), of the integral and of the slip error, shape (2,) [control/signal/s, control/signal].
-        torque_min: Lower limit of the control.
-        torque_max: Upper limit of the control.
+        low: Lower limit of the control.
+        high: Upper limit of the control.
         antiwindup: Anti-windup strategy of the integral.
     """
 
     gain: Vector = param(default=(-11753.0, -48.0), unit="control/signal/s, control/signal")
-    torque_min: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
-    torque_max: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
+    low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
     antiwindup: Part = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
@@ -55,12 +55,12 @@ class StateFeedback:
     def _torque(self, gain: Vector, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
         error = signal.measured[0] - signal.target
         raw = signal.feedforward + gain[0] * memory.flow + gain[1] * error
-        return raw, clamp(raw, self.torque_min, self.torque_max)
+        return raw, clamp(raw, self.low, self.high)
 
     def limits(self) -> tuple[Scalar, Scalar]:
         """Return the lower and the upper limit of the control."""
-        return self.torque_min, self.torque_max
+        return self.low, self.high
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rule torque_min <= torque_max."""
-        yield order_rule(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}")
+        """Yield the rule low <= high."""
+        yield order_rule(("low", self.low), ("high", self.high), "{control}")

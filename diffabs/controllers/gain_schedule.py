@@ -25,22 +25,22 @@ from diffabs.core.types import Part, Scalar, Vector
 
 @pytree
 class ScheduledFeedback:
-    """u = clamp(ff + k1(v) x1 + k2(v) x2, torque_min, torque_max), with gains at increasing speeds.
+    """u = clamp(ff + k1(v) x1 + k2(v) x2, low, high), with gains at increasing speeds.
 
     Attributes:
         speeds: Nodes v, increasing [m/s].
         integral_gains: k1 at the nodes [control/signal/s].
         gains: k2 at the nodes [control/signal].
-        torque_min: Lower limit of the control.
-        torque_max: Upper limit of the control.
+        low: Lower limit of the control.
+        high: Upper limit of the control.
         antiwindup: Anti-windup strategy of the integral.
     """
 
     speeds: Vector = param(default=(5 / 3.6, 50 / 3.6), unit="m/s", low=0.0, free=True)
     integral_gains: Vector = param(default=(-11753.0, -11753.0), unit="control/signal/s", free=True)
     gains: Vector = param(default=(-58.0, -158.0), unit="control/signal", free=True)
-    torque_min: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
-    torque_max: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
+    low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
     antiwindup: Part = part(default=NoAntiWindup)
 
     start, limits, flow, output = StateFeedback.start, StateFeedback.limits, StateFeedback.flow, StateFeedback.output
@@ -58,14 +58,14 @@ class ScheduledFeedback:
             yield f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes.values()))}; they need one"
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rules that the speeds increase and that torque_min <= torque_max."""
+        """Yield the rules that the speeds increase and that low <= high."""
         yield increase_rule("speeds", self.speeds, "do not increase", "m/s")
         yield from StateFeedback.rules(self)  # pyright: ignore[reportArgumentType]  # same fields of limits
 
 
 @pytree
 class ProportionalFeedback:
-    """u = clamp(ff + (v/v0) (k1 x1 + k2 x2), torque_min, torque_max): gains proportional to the measured speed.
+    """u = clamp(ff + (v/v0) (k1 x1 + k2 x2), low, high): gains proportional to the measured speed.
 
     At a frozen speed the gain from torque to slip of a braked wheel is proportional to 1/v, eq. (16) of Maeda and
     Sugiura. The factor v/v0 cancels this, so the loop is equally fast at every speed.
@@ -73,15 +73,15 @@ class ProportionalFeedback:
     Attributes:
         gain: (k1, k2) at v0 [control/signal/s, control/signal].
         reference_speed: v0 [m/s], > 0.
-        torque_min: Lower limit of the control.
-        torque_max: Upper limit of the control.
+        low: Lower limit of the control.
+        high: Upper limit of the control.
         antiwindup: Anti-windup strategy of the integral.
     """
 
     gain: Vector = param(default=(-11753.0, -158.0), unit="control/signal/s, control/signal")
     reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
-    torque_min: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
-    torque_max: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
+    low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
     antiwindup: Part = part(default=NoAntiWindup)
 
     start, limits, flow, output = StateFeedback.start, StateFeedback.limits, StateFeedback.flow, StateFeedback.output

@@ -29,20 +29,20 @@ class ConstantTorque:
 
 @pytree
 class Relay:
-    """torque_max until slip > target + band, then torque_min until slip < target - band.
+    """high until slip > target + band, then low until slip < target - band.
 
     An event locates each switch where the slip crosses the edge of the band, also between grid instants. The memory is
     1 while the brake is applied, else 0.
 
     Attributes:
         band: Half width of the hysteresis [signal], between 0 and 1.
-        torque_min: Control with the brake released.
-        torque_max: Control with the brake applied, > torque_min.
+        low: Control with the brake released.
+        high: Control with the brake applied, > low.
     """
 
     band: Scalar = param(default=0.02, unit="signal", above=0.0, below=1.0)
-    torque_min: Scalar = param(default=0.0, unit="control")
-    torque_max: Scalar = param(default=90.0, unit="control")
+    low: Scalar = param(default=0.0, unit="control")
+    high: Scalar = param(default=90.0, unit="control")
 
     flow = no_flow
 
@@ -54,7 +54,7 @@ class Relay:
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return the control, for a brake its torque [N m]."""
         del t, signal
-        return self.torque_min + memory.held * (self.torque_max - self.torque_min)
+        return self.low + memory.held * (self.high - self.low)
 
     def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: PyTree) -> tuple[PyTree]:
         """Return the signed distance to the switching edge, in the signal's unit: positive before the edge, negative
@@ -72,8 +72,8 @@ class Relay:
         return Memory(held=jnp.where(fired[0], 1.0 - memory.held, memory.held))
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rule torque_min < torque_max."""
-        yield order_rule(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}", equal=False)
+        """Yield the rule low < high."""
+        yield order_rule(("low", self.low), ("high", self.high), "{control}", equal=False)
 
 
 @pytree

@@ -20,7 +20,7 @@ analysis of limit cycles in hybrid anti-lock braking systems, Int. J. Control 82
 
     u' = growth u  for slip < slip_low,   u' = -decay u  for slip > slip_high,   else u' = 0
 
-At torque_max the growth stops. Inside a `sampled` controller of period T, one sample multiplies u by 1 + growth T or by
+At high the growth stops. Inside a `sampled` controller of period T, one sample multiplies u by 1 + growth T or by
 1 - decay T. Both must be positive: decay T < 1. The usual programs with this rule do so.
 """
 
@@ -115,7 +115,7 @@ class BandLogic:
         growth: Relative rate of the torque below the band [1/s].
         decay: Relative rate of its fall above the band [1/s].
         torque: Torque at the start [control].
-        torque_max: Upper limit of the control.
+        high: Upper limit of the control.
     """
 
     slip_low: Scalar = param(default=0.145, unit="signal", above=0.0)
@@ -123,30 +123,30 @@ class BandLogic:
     growth: Scalar = param(default=0.5, unit="1/s", above=0.0)
     decay: Scalar = param(default=1.2, unit="1/s", above=0.0)
     torque: Scalar = param(default=800.0, unit="control", above=0.0)
-    torque_max: Scalar = param(default=1e5, unit="control", above=0.0)
+    high: Scalar = param(default=1e5, unit="control", above=0.0)
 
     jumps = True
 
     def start(self, signal: Tracking) -> Memory:
-        """Return the torque at the start, at most `torque_max`."""
-        return Memory(flow=smaller(self.torque, self.torque_max) + 0.0 * signal.measured[0])
+        """Return the torque at the start, at most `high`."""
+        return Memory(flow=smaller(self.torque, self.high) + 0.0 * signal.measured[0])
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the rate of the torque [control/s]: no growth at `torque_max`, from which it thus falls at once."""
+        """Return the rate of the torque [control/s]: no growth at `high`, from which it thus falls at once."""
         del t
         slip = signal.measured[0]
         above = jnp.where(slip > self.slip_high, -self.decay, 0.0)
-        grows = (slip < self.slip_low) & (memory.flow < self.torque_max)
+        grows = (slip < self.slip_low) & (memory.flow < self.high)
         return memory.flow * jnp.where(grows, self.growth, above)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return the torque [N m]."""
         del t, signal
-        return clamp(memory.flow, 0.0, self.torque_max)
+        return clamp(memory.flow, 0.0, self.high)
 
     def limits(self) -> tuple[Scalar, Scalar]:
         """Return the lower and the upper limit of the control."""
-        return 0.0 * self.torque_max, self.torque_max
+        return 0.0 * self.high, self.high
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rule slip_low < slip_high."""

@@ -24,6 +24,7 @@ from jax.typing import ArrayLike
 from diffabs.core import kinds
 from diffabs.core.arrays import as_array, as_rule_array
 from diffabs.core.compiling import is_traced
+from diffabs.core.renamed import RENAMED, current_name, refuse_old_names
 from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.core.units import Units, resolve_unit, units_inside, units_of
 
@@ -152,6 +153,8 @@ def pytree(cls: type[T]) -> type[T]:
     unknown = [f.name for f in fields if not {"spec", "part", "static"} & set(f.metadata)]
     if unknown:
         raise TypeError(f"{cls.__name__}: declare {', '.join(unknown)} with param, part or static")
+    if cls.__name__ in RENAMED:
+        new.__init__ = refuse_old_names(new.__init__)
     meta = [f.name for f in fields if "static" in f.metadata]
     _register(new, [f.name for f in fields if f.name not in meta], meta)
     return new
@@ -238,7 +241,9 @@ def get(part: Part, path: str) -> PyTree:
     for i, name in enumerate(words):
         names = _names(part, "".join(f"{word}." for word in words[:i]))
         if name not in names:
-            raise KeyError(f"no '{name}' in {path}; there is {', '.join(names) or 'nothing'}")
+            new = current_name(name, names)
+            hint = f"it is now {new}" if new else f"there is {', '.join(names) or 'nothing'}"
+            raise KeyError(f"no '{name}' in {path}; {hint}")
         part = getattr(part, name) if dataclasses.is_dataclass(part) else part[int(name)]
     return part
 

@@ -110,7 +110,7 @@ def _build_closed_loops(loop: Loop, values: Params) -> _ClosedLoops:
         a, b = jax.device_get(jax.vmap(lambda plant: BalanceModel(plant=plant).matrices())(many.plant))
         many = jax.tree.map(np.asarray, jax.device_get(many))
     gain = many.controller.gain
-    limit = many.actuator.voltage_max if isinstance(loop.actuator, VoltageLimit) else np.full(len(a), np.inf)
+    limit = many.actuator.high if isinstance(loop.actuator, VoltageLimit) else np.full(len(a), np.inf)
     voltage = (gain / limit[:, None])[:, None]
     # Each limit is a row with |row x| <= 1: voltage, fall angle, and the plant's own limits of its motor.
     lean = (np.eye(6)[:1] / many.stop.angle[:, None])[:, None]

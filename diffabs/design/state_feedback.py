@@ -109,7 +109,7 @@ def reduce_balance_loop(loop: Loop) -> ReducedLoop:
         "What lies between the points of the grid: a balance is rational in its masses, its hull covers no box.",
     ]
     if isinstance(loop.actuator, VoltageLimit):
-        neglected.append(f"The voltage limit of {float(loop.actuator.voltage_max):g} V.")
+        neglected.append(f"The voltage limit of {float(loop.actuator.high):g} V.")
     if not exact:
         neglected.append(f"The sensor ({type(loop.sensor).__name__}).")
     return ReducedLoop(model, np.asarray(controller.gain, float), exact, tuple(neglected))

@@ -22,7 +22,7 @@ SLIDER_RATIO = 2.0  # a number without a range in the scenario can be dragged to
 NARROW_RATIO = 1.25  # a slider with a range also covers the value times and over this factor
 SPEED_FIELDS = ("speed", "reference_speed")  # fields of a vehicle that are shown in km/h
 FILTERS = ("time_constant", "cutoff")  # parameters of filters, shown at once
-LIMITS = ("torque_min", "torque_max", "low", "high", "reference_speed", "period")  # of controllers: rarely dragged
+LIMITS = ("low", "high", "reference_speed", "period")  # of controllers: rarely dragged
 MOST_FIRST = 14  # number of sliders that are shown at once
 
 

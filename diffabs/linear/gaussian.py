@@ -17,6 +17,7 @@ from diffabs.controllers import ObserverFeedback, Sampled
 from diffabs.controllers.balance import MEASURED_NAMES, STATE_NAMES
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
+from diffabs.core.renamed import refuse_old_names
 from diffabs.core.types import AnyArray, Bool, Part
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.lyapunov import as_float_arrays
@@ -71,6 +72,7 @@ def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
 
 
 @default_flags()
+@refuse_old_names
 def lqg(
     plant: Plant,
     Q: AnyArray,
@@ -79,7 +81,7 @@ def lqg(
     period: float = 0.01,
     disturbance: Part = (1.0, 1.0, 1.0),
     noise: Any = (1e-3, 1e-3),
-    voltage_max: float = np.inf,
+    predicted_high: float = np.inf,
 ) -> Sampled:
     """Return a sampled LQG controller for a balancing plant, which measures only theta and psi.
 
@@ -95,7 +97,7 @@ def lqg(
         disturbance: Standard deviations of unknown accelerations of theta, psi, phi [rad/s^2], constant over a period.
             With larger values the filter trusts its prediction less.
         noise: Standard deviations of the measured angles theta and psi [rad].
-        voltage_max: Limit of the voltage in the filter's prediction [V]. The command itself has no limit.
+        predicted_high: Upper limit of the voltage in the filter's prediction [V]. The command itself has no limit.
 
     Raises:
         ValueError: A standard deviation in `noise` is not positive and finite, or the same cases as in `dlqr`.
@@ -111,6 +113,6 @@ def lqg(
     kicks = jnp.concatenate([jnp.eye(3), jnp.eye(3)]) * spread[:, None]
     filtered = kalman(a, SELECTION, kicks @ kicks.T, jnp.diag(noise**2))
     observer = ObserverFeedback(
-        gain=regulator.gain[0], transition=a, entry=b[:, 0], correction=filtered.gain, voltage_max=voltage_max
+        gain=regulator.gain[0], transition=a, entry=b[:, 0], correction=filtered.gain, predicted_high=predicted_high
     )
     return Sampled(controller=observer, period=period)

@@ -114,7 +114,7 @@ def loop(plant: Part, gain: Matrix, start: PyTree = PAPER_START, voltage: float 
         voltage: Limit of the motor voltage [V].
     """
     return dataclasses.replace(
-        replace(balancing(), {"actuator.voltage_max": voltage}),
+        replace(balancing(), {"actuator.high": voltage}),
         plant=plant,
         initial=BalanceStart(theta=start[0], psi=start[1], phi=start[2]),
         controller=BalanceFeedback(gain=np.asarray(gain)),
@@ -250,7 +250,7 @@ def table(runs_by_name: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[
         rows.append(record.computed_row(name, "fell", "1", runs_by_name[name].metrics["fell"]))
     hanging_gain = lqr_gain(HANGING, WEIGHTS, EFFORT)
     rows.append(record.computed_row("hanging arm, LQR", "heaviest rider held", "kg", heaviest(HANGING, hanging_gain)))
-    reaches = recovered_multiples(loop(HANGING, hanging_gain), {"actuator.voltage_max": np.array(VOLTAGES)})
+    reaches = recovered_multiples(loop(HANGING, hanging_gain), {"actuator.high": np.array(VOLTAGES)})
     for voltage, reach in zip(VOLTAGES, reaches, strict=True):
         words = f"recovered multiple at {voltage:g} V"
         rows.append(

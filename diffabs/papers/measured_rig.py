@@ -219,7 +219,7 @@ def build_record_loop(record: Record, replays: bool, rig: LabRig = MASK) -> Loop
     Args:
         replays: True plays the recorded commands; False lets the loop's relay switch.
     """
-    relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
+    relay = Sampled(controller=Relay(band=1e-9, low=0.0, high=1.0), period=PERIOD)
     return braking(
         plant=rig,
         initial=BrakeStart(speed=BRAKING_SPEED * rig.drum_radius),
@@ -368,7 +368,7 @@ def compare_with_maker() -> list[JsonObject]:
         return difference, {"simulation": name}
 
     rows = []
-    relay = Sampled(controller=Relay(band=1e-9, torque_min=0.0, torque_max=1.0), period=PERIOD)
+    relay = Sampled(controller=Relay(band=1e-9, low=0.0, high=1.0), period=PERIOD)
     for threshold in ("0.1", "0.7"):
         difference, row = run_of(relay, f"maker-simulation-slip-{threshold}", 1.2)
         rows.append(

@@ -47,8 +47,8 @@ class Case:
     Attributes:
         name: Name in the tables.
         mass: Mass [kg].
-        torque_min: Lower torque limit [N m].
-        torque_max: Upper torque limit [N m].
+        low: Lower torque limit [N m].
+        high: Upper torque limit [N m].
         gain: K of u = tau* + K x.
         inertia_factor: c in J2 = c m r2^2.
         slip: Slip at the start.
@@ -56,8 +56,8 @@ class Case:
 
     name: str
     mass: float
-    torque_min: float = -math.inf
-    torque_max: float = math.inf
+    low: float = -math.inf
+    high: float = math.inf
     gain: tuple[float, float] = lmi_design.PUBLISHED_GAIN
     inertia_factor: float = 0.5
     slip: float = 0.0
@@ -65,8 +65,8 @@ class Case:
 
 CASES = (
     Case("5.3 kg, torque unlimited", 5.3),
-    Case("5.3 kg, torque >= 0", 5.3, torque_min=0.0),
-    Case("5.3 kg, torque 0..9.03 N m", 5.3, torque_min=0.0, torque_max=9.03),
+    Case("5.3 kg, torque >= 0", 5.3, low=0.0),
+    Case("5.3 kg, torque 0..9.03 N m", 5.3, low=0.0, high=9.03),
     Case("6.2 kg, torque unlimited", 6.2),
     Case("5.3 kg, J2 = m r2^2", 5.3, inertia_factor=1.0),
     Case("6.2 kg, J2 = m r2^2", 6.2, inertia_factor=1.0),
@@ -125,7 +125,7 @@ def loop(case: Case, reference: Part = None) -> Loop:
         initial=BrakeStart(speed=50 / 3.6, slip=case.slip),
         reference=FixedSlip() if reference is None else reference,
         feedforward=HoldingInput(),
-        controller=StateFeedback(gain=np.array(case.gain), torque_min=case.torque_min, torque_max=case.torque_max),
+        controller=StateFeedback(gain=np.array(case.gain), low=case.low, high=case.high),
         stop=SpeedReached(speed=5 / 3.6),
     )
 

@@ -57,9 +57,9 @@ class ExtremumSeeking:
         frequency: Frequency of the dither, w [rad/s].
         time_constant: Time constant of the means, T [s].
         resolution: Slip deviation r below which the estimated slope fades to 0 [1].
-        least_deceleration: Least deceleration in the denominator of the elasticity, b0 [m/s^2].
-        least_slip: Lower limit of s [1].
-        greatest_slip: Upper limit of s [1].
+        deceleration_floor: Least deceleration in the denominator of the elasticity, b0 [m/s^2].
+        slip_low: Lower limit of s [1].
+        slip_high: Upper limit of s [1].
         band: Relative distance from a limit within which the gain fades to 0 [1].
     """
 
@@ -69,9 +69,9 @@ class ExtremumSeeking:
     frequency: Scalar = param(default=30.0, unit="rad/s", above=0.0)
     time_constant: Scalar = param(default=0.1, unit="s", above=0.0)
     resolution: Scalar = param(default=2e-3, unit="1", above=0.0)
-    least_deceleration: Scalar = param(default=0.5, unit="m/s^2", above=0.0)
-    least_slip: Scalar = param(default=0.02, unit="1", above=0.0, below=1.0)
-    greatest_slip: Scalar = param(default=0.5, unit="1", above=0.0, high=1.0)
+    deceleration_floor: Scalar = param(default=0.5, unit="m/s^2", above=0.0)
+    slip_low: Scalar = param(default=0.02, unit="1", above=0.0, below=1.0)
+    slip_high: Scalar = param(default=0.5, unit="1", above=0.0, high=1.0)
     band: Scalar = param(default=0.1, unit="1", above=0.0, tunable=False)
 
     def start(self, signal: BrakeOutput) -> Memory:
@@ -88,7 +88,7 @@ class ExtremumSeeking:
         means, moments = (tuple(x / self.time_constant for x in pair) for pair in ((slip, deceleration), products))
         e = self.elasticity(memory)
         # The gain fades to 0 at a limit, so s never leaves the limits and no clamp kinks the rate there.
-        room = jnp.where(e > 0, jnp.log(self.greatest_slip) - m.logarithm, m.logarithm - jnp.log(self.least_slip))
+        room = jnp.where(e > 0, jnp.log(self.slip_high) - m.logarithm, m.logarithm - jnp.log(self.slip_low))
         climb = self.gain * e * clamp(room / jnp.log1p(self.band), 0.0, 1.0)
         return SeekingMemory(climb, *means, *moments)
 
@@ -110,10 +110,10 @@ class ExtremumSeeking:
         return (
             m.slip
             * m.covariance
-            / ((m.variance + self.resolution**2) * larger(m.deceleration, self.least_deceleration))
+            / ((m.variance + self.resolution**2) * larger(m.deceleration, self.deceleration_floor))
         )
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rules least_slip <= slip <= greatest_slip."""
-        yield order_rule(("least_slip", self.least_slip), ("slip", self.slip), "1")
-        yield order_rule(("slip", self.slip), ("greatest_slip", self.greatest_slip), "1")
+        """Yield the rules slip_low <= slip <= slip_high."""
+        yield order_rule(("slip_low", self.slip_low), ("slip", self.slip), "1")
+        yield order_rule(("slip", self.slip), ("slip_high", self.slip_high), "1")

@@ -40,16 +40,15 @@ def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, PyTr
     for path, actuator in _actuators(loop.actuator):
         if isinstance(actuator, Delay) and isinstance(solver, FixedStep):
             yield f"{path}.time and the step are equal", actuator.time, solver.step
-    for sign, torque, limit in ((1, "torque_max", "high"), (-1, "torque_min", "low")):
-        name = torque if hasattr(inner, torque) else limit
+    for sign, name in ((1, "high"), (-1, "low")):
         if isinstance(inner, SlidingMode) and isinstance(loop.feedforward, NoFeedforward | ConstantInput):
             constant = getattr(loop.feedforward, "value", 0.0)
             text = f"{prefix}gain reaches {prefix}{name} and no further"
             yield text, sign * inner.gain + constant, getattr(inner, name)
         for path, actuator in _actuators(loop.actuator):
-            if hasattr(inner, name) and hasattr(actuator, limit):
-                text = f"{prefix}{name} and {path}.{limit} are equal"
-                yield text, getattr(inner, name), getattr(actuator, limit)
+            if hasattr(inner, name) and hasattr(actuator, name):
+                text = f"{prefix}{name} and {path}.{name} are equal"
+                yield text, getattr(inner, name), getattr(actuator, name)
     if isinstance(inner, Relay):
         signals = loop.signals(0.0, loop.start())
         yield "the relay starts on its target, where its first state jumps", signals.measured[0], signals.sample.target

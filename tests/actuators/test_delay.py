@@ -231,7 +231,7 @@ def test_a_relay_behind_a_delay_has_its_limit_cycle():
 
     def run(at):
         band, late, force = at
-        relay = Relay(band=band, torque_min=-force, torque_max=force)
+        relay = Relay(band=band, low=-force, high=force)
         there = loop(relay, Delay(time=late, capacity=64), Integrator(), 0.0)
         there = dataclasses.replace(there, reference=Setpoint(value=0.0))
         return d.measure(there, d.FixedStep(1e-3, 0.1), {"mean": Mean()}).ending.sample.output.slip

@@ -266,7 +266,7 @@ def test_json_says_all_that_it_ran_with(whole):
         row = document["parameters"][path]
         assert row["unit"] == spec.unit
         np.testing.assert_array_equal(np.asarray(row["value"], float), value)
-    assert document["parameters"]["controller.torque_min"] == {"value": "-inf", "unit": "N m"}
+    assert document["parameters"]["controller.low"] == {"value": "-inf", "unit": "N m"}
     assert document["parameters"]["objective.settling_time.band"] == {"value": 0.01, "unit": "1"}
     assert document["parts"]["controller"] == {"type": "state-feedback"}
     assert document["parts"]["plant.road"] == {"type": "rational-curve"}
@@ -484,7 +484,7 @@ def test_what_export_writes_and_prints(tmp_path):
 @pytest.mark.slow
 @killed_by("cli/main.py", 'AT_LIMIT = "at a limit\\n"', 'AT_LIMIT = "at a limit"')
 def test_an_objective_may_have_the_name_of_the_share_at_a_limit():
-    limits = ("--set", "controller.torque_min=0", "--set", "controller.torque_max=0.1")  # far below the demand
+    limits = ("--set", "controller.low=0", "--set", "controller.high=0.1")  # far below the demand
     found = json.loads(
         run("simulate", "slip-lmi", *SHORT, *limits, "--set", "objective.at a limit=iae", "--json").stdout
     )

@@ -26,7 +26,7 @@ RELAY = """
 plant = "mirrored-rig"
 initial.speed_kmh = 30.0
 stop = {type = "speed-reached", speed_kmh = 25.0}
-controller = {type = "relay", torque_max = 12.0}
+controller = {type = "relay", high = 12.0}
 actuator = {type = "rate-limit", rate = 500.0}
 solver = {step = 2e-3, duration = 1.0}
 sweep = {samples = 40, chunk = 40, seed = 5, check = 6, over = {"plant.mass" ={low=5.3,high=6.2}}}

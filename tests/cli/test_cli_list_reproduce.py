@@ -32,7 +32,7 @@ def test_list_knows_every_part():
     assert document["plants"]["quarter-car"]["parameters"]["road"]["default"] == "spline-b"
     assert document["roads"]["patches"]["parameters"]["roads"]["default"] == ["dry-asphalt", "snow"]
     assert document["roads"]["snow"]["parameters"]["c1"]["default"] == 0.1946
-    assert document["controllers"]["state-feedback"]["parameters"]["torque_max"]["default"] is None
+    assert document["controllers"]["state-feedback"]["parameters"]["high"]["default"] is None
     assert document["actuators"]["delay"]["parameters"]["capacity"]["default"] == 1024
     assert document["objectives"]["variation"]["unit"] == "N m"
     assert document["scenarios"]["slip-lmi"]["title"]

@@ -83,7 +83,7 @@ def test_a_bound_of_the_overshoot_is_never_rounded_up() -> None:
     """At a target of 0.2, some of these products are rounded up."""
     shares = [f"0.{i}" for i in range(83, 99)]
     claims = [word for share in shares for word in ("--claim", f"overshoot={share}")]
-    limits = [word for change in ("torque_min=0", "torque_max=9.03") for word in ("--set", f"controller.{change}")]
+    limits = [word for change in ("low=0", "high=9.03") for word in ("--set", f"controller.{change}")]
     found = json.loads(run("prove", "slip-lmi", *limits, "--over", "plant.mass=5.5:5.5", *claims, "--json").stdout)
     assert found["verdict"] == "proved"
     for share, claim in zip(shares, found["claims"], strict=True):
@@ -91,7 +91,7 @@ def test_a_bound_of_the_overshoot_is_never_rounded_up() -> None:
         assert exact * (1 - Fraction(1, 10**14)) < Fraction(claim["bound"]) <= exact
 
 
-LIMITED = [word for change in ("torque_min=0", "torque_max=9.03") for word in ("--set", f"controller.{change}")]
+LIMITED = [word for change in ("low=0", "high=9.03") for word in ("--set", f"controller.{change}")]
 
 
 @killed_by("cli/prove.py", 'if operation.name == "const"', "if operation.value is not None")

@@ -14,7 +14,7 @@ from diffabs.plot.proofs import ProofMap, draw_proof
 from diffabs.report import build_report, find_documents
 
 pytestmark = pytest.mark.usefixtures("native_prover")
-LIMITS = ["--set", "controller.torque_min=0", "--set", "controller.torque_max=9.03"]
+LIMITS = ["--set", "controller.low=0", "--set", "controller.high=9.03"]
 BOX = ["--over", "plant.mass=5.3:5.4", "--over", "initial.speed_kmh=5.2:5.3"]
 
 

@@ -73,7 +73,7 @@ def test_a_warning_of_the_library_is_a_line(capsys):
 @pytest.mark.filterwarnings("default")
 def test_a_start_with_a_one_sided_derivative_is_said_in_a_line(file):
     """A relay that starts on its target: the run jumps there."""
-    relay = 'controller={type="relay",torque_max=9.0}'
+    relay = 'controller={type="relay",high=9.0}'
     changes = ("initial.slip=0.15", "reference.slip=0.15", relay, "tune.free={reference.slip=[0.1,0.2]}")
     words = [word for change in changes for word in ("--set", change)]
     found = run("tune", file(SMALL), *words, "--set", "tune.limits.overshoot=9.0")

@@ -340,7 +340,7 @@ def test_steps_end_on_kinks_where_those_of_xla_do():
     loop = braking(
         plant=plants.MirroredRig(),
         initial=d.BrakeStart(speed=50 / 3.6),
-        controller=controllers.StateFeedback(torque_min=0.0, torque_max=9.03),
+        controller=controllers.StateFeedback(low=0.0, high=9.03),
         feedforward=controllers.HoldingInput(),
     )
     given = {

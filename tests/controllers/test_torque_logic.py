@@ -52,12 +52,12 @@ def test_a_band_logic_is_three_exponentials():
     np.testing.assert_allclose(mean(logic), area / LENGTH, rtol=1e-8)
 
 
-@killed_by("controllers/torque_logic.py", "& (memory.flow < self.torque_max)", "")
-@killed_by("controllers/torque_logic.py", "smaller(self.torque, self.torque_max)", "self.torque", case="20.0")
+@killed_by("controllers/torque_logic.py", "& (memory.flow < self.high)", "")
+@killed_by("controllers/torque_logic.py", "smaller(self.torque, self.high)", "self.torque", case="20.0")
 @pytest.mark.parametrize("torque", [10.0, 20.0])
 def test_a_band_logic_falls_from_its_limit_at_once(torque):
     """At 12 from the start or from 10 exp(3 t) on, to slip 0.12 at 0.3 s; then 12 exp(-5 (t - 0.3))."""
-    logic = BandLogic(slip_low=0.08, slip_high=0.12, growth=3.0, decay=5.0, torque=torque, torque_max=12.0)
+    logic = BandLogic(slip_low=0.08, slip_high=0.12, growth=3.0, decay=5.0, torque=torque, high=12.0)
     top, rise = 12.0, np.log(1.2) / 3.0 if torque == 10.0 else 0.0
     area = (top - min(torque, top)) / 3.0 + top * (0.3 - rise) + top * (1 - np.exp(-5.0 * 0.2)) / 5.0
     np.testing.assert_allclose(mean(logic), area / LENGTH, rtol=1e-8)

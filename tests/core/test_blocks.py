@@ -124,10 +124,10 @@ def test_antiwindup(strategy, rates):
 
 def test_antiwindup_of_state_feedback():
     """Its gain is negative and its error slip - target: the signs cancel, and the excess drains all the same."""
-    k = StateFeedback(gain=np.array([-20.0, -100.0]), torque_max=5.0, antiwindup=Clamping())
+    k = StateFeedback(gain=np.array([-20.0, -100.0]), high=5.0, antiwindup=Clamping())
     assert k.flow(0.0, Memory(-1.0), tracking(0.1)) == 0  # raw = 20 + 10, the error asks for more
     close(k.flow(0.0, Memory(-1.0), tracking(-0.05)), 0.05)
-    back = StateFeedback(gain=np.array([-20.0, -100.0]), torque_max=5.0, antiwindup=BackCalculation(tracking_time=0.1))
+    back = StateFeedback(gain=np.array([-20.0, -100.0]), high=5.0, antiwindup=BackCalculation(tracking_time=0.1))
     close(back.flow(0.0, Memory(-1.0), tracking(0.1)), -0.1 + (5.0 - 30.0) / (-20.0 * 0.1))
 
 
@@ -163,7 +163,7 @@ def test_scheduled_feedback_interpolates_between_many_nodes():
 
 @killed_by("controllers/gain_schedule.py", "(signal.measured.speed / self.reference_speed)", "1.0")
 def test_proportional_is_state_feedback_scaled_by_speed():
-    k = ProportionalFeedback(gain=np.array([-30.0, -5.0]), reference_speed=4.0, torque_max=9.0)
+    k = ProportionalFeedback(gain=np.array([-30.0, -5.0]), reference_speed=4.0, high=9.0)
     for speed, part in ((4.0, 1.0), (1.0, 0.25), (8.0, 2.0)):  # all beyond 9 N m with an integral of -3
         signal = tracking(0.1, 2.5)
         signal = signal._replace(measured=signal.measured._replace(speed=speed))
@@ -180,12 +180,12 @@ def test_proportional_is_state_feedback_scaled_by_speed():
     [
         (ScheduledFeedback(gains=np.array([-1.0])), "they need one"),
         (ScheduledFeedback(speeds=np.array([3.0, 2.0])), "do not increase"),
-        (ScheduledFeedback(torque_min=3.0, torque_max=2.0), "exceeds torque_max"),
+        (ScheduledFeedback(low=3.0, high=2.0), "exceeds high"),
         (FourPhase(slip_low=0.5), "^slip_low = 0.5 is not below slip_high = 0.35$"),
         (SettlingTime(share=0.0), "^share and band are both 0; a settling time needs a band of some width$"),
-        (ExtremumSeeking(slip=0.6), "^slip = 0.6 exceeds greatest_slip = 0.5$"),
+        (ExtremumSeeking(slip=0.6), "^slip = 0.6 exceeds slip_high = 0.5$"),
         (Limits(low=[1.0, 2.0], high=3.0), r"^low has shape \(2,\); it needs \(\)$"),
-        (Series(blocks=(Relay(torque_min=[5.0]),)), r"^blocks.0.torque_min has shape \(1,\); it needs \(\)$"),
+        (Series(blocks=(Relay(low=[5.0]),)), r"^blocks.0.low has shape \(1,\); it needs \(\)$"),
         (PID(kp=[1.0, 2.0]), r"^kp has shape \(2,\); it needs \(\)$"),
     ],
 )
@@ -203,7 +203,7 @@ def test_a_part_is_refused_by_its_own_check(part, message):
 def test_relay_switches_on_the_far_side_of_its_band():
     """Slip 0.2 + 0.03 sin(w t), band 0.02: released where the sine is 2/3 and rises, applied where it is -2/3 and
     falls; 10 periods in 523 steps, which no period divides. It starts on its target, released."""
-    relay, steps = Relay(band=0.02, torque_min=1.0, torque_max=9.0), 523
+    relay, steps = Relay(band=0.02, low=1.0, high=9.0), 523
     w = 20 * np.pi / (steps * H)
     _, torque, _, mean = played(lambda t: seen(0.2 + 0.03 * jnp.sin(w * t)), steps, controller=relay)
     phase = (w * H * np.arange(steps)) % (2 * np.pi)
@@ -228,7 +228,7 @@ def test_two_events_in_one_step():
     def script(t):
         return seen(0.15 + rise((t - 5.3e-3) / H), deceleration=9.0 - 4e4 * (t - 5.3e-3) ** 2)
 
-    relay = Relay(band=0.01, torque_min=0.0, torque_max=12.0)
+    relay = Relay(band=0.01, low=0.0, high=12.0)
     target, torque, target_mean, torque_mean = played(script, 12, reference=PeakLatch(), controller=relay)
     close(target, [0.2] * 6 + [0.15] * 6, rtol=1e-9)
     close(torque, [12.0] * 6 + [0.0] * 6)
@@ -248,7 +248,7 @@ def test_what_switches_in_every_step_is_no_run():
         plant=MirroredRig(),
         initial=BrakeStart(speed=50 / 3.6),
         reference=FixedSlip(),
-        controller=Relay(band=1e-6, torque_max=12.0),
+        controller=Relay(band=1e-6, high=12.0),
         stop=SpeedReached(),
     )
     run = d.measure(loop, d.FixedStep(1e-3, 2.0), {"iae": IAE()})

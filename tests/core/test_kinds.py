@@ -23,7 +23,7 @@ RIG = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=30 / 3.6),
     stop=stops.SpeedReached(speed=29 / 3.6),
-    controller=controllers.StateFeedback(torque_min=0.0),
+    controller=controllers.StateFeedback(low=0.0),
     feedforward=controllers.HoldingInput(),
 )
 MEASURED = {"iae": objectives.IAE()}

@@ -319,7 +319,7 @@ def test_a_step_ends_on_a_comparison_near_the_start():
     loop = braking(
         plant=MirroredRig(),
         controller=ScheduledFeedback(
-            speeds=(1.4, 14.0), integral_gains=(-300.0, -3e3), gains=(-6.0, -60.0), torque_min=0.0, torque_max=9.03
+            speeds=(1.4, 14.0), integral_gains=(-300.0, -3e3), gains=(-6.0, -60.0), low=0.0, high=9.03
         ),
         feedforward=HoldingInput(),
         actuator=Lag(time_constant=1e-3),
@@ -396,9 +396,7 @@ def test_an_integral_that_was_clamped_goes_on():
         plant=MirroredRig(),
         initial=d.BrakeStart(speed=11.0, slip=0.03),
         reference=FixedSlip(slip=0.15),
-        controller=StateFeedback(
-            gain=np.array([-3000.0, -60.0]), torque_min=0.2, torque_max=4.3, antiwindup=Clamping()
-        ),
+        controller=StateFeedback(gain=np.array([-3000.0, -60.0]), low=0.2, high=4.3, antiwindup=Clamping()),
         stop=SpeedReached(speed=6.5),
     )
     plain, located = (

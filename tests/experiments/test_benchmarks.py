@@ -31,7 +31,7 @@ def test_the_problem_of_the_peers_is_that_of_our_parts():
     plant, control = loop.plant, loop.controller
     assert (plant.wheel_radius, plant.body_radius, plant.wheel_inertia) == (problem.R1, problem.R2, problem.J1)
     assert tuple(control.gain) == (problem.K1, problem.K2)
-    assert (control.torque_min, control.torque_max) == (0.0, problem.U)
+    assert (control.low, control.high) == (0.0, problem.U)
     assert loop.reference.slip == problem.SLIP
     assert loop.stop.speed == problem.STOP
     for slip in (0.01, 0.2, 0.7):

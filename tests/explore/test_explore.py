@@ -46,8 +46,8 @@ type = "holding-input"
 [controller]
 type = "state-feedback"
 gain = [-11753.0, -48.0]
-torque_min = -inf
-torque_max = inf
+low = -inf
+high = inf
 [stop]
 type = "speed-reached"
 speed_kmh = 10.0

@@ -58,7 +58,7 @@ def observer():
     draw = np.random.default_rng(5)
     transition = np.eye(6) * 0.8 + 0.02 * draw.normal(size=(6, 6))
     matrices = {"transition": transition, "entry": draw.normal(size=6), "correction": draw.normal(size=(6, 2)) * 0.05}
-    return ObserverFeedback(gain=draw.normal(size=6), voltage_max=3.0, **matrices)
+    return ObserverFeedback(gain=draw.normal(size=6), predicted_high=3.0, **matrices)
 
 
 DTYPES = [pytest.param(np.float64, id="float64"), pytest.param(np.float32, id="float32", marks=pytest.mark.slow)]
@@ -68,8 +68,8 @@ LOOPS = {
     "conditional integration": rig(PID(kp=30.0, ki=900.0, high=9.03, antiwindup=Clamping(), low=0.0)),
     "back-calculation": rig(PID(kp=30.0, ki=900.0, high=9.03, antiwindup=BackCalculation(), low=0.0)),
     "schedule": rig(ScheduledFeedback(speeds=(2.0, 6.0, 14.0), integral_gains=(-90.0, -200.0, -300.0),
-                                      gains=(-9.0, -40.0, -58.0), torque_min=0.0, torque_max=9.03)),
-    "proportional to the speed": rig(ProportionalFeedback(gain=(-300.0, -48.0), torque_min=0.0, torque_max=9.03)),
+                                      gains=(-9.0, -40.0, -58.0), low=0.0, high=9.03)),
+    "proportional to the speed": rig(ProportionalFeedback(gain=(-300.0, -48.0), low=0.0, high=9.03)),
     "filtered target": rig(StateFeedback(gain=(-300.0, -48.0)), reference=FilteredSlip()),
     "holding torque": rig(StateFeedback(gain=(-300.0, -48.0)), feedforward=HoldingInput()),
     "holding command, table of friction": rig(SlidingMode(gain=0.2, low=0.0, high=90.0), feedforward=HoldingInput(),

@@ -545,7 +545,7 @@ def test_what_is_neglected():
     assert reduce_loop(braking(controller=StateFeedback(), feedforward=HoldingInput())).neglected == (
         "The fall of the speed: it is frozen.",
     )
-    commanded = braking(plant=LabRig(), controller=StateFeedback(torque_min=0.0, torque_max=1.0))
+    commanded = braking(plant=LabRig(), controller=StateFeedback(low=0.0, high=1.0))
     assert reduce_loop(commanded).neglected[0] == "The controller's torque limits of 0 and 1."  # of no unit
 
 

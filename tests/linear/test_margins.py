@@ -538,7 +538,7 @@ def closed_poles(system):
 def test_noise_is_a_disturbance_and_limits_do_not_act():
     plain = open_loop(rig()).transfer()
     w = np.geomspace(1, 1e3, 9)
-    noisy = rig(sensor=Noise(slip=0.01), controller=StateFeedback(torque_min=0.0, torque_max=9.03))
+    noisy = rig(sensor=Noise(slip=0.01), controller=StateFeedback(low=0.0, high=9.03))
     np.testing.assert_allclose(open_loop(noisy).transfer().response(w), plain.response(w), rtol=1e-12)
     integrating = rig(controller=PID(ki=300.0, low=0.0, high=9.03))
     held = dataclasses.replace(integrating, feedforward=load("slip-estimator").loop.feedforward)

@@ -88,10 +88,10 @@ def test_a_run_always_at_a_limit_is_valid():
         assert d.measure(loop, d.FixedStep(3e-3, 4.0), {"share": at_limits(loop)}).metrics["share"] == 1.0
 
 
-@killed_by("actuators/motor.py", "return -self.voltage_max, self.voltage_max", "return -1e9, 1e9")
+@killed_by("actuators/motor.py", "return -self.high, self.high", "return -1e9, 1e9")
 def test_the_limits_are_those_of_the_command():
     """Of a motor's supply. A valve's command is a rate, which its limits do not bound."""
-    limits = at_limits(pulled(WEAK, actuator=actuators.VoltageLimit(voltage_max=24.0)))
+    limits = at_limits(pulled(WEAK, actuator=actuators.VoltageLimit(high=24.0)))
     assert (limits.low, limits.high) == (-24.0, 24.0)
     limits = at_limits(pulled(WEAK, actuator=actuators.IntegratingValve()))
     assert (limits.low, limits.high) == (-np.inf, np.inf)
@@ -121,7 +121,7 @@ def test_the_command_warns_of_a_run_at_a_limit(limit, warned):
 
 @pytest.mark.slow
 def test_runs_that_never_settle_are_counted_in_a_sweep(tmp_path):
-    changes = ("solver.step=1e-3", "controller.torque_max=1.5", "controller.torque_min=0")
+    changes = ("solver.step=1e-3", "controller.high=1.5", "controller.low=0")
     result = commands.run(
         *("sweep", "slip-lmi", "--samples", "16", "--out", tmp_path / "out", "--json", "--engine", "xla", "--figures"),
         *(word for change in changes for word in ("--set", change)),

@@ -84,8 +84,8 @@ def test_the_variation_with_a_corner_is_that_of_short_steps():
             speeds=np.array([3.0, 7.0, 13.0]),
             integral_gains=np.array([-900.0, -1100.0, -1300.0]),
             gains=np.array([-40.0, -60.0, -80.0]),
-            torque_min=0.3,
-            torque_max=4.0,
+            low=0.3,
+            high=4.0,
             antiwindup=controllers.BackCalculation(tracking_time=0.03),
         ),
     )
@@ -131,7 +131,7 @@ def test_a_torque_peak_has_the_derivative_of_accurate_runs():
         initial=plants.BalanceStart(theta=0.02, psi=0.015, phi=0.01, theta_rate=0.02, psi_rate=0.03, phi_rate=0.01),
         reference=references.Upright(),
         controller=controllers.BalanceFeedback(),
-        actuator=Series(blocks=(actuators.VoltageLimit(voltage_max=90.0), actuators.Lag(time_constant=0.002))),
+        actuator=Series(blocks=(actuators.VoltageLimit(high=90.0), actuators.Lag(time_constant=0.002))),
         stop=stops.Fallen(),
     )
     paths = {"plant.arm_mass": 20.0, "plant.gear": 1.1}

@@ -228,7 +228,7 @@ def test_fig_3_is_that_of_the_printed_equations():
     plant = PrintedArm()
     gain = lqr(*model(plant), np.eye(6), np.eye(1)).gain[0]
     loop = dataclasses.replace(
-        replace(balancing(), {"actuator.voltage_max": 1e6, "controller.gain": np.asarray(gain)}),
+        replace(balancing(), {"actuator.high": 1e6, "controller.gain": np.asarray(gain)}),
         plant=plant,
         initial=BalanceStart(theta=0.5, phi=0.2),
     )

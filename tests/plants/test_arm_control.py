@@ -106,7 +106,7 @@ def test_full_effort_returns_from_within_the_bound_only(share, returns):
 
 @pytest.fixture(scope="module")
 def observer():
-    return lqg(HANGING, WEIGHTS, EFFORT, voltage_max=48.0)
+    return lqg(HANGING, WEIGHTS, EFFORT, predicted_high=48.0)
 
 
 @pytest.mark.slow
@@ -181,7 +181,7 @@ def test_poles_of_the_loop_are_those_of_regulator_and_filter(observer):
 @pytest.mark.slow
 @killed_by(
     "controllers/balance.py",
-    "voltage = clamp(estimate.voltage, -self.voltage_max, self.voltage_max)",
+    "voltage = clamp(estimate.voltage, -self.predicted_high, self.predicted_high)",
     "voltage = estimate.voltage",
 )
 def test_an_observer_knows_the_limit_of_its_voltage(observer):

@@ -19,7 +19,7 @@ flint = pytest.importorskip("flint")
 checker = pytest.importorskip("diffabs.reach.checker")
 arb, check_cell, NotProved = flint.arb, checker.check_cell, checker.NotProved
 
-LMI = ("slip-lmi", ["controller.torque_min=0", "controller.torque_max=9.03"])
+LMI = ("slip-lmi", ["controller.low=0", "controller.high=9.03"])
 CURED = ("slip-cured", [])
 BOX = ("plant.mass", "initial.speed")
 FULL = 50 / 3.6

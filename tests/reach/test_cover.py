@@ -20,7 +20,7 @@ from diffabs.reach.equations import Equations, RealOperation, derive_equations
 from diffabs.scenario.scenario import load
 
 pytestmark = pytest.mark.usefixtures("native_prover")
-LIMITED = ["controller.torque_min=0", "controller.torque_max=9.03"]
+LIMITED = ["controller.low=0", "controller.high=9.03"]
 SMALL = {"plant.mass": (5.3, 5.32), "initial.speed": (6.0, 6.05)}  # kg, m/s
 
 

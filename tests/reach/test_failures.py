@@ -20,7 +20,7 @@ def test_a_slip_that_becomes_negative_is_named() -> None:
 
 
 def test_a_cell_that_is_too_wide_is_named() -> None:
-    limits = ["controller.torque_min=0", "controller.torque_max=9.03"]
+    limits = ["controller.low=0", "controller.high=9.03"]
     prover = Prover(derive_equations(load("slip-lmi", limits).loop, ["plant.mass", "initial.speed"]), ("slip",), 2.0)
     prover.choose_weights(np.array([5.3, 13.5]))
     wide, single = (

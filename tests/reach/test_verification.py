@@ -20,7 +20,7 @@ from diffabs.scenario.scenario import loads
 pytest.importorskip("flint")
 pytestmark = pytest.mark.usefixtures("native_prover")
 BOX = ["--over", "plant.mass=5.3:5.302", "--over", "initial.speed_kmh=10:10.004", "--claim", "no_lock"]
-LIMITS = ["--set", "controller.torque_min=0", "--set", "controller.torque_max=9.03"]
+LIMITS = ["--set", "controller.low=0", "--set", "controller.high=9.03"]
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +57,8 @@ def shorter_stop(document: JsonObject) -> None:
 
 def smaller_torque(document: JsonObject) -> None:
     """The greatest slip becomes 0.2816, and the file says 0.2804."""
-    assert "torque_max = 9.03" in document["scenario"]
-    document["scenario"] = document["scenario"].replace("torque_max = 9.03", "torque_max = 8.9")
+    assert "high = 9.03" in document["scenario"]
+    document["scenario"] = document["scenario"].replace("high = 9.03", "high = 8.9")
 
 
 def shorter_duration(document: JsonObject) -> None:

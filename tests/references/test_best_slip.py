@@ -78,7 +78,7 @@ def test_seeking_finds_the_slope_whatever_moves_the_slip():
 def test_seeking_climbs_at_its_gain_and_stays_within_its_limits():
     """A deceleration in proportion to the slip has the elasticity 1: ln s grows at the gain, until the band."""
     block = references.ExtremumSeeking(
-        slip=0.1, gain=2.0, resolution=1e-9, time_constant=0.01, greatest_slip=0.4, band=0.01
+        slip=0.1, gain=2.0, resolution=1e-9, time_constant=0.01, slip_high=0.4, band=0.01
     )
 
     def signal(t):

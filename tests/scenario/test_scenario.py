@@ -49,7 +49,7 @@ def test_slip_lmi_is_the_papers_example():
     assert s.loop.plant.mass == 5.3
     assert s.loop.plant.road.q == 2.10
     np.testing.assert_array_equal(s.loop.controller.gain, [-11753, -48])
-    assert (s.loop.controller.torque_min, s.loop.controller.torque_max) == (-np.inf, np.inf)
+    assert (s.loop.controller.low, s.loop.controller.high) == (-np.inf, np.inf)
     assert isinstance(s.loop.feedforward, controllers.HoldingInput)
     assert s.loop.initial.speed == pytest.approx(50 / 3.6, rel=1e-15)
     assert s.loop.stop.speed == pytest.approx(5 / 3.6, rel=1e-15)
@@ -535,7 +535,7 @@ def test_aggregates_are_those_of_the_library(kind):
 def test_slip_cured_is_the_rig_with_what_the_paper_leaves_out():
     s = load("slip-cured")
     assert type(s.loop.controller.controller) is controllers.ProportionalFeedback
-    assert (s.loop.controller.controller.torque_min, s.loop.controller.controller.torque_max) == (0.0, 9.03)
+    assert (s.loop.controller.controller.low, s.loop.controller.controller.high) == (0.0, 9.03)
     assert (s.loop.controller.period, s.loop.actuator.time_constant) == (1e-3, 1e-3)
     here = s.loop.plant.output(s.loop.plant.start(s.loop.initial))
     assert s.loop.plant.mass == 5.75
@@ -552,7 +552,7 @@ def test_a_replaced_part_takes_its_ranges_with_it():
 
 @pytest.mark.parametrize("change", ["controller=pid", "controller={type='pid'}"])
 def test_another_part_takes_what_is_tuned_with_it(change):
-    first = ("tune.over.controller.torque_min=0,1", "tune.free.reference.slip=0.1,0.3")
+    first = ("tune.over.controller.low=0,1", "tune.free.reference.slip=0.1,0.3")
     goal = load("slip-lmi", [*first, change]).tune
     assert set(goal.free) == {"reference.slip"}
     assert set(goal.over) == {"plant.mass"}

@@ -61,7 +61,7 @@ def test_the_error_of_a_smooth_loop_is_that_of_fourth_order():
 
 @pytest.mark.slow
 def test_the_estimate_shows_the_order_lost_to_a_torque_limit():
-    loop = d.replace(RIG, {"controller.torque_min": 0.0, "controller.torque_max": 8.0})
+    loop = d.replace(RIG, {"controller.low": 0.0, "controller.high": 8.0})
     exact = truth(0.0, 8.0)
     found = acc.estimate_accuracy(loop, d.FixedStep(2e-3, 2.0), OBJECTIVES)
     for name, one in found.estimates.items():
@@ -71,7 +71,7 @@ def test_the_estimate_shows_the_order_lost_to_a_torque_limit():
 
 
 def relay():
-    return dataclasses.replace(RIG, controller=controllers.Relay(torque_max=12.0, band=0.05))
+    return dataclasses.replace(RIG, controller=controllers.Relay(high=12.0, band=0.05))
 
 
 def delayed(time=0.0061):

@@ -27,7 +27,7 @@ from diffabs.simulate.step.adaptive import StateSpan
 from diffabs.simulate.step.replay import BASE_LOG_CAPACITY, log_capacity, states_between
 from diffabs.tune import worst_case
 
-LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
+LIMITS = ("controller.low=0.0", "controller.high=9.03")
 SAMPLED = "controller={type='sampled',controller={type='pid',low=0.0,high=9.03},period=0.005}"
 FINE = 4  # times shorter than a scenario's are the fixed steps that are compared with
 MEASURED = {"iae": IAE(), "max_slip": MaxSlip(), "stop_distance": StopDistance()}
@@ -242,7 +242,7 @@ def clamped_rig():
         reference=references.LimitedSlip(slip=0.15, rate=2.0, time_constant=0.02, period=2e-3),
         feedforward=controllers.HoldingInput(),
         controller=controllers.StateFeedback(
-            gain=np.array([-3000.0, -90.0]), torque_min=0.3, torque_max=5.0, antiwindup=controllers.Clamping()
+            gain=np.array([-3000.0, -90.0]), low=0.3, high=5.0, antiwindup=controllers.Clamping()
         ),
     )
 
@@ -254,7 +254,7 @@ def relay_at_its_rate():
         initial=d.BrakeStart(speed=6.0, slip=0.03),
         stop=stops.SpeedReached(speed=3.5),
         reference=references.FixedSlip(slip=0.3),
-        controller=controllers.Relay(band=0.05, torque_min=6.0, torque_max=130.0),
+        controller=controllers.Relay(band=0.05, low=6.0, high=130.0),
         actuator=actuators.RateLimit(rate=3000.0, time_constant=0.004),
     )
 
@@ -265,7 +265,7 @@ def test_derivatives_through_many_comparisons(make):
     """Two widths of differences of runs at a far smaller error. The scale is the derivative, or a thousandth of the
     value where that is more: 1 % of it is 10 rtol of the value."""
     loop = make()
-    paths = ["plant.mass", "initial.speed", "controller.torque_max"]
+    paths = ["plant.mass", "initial.speed", "controller.high"]
     start = np.array([float(get(loop, path)) for path in paths])
     lanes = np.random.default_rng(3).uniform(-0.12, 0.12, (6, len(paths)))
 

@@ -26,7 +26,7 @@ from diffabs.stops import SpeedReached
 LOOP = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=50 / 3.6),
-    controller=controllers.StateFeedback(torque_min=0.0, torque_max=9.03),
+    controller=controllers.StateFeedback(low=0.0, high=9.03),
     feedforward=controllers.HoldingInput(),
     stop=SpeedReached(speed=5 / 3.6),
 )

@@ -84,7 +84,7 @@ def test_the_oracle_does_not_depend_on_its_tolerance(name, monkeypatch):
 
 
 # A relay whose band no slip leaves stands on the brake: the wheel locks.
-STUCK = dataclasses.replace(event_oracle.LOOPS["relay"], controller=controllers.Relay(torque_max=600.0, band=0.9))
+STUCK = dataclasses.replace(event_oracle.LOOPS["relay"], controller=controllers.Relay(high=600.0, band=0.9))
 
 
 @pytest.mark.parametrize("name", ["fixed slip, P", "locked"])

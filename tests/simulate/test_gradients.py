@@ -52,8 +52,8 @@ LOOPS = {
             speeds=np.array([2.0, 20.0]),
             integral_gains=np.array([-11000.0, -13000.0]),
             gains=np.array([-40.0, -64.0]),
-            torque_min=0.0,
-            torque_max=9.03,
+            low=0.0,
+            high=9.03,
             antiwindup=controllers.BackCalculation(tracking_time=0.02),
         ),
         feedforward=controllers.ConstantInput(value=2.7),
@@ -79,7 +79,7 @@ LOOPS = {
     ),
     "relay": braking(
         **CAR,
-        controller=controllers.Relay(torque_max=250.0),
+        controller=controllers.Relay(high=250.0),
         reference=references.Setpoint(value=0.2),
         actuator=actuators.Limits(low=5.0, high=190.0),
     ),
@@ -207,7 +207,7 @@ LOOPS = {
     ),
     "valve": braking(
         **CAR,
-        controller=controllers.Relay(band=0.02, torque_min=-1.0, torque_max=1.3),
+        controller=controllers.Relay(band=0.02, low=-1.0, high=1.3),
         reference=references.Setpoint(value=0.15),
         actuator=blocks.Series(
             blocks=(actuators.Lag(time_constant=0.004), actuators.IntegratingValve(gain=2100.0, low=3.0, high=130.0))

@@ -11,7 +11,7 @@ from diffabs.simulate.matlab import write_mat
 
 io = pytest.importorskip("scipy.io")
 
-SHORT = ("--set", "initial.speed_kmh=20", "--set", "controller.torque_max=inf")
+SHORT = ("--set", "initial.speed_kmh=20", "--set", "controller.high=inf")
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_a_mat_file_has_what_the_csv_has(folder):
 def test_a_mat_file_has_metrics_and_parameters(folder):
     found = io.loadmat(folder / "run.mat", simplify_cells=True)
     assert found["parameters"]["plant_mass"] == 5.3
-    assert found["parameters"]["controller_torque_max"] == np.inf
+    assert found["parameters"]["controller_high"] == np.inf
     np.testing.assert_array_equal(found["parameters"]["controller_gain"], [-11753.0, -48.0])
     assert found["metrics"]["stop_time"] == pytest.approx(found["t"][-1], abs=1e-3)
     raw = io.loadmat(folder / "run.mat")

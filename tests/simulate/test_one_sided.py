@@ -177,12 +177,12 @@ def test_a_relay_on_its_target_is_released():
     assert [applied(0.2 + one) for one in (-1e-9, 0.0, 1e-9)] == [1.0, 0.0, 0.0]
 
 
-RELAY, SLIDING = controllers.Relay(torque_max=9.0), controllers.SlidingMode(gain=9.0, high=9.0)
+RELAY, SLIDING = controllers.Relay(high=9.0), controllers.SlidingMode(gain=9.0, high=9.0)
 POINTS = {  # loop; which free parameters are named; a part of what is said
     "torque": (
         braking(controller=RELAY, actuator=actuators.Limits(high=9.0)),
-        {"controller.torque_max", "actuator.high"},
-        "controller.torque_max and actuator.high are equal",
+        {"controller.high", "actuator.high"},
+        "controller.high and actuator.high are equal",
     ),
     "gain": (
         braking(controller=SLIDING, feedforward=controllers.NoFeedforward()),

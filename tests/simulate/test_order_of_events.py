@@ -28,7 +28,7 @@ RIG = braking(
     stop=SpeedReached(speed=1.0),
 )
 LOOPS = {
-    "relay": dataclasses.replace(RIG, controller=controllers.Relay(torque_max=12.0, band=BAND)),
+    "relay": dataclasses.replace(RIG, controller=controllers.Relay(high=12.0, band=BAND)),
     "delay": dataclasses.replace(RIG, actuator=actuators.Delay(time=DELAY, capacity=512)),
     "rate limit": dataclasses.replace(RIG, actuator=actuators.RateLimit(rate=300.0, time_constant=0.004)),
 }

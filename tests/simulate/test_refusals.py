@@ -46,9 +46,9 @@ FEEDBACK = controllers.ScheduledFeedback(speeds=np.array([2.0, 9.0]))
 ROAD = roads.Patches(roads=(roads.RIG, roads.SNOW, roads.RIG), edges=np.array([3.0, 5.0]))
 BAD = {  # a loop, values by lane of which the first is fine, and what is said of the others
     "limits": (
-        replace(RIG, {"controller.torque_min": 0.0, "controller.torque_max": 9.0}),
-        {"controller.torque_min": [0.0, 9.5, np.nan], "controller.torque_max": [9.0, 9.0, 9.0]},
-        ["controller.torque_min exceeds torque_max", "controller.torque_min is outside (-inf, inf) N m"],
+        replace(RIG, {"controller.low": 0.0, "controller.high": 9.0}),
+        {"controller.low": [0.0, 9.5, np.nan], "controller.high": [9.0, 9.0, 9.0]},
+        ["controller.low exceeds high", "controller.low is outside (-inf, inf) N m"],
     ),
     "period": (
         dataclasses.replace(RIG, sensor=sensors.Noise()),
@@ -422,10 +422,10 @@ class TestWhoeverRuns:
 
     def test_a_trial_that_breaks_a_rule_is_a_failed_evaluation(self, any_step):
         """Limits may cross on the way: such a point is too far, whatever its loss."""
-        limited = replace(RIG, {"controller.torque_min": 0.0, "controller.torque_max": 9.0})
-        free = {"controller.torque_min": (-5.0, 20.0), "controller.torque_max": (5.0, 15.0)}
+        limited = replace(RIG, {"controller.low": 0.0, "controller.high": 9.0})
+        free = {"controller.low": (-5.0, 20.0), "controller.high": (5.0, 15.0)}
         problem = build_problem(limited, free=free, objective={"iae": 1.0}, solver=SOLVER)
-        crossed = replace(limited, {"controller.torque_min": 12.0, "controller.torque_max": 8.0})
+        crossed = replace(limited, {"controller.low": 12.0, "controller.high": 8.0})
         z = np.stack([problem.space.place(part) for part in (limited, crossed)])
         assert problem.steady()(z).tolist() == [True, False]
         assert Method().starts == 1

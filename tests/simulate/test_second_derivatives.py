@@ -41,14 +41,14 @@ def car(controller, reference, **parts):
 
 
 def feedback(low=-100.0, high=100.0, **fields):
-    return controllers.StateFeedback(gain=(-3000.0, -90.0), torque_min=low, torque_max=high, **fields)
+    return controllers.StateFeedback(gain=(-3000.0, -90.0), low=low, high=high, **fields)
 
 
-RELAY = controllers.Relay(band=0.03, torque_min=5.0, torque_max=140.0)
+RELAY = controllers.Relay(band=0.03, low=5.0, high=140.0)
 LOOPS = {
     "a stop": (rig(feedback()), "reference.slip"),
     "limits": (rig(feedback(0.3, 4.0, antiwindup=controllers.Clamping())), "reference.slip"),
-    "a relay behind a latch": (car(RELAY, references.PeakLatch(slip=0.25)), "controller.torque_max"),
+    "a relay behind a latch": (car(RELAY, references.PeakLatch(slip=0.25)), "controller.high"),
 }
 
 

@@ -226,7 +226,7 @@ def test_a_wheel_that_turns_again_has_a_derivative():
     loop = braking(
         plant=LabRig(),
         initial=d.BrakeStart(speed=60 / 3.6),
-        controller=Relay(band=0.1, torque_max=25.0),
+        controller=Relay(band=0.1, high=25.0),
         actuator=Lag(time_constant=0.05),
         reference=FixedSlip(slip=0.6),
         stop=SpeedReached(speed=5 / 3.6),
@@ -234,7 +234,7 @@ def test_a_wheel_that_turns_again_has_a_derivative():
 
     def locked(torque):
         solver, measured = d.Adaptive(1e-8, 1.5, 1e-3), {"locked_time": BRAKING["locked_time"]}
-        return d.measure(d.replace(loop, {"controller.torque_max": torque}), solver, measured).metrics["locked_time"]
+        return d.measure(d.replace(loop, {"controller.high": torque}), solver, measured).metrics["locked_time"]
 
     widths = np.array([3e-2, 3e-3, 3e-4])
     torques = 25.0 + np.concatenate([[0.0], widths, -widths])

@@ -25,7 +25,7 @@ SHORT = FixedStep(step=2e-3, duration=4.0)
 
 def closed(multiple=0.0, voltage=48.0, **parts):
     """The hanging arm from a multiple of the start."""
-    values = {path: multiple * value for path, value in DIRECTION.items()} | {"actuator.voltage_max": voltage}
+    values = {path: multiple * value for path, value in DIRECTION.items()} | {"actuator.high": voltage}
     loop = dataclasses.replace(balancing(), plant=HANGING, controller=BalanceFeedback(gain=GAIN))
     return replace(dataclasses.replace(loop, **parts), values)
 

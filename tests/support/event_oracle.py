@@ -9,7 +9,7 @@ of pieces, in each of which everything is smooth: the mode of a piece says at wh
 of its setpoint the slip, in which interval of a tabulated road, and whether the wheel stands still. SciPy finds the end
 of a piece as the root of a guard on its dense output; a jump happens there, and the next piece starts there.
 
-Relay: torque_max until slip > target + band, torque_min until slip < target - band. PeakLatch: the first target until
+Relay: high until slip > target + band, low until slip < target - band. PeakLatch: the first target until
 the deceleration falls, then the slip at its maximum; a later maximum counts if it is greater by a millionth.
 PeakRobust: the same of deceleration and slip behind equal low-passes, from the moment at which the filtered
 deceleration lies below (1 - threshold) of its greatest, if that is above `arming`. ConditionalIntegration: the integral
@@ -60,7 +60,7 @@ LOOPS = {
     ),
     "relay": braking(  # ends well inside a half-wave: its settling time has a derivative
         **ASPHALT | {"stop": SpeedReached(speed=1.3)},
-        controller=controllers.Relay(torque_max=150.0),
+        controller=controllers.Relay(high=150.0),
         reference=references.FixedSlip(slip=0.12),
     ),
     "robust, PI": braking(
@@ -153,8 +153,7 @@ class Brake:
         if m.torque == "inside":
             return self.raw(z, m)
         c = self.controller
-        low, high = (c.torque_min, c.torque_max) if self.relay else (c.low, c.high)
-        return high if m.torque == "high" else low
+        return c.high if m.torque == "high" else c.low
 
     def rates(self, t: float, z: Any, m: Mode) -> list[float]:
         del t

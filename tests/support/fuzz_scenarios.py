@@ -276,7 +276,7 @@ def wrong(scenario: Scenario, run: Run) -> Iterator[str]:
 
 def drives(loop: Any) -> bool:
     """Whether a negative torque, which speeds the wheel up, is allowed."""
-    ends = ("torque_min", "torque", "low", "value")
+    ends = ("torque", "low", "value")
     return any(path.rpartition(".")[2] in ends and get(loop, path) < 0 for path in elements(loop))
 
 

@@ -97,19 +97,19 @@ CONTROLLERS: dict[str, Any] = {
     "state feedback": controllers.StateFeedback(),
     "state feedback, limited": controllers.StateFeedback(
         gain=np.array([-900.0, -150.0]),
-        torque_min=0.0,
-        torque_max=30.0,
+        low=0.0,
+        high=30.0,
         antiwindup=controllers.BackCalculation(tracking_time=0.02),
     ),
     "scheduled feedback": controllers.ScheduledFeedback(
         speeds=np.array([2.0, 11.0, 24.0]),
         integral_gains=np.array([-900.0, -1100.0, -1000.0]),
         gains=np.array([-60.0, -110.0, -150.0]),
-        torque_max=40.0,
+        high=40.0,
     ),
-    "proportional feedback": controllers.ProportionalFeedback(gain=np.array([-900.0, -150.0]), torque_max=40.0),
+    "proportional feedback": controllers.ProportionalFeedback(gain=np.array([-900.0, -150.0]), high=40.0),
     "constant torque": controllers.ConstantTorque(),
-    "relay": controllers.Relay(torque_min=2.0),
+    "relay": controllers.Relay(low=2.0),
     "sliding mode": controllers.SlidingMode(gain=60.0, boundary=0.1, high=70.0, low=0.0),
     "sampled pid": controllers.Sampled(controller=_PID, period=2e-3, delay=5e-4),
     "balance feedback": controllers.BalanceFeedback(),
@@ -118,15 +118,13 @@ CONTROLLERS: dict[str, Any] = {
         transition=0.9 * np.eye(6) + 0.01 * np.eye(6, k=3),
         entry=np.array([0.0, 0.0, 0.0, -0.01, 0.03, 0.02]),
         correction=np.linspace(0.05, 0.6, 12).reshape(6, 2),
-        voltage_max=60.0,
+        predicted_high=60.0,
     ),
     "played command": controllers.PlayedCommand(commands=np.array([0.0, 30.0, 12.0]), period=2e-3),
     "sampled relay": controllers.Sampled(controller=controllers.Relay(), delay=3e-4),
     "sampled on the grid": controllers.SampledOnGrid(controller=_PID, sampling_period=2e-3, delay=1.3e-3),
     "four phase": controllers.FourPhase(torque_low=10.0, torque_high=20.0, slip_low=0.11, slip_high=0.15, rate=6000.0),
-    "band logic": controllers.BandLogic(
-        slip_low=0.12, slip_high=0.17, growth=20.0, decay=30.0, torque=30.0, torque_max=35.0
-    ),
+    "band logic": controllers.BandLogic(slip_low=0.12, slip_high=0.17, growth=20.0, decay=30.0, torque=30.0, high=35.0),
 }
 
 REFERENCES: dict[str, Any] = {
@@ -145,7 +143,7 @@ REFERENCES: dict[str, Any] = {
 ACTUATORS: dict[str, Any] = {
     "direct": blocks.Direct(),
     "limits": actuators.Limits(low=5.0, high=60.0),
-    "voltage": actuators.VoltageLimit(voltage_max=40.0),
+    "voltage": actuators.VoltageLimit(high=40.0),
     "lag": actuators.Lag(),
     "asymmetric lag": actuators.AsymmetricLag(rise=0.012, fall=0.004),
     "dead time": actuators.DeadTime(rise=2.3e-3, fall=1.6e-3),

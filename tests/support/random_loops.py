@@ -86,9 +86,7 @@ class Draw:
 
     def relay(self, band: float = 0.02) -> controllers.Relay:
         """A relay whose lower torque still brakes."""
-        return controllers.Relay(
-            band=self.near(band), torque_min=self.within(2.0, 8.0), torque_max=self.near(140.0, 0.15)
-        )
+        return controllers.Relay(band=self.near(band), low=self.within(2.0, 8.0), high=self.near(140.0, 0.15))
 
     def patches(self, *surfaces: Any) -> roads.Patches:
         """Surfaces in a row, with smooth edges."""
@@ -174,8 +172,8 @@ def rig(r: Draw) -> d.Loop:
         **r.rig(),
         controller=controllers.StateFeedback(
             gain=np.array([-r.near(9000.0), -r.near(90.0)]),
-            torque_min=r.within(0.1, 0.4),
-            torque_max=r.near(3.0),
+            low=r.within(0.1, 0.4),
+            high=r.near(3.0),
             antiwindup=controllers.BackCalculation(tracking_time=r.near(0.02)),
         ),
         feedforward=controllers.HoldingInput(),
@@ -191,8 +189,8 @@ def rig_scheduled(r: Draw) -> d.Loop:
             speeds=np.array([5.0, r.near(8.0, 0.1), 14.0]),
             integral_gains=-np.array([r.near(900.0) for _ in range(3)]),
             gains=-np.array([r.near(60.0) for _ in range(3)]),
-            torque_min=r.within(0.1, 0.4),
-            torque_max=r.near(4.0),
+            low=r.within(0.1, 0.4),
+            high=r.near(4.0),
             antiwindup=controllers.Clamping(),
         ),
         feedforward=controllers.ConstantInput(value=r.near(1.5)),
@@ -206,7 +204,7 @@ def rig_proportional(r: Draw) -> d.Loop:
         **r.rig(),
         sensor=sensors.SpeedScale(factor=r.near(1.0, 0.02)),
         controller=controllers.ProportionalFeedback(
-            gain=np.array([-r.near(2000.0), -r.near(100.0)]), torque_min=r.within(0.1, 0.4), torque_max=r.near(4.0)
+            gain=np.array([-r.near(2000.0), -r.near(100.0)]), low=r.within(0.1, 0.4), high=r.near(4.0)
         ),
         feedforward=controllers.HoldingInput(),
         reference=references.FixedSlip(slip=r.near(0.15)),
@@ -219,8 +217,8 @@ def rig_clamped(r: Draw) -> d.Loop:
         **r.rig(),
         controller=controllers.StateFeedback(
             gain=np.array([-r.near(3000.0), -r.near(90.0)]),
-            torque_min=r.within(0.1, 0.4),
-            torque_max=r.near(5.0),
+            low=r.within(0.1, 0.4),
+            high=r.near(5.0),
             antiwindup=controllers.Clamping(),
         ),
         feedforward=controllers.HoldingInput(),
@@ -235,8 +233,8 @@ def rig_on_grid(r: Draw, speed: Any) -> d.Loop:
         controller=controllers.SampledOnGrid(
             controller=controllers.ProportionalFeedback(
                 gain=np.array([-r.near(2000.0), -r.near(100.0)]),
-                torque_min=r.within(0.1, 0.4),
-                torque_max=r.near(4.0),
+                low=r.within(0.1, 0.4),
+                high=r.near(4.0),
                 antiwindup=controllers.BackCalculation(tracking_time=r.near(0.05)),
             ),
             sampling_period=2e-3,
@@ -263,7 +261,7 @@ def lab_rig(r: Draw) -> d.Loop:
         plant=plants.LabRig(),
         initial=d.BrakeStart(speed=r.within(10.0, 12.0), slip=r.within(0.05, 0.1)),
         stop=SpeedReached(speed=r.within(5.0, 6.0)),
-        controller=controllers.Relay(band=r.near(0.03), torque_min=r.within(0.45, 0.5), torque_max=r.within(0.7, 0.9)),
+        controller=controllers.Relay(band=r.near(0.03), low=r.within(0.45, 0.5), high=r.within(0.7, 0.9)),
         reference=references.Setpoint(value=r.near(0.2)),
     )
 
@@ -303,7 +301,7 @@ def computer_latch(r: Draw) -> d.Loop:
         **r.car(roads.DRY_ASPHALT, rolling=True),
         controller=controllers.Sampled(
             controller=controllers.StateFeedback(
-                gain=np.array([-r.near(2000.0), -r.near(500.0)]), torque_min=r.within(1.0, 4.0), torque_max=r.near(90.0)
+                gain=np.array([-r.near(2000.0), -r.near(500.0)]), low=r.within(1.0, 4.0), high=r.near(90.0)
             ),
             period=2e-3,
             delay=r.within(0.3e-3, 1.7e-3),
@@ -356,8 +354,8 @@ def scheduled_robust(r: Draw) -> d.Loop:
             speeds=np.array([5.0, r.near(10.0, 0.1), 20.0]),
             integral_gains=-np.array([r.near(2000.0) for _ in range(3)]),
             gains=-np.array([r.near(500.0) for _ in range(3)]),
-            torque_min=r.within(1.0, 4.0),
-            torque_max=r.near(90.0),
+            low=r.within(1.0, 4.0),
+            high=r.near(90.0),
             antiwindup=controllers.BackCalculation(tracking_time=r.near(0.03)),
         ),
         reference=references.PeakRobust(
@@ -455,7 +453,7 @@ def band(r: Draw) -> d.Loop:
 def valve(r: Draw) -> d.Loop:
     return braking(
         **r.car(roads.MagicFormula(), rolling=True),
-        controller=controllers.Relay(band=r.near(0.02), torque_min=-r.near(1.0), torque_max=r.near(1.0)),
+        controller=controllers.Relay(band=r.near(0.02), low=-r.near(1.0), high=r.near(1.0)),
         reference=references.FixedSlip(slip=r.near(0.12)),
         actuator=Series(
             blocks=(
@@ -473,7 +471,7 @@ def arm(r: Draw) -> d.Loop:
         reference=references.Upright(),
         controller=controllers.BalanceFeedback(),
         actuator=Series(
-            blocks=(actuators.VoltageLimit(voltage_max=r.near(100.0)), actuators.Lag(time_constant=r.near(0.002)))
+            blocks=(actuators.VoltageLimit(high=r.near(100.0)), actuators.Lag(time_constant=r.near(0.002)))
         ),
         stop=Fallen(),
     )
@@ -491,12 +489,12 @@ def observed(r: Draw) -> d.Loop:
                 transition=0.9 * np.eye(6) + 0.01 * np.eye(6, k=3),
                 entry=np.array([0.0, 0.0, 0.0, -0.01, 0.03, 0.02]),
                 correction=np.linspace(0.05, 0.6, 12).reshape(6, 2),
-                voltage_max=r.near(12.0),
+                predicted_high=r.near(12.0),
             ),
             period=5e-3,
             delay=r.within(0.3e-3, 4e-3),
         ),
-        actuator=actuators.VoltageLimit(voltage_max=r.near(9.0)),
+        actuator=actuators.VoltageLimit(high=r.near(9.0)),
         stop=Fallen(),
     )
 
@@ -507,7 +505,7 @@ def fall(r: Draw) -> d.Loop:
         initial=_leaning(r, 0.1),
         reference=references.Upright(),
         controller=controllers.BalanceFeedback(gain=np.array([5.0, 2.0, 0.1, 2.0, 1.0, 0.1])),
-        actuator=actuators.VoltageLimit(voltage_max=r.near(1.0)),
+        actuator=actuators.VoltageLimit(high=r.near(1.0)),
         sensor=Direct(),
         stop=Fallen(angle=r.within(0.5, 0.8)),
     )

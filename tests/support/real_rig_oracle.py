@@ -116,8 +116,7 @@ class Controller:
 
     def within(self, raw: float) -> float:
         """Within the torque's limits."""
-        names = ("low", "high") if self.kind in ("PID", "SlidingMode") else ("torque_min", "torque_max")
-        return min(max(raw, self.of(names[0])), self.of(names[1]))
+        return min(max(raw, self.of("low")), self.of("high"))
 
     def drained(self, lost: float, gain: float) -> float:
         """What the anti-windup adds to the integral's rate."""

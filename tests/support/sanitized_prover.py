@@ -13,7 +13,7 @@ from diffabs.reach.engine import Prover, apply_operation
 from diffabs.reach.equations import derive_equations
 from diffabs.scenario.scenario import load
 
-LIMITED = ["controller.torque_min=0", "controller.torque_max=9.03"]
+LIMITED = ["controller.low=0", "controller.high=9.03"]
 
 
 def prove_edges() -> None:

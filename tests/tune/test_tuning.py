@@ -49,7 +49,7 @@ RIG = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=8.0, slip=0.02),
     stop=SpeedReached(speed=6.5),
-    controller=controllers.StateFeedback(gain=np.array([-3000.0, -60.0]), torque_min=0.0, torque_max=9.03),
+    controller=controllers.StateFeedback(gain=np.array([-3000.0, -60.0]), low=0.0, high=9.03),
     feedforward=controllers.HoldingInput(),
     actuator=actuators.Lag(time_constant=1e-3),
 )
