@@ -11,7 +11,6 @@ gc.disable()  # during imports: collections would scan all of JAX's objects, a s
 
 import contextlib
 import dataclasses
-import importlib
 import math
 import pathlib
 from collections.abc import Iterator
@@ -169,8 +168,8 @@ def simulate(
             if accuracy:
                 result["accuracy"] = accuracy
             with console.show_before_errors(lambda: _show(result, setup, as_json)):
-                if csv_file and run.trajectory:
-                    show.write_csv(run.trajectory, setup.loop.plant, csv_file)
+                if csv_file:
+                    show.write_csv(run, setup.loop.plant, csv_file)
                 if mat_file:
                     values = {path: value for path, _, value in parameters(setup.loop)}
                     write_mat(mat_file, run, setup.loop.plant, parameters=values, scenario=setup.name)
@@ -246,9 +245,10 @@ def _find_loose_metrics(scenario: Scenario, run: Run, key: Key, keep: bool) -> l
 
 
 def _draw(scenario: Scenario, run: Run, picture: pathlib.Path) -> None:
-    plant = scenario.loop.plant
-    draw = importlib.import_module("diffabs.plot").figure_for(plant)
-    draw(run, title=scenario.title or scenario.name, unit=plant.control_unit).savefig(picture)
+    from diffabs.plot import draw_run
+
+    unit = scenario.loop.plant.control_unit
+    draw_run(run, title=scenario.title or scenario.name, unit=unit).savefig(picture)
 
 
 def _result(scenario: Scenario, run: Run, limited: float) -> JsonObject:

@@ -1,6 +1,5 @@
 """The command `margins`: stability margins of the linearised loop."""
 
-import importlib
 import math
 import pathlib
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from rich.table import Table
 from diffabs.cli import console, show, tables, targets
 from diffabs.config.values import ScenarioError, format_given, read_number_in_range
 from diffabs.core.pytree import ParameterSpec, replace
-from diffabs.core.types import JsonObject, Scalar
+from diffabs.core.types import JsonObject
 from diffabs.runtime import provenance
 from diffabs.runtime.separated import read_decimal
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
@@ -118,7 +117,8 @@ def _find_margins(
 
 
 def _draw(scenario: Scenario, nominal: "System", band: "Band | None", picture: pathlib.Path) -> None:
-    frequency: Scalar = importlib.import_module("diffabs.plot.frequency")
+    from diffabs.plot import frequency
+
     loops = [system.loop for system in band.systems] if band else []
     title = f"{scenario.title or scenario.name}: the open loop"
     frequency.loop_shape(nominal.loop, nominal.margins, loops, title=title).savefig(picture)

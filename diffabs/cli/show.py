@@ -15,13 +15,13 @@ from rich.table import Table
 from diffabs.cli.console import say
 from diffabs.cli.tables import open_console, show_titled_table
 from diffabs.core.bijectors import reached_bound
-from diffabs.core.loop import run_signals
 from diffabs.core.summary import format_metric, round_for_table
 from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.papers.digest import Digest
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.types import Trajectory
+from diffabs.simulate.convert import trajectory_columns
+from diffabs.simulate.types import Run
 
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
 COSTS = {
@@ -49,13 +49,12 @@ def replace_infinite(value: Scalar) -> Scalar:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_csv(trajectory: Trajectory, plant: Part, path: pathlib.Path) -> None:
+def write_csv(run: Run, plant: Part, path: pathlib.Path) -> None:
     """Write the instants up to the end of the run to a CSV file, with units in its header."""
-    columns = {f"{name} [{unit}]": values for name, (unit, values) in run_signals(trajectory.sample, plant).items()}
-    rows = int(trajectory.running.sum()) + 1  # after the end the trajectory repeats its last sample
+    columns = {f"{name} [{unit}]": values for name, (unit, values) in trajectory_columns(run, plant).items()}
     with path.open("w", encoding="utf-8", newline="\n") as file:
         csv.writer(file, lineterminator="\n").writerow(columns)  # a plant from outside may have a comma in a unit
-        for row in zip(*(values[:rows].tolist() for values in columns.values()), strict=True):
+        for row in zip(*(values.tolist() for values in columns.values()), strict=True):
             file.write(",".join(f"{value:.12g}" for value in row) + "\n")
 
 

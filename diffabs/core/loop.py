@@ -71,8 +71,9 @@ class Signals(NamedTuple):
 
 Margins = dict[str, tuple[Any, ...]]  # of stop and blocks, by name; each one of "stop" ends a run
 BLOCKS = ("sensor", "reference", "controller", "actuator")
+LOOP_SIGNALS = tuple(name for name in Sample._fields if name not in ("t", "output"))
 # Names that files and proofs give to other signals of a loop, and to their own columns and variables.
-RESERVED_SIGNALS = {*Sample._fields, "time", "sample", "metrics", "units"} - {"output"}
+RESERVED_SIGNALS = {*LOOP_SIGNALS, "t", "time", "sample", "metrics", "units"}
 
 
 @pytree
@@ -251,16 +252,3 @@ def _block_inputs(signals: Signals) -> dict[str, PyTree]:
     """Return the input of each block by its name."""
     sample, measured, tracking, _ = signals
     return {"sensor": sample.output, "reference": measured, "controller": tracking, "actuator": sample.command}
-
-
-def run_signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, PyTree]]:
-    """Return the stored signals of a run by name, each as (unit, values).
-
-    The names are `t`, the outputs of the plant, `target`, `command` and `control`; `Loop.problems` keeps them apart.
-    """
-    units = plant.shows.units
-    shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
-    target = {"target": (units[sample.output._fields[0]], sample.target)}
-    controls = {name: (plant.control_unit, getattr(sample, name)) for name in ("command", "control")}
-    time = {"t": ("s", sample.t)}
-    return {**time, **shown, **target, **controls}

@@ -8,11 +8,11 @@ from diffabs.plot.runs import draw_braking as draw_braking
 from diffabs.plot.runs import draw_convergence as draw_convergence
 from diffabs.plot.runs import draw_friction as draw_friction
 from diffabs.plot.runs import draw_positions as draw_positions
+from diffabs.plot.runs import draw_run as draw_run
 from diffabs.plot.runs import draw_signals as draw_signals
 from diffabs.plot.runs import draw_slip_lines as draw_slip_lines
 from diffabs.plot.runs import draw_slips as draw_slips
 from diffabs.plot.runs import draw_speeds as draw_speeds
-from diffabs.plot.runs import figure_for as figure_for
 from diffabs.plot.runs import shade_region as shade_region
 from diffabs.plot.style import COLOURS as COLOURS
 from diffabs.plot.style import DASHES as DASHES

@@ -1,12 +1,12 @@
 """Figures of runs: an overview of one run, several runs side by side, friction curves and convergence."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
-from diffabs.core.protocols import Plant, Road
+from diffabs.core.protocols import Road
 from diffabs.core.types import Table
 from diffabs.objectives.balance import motor_torque
 from diffabs.plot.style import (
@@ -133,15 +133,23 @@ FIGURE_BY_SIGNALS = {  # figures of one run by the signals that they draw
 }
 
 
-def figure_for(plant: Plant) -> Callable[..., Figure]:
-    """Return the function that draws an overview of one run of a plant.
+def draw_run(run: Run, *, title: str = "", unit: str = "") -> Figure:
+    """Return an overview of one run of any plant.
 
-    `draw_braking` or `draw_balance` is returned if the plant shows all signals of that figure, else `draw_signals`.
+    It is that of `draw_braking` or `draw_balance` if the plant shows all signals of that figure, else that of
+    `draw_signals`.
 
     Args:
-        plant: Plant of the run.
+        run: Run with a trajectory, as `rollout` returns it.
+        title: Title of the figure.
+        unit: Unit of the control; empty for that of the figure.
+
+    Raises:
+        ValueError: The run has no trajectory, as from `measure`.
     """
-    return next((figure for drawn, figure in FIGURE_BY_SIGNALS.items() if drawn <= {*plant.shows.units}), draw_signals)
+    signals = {*type(run.ending.sample.output).units}
+    draw = next((figure for drawn, figure in FIGURE_BY_SIGNALS.items() if drawn <= signals), draw_signals)
+    return draw(run, title=title, **({"unit": unit} if unit else {}))
 
 
 def draw_angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:

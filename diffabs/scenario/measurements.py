@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.config.values import ScenarioError, format_given, unknown_name_error
+from diffabs.core.loop import LOOP_SIGNALS
 from diffabs.runtime import files, separated
 
 MAX_MEASUREMENT_BYTES = 100_000_000  # bytes
@@ -19,7 +20,7 @@ TIME_COLUMN = "t [s]"
 TIME_NAMES = ("t", "time", "time [s]")  # of the column, beside TIME_COLUMN, in small or capital letters
 RENAME_HINT = '--rename "COLUMN=NAME" gives a column the name of a signal, or t'
 MAX_LISTED = 20  # columns of the file that a message lists
-IGNORED = ("target [", "command [", "control [")  # columns of a simulation without a measurement
+IGNORED = tuple(f"{name} [" for name in LOOP_SIGNALS)  # columns of a simulation without a measurement
 
 
 class Readings(NamedTuple):
@@ -49,9 +50,9 @@ def read_measurements(
     """Return the readings in a file.
 
     Args:
-        path: File of UTF-8 text, at most `MAX_MEASUREMENT_BYTES` long, with the column `t [s]`. Columns of target,
-            command and control are ignored. A column that is infinite in every row, such as a limit that the simulation
-            lacks, is ignored if another column is left.
+        path: File of UTF-8 text, at most `MAX_MEASUREMENT_BYTES` long, with the column `t [s]`. Columns of the
+            loop's other signals (`LOOP_SIGNALS`) are ignored. A column that is infinite in every row, such as a limit
+            that the simulation lacks, is ignored if another column is left.
         units: Units of the plant's signals by name: a column's header is `name [unit]`.
         renamed: Signal, or `t`, by the name of its column in the file. Its values have the signal's unit.
         separator: Character between the cells; None guesses comma, semicolon or tab.

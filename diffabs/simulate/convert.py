@@ -1,14 +1,12 @@
 """Conversion of a run to a summary, a pandas.DataFrame, an xarray.Dataset or a figure."""
 
-import importlib
-from types import SimpleNamespace
-from typing import Any
-
 import jax
 import numpy as np
 from jax.core import Tracer
 
+from diffabs.core.loop import LOOP_SIGNALS
 from diffabs.core.optional import import_optional
+from diffabs.core.protocols import Plant, Sample
 from diffabs.core.summary import Summary, round_for_table
 from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.simulate.faults import describe_faults
@@ -60,26 +58,32 @@ def _summarise_runs(run: PyTree, count: int) -> Summary:
     return Summary(title, ("metric", "mean", "least", "greatest"), tuple(rows), "of those that did not diverge")
 
 
-def trajectory_columns(run: PyTree, plant: Part = None) -> dict[str, tuple[str, np.ndarray]]:
-    """Return a pair (unit, values) for each signal by name, up to the end of a run; values have shape (instants,).
+def signal_columns(sample: Sample, plant: Plant | None = None) -> dict[str, tuple[str, PyTree]]:
+    """Return a pair (unit, values) for each signal of samples, by name: the columns of every table and file of a run.
 
-    The names are `t`, the plant's outputs, `target`, `setpoint`, `feedforward`, `command` and `control`. The plant
-    defines the unit of the last three. Without a plant the unit is "control".
+    The names are `t`, the plant's outputs, `target`, `setpoint`, `feedforward`, `command` and `control`
+    (`Loop.problems` keeps them apart). The plant defines the unit of the last three. Without a plant the unit is
+    "control".
     """
+    units = type(sample.output).units
+    reference = units[sample.output._fields[0]]
+    control = plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT
+    outputs = {name: (units[name], values) for name, values in sample.output._asdict().items()}
+    others = {
+        name: (reference if name in ("target", "setpoint") else control, getattr(sample, name)) for name in LOOP_SIGNALS
+    }
+    return {"t": ("s", sample.t), **outputs, **others}
+
+
+def trajectory_columns(run: PyTree, plant: Plant | None = None) -> dict[str, tuple[str, np.ndarray]]:
+    """Return the `signal_columns` of one run up to its end; values have shape (instants,)."""
     if run.trajectory is None:
         raise ValueError("the run has no trajectory: make it with rollout")
     if np.shape(run.stopped):
         raise ValueError("these are many runs: take one, jax.tree.map(lambda x: x[0], run)")
-    trajectory = run.trajectory
-    count = int(np.sum(trajectory.running)) + 1  # after the end the last sample is repeated
-    sample, units = trajectory.sample, type(trajectory.sample.output).units
-    shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
-    control = plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT
-    target = units[sample.output._fields[0]]
-    references = {"target": (target, sample.target), "setpoint": (target, sample.setpoint)}
-    controls = {name: (control, getattr(sample, name)) for name in ("feedforward", "command", "control")}
-    every = {"t": ("s", sample.t), **shown, **references, **controls}
-    return {name: (unit, np.asarray(values)[:count]) for name, (unit, values) in every.items()}
+    rows = int(np.sum(run.trajectory.running)) + 1  # after the end the last sample is repeated
+    columns = signal_columns(run.trajectory.sample, plant)
+    return {name: (unit, np.asarray(values)[:rows]) for name, (unit, values) in columns.items()}
 
 
 def to_pandas(run: PyTree, plant: Part = None) -> Scalar:
@@ -113,10 +117,9 @@ def to_xarray(run: PyTree, plant: Part = None) -> Scalar:
 
 def to_figure(run: PyTree, plant: Part = None, title: str = "") -> Scalar:
     """Return a matplotlib figure of the run. The signals of the plant's output select the kind of figure."""
-    plot: Any = importlib.import_module("diffabs.plot")
-    shown = SimpleNamespace(shows=type(run.ending.sample.output))
-    unit = plant.control_unit if plant is not None else None
-    return plot.figure_for(shown)(run, title=title, **({"unit": unit} if unit else {}))
+    from diffabs.plot import draw_run  # upwards: the one such import, for the method of `Run`
+
+    return draw_run(run, title=title, unit=plant.control_unit if plant is not None else "")
 
 
 def _attributes(run: PyTree) -> Params:

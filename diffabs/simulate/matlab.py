@@ -5,9 +5,9 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from diffabs.core.loop import run_signals
 from diffabs.core.protocols import Plant
 from diffabs.core.types import PyTree
+from diffabs.simulate.convert import trajectory_columns
 from diffabs.simulate.types import Run
 
 KEYWORDS_TEXT = (
@@ -21,17 +21,15 @@ MAX_NAME = 60  # MATLAB reads 63 characters; a number against equal names takes 
 def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
     """Write the trajectory of one run, up to its end, to a MAT file, with `more` variables by name.
 
-    The file has a column vector for each of `t`, the plant's outputs, `target`, `command` and `control`. The struct
-    `units` has their units, and the struct `metrics` the run's metrics. A mapping becomes a struct, too. A name that is
-    not valid in MATLAB is changed: stop-time becomes `stop_time`.
+    The file has a column vector for each of the `signal_columns`. The struct `units` has their units, and the struct
+    `metrics` the run's metrics. A mapping becomes a struct, too. A name that is not valid in MATLAB is changed:
+    stop-time becomes `stop_time`.
     """
     from scipy.io import savemat
 
-    assert run.trajectory is not None
-    signals = run_signals(run.trajectory.sample, plant)
-    rows = int(run.trajectory.running.sum()) + 1  # after the end the last sample is repeated
-    content: dict[str, PyTree] = {name: values[:rows] for name, (_, values) in signals.items()}
-    content["units"] = {name: unit for name, (unit, _) in signals.items()}
+    columns = trajectory_columns(run, plant)
+    content: dict[str, PyTree] = {name: values for name, (_, values) in columns.items()}
+    content["units"] = {name: unit for name, (unit, _) in columns.items()}
     content["metrics"] = {name: float(value) for name, value in run.metrics.items()}
     with path.open("wb") as file:
         savemat(file, _with_valid_names(content | more), do_compression=True, long_field_names=True, oned_as="column")

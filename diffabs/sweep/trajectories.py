@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import zarr
 
-from diffabs.core.loop import run_signals
 from diffabs.runtime import files
+from diffabs.simulate.convert import signal_columns
 from diffabs.simulate.run import run_unchecked
 from diffabs.simulate.types import Trajectory
 from diffabs.sweep.study import Study, precision
@@ -26,7 +26,7 @@ def write_trajectories(study: Study, folder: str | pathlib.Path, samples: Sequen
     if not samples:
         raise ValueError("samples = []: give the number of at least one sample")
     path = pathlib.Path(folder) / TRAJECTORIES_NAME
-    signals = [run_signals(rerun_sample(study, i).sample, study.loop.plant) for i in samples]
+    signals = [signal_columns(rerun_sample(study, i).sample, study.loop.plant) for i in samples]
     with files.new_folder(path) as folder:
         group = zarr.open_group(folder, mode="w")
         numbers = {"sample": ("", np.asarray(samples, np.int64))}

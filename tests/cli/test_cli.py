@@ -26,6 +26,7 @@ from typer.testing import CliRunner
 
 import diffabs
 from diffabs.cli import main, show
+from diffabs.core.protocols import Sample
 from diffabs.core.pytree import parameters
 from diffabs.objectives import BRAKING
 from diffabs.scenario import model, registry, scenario
@@ -64,7 +65,7 @@ def whole(tmp_path_factory, runs):
         def draw(run, *, title="", unit=""):
             return Figure(f"{title}: {bool(run.stopped)}")
 
-        plot = types.SimpleNamespace(figure_for=lambda plant: draw)
+        plot = types.SimpleNamespace(draw_run=draw)
         patch.setitem(sys.modules, "diffabs.plot", plot)
         result = run("simulate", "slip-lmi", "--json", "--csv", folder / "a.csv", "--plot", folder / "a.png")
     return folder, json.loads(result.stdout)
@@ -102,32 +103,38 @@ def test_metrics_are_the_reference_numbers(whole):
 @killed_by("cli/show.py", 'csv.writer(file, lineterminator="\\n").writerow(columns)', 'file.write(",".join(columns))')
 def test_a_unit_with_a_comma_is_one_column(tmp_path):
     unit, numbers = 'deg, of the "wheel"', np.arange(2.0)
-    plant = types.SimpleNamespace(shows=types.SimpleNamespace(units={"angle": unit}), control_unit="V")
-    output = collections.namedtuple("Output", ["angle"])(numbers)
-    sample = types.SimpleNamespace(t=numbers, output=output, target=numbers, command=numbers, control=numbers)
+    plant, shows = types.SimpleNamespace(control_unit="V"), collections.namedtuple("Output", ["angle"])
+    shows.units = {"angle": unit}
+    sample = Sample(numbers, shows(numbers), *[numbers] * 5)
     trajectory = types.SimpleNamespace(sample=sample, running=np.array([True, False]))
-    show.write_csv(trajectory, plant, tmp_path / "a.csv")
+    run = types.SimpleNamespace(trajectory=trajectory, stopped=True)
+    show.write_csv(run, plant, tmp_path / "a.csv")
     with (tmp_path / "a.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
-    assert header == ["t [s]", f"angle [{unit}]", f"target [{unit}]", "command [V]", "control [V]"]
-    assert rows == [["0"] * 5, ["1"] * 5]
+    assert header == [
+        *("t [s]", f"angle [{unit}]", f"target [{unit}]", f"setpoint [{unit}]"),
+        *("feedforward [V]", "command [V]", "control [V]"),
+    ]
+    assert rows == [["0"] * 7, ["1"] * 7]
 
 
 def test_csv_is_the_run(whole):
     folder, document = whole
     header, *rows = (folder / "a.csv").read_text().splitlines()
     assert header == (
-        "t [s],slip [1],speed [m/s],wheel_speed [m/s],deceleration [m/s^2],distance [m],target [1],command [N m],"
-        "control [N m]"
+        "t [s],slip [1],speed [m/s],wheel_speed [m/s],deceleration [m/s^2],distance [m],target [1],setpoint [1],"
+        "feedforward [N m],command [N m],control [N m]"
     )
-    t, slip, speed, wheel, _, distance, target, command, control = np.array([r.split(",") for r in rows], float).T
+    numbers = np.array([row.split(",") for row in rows], float)
+    t, slip, speed, wheel, _, distance, target, setpoint, feedforward, command, control = numbers.T
     np.testing.assert_allclose(t[:-1], 1e-3 * np.arange(len(t) - 1), rtol=1e-11, atol=0)
     assert t[-1] == pytest.approx(document["metrics"]["stop_time"], rel=1e-11)
     assert distance[-1] == pytest.approx(document["metrics"]["stop_distance"], rel=1e-11)
     assert t[-1] > t[-2]
     assert (speed[0], speed[-1]) == (pytest.approx(50 / 3.6, rel=1e-11), pytest.approx(5 / 3.6, rel=1e-11))
     np.testing.assert_allclose(slip, (speed - wheel) / speed, atol=1e-9)
-    assert set(target) == {0.2}
+    assert set(target) == set(setpoint) == {0.2}
+    assert len(set(feedforward)) == 1
     np.testing.assert_array_equal(command, control)
 
 
@@ -246,7 +253,7 @@ def test_failure_at_the_end_leaves_old_files_as_they_were(tmp_path, monkeypatch,
     def full(run, **_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(figure_for=lambda plant: full))
+    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(draw_run=full))
     (tmp_path / "a.csv").write_text("old")
     files = ("--csv", tmp_path / "a.csv", "--plot", tmp_path / "a.png")
     result = run("simulate", "slip-lmi", *files, status=1)
@@ -293,7 +300,7 @@ def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
         titles.append(title)
         return Figure(title)
 
-    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(figure_for=lambda plant: draw))
+    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(draw_run=draw))
     replace_seam(monkeypatch, "main_run", lambda chosen, key, keep: runs[0])
     gain = ("--set", "controller.gain=-4000,-40")
     tables = [run("simulate", "slip-lmi", *more, "--plot", tmp_path / "a.png").stdout for more in ((), gain)]

@@ -11,11 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.io
+import zarr
 from commands import run as command
 from mutants import killed_by
 
 import diffabs as d
 from diffabs import objectives
+from diffabs.cli import show
 from diffabs.controllers import HoldingInput, StateFeedback
 from diffabs.core.summary import Summary, format_cell, round_for_table
 from diffabs.identify import Traces, identify
@@ -24,8 +27,12 @@ from diffabs.plot.style import sheet
 from diffabs.references import FixedSlip
 from diffabs.runtime import interactive
 from diffabs.scenario.defaults import braking
+from diffabs.scenario.measurements import read_measurements
+from diffabs.simulate.convert import signal_columns
+from diffabs.simulate.matlab import write_mat
 from diffabs.stops import SpeedReached
 from diffabs.sweep import Results, Space, Study, Uniform, sweep
+from diffabs.sweep.trajectories import write_trajectories
 from diffabs.tune import build_problem, grid, tune
 
 SOLVER = d.FixedStep(2e-3, 2.0)
@@ -127,7 +134,7 @@ def test_a_package_that_is_missing_is_named(run, package, monkeypatch):
         getattr(run, package)(rig().plant)
 
 
-@killed_by("simulate/convert.py", "[:count]) for name, (unit, values)", ") for name, (unit, values)")
+@killed_by("simulate/convert.py", "np.asarray(values)[:rows])", "np.asarray(values))")
 @killed_by(
     "simulate/convert.py", "plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT", "DEFAULT_CONTROL_UNIT"
 )
@@ -154,6 +161,45 @@ def test_frames_have_units_and_end_where_the_run_does(run):
         run._replace(trajectory=None).xarray()
     with pytest.raises(ValueError, match="many runs"):
         jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), run).pandas()
+
+
+@killed_by("simulate/convert.py", 'if name in ("target", "setpoint") else control', 'if name == "target" else control')
+@killed_by("core/loop.py", 'if name not in ("t", "output"))', 'if name not in ("t", "output", "setpoint"))')
+def test_every_table_and_file_has_the_same_columns(run, tmp_path):
+    """Units and values of CSV, MAT, zarr and xarray are those of pandas."""
+    plant = rig().plant
+    frame = run.pandas(plant)
+    units = frame.attrs["units"]
+    values = {name: np.asarray(column) for name, column in frame.reset_index().items()}
+    assert [*units] == [*values] == [
+        *("t", *plant.shows._fields), *("target", "setpoint", "feedforward", "command", "control"),
+    ]  # fmt: skip
+    assert units | {"setpoint": "1", "feedforward": "N m"} == units
+    assert np.all(values["feedforward"] > 2)
+    data = run.xarray(plant)
+    show.write_csv(run, plant, tmp_path / "run.csv")
+    write_mat(tmp_path / "run.mat", run, plant)
+    header, *rows = (tmp_path / "run.csv").read_text().splitlines()
+    mat = scipy.io.loadmat(tmp_path / "run.mat", simplify_cells=True)
+    study = Study(loop=rig(), solver=SOLVER, objectives={}, space=Space({"plant.mass": Uniform(5.29, 5.3)}), samples=2)
+    group = zarr.open_group(write_trajectories(study, tmp_path, [1]), mode="r")
+    loop, key = study.lane(1)
+    kept = signal_columns(d.rollout(loop, SOLVER, key=key).trajectory.sample, plant)
+    numbers = np.array([row.split(",") for row in rows], float)
+    assert header.split(",") == [f"{name} [{unit}]" for name, unit in units.items()]
+    assert {*data.variables} == {*units}
+    assert mat["units"] == units
+    assert {*group.array_keys()} - {"sample"} == {"time" if name == "t" else name for name in units}
+    for i, (name, unit) in enumerate(units.items()):
+        array = group["time" if name == "t" else name]
+        assert data[name].attrs["units"] == array.attrs["units"] == unit
+        np.testing.assert_array_equal(data[name], values[name])
+        np.testing.assert_array_equal(mat[name], values[name])
+        np.testing.assert_allclose(numbers[:, i], values[name], rtol=1e-11, atol=1e-15)
+        np.testing.assert_allclose(array[0], kept[name][1], rtol=1e-9, atol=1e-12, err_msg=name)
+    read = read_measurements(tmp_path / "run.csv", plant.shows.units)
+    assert {*read.columns, *read.infinite} == {*plant.shows._fields}
+    np.testing.assert_allclose(read.columns["slip"], values["slip"], rtol=1e-11, atol=1e-15)
 
 
 @pytest.mark.slow
