@@ -47,10 +47,11 @@ class Doctests(griffe.Extension):
             text = listed(fenced(obj.docstring.value), _names(obj))
             parts = [text]
             if obj.is_class and parameters.parameters(obj.source):
-                text, meanings = parameters.without_meanings(text)
-                parts = [text, parameters.table(obj.source, meanings)]
+                parts = [text, parameters.table(obj.source)]
             elif obj.is_class:
                 parts = [parameters.signature(obj.source), text, parameters.table(obj.source)]
+            for name in parameters.meanings(obj.source) if obj.is_class else ():
+                obj.members[name].docstring = None  # the table has it
             obj.docstring.value = "\n\n".join(part for part in parts if part)
 
 

@@ -1,12 +1,12 @@
-"""The parameters of a part, with default, unit and range, as a table for the reference. Read from the text of its
-class: nothing is imported."""
+"""The parameters of a part, with default, unit, range and meaning, as a table for the reference. Read from the text of
+its class: nothing is imported."""
 
 import ast
+import itertools
 import math
-import re
 import textwrap
-from collections.abc import Iterator, Mapping
-from types import MappingProxyType, SimpleNamespace
+from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import NamedTuple
 
 KNOWN = {"math": math, "np": SimpleNamespace(inf=math.inf)}  # what bounds are computed with
@@ -89,30 +89,26 @@ def _after(value: ast.expr | None) -> str:
     return f"={ast.unparse(value)}" if value else ""
 
 
-MEANINGS = re.compile(r"^Attributes:\n((?:    .*\n?|\n)+)", re.MULTILINE)
+def meanings(source: str) -> dict[str, str]:
+    """Return the string below each field of the class whose text this is, by field."""
+    (tree, *_) = ast.parse(textwrap.dedent(source)).body or [None]
+    texts = {}
+    for line, below in itertools.pairwise(tree.body if isinstance(tree, ast.ClassDef) else ()):
+        match line, below:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(text))):
+                texts[name] = " ".join(text.split()).replace("|", "\\|")
+    return texts
 
 
-def without_meanings(docstring: str) -> tuple[str, dict[str, str]]:
-    """Return a docstring without its section `Attributes`, and what that says of each field, without the unit."""
-    meanings = {}
-    for entry in re.split(r"\n(?=    \S)", "\n" + "".join(MEANINGS.findall(docstring))):
-        name, colon, text = " ".join(entry.split()).partition(": ")
-        if colon:
-            meanings[name] = re.sub(r" \[[^\]]*\]\.$", ".", text).replace("|", "\\|")
-    return MEANINGS.sub("", docstring), meanings
-
-
-def table(source: str, meanings: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return the fields of a class with parameters as a table in Markdown, empty if it has no parameters; and what its
-    class attributes say of units."""
-    numeric = {p.name: p for p in parameters(source)}
-    rows = []
-    for name, default, kind in _fields(source) if numeric else ():
+def table(source: str) -> str:
+    """Return the fields of a class with parameters, or with meanings, as a table in Markdown, empty for any other; and
+    what its class attributes say of units."""
+    numeric, texts, rows = {p.name: p for p in parameters(source)}, meanings(source), []
+    for name, default, kind in _fields(source) if numeric or texts else ():
         p = numeric.get(name) or Parameter(name, default, "", kind)
-        cells = (f"`{p.name}`", f"`{p.default}`" if p.default else "", p.unit, p.interval)
-        rows.append("| " + " | ".join((*cells, meanings.get(name, ""))[: 5 if meanings else 4]) + " |")
-    more = (" meaning |", "---|") if meanings else ("", "")
-    head = [f"| parameter | default | unit | range |{more[0]}", f"|---|---|---|---|{more[1]}"]
+        cells = (f"`{p.name}`", f"`{p.default}`" if p.default else "", p.unit, p.interval, texts.get(name, ""))
+        rows.append("| " + " | ".join(cells) + " |")
+    head = ["| parameter | default | unit | range | meaning |", "|---|---|---|---|---|"]
     units = [f"{what}: {unit}." for what, unit in _units(source)]
     return "\n".join(["\n".join(head + rows) if rows else "", *([""] if rows and units else []), *units]).strip()
 

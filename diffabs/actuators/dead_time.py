@@ -44,16 +44,14 @@ class DeadTime:
     The command is read at every instant of the grid and at every event, where `tick` runs, and is held in between. At
     most `capacity` switches may be on their way. With one more the control becomes NaN, and so the plant's state: the
     run has diverged.
-
-    Attributes:
-        rise: Dead time of an increase [s], > 0.
-        fall: Dead time of a decrease [s], > 0.
-        capacity: Greatest number of switches on their way; an integer >= 1.
     """
 
     rise: Scalar = param(default=0.02, unit="s", above=0.0)
+    """Dead time of an increase."""
     fall: Scalar = param(default=0.01, unit="s", above=0.0)
+    """Dead time of a decrease."""
     capacity: int = static(default=8)
+    """Greatest number of switches on their way; an integer >= 1."""
 
     flow = no_flow
 

@@ -99,14 +99,12 @@ class Delay:
     The delay lies between one step and capacity - 2 steps of the integration.
     The ring has spare rows for events that cut every fourth of these steps. A run with more events within one delay has
     diverged: its control becomes NaN.
-
-    Attributes:
-        time: Delay [s], > 0.
-        capacity: Number of steps that the ring holds, without the spare rows; an integer >= 3.
     """
 
     time: Scalar = param(default=0.01, unit="s", above=0.0)
+    """Delay."""
     capacity: int = static(default=1024)
+    """Number of steps that the ring holds, without the spare rows; an integer >= 3."""
 
     flow = no_flow
 

@@ -17,7 +17,9 @@ class Limits:
     """control = clamp(command, low, high); by default both limits are infinite."""
 
     low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    """Lower limit of the control."""
     high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
+    """Upper limit of the control."""
 
     start = no_memory
     flow = no_flow
@@ -41,6 +43,7 @@ class Lag:
     """time_constant control' = command - control, control(0) = 0: a brake that builds up pressure."""
 
     time_constant: Scalar = param(default=0.01, unit="s", above=0.0)
+    """Time constant of the control."""
 
     def start(self, signal: Scalar) -> Memory:
         """Return the memory of a released brake: control 0."""
@@ -63,14 +66,12 @@ class AsymmetricLag:
     """T control' = command - control, control(0) = 0, with T = rise where the command is greater, else T = fall.
 
     A hydraulic brake builds its pressure up slower, or faster, than it releases it.
-
-    Attributes:
-        rise: Time constant towards a greater command [s], > 0.
-        fall: Time constant towards a smaller command [s], > 0.
     """
 
     rise: Scalar = param(default=0.02, unit="s", above=0.0)
+    """Time constant towards a greater command."""
     fall: Scalar = param(default=0.01, unit="s", above=0.0)
+    """Time constant towards a smaller command."""
 
     start = Lag.start
     output = Lag.output
@@ -87,14 +88,12 @@ class RateLimit:
     """control' = clamp((command - control)/time_constant, -rate, rate), control(0) = 0.
 
     This models a servo whose speed saturates. As time_constant goes to 0, the model becomes the ideal rate limiter.
-
-    Attributes:
-        rate: Greatest |control'| [control/s], > 0.
-        time_constant: Time constant of the servo below this rate [s], > 0.
     """
 
     rate: Scalar = param(default=1000.0, unit="control/s", above=0.0)
+    """Greatest |control'|."""
     time_constant: Scalar = param(default=0.002, unit="s", above=0.0)
+    """Time constant of the servo below this rate."""
 
     start = Lag.start
     output = Lag.output

@@ -11,6 +11,7 @@ class VoltageLimit:
     """control = clamp(command, -high, high)."""
 
     high: Scalar = param(default=48.0, unit="V", above=0.0)
+    """Upper limit of the control; the lower one is its negative."""
 
     start = no_memory
     flow = no_flow

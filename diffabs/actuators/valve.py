@@ -19,17 +19,14 @@ from diffabs.core.types import Scalar
 
 @pytree
 class IntegratingValve:
-    """control' = gain command within [low, high], control(0) = low.
-
-    Attributes:
-        gain: Rate of the control at command 1 [1/s].
-        low: Lower limit of the control, an empty brake.
-        high: Upper limit of the control, > low.
-    """
+    """control' = gain command within [low, high], control(0) = low."""
 
     gain: Scalar = param(default=100.0, unit="1/s", above=0.0)
+    """Rate of the control at command 1."""
     low: Scalar = param(default=0.0, unit="control")
+    """Lower limit of the control."""
     high: Scalar = param(default=90.0, unit="control")
+    """Upper limit of the control."""
 
     jumps = True
 

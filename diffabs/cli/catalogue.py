@@ -33,7 +33,7 @@ def list_parts(
 ) -> None:
     """List all parts and packaged scenarios.
 
-    A part is listed with its parameters, their defaults, units and ranges."""
+    A part is listed with its parameters, their defaults, units, ranges and meanings."""
     with console.end_on_errors():
         if family is not None and family not in LISTED_FAMILIES:
             raise values.unknown_name_error(

@@ -85,14 +85,13 @@ def show_family(name: str, members: JsonObject) -> None:
         for member, header in members.items():
             table.add_row(member, header["title"], header["description"])
     else:
-        table = Table("type", "field", "default", "unit", "range")
+        table = Table("type", "field", "default", "unit", "range", "meaning")
         for member, about in members.items():
             member = f"{member} [{about['unit']}]" if about.get("unit") else member
-            fields = about["parameters"] or {"": {"default": "", "unit": "", "range": ""}}
+            fields = about["parameters"] or {"": {"default": "", "unit": "", "range": "", "meaning": ""}}
             for field, row in fields.items():
-                table.add_row(
-                    member, field, format_brief(row["default"]), row["unit"], row["range"].removesuffix(row["unit"])
-                )
+                range_ = row["range"].removesuffix(row["unit"])
+                table.add_row(member, field, format_brief(row["default"]), row["unit"], range_, row["meaning"])
                 member = ""
             table.add_section()
     show_titled_table(name, table)

@@ -30,14 +30,12 @@ class Clamping:
     the limit. This law is continuous and its I' tends to that rate as Tt goes to 0. Metrics differ from those of the
     textbook law by a share of order Tt^2. A sampled controller uses its period instead of a shorter Tt.
 
-    Attributes:
-        tracking_time: Tt [s], > 0. A fixed step of a run may be at most 2.78 Tt.
-
     Source: Astrom and Hagglund, PID Controllers, 2nd ed., sec. 3.5 (conditional integration, back-calculation);
         Filippov, Differential Equations with Discontinuous Righthand Sides, sec. 4 (equivalent rate).
     """
 
     tracking_time: Scalar = param(default=0.01, unit="s", above=0.0)
+    """Time constant Tt. A fixed step of a run may be at most 2.78 Tt."""
 
     def rate(self, error: Scalar, gain: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
         """Return I', in the unit of `error`: between 0 and `error`, and `error` where the output is not limited.
@@ -56,13 +54,11 @@ class Clamping:
 class BackCalculation:
     """I' = e + (limited - raw)/(gain * Tt): the excess over the limit decays with the tracking time Tt.
 
-    Attributes:
-        tracking_time: Tt [s], > 0.
-
     Source: Astrom and Hagglund, PID Controllers, 2nd ed., sec. 3.5.
     """
 
     tracking_time: Scalar = param(default=0.05, unit="s", above=0.0)
+    """Time constant Tt."""
 
     def rate(self, error: Scalar, gain: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
         """Return I' = error + (limited - raw)/(gain * Tt), in the unit of `error`.

@@ -38,6 +38,7 @@ class BalanceFeedback:
     """
 
     gain: Vector = param(default=DEFAULT_BALANCE_GAIN, unit="V/rad, V s/rad")
+    """Gain K, shape (6,)."""
 
     start = no_memory
     flow = no_flow
@@ -68,20 +69,18 @@ class ObserverFeedback:
     The prediction uses the voltage clamped to +-predicted_high. The output itself has no limit. Without `Sampled`, the
     observer computes in every step of the integration, so A and B must be those of this step. The target and the
     feed-forward have no effect.
-
-    Attributes:
-        gain: K, shape (6,) [V/rad, V s/rad].
-        transition: A, shape (6, 6).
-        entry: B, shape (6,) [rad/V, rad/(s V)].
-        correction: L, shape (6, 2) [1, 1/s].
-        predicted_high: Upper limit of the voltage in the prediction [V], > 0.
     """
 
     gain: Vector = param(default=DEFAULT_BALANCE_GAIN, unit="V/rad, V s/rad")
+    """Gain K, shape (6,)."""
     transition: Matrix = param(default=np.eye(6), unit="1")
+    """Matrix A of the prediction, shape (6, 6)."""
     entry: Vector = param(default=np.zeros(6), unit="rad/V, rad/(s V)")
+    """Column B of the prediction, shape (6,)."""
     correction: Matrix = param(default=np.eye(6)[:, :2], unit="1, 1/s")
+    """Kalman gain L, shape (6, 2)."""
     predicted_high: Scalar = param(default=np.inf, unit="V", above=0.0, infinite=True)
+    """Upper limit of the voltage in the prediction; the lower one is its negative."""
 
     every_step = True
     flow = no_flow

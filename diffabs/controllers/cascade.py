@@ -29,16 +29,14 @@ class Cascade:
     """u = inner(target = outer(target, measured), measured), where `inner` follows the signal `inner_signal`.
 
     Both are controllers with a flow, such as PID. For a computer, wrap the cascade in `Sampled`.
-
-    Attributes:
-        outer: Controller of the plant's first signal; its gains are in units of the inner signal.
-        inner: Controller of the inner signal; the loop's feed-forward is added to its command.
-        inner_signal: Name of the plant's output that the inner controller follows; empty for the second one.
     """
 
     outer: Part = part(default=PID)
+    """Controller of the plant's first signal; its gains are in units of the inner signal."""
     inner: Part = part(default=PID)
+    """Controller of the inner signal; the loop's feed-forward is added to its command."""
     inner_signal: str = static(default="")
+    """Name of the plant's output that the inner controller follows; empty for the second one."""
 
     def start(self, signal: Tracking) -> Memory:
         """Return the memories of both controllers, the inner one started on the outer one's command."""

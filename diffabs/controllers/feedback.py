@@ -21,19 +21,16 @@ from diffabs.core.types import Part, Scalar, Vector
 
 @pytree
 class StateFeedback:
-    """u = clamp(ff + k1 x1 + k2 x2, low, high). The default gain is the paper's (section 4).
-
-    Attributes:
-        gain: (k1, k2), of the integral and of the slip error, shape (2,) [control/signal/s, control/signal].
-        low: Lower limit of the control.
-        high: Upper limit of the control.
-        antiwindup: Anti-windup strategy of the integral.
-    """
+    """u = clamp(ff + k1 x1 + k2 x2, low, high). The default gain is the paper's (section 4)."""
 
     gain: Vector = param(default=(-11753.0, -48.0), unit="control/signal/s, control/signal")
+    """(k1, k2), of the integral and of the slip error, shape (2,)."""
     low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    """Lower limit of the control."""
     high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
+    """Upper limit of the control."""
     antiwindup: Part = part(default=NoAntiWindup)
+    """Anti-windup strategy of the integral."""
 
     def start(self, signal: Tracking) -> Memory:
         """Return the memory x1(0) = 0."""

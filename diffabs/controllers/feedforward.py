@@ -10,6 +10,7 @@ class ConstantInput:
     """A constant feed-forward: the input of a controller without a model of mass or road."""
 
     value: Scalar = param(default=0.0, unit="control")
+    """Feed-forward control."""
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Scalar:
         """Return `value`, in the unit of the plant's control."""

@@ -25,23 +25,20 @@ from diffabs.core.types import Part, Scalar, Vector
 
 @pytree
 class ScheduledFeedback:
-    """u = clamp(ff + k1(v) x1 + k2(v) x2, low, high), with gains at increasing speeds.
-
-    Attributes:
-        speeds: Nodes v, increasing [m/s].
-        integral_gains: k1 at the nodes [control/signal/s].
-        gains: k2 at the nodes [control/signal].
-        low: Lower limit of the control.
-        high: Upper limit of the control.
-        antiwindup: Anti-windup strategy of the integral.
-    """
+    """u = clamp(ff + k1(v) x1 + k2(v) x2, low, high), with gains at increasing speeds."""
 
     speeds: Vector = param(default=(5 / 3.6, 50 / 3.6), unit="m/s", low=0.0, free=True)
+    """Nodes v, increasing."""
     integral_gains: Vector = param(default=(-11753.0, -11753.0), unit="control/signal/s", free=True)
+    """Gains k1 at the nodes."""
     gains: Vector = param(default=(-58.0, -158.0), unit="control/signal", free=True)
+    """Gains k2 at the nodes."""
     low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    """Lower limit of the control."""
     high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
+    """Upper limit of the control."""
     antiwindup: Part = part(default=NoAntiWindup)
+    """Anti-windup strategy of the integral."""
 
     start, limits, flow, output = StateFeedback.start, StateFeedback.limits, StateFeedback.flow, StateFeedback.output
     _torque = StateFeedback._torque
@@ -69,20 +66,18 @@ class ProportionalFeedback:
 
     At a frozen speed the gain from torque to slip of a braked wheel is proportional to 1/v, eq. (16) of Maeda and
     Sugiura. The factor v/v0 cancels this, so the loop is equally fast at every speed.
-
-    Attributes:
-        gain: (k1, k2) at v0 [control/signal/s, control/signal].
-        reference_speed: v0 [m/s], > 0.
-        low: Lower limit of the control.
-        high: Upper limit of the control.
-        antiwindup: Anti-windup strategy of the integral.
     """
 
     gain: Vector = param(default=(-11753.0, -158.0), unit="control/signal/s, control/signal")
+    """(k1, k2) at the speed v0, shape (2,)."""
     reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
+    """Speed v0 at which gains and rates have their stated values."""
     low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    """Lower limit of the control."""
     high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
+    """Upper limit of the control."""
     antiwindup: Part = part(default=NoAntiWindup)
+    """Anti-windup strategy of the integral."""
 
     start, limits, flow, output = StateFeedback.start, StateFeedback.limits, StateFeedback.flow, StateFeedback.output
     rules, _torque = StateFeedback.rules, StateFeedback._torque

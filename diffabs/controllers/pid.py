@@ -38,29 +38,26 @@ class PIDMemory(NamedTuple):
 
 @pytree
 class PID:
-    """u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high), with any sign of the gains.
-
-    Attributes:
-        kp: Proportional gain [control/signal]. Negative gains are reverse action.
-        ki: Integral gain kI [control/signal/s].
-        kd: Derivative gain kD [control s/signal].
-        b: Set-point weight of the proportional part.
-        c: Set-point weight of the derivative part.
-        cutoff: Corner frequency wc of the derivative filter [rad/s].
-        low: Lower limit of the control.
-        high: Upper limit of the control.
-        antiwindup: Anti-windup strategy of the integral.
-    """
+    """u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high), with any sign of the gains."""
 
     kp: Scalar = param(default=3893.0, unit="control/signal")
+    """Proportional gain. Negative gains are reverse action."""
     ki: Scalar = param(default=0.0, unit="control/signal/s")
+    """Integral gain kI."""
     kd: Scalar = param(default=0.0, unit="control s/signal")
+    """Derivative gain kD."""
     b: Scalar = param(default=1.0, unit="1", low=0.0)
+    """Set-point weight of the proportional part."""
     c: Scalar = param(default=1.0, unit="1", low=0.0)
+    """Set-point weight of the derivative part."""
     cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
+    """Corner frequency wc of the derivative's low-pass filter."""
     low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    """Lower limit of the control."""
     high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
+    """Upper limit of the control."""
     antiwindup: Part = part(default=NoAntiWindup)
+    """Anti-windup strategy of the integral."""
 
     def start(self, signal: Tracking) -> Memory:
         """Return the memory with integral and filter at zero."""

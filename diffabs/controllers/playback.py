@@ -14,15 +14,12 @@ from diffabs.core.types import Scalar, Vector
 
 @pytree
 class PlayedCommand:
-    """From time k period on, the output is entry k of `commands`; after the last one it stays. Signals have no effect.
-
-    Attributes:
-        commands: Recorded commands, shape (length,) [control].
-        period: Time for which an entry is held [s], a whole multiple of the integration step.
-    """
+    """From time k period on, the output is entry k of `commands`; the last one stays. Signals have no effect."""
 
     commands: Vector = param(default=(0.0,), unit="control", free=True)
+    """Recorded commands, shape (length,)."""
     period: Scalar = param(default=0.01, unit="s", above=0.0, tunable=False)
+    """Period of the entries, a whole multiple of the integration step."""
 
     flow = no_flow
     grid_rules = period_on_grid

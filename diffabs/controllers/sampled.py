@@ -56,16 +56,14 @@ class Sampled:
     """`controller` evaluated every `period`, with its output applied `delay` later and held.
 
     The period must be a whole multiple of the integration step.
-
-    Attributes:
-        controller: Controller that the computer runs.
-        period: Sampling period [s], > 0.
-        delay: Computing time [s], 0 <= delay <= period.
     """
 
     controller: Block = part(default=PID)
+    """Controller that the computer runs."""
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    """Period of the samples."""
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
+    """Computing time, at most the sampling period."""
 
     flow = no_flow
     grid_rules = period_on_grid

@@ -45,18 +45,16 @@ class GridMemory(NamedTuple):
 class SampledOnGrid:
     """`controller` evaluated every `sampling_period`, with its output applied `delay` later. In the step of the change
     it applies the mean over the step.
-
-    Attributes:
-        controller: Controller that the computer runs.
-        sampling_period: Sampling period [s], > 0, a whole multiple of the integration step.
-        delay: Computing time [s], 0 <= delay <= sampling_period.
     """
 
     controller: Block = part(default=PID)
+    """Controller that the computer runs."""
     # The name is not `period`: for a block with a `period`, steps end only at its multiples, but this block must tick
     # at every grid instant.
     sampling_period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    """Period of the samples, a whole multiple of the integration step."""
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
+    """Computing time, at most the sampling period."""
 
     flow = no_flow
     compute_sample = Sampled.compute_sample

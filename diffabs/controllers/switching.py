@@ -17,6 +17,7 @@ class ConstantTorque:
     """u = torque, regardless of the target: a driver who brakes fully, without anti-lock control."""
 
     torque: Scalar = param(default=90.0, unit="control")
+    """Constant control."""
 
     start = no_memory
     flow = no_flow
@@ -33,16 +34,14 @@ class Relay:
 
     An event locates each switch where the slip crosses the edge of the band, also between grid instants. The memory is
     1 while the brake is applied, else 0.
-
-    Attributes:
-        band: Half width of the hysteresis [signal], between 0 and 1.
-        low: Control with the brake released.
-        high: Control with the brake applied, > low.
     """
 
     band: Scalar = param(default=0.02, unit="signal", above=0.0, below=1.0)
+    """Half width of the hysteresis."""
     low: Scalar = param(default=0.0, unit="control")
+    """Lower limit of the control, that of a released brake."""
     high: Scalar = param(default=90.0, unit="control")
+    """Upper limit of the control, that of an applied brake."""
 
     flow = no_flow
 
@@ -82,19 +81,17 @@ class SlidingMode:
 
     First-order sliding mode with a boundary layer. By default both limits are infinite.
 
-    Attributes:
-        gain: Greatest distance of the control from the feed-forward [control].
-        boundary: Half width of the boundary layer [signal].
-        low: Lower limit of the control.
-        high: Upper limit of the control.
-
     Source: Slotine and Li, Applied Nonlinear Control, sec. 7.2.
     """
 
     gain: Scalar = param(default=90.0, unit="control", low=0.0)
+    """Greatest distance of the control from the feed-forward."""
     boundary: Scalar = param(default=0.02, unit="signal", above=0.0)
+    """Half width of the boundary layer."""
     low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
+    """Lower limit of the control."""
     high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
+    """Upper limit of the control."""
 
     start = no_memory
     flow = no_flow

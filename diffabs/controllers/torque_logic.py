@@ -40,20 +40,18 @@ class FourPhase:
     """Raise the torque, hold it until the slip is high, lower it, hold it until the slip is low.
 
     It skips a hold that is already over. The target has no effect.
-
-    Attributes:
-        torque_low: Torque at which the brake stops lowering.
-        torque_high: Torque at which the brake stops raising, > torque_low.
-        slip_low: Slip that ends the second hold [signal].
-        slip_high: Slip that ends the first hold [signal], > slip_low.
-        rate: Rate of the torque [control/s].
     """
 
     torque_low: Scalar = param(default=600.0, unit="control", low=0.0)
+    """Torque at which the brake stops lowering."""
     torque_high: Scalar = param(default=900.0, unit="control", above=0.0)
+    """Torque at which the brake stops raising, > torque_low."""
     slip_low: Scalar = param(default=0.08, unit="signal", above=0.0)
+    """Slip that ends the second hold."""
     slip_high: Scalar = param(default=0.35, unit="signal", above=0.0)
+    """Slip that ends the first hold, > slip_low."""
     rate: Scalar = param(default=5000.0, unit="control/s", above=0.0)
+    """Rate of the torque."""
 
     def start(self, signal: Tracking) -> Memory:
         """Return torque 0 in the first phase."""
@@ -107,23 +105,20 @@ class FourPhase:
 
 @pytree
 class BandLogic:
-    """The torque grows below a band of the slip, decays above it, and stays within. The target has no effect.
-
-    Attributes:
-        slip_low: Lower edge of the band [signal].
-        slip_high: Upper edge of the band [signal], > slip_low.
-        growth: Relative rate of the torque below the band [1/s].
-        decay: Relative rate of its fall above the band [1/s].
-        torque: Torque at the start [control].
-        high: Upper limit of the control.
-    """
+    """The torque grows below a band of the slip, decays above it, and stays within. The target has no effect."""
 
     slip_low: Scalar = param(default=0.145, unit="signal", above=0.0)
+    """Lower edge of the band."""
     slip_high: Scalar = param(default=0.155, unit="signal", above=0.0)
+    """Upper edge of the band, > slip_low."""
     growth: Scalar = param(default=0.5, unit="1/s", above=0.0)
+    """Relative rate of the torque below the band."""
     decay: Scalar = param(default=1.2, unit="1/s", above=0.0)
+    """Relative rate of its fall above the band."""
     torque: Scalar = param(default=800.0, unit="control", above=0.0)
+    """Control at the start."""
     high: Scalar = param(default=1e5, unit="control", above=0.0)
+    """Upper limit of the control."""
 
     jumps = True
 

@@ -3,7 +3,8 @@
 The leaves of a part are its parameters. So `jax.vmap` over a plant is a Monte-Carlo sweep, and `jax.grad` with respect
 to a controller is tuning. A second dictionary of parameters does not exist. A field is one of three kinds:
 
-    param(...)   a leaf: a float (or array), with unit and range; differentiable and batchable
+    param(...)   a leaf: a float (or array), with unit and range; differentiable and batchable. A string below says
+                 what it means
     part(...)    another part, or a tuple of parts
     static(...)  a shape or a choice fixed at trace time
 
@@ -24,6 +25,7 @@ from jax.typing import ArrayLike
 from diffabs.core import kinds
 from diffabs.core.arrays import as_array, as_rule_array
 from diffabs.core.compiling import is_traced
+from diffabs.core.meanings import document_fields
 from diffabs.core.renamed import RENAMED, current_name, refuse_old_names
 from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.core.units import Units, resolve_unit, units_inside, units_of
@@ -157,7 +159,7 @@ def pytree(cls: type[T]) -> type[T]:
         new.__init__ = refuse_old_names(new.__init__)
     meta = [f.name for f in fields if "static" in f.metadata]
     _register(new, [f.name for f in fields if f.name not in meta], meta)
-    return new
+    return document_fields(new)
 
 
 def _register(cls: type, data: list[str], meta: list[str]) -> None:

@@ -31,7 +31,9 @@ class SpeedScaled:
 
     model: SlipModel = part(default=SlipModel)
     reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
+    """Speed v0 at which gains and rates have their stated values."""
     fall: Scalar = param(default=0.0, unit="1", above=-1.0)
+    """Greatest relative fall of the speed over a period, v/v+ - 1."""
 
     @property
     def period(self) -> float | None:

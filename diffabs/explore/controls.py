@@ -161,7 +161,7 @@ class Controls:
     def _row(self, key: str, knob: Knob) -> None:
         value = self.session.value(key)
         with ui.element("div").classes("knob"):
-            ui.label(knob.label).classes("name").tooltip(f"{knob.name} in {knob.spec.interval()}")
+            ui.label(knob.label).classes("name").tooltip(f"{knob.meaning} {knob.name} in {knob.spec.interval()}")
             field = ui.input(value=knob.text(value)).props("dense outlined hide-bottom-space")
             field.props["data-field"], field.props["aria-label"] = key, knob.name
             field.on("change", lambda _: self._change(key, str(field.value), 0))

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from diffabs.config.values import read_number_in_range, wrong_kind_error
-from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.meanings import field_meanings
+from diffabs.core.pytree import ParameterSpec, get, parameters
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import unit_at
 from diffabs.explore.friction import FACTOR_PATH
@@ -36,6 +37,7 @@ class Knob:
         name: Name in scenarios and messages.
         group: Heading on the page.
         label: Label on the page.
+        meaning: What the parameter is, as its class says.
         spec: Displayed unit and range.
         scale: Displayed value per SI value.
         low: Lower end of the slider in the displayed unit, or None without a sensible one.
@@ -47,6 +49,7 @@ class Knob:
     name: str
     group: str
     label: str
+    meaning: str
     spec: ParameterSpec
     scale: float
     low: float | None
@@ -129,6 +132,7 @@ def knobs(scenario: Scenario) -> dict[str, Knob]:
         group, _, label = canonical_path(path).partition(".")
         label = label.removeprefix(f"{group}.").replace("_", " ")
         label = "friction factor" if path == FACTOR_PATH else label
+        meaning = field_meanings(type(get(scenario.loop, path.rpartition(".")[0]))).get(tail, "")
         values = np.asarray(value, float)
         if values.ndim > 1:
             continue  # a matrix has no sliders
@@ -141,7 +145,7 @@ def knobs(scenario: Scenario) -> dict[str, Knob]:
                 shown_spec, float(values[place]) * scale, _range_in_scenario(scenario, path, at, scale)
             )
             words = label if at is None else f"{label} {at + 1}"
-            knob = Knob(path, at, name + suffix, group, words, shown_spec, scale, low, high)
+            knob = Knob(path, at, name + suffix, group, words, meaning, shown_spec, scale, low, high)
             by_key[knob.key] = knob
     return by_key
 

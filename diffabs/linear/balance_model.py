@@ -28,14 +28,12 @@ from diffabs.plants.arm_balance import ArmState
 class BalanceModel:
     """A balancing plant, linearised at rest and upright. With `Sampling` the control is held over the period, without
     delay.
-
-    Attributes:
-        plant: Plant to linearise.
-        sampling: `Continuous`, or `Sampling` with delay 0.
     """
 
     plant: Plant = part(default=ArmBalance)
+    """Plant to linearise."""
     sampling: Continuous | Sampling = part(default=Continuous)
+    """`Continuous`, or `Sampling` with delay 0."""
 
     period = SlipModel.period
 

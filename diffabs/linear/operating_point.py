@@ -50,11 +50,7 @@ class LinearLoop(NamedTuple):
 
 @pytree
 class OperatingPoint:
-    """A loop at rest, as a linear model in continuous time. `operating_point` makes it.
-
-    Attributes:
-        indices: Indices of the loop's states that the model contains.
-    """
+    """A loop at rest, as a linear model in continuous time. `operating_point` makes it."""
 
     plant: Plant = part()
     initial: Part = part()
@@ -64,6 +60,7 @@ class OperatingPoint:
     controller: Block = part()
     actuator: Block = part(default=Direct)
     indices: tuple[int, ...] = static(default=())
+    """Indices of the loop's states that the model contains."""
 
     period = None  # it is in continuous time
 

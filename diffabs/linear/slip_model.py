@@ -42,6 +42,7 @@ class LowPass:
     """
 
     cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
+    """Corner frequency of the low-pass filter."""
 
 
 @pytree
@@ -54,7 +55,9 @@ class Sampling:
     """A controller that runs every `period`. Its output is held, and changes `delay` after the sample."""
 
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    """Period of the samples."""
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
+    """Computing time, at most the sampling period."""
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rule delay <= period."""
@@ -77,7 +80,9 @@ class SlipModel:
 
     plant: Plant = part(default=MirroredRig)
     slip: Scalar = param(default=0.2, unit="1", above=0.0, below=1.0)
+    """Slip at which the model is linearised."""
     speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0, high=200.0)
+    """Frozen speed of the vehicle."""
     actuator: Direct | Lag = part(default=Direct)
     sampling: Continuous | Sampling = part(default=Continuous)
     filter: Direct | LowPass = part(default=Direct)
@@ -85,7 +90,7 @@ class SlipModel:
 
     @property
     def period(self) -> float | None:
-        """Sampling period [s]; None in continuous time."""
+        """Period of the samples [s]; None in continuous time."""
         return float(self.sampling.period) if isinstance(self.sampling, Sampling) else None
 
     @property

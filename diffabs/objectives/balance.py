@@ -150,8 +150,11 @@ class SoftLoss(FinalValue):
     physical = (0.0, 1.0)
 
     weight: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
+    """Weights of the squared states, shape (6,)."""
     radius: Scalar = param(default=0.1, unit="1", above=0.0)
+    """Size |x| at which the loss is 1/2."""
     softness: Scalar = param(default=0.3, unit="1", above=0.0)
+    """Width of the transition; 0 would be a step."""
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the loss, a sigmoid of log |x|."""
@@ -172,6 +175,7 @@ class RestTime(HeldValue):
     unreached = math.inf
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
+    """Half width of the band around upright."""
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory of a run that rests from t = 0."""
@@ -205,7 +209,9 @@ class BalanceCost(Integral):
     physical = (0.0, math.inf)
 
     q: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
+    """Weights of the squared states, shape (6,)."""
     r: Scalar = param(default=0.0, unit="rad^2/V^2", low=0.0)
+    """Weight of the squared control."""
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory with integral 0."""

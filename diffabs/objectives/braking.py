@@ -59,6 +59,7 @@ class LockedTime(HeldValue):
     physical = (0.0, math.inf)
 
     threshold: Scalar = param(default=0.99, unit="1", above=0.0, below=1.0)
+    """Slip from which on the wheel counts as locked."""
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the part of the step above the threshold [s]."""

@@ -206,7 +206,9 @@ class SettlingTime(HeldValue):
     unreached = math.inf
 
     share: Scalar = param(default=0.02, unit="1", low=0.0, below=1.0)
+    """Half width of the band, relative to the step from the first value to the setpoint."""
     band: Scalar = param(default=0.0, unit="signal", low=0.0)
+    """Least half width of the band."""
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory of a run that is settled from t = 0."""
@@ -250,7 +252,9 @@ class ShareAtLimit(HeldValue):
     physical = (0.0, 1.0)
 
     low: Scalar = param(default=-math.inf, unit="control", below=math.inf, infinite=True)
+    """Lower limit of the control."""
     high: Scalar = param(default=math.inf, unit="control", above=-math.inf, infinite=True)
+    """Upper limit of the control."""
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the step, half the step, or 0 [s]."""
@@ -336,7 +340,9 @@ class QuadraticCost(Integral):
     physical = (0.0, math.inf)
 
     q: Vector = param(default=(1.0, 1.0), unit="1", low=0.0)
+    """Weights (q1, q2) of the squared states, shape (2,)."""
     r: Scalar = param(default=1.0, unit="1", above=0.0)
+    """Weight of the squared control."""
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory with both integrals 0."""

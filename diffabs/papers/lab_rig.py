@@ -125,19 +125,16 @@ NOTES = [
 
 @pytree
 class Coasting:
-    """A wheel that only its bearing brakes: J w' = -(d w + M), so w(t) = (w0 + M/d) exp(-d t/J) - M/d.
-
-    Attributes:
-        speed: Speed w0 at t = 0 [rad/s].
-        friction: Viscous friction d [N m s].
-        stiction: Dry friction M [N m].
-        inertia: Inertia J [kg m^2], known.
-    """
+    """A wheel that only its bearing brakes: J w' = -(d w + M), so w(t) = (w0 + M/d) exp(-d t/J) - M/d."""
 
     speed: Scalar = param(default=100.0, unit="rad/s", above=0.0)
+    """Speed w0 at t = 0."""
     friction: Scalar = param(default=1e-4, unit="N m s", above=0.0)
+    """Viscous friction d of the wheel."""
     stiction: Scalar = param(default=1e-2, unit="N m", above=0.0)
+    """Dry friction M of the wheel."""
     inertia: Scalar = param(default=7.5281e-3, unit="kg m^2", above=0.0)
+    """Inertia J of the wheel."""
 
     def at(self, t: Vector) -> Vector:
         """Return the speed [rad/s] at instants `t` [s]."""
@@ -265,15 +262,12 @@ def compare_tables(rig: LabRig) -> list[JsonObject]:
 
 @pytree
 class StepRun:
-    """A loop that brakes with one step of the command, and the instant of this step on the axis of the drawing.
-
-    Attributes:
-        loop: Loop whose brake receives the command at t = 0.
-        instant: Instant of the step on the axis of the drawing [s].
-    """
+    """A loop that brakes with one step of the command, and the instant of this step on the axis of the drawing."""
 
     loop: Loop = part()
+    """Loop whose brake receives the command at t = 0."""
     instant: Scalar = param(default=0.14, unit="s")
+    """Instant of the step on the axis of the drawing."""
 
 
 class StepCurves(NamedTuple):

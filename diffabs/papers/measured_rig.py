@@ -125,20 +125,19 @@ class DrivenStart:
     """Speed and slip at the start of braking; the wheel may be faster than the vehicle, unlike in a `BrakeStart`."""
 
     speed: Scalar = param(default=17.82, unit="m/s", above=0.0)
+    """Speed of the vehicle at t = 0."""
     slip: Scalar = param(default=0.0, unit="1", above=-1.0, high=1.0)
+    """Slip at t = 0; a negative one is that of a wheel that drives."""
 
 
 @pytree
 class RecordedRun:
-    """A loop, and the age of the wheel speed that the counter of its record shows.
-
-    Attributes:
-        loop: Loop of the experiment.
-        counter_lag: Age of the wheel speed in the record [s].
-    """
+    """A loop, and the age of the wheel speed that the counter of its record shows."""
 
     loop: Loop = part()
+    """Loop of the experiment."""
     counter_lag: Scalar = param(default=0.013, unit="s", low=0.0)
+    """Age of the wheel speed in the record."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -70,11 +70,17 @@ class BalanceStart:
     """Angles [rad] and rates [rad/s] of frame (theta), arm (psi) and rider (phi) at t = 0."""
 
     theta: Scalar = param(default=0.0, unit="rad")
+    """Angle of the frame at t = 0, from the vertical."""
     psi: Scalar = param(default=0.0, unit="rad")
+    """Angle of the arm at t = 0, from the frame."""
     phi: Scalar = param(default=0.0, unit="rad")
+    """Angle of the rider at t = 0, from the frame."""
     theta_rate: Scalar = param(default=0.0, unit="rad/s")
+    """Rate of theta at t = 0."""
     psi_rate: Scalar = param(default=0.0, unit="rad/s")
+    """Rate of psi at t = 0."""
     phi_rate: Scalar = param(default=0.0, unit="rad/s")
+    """Rate of phi at t = 0."""
 
 
 def usual_parts(self: Part) -> dict[str, PyTree]:
@@ -92,33 +98,48 @@ def usual_objectives(self: Part) -> dict[str, PyTree]:
 
 @pytree
 class ArmBalance:
-    """Frame, arm and rider under the voltage of the arm's motor. A negative `arm_length` is a hanging arm.
-
-    In the letters of the module's equations, the first ten fields are m1, m2, m3, lg, l, Lg, hg, I1, I2 and I3. The
-    others are K, d, Rm, Kt, Kb, fm, N, the limit of the current, Jr and g. The lengths lg, Lg and hg reach to the
-    centres of mass; arm and rider turn at the height l.
-    """
+    """Frame, arm and rider under the voltage of the arm's motor. A negative `arm_length` is a hanging arm."""
 
     body_mass: Scalar = param(default=30.0, unit="kg", above=0.0)
+    """Mass m1 of the frame."""
     arm_mass: Scalar = param(default=20.0, unit="kg", above=0.0)
+    """Mass m2 of the arm."""
     rider_mass: Scalar = param(default=50.0, unit="kg", low=0.0)
+    """Mass m3 of the rider."""
     body_height: Scalar = param(default=0.6, unit="m", above=0.0)
+    """Height lg of the frame's centre of mass."""
     mount_height: Scalar = param(default=0.7, unit="m", above=0.0)
+    """Height l at which arm and rider turn."""
     arm_length: Scalar = param(default=0.5, unit="m")
+    """Distance Lg from there to the arm's centre of mass; negative for a hanging arm."""
     rider_height: Scalar = param(default=0.6, unit="m")
+    """Distance hg from there to the rider's centre of mass."""
     body_inertia: Scalar = param(default=3.6, unit="kg m^2", low=0.0)
+    """Inertia I1 of the frame."""
     arm_inertia: Scalar = param(default=1.7, unit="kg m^2", above=0.0)
+    """Inertia I2 of the arm."""
     rider_inertia: Scalar = param(default=6.0, unit="kg m^2", above=0.0)
+    """Inertia I3 of the rider."""
     stiffness: Scalar = param(default=1000.0, unit="N m/rad", low=0.0)
+    """Stiffness K of the rider's hip."""
     damping: Scalar = param(default=100.0, unit="N m s/rad", low=0.0)
+    """Damping d of the rider's hip."""
     resistance: Scalar = param(default=3.0, unit="ohm", above=0.0)
+    """Resistance Rm of the motor."""
     torque_constant: Scalar = param(default=30.0, unit="N m/A", above=0.0)
+    """Torque Kt of the motor per ampere."""
     back_emf: Scalar = param(default=30.0, unit="V s/rad", low=0.0)
+    """Induced voltage Kb of the motor per speed."""
     friction: Scalar = param(default=0.02, unit="N m s/rad", low=0.0)
+    """Viscous friction fm of the motor."""
     gear: Scalar = param(default=1.0, unit="1", above=0.0)
+    """Gear ratio N of the motor."""
     current_max: Scalar = param(default=np.inf, unit="A", above=0.0, infinite=True)
+    """Greatest current of the motor."""
     rotor_inertia: Scalar = param(default=0.0, unit="kg m^2", low=0.0)
+    """Inertia Jr of the motor's rotor."""
     gravity: Scalar = param(default=9.81, unit="m/s^2", above=0.0)
+    """Acceleration g of gravity."""
 
     shows = BalanceOutput
     control_unit = "V"

@@ -52,21 +52,20 @@ class _Audit(HeldValue):
 class BrakeAudit(_Audit):
     """Audit of a braked vehicle, whose kinetic energy is that of two masses: one at the car's speed and one at the
     wheel's rim.
-
-    Attributes:
-        car: Mass at the car's speed [kg].
-        wheel: Mass at the speed of the wheel's rim [kg].
-        radius: Radius of the wheel [m].
-        scale: Energy at the start [J].
-        commanded: True if the control is the command of a brake. Otherwise the control is a torque, and a negative one
-            speeds the wheel up.
     """
 
     car: Scalar = param(unit="kg", above=0.0)
+    """Mass at the car's speed."""
     wheel: Scalar = param(unit="kg", above=0.0)
+    """Mass at the speed of the wheel's rim."""
     radius: Scalar = param(unit="m", above=0.0)
+    """Radius r of the wheel."""
     scale: Scalar = param(unit="J", above=0.0)
+    """Energy scale of the tolerance: that at the start."""
     commanded: bool = static(default=False)
+    """True if the control is the command of a brake. Otherwise the control is a torque, and a negative one speeds the
+    wheel up.
+    """
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum of the steps' unexplained gains of energy [J], this step included.
@@ -101,16 +100,14 @@ class BalanceAudit(_Audit):
     """Audit of a two-wheeler with a motor at one joint: the energy at the end is at most `first` plus the motor's work.
 
     The audit evaluates the energy only at the end of the run, because every evaluation costs five cosines.
-
-    Attributes:
-        plant: Plant with `torque` and `energy`.
-        first: Energy at the start [J].
-        scale: Energy scale of the tolerance [J].
     """
 
     plant: Part = part()
+    """Plant with `torque` and `energy`."""
     first: Scalar = param(unit="J")
+    """Energy at the start."""
     scale: Scalar = param(unit="J", above=0.0)
+    """Energy scale of the tolerance."""
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum of the work [J] that the motor may have done, this step included.

@@ -71,27 +71,40 @@ class LabRigState(NamedTuple):
 class LabRig(BrakedWheel):
     """Two wheels, a lever, bearing friction, and a brake with a 49 ms lag. The control u in [0, 1] is the brake
     command.
-
-    In the letters of the module's equations, the first eight fields are r1, r2, J1, J2, d1, d2, M10 and M20. Then
-    follow L, phi, Mg, c31, b1, b2 and u0. `crawl_speed` is the least denominator of the slip.
     """
 
     wheel_radius: Scalar = param(default=0.0995, unit="m", above=0.0)
+    """Radius r1 of the braked wheel."""
     drum_radius: Scalar = param(default=0.099, unit="m", above=0.0)
+    """Radius r2 of the road wheel."""
     wheel_inertia: Scalar = param(default=7.53e-3, unit="kg m^2", above=0.0)
+    """Inertia J1 of the braked wheel."""
     drum_inertia: Scalar = param(default=25.6e-3, unit="kg m^2", above=0.0)
+    """Inertia J2 of the road wheel."""
     wheel_friction: Scalar = param(default=1.1874e-4, unit="N m s", low=0.0)
+    """Viscous friction d1 of the braked wheel."""
     drum_friction: Scalar = param(default=2.1468e-4, unit="N m s", low=0.0)
+    """Viscous friction d2 of the road wheel."""
     wheel_stiction: Scalar = param(default=0.003, unit="N m", low=0.0)
+    """Dry friction M10 of the braked wheel."""
     drum_stiction: Scalar = param(default=0.0925, unit="N m", low=0.0)
+    """Dry friction M20 of the road wheel."""
     lever: Scalar = param(default=0.37, unit="m", above=0.0)
+    """Length L of the lever."""
     lever_angle: Scalar = param(default=math.radians(65.61), unit="rad", above=0.0, below=math.pi / 2)
+    """Angle phi of the lever."""
     weight_torque: Scalar = param(default=19.6181, unit="N m", above=0.0)
+    """Torque Mg of the lever's weight."""
     brake_rate: Scalar = param(default=20.37, unit="1/s", above=0.0)
+    """Rate c31 of the brake."""
     brake_gain: Scalar = param(default=15.24, unit="N m", above=0.0)
+    """Torque b1 of the brake at command 1, without the offset."""
     brake_offset: Scalar = param(default=-6.21, unit="N m")
+    """Offset b2 of the brake's torque."""
     brake_threshold: Scalar = param(default=0.415, unit="1", low=0.0, high=1.0, tunable=False)
+    """Command u0 below which the brake is released."""
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
+    """Least denominator of the slip."""
     road: Road = part(default=RIG)
 
     control_unit = "1"  # a command; the other braked plants take a torque in N m

@@ -30,17 +30,20 @@ class RigState(NamedTuple):
 
 @pytree
 class MirroredRig(BrakedWheel):
-    """J1 omega1' = m g r1 mu - tau1, c m r2^2 omega2' = -m g r2 mu.
-
-    The fields are m, r1, r2, J1 and c; `crawl_speed` is the least denominator of the slip.
-    """
+    """J1 omega1' = m g r1 mu - tau1, c m r2^2 omega2' = -m g r2 mu."""
 
     mass: Scalar = param(default=5.3, unit="kg", above=0.0)
+    """Mass m of the vehicle on the wheel."""
     wheel_radius: Scalar = param(default=0.0995, unit="m", above=0.0)
+    """Radius r1 of the braked wheel."""
     body_radius: Scalar = param(default=0.099, unit="m", above=0.0)
+    """Radius r2 of the body wheel."""
     wheel_inertia: Scalar = param(default=7.53e-3, unit="kg m^2", above=0.0)
+    """Inertia J1 of the braked wheel."""
     inertia_factor: Scalar = param(default=0.5, unit="1", above=0.0, high=1.0)
+    """Inertia factor c of the body wheel, J2 = c m r2^2; 1/2 is a disk."""
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
+    """Least denominator of the slip."""
     road: Road = part(default=RIG)
 
     def start(self, initial: BrakeStart) -> RigState:

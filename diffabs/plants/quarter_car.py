@@ -29,15 +29,16 @@ class QuarterCarState(NamedTuple):
 
 @pytree
 class QuarterCar(BrakedWheel):
-    """m v' = -mu m g, J omega' = r mu m g - u. The inertia was identified together with the spline road.
-
-    `crawl_speed` is the least denominator of the slip.
-    """
+    """m v' = -mu m g, J omega' = r mu m g - u. The inertia was identified together with the spline road."""
 
     mass: Scalar = param(default=15.0, unit="kg", above=0.0)
+    """Mass m of the vehicle on the wheel."""
     radius: Scalar = param(default=0.2, unit="m", above=0.0)
+    """Radius r of the wheel."""
     inertia: Scalar = param(default=1.04456, unit="kg m^2", above=0.0)
+    """Inertia J of the wheel."""
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
+    """Least denominator of the slip."""
     road: Road = part(default=SPLINE_B)
 
     def start(self, initial: BrakeStart) -> QuarterCarState:

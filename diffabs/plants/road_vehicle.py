@@ -23,29 +23,26 @@ from diffabs.roads import DRY_ASPHALT
 
 @pytree
 class RoadVehicle(BrakedWheel):
-    """m v' = -Fz mu - c v^2 - f m g, J omega' = r Fz mu - B omega - u.
-
-    Attributes:
-        mass: Mass m of the wheel's share of the car [kg].
-        radius: Radius r of the wheel [m].
-        inertia: Inertia J of the wheel [kg m^2].
-        wheel_load: Load Fz of the wheel on the road [N].
-        drag: Air drag c at 1 m/s [kg/m], half of density, drag coefficient and area.
-        rolling: Coefficient f of rolling resistance [1].
-        bearing: Viscous friction B of the wheel's bearing [N m s].
-        crawl_speed: Least denominator of the slip [m/s].
-        road: Friction curve.
-    """
+    """m v' = -Fz mu - c v^2 - f m g, J omega' = r Fz mu - B omega - u."""
 
     mass: Scalar = param(default=440.0, unit="kg", above=0.0)
+    """Mass m of the vehicle on the wheel."""
     radius: Scalar = param(default=0.3, unit="m", above=0.0)
+    """Radius r of the wheel."""
     inertia: Scalar = param(default=1.6, unit="kg m^2", above=0.0)
+    """Inertia J of the wheel."""
     wheel_load: Scalar = param(default=4316.4, unit="N", above=0.0)
+    """Load Fz of the wheel on the road."""
     drag: Scalar = param(default=0.856, unit="kg/m", low=0.0)
+    """Air drag c at 1 m/s, half of density, drag coefficient and area."""
     rolling: Scalar = param(default=0.01, unit="1", low=0.0)
+    """Coefficient f of rolling resistance."""
     bearing: Scalar = param(default=0.08, unit="N m s", low=0.0)
+    """Viscous friction B of the wheel."""
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
+    """Least denominator of the slip."""
     road: Road = part(default=DRY_ASPHALT)
+    """Friction curve."""
 
     start, project, energy, audit = QuarterCar.start, QuarterCar.project, QuarterCar.energy, QuarterCar.audit
 

@@ -27,7 +27,9 @@ class BrakeStart:
     """A vehicle at `speed` [m/s] whose wheel has `slip` [1], at distance 0."""
 
     speed: Scalar = param(default=100 / 3.6, unit="m/s", above=0.0, high=200.0)
+    """Speed of the vehicle at t = 0."""
     slip: Scalar = param(default=0.0, unit="1", low=0.0, high=1.0)
+    """Slip at t = 0."""
 
 
 def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Scalar:

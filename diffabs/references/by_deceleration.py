@@ -24,16 +24,14 @@ from diffabs.core.types import Scalar, Vector
 class SlipByDeceleration:
     """target = slips(a_f): a table of slips at increasing decelerations, read at the low-pass filtered deceleration
     a_f.
-
-    Attributes:
-        decelerations: Nodes, increasing [m/s^2].
-        slips: Target slips at the nodes [1].
-        time_constant: T of the low-pass filter [s], > 0.
     """
 
     decelerations: Vector = param(default=(1.0, 3.0, 6.0, 10.0), unit="m/s^2", free=True)
+    """Nodes, increasing."""
     slips: Vector = param(default=(0.08, 0.1, 0.13, 0.16), unit="1", above=0.0, high=1.0, free=True)
+    """Targets at the nodes."""
     time_constant: Scalar = param(default=0.05, unit="s", above=0.0)
+    """Time constant T of the low-pass filter."""
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with a_f at the measured deceleration."""

@@ -48,31 +48,28 @@ class SeekingMemory(NamedTuple):
 
 @pytree
 class ExtremumSeeking:
-    """target = s (1 + dither sin(frequency t)), where s climbs the slope of the deceleration between two limits.
-
-    Attributes:
-        slip: Estimate s at the start [1].
-        gain: Rate of ln s for an elasticity of 1, k [1/s].
-        dither: Relative amplitude of the dither, d [1].
-        frequency: Frequency of the dither, w [rad/s].
-        time_constant: Time constant of the means, T [s].
-        resolution: Slip deviation r below which the estimated slope fades to 0 [1].
-        deceleration_floor: Least deceleration in the denominator of the elasticity, b0 [m/s^2].
-        slip_low: Lower limit of s [1].
-        slip_high: Upper limit of s [1].
-        band: Relative distance from a limit within which the gain fades to 0 [1].
-    """
+    """target = s (1 + dither sin(frequency t)), where s climbs the slope of the deceleration between two limits."""
 
     slip: Scalar = param(default=0.12, unit="1", above=0.0, high=1.0)
+    """Target s at the start."""
     gain: Scalar = param(default=3.0, unit="1/s", low=0.0)
+    """Rate k of ln s for an elasticity of 1."""
     dither: Scalar = param(default=0.1, unit="1", low=0.0, below=1.0)
+    """Relative amplitude d of the dither."""
     frequency: Scalar = param(default=30.0, unit="rad/s", above=0.0)
+    """Frequency w of the dither."""
     time_constant: Scalar = param(default=0.1, unit="s", above=0.0)
+    """Time constant T of the means."""
     resolution: Scalar = param(default=2e-3, unit="1", above=0.0)
+    """Slip deviation r below which the estimated slope fades to 0."""
     deceleration_floor: Scalar = param(default=0.5, unit="m/s^2", above=0.0)
+    """Least deceleration b0 in the denominator of the elasticity."""
     slip_low: Scalar = param(default=0.02, unit="1", above=0.0, below=1.0)
+    """Lower limit of the target."""
     slip_high: Scalar = param(default=0.5, unit="1", above=0.0, high=1.0)
+    """Upper limit of the target."""
     band: Scalar = param(default=0.1, unit="1", above=0.0, tunable=False)
+    """Relative distance from a limit within which the gain fades to 0."""
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with s = slip, means at the measured signals, and covariance and variance 0."""

@@ -19,23 +19,20 @@ from diffabs.core.types import Scalar
 
 @pytree
 class LimitedSlip:
-    """A target that rises at most at `rate` v0/v and settles with the time constant T v/v0.
-
-    Attributes:
-        slip: Final target [1].
-        rate: Greatest rate of the target at v0 [1/s], > 0.
-        time_constant: T [s], > 0.
-        reference_speed: v0 [m/s], > 0.
-        period: Period h of the steps [s], > 0.
-        floor: Least speed in the denominator [m/s], > 0.
-    """
+    """A target that rises at most at `rate` v0/v and settles with the time constant T v/v0."""
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
+    """Final target."""
     rate: Scalar = param(default=4.0, unit="1/s", above=0.0)
+    """Greatest rate of the target at v0."""
     time_constant: Scalar = param(default=0.02, unit="s", above=0.0)
+    """Time constant T of the low-pass filter."""
     reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
+    """Speed v0 at which gains and rates have their stated values."""
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    """Period of the samples h."""
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
+    """Least speed in the denominator of the step."""
 
     flow = no_flow
     grid_rules = period_on_grid

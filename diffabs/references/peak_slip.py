@@ -60,13 +60,10 @@ def _fresh_memory(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMem
 
 @pytree
 class PeakLiteral:
-    """The paper's estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake.
-
-    Attributes:
-        slip: Target until |a| exceeds its first sample [1].
-    """
+    """The paper's estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake."""
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
+    """Target until |a| exceeds its first sample."""
 
     every_step = True  # ticks in every step: its braking comes only from the delay of one sample
     flow = no_flow
@@ -102,12 +99,10 @@ class PeakLatch:
 
     It needs an exact accelerometer. Noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip. A forward bias
     does the same, because |a| falls through zero before it rises.
-
-    Attributes:
-        slip: Target before the first maximum [1].
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
+    """Target before the latch."""
 
     flow = no_flow
     output = PeakLiteral.output
@@ -147,18 +142,16 @@ class PeakRobust:
 
     Deceleration and slip pass the same low-pass filter, so their delays cancel. The deceleration keeps its sign,
     because the absolute value of noise has a nonzero mean. A maximum of at most `arming` does not latch.
-
-    Attributes:
-        slip: Target before the latch [1].
-        time_constant: Time constant of both low-pass filters [s], > 0.
-        threshold: Fraction of the maximum by which the deceleration must fall [1].
-        arming: Bound that the maximum must exceed for a latch [m/s^2].
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
+    """Target before the latch."""
     time_constant: Scalar = param(default=0.02, unit="s", above=0.0)
+    """Time constant of both low-pass filters."""
     threshold: Scalar = param(default=0.03, unit="1", above=0.0, below=1.0)
+    """Fraction of the maximum by which the deceleration must fall."""
     arming: Scalar = param(default=3.0, unit="m/s^2", low=0.0, tunable=False)
+    """Bound that the maximum must exceed for a latch."""
 
     output = PeakLiteral.output
     setpoint = PeakLiteral.setpoint

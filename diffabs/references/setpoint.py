@@ -10,6 +10,7 @@ class Setpoint:
     """target = value, for the first signal of the plant's output."""
 
     value: Scalar = param(default=1.0, unit="signal")
+    """Target."""
 
     start = no_memory
     flow = no_flow
@@ -30,6 +31,7 @@ class FixedSlip:
     """target = slip."""
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
+    """Target."""
 
     start = no_memory
     flow = no_flow
@@ -50,14 +52,12 @@ class FilteredSlip:
     """time_constant target' = slip - target, from the measured slip at the start.
 
     From slip 0 this is slip (1 - exp(-t/T)), which the loop can follow without overshoot.
-
-    Attributes:
-        slip: Final value of the target [1].
-        time_constant: T [s], > 0.
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
+    """Final target."""
     time_constant: Scalar = param(default=0.035, unit="s", above=0.0)
+    """Time constant T of the low-pass filter."""
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with the measured slip."""

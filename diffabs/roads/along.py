@@ -28,8 +28,7 @@ FIRST_NODE, LAST = 2, 1  # intervals before 0 and beyond the last factor after w
 class ScaledAlong:
     """f(x) mu of another road, with f a cubic B-spline along the distance x.
 
-    The coefficients are `factors` (n,): factor i belongs to the distance i * `spacing` [m]. The spline smooths them and
-    does not pass through them.
+    Factor i belongs to the distance i * `spacing`. The spline smooths them and does not pass through them.
 
     >>> from diffabs.roads import RIG, ScaledAlong
     >>> road = ScaledAlong(road=RIG, factors=(1.0, 1.0, 1.0, 0.5, 0.5, 0.5), spacing=2.0)
@@ -39,7 +38,9 @@ class ScaledAlong:
 
     road: Road = part(default=DRY_ASPHALT)
     factors: Vector = param(default=(1.0, 0.9, 1.1, 1.0), unit="1", above=0.0, high=10.0, free=True)
+    """Coefficients of the spline f, shape (n,)."""
     spacing: Scalar = param(default=1.0, unit="m", above=0.0)
+    """Distance between the centres of two coefficients."""
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
         """Return mu [1] at a `slip` [1], vehicle `speed` [m/s] and `distance` on the road [m]."""

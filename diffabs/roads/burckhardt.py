@@ -32,9 +32,13 @@ class Burckhardt:
     """
 
     c1: Scalar = param(default=1.2801, unit="1", low=0.0)
+    """Friction that the rise with the slip approaches."""
     c2: Scalar = param(default=23.99, unit="1", above=0.0)
+    """Rate of that rise."""
     c3: Scalar = param(default=0.52, unit="1", low=0.0)
+    """Fall of the friction per slip."""
     c4: Scalar = param(default=0.03, unit="s/m", low=0.0)
+    """Rate of the fall with slip and speed."""
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar = 0.0) -> Scalar:
         """Return mu [1] at a `slip` [1] and vehicle `speed` [m/s]; `distance` has no effect."""

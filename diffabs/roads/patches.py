@@ -20,6 +20,7 @@ class Scaled:
 
     road: Road = part(default=DRY_ASPHALT)
     scale: Scalar = param(default=1.0, unit="1", above=0.0, high=10.0)
+    """Factor of the friction."""
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
         """Return scale * mu [1] at a `slip` [1], vehicle `speed` [m/s] and `distance` on the road [m]."""
@@ -44,7 +45,9 @@ class Patches:
 
     roads: tuple[Road, ...] = part(default=(DRY_ASPHALT, SNOW))
     edges: Vector = param(default=(10.0,), unit="m", low=0.0, free=True)
+    """Distances at which one surface ends and the next begins, increasing."""
     width: Scalar = param(default=0.1, unit="m", low=0.0)
+    """Length of the transition between two surfaces; 0 is a jump."""
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
         """Return mu [1] of the surface at a `distance` [m], for a `slip` [1] and vehicle `speed` [m/s].

@@ -32,7 +32,9 @@ class PiecewiseLinear:
     """
 
     slip: Vector = param(default=TABLE[0], unit="1", low=0.0, high=1.0, free=True)
+    """Knots, increasing from 0 to 1, shape (n,)."""
     mu: Vector = param(default=TABLE[1], unit="1", low=0.0, free=True)
+    """Friction at the knots, shape (n,)."""
 
     problems, rules = Tabulated.problems, Tabulated.rules
 

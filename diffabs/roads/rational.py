@@ -25,11 +25,17 @@ class RationalCurve:
     """mu(s) = w4 s^q/(a + s^q) + w3 s^3 + w2 s^2 + w1 s, with the coefficients rounded as in eq. (13)."""
 
     w1: Scalar = param(default=-4.24e-2, unit="1")
+    """Coefficient of s."""
     w2: Scalar = param(default=2.94e-10, unit="1")
+    """Coefficient of s^2."""
     w3: Scalar = param(default=3.51e-2, unit="1")
+    """Coefficient of s^3."""
     w4: Scalar = param(default=0.407, unit="1", low=0.0)
+    """Friction that the rise with the slip approaches."""
     a: Scalar = param(default=2.57e-4, unit="1", above=0.0)
+    """Value of s^q at which the rise is half over."""
     q: Scalar = param(default=2.10, unit="1", above=1.0)
+    """Exponent of the rise."""
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
         """Return mu [1] at a `slip` [1]; `speed` and `distance` have no effect."""

@@ -44,7 +44,9 @@ class Tabulated:
     """
 
     slip: Vector = param(default=KNOTS[0], unit="1", low=0.0, high=1.0, free=True)
+    """Knots, increasing from 0 to 1, shape (n,)."""
     mu: Vector = param(default=KNOTS[1], unit="1", low=0.0, free=True)
+    """Friction at the knots, shape (n,)."""
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
         """Return mu [1] at a `slip` [1], constant beyond the last knot; `speed` and `distance` have no effect."""
@@ -84,15 +86,12 @@ class Tabulated:
 
 @pytree
 class PiecewiseCubic:
-    """mu(s) = c0 + z (c1 + z (c2 + z c3)), z = s - x_i, between knots.
-
-    Attributes:
-        knots: Knots x_i, shape (n,).
-        rows: Rows (x_i, c0, c1, c2, c3), shape (n - 1, 5).
-    """
+    """mu(s) = c0 + z (c1 + z (c2 + z c3)), z = s - x_i, between knots."""
 
     knots: Vector = param(unit="1")
+    """Knots x_i, shape (n,)."""
     rows: Vector = param(unit="1")
+    """Rows (x_i, c0, c1, c2, c3), shape (n - 1, 5)."""
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
         """Return mu [1] at a `slip` [1], odd in slip and constant beyond the last knot; `speed` and `distance` have no

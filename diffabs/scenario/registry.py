@@ -33,6 +33,7 @@ from diffabs.config.values import (
 )
 from diffabs.core import blocks, protocols
 from diffabs.core.loop import Loop
+from diffabs.core.meanings import field_meanings
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
 from diffabs.core.units import Units, resolve_unit, units_inside, units_of
@@ -360,29 +361,29 @@ def in_kmh(spec: ParameterSpec) -> ParameterSpec:
 
 
 def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
-    """Return the fields of a part as plain values by name: "default", "unit", "range", "low" and "high" of each.
+    """Return by name "meaning", "default", "unit", "range", "low" and "high" of each field, as plain values.
 
     A default that is a part is given by its name. An infinite end of a range is None.
     """
-    rows = {}
+    rows, meanings = {}, field_meanings(type(part))
     for field in dataclasses.fields(part):
         value, spec = getattr(part, field.name), field.metadata.get("spec")
         spec = spec and spec.around(DEFAULT_UNITS)
+        row = {"default": value, "unit": "", "range": "", "low": None, "high": None}
         if "part" in field.metadata:
             inner = family_of(field.name, family)
             names = (
                 [name_of(inner, item) for item in value] if isinstance(value, tuple | list) else name_of(inner, value)
             )
-            rows[field.name] = {"default": names, "unit": "", "range": f"any {inner}", "low": None, "high": None}
-        elif spec is None:
-            low, high = _whole_range(field, value) or (None, None)
-            text = "" if low is None else f"[{low}, {high}]"
-            rows[field.name] = {"default": value, "unit": "", "range": text, "low": low, "high": high}
-        else:
+            row |= {"default": names, "range": f"any {inner}"}
+        elif spec is not None:
             ends = {"low": spec.low, "high": spec.high}
             ends = {name: end if math.isfinite(end) else None for name, end in ends.items()}
-            default = np.asarray(value, float).tolist()
-            rows[field.name] = {"default": default, "unit": spec.unit, "range": spec.interval(), **ends}
+            row |= {"default": np.asarray(value, float).tolist(), "unit": spec.unit, "range": spec.interval(), **ends}
+        elif ends := _whole_range(field, value):
+            low, high = ends
+            row |= {"range": f"[{low}, {high}]", "low": low, "high": high}
+        rows[field.name] = {"meaning": meanings.get(field.name, ""), **row}
     return rows
 
 

@@ -15,16 +15,14 @@ class AngleSensor:
     """theta and psi with Gaussian noise, drawn every `period` and held; all other channels read 0.
 
     A run needs a random key (`rollout(..., key=)`), also with both deviations 0.
-
-    Attributes:
-        theta: Standard deviation of theta [rad].
-        psi: Standard deviation of psi [rad].
-        period: Time between two draws [s], a whole multiple of the integration step.
     """
 
     theta: Scalar = param(default=0.0, unit="rad", low=0.0)
+    """Standard deviation of theta's noise."""
     psi: Scalar = param(default=0.0, unit="rad", low=0.0)
+    """Standard deviation of psi's noise."""
     period: Scalar = param(default=0.01, unit="s", above=0.0, tunable=False)
+    """Period of the draws, a whole multiple of the integration step."""
 
     flow = no_flow
     grid_rules = period_on_grid

@@ -40,16 +40,14 @@ class EncoderSlip:
     """Slip and speeds from differences of positions every `period`, held in between.
 
     The deceleration and the distance are the true ones.
-
-    Attributes:
-        period: Sampling period [s], > 0, a whole multiple of the integration step.
-        dead_zone: A speed below it counts as 0 [m/s].
-        floor: Speed added in the slip's denominator [m/s], > 0.
     """
 
     period: Scalar = param(default=0.01, unit="s", above=0.0, tunable=False)
+    """Period of the samples, a whole multiple of the integration step."""
     dead_zone: Scalar = param(default=0.05, unit="m/s", low=0.0, tunable=False)
+    """A speed below it counts as 0."""
     floor: Scalar = param(default=0.01, unit="m/s", above=0.0)
+    """Least speed in the slip's denominator, which is added there."""
 
     grid_rules = period_on_grid
 

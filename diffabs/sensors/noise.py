@@ -23,20 +23,18 @@ class Noise:
     (`rollout(..., key=)`), also with all deviations 0. The k-th draw is a function of (key, k), so a run is
     deterministic and differentiable in the deviations. A channel with deviation 0 draws nothing, because drawing would
     take most of the run's time.
-
-    Attributes:
-        slip: Standard deviation of the slip [1].
-        speed: Standard deviation of the vehicle speed [m/s].
-        wheel_speed: Standard deviation of the wheel speed [m/s].
-        deceleration: Standard deviation of the deceleration [m/s^2].
-        period: Time between two draws [s], a whole multiple of the integration step.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0)
+    """Standard deviation of the slip's noise."""
     speed: Scalar = param(default=0.0, unit="m/s", low=0.0)
+    """Standard deviation of the vehicle speed's noise."""
     wheel_speed: Scalar = param(default=0.0, unit="m/s", low=0.0)
+    """Standard deviation of the wheel speed's noise."""
     deceleration: Scalar = param(default=0.0, unit="m/s^2", low=0.0)
+    """Standard deviation of the deceleration's noise."""
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    """Period of the draws, a whole multiple of the integration step."""
 
     flow = no_flow
     grid_rules = period_on_grid
@@ -71,14 +69,12 @@ class WheelNoise:
 
     The slip shown is slip + n at any speed. A run needs a random key, also with deviation 0. Teeth of unequal width
     cause such noise. It also enters an estimate of the vehicle speed from the wheel speed.
-
-    Attributes:
-        slip: Standard deviation of n [1].
-        period: Time between two draws [s], a whole multiple of the integration step.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0)
+    """Standard deviation of the slip's noise n."""
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    """Period of the draws, a whole multiple of the integration step."""
 
     flow = no_flow
     grid_rules = period_on_grid
@@ -111,14 +107,12 @@ class PlayedWheelNoise:
     Each period holds one entry of `noise` (length,), cyclically. The slip shown is slip + n. No random key is
     necessary. The entries of `noise` are parameters in place of the draws of `WheelNoise`: a recorded sequence, or the
     result of a search. A repeating sequence models the teeth of a wheel.
-
-    Attributes:
-        noise: Values of n, shape (length,) [1].
-        period: Time for which an entry is held [s], a whole multiple of the integration step.
     """
 
     noise: Vector = param(default=(0.0,), unit="1", free=True)
+    """Values of n, shape (length,)."""
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    """Period of the entries, a whole multiple of the integration step."""
 
     flow = no_flow
     grid_rules, start, output = period_on_grid, WheelNoise.start, WheelNoise.output
@@ -170,9 +164,13 @@ class Bias:
     """
 
     slip: Scalar = param(default=0.0, unit="1")
+    """Bias of the slip."""
     speed: Scalar = param(default=0.0, unit="m/s")
+    """Bias of the vehicle speed."""
     wheel_speed: Scalar = param(default=0.0, unit="m/s")
+    """Bias of the wheel speed."""
     deceleration: Scalar = param(default=0.0, unit="m/s^2")
+    """Bias of the deceleration."""
 
     start = no_memory
     flow = no_flow
@@ -193,15 +191,18 @@ class Bias:
 class Quantisation:
     """measured = q round(true/q) for each channel; q = 0 leaves the channel unchanged.
 
-    Every field is the q of its channel. The distance has none. The derivative with respect to the signal is 0, as on
-    the treads of a staircase; it does not contain the jumps. A run does not depend smoothly on q: a derivative with
-    respect to q raises a ValueError.
+    The distance has no q. The derivative with respect to the signal is 0, as on the treads of a staircase; it does not
+    contain the jumps. A run does not depend smoothly on q: a derivative with respect to q raises a ValueError.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0, tunable=False)
+    """Step q of the slip."""
     speed: Scalar = param(default=0.0, unit="m/s", low=0.0, tunable=False)
+    """Step q of the vehicle speed."""
     wheel_speed: Scalar = param(default=0.0, unit="m/s", low=0.0, tunable=False)
+    """Step q of the wheel speed."""
     deceleration: Scalar = param(default=0.0, unit="m/s^2", low=0.0, tunable=False)
+    """Step q of the deceleration."""
 
     start = no_memory
     flow = no_flow

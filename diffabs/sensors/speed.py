@@ -9,15 +9,12 @@ from diffabs.core.types import Scalar
 
 @pytree
 class WheelSpeed:
-    """A wheel-speed sensor with a first-order filter, w' = (true - w)/T, and the slip (v - w)/max(v, floor).
-
-    Attributes:
-        time_constant: T [s], > 0.
-        floor: Least speed in the slip's denominator [m/s], > 0.
-    """
+    """A wheel-speed sensor with a first-order filter, w' = (true - w)/T, and the slip (v - w)/max(v, floor)."""
 
     time_constant: Scalar = param(default=0.002, unit="s", above=0.0)
+    """Time constant T of the low-pass filter."""
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
+    """Least speed in the slip's denominator."""
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with the filter at the true wheel speed."""
@@ -42,15 +39,13 @@ class IntegratedAccelerometer:
     The bias is that of the signed forward acceleration. A positive bias makes the estimated speed too high and the slip
     too large, which releases the brake. The `floor` limits this effect near standstill.
 
-    Attributes:
-        bias: Bias of the forward acceleration [m/s^2].
-        floor: Least speed in the slip's denominator [m/s], > 0.
-
     Source: Aoki and Nakamura, sec. 4: "obtained by integrating the acceleration sensors".
     """
 
     bias: Scalar = param(default=0.0, unit="m/s^2")
+    """Bias of the forward acceleration."""
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
+    """Least speed in the slip's denominator."""
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Return the memory with the true speed: it is known at the start of braking, because the wheel still rolls."""
@@ -75,14 +70,12 @@ class SpeedScale:
 
     A wrong rolling radius has this effect on a speed that is estimated from another wheel. A factor below 1 hides slip:
     at a measured slip s, the wheel slips by 1 - factor (1 - s).
-
-    Attributes:
-        factor: Ratio of the shown speed to the true one [1], > 0.
-        floor: Least speed in the slip's denominator [m/s], > 0.
     """
 
     factor: Scalar = param(default=1.0, unit="1", above=0.0)
+    """Ratio of the shown speed to the true one."""
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
+    """Least speed in the slip's denominator."""
 
     start = no_memory
     flow = no_flow
@@ -101,18 +94,16 @@ class DriftingSpeed:
         v_seen = (1 + e) v,   e = last + (first - last) exp(-t/T),   slip = (v_seen - w)/max(v_seen, floor)
 
     At a measured slip s, the wheel slips by s - e (1 - s). An error e < 0 hides slip.
-
-    Attributes:
-        first: Relative error at t = 0 [1], > -1.
-        last: Relative error for large t [1], > -1.
-        time_constant: T [s], > 0.
-        floor: Least speed in the slip's denominator [m/s], > 0.
     """
 
     first: Scalar = param(default=0.0, unit="1", above=-1.0)
+    """Relative error at t = 0."""
     last: Scalar = param(default=0.0, unit="1", above=-1.0)
+    """Relative error for large t."""
     time_constant: Scalar = param(default=0.5, unit="s", above=0.0)
+    """Time constant T of the drift."""
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
+    """Least speed in the slip's denominator."""
 
     start = no_memory
     flow = no_flow

@@ -67,25 +67,22 @@ class EstimatorMemory(NamedTuple):
 
 @pytree
 class SpeedEstimator:
-    """A gated Kalman filter of the vehicle speed from wheel speed and accelerometer, for a wheel that slips at times.
-
-    Attributes:
-        noise: Relative noise of the wheel speed [1].
-        growth: Growth q of the uncertainty, from noise and bias of the accelerometer [m/s/s^0.5].
-        gate: Slip from which on the wheel is not trusted [1], unless the recent deceleration is below `rest`.
-        rest: Recent deceleration below which the filter restarts from the wheel speed [m/s^2].
-        hold: Time constant with which the recent deceleration decays [s].
-        period: Sampling period h [s].
-        floor: Least estimate of the speed [m/s].
-    """
+    """A gated Kalman filter of the vehicle speed from wheel speed and accelerometer for a wheel that may slip."""
 
     noise: Scalar = param(default=0.005, unit="1", above=0.0)
+    """Relative noise of the wheel speed."""
     growth: Scalar = param(default=0.05, unit="m/s/s^0.5", above=0.0)
+    """Growth q of the uncertainty, from noise and bias of the accelerometer."""
     gate: Scalar = param(default=0.03, unit="1", above=0.0, below=1.0)
+    """Slip from which on the wheel is not trusted, unless the recent deceleration is below `rest`."""
     rest: Scalar = param(default=1.0, unit="m/s^2", above=0.0)
+    """Recent deceleration below which the filter restarts from the wheel speed."""
     hold: Scalar = param(default=0.02, unit="s", above=0.0)
+    """Time constant with which the recent deceleration decays."""
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    """Period of the samples h."""
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
+    """Least speed that is estimated."""
 
     flow = no_flow
     grid_rules = period_on_grid

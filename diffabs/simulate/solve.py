@@ -247,17 +247,14 @@ class FieldPlant:
 
 @pytree
 class FieldLoop:
-    """A field with its events, as the engine reads a loop (`core.loop.Loop`), in the time s.
-
-    Attributes:
-        inputs: Pytree of y0, t0, t1, args, and the constants of the functions.
-        code: The functions.
-        times_per_event: Number of times that are kept of each event.
-    """
+    """A field with its events, as the engine reads a loop (`core.loop.Loop`), in the time s."""
 
     inputs: dict[str, PyTree] = part()
+    """Pytree of y0, t0, t1, args, and the constants of the functions."""
     code: FieldCode = static()
+    """The functions."""
     times_per_event: int = static()
+    """Number of times that are kept of each event."""
     plant = FieldPlant()
     ticks, jumps, recorders = False, True, ()
 
@@ -459,8 +456,10 @@ class FieldLoop:
 class Saves:
     """An objective that keeps the state at given times, from the cubic of each step."""
 
-    places: Array = param(unit="1", free=True)  # of the span, shape (n,)
-    times: Array = param(unit="1", free=True)  # the same in the time of the field
+    places: Array = param(unit="1", free=True)
+    """Times as shares of the span, shape (n,)."""
+    times: Array = param(unit="1", free=True)
+    """The same in the time of the field, shape (n,)."""
 
     def start(self, sample: Sample) -> Memory:
         """Return the first state for each time."""

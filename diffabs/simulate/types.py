@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.jax_flags import default_flags
+from diffabs.core.meanings import document_fields
 from diffabs.core.protocols import Ending, Sample
 from diffabs.core.types import AnyArray, Bool, Int, Part, PyTree, Scalar
 from diffabs.simulate import convert
 
 
+@document_fields
 @dataclasses.dataclass(frozen=True)
 class FixedStep:
     """Steps of equal length with the classical fourth-order Runge-Kutta method, up to a duration.
@@ -21,19 +23,18 @@ class FixedStep:
     A kink is an instant at which a comparison of the flow changes. Examples are a limit, the knot of a measured road,
     and a wheel that locks. A step that ends on the kink keeps its order. A step across it is exact to h^2, or to h
     where a rate jumps. Its derivative is exact to one order less.
-
-    Attributes:
-        step: Length of a step [s].
-        duration: Longest time of the run [s]. The run ends at the first instant that is not before it.
-        every: A trajectory keeps every `every`-th instant.
-        kinks: True if steps end on kinks, which costs up to twice as much time; False if they do not. None means True
-            for derivatives, and for values only if a rate jumps at a kink (conditional integration).
     """
 
     step: float = 1e-3
+    """Length of a step [s]."""
     duration: float = 10.0
+    """Longest time of the run [s]. The run ends at the first instant that is not before it."""
     every: int = 1
+    """A trajectory keeps every `every`-th instant."""
     kinks: bool | None = None
+    """True if steps end on kinks, which costs up to twice as much time; False if they do not. None means True for
+    derivatives, and for values only if a rate jumps at a kink (conditional integration).
+    """
 
     @property
     def steps(self) -> int:
@@ -42,6 +43,7 @@ class FixedStep:
         return math.ceil(self.duration / self.step * (1 - 1e-12))
 
 
+@document_fields
 @dataclasses.dataclass(frozen=True)
 class Adaptive:
     """Steps as long as their error allows, by Tsitouras' method of fifth order. The reference method remains
@@ -53,20 +55,19 @@ class Adaptive:
     The error of the states and of the plant's first signal controls the step. A signal that depends on time alone has
     no influence, unless states follow it. If a setpoint swings faster than every state, use fixed steps for an integral
     over it.
-
-    Attributes:
-        rtol: Error of a step, as a fraction of the greatest value so far of each state and of the plant's first signal.
-            The error of a metric is some ten times as much (`estimate_accuracy` estimates it).
-        duration: Longest time of the run [s]. The run ends at the first instant of the grid that is not before it.
-        step: Step of a grid [s]. Clocks strike and delays remember on this grid. No step of the integration has to end
-            there.
-        every: A trajectory keeps every `every`-th instant of the grid, by interpolation.
     """
 
     rtol: float = 1e-5
+    """Error of a step, as a fraction of the greatest value so far of each state and of the plant's first signal.
+    The error of a metric is some ten times as much (`estimate_accuracy` estimates it).
+    """
     duration: float = 10.0
+    """Longest time of the run [s]. The run ends at the first instant of the grid that is not before it."""
     step: float = 1e-3
+    """Step of a grid [s]. Clocks strike and delays remember on this grid. No step of the integration has to end there.
+    """
     every: int = 1
+    """A trajectory keeps every `every`-th instant of the grid, by interpolation."""
 
     @property
     def steps(self) -> int:

@@ -21,6 +21,7 @@ class SpeedReached:
     """
 
     speed: Scalar = param(default=5 / 3.6, unit="m/s", above=0.0)
+    """Speed of the vehicle at the end of the run."""
 
     success = True
     otherwise = EXTRAPOLATED
@@ -48,6 +49,7 @@ class Standstill:
     """
 
     speed: Scalar = param(default=0.05, unit="m/s", above=0.0)
+    """Speed of the vehicle at the end of the run."""
 
     success = True
     otherwise = EXTRAPOLATED
@@ -66,6 +68,7 @@ class Fallen:
     """The run of a two-wheeler ends where its frame leans by `angle`; pi/2 is the ground."""
 
     angle: Scalar = param(default=math.pi / 2, unit="rad", above=0.0, high=math.pi)
+    """Lean of the frame at the end of the run; pi/2 is the ground."""
 
     success = False
     otherwise = "FELL: the frame reached the stop's angle"

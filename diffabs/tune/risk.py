@@ -32,12 +32,10 @@ class SmoothWorst:
     """A smooth maximum over the runs, w ln(mean exp(x/w)), with w = `softness` times the mean of |x|.
 
     It lies between the mean (w -> infinity) and the greatest value (w -> 0).
-
-    Attributes:
-        softness: Width w over the mean of |x| [1], > 0.
     """
 
     softness: Scalar = param(default=0.02, unit="1", above=0.0)
+    """Width w over the mean of |x|."""
 
     def __call__(self, values: Vector) -> Scalar:
         """Return the smooth maximum of `values`."""
@@ -52,13 +50,11 @@ class CVaR:
 
     The run at the edge of that fraction counts in part. Level 0 is the mean.
 
-    Attributes:
-        level: Fraction of the runs outside the tail [1], 0 <= level < 1.
-
     Source: R. T. Rockafellar and S. Uryasev, Optimization of conditional value-at-risk, J. Risk 2 (2000).
     """
 
     level: Scalar = param(default=0.9, unit="1", low=0.0, below=1.0)
+    """Share of the runs outside the tail."""
 
     def __call__(self, values: Vector) -> Scalar:
         """Return the mean of the tail of `values`."""
@@ -71,13 +67,10 @@ class CVaR:
 
 @pytree
 class Quantile:
-    """The value that a fraction `level` of the runs does not exceed, interpolated linearly.
-
-    Attributes:
-        level: Fraction of the runs [1], from 0 to 1.
-    """
+    """The value that a fraction `level` of the runs does not exceed, interpolated linearly."""
 
     level: Scalar = param(default=0.9, unit="1", low=0.0, high=1.0)
+    """Share of the runs at or below the quantile."""
 
     def __call__(self, values: Vector) -> Scalar:
         """Return the quantile of `values`."""

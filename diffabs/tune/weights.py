@@ -32,22 +32,19 @@ class LQWeights:
 
     Q (n, n) has the order of the design's states. The first row (n,) of the designed gain replaces the parameter at
     `path`.
-
-    Attributes:
-        loop: The loop.
-        log_diagonal: Logarithm d (n,) of the diagonal of L [1].
-        lower: Entries of L below the diagonal, row by row [1].
-        log_effort: rho = ln R [1].
-        design: Function (Q, R) -> gain.
-        path: Dotted path of the gain in the loop.
     """
 
     loop: Loop = part(default=Loop)
     log_diagonal: Vector = param(default=(0.0, 0.0), unit="1", free=True)
+    """Logarithm d (n,) of the diagonal of L."""
     lower: Vector = param(default=(0.0,), unit="1", free=True)
+    """Entries of L below the diagonal, row by row."""
     log_effort: Scalar = param(default=0.0, unit="1")
+    """rho = ln R."""
     design: GainDesign = static()
+    """Function (Q, R) -> gain."""
     path: str = static(default="controller.gain")
+    """Dotted path of the gain in the loop."""
 
     def problems(self) -> Iterator[str]:
         """Yield a message if `log_diagonal` and `lower` do not have the shapes (n,) and (n (n - 1)/2,)."""

@@ -28,7 +28,8 @@ def test_list_knows_every_part():
     for plural, family in catalogue.PLURALS.items():
         assert set(document[plural]) == set(registry.family_types(family))
     mass = document["plants"]["quarter-car"]["parameters"]["mass"]
-    assert mass == {"default": 15.0, "unit": "kg", "range": "(0, inf) kg", "low": 0.0, "high": None}
+    ends = {"range": "(0, inf) kg", "low": 0.0, "high": None}
+    assert mass == {"meaning": "Mass m of the vehicle on the wheel.", "default": 15.0, "unit": "kg", **ends}
     assert document["plants"]["quarter-car"]["parameters"]["road"]["default"] == "spline-b"
     assert document["roads"]["patches"]["parameters"]["roads"]["default"] == ["dry-asphalt", "snow"]
     assert document["roads"]["snow"]["parameters"]["c1"]["default"] == 0.1946
@@ -42,7 +43,13 @@ def test_list_knows_every_part():
 def test_list_table_shows_units_and_ranges():
     text = run("list", "plants").stdout
     row = next(line for line in text.splitlines() if " mass " in line)
-    assert [cell.strip() for cell in row.split("│")[2:-1]] == ["mass", "5.3", "kg", "(0, inf)"]
+    assert [cell.strip() for cell in row.split("│")[2:-1]] == [
+        "mass",
+        "5.3",
+        "kg",
+        "(0, inf)",
+        "Mass m of the vehicle on the wheel.",
+    ]
     assert "[0, 1]" in text
     assert "snow" not in text
     assert "[dry-asphalt, snow]" in run("list", "roads").stdout

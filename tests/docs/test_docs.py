@@ -96,8 +96,8 @@ def test_the_reference_shows_unit_and_range_of_every_parameter():
 @killed_by("../docs/parameters.py", 'named = {"unit": "Unit of the value", ', "named = {")
 def test_a_part_becomes_a_table():
     text = parameters.table(inspect.getsource(importlib.import_module("diffabs.controllers").PID))
-    assert "| `kp` | `3893.0` | control/signal | (-inf, inf) |" in text.splitlines()
-    assert "| `antiwindup` | `NoAntiWindup` |  | Part |" in text.splitlines()
+    assert "| `b` | `1.0` | 1 | [0, inf) | Set-point weight of the proportional part. |" in text.splitlines()
+    assert "| `antiwindup` | `NoAntiWindup` |  | Part | Anti-windup strategy of the integral. |" in text.splitlines()
     assert parameters.table("def f():\n    return 1\n") == ""
     assert parameters.table("class A:\n    unit = 'm'\n") == "Unit of the value: m."
 

@@ -1,0 +1,49 @@
+"""The meaning of a field is the string below it, as editors and Griffe read it. Help and tables take it from there."""
+
+import ast
+import dataclasses
+import functools
+import inspect
+import itertools
+import textwrap
+from typing import TypeVar
+
+T = TypeVar("T", bound=type)
+
+
+@functools.cache
+def field_meanings(cls: type) -> dict[str, str]:
+    """Return the strings below the fields of a class and its bases, by field; none where the source is not at hand."""
+    meanings: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        try:
+            (tree, *_) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        for field, text in itertools.pairwise(tree.body if isinstance(tree, ast.ClassDef) else ()):
+            match field, text:
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(meaning))):
+                    meanings[name] = " ".join(meaning.split())
+    return meanings
+
+
+def document_fields(cls: T) -> T:
+    """Return the dataclass with the meaning of every field, and the range of a parameter, added to its docstring."""
+    cls.__doc__ = _Docstring(cls.__doc__ or "")  # pyright: ignore[reportAttributeAccessIssue]  # it returns a text
+    return cls
+
+
+@dataclasses.dataclass(frozen=True)
+class _Docstring:
+    """A docstring that is completed when it is read, so that no import waits for the source."""
+
+    text: str
+
+    def __get__(self, instance: object, owner: type) -> str:
+        meanings, lines = field_meanings(owner), []
+        for field in dataclasses.fields(owner):
+            spec = field.metadata.get("spec")
+            words = [meanings.get(field.name, ""), f"In {spec.interval()}." if spec else ""]
+            if any(words):
+                lines.append(f"    {field.name}: {' '.join(filter(None, words))}")
+        return "\n".join([inspect.cleandoc(self.text), *(["", "Attributes:"] if lines else []), *lines])
