@@ -26,7 +26,7 @@ from project import ROOT
 
 TESTS = ROOT / "tests"
 LIMIT_S = 300.0  # for one test; the slowest takes a minute when nothing is compiled yet
-COPIED = ("diffabs", "tests", "experiments", "docs", "examples")
+COPIED = ("diffabs", "tests", "experiments", "docs", "examples", "benchmarks")
 
 
 class Mutant(NamedTuple):
