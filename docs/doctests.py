@@ -1,5 +1,6 @@
 """An extension of Griffe: an example in a docstring, `>>> ...` up to the next empty line, is code on the page; a part
-has a table of its parameters, another class its signature; and lines `name: what it is` are a list."""
+has a table of its parameters, another class its signature; lines `name: what it is` are a list; and the names below
+`See also:` are links."""
 
 import importlib.util
 import pathlib
@@ -9,6 +10,8 @@ from typing import Any
 import griffe
 
 EXAMPLE = re.compile(r"(?:^>>> .*\n?)(?:^.+\n?)*", re.MULTILINE)
+SEE_ALSO = re.compile(r"^See also:\n((?:    `.*\n?)+)", re.MULTILINE)
+NAME = re.compile(r"`([\w.]+)`")
 spec = importlib.util.spec_from_file_location("parameters", pathlib.Path(__file__).with_name("parameters.py"))
 assert spec
 assert spec.loader
@@ -37,6 +40,16 @@ def listed(text: str, names: set[str]) -> str:
     return "\n".join(found)
 
 
+def linked(text: str) -> str:
+    """Return a docstring whose section `See also:` is a list of links; its names are those below `diffabs`."""
+
+    def entry(line: str) -> str:
+        names, _, rest = line.strip().partition(": ")
+        return f"    - {NAME.sub(lambda name: f'[{name[0]}][diffabs.{name[1]}]', names)}: {rest}\n"
+
+    return SEE_ALSO.sub(lambda found: "See also:\n" + "".join(map(entry, found[1].splitlines())), text)
+
+
 class Doctests(griffe.Extension):
     """Changes the docstrings of what is documented."""
 
@@ -44,12 +57,13 @@ class Doctests(griffe.Extension):
         """Of each object, when its members are known."""
         del given
         if obj.docstring:
-            text = listed(fenced(obj.docstring.value), _names(obj))
+            text = linked(listed(fenced(obj.docstring.value), _names(obj)))
             parts = [text]
-            if obj.is_class and parameters.parameters(obj.source):
-                parts = [text, parameters.table(obj.source)]
-            elif obj.is_class:
-                parts = [parameters.signature(obj.source), text, parameters.table(obj.source)]
+            if obj.is_class:
+                text, mark, rest = text.partition("See also:\n")
+                parts = [text.rstrip(), parameters.table(obj.source), mark + rest]
+                if not parameters.parameters(obj.source):
+                    parts.insert(0, parameters.signature(obj.source))
             for name in parameters.meanings(obj.source) if obj.is_class else ():
                 obj.members[name].docstring = None  # the table has it
             obj.docstring.value = "\n\n".join(part for part in parts if part)

@@ -38,7 +38,39 @@ class PIDMemory(NamedTuple):
 
 @pytree
 class PID:
-    """u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high), with any sign of the gains."""
+    """u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high), with any sign of the gains.
+
+    See also:
+        `controllers.Clamping`, `controllers.BackCalculation`: Anti-windup strategies.
+        `controllers.Cascade`: An outer and an inner controller.
+        `controllers.StateFeedback`: u = K x.
+        `tune.tune`: Gains by gradients.
+
+    Notes:
+        With the target r, the plant's first signal y and the feedforward ff
+
+            u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high)
+            I' = r - y,   d' = wc (c r - y - d)
+
+        so the derivative part is kD s wc/(s + wc). The set-point weights b and c change the response to the target
+        only; that to disturbances and the margins of the loop stay. Sources: Aoki and Nakamura, eq. (13), without
+        weights; K. J. Astrom and T. Hagglund, PID Controllers: Theory, Design, and Tuning, 2nd ed., 1995, sec. 3.4, for
+        the weights.
+
+    Examples:
+        >>> from diffabs.controllers import PID
+        >>> from diffabs.core.protocols import Tracking
+        >>> pid = PID(kp=100.0, ki=20.0, low=0.0, high=30.0)
+        >>> signal = Tracking(target=0.2, measured=(0.05,), feedforward=10.0)
+        >>> print(f"{pid.output(0.0, pid.start(signal), signal):.1f}")  # 10 + 100 (0.2 - 0.05)
+        25.0
+
+        Its limits hold also while the integral grows:
+
+        >>> signal = Tracking(target=0.9, measured=(0.05,), feedforward=10.0)
+        >>> print(f"{pid.output(0.0, pid.start(signal), signal):.1f}")
+        30.0
+    """
 
     kp: Scalar = param(default=3893.0, unit="control/signal")
     """Proportional gain. Negative gains are reverse action."""

@@ -269,10 +269,22 @@ def replace(part: T, values: Params) -> T:
     Raises:
         KeyError: A path does not exist.
 
-    >>> import diffabs as d
-    >>> loop = d.replace(d.braking(), {"plant.mass": 12.0, "plant.road.mu.2": 0.8})
-    >>> loop.plant.mass, round(float(loop.plant.road.mu[2]), 3)
-    (12.0, 0.8)
+    See also:
+        `Batch`: Values by path that differ between runs.
+        `arrays`: Every parameter as an array.
+        `check`: Lines about values out of range.
+
+    Notes:
+        Parts are immutable pytrees; the copy shares all other parts. A number in a path is an index of an array or
+        tuple. A derivative by a replaced value is that by the parameter, so a function of one number suffices:
+
+            jax.grad(lambda mass: metric(replace(loop, {"plant.mass": mass})))
+
+    Examples:
+        >>> import diffabs as d
+        >>> loop = d.replace(d.braking(), {"plant.mass": 12.0, "plant.road.mu.2": 0.8})
+        >>> loop.plant.mass, round(float(loop.plant.road.mu[2]), 3)
+        (12.0, 0.8)
     """
     for path, value in values.items():
         get(part, path)

@@ -65,7 +65,25 @@ def certify(
             schedule in discrete time, without `spec.rates`, or with specifications besides decay and cost.
         ModuleNotFoundError: cvxpy is not installed.
 
+    See also:
+        `design.design`: A gain with such a certificate.
+        `design.Certificate`: What is proved. `diffabs verify FILE` proves a stored one again, by independent code.
+        `reach.prove_box`: Bounds of the nonlinear loop with its limits.
+
+    Notes:
+        With C = A + B K at every vertex, a matrix P > 0 proves
+
+            decay   He[P C] + 2 rate P < 0
+            cost    He[P C] + Q + K'R K < 0,   of which trace P is the bound
+
+        where He[M] = M + M'. P is common to all vertices, so the system may vary arbitrarily fast. No such P exists if
+        there are W_i >= 0, not all zero, with sum He[C_i W_i] > 0. A solver finds P or W in floating point; integers of
+        any length then decide the inequalities, with 2^-40 of each entry for its rounding. Source: S. Boyd, L. El
+        Ghaoui, E. Feron and V. Balakrishnan, Linear Matrix Inequalities in System and Control Theory, SIAM, 1994.
+
     Examples:
+        Position feedback of the wrong sign has no common Lyapunov matrix, by proof:
+
         >>> from diffabs.design import Polytope, certify
         >>> box = Polytope(A=[[[0.0, 1.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, -2.0]]], B=[[[0.0], [1.0]]] * 2)
         >>> [certify(gain, box).quadratically_stable for gain in ((-1.0, -1.0), (1.0, -1.0))]

@@ -42,13 +42,6 @@ class Regulator(NamedTuple):
 def lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Regulator:
     """Return the regulator that minimises the integral of x'Q x + 2 x'S u + u'R u for x' = A x + B u.
 
-    >>> import jax
-    >>> from diffabs.linear import lqr
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> A, B = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
-    >>> print(lqr(A, B, [[1.0, 0.0], [0.0, 1.0]], [[1.0]]).gain.round(4))  # -1 and -sqrt(3)
-    [[-1.     -1.7321]]
-
     Args:
         A: State matrix, shape (n, n).
         B: Input matrix, shape (n, m).
@@ -60,6 +53,36 @@ def lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None =
         ValueError: The shapes do not fit, there is no state or no input, or the arrays are float32, in which no P can
             be proven. For matrices that are not traced also: an entry is not finite, Q or R is not symmetric, R is not
             positive definite, or the pair (A, B) is not stabilisable.
+
+    See also:
+        `linear.dlqr`: The same for a sampled system.
+        `linear.care`: The Riccati equation alone.
+        `linear.linearize`: A and B of a loop.
+        `design.design`: One gain for many A and B, with a proof.
+
+    Notes:
+        The gain follows from the stabilising solution P of the Riccati equation
+
+            A' P + P A - (P B + S) R^-1 (B' P + S') + Q = 0,   u = K x,   K = -R^-1 (B' P + S')
+
+        and x(0)' P x(0) is the least cost. The sign is that of u = +K x; python-control and MATLAB return -K. Source:
+        B. D. O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990.
+
+    Examples:
+        A double integrator has the gain (-1, -sqrt(3)):
+
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> from diffabs.linear import lqr
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> A, B, Q = jnp.array([[0.0, 1.0], [0.0, 0.0]]), jnp.array([[0.0], [1.0]]), jnp.eye(2)
+        >>> print(lqr(A, B, Q, jnp.array([[1.0]])).gain.round(4))
+        [[-1.     -1.7321]]
+
+        The gain's derivative by the weight r of the input; K1 = -r^(-1/2):
+
+        >>> print(jax.jacobian(lambda r: lqr(A, B, Q, r[None, None]).gain[0, 0])(jnp.array(1.0)).round(6))
+        0.5
     """
     _check_matrices(A, B, Q, R, S, discrete=False)
     return _solve_lqr(A, B, Q, R, S)

@@ -77,6 +77,34 @@ def care(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
 
     Raises:
         ValueError: The shapes do not fit, there is no state or no input, or the matrices are complex or float32.
+
+    See also:
+        `linear.dare`: The equation in discrete time.
+        `linear.lqr`: The regulator that belongs to P.
+        `linear.kalman`: The filter, whose equation is the dual one.
+        `linear.lyapunov`: The linear equation without feedback.
+
+    Notes:
+        P is computed by structured doubling or, where that does not converge, by the matrix sign of the Hamiltonian.
+        Newton's steps, each a Lyapunov equation, then refine it. The derivative for changes dA, dB, dQ, dR, dS solves
+        one Lyapunov equation with the closed loop Ac = A - B R^-1 (B'P + S')
+
+            Ac' dP + dP Ac + dQ + (dA + dB F)' P + P (dA + dB F) + F'dR F + dS F + F'dS' = 0,   F = -R^-1 (B'P + S')
+
+        Sources: E. K.-W. Chu, H.-Y. Fan and W.-W. Lin, A structure-preserving doubling algorithm for continuous-time
+        algebraic Riccati equations, Linear Algebra Appl. 396 (2005); R. Byers, Solving the algebraic Riccati equation
+        with the matrix sign function, ibid. 85 (1987); D. L. Kleinman, IEEE Trans. Autom. Control 13 (1968).
+
+    Examples:
+        For a double integrator P = [[sqrt(3), 1], [1, sqrt(3)]]:
+
+        >>> import jax
+        >>> from diffabs.linear import care
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> solution = care([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0], [0.0, 1.0]], [[1.0]])
+        >>> print(solution.P.round(4), bool(solution.stabilising))
+        [[1.7321 1.    ]
+         [1.     1.7321]] True
     """
     return _riccati(_solve_continuous, A, B, Q, R, S)
 

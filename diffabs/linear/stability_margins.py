@@ -120,6 +120,36 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
     Raises:
         ValueError: The loop is no open loop, has several inputs or outputs, or has a field that `check_transfer`
             refuses.
+
+    See also:
+        `linear.Transfer`: A linear system with a delay, as an argument.
+        `linear.open_loop`: The loop of a plant and a controller, opened at the control.
+        `linear.linearize`: Its linear model.
+
+    Notes:
+        With the open loop L, feedback u = -L v, S = 1/(1 + L) and T = L/(1 + L)
+
+            gain      the factors k nearest to 1 with k L(jw) = -1
+            phase     the least |angle| to -1 over all w with |L(jw)| = 1
+            delay     the least lag/w to -1 over these w
+            modulus   1/Ms, Ms = max |S(jw)|
+
+        A loop with the modulus margin 1/Ms has a gain margin of at least Ms/(Ms - 1), and a phase margin of at least 2
+        asin(1/(2 Ms)). Frequencies with |L| = 1 are eigenvalues of a Hamiltonian matrix (S. Boyd, V. Balakrishnan and
+        P. Kabamba, A bisection method for computing the H-infinity norm, Math. Control Signals Syst. 2 (1989)). Only
+        there can poles cross the imaginary axis while a delay grows (K. L. Cooke and P. van den Driessche, On zeroes of
+        some transcendental equations, Funkcial. Ekvac. 29 (1986)).
+
+    Examples:
+        L = 1/(s (s + 1)) crosses 1 at w = 0.786 rad/s, with a phase margin of 51.8 degrees:
+
+        >>> import math
+        >>> import numpy as np
+        >>> from diffabs.linear import Transfer, margins
+        >>> A, B = np.array([[0.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [1.0]])
+        >>> result = margins(Transfer(A, B, C=np.array([[1.0, 0.0]]), D=np.zeros((1, 1))))
+        >>> print(f"{math.degrees(result.phase):.1f} degrees at {result.phase_at:.3f} rad/s, {result.delay:.3f} s")
+        51.8 degrees at 0.786 rad/s, 1.151 s
     """
     if not isinstance(loop, OpenLoop | Transfer):
         raise ValueError(

@@ -74,15 +74,31 @@ def failure_probability(
             type, or a drawn point cannot be run.
         importance_sampling.DivergenceError: Too many runs diverge.
 
-    >>> import diffabs as d
-    >>> from diffabs import controllers, reliability, stops, sweep
-    >>> parts = {"initial": d.BrakeStart(speed=10.0, slip=1.0), "stop": stops.SpeedReached(speed=5.0)}
-    >>> loop = d.braking(controller=controllers.ConstantTorque(torque=500.0), **parts)  # a locked wheel
-    >>> space = sweep.Space({"initial.speed": sweep.Normal(10.0, 0.5, low=6.0, high=14.0)})
-    >>> study = sweep.Study(loop, space, samples=1, solver=d.FixedStep(5e-3, 6.0))
-    >>> event = reliability.failure_probability(study, "stop_time", 0.878)
-    >>> print(f"{event.probability:.0e}")  # 1.1e-3 in closed form
-    1e-03
+    See also:
+        `reliability.subset_simulation`: The same for any function of standard normal numbers.
+        `sweep.sweep`: Frequent failures, by counting.
+        `tune.worst_case`: The worst run of a box, without probabilities.
+
+    Notes:
+        The estimate is a product of conditional probabilities along levels b_1 < ... < b_m = bound
+
+            P[F] = P[F_1] P[F_2|F_1] ... P[F_m|F_m-1],   F_j = {z: metric(z) >= b_j},   z ~ N(0, I)
+
+        each of which is large enough for a count. Importance sampling then follows if the failures predict that it
+        halves the deviation. Sources: S.-K. Au and J. L. Beck, Estimation of small failure probabilities in high
+        dimensions by subset simulation, Probab. Eng. Mech. 16 (2001); I. Papaioannou, W. Betz, K. Zwirglmaier and D.
+        Straub, MCMC algorithms for subset simulation, ibid. 41 (2015).
+
+    Examples:
+        >>> import diffabs as d
+        >>> from diffabs import controllers, reliability, stops, sweep
+        >>> parts = {"initial": d.BrakeStart(speed=10.0, slip=1.0), "stop": stops.SpeedReached(speed=5.0)}
+        >>> loop = d.braking(controller=controllers.ConstantTorque(torque=500.0), **parts)  # a locked wheel
+        >>> space = sweep.Space({"initial.speed": sweep.Normal(10.0, 0.5, low=6.0, high=14.0)})
+        >>> study = sweep.Study(loop, space, samples=1, solver=d.FixedStep(5e-3, 6.0))
+        >>> event = reliability.failure_probability(study, "stop_time", 0.878)
+        >>> print(f"{event.probability:.0e}")  # 1.1e-3 in closed form
+        1e-03
     """
     study.check()
     if metric not in study.objectives:

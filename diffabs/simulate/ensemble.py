@@ -78,14 +78,6 @@ def run_batch(
             It also uses XLA if a kernel is impossible. The log says so. The environment variable `DIFFABS_ENGINE`
             replaces "auto" by "xla" or "kernel".
 
-    Examples:
-        >>> import diffabs as d
-        >>> from diffabs.objectives import StopDistance
-        >>> masses = d.Batch({"plant.mass": [12.0, 18.0]})
-        >>> run = d.run_batch(d.braking(), masses, d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
-        >>> print(*(f"{distance:.1f}" for distance in run.metrics["distance"]))
-        43.9 43.8
-
     Raises:
         ValueError: Columns have different lengths, `measure` rejects the arguments, or `enough` is given for runs that
             step together. Also if a batch without values has a loop that `measure` rejects, if `accepted` has a wrong
@@ -93,6 +85,25 @@ def run_batch(
             the reason without a run.
         KeyError: A path does not exist.
         RuntimeError: The engine is "auto" or "kernel", in a process that was forked after JAX had started.
+
+    See also:
+        `Batch`: The parameters that differ, and keys of noise.
+        `measure`: One run, also inside `jax.vmap`.
+        `sweep.sweep`: Millions of runs into files, with statistics.
+        `tune.worst_case`: The worst run of a box.
+
+    Notes:
+        The runs are independent, so their order and number change results by rounding only. With `together=False` a run
+        that has ended makes room for the next: n runs of s_1, ..., s_n steps cost about sum s_i steps, those of
+        `jax.vmap` n max s_i. `docs/performance.md` has times.
+
+    Examples:
+        >>> import diffabs as d
+        >>> from diffabs.objectives import StopDistance
+        >>> masses = d.Batch({"plant.mass": [12.0, 18.0]})
+        >>> run = d.run_batch(d.braking(), masses, d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
+        >>> print(*(f"{distance:.1f}" for distance in run.metrics["distance"]))
+        43.9 43.8
     """
     if not isinstance(batch, Batch):
         raise ValueError(f"batch = {kinds.format_value(batch)} is no Batch; d.Batch(values by path) is needed")

@@ -64,17 +64,36 @@ def rollout(
         objectives: Objectives by the names of their metrics; None for no metrics.
         key: Random key of `jax.random`, for noisy sensors.
 
-    Examples:
-        >>> import diffabs as d
-        >>> run = d.rollout(d.braking(), d.FixedStep(1e-4, 3.0, every=10000))
-        >>> print(*(f"{speed:.1f}" for speed in run.trajectory.sample.output.speed))  # after 0, 1, 2, 3 s
-        27.8 19.1 10.0 1.0
-
     Raises:
         ValueError: A step, duration or stride is not positive, or the step is longer than the duration. A parameter is
             not a real number of at least 32 bits, or has a wrong shape. A concrete parameter is out of range or breaks
             a rule of its part. The start is beyond the stop, or a clock is off the grid. The step
             is not stable; `run_batch` with `accepted=True` makes such a run all the same.
+
+    See also:
+        `measure`: Metrics only, in memory that does not grow with the number of steps.
+        `run_batch`: Many runs, also with trajectories.
+        `solve`: Any other field, without parts.
+        `check`: Lines about what is wrong with a loop, before a run.
+
+    Notes:
+        A loop is a hybrid system, of plant x, controller m and what the sensor and the actuator remember
+
+            x' = f(t, x, u),   y = h(x),   u = c(t, m, r - y),   m' = k(t, m, r - y)
+
+        Steps end where a margin g(t, x) falls through zero: at the stop, at a limit, where a wheel locks. The time t*
+        of such an event depends on the parameters p by
+
+            dt*/dp = -(g_x dx/dp + g_p)/(g_t + g_x f)
+
+        and derivatives of the run contain this term, so that they are right across events. Source: I. A. Hiskens and M.
+        A. Pai, Trajectory sensitivity analysis of hybrid systems, IEEE Trans. Circuits Syst. I 47 (2000).
+
+    Examples:
+        >>> import diffabs as d
+        >>> run = d.rollout(d.braking(), d.FixedStep(1e-4, 3.0, every=10000))
+        >>> print(*(f"{speed:.1f}" for speed in run.trajectory.sample.output.speed))  # after 0, 1, 2, 3 s
+        27.8 19.1 10.0 1.0
     """
     objectives = objectives or {}
     refuse_values(loop, solver, objectives)
@@ -91,15 +110,38 @@ def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, 
         objectives: Objectives by the names of their metrics.
         key: Random key of `jax.random`, for noisy sensors.
 
-    Examples:
-        >>> import diffabs as d
-        >>> from diffabs.objectives import StopDistance
-        >>> run = d.measure(d.braking(), d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
-        >>> print(f"{run.metrics['distance']:.2f} m")
-        43.85 m
-
     Raises:
         ValueError: The arguments are invalid, as in `rollout`.
+
+    See also:
+        `rollout`: The same run with its trajectory.
+        `run_batch`: Many runs by the fastest engine.
+        `replace`: New values of parameters, for a function that JAX differentiates.
+        `tune.tune`: A descent along these derivatives.
+
+    Notes:
+        An objective is an integral, an extreme or the value at an instant. Within a step each signal is the cubic of
+        its values and rates at both ends (Hermite)
+
+            y(t + a h) = (1 - a) y0 + a y1 + a (a - 1) ((1 - 2 a) (y1 - y0) + (a - 1) h y0' + a h y1'),   0 <= a <= 1
+
+        so integrals, peaks and crossings have the fourth order of the steps. Source: E. Hairer, S. P. Norsett and G.
+        Wanner, Solving Ordinary Differential Equations I, sec. II.6.
+
+    Examples:
+        >>> import jax
+        >>> import diffabs as d
+        >>> from diffabs.objectives import StopDistance
+        >>> solver, metrics = d.FixedStep(1e-4, 4.0), {"distance": StopDistance()}
+        >>> print(f"{d.measure(d.braking(), solver, metrics).metrics['distance']:.2f} m")
+        43.85 m
+
+        A metric is a differentiable function of every parameter:
+
+        >>> def distance(mass):
+        ...     return d.measure(d.replace(d.braking(), {"plant.mass": mass}), solver, metrics).metrics["distance"]
+        >>> print(f"{jax.jvp(distance, (15.0,), (1.0,))[1]:.3f} m/kg")
+        -0.017 m/kg
     """
     refuse_values(loop, solver, objectives)
     return run_unchecked(loop, solver, objectives, key, 0, default_engine())

@@ -23,6 +23,32 @@ class FixedStep:
     A kink is an instant at which a comparison of the flow changes. Examples are a limit, the knot of a measured road,
     and a wheel that locks. A step that ends on the kink keeps its order. A step across it is exact to h^2, or to h
     where a rate jumps. Its derivative is exact to one order less.
+
+    See also:
+        `Adaptive`: Steps as long as a tolerance allows.
+        `solve`, `rollout`, `measure`: What takes steps.
+
+    Notes:
+        A step of length h takes four evaluations of the rates
+
+            k1 = f(t, x),   k2 = f(t + h/2, x + h/2 k1),   k3 = f(t + h/2, x + h/2 k2),   k4 = f(t + h, x + h k3)
+            x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4)
+
+        with an error of h^5, so h^4 over a run. Steps are stable for h |lambda| < 2.8 about, with the fastest
+        eigenvalue lambda; an unstable step is refused. Source: E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary
+        Differential Equations I, 2nd ed., sec. II.1.
+
+    Examples:
+        Half the step has a sixteenth of the error:
+
+        >>> import jax, math
+        >>> import diffabs as d
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> for step in (0.1, 0.05):
+        ...     y = d.solve(lambda t, y, args: -y, 1.0, 0.0, 1.0, solver=d.FixedStep(step, 1.0)).y
+        ...     print(f"{abs(y - math.exp(-1.0)):.1e}")
+        3.3e-07
+        2.0e-08
     """
 
     step: float = 1e-3
@@ -55,6 +81,28 @@ class Adaptive:
     The error of the states and of the plant's first signal controls the step. A signal that depends on time alone has
     no influence, unless states follow it. If a setpoint swings faster than every state, use fixed steps for an integral
     over it.
+
+    See also:
+        `FixedStep`: Steps of equal length.
+        `solve`, `rollout`, `measure`: What takes steps.
+
+    Notes:
+        A step takes six evaluations of the rates. Its error e, that of the cubic between its ends, falls as h^4, so the
+        next step has about the length
+
+            0.85 h (rtol max|x|/e)^(1/4)
+
+        within limits: stability, the surface where a comparison changes next, clocks. The states' largest values so far
+        are the scales, so no part declares any. Source: Ch. Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only
+        the first column simplifying assumption, Comput. Math. Appl. 62 (2011).
+
+    Examples:
+        >>> import jax, math
+        >>> import diffabs as d
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> y = d.solve(lambda t, y, args: -y, 1.0, 0.0, 1.0, solver=d.Adaptive(1e-8)).y
+        >>> print(abs(y - math.exp(-1.0)) < 1e-8)
+        True
     """
 
     rtol: float = 1e-5

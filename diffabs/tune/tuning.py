@@ -53,6 +53,37 @@ def tune(
         ValueError: `problem` is no Problem.
         EngineError: The engine of the problem is "kernel", and a kernel cannot make the runs.
         StartError: At every start a run diverges or is inadmissible, or the objective or its gradient is not finite.
+
+    See also:
+        `tune.build_problem`: The problem, from a loop, free parameters and an objective.
+        `tune.worst_case`: Whether the result holds in a box.
+        `design.design`: A gain with a proof, for a linear model.
+
+    Notes:
+        A search works in unbounded coordinates z of the free parameters and descends along the gradient of
+
+            L(z) = J(z)/s + sum [max(0, m + c (g(z) + d))^2 - m^2]/(2 c)
+
+        with the objective J, its scale s, excesses g of the constraints, margin d, multipliers m and penalty c. Steps
+        of L-BFGS satisfy the weak Wolfe conditions, found by bisection, which suits objectives with kinks. Sources: A.
+        S. Lewis and M. L. Overton, Nonsmooth optimization via quasi-Newton methods, Math. Program. 141 (2013); J.
+        Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4. The search is local: several starts show
+        whether its minimum depends on the start.
+
+    Examples:
+        A constant brake torque is tuned for a slip of 0.2:
+
+        >>> import diffabs as d
+        >>> from diffabs import controllers, objectives, plants, roads, stops, tune
+        >>> parts = {"plant": plants.QuarterCar(road=roads.DRY_ASPHALT), "stop": stops.SpeedReached(speed=5.0)}
+        >>> loop = d.braking(controller=controllers.ConstantTorque(torque=20.0), **parts)
+        >>> free, measured = {"controller.torque": (10.0, 100.0)}, {"iae": objectives.IAE()}
+        >>> solver = d.FixedStep(1e-3, 6.0)
+        >>> problem = tune.build_problem(loop, free=free, objective={"iae": 1.0}, measured=measured, solver=solver)
+        >>> tuned = tune.tune(problem)
+        >>> before, after = tuned.objective
+        >>> print(f"{tuned.values['controller.torque']:.1f} N m, {before:.2f} to {after:.2f} s")
+        85.6 N m, 1.14 to 0.18 s
     """
     if not isinstance(problem, Problem):
         kind = type(problem).__name__ if isinstance(problem, Loop) else format_value(problem)
@@ -104,16 +135,38 @@ def build_problem(
         ValueError: A path, range, metric, constraint or batch does not fit, or a parameter is out of range.
         ValueError: `over` or `closed_loop()` overwrites a free parameter, or the engine is unknown.
 
-    >>> import diffabs as d
-    >>> from diffabs import controllers, objectives, plants, roads, stops, tune
-    >>> parts = {"plant": plants.QuarterCar(road=roads.DRY_ASPHALT), "stop": stops.SpeedReached(speed=5.0)}
-    >>> loop = d.braking(controller=controllers.ConstantTorque(torque=20.0), **parts)
-    >>> free, measured = {"controller.torque": (10.0, 100.0)}, {"iae": objectives.IAE()}
-    >>> solver = d.FixedStep(1e-3, 6.0)
-    >>> problem = tune.build_problem(loop, free=free, objective={"iae": 1.0}, measured=measured, solver=solver)
-    >>> tuned = tune.tune(problem)
-    >>> print(f"{tuned.values['controller.torque']:.1f} N m, {tuned.objective[0]:.2f} to {tuned.objective[1]:.2f} s")
-    85.6 N m, 1.14 to 0.18 s
+    See also:
+        `tune.tune`: The search that solves it.
+        `tune.AtMost`: A bound of a metric in every run.
+        `tune.CVaR`, `tune.SmoothWorst`, `tune.Mean`, `tune.Quantile`: Aggregates over the runs.
+        `Batch`: The runs.
+
+    Notes:
+        The objective is
+
+            J(p) = aggregate over the runs i of sum_k w_k m_k(p, i)
+
+        with the weights w of `objective` and the metrics m. A finite range of a parameter becomes the real line by the
+        logistic function. Source of `CVaR`: R. T. Rockafellar and S. Uryasev, Optimization of conditional
+        value-at-risk, J. Risk 2 (2000).
+
+    Examples:
+        The worst of three masses counts, and no wheel may lock:
+
+        >>> import diffabs as d
+        >>> from diffabs import controllers, objectives, tune
+        >>> problem = tune.build_problem(
+        ...     d.braking(controller=controllers.PID(kp=1000.0, ki=100.0)),
+        ...     free={"controller.kp": (100.0, 1e4), "controller.ki": (1.0, 1e4)},
+        ...     measured={"iae": objectives.IAE(), "locked": objectives.LockedTime()},
+        ...     objective={"iae": 1.0},
+        ...     constraints=[tune.AtMost("locked", 0.01)],
+        ...     over=d.Batch({"plant.mass": [12.0, 15.0, 18.0]}),
+        ...     aggregate=tune.SmoothWorst(),
+        ...     solver=d.FixedStep(1e-4, 4.0),
+        ... )
+        >>> problem.space.size, len(problem.constraints), problem.mode.value
+        (2, 1, 'forward')
     """
     check_part(subject)
     loop = build_subject_loop(subject)

@@ -170,6 +170,37 @@ def worst_case(
     Raises:
         ValueError: A path or range does not fit, the metric is unknown, a number is out of its range, a screened point
             cannot be run, or a requested kernel is impossible.
+
+    See also:
+        `tune.tune`: Better parameters for such cases.
+        `reach.prove_box`: A bound that no run of the box exceeds.
+        `reliability.failure_probability`: How often a bound is exceeded.
+
+    Notes:
+        The search maximises m(p) for p in the box: corners and points of a Sobol sequence first, then ascents along
+        dm/dp from the worst of them, in unbounded coordinates. It is local, so a bound that it does not exceed is not
+        proved. A run that exceeds it is a counterexample. Source of the points: I. M. Sobol, USSR Comput. Math. Math.
+        Phys. 7 (1967), scrambled as J. Matousek, J. Complexity 14 (1998).
+
+    Examples:
+        A locked wheel stops later from a higher speed, (14 - 5)/(mu g) = 1.21 s:
+
+        >>> import diffabs as d
+        >>> from diffabs import controllers, objectives, stops, tune
+        >>> parts = {"initial": d.BrakeStart(speed=10.0, slip=1.0), "stop": stops.SpeedReached(speed=5.0)}
+        >>> loop = d.braking(controller=controllers.ConstantTorque(torque=500.0), **parts)
+        >>> worst = tune.worst_case(
+        ...     loop,
+        ...     over={"initial.speed": (8.0, 14.0)},
+        ...     metric="stop_time",
+        ...     measured={"stop_time": objectives.StopTime()},
+        ...     bound=1.0,
+        ...     solver=d.FixedStep(5e-3, 6.0),
+        ...     screen=8,
+        ...     starts=1,
+        ... )
+        >>> print(f"{worst.value:.2f} s from {worst.values['initial.speed']:.1f} m/s", worst.met)
+        1.21 s from 14.0 m/s False
     """
     check_part(loop)
     measured = default_objectives(loop.plant) if measured is None else measured

@@ -185,8 +185,15 @@ def test_a_part_has_one_table_and_no_signature(site):
     assert pid.count("<table>") == 1
     assert "Proportional gain" in pid
     assert "antiwindup" in pid
-    assert "<pre" not in pid
+    assert "PID(</span>" not in pid.partition("<details")[0]
     assert "<h3" not in pid  # no methods
+
+
+def test_see_also_is_a_list_of_links(site):
+    page = (site / "reference" / "loops" / "index.html").read_text()
+    (measure,) = re.findall(r'<h3 id="diffabs.measure".*?(?=<h3 )', page, re.DOTALL)
+    links = re.findall(r'<a [^>]*href="([^"]+)"', measure.partition("See also")[2].partition("</details>")[0])
+    assert links == ["#diffabs.rollout", "#diffabs.run_batch", "#diffabs.replace", "../tuning/#diffabs.tune.tune"]
 
 
 # a query of a newcomer, and pages of which one is among the first three

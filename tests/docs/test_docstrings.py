@@ -14,7 +14,7 @@ from mutants import killed_by
 
 import diffabs
 
-PACKAGES = ("design", "identify", "linear", "reliability", "roads", "scenario", "sweep", "tune")
+PACKAGES = ("controllers", "design", "identify", "linear", "reach", "reliability", "roads", "scenario", "sweep", "tune")
 PACKAGES = ("diffabs", *(f"diffabs.{name}" for name in PACKAGES))
 
 
@@ -89,11 +89,16 @@ def test_every_argument_of_an_exported_function_is_described(name):
     assert [argument for argument in inspect.signature(EXPORTED[name]).parameters if argument not in named] == []
 
 
-SHOWN = {
+MOST_USED = {
     *("core.pytree.replace", "simulate.run.rollout", "simulate.run.measure", "simulate.ensemble.run_batch"),
-    *("linear.linearization.linearize", "linear.regulator.lqr", "linear.regulator.dlqr"),
-    *("design.parameter_box.polytope", "design.synthesis.design", "design.analysis.certify"),
-    *("tune.tuning.build_problem", "reliability.failure.failure_probability", "roads.optimum.peak"),
+    *("simulate.solve.solve", "simulate.types.FixedStep", "simulate.types.Adaptive", "controllers.pid.PID"),
+    *("linear.regulator.lqr", "linear.riccati.care", "linear.stability_margins.margins"),
+    *("design.synthesis.design", "design.analysis.certify", "reach.cover.prove_box"),
+    *("tune.tuning.tune", "tune.tuning.build_problem", "tune.worst.worst_case"),
+    *("identify.identification.identify", "sweep.run.sweep", "reliability.failure.failure_probability"),
+}
+SHOWN = MOST_USED | {
+    *("linear.linearization.linearize", "linear.regulator.dlqr", "design.parameter_box.polytope", "roads.optimum.peak"),
     *(f"roads.{part}" for part in ("burckhardt.Burckhardt", "magic_formula.MagicFormula", "tabulated.Tabulated")),
     "roads.patches.Patches",
 }
@@ -109,10 +114,21 @@ def test_what_is_used_most_has_an_example():
     assert {name.removeprefix("diffabs.") for name in EXAMPLES} >= SHOWN
 
 
+@killed_by("linear/regulator.py", "    Notes:\n", "    Remarks:\n", case="lqr")
+@pytest.mark.parametrize("name", sorted(MOST_USED))
+def test_what_is_used_most_is_explained(name):
+    """With what is similar, and with formulas and their sources."""
+    text = inspect.getdoc(EXPORTED[f"diffabs.{name}"])
+    sections = re.findall(r"^(See also|Notes|Examples):$", text, re.MULTILINE)
+    assert sections == ["See also", "Notes", "Examples"]
+
+
 DEAR = (  # some seconds of compiling
-    *("diffabs.tune.tuning.build_problem", "diffabs.reliability.failure.failure_probability"),
+    *("diffabs.linear.regulator.lqr", "diffabs.linear.riccati.care", "diffabs.reliability.failure.failure_probability"),
     *("diffabs.simulate.ensemble.run_batch", "diffabs.simulate.run.measure", "diffabs.linear.linearization.linearize"),
-    "diffabs.roads.optimum.peak",
+    *("diffabs.roads.optimum.peak", "diffabs.tune.tuning.tune", "diffabs.tune.worst.worst_case"),
+    *("diffabs.sweep.run.sweep", "diffabs.identify.identification.identify", "diffabs.reach.cover.prove_box"),
+    *("diffabs.simulate.solve.solve", "diffabs.simulate.run.rollout"),
 )
 
 
